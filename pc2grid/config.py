@@ -1,0 +1,52 @@
+"""Every number that a user may turn, with its unit, default and reason, for the point-cloud half.
+
+A section per stage; each stage takes only its own. Sections are frozen; unknown keys and values out of
+range are `ConfigError`s that name the key and the closest known one. The whole tree with the sections
+of `signature` is `signature.config.Config`.
+"""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Section(BaseModel):
+    """Base of all sections: frozen, no unknown keys, finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+
+
+class ReadConfig(Section):
+    """How a recording is read."""
+
+    topic: str | None = Field(None, description="topic of the scans; null: the only one that fits")
+    odometry: str | None = Field(None, description='odometry topic; null: found in the log; "none": ignored')
+    base_frame: str | None = Field(None, description="null: base_link, base_footprint, or the sensor if no tf")
+    assume_identity: bool = Field(False, description="treat a sensor frame that tf does not connect as the base")
+
+
+class RegistrationConfig(Section):
+    """Scans -> poses."""
+
+    voxel_m: float | None = Field(None, gt=0, description="KISS-ICP voxel; null: chosen from the data")
+    min_range_m: float = Field(0.3, ge=0, description="nearer returns are the robot itself")
+    max_range_m: float | None = Field(None, gt=0, description="null: chosen from the data")
+    deskew: bool = Field(True, description="undo the motion within a scan where per-point times exist")
+
+
+class ProjectionConfig(Section):
+    """Registered scans -> occupancy grid."""
+
+    resolution_m: float = Field(0.05, gt=0.005, le=1.0, description="edge of a grid cell")
+    band_min_m: float = Field(0.2, description="lower edge of the obstacle band above the floor")
+    band_max_m: float = Field(1.8, description="upper edge of the obstacle band above the floor")
+    max_range_m: float = Field(20.0, gt=0, description="returns farther than this do not draw the map")
+    max_cells: int = Field(100_000_000, gt=0, description="a map larger than this is refused")
+
+
+class PartitionConfig(Section):
+    """Occupancy grid -> submaps (paper III-A)."""
+
+    radius_m: float = Field(8.0, gt=0, description="submap radius r (Table II)")
+    clearance_m: float = Field(0.35, ge=0, description="free space is eroded by this before thinning")
+    cluster_m: float = Field(1.0, gt=0, description="DBSCAN radius that merges junction pixels")

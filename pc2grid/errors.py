@@ -1,0 +1,122 @@
+"""Every error that pc2grid raises on purpose, as one tree.
+
+The library raises; only the command line prints and exits. A message is one line that says what is
+wrong and where; `hint` says what to type next.
+"""
+
+from __future__ import annotations
+
+
+class Pc2GridError(Exception):
+    """Base of all errors of pc2grid.
+
+    Parameters
+    ----------
+    message : what is wrong and where (file, topic, key), in one line.
+    hint : what the user can do or type next; printed behind the message.
+    """
+
+    exit_code = 1
+
+    def __init__(self, message: str, *, hint: str | None = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+    def __str__(self) -> str:
+        return self.message if self.hint is None else f"{self.message} ({self.hint})"
+
+
+# --- logs ---------------------------------------------------------------------------------------------
+
+
+class LogError(Pc2GridError):
+    """A recording cannot be used."""
+
+
+class LogNotFound(LogError):
+    """The path is missing, a folder without a recording, or unreadable."""
+
+
+class NotALog(LogError):
+    """The file is of a kind that pc2grid does not read."""
+
+
+class LogTruncated(LogError):
+    """The recording ends in the middle."""
+
+
+class LogCorrupt(LogError):
+    """The recording is damaged."""
+
+
+class LimitExceeded(LogError):
+    """The file asks for more memory or work than the configured limit allows."""
+
+
+class UnsupportedSchema(LogError):
+    """A topic's message type, encoding or compression is not one that pc2grid reads."""
+
+
+class TopicError(LogError):
+    """The topic asked for does not exist, or several would do and none was named."""
+
+
+class NoScans(LogError):
+    """There is nothing in the recording (or in the part asked for) to make a map from."""
+
+
+class PointCloudError(LogError):
+    """A PointCloud2, LaserScan or depth image contradicts itself."""
+
+
+class FrameError(LogError):
+    """A coordinate frame is unknown, or not connected to the base frame."""
+
+
+# --- maps and registration ----------------------------------------------------------------------------
+
+
+class RegistrationDiverged(Pc2GridError):
+    """Registration lost track and could not go on."""
+
+
+class MapFileError(Pc2GridError):
+    """A map.yaml or its image is malformed."""
+
+
+class TrajectoryFileError(Pc2GridError):
+    """A TUM or KITTI trajectory file is malformed."""
+
+
+# --- configuration, database, output ------------------------------------------------------------------
+
+
+class ConfigError(Pc2GridError):
+    """A configuration key or value is wrong."""
+
+    exit_code = 2
+
+
+class DatabaseError(Pc2GridError):
+    """A submap database cannot be used."""
+
+
+class NotADatabase(DatabaseError):
+    """The file is not a pc2grid database."""
+
+
+class DatabaseCorrupt(DatabaseError):
+    """The database is damaged: its structure, or a row whose checksum is wrong."""
+
+
+class DatabaseVersion(DatabaseError):
+    """The database was written in a format this version does not read."""
+
+
+class DatabaseBusy(DatabaseError):
+    """Another process holds the database for writing."""
+
+
+class OutputError(Pc2GridError):
+    """A result cannot be written: it exists already, the disk is full, or permission is missing."""

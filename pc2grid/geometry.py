@@ -1,0 +1,147 @@
+"""Planar and spatial poses.
+
+Convention, everywhere: `T_target_source` maps coordinates of `source` into `target`,
+`p_target = T_target_source @ p_source`. Axes as in REP-103 (x forward, y left, z up), angles in radians.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+F64 = NDArray[np.float64]
+
+
+def wrap_angle(angle_rad: float) -> float:
+    """The same angle in (-pi, pi]."""
+    wrapped = math.remainder(angle_rad, 2.0 * math.pi)
+    return math.pi if wrapped == -math.pi else wrapped
+
+
+@dataclass(frozen=True, slots=True)
+class SE2:
+    """A planar rigid transform: rotate by `yaw`, then translate by (`x`, `y`). Metres and radians."""
+
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+
+    def __matmul__(self, other: SE2) -> SE2:
+        """Compose: `T_a_c = T_a_b @ T_b_c`."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return SE2(
+            self.x + c * other.x - s * other.y,
+            self.y + s * other.x + c * other.y,
+            wrap_angle(self.yaw + other.yaw),
+        )
+
+    def inverse(self) -> SE2:
+        """`T_b_a` of `T_a_b`."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return SE2(-c * self.x - s * self.y, s * self.x - c * self.y, wrap_angle(-self.yaw))
+
+    def apply(self, points_m: ArrayLike) -> F64:
+        """Map points (N, 2) of the source frame into the target frame, (N, 2)."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        points = np.asarray(points_m, dtype=np.float64)
+        return points @ np.array([[c, s], [-s, c]]) + np.array([self.x, self.y])
+
+    def matrix(self) -> F64:
+        """Homogeneous (3, 3)."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return np.array([[c, -s, self.x], [s, c, self.y], [0.0, 0.0, 1.0]])
+
+    def lift(self) -> F64:
+        """The same motion in space, (4, 4), at z = 0 and level."""
+        matrix = np.eye(4)
+        matrix[:2, :2] = self.matrix()[:2, :2]
+        matrix[:2, 3] = self.x, self.y
+        return matrix
+
+    @staticmethod
+    def flatten(T_target_source: F64) -> SE2:
+        """The planar part of a spatial pose (4, 4): x, y and the heading of its x axis."""
+        return SE2(
+            float(T_target_source[0, 3]),
+            float(T_target_source[1, 3]),
+            math.atan2(float(T_target_source[1, 0]), float(T_target_source[0, 0])),
+        )
+
+
+def transform_points(T_target_source: F64, points_m: NDArray[np.floating]) -> F64:
+    """Map points (N, 3) by a pose (4, 4); returns (N, 3) float64 in the target frame."""
+    return np.asarray(points_m, dtype=np.float64) @ T_target_source[:3, :3].T + T_target_source[:3, 3]
+
+
+def invert_pose(T_target_source: F64) -> F64:
+    """Inverse of a rigid pose (4, 4)."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = T_target_source[:3, :3].T
+    inverse[:3, 3] = -T_target_source[:3, :3].T @ T_target_source[:3, 3]
+    return inverse
+
+
+def pose_from_xyz_quat(xyz_m: ArrayLike, quat_xyzw: ArrayLike) -> F64:
+    """Pose (4, 4) from a translation (3,) and a quaternion (4,) in x, y, z, w order (any length but 0).
+
+    Raises ValueError for a quaternion of length zero or not finite.
+    """
+    x, y, z, w = (float(v) for v in np.asarray(quat_xyzw, dtype=np.float64))
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    if not math.isfinite(norm) or norm < 1e-9:
+        raise ValueError(f"quaternion has no direction: {(x, y, z, w)}")
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = np.asarray(xyz_m, dtype=np.float64)
+    return pose
+
+
+def quat_xyzw_from_pose(T_target_source: F64) -> F64:
+    """Unit quaternion (4,) in x, y, z, w order, w >= 0, of a pose's rotation (4, 4) or (3, 3)."""
+    m = T_target_source
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    # Shepperd's method: divide by the largest component, so that no half turn loses digits.
+    choice = int(np.argmax([m[0, 0], m[1, 1], m[2, 2], trace]))
+    quat = np.empty(4)
+    if choice == 3:
+        quat[:] = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], 1.0 + trace
+    else:
+        i, j, k = choice, (choice + 1) % 3, (choice + 2) % 3
+        quat[i] = 1.0 + m[i, i] - m[j, j] - m[k, k]
+        quat[j] = m[j, i] + m[i, j]
+        quat[k] = m[k, i] + m[i, k]
+        quat[3] = m[k, j] - m[j, k]
+    quat /= np.linalg.norm(quat)
+    return -quat if quat[3] < 0 else quat
+
+
+def rotation_vector(T_target_source: F64) -> F64:
+    """Axis times angle (3,) of a pose's rotation, radians."""
+    quat = quat_xyzw_from_pose(T_target_source)
+    sin_half = float(np.linalg.norm(quat[:3]))
+    if sin_half < 1e-12:
+        return 2.0 * quat[:3]
+    return quat[:3] * (2.0 * math.atan2(sin_half, float(quat[3])) / sin_half)
+
+
+def pose_from_rotation_vector(rotation_rad: ArrayLike, xyz_m: ArrayLike = (0.0, 0.0, 0.0)) -> F64:
+    """Pose (4, 4) from axis times angle (3,) and a translation (3,)."""
+    vector = np.asarray(rotation_rad, dtype=np.float64)
+    angle = float(np.linalg.norm(vector))
+    axis = vector / angle if angle > 1e-12 else np.zeros(3)
+    return pose_from_xyz_quat(xyz_m, (*(axis * math.sin(angle / 2)), math.cos(angle / 2)))
+
+
+def interpolate_pose(T_a: F64, T_b: F64, fraction: float) -> F64:
+    """Pose between two poses (4, 4): straight in translation, constant rate in rotation; 0 -> a, 1 -> b."""
+    relative = invert_pose(T_a) @ T_b
+    step = pose_from_rotation_vector(fraction * rotation_vector(relative), fraction * relative[:3, 3])
+    return T_a @ step

@@ -1,0 +1,1 @@
+"""The console program `pc2grid`: one file per subcommand."""
