@@ -1,0 +1,46 @@
+# pc2grid: every target makes .venv and installs into it when that has not happened yet.
+# Only make, a POSIX shell and python3 >= 3.10 with venv are needed; `make help` lists the targets.
+
+PYTHON ?=
+BIN = .venv/bin
+READY = .venv/.ready
+# Two workers on two cores: the numeric libraries must not each start as many threads as there are cores.
+ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
+PYTEST_ARGS ?=
+
+.PHONY: help demo test check bench fuzz clean
+.DEFAULT_GOAL = help
+
+help:
+	@echo 'make demo    simulate two robots, map with one, find the other; leaves a picture in demo_out/'
+	@echo 'make test    run the tests (PYTEST_ARGS="-k name" for some of them)'
+	@echo 'make check   lint, format, types, import order'
+	@echo 'make bench   measure against the goals and the peers'
+	@echo 'make fuzz    the long search for inputs that break it'
+	@echo 'make clean   remove .venv and everything that was made'
+	@echo 'All of them work from a fresh clone. PYTHON=/path/to/python3 chooses the interpreter for .venv.'
+
+$(READY): pyproject.toml constraints.txt tools/setup.sh
+	@PYTHON='$(PYTHON)' sh tools/setup.sh
+	@touch $(READY)
+
+demo: $(READY)
+	$(BIN)/pc2grid demo --out demo_out --force
+
+test: $(READY)
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n auto --dist loadfile $(PYTEST_ARGS)
+
+check: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	MYPYPATH=tools $(BIN)/mypy -p pc2grid -p signature -p pc2grid_cli
+	$(BIN)/lint-imports
+
+bench: $(READY)
+	$(BIN)/python tools/bench/run.py
+
+fuzz: $(READY)
+	PC2GRID_FUZZ=20000 $(BIN)/python -m pytest -q -n auto -k fuzz --timeout 1200 $(PYTEST_ARGS)
+
+clean:
+	rm -rf .venv demo_out dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

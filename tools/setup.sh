@@ -1,0 +1,80 @@
+#!/bin/sh
+# Make .venv and install pc2grid with its tools for developers into it. Called by the Makefile.
+#
+# open3d needs five libraries of the system, even without a screen. Where they are missing, root gets
+# them from apt; anyone else is told the one line to type.
+set -eu
+
+fail() {
+    echo "setup: $1" >&2
+    [ $# -lt 2 ] || echo "  $2" >&2
+    exit 1
+}
+
+has_apt() { command -v apt-get >/dev/null 2>&1; }
+is_root() { [ "$(id -u)" -eq 0 ]; }
+
+# A Python from 3.10 to 3.13; open3d has no wheels for others.
+fits() { "$1" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1; }
+has_venv() { "$1" -c 'import venv, ensurepip' >/dev/null 2>&1; }
+
+find_python() {
+    for candidate in ${PYTHON:-python3 python3.13 python3.12 python3.11 python3.10}; do
+        if fits "$candidate" && has_venv "$candidate"; then
+            echo "$candidate"
+            return
+        fi
+    done
+}
+
+apt_install() { # why, then package names
+    why=$1
+    shift
+    has_apt || fail "$why; install what your system calls: $*"
+    is_root || fail "$why; install with:" "sudo apt-get update && sudo apt-get install -y $*"
+    echo "setup: $why; installing $*"
+    apt-get update -q >&2 || echo "setup: apt-get update failed, trying with the lists that are there" >&2
+    DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends "$@" >&2 ||
+        fail "apt-get could not install $*"
+}
+
+missing_libraries() { # prints the packages that hold what cannot be loaded
+    "$1" - <<'END'
+import ctypes
+import sys
+
+NEEDED = {
+    "libusb-1.0.so.0": "libusb-1.0-0",
+    "libGL.so.1": "libgl1",
+    "libEGL.so.1": "libegl1",
+    "libX11.so.6": "libx11-6",
+    "libgomp.so.1": "libgomp1",
+}
+for library, package in NEEDED.items() if sys.platform == "linux" else ():
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        print(package)
+END
+}
+
+python=$(find_python)
+if [ -z "$python" ] && [ -z "${PYTHON:-}" ] && fits python3; then
+    apt_install "python3 has no venv" python3-venv
+    python=$(find_python)
+fi
+if [ -z "$python" ]; then
+    [ -z "${PYTHON:-}" ] || fail "PYTHON=$PYTHON is not a Python 3.10 to 3.13 with venv"
+    fail "no Python 3.10 to 3.13 with venv found" "make PYTHON=/path/to/python3.11 ... uses the one you name"
+fi
+
+packages=$(missing_libraries "$python")
+# shellcheck disable=SC2086  # one word per package
+[ -z "$packages" ] || apt_install "open3d needs libraries that are missing here" $packages
+
+.venv/bin/python -c 'import pip' >/dev/null 2>&1 || "$python" -m venv --clear .venv
+echo "setup: installing into .venv with $(.venv/bin/python --version) (the first time takes some minutes)"
+.venv/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]' ||
+    fail "pip could not install pc2grid; its message is above"
+.venv/bin/python -c 'import open3d' || fail "open3d does not load; its message is above"
+echo "setup: ready"
