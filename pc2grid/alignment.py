@@ -1,0 +1,457 @@
+"""Where does one grid fit on another? Best-first branch and bound over planar poses.
+
+The query is a set of occupied points; the map is a likelihood field (how near is the closest occupied
+cell), stored with its sliding maxima. A box of poses (dx, dy, dyaw) moves a point at distance d from the
+query's centre by no more than `half_t + d * half_a`, so the maximum of the field within that reach bounds
+what any pose in the box can score: boxes that cannot beat what has been found are never opened (Olson
+2015, "M3RSM: many-to-many multi-resolution scan matching", and Hess et al. 2016 for translations; here the
+bound is per point, so rotation is searched by the same tree).
+
+The winners are refined below the cell size by Gauss-Newton on the interpolated field and scored both
+ways: the query's walls against the map's free space, and the map's walls against the query's.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.geometry import F64, SE2, wrap_angle
+from pc2grid.model import F32, OccupancyGrid
+
+U8 = NDArray[np.uint8]
+
+SIGMA_M = 0.10
+"""Width of the likelihood around a wall: cell size, registration and sensor noise together."""
+NEUTRAL = 0.35
+"""What a point on unknown cells scores: about what a random point of a building scores, so that ground
+one side has not seen speaks neither for nor against a pose."""
+REACHES_M = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+"""Radii of the sliding maxima; the first is the field itself."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LikelihoodField:
+    """A map prepared for alignment.
+
+    levels : (L, H, W) uint8, sliding maxima of the field over `reaches_m`; 255 = on a wall.
+    walls_m : (K, 2) float32 occupied cell centres, map frame, sorted by tile of `TILE_M`.
+    """
+
+    levels: U8
+    reaches_m: tuple[float, ...]
+    known: NDArray[np.bool_]
+    walls_m: F32
+    resolution_m: float
+    origin_m: tuple[float, float]
+
+
+def likelihood(
+    grid: OccupancyGrid, sigma_m: float = SIGMA_M, neutral: float = NEUTRAL
+) -> tuple[U8, NDArray[np.bool_]]:
+    """Field (H, W) uint8 of exp(-d^2 / 2 sigma^2) to the nearest wall, unknown cells at least neutral.
+
+    Also returns which cells are known (H, W).
+    """
+    import cv2
+
+    occupied = grid.occupied
+    known = occupied | grid.free
+    distance = cv2.distanceTransform((~occupied).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    field = np.exp(-0.5 * (distance * (grid.resolution_m / sigma_m)) ** 2) * 255.0
+    if not occupied.any():
+        field = np.zeros(grid.cells.shape)
+    field = np.where(known, field, np.maximum(field, neutral * 255.0))
+    return field.astype(np.uint8), known
+
+
+def prepare(grid: OccupancyGrid) -> LikelihoodField:
+    """Build the likelihood field of a map and its sliding maxima, padded so that queries may hang over.
+
+    Everything outside the map counts as unknown.
+    """
+    import cv2
+
+    pad = round(2.0 / grid.resolution_m)
+    cells = np.full((grid.cells.shape[0] + 2 * pad, grid.cells.shape[1] + 2 * pad), -1, dtype=np.int8)
+    cells[pad:-pad, pad:-pad] = grid.cells
+    padded = OccupancyGrid(
+        cells=cells,
+        resolution_m=grid.resolution_m,
+        origin_m=(grid.origin_m[0] - pad * grid.resolution_m, grid.origin_m[1] - pad * grid.resolution_m),
+    )
+    field, known = likelihood(padded)
+    levels = [field]
+    for reach_m in REACHES_M[1:]:
+        n = math.ceil(reach_m / grid.resolution_m)
+        kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * n + 1, 2 * n + 1))
+        levels.append(cv2.dilate(field, kernel, borderType=cv2.BORDER_REPLICATE))
+    walls = padded.to_point(np.argwhere(padded.occupied)).astype(np.float32)
+    return LikelihoodField(
+        levels=np.stack(levels),
+        reaches_m=REACHES_M,
+        known=known,
+        walls_m=walls,
+        resolution_m=padded.resolution_m,
+        origin_m=padded.origin_m,
+    )
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[untyped-decorator]
+def _bound(
+    levels: U8,
+    point_level: NDArray[np.int64],
+    x: F32,
+    y: F32,
+    tx: float,
+    ty: float,
+    yaw: float,
+    outside: int,
+    least: float,
+) -> float:
+    """Sum of the field at the transformed points (all lengths in cells); stops once below `least`."""
+    _, height, width = levels.shape
+    c, s = math.cos(yaw), math.sin(yaw)
+    n = len(x)
+    total = 0.0
+    for p in range(n):
+        j = int(math.floor(c * x[p] - s * y[p] + tx))
+        i = int(math.floor(s * x[p] + c * y[p] + ty))
+        total += levels[point_level[p], i, j] if (0 <= i < height and 0 <= j < width) else outside
+        if (p & 31) == 31 and total + 255.0 * (n - 1 - p) < least:
+            return -1.0
+    return total
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _levels_for(d: F32, half_t: float, half_a: float, reaches: F64) -> NDArray[np.int64]:
+    """The smallest sliding maximum that covers what a box does to a point at distance d (cells)."""
+    out = np.empty(len(d), dtype=np.int64)
+    for p in range(len(d)):
+        reach = half_t + d[p] * half_a
+        level = 0
+        while level < len(reaches) - 1 and reaches[level] < reach - 0.5:
+            level += 1
+        out[p] = level
+    return out
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _search(
+    levels: U8,
+    reaches: F64,
+    x: F32,
+    y: F32,
+    starts: F64,
+    half_t0: float,
+    half_a0: float,
+    depth: int,
+    floor: float,
+    keep: float,
+    most: int,
+    apart_t: float,
+    apart_a: float,
+    budget: int,
+    outside: int,
+) -> tuple[F64, int]:
+    """Best-first search; see `search`. Poses are (tx, ty, yaw, score) in cells, score in 0..1."""
+    n = len(x)
+    d = np.sqrt(x * x + y * y)
+    point_levels = np.empty((depth + 1, n), dtype=np.int64)
+    for k in range(depth + 1):
+        point_levels[k] = _levels_for(d, half_t0 * 0.5**k, half_a0 * 0.5**k, reaches)
+    scale = 1.0 / (255.0 * n)
+    heap = [(0.0, 0, 0.0, 0.0, 0.0)]
+    heap.pop()
+    for b in range(len(starts)):
+        score = _bound(
+            levels, point_levels[0], x, y, starts[b, 0], starts[b, 1], starts[b, 2], outside, floor / scale
+        )
+        if score * scale >= floor:
+            heap.append((-score * scale, 0, starts[b, 0], starts[b, 1], starts[b, 2]))
+    heapq.heapify(heap)
+    found = np.empty((most, 4), dtype=np.float64)
+    count, opened = 0, 0
+    while len(heap) > 0 and count < most and opened < budget:
+        negative, k, tx, ty, yaw = heapq.heappop(heap)
+        if count > 0 and -negative < max(floor, keep * found[0, 3]):
+            break
+        near = False
+        for h in range(count):
+            dyaw = abs(yaw - found[h, 2]) % (2 * math.pi)
+            dyaw = min(dyaw, 2 * math.pi - dyaw)
+            if max(abs(tx - found[h, 0]), abs(ty - found[h, 1])) < apart_t and dyaw < apart_a:
+                near = True
+                break
+        if near:
+            continue
+        if k == depth:
+            found[count] = tx, ty, yaw, -negative
+            count += 1
+            continue
+        opened += 1
+        half_t, half_a = half_t0 * 0.5 ** (k + 1), half_a0 * 0.5 ** (k + 1)
+        least = floor if count == 0 else max(floor, keep * found[0, 3])
+        for sx in (-1, 1):
+            for sy in (-1, 1):
+                for sa in (-1, 1):
+                    bx, by, ba = tx + sx * half_t, ty + sy * half_t, yaw + sa * half_a
+                    score = _bound(levels, point_levels[k + 1], x, y, bx, by, ba, outside, least / scale)
+                    if score * scale >= least:
+                        heapq.heappush(heap, (max(-score * scale, negative), k + 1, bx, by, ba))
+    return found[:count], opened
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fit:
+    """How a query lies on a map at one pose.
+
+    T_map_query : pose of the query's frame in the map.
+    forward : 0..1, mean likelihood of the query's walls where the map is known.
+    backward : 0..1, mean likelihood of the map's walls where the query has looked.
+    overlap : 0..1, share of the query's walls that fall on known ground of the map.
+    conflict : 0..1, share of known ground on which the two sides contradict each other clearly.
+    score : 0..1, what hypotheses are ranked by.
+    covariance : (3, 3) of x, y, yaw from the score surface: wide along a corridor, narrow across it.
+    """
+
+    T_map_query: SE2
+    forward: float
+    backward: float
+    overlap: float
+    conflict: float
+    score: float
+    covariance: F64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Query:
+    """A query's grid prepared for alignment.
+
+    walls_m : (M, 2) float32 occupied cell centres, query frame, thinned evenly to `spacing_m`.
+    field, known : likelihood (H, W) uint8 and known cells of the query's grid, for the way back.
+    """
+
+    walls_m: F32
+    field: U8
+    known: NDArray[np.bool_]
+    resolution_m: float
+    origin_m: tuple[float, float]
+    center_m: tuple[float, float]
+
+
+def thin_evenly(points_m: NDArray[np.floating], spacing_m: float) -> NDArray[np.intp]:
+    """Indices (K,) of one point per square of `spacing_m`; deterministic, keeps the order of the points."""
+    keys = np.floor(np.asarray(points_m) / spacing_m).astype(np.int64)
+    keys -= keys.min(axis=0, initial=0)
+    flat = keys[:, 0] * (keys[:, 1].max(initial=0) + 1) + keys[:, 1]
+    return np.sort(np.unique(flat, return_index=True)[1])
+
+
+def prepare_query(
+    grid: OccupancyGrid, *, spacing_m: float = 0.1, center_m: tuple[float, float] | None = None
+) -> Query:
+    """Prepare a query grid; `center_m` (query frame) is what poses rotate about, by default the walls' mean."""
+    field, known = likelihood(grid)
+    walls = grid.to_point(np.argwhere(grid.occupied))
+    walls = walls[thin_evenly(walls, spacing_m)]
+    if center_m is None:
+        mean = walls.mean(axis=0) if len(walls) else np.zeros(2)
+        center_m = (float(mean[0]), float(mean[1]))
+    return Query(
+        walls_m=walls.astype(np.float32),
+        field=field,
+        known=known,
+        resolution_m=grid.resolution_m,
+        origin_m=grid.origin_m,
+        center_m=center_m,
+    )
+
+
+def search(
+    target: LikelihoodField,
+    walls_m: F32,
+    starts: F64,
+    *,
+    half_t_m: float = 0.4,
+    half_a_rad: float = math.radians(8.0),
+    finest_m: float = 0.06,
+    floor: float = 0.45,
+    keep: float = 0.8,
+    most: int = 10,
+    apart_m: float = 0.5,
+    apart_rad: float = math.radians(10.0),
+    budget: int = 50_000,
+) -> F64:
+    """The best distinct poses of a point set on a map, best first.
+
+    Parameters
+    ----------
+    walls_m : (M, 2) points, already centred on what they should rotate about.
+    starts : (B, 3) x, y, yaw: boxes of poses with half widths `half_t_m` and `half_a_rad` to search.
+    finest_m : boxes are split until their half width is at most this.
+    floor, keep : poses scoring below `floor`, or below `keep` times the best, are not reported.
+    apart_m, apart_rad : two reported poses differ by more than one of these.
+    budget : boxes opened at most.
+
+    Returns (H, 4): x, y, yaw, score (mean likelihood over all points, 0..1, at the box centre).
+    """
+    if not len(walls_m) or not len(starts):
+        return np.empty((0, 4))
+    res = target.resolution_m
+    depth = max(0, math.ceil(math.log2(half_t_m / finest_m)))
+    cells = (starts - np.array([target.origin_m[0], target.origin_m[1], 0.0])) / np.array([res, res, 1.0])
+    found, _ = _search(
+        target.levels,
+        np.asarray(target.reaches_m) / res,
+        np.ascontiguousarray(walls_m[:, 0] / res, dtype=np.float32),
+        np.ascontiguousarray(walls_m[:, 1] / res, dtype=np.float32),
+        cells,
+        half_t_m / res,
+        half_a_rad,
+        depth,
+        floor,
+        keep,
+        most,
+        apart_m / res,
+        apart_rad,
+        budget,
+        int(255 * NEUTRAL),
+    )
+    found[:, :2] = found[:, :2] * res + np.asarray(target.origin_m)
+    return found
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _gauss_newton(
+    field: U8, x: F64, y: F64, tx: float, ty: float, yaw: float, steps: int
+) -> tuple[float, float, float, F64, float]:
+    """Climb the interpolated field; lengths in cells. Returns pose, Hessian (3, 3) and mean squared misfit."""
+    height, width = field.shape
+    H = np.zeros((3, 3))
+    misfit = 1.0
+    for _ in range(steps):
+        c, s = math.cos(yaw), math.sin(yaw)
+        H[:] = 0.0
+        g = np.zeros(3)
+        total, count = 0.0, 0
+        for p in range(len(x)):
+            u = c * x[p] - s * y[p] + tx - 0.5
+            v = s * x[p] + c * y[p] + ty - 0.5
+            j, i = int(math.floor(u)), int(math.floor(v))
+            if i < 0 or j < 0 or i >= height - 1 or j >= width - 1:
+                continue
+            a, b = u - j, v - i
+            f00, f01 = field[i, j] / 255.0, field[i, j + 1] / 255.0
+            f10, f11 = field[i + 1, j] / 255.0, field[i + 1, j + 1] / 255.0
+            f = (1 - b) * ((1 - a) * f00 + a * f01) + b * ((1 - a) * f10 + a * f11)
+            du = (1 - b) * (f01 - f00) + b * (f11 - f10)
+            dv = (1 - a) * (f10 - f00) + a * (f11 - f01)
+            if f < 0.05:  # clutter or moved furniture: too far from any wall to pull
+                continue
+            r = 1.0 - f
+            jy = du * (-s * x[p] - c * y[p]) + dv * (c * x[p] - s * y[p])
+            total += r * r
+            count += 1
+            J = (du, dv, jy)
+            for m in range(3):
+                g[m] += J[m] * r
+                for n in range(3):
+                    H[m, n] += J[m] * J[n]
+        if count < 10:
+            break
+        misfit = total / count
+        damped = H.copy()
+        for m in range(3):
+            damped[m, m] = H[m, m] * 1.05 + 1e-3
+        step = np.linalg.solve(damped, g)
+        size = math.sqrt(step[0] ** 2 + step[1] ** 2)
+        if size > 2.0:
+            step *= 2.0 / size
+        tx += step[0]
+        ty += step[1]
+        yaw += step[2]
+        if size < 0.005 and abs(step[2]) < 1e-4:
+            break
+    return tx, ty, yaw, H, misfit
+
+
+def refine(target: LikelihoodField, query: Query, T_map_query: SE2, *, steps: int = 12) -> tuple[SE2, F64]:
+    """Improve a pose below the cell size; returns it with its covariance (3, 3) of x, y, yaw in the map.
+
+    The covariance is the inverse of the Gauss-Newton Hessian, scaled for the correlation of neighbouring
+    points, with the neighbourhood that the field can see (0.5 m, 0.1 rad) as its prior, so that a direction
+    the walls do not constrain is answered with that width and not with infinity.
+    """
+    res = target.resolution_m
+    cx, cy = query.center_m
+    at = T_map_query.apply(np.array([[cx, cy]]))[0]
+    local = (query.walls_m.astype(np.float64) - (cx, cy)) / res
+    tx, ty, yaw, H, misfit = _gauss_newton(
+        target.levels[0],
+        local[:, 0],
+        local[:, 1],
+        (at[0] - target.origin_m[0]) / res,
+        (at[1] - target.origin_m[1]) / res,
+        T_map_query.yaw,
+        steps,
+    )
+    center = SE2(tx * res + target.origin_m[0], ty * res + target.origin_m[1], wrap_angle(yaw))
+    scale = np.array([res, res, 1.0])
+    correlated = 5.0
+    information = H / np.outer(scale, scale) / (correlated * max(misfit, 0.02))
+    information += np.diag([1 / 0.5**2, 1 / 0.5**2, 1 / 0.1**2])
+    return center @ SE2(-cx, -cy, 0.0), np.linalg.inv(information)
+
+
+def _sample(field: NDArray[np.generic], cells: NDArray[np.int64], outside: float) -> F64:
+    """Values of a grid (H, W) at cells (N, 2) given as (column, row), `outside` beyond its edge."""
+    height, width = field.shape
+    columns, rows = cells[:, 0], cells[:, 1]
+    inside = (rows >= 0) & (columns >= 0) & (rows < height) & (columns < width)
+    values = np.full(len(cells), outside)
+    values[inside] = field[rows[inside], columns[inside]]
+    return values
+
+
+def assess(target: LikelihoodField, query: Query, T_map_query: SE2, covariance: F64) -> Fit:
+    """Score a pose both ways: query walls on the map, and map walls on what the query has looked at."""
+    res = target.resolution_m
+    there = np.floor((T_map_query.apply(query.walls_m) - target.origin_m) / res).astype(np.int64)
+    known = _sample(target.known, there, 0.0) > 0
+    fits = _sample(target.levels[0], there, 0.0)[known] / 255.0
+    forward = float(fits.mean()) if len(fits) else 0.0
+
+    height, width = query.known.shape
+    corners = (
+        np.array([[0, 0], [width, 0], [0, height], [width, height]]) * query.resolution_m + query.origin_m
+    )
+    low, high = (f(T_map_query.apply(corners), axis=0) for f in (np.min, np.max))
+    walls = target.walls_m
+    walls = walls[((walls >= low) & (walls <= high)).all(axis=1)]
+    if len(walls):
+        walls = walls[thin_evenly(walls, 0.1)]
+    back = np.floor((T_map_query.inverse().apply(walls) - query.origin_m) / query.resolution_m).astype(
+        np.int64
+    )
+    looked = _sample(query.known, back, 0.0) > 0
+    echoes = _sample(query.field, back, 0.0)[looked] / 255.0
+    backward = float(echoes.mean()) if len(echoes) else 0.0
+
+    seen = len(fits) + len(echoes)
+    conflict = float((np.sum(fits < 0.02) + np.sum(echoes < 0.02)) / seen) if seen else 1.0
+    overlap = len(fits) / max(len(query.walls_m), 1)
+    return Fit(
+        T_map_query=T_map_query,
+        forward=forward,
+        backward=backward,
+        overlap=overlap,
+        conflict=conflict,
+        score=math.sqrt(forward * backward) * min(1.0, overlap / 0.5),
+        covariance=covariance,
+    )
