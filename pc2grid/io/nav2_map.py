@@ -1,0 +1,286 @@
+"""nav2 map files: `map.yaml` and its image, read and written with exactly the semantics of nav2_map_server.
+
+Pixels are grey: 254 free, 0 occupied, 205 unknown (trinary); image row 0 is the largest y; `origin` is the
+lower-left corner of the lower-left pixel.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import re
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.errors import MapFileError
+from pc2grid.io.atomic import replace_file
+from pc2grid.model import UNKNOWN, OccupancyGrid
+
+MapMode = Literal["trinary", "scale", "raw"]
+
+MAX_CELLS = 100_000_000
+_MAX_YAML_BYTES = 65_536
+_log = logging.getLogger(__name__)
+
+
+def load_map(yaml_path: Path) -> OccupancyGrid:
+    """Read a `map.yaml` with its image, as nav2_map_server's map_io does.
+
+    Trinary: above `occupied_thresh` 100, below `free_thresh` 0, else -1. Scale: linear between the
+    thresholds, not opaque -1. Raw: the pixel value if 0..100, else -1.
+
+    Raises MapFileError naming the key or the image that is wrong.
+    """
+    yaml_path = Path(yaml_path)
+    keys = _read_yaml(yaml_path)
+    image_path = _image_path(yaml_path, keys)
+    mode = str(keys.get("mode", "trinary"))
+    resolution_m = _number(yaml_path, keys, "resolution")
+    if resolution_m <= 0:
+        raise MapFileError(f"{yaml_path}: resolution: expected > 0, found {resolution_m}")
+    origin = _origin(yaml_path, keys)
+    negate = _flag(yaml_path, keys, "negate")
+    occupied_thresh = _number(yaml_path, keys, "occupied_thresh")
+    free_thresh = _number(yaml_path, keys, "free_thresh")
+    if not 0.0 <= free_thresh <= occupied_thresh <= 1.0:
+        raise MapFileError(
+            f"{yaml_path}: free_thresh: expected 0 <= free_thresh <= occupied_thresh <= 1, "
+            f"found {free_thresh} and {occupied_thresh}"
+        )
+    grey, alpha = _read_image(image_path)
+    shade = grey
+    if mode == "trinary" and alpha is not None:
+        shade = (3.0 * grey + alpha) / 4.0  # nav2 averages the alpha channel in with the colours here
+    occupancy = shade if negate else 1.0 - shade
+
+    cells = np.full(grey.shape, UNKNOWN, dtype=np.int8)
+    if mode == "raw":
+        value = np.round(grey * 255.0)
+        cells[value <= 100] = value[value <= 100].astype(np.int8)
+    elif mode in ("trinary", "scale"):
+        if mode == "scale":
+            span = (occupied_thresh - free_thresh) or 1.0
+            between = (occupancy >= free_thresh) & (occupancy <= occupied_thresh)
+            cells[between] = np.rint((occupancy[between] - free_thresh) / span * 100.0).astype(np.int8)
+        cells[occupancy > occupied_thresh] = 100
+        cells[occupancy < free_thresh] = 0
+        if mode == "scale" and alpha is not None:
+            cells[alpha < 1.0] = UNKNOWN
+    else:
+        raise MapFileError(f"{yaml_path}: mode: {mode!r} is not one of trinary, scale, raw")
+    return OccupancyGrid(cells=np.ascontiguousarray(cells[::-1]), resolution_m=resolution_m, origin_m=origin)
+
+
+def save_map(
+    grid: OccupancyGrid,
+    stem: Path,
+    *,
+    mode: MapMode = "trinary",
+    image_format: Literal["pgm", "png"] = "pgm",
+) -> tuple[Path, Path]:
+    """Write `<stem>.yaml` and `<stem>.pgm` or `.png`; returns both paths. Existing files are replaced.
+
+    `scale` needs transparency for unknown cells and therefore always writes png, as nav2's saver does.
+    Numbers have full precision (nav2's saver rounds them to three decimals).
+    """
+    stem = Path(stem)
+    if mode not in ("trinary", "scale", "raw"):
+        raise MapFileError(f"mode: {mode!r} is not one of trinary, scale, raw")
+    suffix = "png" if mode == "scale" else image_format
+    cells = grid.cells[::-1].astype(np.int16)
+    known = cells >= 0
+    # 0.196 and not 0.25: grey 205 is p = 0.196078, which a threshold of 0.25 would read as free.
+    occupied_thresh, free_thresh = 0.65, 0.196
+    pixels: NDArray[np.uint8]
+    if mode == "trinary":
+        pixels = np.full(cells.shape, 205, dtype=np.uint8)
+        pixels[known & (cells < 20)] = 254
+        pixels[cells >= 65] = 0
+    elif mode == "raw":
+        pixels = np.where(known, cells, 255).astype(np.uint8)
+    else:
+        occupied_thresh, free_thresh = 1.0, 0.0  # so that every value between comes back as it was
+        grey = np.where(known, np.rint((100 - cells) * 2.55), 128).astype(np.uint8)
+        pixels = np.dstack((grey, grey, grey, np.where(known, 255, 0).astype(np.uint8)))
+
+    image_path = stem.with_name(f"{stem.name}.{suffix}")
+    yaml_path = stem.with_name(f"{stem.name}.yaml")
+    with replace_file(image_path) as temporary:
+        temporary.write_bytes(_encode_image(pixels, suffix, grid.resolution_m))
+    plain = re.fullmatch(r"[A-Za-z_][\w.\-]*", image_path.name)
+    text = (
+        f"image: {image_path.name if plain else json.dumps(image_path.name)}\n"
+        f"mode: {mode}\n"
+        f"resolution: {_yaml_number(grid.resolution_m)}\n"
+        f"origin: [{_yaml_number(grid.origin_m[0])}, {_yaml_number(grid.origin_m[1])}, 0]\n"
+        "negate: 0\n"
+        f"occupied_thresh: {occupied_thresh}\n"
+        f"free_thresh: {free_thresh}\n"
+    )
+    with replace_file(yaml_path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return yaml_path, image_path
+
+
+# --- yaml ---------------------------------------------------------------------------------------------
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    import yaml
+
+    try:
+        with path.open("rb") as file:
+            text = file.read(_MAX_YAML_BYTES + 1)
+    except OSError as error:
+        raise MapFileError(f"{path}: {error.strerror}") from error
+    if len(text) > _MAX_YAML_BYTES:
+        raise MapFileError(f"{path}: larger than {_MAX_YAML_BYTES} bytes: not a map.yaml")
+    try:
+        keys = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:
+        raise MapFileError(f"{path}: not readable as YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(keys, dict):
+        raise MapFileError(f"{path}: not a map.yaml: expected keys like image and resolution")
+    return keys
+
+
+def _value(path: Path, keys: dict[str, Any], key: str) -> Any:
+    if keys.get(key) is None:
+        raise MapFileError(f"{path}: {key}: missing", hint="see nav2's map.yaml format")
+    return keys[key]
+
+
+def _as_float(value: object) -> float:
+    """A YAML number as yaml-cpp reads it: `1e-3` is one, although PyYAML gives it as text."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        raise ValueError(value)
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(value)
+    return number
+
+
+def _number(path: Path, keys: dict[str, Any], key: str) -> float:
+    value = _value(path, keys, key)
+    try:
+        return _as_float(value)
+    except (ValueError, OverflowError):
+        raise MapFileError(f"{path}: {key}: expected a finite number, found {value!r:.60}") from None
+
+
+def _flag(path: Path, keys: dict[str, Any], key: str) -> bool:
+    value = _value(path, keys, key)
+    named = {"0": False, "1": True, "false": False, "true": True}.get(str(value).lower())
+    if named is None:
+        raise MapFileError(f"{path}: {key}: expected 0 or 1, found {value!r:.60}")
+    return named
+
+
+def _origin(path: Path, keys: dict[str, Any]) -> tuple[float, float]:
+    value = _value(path, keys, "origin")
+    try:
+        x, y, yaw = (_as_float(v) for v in value)
+    except (TypeError, ValueError, OverflowError):
+        raise MapFileError(f"{path}: origin: expected [x, y, yaw], found {value!r:.60}") from None
+    if abs(yaw) > 1e-9:
+        raise MapFileError(
+            f"{path}: origin: a map rotated by yaw {yaw} is not supported",
+            hint="rotate the image and set yaw to 0; nav2's static layer ignores it, too",
+        )
+    return x, y
+
+
+def _image_path(path: Path, keys: dict[str, Any]) -> Path:
+    name = _value(path, keys, "image")
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise MapFileError(f"{path}: image: expected a file name, found {name!r:.60}")
+    if ".." in Path(name).parts:
+        _log.warning("%s: image: %s leaves the folder of the map", path, name)
+    return path.parent / name  # an absolute name stays absolute, as in nav2
+
+
+def _yaml_number(value: float) -> str:
+    text = repr(float(value))
+    # "1e-05" is text to PyYAML, which wants a point in the mantissa.
+    return text.replace("e", ".0e", 1) if "e" in text and "." not in text else text
+
+
+# --- images -------------------------------------------------------------------------------------------
+
+
+def _read_image(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Grey and alpha of an image, each (H, W) in 0..1; alpha None if it has none."""
+    try:
+        data = path.read_bytes()
+    except (OSError, ValueError) as error:
+        raise MapFileError(f"{path}: cannot read the map's image: {error}") from error
+    if data[:2] in (b"P5", b"P2"):
+        return _decode_pgm(path, data), None
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
+        _check_size(path, int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"))
+    import cv2
+
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None or image.size == 0:
+        raise MapFileError(f"{path}: not an image (or a damaged one)", hint="nav2 maps are 8-bit pgm or png")
+    if image.dtype != np.uint8:
+        raise MapFileError(f"{path}: {8 * image.itemsize} bits per channel", hint="save the map with 8 bits")
+    _check_size(path, image.shape[1], image.shape[0])
+    if image.ndim == 2:
+        return np.asarray(image, dtype=np.float64) / 255.0, None
+    alpha = np.asarray(image[..., -1], dtype=np.float64) / 255.0 if image.shape[2] in (2, 4) else None
+    colours = image[..., : min(3, image.shape[2])].astype(np.int16)
+    if image.shape[2] >= 3 and int(np.ptp(colours, axis=2).max()) > 2:
+        raise MapFileError(f"{path}: a colour image", hint="maps are grey: 254 free, 0 occupied, 205 unknown")
+    grey = image[..., 0] if image.shape[2] == 2 else colours.mean(axis=2)
+    return np.asarray(grey, dtype=np.float64) / 255.0, alpha
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width < 1 or height < 1 or width * height > MAX_CELLS:
+        raise MapFileError(f"{path}: {width} x {height} pixels; the limit is {MAX_CELLS} cells")
+
+
+def _decode_pgm(path: Path, data: bytes) -> NDArray[np.float64]:
+    """Binary (P5) or text (P2) PGM to (H, W) in 0..1."""
+    number = rb"(?:\s|#[^\n]*\n)+(\d{1,9})"
+    header = re.match(rb"P[25]" + number * 3 + rb"\s", data)
+    if header is None:
+        raise MapFileError(f"{path}: the PGM header is damaged")
+    width, height, top = (int(v) for v in header.groups())
+    _check_size(path, width, height)
+    if not 0 < top <= 255:
+        raise MapFileError(f"{path}: PGM with maximum {top}", hint="save the map with 8 bits")
+    body = data[header.end() :]
+    if data[:2] == b"P2":
+        try:
+            values = np.array(re.sub(rb"#[^\n]*", b"", body).split(), dtype=np.int64)
+        except (ValueError, OverflowError) as error:
+            raise MapFileError(f"{path}: the PGM text is damaged") from error
+    else:
+        values = np.frombuffer(body, dtype=np.uint8)[: width * height].astype(np.int64)
+    if len(values) != width * height or (
+        values.size and not 0 <= int(values.min()) <= int(values.max()) <= top
+    ):
+        raise MapFileError(f"{path}: {width} x {height} pixels declared, {len(values)} usable found")
+    return values.reshape(height, width) / float(top)
+
+
+def _encode_image(pixels: NDArray[np.uint8], suffix: str, resolution_m: float) -> bytes:
+    if suffix == "pgm":
+        height, width = pixels.shape
+        header = f"P5\n# CREATOR: pc2grid {resolution_m:.3f} m/pix\n{width} {height}\n255\n"
+        return header.encode("ascii") + pixels.tobytes()
+    import cv2
+
+    done, encoded = cv2.imencode(".png", pixels)
+    if not done:
+        raise MapFileError(f"cannot encode a map image as {suffix}")
+    return bytes(encoded.tobytes())

@@ -1,0 +1,123 @@
+"""Trajectories as TUM and KITTI text files, as evo reads them.
+
+TUM: `t tx ty tz qx qy qz qw` per line, seconds with 9 decimals, `#` starts a comment.
+KITTI: the first three rows of the pose, 12 numbers per line, no time.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pc2grid.errors import TrajectoryFileError
+from pc2grid.geometry import F64, pose_from_xyz_quat, quat_xyzw_from_pose
+from pc2grid.io.atomic import replace_file
+from pc2grid.model import Trajectory
+
+
+def stamp_ns_from_text(text: str) -> int:
+    """Seconds as decimal text to int64 nanoseconds, exactly (a float would lose the last three digits).
+
+    Raises ValueError if it is not a finite decimal number that fits.
+    """
+    mantissa, _, exponent = text.strip().lower().partition("e")
+    if exponent:  # numpy.savetxt writes 1.283e+09; rare enough for the slow way
+        from decimal import Decimal
+
+        stamp = int((Decimal(text) * 1_000_000_000).to_integral_value())
+    else:
+        sign = -1 if mantissa.startswith("-") else 1
+        whole, _, fraction = mantissa.lstrip("+-").partition(".")
+        if not (whole + fraction).isdecimal():
+            raise ValueError(f"not a time: {text!r}")
+        stamp = sign * (int(whole or "0") * 1_000_000_000 + round(int((fraction + "0" * 10)[:10]) / 10))
+    if not -(2**63) <= stamp < 2**63:
+        raise ValueError(f"not a time: {text!r}")
+    return stamp
+
+
+def stamp_text(stamp_ns: int) -> str:
+    """Nanoseconds to seconds with 9 decimals, exactly."""
+    sign = "-" if stamp_ns < 0 else ""
+    seconds, rest = divmod(abs(int(stamp_ns)), 1_000_000_000)
+    return f"{sign}{seconds}.{rest:09d}"
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a TUM file; stamps must increase.
+
+    Raises TrajectoryFileError with the line that is wrong.
+    """
+    stamps: list[int] = []
+    poses: list[F64] = []
+    for number, line in enumerate(_lines(path), start=1):
+        words = line.replace(",", " ").split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            if len(words) != 8:
+                raise ValueError(f"expected 8 numbers (t x y z qx qy qz qw), found {len(words)}")
+            stamp = stamp_ns_from_text(words[0])
+            values = np.array([float(word) for word in words[1:]])
+            if not np.isfinite(values).all():
+                raise ValueError("not a finite number")
+            if stamps and stamp <= stamps[-1]:
+                raise ValueError("time does not increase")
+            poses.append(pose_from_xyz_quat(values[:3], values[3:]))
+        except (ValueError, ArithmeticError) as error:
+            raise TrajectoryFileError(f"{path}, line {number}: {error}") from error
+        stamps.append(stamp)
+    return _trajectory(stamps, poses)
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write a TUM file: 9 decimals on the time, full precision on the rest, no trailing space."""
+    with replace_file(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
+        for stamp_ns, T_map_base in zip(trajectory.stamps_ns, trajectory.T_map_base, strict=True):
+            values = (*T_map_base[:3, 3], *quat_xyzw_from_pose(T_map_base))
+            out.write(" ".join((stamp_text(int(stamp_ns)), *(f"{v:.9f}" for v in values))) + "\n")
+
+
+def read_kitti(path: Path) -> F64:
+    """Read a KITTI pose file; returns (N, 4, 4).
+
+    Raises TrajectoryFileError with the line that is wrong.
+    """
+    poses: list[F64] = []
+    for number, line in enumerate(_lines(path), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            if len(words) != 12:
+                raise ValueError(f"expected 12 numbers (a 3x4 pose), found {len(words)}")
+            pose = np.eye(4)
+            pose[:3] = np.array([float(word) for word in words]).reshape(3, 4)
+            if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3]) - 1) > 1e-2:
+                raise ValueError("not a rigid pose")
+        except ValueError as error:
+            raise TrajectoryFileError(f"{path}, line {number}: {error}") from error
+        poses.append(pose)
+    return np.array(poses).reshape(-1, 4, 4)
+
+
+def write_kitti(path: Path, trajectory: Trajectory) -> None:
+    """Write a KITTI pose file: 12 numbers per line, row-major."""
+    with replace_file(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
+        for T_map_base in trajectory.T_map_base:
+            out.write(" ".join(f"{v:.9e}" for v in T_map_base[:3].ravel()) + "\n")
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return Path(path).read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise TrajectoryFileError(f"{path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise TrajectoryFileError(f"{path}: not a text file") from error
+
+
+def _trajectory(stamps: list[int], poses: list[F64]) -> Trajectory:
+    matrices = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
+    return Trajectory(stamps_ns=np.array(stamps, dtype=np.int64), T_map_base=matrices)
