@@ -7,6 +7,8 @@ of `signature` is `signature.config.Config`.
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 
@@ -21,8 +23,12 @@ class ReadConfig(Section):
 
     topic: str | None = Field(None, description="topic of the scans; null: the only one that fits")
     odometry: str | None = Field(None, description='odometry topic; null: found in the log; "none": ignored')
-    base_frame: str | None = Field(None, description="null: base_link, base_footprint, or the sensor if no tf")
-    assume_identity: bool = Field(False, description="treat a sensor frame that tf does not connect as the base")
+    base_frame: str | None = Field(
+        None, description="null: base_link, base_footprint, or the sensor if no tf"
+    )
+    assume_identity: bool = Field(
+        False, description="treat a sensor frame that tf does not connect as the base"
+    )
 
 
 class RegistrationConfig(Section):
@@ -48,5 +54,17 @@ class PartitionConfig(Section):
     """Occupancy grid -> submaps (paper III-A)."""
 
     radius_m: float = Field(8.0, gt=0, description="submap radius r (Table II)")
-    clearance_m: float = Field(0.35, ge=0, description="free space is eroded by this before thinning")
+    clearance_m: float = Field(
+        0.3,
+        ge=0,
+        description="free space is eroded by this before thinning: keeps doors, drops gaps in furniture",
+    )
     cluster_m: float = Field(1.0, gt=0, description="DBSCAN radius that merges junction pixels")
+    thinning: Literal["guo_hall", "zhang_suen"] = Field(
+        "zhang_suen", description="zhang_suen keeps fewer side branches than guo_hall, so fewer junctions"
+    )
+    spacing_m: float | None = Field(
+        None,
+        gt=0,
+        description="also a submap every so far along the skeleton; null: junctions only, as III-A",
+    )

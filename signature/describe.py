@@ -1,0 +1,51 @@
+"""A submap to its three signatures (paper III, Figure 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pc2grid.model import F32, Submap
+from signature.boundary import boundary_edges, boundary_histogram, boundary_points
+from signature.config import SignatureConfig
+from signature.freespace import adjacency, freespace_histogram, freespace_nodes, shortest_paths
+from signature.symmetry import symmetry_scores
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Signature:
+    """What a submap is remembered by.
+
+    boundary : (Nb,) float32, H^b of Eq. 2; sum 1, or all 0 if fewer than two boundary points are known.
+    freespace : (Nf,) float32, H^f of Eq. 4; sum 1, or all 0 if no two free places are connected.
+    symmetry : (2,) float32, s^alpha and s^beta of Eq. 5; 0 where there is no axis.
+    """
+
+    boundary: F32
+    freespace: F32
+    symmetry: F32
+
+    def __post_init__(self) -> None:
+        for name in ("boundary", "freespace", "symmetry"):
+            value = np.asarray(getattr(self, name), np.float32)
+            if value.ndim != 1:
+                raise ValueError(f"Signature.{name}: expected one axis, got shape {value.shape}")
+            if value.flags.writeable:
+                value = value.view()
+                value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+
+def describe(submap: Submap, config: SignatureConfig = SignatureConfig()) -> Signature:
+    """The three signatures of a submap; defined for every submap, never NaN."""
+    grid, radius_m = submap.grid, submap.radius_m
+    edges = boundary_edges(submap, config)
+    points = boundary_points(edges, grid.resolution_m, config)
+    nodes = freespace_nodes(submap, config)
+    weights = adjacency(nodes, grid.cells >= config.occupied_percent, grid.resolution_m, config)
+    return Signature(
+        boundary=boundary_histogram(points, radius_m, grid.resolution_m, config),
+        freespace=freespace_histogram(shortest_paths(weights), radius_m, config),
+        symmetry=symmetry_scores(edges, grid.resolution_m, config),
+    )

@@ -1,0 +1,128 @@
+"""How alike two submaps are (paper III-E, Eq. 6-8)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pc2grid.geometry import F64
+from pc2grid.model import F32
+from signature.config import SignatureConfig
+from signature.describe import Signature
+
+I32 = NDArray[np.int32]
+
+_FARTHEST = 20.0  # cap of -ln BC: BC below 2e-9 means that no bin is shared
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SignatureTable:
+    """Signatures of N submaps side by side, a row each.
+
+    boundary (N, Nb), freespace (N, Nf), symmetry (N, 2) : float32, as in `Signature`.
+    session_index (N,), submap_id (N,) : int32, whose they are.
+    center_m (N, 2) : float64, centre of the submap in its session's map frame.
+    """
+
+    boundary: F32
+    freespace: F32
+    symmetry: F32
+    session_index: I32
+    submap_id: I32
+    center_m: F64
+
+    def __post_init__(self) -> None:
+        n = len(self.boundary)
+        for name in ("boundary", "freespace", "symmetry", "center_m"):
+            value = getattr(self, name)
+            if value.ndim != 2 or len(value) != n:
+                raise ValueError(f"SignatureTable.{name}: expected {n} rows, got shape {value.shape}")
+        for name in ("session_index", "submap_id"):
+            if getattr(self, name).shape != (n,):
+                raise ValueError(f"SignatureTable.{name}: expected {n} entries")
+
+    def __len__(self) -> int:
+        return len(self.boundary)
+
+    @staticmethod
+    def of(
+        signatures: Sequence[Signature],
+        center_m: ArrayLike,
+        *,
+        submap_id: ArrayLike | None = None,
+        session_index: ArrayLike | None = None,
+    ) -> SignatureTable:
+        """A table of signatures with their centres (N, 2); ids default to 0.. N - 1, sessions to 0."""
+        n = len(signatures)
+
+        def stack(name: str) -> F32:
+            rows = [getattr(s, name) for s in signatures]
+            return np.stack(rows) if rows else np.empty((0, 2 if name == "symmetry" else 0), np.float32)
+
+        return SignatureTable(
+            boundary=stack("boundary"),
+            freespace=stack("freespace"),
+            symmetry=stack("symmetry"),
+            session_index=np.zeros(n, np.int32)
+            if session_index is None
+            else np.asarray(session_index, np.int32),
+            submap_id=np.arange(n, dtype=np.int32) if submap_id is None else np.asarray(submap_id, np.int32),
+            center_m=np.asarray(center_m, np.float64).reshape(n, 2),
+        )
+
+
+def distances(query: Signature, table: SignatureTable, config: SignatureConfig = SignatureConfig()) -> F64:
+    """The matching score s of Eq. 6 against every row of a table, (N,); smaller is more alike, never NaN.
+
+    s = Omega * (omega_b d(H^b) + omega_f d(H^f)). A histogram without entries knows nothing and shares no
+    bin with any, not even with another empty one: its distance is the largest there is.
+    """
+    scores = score_matrix(query.boundary[None], query.freespace[None], query.symmetry[None], table, config)
+    return np.asarray(scores[0])
+
+
+def score_matrix(
+    boundary: F32, freespace: F32, symmetry: F32, table: SignatureTable, config: SignatureConfig
+) -> F64:
+    """Eq. 6 of M queries, given as (M, Nb), (M, Nf), (M, 2), against N rows: (M, N)."""
+    geometric = config.weight_boundary * histogram_distance(boundary, table.boundary, config)
+    geometric += (1.0 - config.weight_boundary) * histogram_distance(freespace, table.freespace, config)
+    return structural_factor(symmetry, table.symmetry, config) * geometric
+
+
+def similarity(score: F64) -> F64:
+    """The submap similarity rho, the reciprocal of the matching score; inf for identical submaps."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(1.0 / np.asarray(score, np.float64))
+
+
+def histogram_distance(a: F32, b: F32, config: SignatureConfig) -> F64:
+    """d of Eq. 6 between histograms (M, K) and (N, K): (M, N).
+
+    From the Bhattacharyya coefficient BC = sum sqrt(a b), 1 for equal histograms and 0 without a shared bin:
+    sqrt(1 - BC) in [0, 1] or -ln BC in [0, 20], by `config.histogram_distance`.
+    """
+    if a.shape[-1] != b.shape[-1] and len(b):
+        raise ValueError(f"histograms of {a.shape[-1]} and {b.shape[-1]} bins: other radius or bin width")
+    if len(b) == 0:
+        return np.zeros((len(a), 0))
+    # float32 histograms carry 1e-7 a bin: 1 - BC of equal ones is rounding, and the root would blow it up.
+    bc = np.sqrt(a.astype(np.float64)) @ np.sqrt(b.astype(np.float64)).T
+    bc = np.where(bc > 1.0 - 1e-7, 1.0, bc)
+    if config.histogram_distance == "hellinger":
+        return np.asarray(np.sqrt(1.0 - bc))
+    return np.asarray(-np.log(np.maximum(bc, np.exp(-_FARTHEST))))
+
+
+def structural_factor(a: F32, b: F32, config: SignatureConfig) -> F64:
+    """Omega of Eq. 7-8 between symmetry scores (M, 2) and (N, 2): (M, N), at least eta^2.
+
+    Eq. 8 prints "eta e(-(s_i - s_j)^2 / 2 sigma^2)^-1". The reciprocal is of the exponential: the score of
+    Eq. 6 must grow as the symmetries differ, so phi = eta exp(+(s_i - s_j)^2 / (2 sigma^2)).
+    """
+    differences = a[:, None].astype(np.float64) - b[None].astype(np.float64)
+    exponent = (differences**2).sum(axis=-1) / (2.0 * config.symmetry_sigma**2)
+    return np.asarray(config.symmetry_scale**2 * np.exp(np.minimum(exponent, 300.0)))

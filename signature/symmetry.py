@@ -1,0 +1,117 @@
+"""Reflection symmetry scores: how well the walls fall onto their own mirror image (paper III-D)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.geometry import F64
+from pc2grid.model import F32, I64, BoolGrid
+from signature.config import SignatureConfig
+
+
+class Axes(NamedTuple):
+    """Directions of the two symmetry axes, radians in [0, pi) from the x axis towards y."""
+
+    alpha_rad: float
+    beta_rad: float
+
+
+def line_segments(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F64:
+    """Line segments L^S longer than lambda_theta (III-D 1), (N, 4) as column, row of both ends, cells.
+
+    OpenCV's probabilistic Hough transform; its random order is seeded alike on every call.
+    """
+    segments = cv2.HoughLinesP(
+        edges.view(np.uint8),
+        1.0,
+        math.pi / 180,
+        config.segment_votes,
+        minLineLength=config.segment_min_m / resolution_m,
+        maxLineGap=config.segment_gap_m / resolution_m,
+    )
+    return np.empty((0, 4)) if segments is None else segments.reshape(-1, 4).astype(np.float64)
+
+
+def symmetry_axes(segments: F64, config: SignatureConfig) -> Axes | None:
+    """The two directions most voted for (III-D 2); None without segments.
+
+    A segment votes for its direction with its length, as it stands for that many pixels. Votes are blurred
+    around the half circle; beta is the best at least `config.axis_separation_deg` from alpha, or alpha's
+    perpendicular when no segment lies there.
+    """
+    steps = segments[:, 2:] - segments[:, :2]
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    if not lengths.any():
+        return None
+    angles = np.arctan2(steps[:, 1], steps[:, 0]) % math.pi
+    degrees = np.arange(180)
+    votes = np.bincount(np.degrees(angles).round().astype(np.int64) % 180, lengths, 180)
+    kernel = np.exp(-0.5 * (_apart_deg(degrees, 0) / config.axis_smoothing_deg) ** 2)
+    smooth = np.fft.irfft(np.fft.rfft(votes) * np.fft.rfft(kernel), 180)
+    alpha = int(np.argmax(smooth))
+    rest = np.where(_apart_deg(degrees, alpha) >= config.axis_separation_deg, smooth, 0.0)
+    beta = int(np.argmax(rest)) if rest.max() > 1e-6 * smooth[alpha] else (alpha + 90) % 180
+    return Axes(
+        _refined(alpha, angles, lengths, config.axis_smoothing_deg),
+        _refined(beta, angles, lengths, config.axis_smoothing_deg),
+    )
+
+
+def _apart_deg(a_deg: I64, b_deg: int) -> I64:
+    """Angle between undirected lines, 0 .. 90 degrees."""
+    return np.asarray(np.abs((a_deg - b_deg + 90) % 180 - 90))
+
+
+def _refined(peak_deg: int, angles_rad: F64, lengths: F64, window_deg: float) -> float:
+    """Mean direction of the segments within a window around a whole degree, finer than the vote."""
+    away = (angles_rad - math.radians(peak_deg) + math.pi / 2) % math.pi - math.pi / 2
+    near = np.abs(away) <= math.radians(window_deg)
+    weight = lengths[near].sum()
+    shift = float((away[near] * lengths[near]).sum() / weight) if weight > 0 else 0.0
+    return (math.radians(peak_deg) + shift) % math.pi
+
+
+def blurred(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F32:
+    """S^G (H, W): the edge map under a Gaussian, scaled so that a straight line peaks at `symmetry_peak`."""
+    sigma = config.symmetry_blur_m / resolution_m
+    crest = config.symmetry_peak * sigma * math.sqrt(2 * math.pi)
+    image = cv2.GaussianBlur(
+        edges.astype(np.float32) * np.float32(crest), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT
+    )
+    return np.asarray(np.minimum(image, config.symmetry_peak), np.float32)
+
+
+def reflection_score(cells: NDArray[np.integer], image: F32, axis_rad: float) -> float:
+    """Eq. 5: mean of the blurred image at the mirror images of the boundary pixels.
+
+    cells : (N, 2) as (row, column), mirrored at the line of direction `axis_rad` through the image's centre.
+    The paper rotates the image until the axis is upright and flips it; mirroring the pixels and reading the
+    blurred image between its cells is the same without resampling twice. Mirror images outside count 0.
+    """
+    if len(cells) == 0:
+        return 0.0
+    center = (np.array(image.shape) - 1) / 2
+    rows, columns = (cells - center).T
+    c, s = math.cos(2 * axis_rad), math.sin(2 * axis_rad)
+    x = (c * columns + s * rows + center[1]).astype(np.float32)
+    y = (s * columns - c * rows + center[0]).astype(np.float32)
+    values = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    return float(values.mean())
+
+
+def symmetry_scores(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F32:
+    """Both reflection symmetry scores (s^alpha, s^beta), (2,), 0 .. `symmetry_peak` (III-D 3).
+
+    Without any line segment there is no axis, and both are 0.
+    """
+    axes = symmetry_axes(line_segments(edges, resolution_m, config), config)
+    if axes is None:
+        return np.zeros(2, np.float32)
+    image = blurred(edges, resolution_m, config)
+    cells = np.argwhere(edges)
+    return np.array([reflection_score(cells, image, axis) for axis in axes], np.float32)
