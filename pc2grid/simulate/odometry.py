@@ -1,0 +1,76 @@
+"""What the wheels say about a drive."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pc2grid.geometry import SE2
+from pc2grid.model import F64, _freeze
+from pc2grid.simulate.config import OdometryConfig
+from pc2grid.simulate.drive import Drive
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """Odometry as the robot publishes it, starting at the identity.
+
+    times_s : (N,) since the session's start. poses : (N, 3) x, y, yaw of the base in the odom frame, metres
+    and radians, yaw without jumps.
+    """
+
+    times_s: F64
+    poses: F64
+
+    def __post_init__(self) -> None:
+        _freeze(self, "times_s", np.float64, (None,))
+        _freeze(self, "poses", np.float64, (len(self.times_s), 3))
+
+    def at(self, time_s: float) -> SE2:
+        """T_odom_base between two messages."""
+        x, y, yaw = (float(np.interp(time_s, self.times_s, self.poses[:, k])) for k in range(3))
+        return SE2(x, y, math.remainder(yaw, 2 * math.pi))
+
+
+def _slip(steps: int, error: float, step_s: float, memory_s: float, rng: np.random.Generator) -> F64:
+    """(steps,): a relative error of standard deviation `error` that forgets itself over `memory_s`."""
+    from scipy.signal import lfilter
+
+    keep = math.exp(-step_s / memory_s)
+    white = rng.standard_normal(steps) * error * math.sqrt(1 - keep * keep)
+    first = error * rng.standard_normal()
+    slip: F64 = lfilter([1.0], [1.0, -keep], white, zi=[keep * first])[0]
+    return slip
+
+
+def odometry_of(drive: Drive, config: OdometryConfig, rng: np.random.Generator) -> Odometry:
+    """Integrate the drive's own steps with wheel-like errors.
+
+    Each step's distance and rotation is off by a share that stays alike for `slip_s` (an
+    Ornstein-Uhlenbeck process), by a share that is the same all session, and the robot veers a little
+    per metre: errors grow with what was driven, never while standing.
+    """
+    step_s = 1.0 / config.rate_hz
+    times_s = np.arange(math.floor(drive.duration_s * config.rate_hz) + 2) * step_s
+    x, y, yaw = drive.at(times_s).T
+    middle = (yaw[1:] + yaw[:-1]) / 2
+    forward = np.diff(x) * np.cos(middle) + np.diff(y) * np.sin(middle)
+    turn = np.diff(yaw)
+    steps = len(turn)
+    bias_forward, bias_turn, veer = rng.standard_normal(3) * (
+        config.distance_bias,
+        config.rotation_bias,
+        config.veer_rpm,
+    )
+    slip_forward = _slip(steps, config.distance_error, step_s, config.slip_s, rng)
+    slip_turn = _slip(steps, config.rotation_error, step_s, config.slip_s, rng)
+    turn = turn * (1 + bias_turn + slip_turn) + veer * np.abs(forward)
+    forward = forward * (1 + bias_forward + slip_forward)
+    poses = np.zeros((steps + 1, 3))
+    poses[1:, 2] = np.cumsum(turn)
+    middle = poses[:-1, 2] + turn / 2
+    poses[1:, 0] = np.cumsum(forward * np.cos(middle))
+    poses[1:, 1] = np.cumsum(forward * np.sin(middle))
+    return Odometry(times_s, poses)

@@ -1,0 +1,88 @@
+"""Where a robot can pass, and whether something may stand in its way."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.model import F32, F64, BoolGrid
+
+
+def clearance_m(free: BoolGrid, resolution_m: float) -> F32:
+    """Distance (H, W) from each cell's centre to the edge of the nearest cell that is not free, metres.
+
+    Beyond the grid nothing is free.
+    """
+    import cv2
+
+    padded = np.pad(free, 1).astype(np.uint8)
+    cells = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    distance: F32 = np.maximum(cells - np.float32(0.5), 0).astype(np.float32) * np.float32(resolution_m)
+    return distance
+
+
+def outline_mask(outline_cells: F64, shape: tuple[int, int]) -> BoolGrid:
+    """Cells of a grid that a convex outline (N, 2), as x and y in cells from the corner, touches."""
+    import cv2
+
+    shift = 6
+    corners = np.round((outline_cells - 0.5) * (1 << shift)).astype(np.int32)
+    mask = np.zeros(shape, np.uint8)
+    cv2.fillConvexPoly(mask, corners, 1, lineType=cv2.LINE_8, shift=shift)
+    return mask.astype(bool)
+
+
+class Passages:
+    """Free space that is being furnished, piece by piece, without ever cutting it in two.
+
+    free : (H, W) cells that are empty; changes as pieces are put down.
+    reserved : (H, W) cells that must stay as they are.
+    """
+
+    def __init__(self, free: BoolGrid, resolution_m: float, robot_m: float) -> None:
+        self.free = free.copy()
+        self.reserved: BoolGrid = np.zeros_like(self.free)
+        self.resolution_m = resolution_m
+        self.robot_m = robot_m
+        self._passable = clearance_m(free, resolution_m) >= robot_m
+
+    def reserve(self, cells: BoolGrid) -> None:
+        """Nothing may be put on these cells (H, W) any more, though they stay passable."""
+        self.reserved |= cells
+
+    def put(self, outline_cells: F64, *, overlap: bool = False) -> bool:
+        """Put down a piece if it stands on free cells only and every way past it stays open.
+
+        outline_cells : (N, 2) convex outline, x and y in cells from the grid's corner.
+        overlap : it may reach into walls and other pieces.
+
+        Decided in a window around the piece: what was connected there must stay so. That is stricter
+        than connectivity of the whole building, and right: nobody blocks a corridor because there is
+        another way round.
+        """
+        from scipy import ndimage
+
+        margin = int(np.ceil((self.robot_m + 1.2) / self.resolution_m))
+        low = np.floor(outline_cells.min(axis=0)).astype(int) - margin
+        high = np.ceil(outline_cells.max(axis=0)).astype(int) + margin
+        height, width = self.free.shape
+        c0, r0 = (int(v) for v in np.maximum(low, 0))
+        c1, r1 = min(int(high[0]), width), min(int(high[1]), height)
+        if r0 >= r1 or c0 >= c1 or (outline_cells < 0).any() or (outline_cells > (width, height)).any():
+            return False
+        window = np.s_[r0:r1, c0:c1]
+        mask = outline_mask(outline_cells - (c0, r0), (r1 - r0, c1 - c0))
+        distance = clearance_m(~mask, self.resolution_m)
+        if (mask & self.reserved[window]).any() or not (overlap or self.free[window][mask].all()):
+            return False
+        before = self._passable[window]
+        after = before & (distance >= self.robot_m)
+        eight = np.ones((3, 3), bool)
+        parts_before, count_before = ndimage.label(before, eight)
+        parts_after, count_after = ndimage.label(after, eight)
+        kept: NDArray[np.int64] = np.unique(parts_before[after])
+        if count_after != count_before or len(kept) != count_before:
+            return False
+        self.free[window] &= ~mask
+        self._passable[window] = after
+        return True

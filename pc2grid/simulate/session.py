@@ -1,0 +1,170 @@
+"""One simulated session: a building, things in it, a drive, and what a sensor saw."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from pc2grid.geometry import SE2
+from pc2grid.model import F32, F64, OccupancyGrid, Scan, SensorKind
+from pc2grid.simulate.clutter import Piece, covered, place_clutter
+from pc2grid.simulate.config import SimulationConfig
+from pc2grid.simulate.drive import Drive, drive_along
+from pc2grid.simulate.floorplan import office_floorplan
+from pc2grid.simulate.odometry import Odometry, odometry_of
+from pc2grid.simulate.route import plan_route
+from pc2grid.simulate.scene import Mesh, Scene, extrude
+from pc2grid.simulate.sensors import Sensor, make_sensor
+
+EPOCH_NS = 1_700_000_000_000_000_000
+"""Every session starts at the same moment, so that the same seed gives the same bytes."""
+
+RAYS_PER_CAST = 300_000
+
+# Independent streams of random numbers: more clutter must not change the noise.
+_CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE = range(5)
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What the sensor measured in one scan.
+
+    index : number of the scan. time_s : of its stamp, since the session's start. values_m : (R,) float32, one
+    per ray, NaN where nothing came back.
+    """
+
+    index: int
+    time_s: float
+    values_m: F32
+
+    @property
+    def stamp_ns(self) -> int:
+        """Its header stamp."""
+        return EPOCH_NS + round(self.time_s * 1e9)
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """All that a session's seed decides, before the first ray is cast.
+
+    grid : the true floor plan. pieces : the clutter in it. drive : true motion in the plan's map frame.
+    odometry : None when switched off. scan_count : scans of the sensor during the drive.
+    """
+
+    sensor: Sensor
+    grid: OccupancyGrid
+    pieces: tuple[Piece, ...]
+    drive: Drive
+    odometry: Odometry | None
+    config: SimulationConfig
+
+    @property
+    def scan_count(self) -> int:
+        """Whole scans from start to end of the drive."""
+        return max(int(self.drive.duration_s * self.sensor.rate_hz), 1)
+
+    def mesh(self) -> Mesh:
+        """Building and clutter as triangles in the map frame."""
+        return Mesh.join(
+            [extrude(self.grid, self.config.wall_height_m), *(piece.mesh() for piece in self.pieces)]
+        )
+
+    def readings(self) -> Iterator[Reading]:
+        """Cast all scans, many per call, each ray from where the robot is at its own time."""
+        sensor = self.sensor
+        scene = Scene(self.mesh())
+        T = sensor.T_base_sensor
+        directions = sensor.directions @ T[:3, :3].T
+        batch = max(RAYS_PER_CAST // len(directions), 1)
+        for first in range(0, self.scan_count, batch):
+            indices = np.arange(first, min(first + batch, self.scan_count))
+            rays = _rays(
+                self.drive.at(indices[:, None] / sensor.rate_hz + sensor.offsets_s), T[:3, 3], directions
+            )
+            true_m = scene.cast(rays.reshape(-1, 6)).reshape(len(indices), -1)
+            for index, ranges in zip(indices, true_m, strict=True):
+                rng = np.random.default_rng([self.config.seed, _NOISE, int(index)])
+                yield Reading(int(index), float(index) / sensor.rate_hz, sensor.measure(ranges, rng))
+
+    def scan(self, reading: Reading) -> Scan:
+        """A reading as the scan that `pc2grid.io` would make of it."""
+        sensor = self.sensor
+        T = sensor.T_base_sensor
+        kept = np.isfinite(reading.values_m)
+        points = (reading.values_m[kept, None] * sensor.directions[kept]).astype(np.float32)
+        moving = bool(sensor.offsets_s.any())
+        return Scan(
+            stamp_ns=reading.stamp_ns,
+            points_m=(points @ T[:3, :3].T + T[:3, 3]).astype(np.float32),
+            T_base_sensor=T,
+            sensor=sensor.kind,
+            offsets_s=sensor.offsets_s[kept].astype(np.float32) if moving else None,
+            T_odom_base=None if self.odometry is None else self.odometry.at(reading.time_s).lift(),
+            dropped=int((~kept).sum()),
+        )
+
+    def scans(self) -> Iterator[tuple[Scan, SE2]]:
+        """Scans in the base frame, not deskewed, with the true T_map_base at their stamps."""
+        for reading in self.readings():
+            yield self.scan(reading), self.drive.pose(reading.time_s)
+
+
+def _rays(poses: F64, mount_m: F64, directions: F64) -> F32:
+    """Rays (S, R, 6) in the map frame from base poses (S, R, 3), the mounting point (3,) and directions
+    (R, 3) in base axes."""
+    x, y, yaw = poses[..., 0], poses[..., 1], poses[..., 2]
+    c, s = np.cos(yaw), np.sin(yaw)
+    rays = np.empty((*yaw.shape, 6), np.float32)
+    rays[..., 0] = x + c * mount_m[0] - s * mount_m[1]
+    rays[..., 1] = y + s * mount_m[0] + c * mount_m[1]
+    rays[..., 2] = mount_m[2]
+    rays[..., 3] = c * directions[:, 0] - s * directions[:, 1]
+    rays[..., 4] = s * directions[:, 0] + c * directions[:, 1]
+    rays[..., 5] = directions[:, 2]
+    return rays
+
+
+def prepare_session(
+    *, sensor: SensorKind, grid: OccupancyGrid | None = None, config: SimulationConfig | None = None
+) -> Session:
+    """Furnish the building, plan the drive and its odometry.
+
+    grid : the floor plan; None for the procedural office of `config.building_seed`.
+    Raises ConfigError when the robot has no room, or none at the given start.
+    """
+    config = config or SimulationConfig()
+    plan = office_floorplan(config.building_seed) if grid is None else grid
+
+    def stream(number: int) -> np.random.Generator:
+        return np.random.default_rng([config.seed, number])
+
+    pieces = place_clutter(
+        plan,
+        config.clutter,
+        stream(_CLUTTER),
+        robot_m=config.drive.clearance_m,
+        keep_free_m=() if config.start_m is None else (config.start_m,),
+    )
+    route = plan_route(
+        plan,
+        covered(plan, pieces),
+        config.length_m,
+        start_m=config.start_m,
+        least_m=config.drive.clearance_m,
+        rng=stream(_ROUTE),
+    )
+    drive = drive_along(route, config.drive, stream(_DRIVE))
+    odometry = odometry_of(drive, config.odometry, stream(_ODOMETRY)) if config.odometry.enabled else None
+    return Session(make_sensor(sensor, config), plan, pieces, drive, odometry, config)
+
+
+def iter_session(
+    *, sensor: SensorKind, grid: OccupancyGrid | None = None, config: SimulationConfig | None = None
+) -> Iterator[tuple[Scan, SE2]]:
+    """A session in memory: each scan with the true T_map_base at its stamp.
+
+    The same scans as in the log that `simulate_session` writes, without the log.
+    """
+    yield from prepare_session(sensor=sensor, grid=grid, config=config).scans()
