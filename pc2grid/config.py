@@ -29,6 +29,16 @@ class ReadConfig(Section):
     assume_identity: bool = Field(
         False, description="treat a sensor frame that tf does not connect as the base"
     )
+    depth_stride: int = Field(
+        2, ge=1, le=16, description="every n-th row and column of a depth image is used"
+    )
+    point_time: Literal["auto", "s", "ms", "us", "ns", "none"] = Field(
+        "auto", description="unit of the per-point times of a cloud; none: ignore them"
+    )
+    max_range_m: float = Field(1000.0, gt=0, description="farther returns are not believed by any sensor")
+    max_chunk_bytes: int = Field(256 << 20, gt=0, description="a chunk that expands to more is refused")
+    max_record_bytes: int = Field(1 << 30, gt=0, description="a larger record of a log is refused")
+    max_points: int = Field(20_000_000, gt=0, description="a scan that claims more points is refused")
 
 
 class RegistrationConfig(Section):
@@ -53,6 +63,10 @@ class ProjectionConfig(Section):
 class PartitionConfig(Section):
     """Occupancy grid -> submaps (paper III-A)."""
 
+    view: Literal["disc", "isovist"] = Field(
+        "disc",
+        description="disc: all within the radius, as III-A; isovist: only what is seen from the centre",
+    )
     radius_m: float = Field(8.0, gt=0, description="submap radius r (Table II)")
     clearance_m: float = Field(
         0.3,

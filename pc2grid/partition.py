@@ -24,9 +24,22 @@ def partition(grid: OccupancyGrid, config: PartitionConfig = PartitionConfig()) 
     """
     centers_m = submap_centers(grid, config)
     return tuple(
-        submap_at(grid, (float(x), float(y)), config.radius_m, submap_id=i)
-        for i, (x, y) in enumerate(centers_m)
+        view_at(grid, (float(x), float(y)), config, submap_id=i) for i, (x, y) in enumerate(centers_m)
     )
+
+
+def view_at(
+    grid: OccupancyGrid, center_m: tuple[float, float], config: PartitionConfig, *, submap_id: int = 0
+) -> Submap:
+    """The submap around `center_m` as `config.view` asks: the whole disc, or what is seen from its centre.
+
+    Both sides of a comparison must be cut alike, so the query's submaps come from here too.
+    """
+    if config.view == "isovist":
+        from pc2grid.visibility import isovist, visible_submap
+
+        return visible_submap(grid, isovist(grid, center_m, config.radius_m), submap_id)
+    return submap_at(grid, center_m, config.radius_m, submap_id=submap_id)
 
 
 def submap_at(
