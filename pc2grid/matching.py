@@ -1,0 +1,203 @@
+"""Points against a local map in the plane: point-to-line Gauss-Newton with a prior.
+
+The map is a grid of moments: each cell keeps number, sum and second moments of the points that fell into
+it. The line at a place is the principal axis of the cells around it, so that the accuracy is not bound
+by the cell size, and adding a scan costs one pass over its points.
+
+Point-to-line as in Censi, "An ICP variant using a point-to-line metric" (2008); the moments are those of
+Biber and Strasser's normal distributions transform (2003).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pc2grid.geometry import SE2, F64, wrap_angle
+
+CELL_M = 0.1
+RESIDUAL_SCALE_M = 0.05  # beyond this a point is more likely something else (Cauchy)
+# One point is worth its noise, but neighbours on one wall err together: count every point as a fraction.
+_POINT_SIGMA_M = 0.1
+_PRIOR_SCALE = 2.0  # standard deviations
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """Where a point set lies on a map.
+
+    pose : T_map_points. information : (3, 3) of x, y, yaw in the map frame, from the points alone.
+    overlap : share of the points that found a line. residual_m : mean distance of those from their lines.
+    """
+
+    pose: SE2
+    information: F64
+    overlap: float
+    residual_m: float
+
+
+class PointGrid:
+    """A square map of point moments around a centre.
+
+    Points outside the square are ignored, both when adding and when matching.
+    """
+
+    def __init__(self, center_m: tuple[float, float], half_width_m: float, cell_m: float = CELL_M) -> None:
+        cells = 2 * math.ceil(half_width_m / cell_m)
+        self.cell_m = cell_m
+        self.low_m = np.array(center_m, dtype=np.float64) - 0.5 * cells * cell_m
+        self._moments = np.zeros((cells, cells, 6), dtype=np.float64)
+        self.scans = 0
+
+    def add(self, points_m: NDArray[np.floating]) -> None:
+        """Add points (N, 2) given in the map frame."""
+        _add_moments(self._moments, np.asarray(points_m, dtype=np.float64), self.low_m, self.cell_m)
+        self.scans += 1
+
+    def match(
+        self,
+        points_m: NDArray[np.floating],
+        guess: SE2,
+        prior: SE2,
+        prior_information: F64,
+        *,
+        radii: tuple[int, ...] = (3, 3, 2, 2, 1, 1, 1, 1, 1, 1),
+    ) -> Match:
+        """Align points (N, 2) to the map, starting at `guess`, held to `prior` by `prior_information` (3, 3).
+
+        `radii` are the half widths, in cells, of the neighbourhood that gives each point its line, one
+        entry an iteration: wide first, to catch, then narrow, to be exact.
+        """
+        points = np.asarray(points_m, dtype=np.float64)
+        start = np.array([guess.x, guess.y, guess.yaw])
+        held = np.array([prior.x, prior.y, prior.yaw])
+        pose, information, overlap, residual = _gauss_newton(
+            self._moments,
+            self.low_m,
+            self.cell_m,
+            points,
+            start,
+            held,
+            np.asarray(prior_information, dtype=np.float64),
+            np.array(radii, dtype=np.int64),
+        )
+        return Match(
+            SE2(float(pose[0]), float(pose[1]), wrap_angle(float(pose[2]))),
+            information,
+            float(overlap),
+            float(residual),
+        )
+
+
+@njit(cache=True)
+def _add_moments(moments: F64, points: F64, low: F64, cell_m: float) -> None:
+    height, width = moments.shape[0], moments.shape[1]
+    for k in range(points.shape[0]):
+        x, y = points[k, 0] - low[0], points[k, 1] - low[1]
+        column, row = int(math.floor(x / cell_m)), int(math.floor(y / cell_m))
+        if 0 <= row < height and 0 <= column < width:
+            m = moments[row, column]
+            m[0] += 1.0
+            m[1] += x
+            m[2] += y
+            m[3] += x * x
+            m[4] += x * y
+            m[5] += y * y
+
+
+@njit(cache=True)
+def _line_at(moments: F64, x: float, y: float, cell_m: float, radius: int, line: F64) -> bool:
+    """Mean, normal and straightness (5 values) of the points within `radius` cells; False if too few."""
+    height, width = moments.shape[0], moments.shape[1]
+    column, row = int(math.floor(x / cell_m)), int(math.floor(y / cell_m))
+    if row < radius or column < radius or row >= height - radius or column >= width - radius:
+        return False
+    n = sx = sy = sxx = sxy = syy = 0.0
+    for r in range(row - radius, row + radius + 1):
+        for c in range(column - radius, column + radius + 1):
+            m = moments[r, c]
+            if m[0] > 0.0:
+                n += m[0]
+                sx += m[1]
+                sy += m[2]
+                sxx += m[3]
+                sxy += m[4]
+                syy += m[5]
+    if n < 3.0:
+        return False
+    mx, my = sx / n, sy / n
+    a, b, d = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
+    middle = 0.5 * (a + d)
+    spread = math.sqrt(max(0.25 * (a - d) * (a - d) + b * b, 0.0))
+    large, small = middle + spread, max(middle - spread, 0.0)
+    if large < 1e-4:
+        return False
+    angle = 0.5 * math.atan2(2.0 * b, a - d)  # of the line; its normal is a quarter turn on
+    line[0], line[1] = mx, my
+    line[2], line[3] = -math.sin(angle), math.cos(angle)
+    line[4] = 1.0 - small / large
+    return True
+
+
+@njit(cache=True)
+def _gauss_newton(
+    moments: F64,
+    low: F64,
+    cell_m: float,
+    points: F64,
+    start: F64,
+    prior: F64,
+    prior_information: F64,
+    radii: NDArray[np.int64],
+) -> tuple[F64, F64, float, float]:
+    pose = start.copy()
+    line = np.zeros(5)
+    information = np.zeros((3, 3))
+    overlap = residual = 0.0
+    unit = 1.0 / (_POINT_SIGMA_M * _POINT_SIGMA_M)
+    for step in range(len(radii)):
+        radius = radii[step]
+        scale = RESIDUAL_SCALE_M * radius
+        H = np.zeros((3, 3))
+        g = np.zeros(3)
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        found = 0
+        distance = 0.0
+        for k in range(points.shape[0]):
+            rx = c * points[k, 0] - s * points[k, 1]
+            ry = s * points[k, 0] + c * points[k, 1]
+            x, y = rx + pose[0] - low[0], ry + pose[1] - low[1]
+            if not _line_at(moments, x, y, cell_m, radius, line):
+                continue
+            nx, ny = line[2], line[3]
+            r = nx * (x - line[0]) + ny * (y - line[1])
+            found += 1
+            distance += abs(r)
+            w = unit * line[4] * line[4] / (1.0 + (r / scale) ** 2)
+            j2 = ny * rx - nx * ry
+            H[0, 0] += w * nx * nx
+            H[0, 1] += w * nx * ny
+            H[0, 2] += w * nx * j2
+            H[1, 1] += w * ny * ny
+            H[1, 2] += w * ny * j2
+            H[2, 2] += w * j2 * j2
+            g[0] += w * nx * r
+            g[1] += w * ny * r
+            g[2] += w * j2 * r
+        H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+        information = H
+        overlap = found / max(points.shape[0], 1)
+        residual = distance / max(found, 1)
+        away = pose - prior
+        away[2] = math.atan2(math.sin(away[2]), math.cos(away[2]))
+        # Wheels slip and drivers lie: a prior that the points contradict loses its say (Cauchy, again).
+        held = prior_information / (1.0 + (away @ prior_information @ away) / _PRIOR_SCALE**2)
+        delta = np.linalg.solve(H + held + 1e-6 * np.eye(3), -(g + held @ away))
+        pose += delta
+        if radius == radii[-1] and abs(delta[0]) + abs(delta[1]) + abs(delta[2]) < 1e-4:
+            break
+    return pose, information, overlap, residual

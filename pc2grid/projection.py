@@ -1,0 +1,115 @@
+"""Sweeps with poses -> log-odds occupancy grid.
+
+The grid is kept in tiles that come into being where something was seen, so a long corridor does not pay
+for the empty rectangle around it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.config import ProjectionConfig
+from pc2grid.errors import LimitExceeded
+from pc2grid.geometry import SE2, F64
+from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from pc2grid.sweep import Sweep
+
+_TILE = 256
+_SUBPIXEL = 4  # fractional bits of cv2's polygon corners
+# Log-odds in hundredths, as int16. A hit weighs about two misses, so a thin wall that is grazed by
+# passing rays stays, and a person who left is cleared by the third look.
+_HIT = 85
+_MISS = -40
+_CLAMP = 350
+
+
+class GridBuilder:
+    """Draws sweeps into a growing grid.
+
+    Cells are aligned to multiples of the resolution in the map frame. What no sweep looked at stays
+    unknown.
+    """
+
+    def __init__(self, config: ProjectionConfig) -> None:
+        self._config = config
+        self._log_odds: dict[tuple[int, int], NDArray[np.int16]] = {}
+        self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
+
+    def add(self, sweep: Sweep, T_map_base: SE2) -> None:
+        """Draw one sweep taken at `T_map_base`. Raises LimitExceeded if the map grows past `max_cells`."""
+        import cv2
+
+        resolution = self._config.resolution_m
+        outline = T_map_base.apply(sweep.free_polygon()) / resolution
+        hits = np.floor(T_map_base.apply(sweep.hits_m) / resolution).astype(np.int64)
+        low = np.floor(outline.min(axis=0)).astype(np.int64) - 1
+        high = np.floor(outline.max(axis=0)).astype(np.int64) + 2
+        if len(hits):
+            low, high = np.minimum(low, hits.min(axis=0)), np.maximum(high, hits.max(axis=0) + 1)
+        update = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.int16)
+        corners = np.rint((_shrink(outline, sweep, T_map_base, resolution) - low - 0.5) * (1 << _SUBPIXEL))
+        cv2.fillPoly(update, [corners.astype(np.int32)], _MISS, shift=_SUBPIXEL)
+        update[hits[:, 1] - low[1], hits[:, 0] - low[0]] = _HIT
+        self._add_window(update, int(low[0]), int(low[1]))
+
+    def grid(self) -> OccupancyGrid:
+        """The map so far: 0..100 where seen, unknown elsewhere, cropped to what was seen."""
+        if not self._log_odds:
+            return OccupancyGrid(
+                cells=np.zeros((0, 0), np.int8), resolution_m=self._config.resolution_m, origin_m=(0.0, 0.0)
+            )
+        rows, columns = zip(*self._log_odds, strict=True)
+        height = (max(rows) - min(rows) + 1) * _TILE
+        width = (max(columns) - min(columns) + 1) * _TILE
+        self._check_size(height * width)
+        cells = np.full((height, width), UNKNOWN, dtype=np.int8)
+        for (row, column), log_odds in self._log_odds.items():
+            odds = log_odds.astype(np.float32) / 100.0
+            percent = np.rint(OCCUPIED / (1.0 + np.exp(-odds))).astype(np.int8)
+            r, c = (row - min(rows)) * _TILE, (column - min(columns)) * _TILE
+            cells[r : r + _TILE, c : c + _TILE] = np.where(self._seen[row, column], percent, UNKNOWN)
+        known_rows = np.flatnonzero((cells >= FREE).any(axis=1))
+        known_columns = np.flatnonzero((cells >= FREE).any(axis=0))
+        r0, r1 = int(known_rows[0]), int(known_rows[-1]) + 1
+        c0, c1 = int(known_columns[0]), int(known_columns[-1]) + 1
+        resolution = self._config.resolution_m
+        return OccupancyGrid(
+            cells=cells[r0:r1, c0:c1].copy(),
+            resolution_m=resolution,
+            origin_m=((min(columns) * _TILE + c0) * resolution, (min(rows) * _TILE + r0) * resolution),
+        )
+
+    def _add_window(self, update: NDArray[np.int16], x0: int, y0: int) -> None:
+        height, width = update.shape
+        for row in range(y0 // _TILE, (y0 + height - 1) // _TILE + 1):
+            for column in range(x0 // _TILE, (x0 + width - 1) // _TILE + 1):
+                r, c = row * _TILE - y0, column * _TILE - x0
+                part = update[max(r, 0) : max(r + _TILE, 0), max(c, 0) : max(c + _TILE, 0)]
+                touched = part != 0
+                if not touched.any():
+                    continue
+                if (row, column) not in self._log_odds:
+                    self._check_size((len(self._log_odds) + 1) * _TILE * _TILE)
+                    self._log_odds[row, column] = np.zeros((_TILE, _TILE), dtype=np.int16)
+                    self._seen[row, column] = np.zeros((_TILE, _TILE), dtype=np.bool_)
+                where = np.s_[max(-r, 0) : max(-r, 0) + part.shape[0], max(-c, 0) : max(-c, 0) + part.shape[1]]
+                tile = self._log_odds[row, column][where]
+                np.clip(tile + part, -_CLAMP, _CLAMP, out=tile)
+                self._seen[row, column][where] |= touched
+
+    def _check_size(self, cells: int) -> None:
+        if cells > self._config.max_cells:
+            raise LimitExceeded(
+                f"the map needs {cells} cells, more than projection.max_cells = {self._config.max_cells}",
+                hint="raise projection.max_cells, or choose a coarser projection.resolution_m",
+            )
+
+
+def _shrink(outline: F64, sweep: Sweep, T_map_base: SE2, resolution: float) -> F64:
+    """Pull the outline (in cells) half a cell towards the sensor: the last cell belongs to the obstacle."""
+    origin = T_map_base.apply(sweep.origin_m[None, :]) / resolution
+    rays = outline - origin
+    lengths = np.linalg.norm(rays, axis=1, keepdims=True)
+    shrunk: F64 = origin + rays * np.maximum(1.0 - 0.5 / np.maximum(lengths, 0.5), 0.0)
+    return shrunk

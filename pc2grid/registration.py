@@ -1,0 +1,89 @@
+"""KISS-ICP per scan. The only file that imports kiss_icp.
+
+KISS-ICP's defaults are for cars, so voxel and range are chosen from the first scans; floor and ceiling
+are not given to it: rings on the floor move with the sensor and pull point-to-point ICP towards standing
+still. The predicted motion (odometry where the log has it) is set before each frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.config import RegistrationConfig
+from pc2grid.geometry import F64
+from pc2grid.model import RegisteredScan, Scan, SensorKind
+
+_MAX_POINTS = 20_000  # per scan; voxelisation throws more away in any case
+
+
+class KissRegistration:
+    """KissICP.register_frame with a prior, single-threaded, hence repeatable.
+
+    The voxel and the range come from the first frame with returns, unless `config` fixes them: the range
+    of a room wants 0.1 m voxels, that of a hall 0.3 m.
+    """
+
+    def __init__(self, config: RegistrationConfig, sensor: SensorKind) -> None:
+        self._config = config
+        self._sensor = sensor
+        self._kiss = None
+
+    def register(self, points_m: NDArray[np.floating], T_map_last: F64, predicted_motion: F64) -> F64:
+        """Align one frame.
+
+        points_m : (N, 3) deskewed, without floor and ceiling, in the base frame.
+        T_map_last : (4, 4) the pose that was settled on for the frame before.
+        predicted_motion : (4, 4) T_last_now.
+
+        Returns T_map_base (4, 4). Frames without enough points return the prediction.
+        """
+        predicted: F64 = T_map_last @ predicted_motion
+        if len(points_m) < 10:
+            return predicted
+        kiss = self._kiss or self._start(points_m)
+        kiss.last_pose = T_map_last
+        kiss.last_delta = predicted_motion
+        kiss.register_frame(np.ascontiguousarray(points_m, dtype=np.float64), np.empty(0))
+        pose = np.asarray(kiss.last_pose, dtype=np.float64)
+        return pose if np.isfinite(pose).all() else predicted
+
+    def _start(self, points_m: NDArray[np.floating]):  # type: ignore[no-untyped-def]
+        from kiss_icp.config import KISSConfig
+        from kiss_icp.kiss_icp import KissICP
+
+        ranges = np.linalg.norm(points_m, axis=1)
+        config = KISSConfig()
+        config.data.deskew = False
+        config.data.min_range = 0.0  # applied before, to all that a scan is used for
+        config.data.max_range = self._config.max_range_m or float(
+            np.clip(1.5 * np.percentile(ranges, 98), 10.0, 100.0)
+        )
+        config.mapping.voxel_size = self._config.voxel_m or float(
+            np.clip(np.percentile(ranges, 75) / 40.0, 0.1, 1.0)
+        )
+        config.registration.max_num_threads = 1
+        config.adaptive_threshold.initial_threshold = 1.0
+        self._kiss = KissICP(config)
+        return self._kiss
+
+
+def thin(points_m: NDArray[np.floating], count: int = _MAX_POINTS) -> NDArray[np.intp]:
+    """Indices of at most `count` of the points (N, 3), random but always the same, in order.
+
+    Random, because a camera's regular pixel grid pulls ICP towards standing still as a lidar's rings do.
+    """
+    if len(points_m) <= count:
+        return np.arange(len(points_m))
+    return np.sort(np.random.default_rng(len(points_m)).choice(len(points_m), count, replace=False, shuffle=False))
+
+
+def register(scans: Iterable[Scan], config: RegistrationConfig = RegistrationConfig()) -> Iterator[RegisteredScan]:  # noqa: B008
+    """Registered scans, one for each scan, as they come: the streaming front half without its sweeps."""
+    from pc2grid.tracking import Tracker
+
+    tracker = Tracker(config)
+    for scan in scans:
+        yield tracker.track(scan)[0]

@@ -1,0 +1,186 @@
+"""Following a robot from scan to scan: prediction, KISS-ICP, refinement in the plane, health.
+
+Each source is weighed by what it observes. Odometry knows the motion to a few percent in every
+direction; the scan knows the pose to millimetres, but only across the walls that it sees. So KISS-ICP
+brings the scan near, and a point-to-line Gauss-Newton against the local map, with the odometry as a
+prior, settles it: along a corridor the prior decides, across it the walls do.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pc2grid.config import ProjectionConfig, RegistrationConfig
+from pc2grid.deskew import deskew
+from pc2grid.floor import Ground, assumed_ground, find_ground
+from pc2grid.geometry import SE2, F64, invert_pose, rotation_vector, transform_points
+from pc2grid.matching import PointGrid
+from pc2grid.model import F32, Health, RegisteredScan, Scan
+from pc2grid.registration import KissRegistration, thin
+from pc2grid.sweep import Sweep, flatten
+
+KEYFRAME_TRAVEL_M = 0.25
+KEYFRAME_TURN_RAD = math.radians(12.0)
+LOCAL_MAP_TRAVEL_M = 5.0
+_MAX_POINTS = 40_000  # of a camera's 300 000 pixels
+
+
+class Tracker:
+    """Turns scans into poses and sweeps, one by one; its memory is one local map.
+
+    The map frame is the base at the first scan, levelled: z up.
+    """
+
+    def __init__(self, registration: RegistrationConfig, projection: ProjectionConfig | None = None) -> None:
+        self._config = registration
+        self._projection = projection or ProjectionConfig()
+        self._kiss: KissRegistration | None = None
+        self._ground: Ground | None = None
+        self._last: Scan | None = None
+        self._last_pose = np.eye(4)
+        self._velocity = np.eye(4)
+        self._maps: list[tuple[PointGrid, float]] = []
+        self._last_keyframe: SE2 | None = None
+        self._travel_m = 0.0
+        self._planar = True
+
+    def track(self, scan: Scan) -> tuple[RegisteredScan, Sweep]:
+        """Pose and sweep of the next scan; stamps must increase."""
+        if self._kiss is None:
+            self._kiss = KissRegistration(self._config, scan.sensor)
+        motion, motion_s, measured = self._predict(scan)
+        points = self._usable(scan, motion, motion_s)
+        flat = scan.sensor == "laser"
+        if not flat:
+            self._follow_ground(points, scan)
+        first = self._last is None
+        if first:
+            pose = np.eye(4) if flat or self._ground is None else self._ground.leveling()
+            self._kiss.register(self._without_floor(points), pose, np.eye(4))
+        else:
+            predicted = self._last_pose @ motion
+            pose = self._kiss.register(self._without_floor(points), self._last_pose, motion)
+            pose = self._hold_to_floor(pose, predicted, flat)
+        planar = SE2.flatten(pose)
+        T_level_base = planar.inverse().lift() @ pose
+        T_level_base[2, 3] = 0.0
+        sweep = self._flatten(points, scan, T_level_base)
+        if not first and len(sweep.hits_m) >= 10:
+            planar = self._refine(sweep, planar, self._last_pose @ motion, motion, measured)
+            T_level_base[2, 3] = pose[2, 3]
+            pose = planar.lift() @ T_level_base
+        self._extend_maps(sweep, planar)
+        if not first:
+            self._velocity = invert_pose(self._last_pose) @ pose
+        self._last, self._last_pose = scan, pose
+        deskewed = Scan(
+            stamp_ns=scan.stamp_ns,
+            points_m=points,
+            T_base_sensor=scan.T_base_sensor,
+            sensor=scan.sensor,
+            T_odom_base=scan.T_odom_base,
+            dropped=scan.dropped,
+        )
+        return RegisteredScan(scan=deskewed, T_map_base=pose, health=Health.FINE), sweep
+
+    def _predict(self, scan: Scan) -> tuple[F64, float, bool]:
+        """Motion since the last scan, over how many seconds, and whether odometry measured it."""
+        if self._last is None:
+            return np.eye(4), 0.0, False
+        seconds = (scan.stamp_ns - self._last.stamp_ns) * 1e-9
+        if scan.T_odom_base is not None and self._last.T_odom_base is not None:
+            return invert_pose(self._last.T_odom_base) @ scan.T_odom_base, seconds, True
+        return self._velocity, seconds, False
+
+    def _usable(self, scan: Scan, motion: F64, motion_s: float) -> F32:
+        points, offsets = scan.points_m, scan.offsets_s
+        keep = thin(points, _MAX_POINTS)
+        points = points[keep]
+        sensor = scan.T_base_sensor[:3, 3].astype(np.float32)
+        far = np.einsum("ij,ij->i", points - sensor, points - sensor) >= self._config.min_range_m**2
+        points = points[far]
+        if offsets is not None and self._config.deskew:
+            points = deskew(points, offsets[keep][far], motion, motion_s)
+        return points
+
+    def _follow_ground(self, points: F32, scan: Scan) -> None:
+        found = find_ground(points, scan.T_base_sensor[:3, 3], self._ground)
+        if found is not None:
+            self._ground = found
+        elif self._ground is None:
+            self._ground = assumed_ground(scan.T_base_sensor)
+
+    def _without_floor(self, points: F32) -> F32:
+        if self._ground is None or not len(points):
+            return points
+        heights = self._ground.heights(points)
+        slack = 0.1 + 0.01 * np.hypot(points[:, 0], points[:, 1])
+        keep = heights > slack
+        if self._ground.ceiling_m is not None:
+            keep &= heights < self._ground.ceiling_m - slack
+        return points[keep] if keep.sum() > 100 else points
+
+    def _hold_to_floor(self, pose: F64, predicted: F64, flat: bool) -> F64:
+        """Tilt and height from the floor: without it, walls alone let them drift."""
+        heading = SE2.flatten(pose).lift()
+        if flat or self._ground is None:
+            return heading
+        if not self._ground.seen:
+            return pose
+        held: F64 = heading @ self._ground.leveling()
+        # heading of the base's x axis must survive the levelling
+        fix = SE2(0.0, 0.0, SE2.flatten(pose).yaw - SE2.flatten(held).yaw).lift()
+        held[:3, :3] = fix[:3, :3] @ held[:3, :3]
+        return held
+
+    def _flatten(self, points: F32, scan: Scan, T_level_base: F64) -> Sweep:
+        if scan.sensor == "laser":
+            level, sensor, ground = points, scan.T_base_sensor[:3, 3], None
+        else:
+            R = T_level_base[:3, :3]
+            level = points @ R.T.astype(np.float32)
+            sensor = R @ scan.T_base_sensor[:3, 3]
+            assert self._ground is not None
+            ground = Ground(
+                R @ self._ground.normal, self._ground.offset_m, self._ground.ceiling_m, self._ground.seen
+            )
+        return flatten(level, stamp_ns=scan.stamp_ns, sensor_m=sensor, ground=ground, config=self._projection)
+
+    def _refine(self, sweep: Sweep, guess: SE2, predicted: F64, motion: F64, measured: bool) -> SE2:
+        distance = float(np.linalg.norm(motion[:3, 3]))
+        turn = float(np.linalg.norm(rotation_vector(motion)))
+        prior = SE2.flatten(predicted) if measured else guess
+        if measured:
+            sigma_m, sigma_rad = 0.01 + 0.1 * distance + 0.05 * turn, 0.01 + 0.1 * turn + 0.1 * distance
+        else:
+            sigma_m, sigma_rad = 0.03, 0.01
+        information = np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
+        match = self._maps[0][0].match(sweep.hits_m, guess, prior, information)
+        if match.overlap < 0.3:
+            return guess if not measured else prior
+        return match.pose
+
+    def _extend_maps(self, sweep: Sweep, pose: SE2) -> None:
+        """Two overlapping local maps: the older one is matched against, the younger takes over in time."""
+        last = self._last_keyframe
+        if last is not None:
+            step = last.inverse() @ pose
+            if math.hypot(step.x, step.y) < KEYFRAME_TRAVEL_M and abs(step.yaw) < KEYFRAME_TURN_RAD:
+                return
+            self._travel_m += math.hypot(step.x, step.y)
+        if not self._maps or self._travel_m - self._maps[-1][1] > LOCAL_MAP_TRAVEL_M:
+            half = self._projection.max_range_m + 2 * LOCAL_MAP_TRAVEL_M
+            self._maps.append((PointGrid((pose.x, pose.y), half), self._travel_m))
+        if len(self._maps) > 2:
+            del self._maps[0]
+        hits = pose.apply(sweep.hits_m)
+        for grid, _ in self._maps:
+            grid.add(hits)
+        self._last_keyframe = pose
+
+
+def level_points(points_m: F32, T_level_base: F64) -> F32:
+    """Points (N, 3) of the base frame in the levelled base frame."""
+    return transform_points(T_level_base, points_m).astype(np.float32)
