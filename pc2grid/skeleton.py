@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.model import BoolGrid
+from pc2grid.model import I64, BoolGrid
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 Thinning = Literal["guo_hall", "zhang_suen"]
 
 # Neighbours clockwise from north: bit k of a code is neighbour k.
-_ROW_STEPS = np.array([-1, -1, 0, 1, 1, 1, 0, -1])
-_COLUMN_STEPS = np.array([0, 1, 1, 1, 0, -1, -1, -1])
 _NEIGHBOURS = [tuple((code >> k) & 1 for k in range(8)) for code in range(256)]
 
 
@@ -60,17 +58,25 @@ _END = np.array([sum(p) == 1 for p in _NEIGHBOURS])
 
 
 @numba.njit(cache=True)
-def _code(image: NDArray[np.uint8], r: int, c: int) -> int:
-    return int(
-        image[r - 1, c]
-        | image[r - 1, c + 1] << 1
-        | image[r, c + 1] << 2
-        | image[r + 1, c + 1] << 3
-        | image[r + 1, c] << 4
-        | image[r + 1, c - 1] << 5
-        | image[r, c - 1] << 6
-        | image[r - 1, c - 1] << 7
-    )
+def _codes(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The eight neighbours of every pixel as bits; image 0/1 with a border of zeros."""
+    height, width = image.shape
+    codes = np.zeros((height, width), np.uint8)
+    inner = width - 2
+    for r in range(1, height - 1):
+        above, here, below, out = image[r - 1], image[r], image[r + 1], codes[r]
+        for c in range(inner):
+            out[c + 1] = (
+                above[c + 1]
+                | (above[c + 2] << 1)
+                | (here[c + 2] << 2)
+                | (below[c + 2] << 3)
+                | (below[c + 1] << 4)
+                | (below[c] << 5)
+                | (here[c] << 6)
+                | (above[c] << 7)
+            )
+    return codes
 
 
 @numba.njit(cache=True)
@@ -78,51 +84,52 @@ def _thin(image: NDArray[np.uint8], deletable: NDArray[np.bool_]) -> None:
     """Thin a 0/1 image with a border of zeros in place.
 
     Whether a pixel goes depends on its neighbours alone, so it is looked at again only after one of them
-    went: two lists, one for each half of an iteration, hold the pixels with news.
+    went: `pending` says in which half of an iteration it still has to be, and `waiting` lists the pixels
+    with something pending. All that go in one half go together, as the parallel algorithm has it.
     """
     height, width = image.shape
-    # At most every set pixel is listed at once, since `listed` lets it in once a half.
-    area = 0
-    for r in range(1, height - 1):
-        for c in range(1, width - 1):
-            area += image[r, c]
-    lists = np.empty((2, area), np.int32)
-    sizes = np.zeros(2, np.int64)
-    gone = np.empty(area, np.int32)
-    listed = np.zeros((height, width), np.uint8)
+    codes = _codes(image).reshape(-1)
     flat = image.reshape(-1)
-    flags = listed.reshape(-1)
-    for r in range(1, height - 1):
-        for c in range(1, width - 1):
-            if image[r, c] and _code(image, r, c) != 255:
-                flags[r * width + c] = 3
-                for half in range(2):
-                    lists[half, sizes[half]] = r * width + c
-                    sizes[half] += 1
+    pending = np.zeros(height * width, np.uint8)
+    waiting = np.empty(height * width, np.int32)
+    gone = np.empty(height * width, np.int32)
+    # Seen from a neighbour in direction k, the pixel itself lies in direction k + 4.
+    steps = np.array([-width, 1 - width, 1, width + 1, width, width - 1, -1, -width - 1])
+    keep = np.array([255 - (1 << ((k + 4) % 8)) for k in range(8)], np.uint8)
+    count = 0
+    for i in range(width, (height - 1) * width):
+        if flat[i] and codes[i] != 255:
+            pending[i] = 3
+            waiting[count] = i
+            count += 1
     half = 0
-    while sizes[0] + sizes[1] > 0:
-        losses = 0
-        bit = 1 << half
-        for k in range(sizes[half]):
-            i = lists[half, k]
-            flags[i] &= 3 - bit
-            if flat[i] and deletable[half, _code(image, i // width, i % width)]:
-                gone[losses] = i
-                losses += 1
-        sizes[half] = 0
+    while count > 0:
+        left, losses = 0, 0
+        for k in range(count):
+            i = waiting[k]
+            if pending[i] & (1 << half):
+                if deletable[half, codes[i]]:
+                    pending[i] = 0
+                    gone[losses] = i
+                    losses += 1
+                    continue
+                pending[i] &= 2 >> half
+            if pending[i]:
+                waiting[left] = i
+                left += 1
+        count = left
         for k in range(losses):
             flat[gone[k]] = 0
         for k in range(losses):
             i = gone[k]
-            for dr in range(-1, 2):
-                for dc in range(-1, 2):
-                    j = i + dr * width + dc
-                    if flat[j]:
-                        for h in range(2):
-                            if not flags[j] & (1 << h):
-                                flags[j] |= 1 << h
-                                lists[h, sizes[h]] = j
-                                sizes[h] += 1
+            for n in range(8):
+                j = i + steps[n]
+                codes[j] &= keep[n]
+                if flat[j]:
+                    if not pending[j]:
+                        waiting[count] = j
+                        count += 1
+                    pending[j] = 3
         half = 1 - half
 
 
@@ -161,19 +168,9 @@ def skeleton_of(
     return thin(clearance_of(free, resolution_m) > clearance_m, thinning)
 
 
-@numba.njit(cache=True)
-def _classify(image: NDArray[np.uint8], table: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    out = np.zeros_like(image)
-    for r in range(1, image.shape[0] - 1):
-        for c in range(1, image.shape[1] - 1):
-            if image[r, c] and table[_code(image, r, c)]:
-                out[r, c] = 1
-    return out
-
-
 def _pixels_like(skeleton: BoolGrid, table: NDArray[np.bool_]) -> BoolGrid:
-    padded = np.pad(skeleton, 1).view(np.uint8)
-    return _classify(padded, table)[1:-1, 1:-1].view(np.bool_)
+    codes = _codes(np.pad(skeleton, 1).view(np.uint8))[1:-1, 1:-1]
+    return np.asarray(skeleton & table[codes])
 
 
 def junctions(skeleton: BoolGrid) -> BoolGrid:
@@ -210,31 +207,53 @@ def pixel_graph(skeleton: BoolGrid, resolution_m: float) -> nx.Graph:
 
 
 @numba.njit(cache=True)
-def _sample(rows: NDArray[np.int64], columns: NDArray[np.int64], spacing: float) -> NDArray[np.int64]:
-    if len(rows) == 0:
-        return np.empty(0, np.int64)
-    reach = int(np.ceil(spacing))
-    r0, c0 = rows.min(), columns.min()
-    taken = np.zeros((rows.max() - r0 + 2 * reach + 1, columns.max() - c0 + 2 * reach + 1), np.uint8)
-    kept = np.empty(len(rows), np.int64)
+def cells_of(mask: BoolGrid) -> I64:
+    """Set cells (N, 2) of a mask as (row, column), row by row: `np.argwhere`, several times as fast."""
     count = 0
-    limit = spacing * spacing - 1e-9
-    for k in range(len(rows)):
-        r, c = rows[k] - r0 + reach, columns[k] - c0 + reach
-        if taken[r, c]:
-            continue
-        kept[count] = k
-        count += 1
-        for dr in range(-reach, reach + 1):
-            for dc in range(-reach, reach + 1):
-                if dr * dr + dc * dc < limit:
-                    taken[r + dr, c + dc] = 1
-    return kept[:count]
+    for r in range(mask.shape[0]):
+        count += mask[r].sum()
+    cells = np.empty((count, 2), np.int64)
+    k = 0
+    for r in range(mask.shape[0]):
+        for c in range(mask.shape[1]):
+            if mask[r, c]:
+                cells[k, 0] = r
+                cells[k, 1] = c
+                k += 1
+    return cells
 
 
-def sample_evenly(cells: NDArray[np.int64], spacing_cells: float) -> NDArray[np.int64]:
+@numba.njit(cache=True)
+def sample_evenly(cells: I64, spacing_cells: float) -> I64:
     """Thin out cells (N, 2) until no two are closer than `spacing_cells`; returns (M, 2), M <= N.
 
     Greedy in the given order; every cell left out lies closer than the spacing to one that is kept.
     """
-    return cells[_sample(cells[:, 0], cells[:, 1], float(spacing_cells))]
+    if len(cells) == 0:
+        return cells.copy()
+    rows, columns = cells[:, 0], cells[:, 1]
+    reach = int(np.ceil(spacing_cells))
+    r0, c0 = rows.min(), columns.min()
+    taken = np.zeros((rows.max() - r0 + 2 * reach + 1, columns.max() - c0 + 2 * reach + 1), np.uint8)
+    kept = np.empty_like(cells)
+    count = 0
+    limit = spacing_cells * spacing_cells - 1e-9
+    # Half the width of the disc in each of its rows.
+    widths = np.empty(2 * reach + 1, np.int64)
+    for dr in range(-reach, reach + 1):
+        width = -1
+        while width < reach and dr * dr + (width + 1) ** 2 < limit:
+            width += 1
+        widths[dr + reach] = width
+    for k in range(len(cells)):
+        r, c = rows[k] - r0 + reach, columns[k] - c0 + reach
+        if taken[r, c]:
+            continue
+        kept[count, 0] = rows[k]
+        kept[count, 1] = columns[k]
+        count += 1
+        for dr in range(-reach, reach + 1):
+            width = widths[dr + reach]
+            for dc in range(-width, width + 1):
+                taken[r + dr, c + dc] = 1
+    return kept[:count].copy()

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.model import F32, I64, BoolGrid, Submap
-from pc2grid.skeleton import sample_evenly, thin
+from pc2grid.skeleton import cells_of, sample_evenly, thin
 from signature.config import SignatureConfig
 
 
@@ -20,7 +20,7 @@ def boundary_edges(submap: Submap, config: SignatureConfig) -> BoolGrid:
 
 def boundary_points(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> I64:
     """Evenly sampled boundary points P^B (N, 2) as (row, column) of the edge map (III-B 3)."""
-    return sample_evenly(np.argwhere(edges), config.boundary_spacing_m / resolution_m)
+    return sample_evenly(cells_of(edges), config.boundary_spacing_m / resolution_m)
 
 
 def boundary_bins(radius_m: float, config: SignatureConfig) -> int:
@@ -50,15 +50,22 @@ def normalized(counts: NDArray[np.int64]) -> F32:
 @numba.njit(cache=True)
 def _pair_distance_counts(points: NDArray[np.int64], bins_per_cell: float, bins: int) -> NDArray[np.int64]:
     """Histogram of the distances of all pairs m < n."""
-    counts = np.zeros(bins, np.int64)
+    counts = np.zeros((2, bins), np.int64)
     n = len(points)
-    rows = points[:, 0].astype(np.float64)
-    columns = points[:, 1].astype(np.float64)
+    rows = points[:, 0].astype(np.float32)
+    columns = points[:, 1].astype(np.float32)
+    scale = np.float32(bins_per_cell)
+    # More than float32's rounding, less than two distances of cells differ: on an edge the upper bin counts.
+    nudge = np.float32(1e-4)
+    last = np.int32(bins - 1)
+    found = np.empty(n, np.int32)
     for i in range(n):
         r, c = rows[i], columns[i]
         for j in range(i + 1, n):
             dr, dc = rows[j] - r, columns[j] - c
-            # The 1e-9 puts a distance on the edge of two bins always into the upper one.
-            k = int(math.sqrt(dr * dr + dc * dc) * bins_per_cell + 1e-9)
-            counts[min(k, bins - 1)] += 1
-    return counts
+            found[j] = min(np.int32(np.sqrt(dr * dr + dc * dc) * scale + nudge), last)
+        # Two counters in turn, as neighbours often fall into the same bin and would wait for each other.
+        for j in range(i + 1, n):
+            counts[j & 1, found[j]] += 1
+    total: NDArray[np.int64] = counts[0] + counts[1]
+    return total

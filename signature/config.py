@@ -33,6 +33,9 @@ class SignatureConfig(Section):
     freespace_clearance_m: float = Field(
         0.3, ge=0, description="free space is eroded by this before thinning; as in the partition"
     )
+    freespace_cell_m: float = Field(
+        0.1, gt=0, description="cells in which the free-space skeleton is found; fine enough for the spacing"
+    )
     freespace_spacing_m: float = Field(
         0.6,
         gt=0,
@@ -46,6 +49,12 @@ class SignatureConfig(Section):
     segment_gap_m: float = Field(0.1, ge=0, description="Hough joins collinear pixels across this much")
     segment_votes: int = Field(
         6, gt=0, description="Hough votes a line needs; about 0.3 m of pixels at 0.05 m"
+    )
+    segment_step_deg: float = Field(
+        2.0,
+        gt=0,
+        le=15,
+        description="Hough's step in angle; a segment's direction comes from its ends, not from it",
     )
     axis_smoothing_deg: float = Field(
         2.0, gt=0, description="blur of the vote on angles; a pixel's step in a 1 m segment is 3 degrees"
@@ -79,7 +88,27 @@ class SignatureConfig(Section):
 class RelocalizeConfig(Section):
     """Query -> hypotheses -> answer."""
 
-    top_k: int = Field(20, gt=0, description="candidates that retrieval hands to alignment")
+    window_m: float = Field(15.0, gt=0, description="how far back along its path a query remembers")
+    step_m: float = Field(1.0, gt=0, description="a new look at the database every so many metres of travel")
+    views: int = Field(6, gt=0, description="places of its path at which a query is described")
+    view_spacing_m: float = Field(1.5, gt=0, description="least distance of two views")
+    shortlist: int = Field(
+        400, gt=0, description="places that the signatures hand to the comparison of isovists"
+    )
+    signature_weight: float = Field(
+        0.2, ge=0, description="say of the signatures against the isovists' ranges; 0: none"
+    )
+    top_k: int = Field(50, gt=0, description="places that retrieval hands to alignment")
+    coarse_floor: float = Field(0.4, ge=0, le=1, description="coarse scores below this are not looked at")
+    coarse_keep: float = Field(0.75, gt=0, le=1, description="nor those below this share of the best")
+    hypotheses: int = Field(20, gt=0, description="hypotheses kept at most")
+    exhaustive_m2: float = Field(
+        20_000.0,
+        ge=0,
+        description="where signatures do not settle it, maps up to this free area are searched as a whole",
+    )
+    accept: float = Field(0.9, gt=0, lt=1, description="least confidence to answer located")
+    plausible: float = Field(0.55, gt=0, lt=1, description="least score for a hypothesis to be named at all")
 
 
 class Config(Section):

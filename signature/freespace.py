@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.model import F32, I64, BoolGrid, Submap
-from pc2grid.skeleton import sample_evenly, skeleton_of
+from pc2grid.skeleton import cells_of, sample_evenly, skeleton_of
 from signature.boundary import normalized
 from signature.config import SignatureConfig
 
@@ -19,10 +19,24 @@ if TYPE_CHECKING:
 
 
 def freespace_nodes(submap: Submap, config: SignatureConfig) -> I64:
-    """Free-space nodes V^F (N, 2) as (row, column): evenly sampled pixels of the free-space skeleton."""
+    """Free-space nodes V^F (N, 2) as (row, column): evenly sampled pixels of the free-space skeleton.
+
+    The skeleton is found on blocks of cells (`config.freespace_cell_m`), free if all their cells are: nodes
+    far apart need no finer one, and thinning a wide area is the dearest step.
+    """
     grid = submap.grid
-    skeleton = skeleton_of(grid.free, grid.resolution_m, config.freespace_clearance_m, config.thinning)
-    return sample_evenly(np.argwhere(skeleton), config.freespace_spacing_m / grid.resolution_m)
+    block = max(1, round(config.freespace_cell_m / grid.resolution_m))
+    free = _all_in_blocks(grid.free, block)
+    cell_m = block * grid.resolution_m
+    skeleton = skeleton_of(free, cell_m, config.freespace_clearance_m, config.thinning)
+    return sample_evenly(cells_of(skeleton), config.freespace_spacing_m / cell_m) * block + block // 2
+
+
+def _all_in_blocks(mask: BoolGrid, block: int) -> BoolGrid:
+    """Whether all cells of each block x block square are set; a rest at the far edges is left out."""
+    height, width = mask.shape[0] // block * block, mask.shape[1] // block * block
+    rows = np.logical_and.reduce([mask[k:height:block] for k in range(block)])
+    return np.asarray(np.logical_and.reduce([rows[:, k:width:block] for k in range(block)]))
 
 
 def adjacency(nodes: I64, occupied: BoolGrid, resolution_m: float, config: SignatureConfig) -> F32:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pc2grid.geometry import F64
 from pc2grid.model import F32, I64, BoolGrid
+from pc2grid.skeleton import cells_of
 from signature.config import SignatureConfig
 
 
@@ -29,7 +30,7 @@ def line_segments(edges: BoolGrid, resolution_m: float, config: SignatureConfig)
     segments = cv2.HoughLinesP(
         edges.view(np.uint8),
         1.0,
-        math.pi / 180,
+        math.radians(config.segment_step_deg),
         config.segment_votes,
         minLineLength=config.segment_min_m / resolution_m,
         maxLineGap=config.segment_gap_m / resolution_m,
@@ -79,9 +80,10 @@ def _refined(peak_deg: int, angles_rad: F64, lengths: F64, window_deg: float) ->
 def blurred(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F32:
     """S^G (H, W): the edge map under a Gaussian, scaled so that a straight line peaks at `symmetry_peak`."""
     sigma = config.symmetry_blur_m / resolution_m
+    width = 2 * math.ceil(3 * sigma) + 1
     crest = config.symmetry_peak * sigma * math.sqrt(2 * math.pi)
     image = cv2.GaussianBlur(
-        edges.astype(np.float32) * np.float32(crest), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT
+        edges.astype(np.float32) * np.float32(crest), (width, width), sigma, borderType=cv2.BORDER_CONSTANT
     )
     return np.asarray(np.minimum(image, config.symmetry_peak), np.float32)
 
@@ -113,5 +115,5 @@ def symmetry_scores(edges: BoolGrid, resolution_m: float, config: SignatureConfi
     if axes is None:
         return np.zeros(2, np.float32)
     image = blurred(edges, resolution_m, config)
-    cells = np.argwhere(edges)
+    cells = cells_of(edges)
     return np.array([reflection_score(cells, image, axis) for axis in axes], np.float32)

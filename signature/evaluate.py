@@ -1,0 +1,187 @@
+"""The paper's experiment: queries cut from the map, matched against its submaps (paper IV-B)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.geometry import F64
+from pc2grid.model import UNKNOWN, OccupancyGrid, Submap
+from signature.baselines import Method
+from signature.noise import Noise, add_noise
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Protocol:
+    """How queries are drawn and judged.
+
+    queries : how many a map.
+    offset_m : a query's centre lies this far from some submap's centre at most. The paper does not say;
+        results hang on it, so both 0.5 and 1.0 are reported.
+    correct_m : a match is true if the matched submap's centre is this near.
+    seed : of everything random; query i of a seed is the same whatever the number of queries, and lies at
+        the same place at every noise level.
+    """
+
+    queries: int = 2000
+    offset_m: float = 0.5
+    correct_m: float = 1.0
+    seed: int = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """Best match of every query.
+
+    similarity : (Q,) of the best match, larger is more alike; method-specific scale.
+    correct : (Q,) bool, whether the best match is true.
+    """
+
+    similarity: F64
+    correct: NDArray[np.bool_]
+
+    def curve(self) -> PrecisionRecall:
+        """Precision and recall over the similarity threshold."""
+        return precision_recall(self.similarity, self.correct)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrecisionRecall:
+    """A precision-recall curve, from the strictest threshold to none.
+
+    recall, precision : (T,) each, one point a distinct similarity.
+
+    Recall is the share of the true matches that pass the threshold, so that it ends at 1. The paper does
+    not say, but its Table III does: with recall as a share of all queries the area could not exceed the
+    share of true matches, which F1 is at least - and in most rows AUC exceeds F1.
+    """
+
+    recall: F64
+    precision: F64
+
+    @property
+    def auc(self) -> float:
+        """Area under the curve (AUPRC), trapezoids from (0, precision of the first point)."""
+        if len(self.recall) == 0:
+            return 0.0
+        recall = np.concatenate(([0.0], self.recall))
+        precision = np.concatenate((self.precision[:1], self.precision))
+        return float(np.sum(np.diff(recall) * (precision[1:] + precision[:-1]) / 2))
+
+    @property
+    def recall_at_90(self) -> float:
+        """RP9: largest recall at a precision of at least 0.9; 0 if there is none."""
+        return float(self.recall[self.precision >= 0.9].max(initial=0.0))
+
+    @property
+    def f1(self) -> float:
+        """Largest F1 score over the thresholds."""
+        total = self.precision + self.recall
+        scores = np.divide(2 * self.precision * self.recall, total, out=np.zeros_like(total), where=total > 0)
+        return float(scores.max(initial=0.0))
+
+
+def precision_recall(similarity: F64, correct: NDArray[np.bool_]) -> PrecisionRecall:
+    """The curve of best matches with similarity (Q,) and truth (Q,); empty without any true match."""
+    if not correct.any():
+        return PrecisionRecall(recall=np.empty(0), precision=np.empty(0))
+    order = np.argsort(-similarity, kind="stable")
+    hits = np.cumsum(correct[order])
+    # Equal similarities pass a threshold together.
+    last = np.append(np.diff(similarity[order]) != 0, True)
+    return PrecisionRecall(
+        recall=(hits / hits[-1])[last], precision=(hits / np.arange(1, len(hits) + 1))[last]
+    )
+
+
+def draw_queries(
+    grid: OccupancyGrid, centers_m: F64, radius_m: float, protocol: Protocol, noise: Noise
+) -> Iterator[Submap]:
+    """Query submaps: a free place near a submap centre, cut out, turned at random, with noise (IV-B).
+
+    centers_m : (N, 2) of the submaps. `center_m` of a query is where it was cut; its grid is centred on
+    (0, 0) of its own turned frame and tells nothing of the place.
+    """
+    for index in range(protocol.queries):
+        rng = np.random.default_rng([protocol.seed, index])
+        center_m = _free_place(grid, centers_m, protocol.offset_m, rng)
+        turned = rotated_submap(grid, center_m, radius_m, float(rng.uniform(-math.pi, math.pi)), index)
+        # A stream of its own, so that drawing more noise does not move the next query.
+        yield add_noise(turned, noise, np.random.default_rng([protocol.seed, index, noise.boundary]))
+
+
+def _free_place(
+    grid: OccupancyGrid, centers_m: F64, offset_m: float, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Uniform over the disc of `offset_m` around a random centre, tried again until the cell is free."""
+    height, width = grid.cells.shape
+    for _ in range(1000):
+        angle, reach = rng.uniform(0, 2 * math.pi), offset_m * math.sqrt(rng.random())
+        place = centers_m[rng.integers(len(centers_m))] + reach * np.array([math.cos(angle), math.sin(angle)])
+        row, column = (int(v) for v in grid.to_cell(place[None])[0])
+        if 0 <= row < height and 0 <= column < width and 0 <= grid.cells[row, column] < 20:
+            return float(place[0]), float(place[1])
+    raise ValueError(f"no free cell within {offset_m} m of any submap centre")
+
+
+def rotated_submap(
+    grid: OccupancyGrid, center_m: tuple[float, float], radius_m: float, angle_rad: float, submap_id: int = 0
+) -> Submap:
+    """The disc around a place as seen by someone turned by `angle_rad`: nearest cells, no interpolation."""
+    resolution = grid.resolution_m
+    n = round(radius_m / resolution)
+    # Cut a square that holds every rotation first: warping costs what it reads.
+    around = grid.crop(center_m, radius_m + 2 * resolution)
+    x, y = (np.asarray(center_m) - around.origin_m) / resolution - 0.5
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    to_map = np.array([[c, -s, x - c * n + s * n], [s, c, y - s * n - c * n]])
+    cells = cv2.warpAffine(
+        np.ascontiguousarray(around.cells).view(np.uint8),
+        to_map,
+        (2 * n + 1, 2 * n + 1),
+        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=255,
+    ).view(np.int8)
+    steps = np.arange(-n, n + 1) ** 2
+    cells = np.where(steps[:, None] + steps <= (radius_m / resolution) ** 2 + 1e-9, cells, np.int8(UNKNOWN))
+    half_m = (n + 0.5) * resolution
+    return Submap(
+        submap_id=submap_id,
+        center_m=center_m,
+        radius_m=radius_m,
+        grid=OccupancyGrid(cells=cells, resolution_m=resolution, origin_m=(-half_m, -half_m)),
+    )
+
+
+def evaluate(
+    method: Method,
+    grid: OccupancyGrid,
+    submaps: Sequence[Submap],
+    protocol: Protocol,
+    noise: Noise,
+    progress: Callable[[float], None] | None = None,
+) -> Outcome:
+    """One cell of Table III: a method on a map at a noise level.
+
+    submaps : the map's partition, all of one radius. Raises ValueError if there are none.
+    """
+    if not submaps:
+        raise ValueError("a map without submaps cannot be evaluated")
+    centers_m = np.array([submap.center_m for submap in submaps])
+    matcher = method.fit(submaps)
+    similarity = np.empty(protocol.queries)
+    correct = np.empty(protocol.queries, np.bool_)
+    for i, query in enumerate(draw_queries(grid, centers_m, submaps[0].radius_m, protocol, noise)):
+        scores = matcher.similarities(query)
+        best = int(np.argmax(scores))
+        similarity[i] = scores[best]
+        correct[i] = np.hypot(*(centers_m[best] - query.center_m)) <= protocol.correct_m
+        if progress is not None:
+            progress((i + 1) / protocol.queries)
+    return Outcome(similarity=similarity, correct=correct)
