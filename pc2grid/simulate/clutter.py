@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.geometry import SE2
-from pc2grid.model import F64, BoolGrid, OccupancyGrid
+from pc2grid.geometry import F64, SE2
+from pc2grid.model import BoolGrid, OccupancyGrid
 from pc2grid.simulate.passage import Passages, outline_mask
 from pc2grid.simulate.scene import Mesh, prism
 
@@ -121,12 +121,9 @@ def place_clutter(
         cell = np.array([np.unravel_index(places[rng.integers(len(places))], grid.cells.shape)])
         x, y = (float(v) for v in grid.to_point(cell)[0])
         # Half of what people put down stands square to the walls.
-        yaw = (
-            float(rng.choice(4)) * math.pi / 2
-            if rng.random() < 0.5
-            else float(rng.uniform(-math.pi, math.pi))
-        )
-        piece = Piece(name, SE2(x, y, yaw), outline, tuple(parts))
+        square = rng.random() < 0.5
+        yaw = rng.choice(4) * math.pi / 2 if square else rng.uniform(-math.pi, math.pi)
+        piece = Piece(name, SE2(x, y, float(yaw)), outline, tuple(parts))
         reach = float(np.linalg.norm(outline, axis=1).max())
         if any(math.hypot(x - px, y - py) < 1.0 + reach for px, py in keep_free_m):
             continue
@@ -138,9 +135,9 @@ def place_clutter(
 
 def covered(grid: OccupancyGrid, pieces: tuple[Piece, ...]) -> BoolGrid:
     """Cells (H, W) that some piece stands over."""
-    mask = np.zeros(grid.cells.shape, bool)
+    shape = (grid.cells.shape[0], grid.cells.shape[1])
+    mask: BoolGrid = np.zeros(shape, bool)
     for piece in pieces:
-        mask |= outline_mask(
-            (piece.pose.apply(piece.outline_m) - grid.origin_m) / grid.resolution_m, mask.shape
-        )
+        footprint = (piece.pose.apply(piece.outline_m) - grid.origin_m) / grid.resolution_m
+        mask |= outline_mask(footprint, shape)
     return mask

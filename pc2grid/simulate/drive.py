@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.model import F64, _freeze
+from pc2grid.geometry import F64, SE2, wrap_angle
+from pc2grid.model import _freeze
 from pc2grid.simulate.config import DriveConfig
 from pc2grid.simulate.route import Route
 
@@ -112,7 +113,7 @@ def drive_along(route: Route, config: DriveConfig, rng: np.random.Generator) -> 
                 poses.append(np.column_stack((np.tile(line[0], (len(when), 1)), yaw + angles)))
             yaws += yaw + spin - yaws[0]
         cuts = sorted({a, b, *(s for s in stops if a + 10 < s < b - 10)})
-        for c, d in zip(cuts[:-1], cuts[1:], strict=True):
+        for c, d in pairwise(cuts):
             part, headings = points[c : d + 1], yaws[c - a : d - a + 1]
             times.append(times[-1][-1] + _follow(part, headings, config))
             poses.append(np.column_stack((part, headings)))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pc2grid.errors import ConfigError
+from pc2grid.geometry import F64
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, BoolGrid, OccupancyGrid
 from pc2grid.simulate.layout import Box, Layout, lay_out
 from pc2grid.simulate.passage import Passages
@@ -13,12 +15,18 @@ OUTER_WALL_M = 0.3
 INNER_WALL_M = 0.1
 
 
-def _fill(cells: np.ndarray, box: Box, value: int) -> None:
+def _fill(cells: NDArray[np.int8], box: Box, value: int) -> None:
     cells[max(box.y0, 0) : max(box.y1, 0), max(box.x0, 0) : max(box.x1, 0)] = value
 
 
-def _corners(box: Box) -> np.ndarray:
-    return np.array([(box.x0, box.y0), (box.x1, box.y0), (box.x1, box.y1), (box.x0, box.y1)], float)
+def _within(box: Box, other: Box) -> Box:
+    return Box(max(box.x0, other.x0), max(box.y0, other.y0), min(box.x1, other.x1), min(box.y1, other.y1))
+
+
+def _corners(box: Box) -> F64:
+    # Through the centres of its outermost cells, so that exactly the cells of the box are covered.
+    x0, y0, x1, y1 = box.x0 + 0.5, box.y0 + 0.5, box.x1 - 0.5, box.y1 - 0.5
+    return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
 
 
 def office_floorplan(
@@ -53,19 +61,13 @@ def office_floorplan(
     return OccupancyGrid(cells=cells, resolution_m=resolution_m, origin_m=(-margin / unit, -margin / unit))
 
 
-def _carve(cells: np.ndarray, layout: Layout, inside: Box, wall: int) -> None:
+def _carve(cells: NDArray[np.int8], layout: Layout, inside: Box, wall: int) -> None:
     """Take the free space out of the solid block."""
     reached = {side for door in layout.doors for side in door.sides}
     for number, room in enumerate(layout.rooms):
         _fill(cells, room.grown(-wall), FREE if number in reached else UNKNOWN)
     for corridor in layout.corridors:
-        clipped = Box(
-            max(corridor.x0, inside.x0),
-            max(corridor.y0, inside.y0),
-            min(corridor.x1, inside.x1),
-            min(corridor.y1, inside.y1),
-        )
-        _fill(cells, clipped, FREE)
+        _fill(cells, _within(corridor.grown(-wall), inside), FREE)
     for door in layout.doors:
         _fill(cells, door.box, FREE)
 
@@ -82,29 +84,26 @@ def _keep_doors_clear(passages: Passages, layout: Layout, margin: int) -> None:
 def _relief(passages: Passages, layout: Layout, wall: int, margin: int, rng: np.random.Generator) -> None:
     """Pilasters, pipes, radiators and cases on corridor walls, so that no corridor is smooth."""
     unit = layout.unit
-    for corridor in layout.corridors:
+    for whole in layout.corridors:
+        corridor = whole.grown(-wall)
         along_x = corridor.width >= corridor.height
         low, high = (corridor.x0, corridor.x1) if along_x else (corridor.y0, corridor.y1)
+        wide = corridor.height if along_x else corridor.width
         for near in (True, False):
-            at = low + rng.uniform(0.3, 2.0) * unit
+            at = low + float(rng.uniform(0.3, 2.0)) * unit
             while at < high:
-                long = rng.choice([rng.uniform(0.15, 0.4), rng.uniform(0.6, 1.6)])
-                deep = max(round(float(rng.uniform(0.05, 0.2 if long < 0.5 else 0.15)) * unit), 1)
-                a, b = round(at), round(at + long * unit)
+                slim = rng.random() < 0.5
+                long_m = float(rng.uniform(0.15, 0.4) if slim else rng.uniform(0.6, 1.6))
+                deep = max(round(float(rng.uniform(0.05, 0.2 if slim else 0.15)) * unit), 1)
+                a, b = round(at), round(at + long_m * unit)
+                # Along the corridor from a to b, across it from c to d.
+                c, d = (0, deep) if near else (wide - deep, wide)
                 if along_x:
-                    box = (
-                        Box(a, corridor.y0, b, corridor.y0 + deep)
-                        if near
-                        else Box(a, corridor.y1 - deep, b, corridor.y1)
-                    )
+                    box = Box(a, corridor.y0 + c, b, corridor.y0 + d)
                 else:
-                    box = (
-                        Box(corridor.x0, a, corridor.x0 + deep, b)
-                        if near
-                        else Box(corridor.x1 - deep, a, corridor.x1, b)
-                    )
+                    box = Box(corridor.x0 + c, a, corridor.x0 + d, b)
                 passages.put(_corners(box) + margin)
-                at += (long + rng.uniform(0.6, 4.0)) * unit
+                at += (long_m + float(rng.uniform(0.6, 4.0))) * unit
 
 
 def _columns(passages: Passages, inside: Box, margin: int, unit: float, rng: np.random.Generator) -> None:
@@ -129,7 +128,7 @@ def _shelves(passages: Passages, layout: Layout, wall: int, margin: int, rng: np
                 round(float(rng.uniform(0.6, 2.2)) * unit),
                 round(float(rng.uniform(0.3, 0.5)) * unit),
             )
-            side = rng.integers(4)
+            side = int(rng.integers(4))
             width, height = (long, deep) if side < 2 else (deep, long)
             if width >= free.width or height >= free.height:
                 continue
@@ -137,9 +136,8 @@ def _shelves(passages: Passages, layout: Layout, wall: int, margin: int, rng: np
             y = int(rng.integers(free.y0, free.y1 - height + 1))
             # Against the lower, upper, left or right wall; in large rooms some stand free.
             if area_m2 < 30 or rng.random() < 0.7:
-                x, y = (
-                    (x, (free.y0, free.y1 - height)[side])
-                    if side < 2
-                    else ((free.x0, free.x1 - width)[side - 2], y)
-                )
+                if side < 2:
+                    y = (free.y0, free.y1 - height)[side]
+                else:
+                    x = (free.x0, free.x1 - width)[side - 2]
             passages.put(_corners(Box(x, y, x + width, y + height)) + margin)

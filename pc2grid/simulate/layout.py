@@ -79,9 +79,9 @@ def _corridors(inside: Box, unit: float, rng: np.random.Generator) -> list[Box]:
             corridors.append(Box(x0, y, x1, y + wide()))
         if rng.random() < 0.6:
             x = x0 + int((x1 - x0) * rng.uniform(0.2, 0.8))
-            corridors.append(
-                Box(x, y1, x + wide(), inside.y1) if rng.random() < 0.5 else Box(x, inside.y0, x + wide(), y0)
-            )
+            over = _cells(1.0, unit)
+            up, down = Box(x, y1 - over, x + wide(), inside.y1), Box(x, inside.y0, x + wide(), y0 + over)
+            corridors.append(up if rng.random() < 0.5 else down)
     elif kind == "ladder":
         corridors += [Box(inside.x0, y0, x1, y0 + wide()), Box(x0, y1 - wide(), inside.x1, y1)]
         rungs = int(rng.integers(2, 5))
@@ -97,10 +97,10 @@ def _corridors(inside: Box, unit: float, rng: np.random.Generator) -> list[Box]:
         pitch = inside.width / teeth
         for k in range(teeth):
             x = int(inside.x0 + (k + rng.uniform(0.15, 0.75)) * pitch)
-            up = rng.random()
-            if up < 0.7:
+            side = rng.random()
+            if side < 0.7:
                 corridors.append(Box(x, spine.y0, x + wide(), y1))
-            if up > 0.3:
+            if side > 0.3:
                 x = min(x + int(rng.uniform(-0.1, 0.1) * pitch), inside.x1 - wide())
                 corridors.append(Box(x, y0, x + wide(), spine.y1))
         # One cross-way makes a loop of two teeth.

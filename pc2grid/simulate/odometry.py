@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.geometry import SE2
-from pc2grid.model import F64, _freeze
+from pc2grid.geometry import F64, SE2
+from pc2grid.model import _freeze
 from pc2grid.simulate.config import OdometryConfig
 from pc2grid.simulate.drive import Drive
 
@@ -53,7 +53,7 @@ def odometry_of(drive: Drive, config: OdometryConfig, rng: np.random.Generator) 
     per metre: errors grow with what was driven, never while standing.
     """
     step_s = 1.0 / config.rate_hz
-    times_s = np.arange(math.floor(drive.duration_s * config.rate_hz) + 2) * step_s
+    times_s = (np.arange(math.floor(drive.duration_s * config.rate_hz) + 2) * step_s).astype(np.float64)
     x, y, yaw = drive.at(times_s).T
     middle = (yaw[1:] + yaw[:-1]) / 2
     forward = np.diff(x) * np.cos(middle) + np.diff(y) * np.sin(middle)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.model import F32, F64, BoolGrid
+from pc2grid.geometry import F64
+from pc2grid.model import F32, BoolGrid
 
 
 def clearance_m(free: BoolGrid, resolution_m: float) -> F32:
@@ -78,9 +79,9 @@ class Passages:
         before = self._passable[window]
         after = before & (distance >= self.robot_m)
         eight = np.ones((3, 3), bool)
-        parts_before, count_before = ndimage.label(before, eight)
-        parts_after, count_after = ndimage.label(after, eight)
-        kept: NDArray[np.int64] = np.unique(parts_before[after])
+        parts, count_before = ndimage.label(before, eight)
+        _, count_after = ndimage.label(after, eight)
+        kept: NDArray[np.int64] = np.unique(parts[after])
         if count_after != count_before or len(kept) != count_before:
             return False
         self.free[window] &= ~mask

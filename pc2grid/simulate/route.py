@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.errors import ConfigError
-from pc2grid.model import F32, F64, I64, OccupancyGrid, _freeze
+from pc2grid.geometry import F64
+from pc2grid.model import F32, I64, OccupancyGrid, _freeze
 from pc2grid.simulate.passage import clearance_m
 
 STEP_M = 0.05
@@ -80,13 +81,14 @@ def _lattice(
     if start_m is not None:
         cells = np.argwhere(passable)
         away = np.linalg.norm(grid.to_point(cells * stride) - start_m, axis=1)
-        nearest = int(np.argmin(away))
-        if away[nearest] > 1.0:
+        if away.min() > 1.0:
+            x, y = grid.to_point(cells[[np.argmin(away)]] * stride)[0]
             raise ConfigError(
-                f"the start ({start_m[0]:g}, {start_m[1]:g}) is {away[nearest]:.1f} m away from where a robot fits",
-                hint=f"the nearest such place is ({grid.to_point(cells[nearest : nearest + 1] * stride)[0].round(2)})",
+                f"the start ({start_m[0]:g}, {start_m[1]:g}) is {away.min():.1f} m from where a robot fits",
+                hint=f"the nearest such place is ({x:.2f}, {y:.2f})",
             )
-        label = int(labels[tuple(cells[nearest])])
+        near = labels[tuple(cells[away <= 1.0].T)]
+        label = int(near[np.argmax(sizes[near])])
     part = labels == label
     # In the middle: nowhere around is clearly more room.
     size = 2 * round(0.6 / (stride * grid.resolution_m)) + 1
@@ -151,9 +153,8 @@ class _Explorer:
                 break
         else:
             self.new[:] = True
-            goals = np.flatnonzero(
-                np.isfinite(away) & (away > 0.5 * np.max(away, where=np.isfinite(away), initial=0))
-            )
+            reachable = np.isfinite(away)
+            goals = np.flatnonzero(reachable & (away > 0.5 * away[reachable].max()))
             if len(goals) == 0:
                 raise ConfigError("the free space is too small to drive in", hint="choose another --start")
             goals = goals[[self.rng.integers(len(goals))]]
@@ -174,7 +175,7 @@ class _Explorer:
 def _resample(points_m: F64) -> F64:
     """The same line with points STEP_M apart; its ends stay."""
     lengths = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))))
-    count = max(int(round(lengths[-1] / STEP_M)), 1)
+    count = max(round(float(lengths[-1]) / STEP_M), 1)
     at = np.linspace(0, lengths[-1], count + 1)
     return np.column_stack([np.interp(at, lengths, points_m[:, k]) for k in (0, 1)])
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.model import F32, F64, BoolGrid, OccupancyGrid, _freeze
+from pc2grid.geometry import F64
+from pc2grid.model import F32, BoolGrid, OccupancyGrid, _freeze
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +45,9 @@ class Mesh:
 
 def quads(corners_m: F64) -> Mesh:
     """Flat four-cornered faces (N, 4, 3), corners in order around each face."""
-    first = 4 * np.arange(len(corners_m), dtype=np.uint32)[:, None]
+    first = 4 * np.arange(len(corners_m))[:, None]
     triangles = np.concatenate((first + np.array([0, 1, 2]), first + np.array([0, 2, 3])))
-    return Mesh(corners_m.reshape(-1, 3), triangles)
+    return Mesh(corners_m.reshape(-1, 3).astype(np.float32), triangles.astype(np.uint32))
 
 
 def prism(outline_m: F64, bottom_m: float, top_m: float) -> Mesh:
@@ -58,7 +59,9 @@ def prism(outline_m: F64, bottom_m: float, top_m: float) -> Mesh:
     sides[:, 1, :2] = sides[:, 2, :2] = after
     sides[:, :2, 2], sides[:, 2:, 2] = bottom_m, top_m
     fan = np.column_stack((np.zeros(n - 2), np.arange(1, n - 1), np.arange(2, n))).astype(np.uint32)
-    lids = [Mesh(np.column_stack((outline_m, np.full(n, z))), fan) for z in (bottom_m, top_m)]
+    lids = [
+        Mesh(np.column_stack((outline_m, np.full(n, z))).astype(np.float32), fan) for z in (bottom_m, top_m)
+    ]
     return Mesh.join([quads(sides), *lids])
 
 
@@ -102,10 +105,11 @@ class Scene:
     def __init__(self, mesh: Mesh) -> None:
         import open3d as o3d
 
-        self._tensor: Any = o3d.core.Tensor
+        tensor: Any = o3d.core.Tensor
+        self._tensor = tensor
         self._scene: Any = o3d.t.geometry.RaycastingScene()
         # Open3D's tensors do not take read-only memory.
-        self._scene.add_triangles(self._tensor(mesh.vertices_m.copy()), self._tensor(mesh.triangles.copy()))
+        self._scene.add_triangles(tensor(mesh.vertices_m.copy()), tensor(mesh.triangles.copy()))
 
     def cast(self, rays: F32) -> F32:
         """Rays (N, 6), origin in metres and direction, to (N,): multiples of the direction until the

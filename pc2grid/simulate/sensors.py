@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pc2grid.model import F32, F64, SensorKind, _freeze
+from pc2grid.geometry import F64
+from pc2grid.model import F32, SensorKind, _freeze
 from pc2grid.simulate.config import DepthConfig, LaserConfig, LidarConfig, SimulationConfig
 
 OPTICAL = np.array([(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
@@ -91,7 +92,7 @@ def laser(config: LaserConfig) -> Sensor:
     count = round(config.field_deg / config.step_deg) + 1
     angle = laser_angle_min(config) + np.arange(count) * math.radians(config.step_deg)
     directions = np.column_stack((np.cos(angle), np.sin(angle), np.zeros(count)))
-    offsets = np.arange(count) * laser_time_increment(config)
+    offsets = np.arange(count, dtype=np.float64) * laser_time_increment(config)
     return Sensor("laser", "laser_link", _mount(config.mount_m), config.rate_hz, directions, offsets, config)
 
 

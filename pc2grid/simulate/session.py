@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.geometry import SE2
-from pc2grid.model import F32, F64, OccupancyGrid, Scan, SensorKind
+from pc2grid.geometry import F64, SE2
+from pc2grid.model import F32, OccupancyGrid, Scan, SensorKind
 from pc2grid.simulate.clutter import Piece, covered, place_clutter
 from pc2grid.simulate.config import SimulationConfig
 from pc2grid.simulate.drive import Drive, drive_along
