@@ -12,7 +12,7 @@ class DriveConfig(Section):
 
     clearance_m: float = Field(default=0.35, ge=0.1, le=2.0, description="least distance to anything solid")
     speed_mps: float = Field(default=0.6, gt=0.05, le=0.8, description="cruising speed")
-    yaw_rate_rps: float = Field(default=0.9, gt=0.05, le=1.0, description="fastest turn")
+    yaw_rate_rps: float = Field(default=0.8, gt=0.05, le=1.0, description="fastest turn")
     acceleration_mps2: float = Field(default=0.5, gt=0, description="speeding up and braking")
     yaw_acceleration_rps2: float = Field(default=1.5, gt=0, description="of turns in place")
     pause_every_m: float = Field(default=15.0, gt=0, description="mean distance between short stops")

@@ -63,15 +63,20 @@ def _headings(points_m: F64) -> F64:
 
 def _follow(points_m: F64, yaws: F64, config: DriveConfig) -> F64:
     """Times (N,) along a line, starting and ending at rest, within speed, yaw rate and acceleration."""
+    from scipy.ndimage import maximum_filter1d
+
     steps = np.maximum(np.linalg.norm(np.diff(points_m, axis=0), axis=1), 1e-6)
     bend = np.abs(np.gradient(yaws)) / np.gradient(np.concatenate(([0.0], np.cumsum(steps))))
+    bend = maximum_filter1d(bend, 5)
     speed = np.minimum(config.speed_mps, config.yaw_rate_rps / np.maximum(bend, 1e-3))
     speed[0] = speed[-1] = 0.0
     for i in range(1, len(speed)):
         speed[i] = min(speed[i], np.sqrt(speed[i - 1] ** 2 + 2 * config.acceleration_mps2 * steps[i - 1]))
     for i in range(len(speed) - 2, -1, -1):
         speed[i] = min(speed[i], np.sqrt(speed[i + 1] ** 2 + 2 * config.acceleration_mps2 * steps[i]))
-    return np.concatenate(([0.0], np.cumsum(2 * steps / np.maximum(speed[1:] + speed[:-1], 0.02))))
+    seconds = 2 * steps / np.maximum(speed[1:] + speed[:-1], 0.02)
+    seconds = np.maximum(seconds, np.abs(np.diff(yaws)) / config.yaw_rate_rps)
+    return np.concatenate(([0.0], np.cumsum(seconds)))
 
 
 def _turn(angle_rad: float, config: DriveConfig) -> tuple[F64, F64]:

@@ -23,6 +23,11 @@ def _within(box: Box, other: Box) -> Box:
     return Box(max(box.x0, other.x0), max(box.y0, other.y0), min(box.x1, other.x1), min(box.y1, other.y1))
 
 
+def _touch(box: Box, other: Box) -> bool:
+    common = _within(box, other)
+    return common.width > 0 and common.height > 0
+
+
 def _corners(box: Box) -> F64:
     # Through the centres of its outermost cells, so that exactly the cells of the box are covered.
     x0, y0, x1, y1 = box.x0 + 0.5, box.y0 + 0.5, box.x1 - 0.5, box.y1 - 0.5
@@ -102,7 +107,9 @@ def _relief(passages: Passages, layout: Layout, wall: int, margin: int, rng: np.
                     box = Box(a, corridor.y0 + c, b, corridor.y0 + d)
                 else:
                     box = Box(corridor.x0 + c, a, corridor.x0 + d, b)
-                passages.put(_corners(box) + margin)
+                crossing = any(_touch(box, other) for other in layout.corridors if other != whole)
+                if not crossing:
+                    passages.put(_corners(box) + margin)
                 at += (long_m + float(rng.uniform(0.6, 4.0))) * unit
 
 

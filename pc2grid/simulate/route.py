@@ -229,7 +229,8 @@ def plan_route(
     pieces: list[list[F64]] = [[lattice.points_m[[at]]]]
     heading: F64 | None = None
     driven_m = 0.0
-    while driven_m < 1.1 * length_m + 2.0:
+    # Smoothing takes the corners off, so plan for more than is asked for.
+    while driven_m < 1.3 * length_m + 2.0:
         leg = lattice.points_m[explorer.next_path(heading)]
         driven_m += float(np.linalg.norm(np.diff(leg, axis=0), axis=1).sum())
         leaving = leg[min(5, len(leg) - 1)] - leg[0]

@@ -38,9 +38,11 @@ def simulate_command(
     force: Annotated[bool, typer.Option("--force", help="replace existing files")] = False,
 ) -> None:
     """Drive a robot through a building and record it: OUT.mcap, and OUT.tum with the true poses."""
+    from pydantic import ValidationError
     from rich.console import Console
     from rich.progress import Progress
 
+    from pc2grid.errors import ConfigError
     from pc2grid.io.nav2_map import load_map
     from pc2grid.simulate import SimulationConfig, simulate_session
     from pc2grid.simulate.config import OdometryConfig
@@ -50,14 +52,18 @@ def simulate_command(
     if files[-1].suffix != ".mcap":
         raise typer.BadParameter(f"the file to write must end in .mcap: {files[-1]}")
     grid = load_map(files[0]) if len(files) == 2 else None
-    config = SimulationConfig(
-        length_m=length,
-        seed=seed,
-        clutter=clutter,
-        start_m=start,
-        building_seed=building_seed,
-        odometry=OdometryConfig(enabled=not no_odometry),
-    )
+    try:
+        config = SimulationConfig(
+            length_m=length,
+            seed=seed,
+            clutter=clutter,
+            start_m=start,
+            building_seed=building_seed,
+            odometry=OdometryConfig(enabled=not no_odometry),
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ConfigError(f"{first['loc'][0]}: {first['msg']}, got {first['input']}") from error
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task(f"simulate {sensor.value}", total=1.0)
