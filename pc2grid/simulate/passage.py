@@ -14,10 +14,14 @@ def clearance_m(free: BoolGrid, resolution_m: float) -> F32:
 
     Beyond the grid nothing is free.
     """
+    return _distance_m(np.pad(free, 1), resolution_m)[1:-1, 1:-1]
+
+
+def _distance_m(free: BoolGrid, resolution_m: float) -> F32:
+    """The same where nothing is known beyond the grid."""
     import cv2
 
-    padded = np.pad(free, 1).astype(np.uint8)
-    cells = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    cells = cv2.distanceTransform(free.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     distance: F32 = np.maximum(cells - np.float32(0.5), 0).astype(np.float32) * np.float32(resolution_m)
     return distance
 
@@ -73,7 +77,7 @@ class Passages:
             return False
         window = np.s_[r0:r1, c0:c1]
         mask = outline_mask(outline_cells - (c0, r0), (r1 - r0, c1 - c0))
-        distance = clearance_m(~mask, self.resolution_m)
+        distance = _distance_m(~mask, self.resolution_m)
         if (mask & self.reserved[window]).any() or not (overlap or self.free[window][mask].all()):
             return False
         before = self._passable[window]
