@@ -24,14 +24,15 @@ class SignatureConfig(Section):
 
     boundary_bin_m: float = Field(0.2, gt=0, description="bin width of the boundary histogram (delta_b)")
     boundary_spacing_m: float = Field(
-        0.2,
-        ge=0,
-        description="least distance of two boundary points: one bin, finer adds nothing to a histogram",
+        0.1, ge=0, description="least distance of two boundary points; half a bin: coarser costs recognition"
     )
 
     freespace_bin_m: float = Field(0.4, gt=0, description="bin width of the free-space histogram (delta_f)")
     freespace_clearance_m: float = Field(
-        0.3, ge=0, description="free space is eroded by this before thinning; as in the partition"
+        0.2,
+        ge=0,
+        description="free space is eroded by this before thinning; less than half a door, so that obstacles "
+        "in the way leave a way around them",
     )
     freespace_cell_m: float = Field(
         0.1, gt=0, description="cells in which the free-space skeleton is found; fine enough for the spacing"
@@ -69,9 +70,9 @@ class SignatureConfig(Section):
         0.15, gt=0, description="standard deviation of the blur; mapping error plus the error of the axis"
     )
     symmetry_peak: float = Field(
-        255.0,
+        34.0,
         gt=0,
-        description="crest of a straight line after the blur; the scale on which sigma = 120 bites",
+        description="crest of a straight line after the blur: what 0 and 255 give at 0.05 m, unscaled",
     )
 
     weight_boundary: float = Field(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,7 +17,7 @@ from signature.noise import Noise, add_noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Protocol:
+class Experiment:
     """How queries are drawn and judged.
 
     queries : how many a map.
@@ -100,19 +100,19 @@ def precision_recall(similarity: F64, correct: NDArray[np.bool_]) -> PrecisionRe
 
 
 def draw_queries(
-    grid: OccupancyGrid, centers_m: F64, radius_m: float, protocol: Protocol, noise: Noise
+    grid: OccupancyGrid, centers_m: F64, radius_m: float, experiment: Experiment, noise: Noise
 ) -> Iterator[Submap]:
     """Query submaps: a free place near a submap centre, cut out, turned at random, with noise (IV-B).
 
     centers_m : (N, 2) of the submaps. `center_m` of a query is where it was cut; its grid is centred on
     (0, 0) of its own turned frame and tells nothing of the place.
     """
-    for index in range(protocol.queries):
-        rng = np.random.default_rng([protocol.seed, index])
-        center_m = _free_place(grid, centers_m, protocol.offset_m, rng)
+    for index in range(experiment.queries):
+        rng = np.random.default_rng([experiment.seed, index])
+        center_m = _free_place(grid, centers_m, experiment.offset_m, rng)
         turned = rotated_submap(grid, center_m, radius_m, float(rng.uniform(-math.pi, math.pi)), index)
         # A stream of its own, so that drawing more noise does not move the next query.
-        yield add_noise(turned, noise, np.random.default_rng([protocol.seed, index, noise.boundary]))
+        yield add_noise(turned, noise, np.random.default_rng([experiment.seed, index, noise.boundary]))
 
 
 def _free_place(
@@ -160,28 +160,30 @@ def rotated_submap(
 
 
 def evaluate(
-    method: Method,
+    methods: Mapping[str, Method],
     grid: OccupancyGrid,
     submaps: Sequence[Submap],
-    protocol: Protocol,
+    experiment: Experiment,
     noise: Noise,
     progress: Callable[[float], None] | None = None,
-) -> Outcome:
-    """One cell of Table III: a method on a map at a noise level.
+) -> dict[str, Outcome]:
+    """Cells of Table III: methods on a map at a noise level, all on the same queries.
 
-    submaps : the map's partition, all of one radius. Raises ValueError if there are none.
+    submaps : the map's partition, all of one radius. `progress` gets the share done. Raises ValueError if
+    there are no submaps.
     """
     if not submaps:
         raise ValueError("a map without submaps cannot be evaluated")
     centers_m = np.array([submap.center_m for submap in submaps])
-    matcher = method.fit(submaps)
-    similarity = np.empty(protocol.queries)
-    correct = np.empty(protocol.queries, np.bool_)
-    for i, query in enumerate(draw_queries(grid, centers_m, submaps[0].radius_m, protocol, noise)):
-        scores = matcher.similarities(query)
-        best = int(np.argmax(scores))
-        similarity[i] = scores[best]
-        correct[i] = np.hypot(*(centers_m[best] - query.center_m)) <= protocol.correct_m
+    matchers = {name: method.fit(submaps) for name, method in methods.items()}
+    similarity = {name: np.empty(experiment.queries) for name in methods}
+    correct = {name: np.empty(experiment.queries, np.bool_) for name in methods}
+    for i, query in enumerate(draw_queries(grid, centers_m, submaps[0].radius_m, experiment, noise)):
+        for name, matcher in matchers.items():
+            scores = matcher.similarities(query)
+            best = int(np.argmax(scores))
+            similarity[name][i] = scores[best]
+            correct[name][i] = math.dist(centers_m[best], query.center_m) <= experiment.correct_m
         if progress is not None:
-            progress((i + 1) / protocol.queries)
-    return Outcome(similarity=similarity, correct=correct)
+            progress((i + 1) / experiment.queries)
+    return {name: Outcome(similarity=similarity[name], correct=correct[name]) for name in methods}

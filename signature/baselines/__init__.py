@@ -5,11 +5,14 @@ A method is fitted to the submaps of a map and then asked, for a query, how alik
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Protocol, runtime_checkable
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from pc2grid.geometry import F64
 from pc2grid.model import Submap
+
+if TYPE_CHECKING:
+    from signature.baselines.words import Vocabulary
 
 
 @runtime_checkable
@@ -30,13 +33,53 @@ class Method(Protocol):
         ...
 
 
-def _proposed() -> Method:
-    from signature.baselines.proposed import Proposed
+METHOD_NAMES = (
+    "shape_context",
+    "sift_bow",
+    "surf_bow",
+    "sift_tfidf",
+    "surf_tfidf",
+    "sdf",
+    "proposed",
+)
+"""In the order of Table III."""
 
-    return Proposed()
+EXTRA_METHOD_NAMES = ("point_contexts",)
+"""Rivals that the paper does not have."""
 
 
-METHODS: dict[str, Callable[[], Method]] = {
-    "proposed": _proposed,
-}
-"""Every method by name, in the order of Table III with the proposed one first; made when called."""
+def make_methods(names: Iterable[str]) -> dict[str, Method]:
+    """Methods by name, with the paper's parameters.
+
+    Methods on the same local features share them when they are made together, so that evaluating them
+    side by side extracts the features of a submap once. Raises KeyError for a name that is not known.
+    """
+    vocabularies: dict[str, Vocabulary] = {}
+    return {name: _make(name, vocabularies) for name in names}
+
+
+def _make(name: str, vocabularies: dict[str, Vocabulary]) -> Method:
+    # Imports are here because each method brings a library that the others do not need.
+    if name == "proposed":
+        from signature.baselines.proposed import Proposed
+
+        return Proposed()
+    if name == "shape_context":
+        from signature.baselines.shape_context import ShapeContext
+
+        return ShapeContext()
+    if name == "point_contexts":
+        from signature.baselines.point_contexts import PointContexts
+
+        return PointContexts()
+    if name == "sdf":
+        from signature.baselines.sdf import DistanceFeatures
+
+        return DistanceFeatures()
+    feature, _, weighting = name.partition("_")
+    if name in METHOD_NAMES:
+        from signature.baselines.words import FEATURES, Vocabulary, Words
+
+        vocabulary = vocabularies.setdefault(feature, Vocabulary(FEATURES[feature]))
+        return Words(vocabulary, tfidf=weighting == "tfidf")
+    raise KeyError(f"no method {name!r}; there are {', '.join(METHOD_NAMES + EXTRA_METHOD_NAMES)}")
