@@ -15,6 +15,9 @@ from pc2grid.geometry import F64, pose_from_rotation_vector
 
 MAX_TILT_RAD = np.radians(35.0)
 FLOOR_THICKNESS_M = 0.04
+BENEATH_M = 0.12  # a floor has nothing farther than this below it
+STEP_TILT_RAD = np.radians(3.0)  # from one scan to the next
+STEP_HEIGHT_M = 0.06
 _SAMPLE = 2500
 _HYPOTHESES = 300
 
@@ -48,17 +51,27 @@ class Ground:
             return np.eye(4)
         return pose_from_rotation_vector(axis / sine * np.arctan2(sine, float(self.normal[2])))
 
-    def upright(self) -> Ground:
-        """The same ground seen from the levelled frame: normal (0, 0, 1)."""
-        return Ground(np.array([0.0, 0.0, 1.0]), self.offset_m, self.ceiling_m, self.seen)
+    def toward(self, other: Ground, gain: float) -> Ground:
+        """This ground moved towards another one by a share of the way."""
+        normal = (1.0 - gain) * self.normal + gain * other.normal
+        offset = (1.0 - gain) * self.offset_m + gain * other.offset_m
+        ceiling = other.ceiling_m if other.ceiling_m is not None else self.ceiling_m
+        return Ground(normal / np.linalg.norm(normal), offset, ceiling, self.seen or other.seen)
+
+    def moved(self, T_new_old: F64) -> Ground:
+        """The same ground in another frame, given the pose (4, 4) of the old frame in the new one."""
+        normal = T_new_old[:3, :3] @ self.normal
+        return Ground(normal, self.offset_m - float(normal @ T_new_old[:3, 3]), self.ceiling_m, self.seen)
 
 
-def find_ground(points_m: NDArray[np.floating], sensor_m: F64, expected: Ground | None = None) -> Ground | None:
+def find_ground(
+    points_m: NDArray[np.floating], sensor_m: F64, expected: Ground | None = None
+) -> Ground | None:
     """The floor in one scan, or None if it shows none.
 
     points_m : (N, 3) returns. sensor_m : (3,) where the sensor is, same frame.
-    expected : what the last scans said; searched near it first, and its ceiling is kept if this scan
-        shows none.
+    expected : what is known already; only a plane close to it will do (a few centimetres, a few degrees),
+        lest a box or a table be taken for the floor. Its ceiling is kept if this scan shows none.
 
     Without an expectation: RANSAC over planes tilted by at most 35 degrees that hold many points and
     have hardly any below them, which is what tells a floor from a table. The seed is fixed.
@@ -66,12 +79,17 @@ def find_ground(points_m: NDArray[np.floating], sensor_m: F64, expected: Ground 
     points = _thin(np.asarray(points_m, dtype=np.float64), _SAMPLE)
     if len(points) < 50:
         return None
-    plane = None if expected is None else _refine(points, expected.normal, expected.offset_m, tolerance_m=0.12)
-    if plane is None:
+    if expected is None:
         plane = _search(points, sensor_m)
-    if plane is None:
+    else:
+        plane = _refine(points, expected.normal, expected.offset_m, tolerance_m=2 * FLOOR_THICKNESS_M)
+    if plane is None or (points @ plane[0] + plane[1] < -BENEATH_M).mean() > 0.05:
         return None
     normal, offset = plane
+    if expected is not None and (
+        normal @ expected.normal < np.cos(STEP_TILT_RAD) or abs(offset - expected.offset_m) > STEP_HEIGHT_M
+    ):
+        return None
     ceiling = _find_ceiling(points @ normal + offset)
     if ceiling is None and expected is not None:
         ceiling = expected.ceiling_m
@@ -109,7 +127,7 @@ def _search(points: F64, sensor_m: F64) -> tuple[F64, float] | None:
     offsets = -np.einsum("ij,ij->i", normals, a)
     heights = points @ normals.T + offsets
     inliers = (np.abs(heights) < FLOOR_THICKNESS_M).sum(axis=0)
-    beneath = (heights < -0.12).sum(axis=0)
+    beneath = (heights < -BENEATH_M).sum(axis=0)
     best = int(np.argmax(inliers - 3 * beneath))
     if inliers[best] < 0.02 * len(points) or beneath[best] > 0.1 * len(points):
         return None

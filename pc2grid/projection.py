@@ -93,7 +93,9 @@ class GridBuilder:
                     self._check_size((len(self._log_odds) + 1) * _TILE * _TILE)
                     self._log_odds[row, column] = np.zeros((_TILE, _TILE), dtype=np.int16)
                     self._seen[row, column] = np.zeros((_TILE, _TILE), dtype=np.bool_)
-                where = np.s_[max(-r, 0) : max(-r, 0) + part.shape[0], max(-c, 0) : max(-c, 0) + part.shape[1]]
+                where = np.s_[
+                    max(-r, 0) : max(-r, 0) + part.shape[0], max(-c, 0) : max(-c, 0) + part.shape[1]
+                ]
                 tile = self._log_odds[row, column][where]
                 np.clip(tile + part, -_CLAMP, _CLAMP, out=tile)
                 self._seen[row, column][where] |= touched

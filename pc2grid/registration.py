@@ -8,13 +8,14 @@ still. The predicted motion (odometry where the log has it) is set before each f
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.config import RegistrationConfig
 from pc2grid.geometry import F64
-from pc2grid.model import RegisteredScan, Scan, SensorKind
+from pc2grid.model import RegisteredScan, Scan
 
 _MAX_POINTS = 20_000  # per scan; voxelisation throws more away in any case
 
@@ -26,10 +27,10 @@ class KissRegistration:
     of a room wants 0.1 m voxels, that of a hall 0.3 m.
     """
 
-    def __init__(self, config: RegistrationConfig, sensor: SensorKind) -> None:
+    def __init__(self, config: RegistrationConfig) -> None:
         self._config = config
-        self._sensor = sensor
-        self._kiss = None
+        self._kiss: Any = None
+        self._pending: NDArray[np.float64] | None = None
 
     def register(self, points_m: NDArray[np.floating], T_map_last: F64, predicted_motion: F64) -> F64:
         """Align one frame.
@@ -38,8 +39,10 @@ class KissRegistration:
         T_map_last : (4, 4) the pose that was settled on for the frame before.
         predicted_motion : (4, 4) T_last_now.
 
-        Returns T_map_base (4, 4). Frames without enough points return the prediction.
+        Returns T_map_base (4, 4). Frames without enough points return the prediction. The frame becomes
+        part of KISS-ICP's map only by `integrate`.
         """
+        self._pending = None
         predicted: F64 = T_map_last @ predicted_motion
         if len(points_m) < 10:
             return predicted
@@ -50,7 +53,13 @@ class KissRegistration:
         pose = np.asarray(kiss.last_pose, dtype=np.float64)
         return pose if np.isfinite(pose).all() else predicted
 
-    def _start(self, points_m: NDArray[np.floating]):  # type: ignore[no-untyped-def]
+    def integrate(self, T_map_base: F64) -> None:
+        """Add the frame registered last to the map, at the pose (4, 4) that was settled on."""
+        if self._pending is not None:
+            self._kiss.local_map.inner.update(self._pending, T_map_base)
+            self._pending = None
+
+    def _start(self, points_m: NDArray[np.floating]) -> Any:
         from kiss_icp.config import KISSConfig
         from kiss_icp.kiss_icp import KissICP
 
@@ -65,9 +74,32 @@ class KissRegistration:
             np.clip(np.percentile(ranges, 75) / 40.0, 0.1, 1.0)
         )
         config.registration.max_num_threads = 1
+        config.registration.max_num_iterations = 30  # what is left after that, the refinement does better
+        config.registration.convergence_criterion = 1e-3
         config.adaptive_threshold.initial_threshold = 1.0
-        self._kiss = KissICP(config)
-        return self._kiss
+        kiss = KissICP(config)
+        kiss.local_map = _DeferredMap(kiss.local_map, self)
+        self._kiss = kiss
+        return kiss
+
+
+class _DeferredMap:
+    """KISS-ICP's voxel map, except that a frame waits until its pose is settled.
+
+    register_frame adds each frame where ICP put it, which spoils the map when the refinement or the
+    odometry knows better, and thickens it a thousand times while the robot stands still.
+    """
+
+    def __init__(self, inner: Any, owner: KissRegistration) -> None:
+        self.inner = inner
+        self._owner = owner
+
+    @property
+    def _internal_map(self) -> Any:
+        return self.inner._internal_map
+
+    def update(self, points: NDArray[np.float64], pose: F64) -> None:
+        self._owner._pending = points
 
 
 def thin(points_m: NDArray[np.floating], count: int = _MAX_POINTS) -> NDArray[np.intp]:
@@ -77,10 +109,14 @@ def thin(points_m: NDArray[np.floating], count: int = _MAX_POINTS) -> NDArray[np
     """
     if len(points_m) <= count:
         return np.arange(len(points_m))
-    return np.sort(np.random.default_rng(len(points_m)).choice(len(points_m), count, replace=False, shuffle=False))
+    return np.sort(
+        np.random.default_rng(len(points_m)).choice(len(points_m), count, replace=False, shuffle=False)
+    )
 
 
-def register(scans: Iterable[Scan], config: RegistrationConfig = RegistrationConfig()) -> Iterator[RegisteredScan]:  # noqa: B008
+def register(
+    scans: Iterable[Scan], config: RegistrationConfig = RegistrationConfig()
+) -> Iterator[RegisteredScan]:  # noqa: B008
     """Registered scans, one for each scan, as they come: the streaming front half without its sweeps."""
     from pc2grid.tracking import Tracker
 

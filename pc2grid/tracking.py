@@ -8,6 +8,7 @@ prior, settles it: along a corridor the prior decides, across it the walls do.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.deskew import deskew
 from pc2grid.floor import Ground, assumed_ground, find_ground
-from pc2grid.geometry import SE2, F64, invert_pose, rotation_vector, transform_points
+from pc2grid.geometry import SE2, F64, invert_pose, rotation_vector
 from pc2grid.matching import PointGrid
 from pc2grid.model import F32, Health, RegisteredScan, Scan
 from pc2grid.registration import KissRegistration, thin
@@ -24,6 +25,8 @@ from pc2grid.sweep import Sweep, flatten
 KEYFRAME_TRAVEL_M = 0.25
 KEYFRAME_TURN_RAD = math.radians(12.0)
 LOCAL_MAP_TRAVEL_M = 5.0
+_ROLLING_GAIN = 0.05  # how fast the floor follows what is seen of it
+_CARRIED_GAIN = 0.3
 _MAX_POINTS = 40_000  # of a camera's 300 000 pixels
 
 
@@ -36,7 +39,7 @@ class Tracker:
     def __init__(self, registration: RegistrationConfig, projection: ProjectionConfig | None = None) -> None:
         self._config = registration
         self._projection = projection or ProjectionConfig()
-        self._kiss: KissRegistration | None = None
+        self._kiss = KissRegistration(registration)
         self._ground: Ground | None = None
         self._last: Scan | None = None
         self._last_pose = np.eye(4)
@@ -44,45 +47,38 @@ class Tracker:
         self._maps: list[tuple[PointGrid, float]] = []
         self._last_keyframe: SE2 | None = None
         self._travel_m = 0.0
-        self._planar = True
+        self._rolling = True
+        self._height_m = 0.0
 
     def track(self, scan: Scan) -> tuple[RegisteredScan, Sweep]:
         """Pose and sweep of the next scan; stamps must increase."""
-        if self._kiss is None:
-            self._kiss = KissRegistration(self._config, scan.sensor)
         motion, motion_s, measured = self._predict(scan)
         points = self._usable(scan, motion, motion_s)
-        flat = scan.sensor == "laser"
-        if not flat:
-            self._follow_ground(points, scan)
-        first = self._last is None
-        if first:
-            pose = np.eye(4) if flat or self._ground is None else self._ground.leveling()
+        predicted: F64 = self._last_pose @ motion
+        if self._last is None:
+            self._rolling = scan.sensor == "laser" or _is_planar(scan.T_odom_base)
+            if scan.sensor != "laser":
+                self._ground = _ground_at_start(points, scan.T_base_sensor)
+                self._height_m = self._ground.offset_m
+                predicted = self._ground.leveling()
+            pose = predicted
             self._kiss.register(self._without_floor(points), pose, np.eye(4))
         else:
-            predicted = self._last_pose @ motion
+            self._follow_ground(points, scan, motion)
             pose = self._kiss.register(self._without_floor(points), self._last_pose, motion)
-            pose = self._hold_to_floor(pose, predicted, flat)
+            pose = self._hold_to_floor(pose)
         planar = SE2.flatten(pose)
         T_level_base = planar.inverse().lift() @ pose
-        T_level_base[2, 3] = 0.0
         sweep = self._flatten(points, scan, T_level_base)
-        if not first and len(sweep.hits_m) >= 10:
-            planar = self._refine(sweep, planar, self._last_pose @ motion, motion, measured)
-            T_level_base[2, 3] = pose[2, 3]
+        if self._last is not None and len(sweep.hits_m) >= 10:
+            planar = self._refine(sweep, planar, predicted, motion, measured)
             pose = planar.lift() @ T_level_base
-        self._extend_maps(sweep, planar)
-        if not first:
+        if self._extend_maps(sweep, planar):
+            self._kiss.integrate(pose)
+        if self._last is not None:
             self._velocity = invert_pose(self._last_pose) @ pose
         self._last, self._last_pose = scan, pose
-        deskewed = Scan(
-            stamp_ns=scan.stamp_ns,
-            points_m=points,
-            T_base_sensor=scan.T_base_sensor,
-            sensor=scan.sensor,
-            T_odom_base=scan.T_odom_base,
-            dropped=scan.dropped,
-        )
+        deskewed = dataclasses.replace(scan, points_m=points, offsets_s=None)
         return RegisteredScan(scan=deskewed, T_map_base=pose, health=Health.FINE), sweep
 
     def _predict(self, scan: Scan) -> tuple[F64, float, bool]:
@@ -105,12 +101,14 @@ class Tracker:
             points = deskew(points, offsets[keep][far], motion, motion_s)
         return points
 
-    def _follow_ground(self, points: F32, scan: Scan) -> None:
-        found = find_ground(points, scan.T_base_sensor[:3, 3], self._ground)
-        if found is not None:
-            self._ground = found
-        elif self._ground is None:
-            self._ground = assumed_ground(scan.T_base_sensor)
+    def _follow_ground(self, points: F32, scan: Scan, motion: F64) -> None:
+        """Where the floor is now: fixed to a robot that rolls on it, else where the motion has taken it."""
+        if self._ground is None:
+            return
+        expected = self._ground if self._rolling else self._ground.moved(invert_pose(motion))
+        found = find_ground(points, scan.T_base_sensor[:3, 3], expected)
+        gain = _ROLLING_GAIN if self._rolling else _CARRIED_GAIN
+        self._ground = expected if found is None else expected.toward(found, gain)
 
     def _without_floor(self, points: F32) -> F32:
         if self._ground is None or not len(points):
@@ -122,30 +120,30 @@ class Tracker:
             keep &= heights < self._ground.ceiling_m - slack
         return points[keep] if keep.sum() > 100 else points
 
-    def _hold_to_floor(self, pose: F64, predicted: F64, flat: bool) -> F64:
-        """Tilt and height from the floor: without it, walls alone let them drift."""
+    def _hold_to_floor(self, pose: F64) -> F64:
+        """Tilt and height from the floor: walls alone let them drift."""
         heading = SE2.flatten(pose).lift()
-        if flat or self._ground is None:
+        if self._ground is None:
             return heading
         if not self._ground.seen:
             return pose
         held: F64 = heading @ self._ground.leveling()
-        # heading of the base's x axis must survive the levelling
-        fix = SE2(0.0, 0.0, SE2.flatten(pose).yaw - SE2.flatten(held).yaw).lift()
-        held[:3, :3] = fix[:3, :3] @ held[:3, :3]
+        if not self._rolling:
+            held[2, 3] = self._ground.offset_m - self._height_m
+        # Levelling turns the shortest way; the heading must survive it.
+        held[:3, :3] = (
+            SE2(0.0, 0.0, SE2.flatten(pose).yaw - SE2.flatten(held).yaw).lift()[:3, :3] @ held[:3, :3]
+        )
         return held
 
     def _flatten(self, points: F32, scan: Scan, T_level_base: F64) -> Sweep:
-        if scan.sensor == "laser":
-            level, sensor, ground = points, scan.T_base_sensor[:3, 3], None
-        else:
-            R = T_level_base[:3, :3]
-            level = points @ R.T.astype(np.float32)
-            sensor = R @ scan.T_base_sensor[:3, 3]
-            assert self._ground is not None
-            ground = Ground(
-                R @ self._ground.normal, self._ground.offset_m, self._ground.ceiling_m, self._ground.seen
-            )
+        level, sensor, ground = points, scan.T_base_sensor[:3, 3], None
+        if self._ground is not None:
+            R = T_level_base.copy()
+            R[:3, 3] = 0.0  # the sweep keeps the base's own origin; heights come from the ground
+            level = points @ R[:3, :3].T.astype(np.float32)
+            sensor = R[:3, :3] @ sensor
+            ground = self._ground.moved(R)
         return flatten(level, stamp_ns=scan.stamp_ns, sensor_m=sensor, ground=ground, config=self._projection)
 
     def _refine(self, sweep: Sweep, guess: SE2, predicted: F64, motion: F64, measured: bool) -> SE2:
@@ -162,13 +160,16 @@ class Tracker:
             return guess if not measured else prior
         return match.pose
 
-    def _extend_maps(self, sweep: Sweep, pose: SE2) -> None:
-        """Two overlapping local maps: the older one is matched against, the younger takes over in time."""
+    def _extend_maps(self, sweep: Sweep, pose: SE2) -> bool:
+        """Two overlapping local maps: the older one is matched against, the younger takes over in time.
+
+        Returns whether the scan became part of them: a robot that stands still adds nothing.
+        """
         last = self._last_keyframe
         if last is not None:
             step = last.inverse() @ pose
             if math.hypot(step.x, step.y) < KEYFRAME_TRAVEL_M and abs(step.yaw) < KEYFRAME_TURN_RAD:
-                return
+                return False
             self._travel_m += math.hypot(step.x, step.y)
         if not self._maps or self._travel_m - self._maps[-1][1] > LOCAL_MAP_TRAVEL_M:
             half = self._projection.max_range_m + 2 * LOCAL_MAP_TRAVEL_M
@@ -179,8 +180,16 @@ class Tracker:
         for grid, _ in self._maps:
             grid.add(hits)
         self._last_keyframe = pose
+        return True
 
 
-def level_points(points_m: F32, T_level_base: F64) -> F32:
-    """Points (N, 3) of the base frame in the levelled base frame."""
-    return transform_points(T_level_base, points_m).astype(np.float32)
+def _ground_at_start(points: F32, T_base_sensor: F64) -> Ground:
+    """Near where the mounting puts it, else the lowest level plane, else assumed."""
+    sensor = T_base_sensor[:3, 3]
+    assumed = assumed_ground(T_base_sensor)
+    mounted = find_ground(points, sensor, assumed) if assumed.offset_m == 0.0 else None
+    return mounted or find_ground(points, sensor) or assumed
+
+
+def _is_planar(T_odom_base: F64 | None) -> bool:
+    return T_odom_base is not None and abs(T_odom_base[2, 3]) < 1e-3 and T_odom_base[2, 2] > 1.0 - 1e-6
