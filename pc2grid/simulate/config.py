@@ -85,6 +85,7 @@ class SimulationConfig(Section):
     length_m: float = Field(default=40.0, gt=0, le=20_000, description="distance to drive")
     seed: int = Field(default=0, ge=0, description="route, clutter, noise and odometry")
     clutter: int = Field(default=30, ge=0, le=10_000, description="movable pieces, placed by the seed")
+    walkers: int = Field(default=0, ge=0, le=1000, description="people who walk about during the drive")
     start_m: tuple[float, float] | None = Field(default=None, description="x, y in the map; null: anywhere")
     building_seed: int = Field(default=0, ge=0, description="the procedural office, when no map is given")
     wall_height_m: float = Field(default=2.5, gt=0.5, le=20)

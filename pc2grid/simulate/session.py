@@ -17,6 +17,7 @@ from pc2grid.simulate.odometry import Odometry, odometry_of
 from pc2grid.simulate.route import plan_route
 from pc2grid.simulate.scene import Mesh, Scene, extrude
 from pc2grid.simulate.sensors import Sensor, make_sensor
+from pc2grid.simulate.walkers import Walker, send_walkers
 
 EPOCH_NS = 1_700_000_000_000_000_000
 """Every session starts at the same moment, so that the same seed gives the same bytes."""
@@ -24,7 +25,7 @@ EPOCH_NS = 1_700_000_000_000_000_000
 RAYS_PER_CAST = 300_000
 
 # Independent streams of random numbers: more clutter must not change the noise.
-_CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE = range(5)
+_CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE, _WALKERS = range(6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +50,15 @@ class Reading:
 class Session:
     """All that a session's seed decides, before the first ray is cast.
 
-    grid : the true floor plan. pieces : the clutter in it. drive : true motion in the plan's map frame.
+    grid : the true floor plan. pieces : the clutter in it. walkers : people on their way.
+    drive : true motion in the plan's map frame.
     odometry : None when switched off. scan_count : scans of the sensor during the drive.
     """
 
     sensor: Sensor
     grid: OccupancyGrid
     pieces: tuple[Piece, ...]
+    walkers: tuple[Walker, ...]
     drive: Drive
     odometry: Odometry | None
     config: SimulationConfig
@@ -80,10 +83,12 @@ class Session:
         batch = max(RAYS_PER_CAST // len(directions), 1)
         for first in range(0, self.scan_count, batch):
             indices = np.arange(first, min(first + batch, self.scan_count))
-            rays = _rays(
-                self.drive.at(indices[:, None] / sensor.rate_hz + sensor.offsets_s), T[:3, 3], directions
-            )
-            true_m = scene.cast(rays.reshape(-1, 6)).reshape(len(indices), -1)
+            times_s = indices[:, None] / sensor.rate_hz + sensor.offsets_s
+            poses = self.drive.at(times_s)
+            rays = _rays(poses, T[:3, 3], directions)
+            true_m = scene.cast(rays.reshape(-1, 6)).reshape(times_s.shape)
+            for walker in self.walkers:
+                true_m = np.minimum(true_m, walker.hits(rays, times_s, poses[:, 0, :2]))
             for index, ranges in zip(indices, true_m, strict=True):
                 rng = np.random.default_rng([self.config.seed, _NOISE, int(index)])
                 yield Reading(int(index), float(index) / sensor.rate_hz, sensor.measure(ranges, rng))
@@ -147,17 +152,14 @@ def prepare_session(
         robot_m=config.drive.clearance_m,
         keep_free_m=() if config.start_m is None else (config.start_m,),
     )
+    blocked, clearance_m = covered(plan, pieces), config.drive.clearance_m
     route = plan_route(
-        plan,
-        covered(plan, pieces),
-        config.length_m,
-        start_m=config.start_m,
-        least_m=config.drive.clearance_m,
-        rng=stream(_ROUTE),
+        plan, blocked, config.length_m, start_m=config.start_m, least_m=clearance_m, rng=stream(_ROUTE)
     )
     drive = drive_along(route, config.drive, stream(_DRIVE))
+    walkers = send_walkers(plan, blocked, config.walkers, drive.duration_s, stream(_WALKERS))
     odometry = odometry_of(drive, config.odometry, stream(_ODOMETRY)) if config.odometry.enabled else None
-    return Session(make_sensor(sensor, config), plan, pieces, drive, odometry, config)
+    return Session(make_sensor(sensor, config), plan, pieces, walkers, drive, odometry, config)
 
 
 def iter_session(

@@ -29,6 +29,7 @@ def simulate_command(
     length: Annotated[float, typer.Option(min=0.1, metavar="M", help="metres to drive")] = 40.0,
     seed: Annotated[int, typer.Option(min=0, help="route, clutter, noise and odometry")] = 0,
     clutter: Annotated[int, typer.Option(min=0, help="movable pieces in the way")] = 30,
+    walkers: Annotated[int, typer.Option(min=0, help="people who walk about meanwhile")] = 0,
     start: Annotated[
         tuple[float, float] | None,
         typer.Option(metavar="X Y", help="where to start in the map; default: anywhere"),
@@ -57,6 +58,7 @@ def simulate_command(
             length_m=length,
             seed=seed,
             clutter=clutter,
+            walkers=walkers,
             start_m=start,
             building_seed=building_seed,
             odometry=OdometryConfig(enabled=not no_odometry),
