@@ -90,7 +90,7 @@ def prepare(grid: OccupancyGrid) -> LikelihoodField:
     for reach_m in REACHES_M[1:]:
         n = math.ceil(reach_m / grid.resolution_m)
         kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * n + 1, 2 * n + 1))
-        levels.append(cv2.dilate(field, kernel, borderType=cv2.BORDER_REPLICATE))
+        levels.append(np.asarray(cv2.dilate(field, kernel, borderType=cv2.BORDER_REPLICATE), np.uint8))
     walls = padded.to_point(np.argwhere(padded.occupied)).astype(np.float32)
     return LikelihoodField(
         levels=np.stack(levels),
@@ -102,7 +102,7 @@ def prepare(grid: OccupancyGrid) -> LikelihoodField:
     )
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True, fastmath=True)
 def _bound(
     levels: U8,
     point_level: NDArray[np.int64],
@@ -120,15 +120,15 @@ def _bound(
     n = len(x)
     total = 0.0
     for p in range(n):
-        j = int(math.floor(c * x[p] - s * y[p] + tx))
-        i = int(math.floor(s * x[p] + c * y[p] + ty))
+        j = math.floor(c * x[p] - s * y[p] + tx)
+        i = math.floor(s * x[p] + c * y[p] + ty)
         total += levels[point_level[p], i, j] if (0 <= i < height and 0 <= j < width) else outside
         if (p & 31) == 31 and total + 255.0 * (n - 1 - p) < least:
             return -1.0
     return total
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True)
 def _levels_for(d: F32, half_t: float, half_a: float, reaches: F64) -> NDArray[np.int64]:
     """The smallest sliding maximum that covers what a box does to a point at distance d (cells)."""
     out = np.empty(len(d), dtype=np.int64)
@@ -141,7 +141,7 @@ def _levels_for(d: F32, half_t: float, half_a: float, reaches: F64) -> NDArray[n
     return out
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True)
 def _search(
     levels: U8,
     reaches: F64,
@@ -256,7 +256,7 @@ def thin_evenly(points_m: NDArray[np.floating], spacing_m: float) -> NDArray[np.
 def prepare_query(
     grid: OccupancyGrid, *, spacing_m: float = 0.1, center_m: tuple[float, float] | None = None
 ) -> Query:
-    """Prepare a query grid; `center_m` (query frame) is what poses rotate about, by default the walls' mean."""
+    """Prepare a query grid; poses rotate about `center_m` (query frame), by default the mean of the walls."""
     field, known = likelihood(grid)
     walls = grid.to_point(np.argwhere(grid.occupied))
     walls = walls[thin_evenly(walls, spacing_m)]
@@ -327,11 +327,11 @@ def search(
     return found
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True)
 def _gauss_newton(
     field: U8, x: F64, y: F64, tx: float, ty: float, yaw: float, steps: int
 ) -> tuple[float, float, float, F64, float]:
-    """Climb the interpolated field; lengths in cells. Returns pose, Hessian (3, 3) and mean squared misfit."""
+    """Climb the interpolated field; lengths in cells. Returns pose, Hessian (3, 3), mean squared misfit."""
     height, width = field.shape
     H = np.zeros((3, 3))
     misfit = 1.0
@@ -343,7 +343,7 @@ def _gauss_newton(
         for p in range(len(x)):
             u = c * x[p] - s * y[p] + tx - 0.5
             v = s * x[p] + c * y[p] + ty - 0.5
-            j, i = int(math.floor(u)), int(math.floor(v))
+            j, i = math.floor(u), math.floor(v)
             if i < 0 or j < 0 or i >= height - 1 or j >= width - 1:
                 continue
             a, b = u - j, v - i
@@ -406,7 +406,7 @@ def refine(target: LikelihoodField, query: Query, T_map_query: SE2, *, steps: in
     correlated = 5.0
     information = H / np.outer(scale, scale) / (correlated * max(misfit, 0.02))
     information += np.diag([1 / 0.5**2, 1 / 0.5**2, 1 / 0.1**2])
-    return center @ SE2(-cx, -cy, 0.0), np.linalg.inv(information)
+    return center @ SE2(-cx, -cy, 0.0), np.asarray(np.linalg.inv(information), np.float64)
 
 
 def _sample(field: NDArray[np.generic], cells: NDArray[np.int64], outside: float) -> F64:

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.model import F32, F64, OCCUPIED, UNKNOWN, OccupancyGrid, Submap, _freeze
+from pc2grid.model import F32, OCCUPIED, UNKNOWN, OccupancyGrid, Submap, _freeze
 
 BEARINGS = 360
 
@@ -49,7 +49,7 @@ class Isovist:
         return float(np.mean(self.ranges_m.astype(np.float64) ** 2) * np.pi)
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True)
 def _cast(
     cells: NDArray[np.int8], row: float, column: float, limit: float, bearings: int, patience: int
 ) -> tuple[F32, NDArray[np.int8]]:
@@ -152,11 +152,4 @@ def visible_submap(grid: OccupancyGrid, view: Isovist, submap_id: int) -> Submap
         center_m=view.center_m,
         radius_m=view.sight_m,
         grid=OccupancyGrid(cells=cells, resolution_m=crop.resolution_m, origin_m=crop.origin_m),
-    )
-
-
-def observed_share(grid: OccupancyGrid, centers_m: F64, sight_m: float, *, bearings: int = 72) -> F64:
-    """For each centre (N, 2): share of its rays (N,) in 0..1 that end on something known."""
-    return np.array(
-        [isovist(grid, (float(x), float(y)), sight_m, bearings=bearings).observed for x, y in centers_m]
     )

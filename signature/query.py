@@ -1,0 +1,167 @@
+"""What a robot has seen over its last metres, made ready to be looked up.
+
+A robot rarely stands where it has seen most. So the query is described not where the robot is but at
+those places of its own path whose surroundings it has observed best; each is a view, and all views vote.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from pc2grid.alignment import Query as AlignedQuery
+from pc2grid.alignment import prepare_query
+from pc2grid.config import PartitionConfig, ProjectionConfig
+from pc2grid.geometry import F64, SE2
+from pc2grid.model import OccupancyGrid
+from pc2grid.partition import view_at
+from pc2grid.projection import GridBuilder
+from pc2grid.sweep import Sweep
+from pc2grid.visibility import Isovist, isovist
+from signature.config import RelocalizeConfig, SignatureConfig
+from signature.describe import Signature, describe
+
+PROFILE_BEARINGS = 90
+"""Rays of the isovists that are compared by their ranges: one every four degrees."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """The query described at one place.
+
+    center_m : (x, y) in the query's odom frame.
+    profile : its isovist with `PROFILE_BEARINGS` rays.
+    signature : the three signatures of the submap around it, cut like those of the database.
+    """
+
+    center_m: tuple[float, float]
+    profile: Isovist
+    signature: Signature
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QueryMap:
+    """The query at one moment of its travel.
+
+    stamp_ns : the last scan. T_odom_base : pose of the base there. path_m : driven so far.
+    grid : local map in the odom frame. views : best observed first. aligned : prepared for alignment.
+    """
+
+    stamp_ns: int
+    path_m: float
+    T_odom_base: SE2
+    grid: OccupancyGrid
+    views: tuple[View, ...]
+    aligned: AlignedQuery
+
+
+@dataclass(frozen=True, slots=True)
+class _Keyframe:
+    sweep: Sweep
+    T_odom_base: SE2
+    path_m: float
+
+
+class Window:
+    """The last metres of travel as keyframes: what a query is built from. Memory is bounded by the metres."""
+
+    def __init__(self, projection: ProjectionConfig, config: RelocalizeConfig) -> None:
+        self._projection = projection
+        self._config = config
+        self._keyframes: deque[_Keyframe] = deque()
+        self.path_m = 0.0
+        self.stamp_ns = 0
+        self.T_odom_base = SE2()
+        self._started = False
+
+    def add(self, sweep: Sweep, T_odom_base: SE2) -> None:
+        """Take in the next sweep and its pose; forgets what lies more than `window_m` of travel back."""
+        if self._started:
+            step = self.T_odom_base.inverse() @ T_odom_base
+            self.path_m += math.hypot(step.x, step.y)
+        self._started = True
+        self.stamp_ns, self.T_odom_base = sweep.stamp_ns, T_odom_base
+        if self._keyframes:
+            last = self._keyframes[-1].T_odom_base.inverse() @ T_odom_base
+            if math.hypot(last.x, last.y) < 0.1 and abs(last.yaw) < math.radians(5.0):
+                return
+        self._keyframes.append(_Keyframe(sweep, T_odom_base, self.path_m))
+        while self.path_m - self._keyframes[0].path_m > self._config.window_m:
+            self._keyframes.popleft()
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    def query(self, partition: PartitionConfig, signature: SignatureConfig) -> QueryMap:
+        """Draw the window and describe it. Needs at least one keyframe."""
+        builder = GridBuilder(self._projection)
+        for keyframe in self._keyframes:
+            builder.add(keyframe.sweep, keyframe.T_odom_base)
+        path = np.array([(k.T_odom_base.x, k.T_odom_base.y) for k in self._keyframes])
+        return query_of(
+            builder.grid(),
+            path,
+            partition=partition,
+            signature=signature,
+            config=self._config,
+            T_odom_base=self.T_odom_base,
+            stamp_ns=self.stamp_ns,
+            path_m=self.path_m,
+        )
+
+
+def query_of(
+    grid: OccupancyGrid,
+    path_xy_m: F64,
+    *,
+    partition: PartitionConfig,
+    signature: SignatureConfig,
+    config: RelocalizeConfig,
+    T_odom_base: SE2,
+    stamp_ns: int = 0,
+    path_m: float = 0.0,
+) -> QueryMap:
+    """Describe a local map (odom frame) that was seen from `path_xy_m` (K, 2).
+
+    partition, signature : as the database was made, or the two sides are not comparable.
+    """
+    centers = best_observed(grid, path_xy_m, partition.radius_m, config)
+    views = tuple(
+        View(
+            center_m=center,
+            profile=isovist(grid, center, partition.radius_m, bearings=PROFILE_BEARINGS),
+            signature=describe(view_at(grid, center, partition), signature),
+        )
+        for center in centers
+    )
+    return QueryMap(
+        stamp_ns=stamp_ns,
+        path_m=path_m,
+        T_odom_base=T_odom_base,
+        grid=grid,
+        views=views,
+        aligned=prepare_query(grid, center_m=(T_odom_base.x, T_odom_base.y)),
+    )
+
+
+def best_observed(
+    grid: OccupancyGrid, path_xy_m: F64, sight_m: float, config: RelocalizeConfig
+) -> tuple[tuple[float, float], ...]:
+    """Up to `config.views` points of the path, `config.view_spacing_m` apart, best observed first.
+
+    How well a place is observed is the share of the rays from it that end on something known.
+    """
+    if not len(path_xy_m):
+        return ()
+    points = [(float(x), float(y)) for x, y in path_xy_m[:: max(1, len(path_xy_m) // 40)]]
+    observed = [isovist(grid, p, sight_m, bearings=PROFILE_BEARINGS).observed for p in points]
+    chosen: list[tuple[float, float]] = []
+    for i in np.argsort(-np.asarray(observed), kind="stable"):
+        if all(math.dist(points[i], c) >= config.view_spacing_m for c in chosen):
+            chosen.append(points[i])
+        if len(chosen) == config.views:
+            break
+    return tuple(chosen)

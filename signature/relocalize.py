@@ -1,0 +1,288 @@
+"""Where in the database was this recording made? Retrieve, verify, carry on, decide.
+
+Hypotheses are carried along the query's travel: at every step the old ones are refined on what has been
+seen since, and the database is asked anew, so a wrong first idea costs nothing and the right one gains
+support. The answer is `located` only when one hypothesis stands clear of all others.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from pc2grid.alignment import LikelihoodField, prepare
+from pc2grid.errors import NoScans
+from pc2grid.geometry import F64, SE2
+from pc2grid.model import Health, OccupancyGrid, RegisteredScan
+from pc2grid.sweep import Sweep
+from signature.confidence import Evidence, confidence
+from signature.config import Config
+from signature.query import QueryMap, Window
+from signature.retrieve import Places, retrieve
+from signature.verify import Hypothesis, carry_on, distinct, search_everywhere, verify
+
+if TYPE_CHECKING:
+    from signature.database import SubmapDatabase
+
+SCHEMA_VERSION = 1
+
+Status = Literal["located", "ambiguous", "not_found"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Moment:
+    """The answer as it stood after `path_m` of travel; the pose is of the best hypothesis, if any."""
+
+    stamp_ns: int
+    path_m: float
+    status: Status
+    pose: SE2 | None
+    confidence: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """Where the query was.
+
+    status : located, ambiguous (several places fit) or not_found (none does).
+    session : name of the session whose map frame `T_map_base` is in; None unless located.
+    T_map_base : base at the query's last scan. covariance : (3, 3) of x, y, yaw.
+    T_map_odom : puts the whole query trajectory into the map.
+    confidence : probability that the best hypothesis is right.
+    hypotheses : all that fit, best first. history : how the answer came to be.
+    """
+
+    status: Status
+    session: str | None
+    stamp_ns: int
+    T_map_base: SE2 | None
+    covariance: F64 | None
+    T_map_odom: SE2 | None
+    confidence: float
+    hypotheses: tuple[Hypothesis, ...]
+    history: tuple[Moment, ...]
+    T_odom_base: SE2
+    path_m: float
+    sessions: tuple[str, ...]
+    submap_ids: tuple[int, ...]
+    timing_ms: dict[str, float] = field(default_factory=dict)
+
+    def to_json(
+        self, *, query: dict[str, Any] | None = None, database: dict[str, Any] | None = None
+    ) -> dict[str, Any]:
+        """The document that `pc2grid relocalize --json` prints (plain types only)."""
+        pose = self.T_map_base
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "status": self.status,
+            "session": self.session,
+            "pose": None
+            if pose is None or self.covariance is None
+            else {"stamp_ns": self.stamp_ns, **_plain(pose), "covariance": self.covariance.tolist()},
+            "T_map_odom": None if self.T_map_odom is None else _plain(self.T_map_odom),
+            "confidence": self.confidence,
+            "hypotheses": [
+                {
+                    "session": self.sessions[h.session_index],
+                    "submap_id": submap_id if submap_id >= 0 else None,
+                    **_plain(h.fit.T_map_query @ self.T_odom_base),
+                    "score": h.fit.score,
+                    "overlap": h.fit.overlap,
+                }
+                for h, submap_id in zip(self.hypotheses, self.submap_ids, strict=True)
+            ],
+            "history": [
+                {
+                    "stamp_ns": m.stamp_ns,
+                    "path_m": m.path_m,
+                    "status": m.status,
+                    **(_plain(m.pose) if m.pose is not None else {"x": None, "y": None, "yaw": None}),
+                    "confidence": m.confidence,
+                }
+                for m in self.history
+            ],
+            "query": {"path_m": self.path_m, "stamp_ns": self.stamp_ns, **(query or {})},
+            "database": {"sessions": list(self.sessions), **(database or {})},
+            "timing_ms": self.timing_ms,
+        }
+
+
+def _plain(pose: SE2) -> dict[str, float]:
+    return {"x": float(pose.x), "y": float(pose.y), "yaw": float(pose.yaw)}
+
+
+class Building:
+    """A database made ready to be asked again and again: isovists and likelihood fields of its maps.
+
+    Nothing of the database is changed. Made once (tens of milliseconds a map), used for every query.
+    """
+
+    def __init__(self, database: SubmapDatabase, config: Config) -> None:
+        """`config` gives the relocalize section; how to cut and describe comes from the database."""
+        self.made_with = database.config()
+        self.config = config.relocalize
+        self.projection = self.made_with.projection
+        self.sessions = tuple(info.name for info in database.sessions())
+        grids = {i: database.grid(name) for i, name in enumerate(self.sessions)}
+        self.places = Places.of(database.signatures(), grids, self.made_with.partition.radius_m)
+        self.fields: list[LikelihoodField] = [prepare(grids[i]) for i in range(len(self.sessions))]
+        self._free = [free_squares(grids[i]) for i in range(len(self.sessions))]
+        self._area_m2 = [
+            float(grids[i].free.sum()) * grids[i].resolution_m ** 2 for i in range(len(self.sessions))
+        ]
+
+    def look_up(
+        self, query: QueryMap, carried: tuple[Hypothesis, ...] = (), *, driven_m: float = 0.0
+    ) -> tuple[Hypothesis, ...]:
+        """Hypotheses for the query, best first: the carried ones, refined, and what retrieval proposes."""
+        old = [carry_on(query, h, self.fields[h.session_index], driven_m) for h in carried]
+        proposals = retrieve(query, self.places, signature=self.made_with.signature, config=self.config)
+        new = verify(query, proposals, self.places, self.fields, self.config)
+        return self._worth_keeping((*old, *new), query)
+
+    def look_everywhere(self, query: QueryMap, known: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
+        """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole."""
+        found = list(known)
+        for index, field_ in enumerate(self.fields):
+            if self._area_m2[index] <= self.config.exhaustive_m2:
+                found.extend(search_everywhere(query, index, field_, self._free[index], self.config))
+        return self._worth_keeping(tuple(found), query)
+
+    def _worth_keeping(self, found: tuple[Hypothesis, ...], query: QueryMap) -> tuple[Hypothesis, ...]:
+        kept = distinct(found, query.T_odom_base)
+        floor = 0.6 * kept[0].fit.score if kept else 0.0
+        return tuple(h for h in kept if h.fit.score >= floor)[: self.config.hypotheses]
+
+    def judge(self, hypotheses: tuple[Hypothesis, ...], query: QueryMap) -> tuple[Status, float]:
+        """The status and the confidence in the best hypothesis."""
+        if not hypotheses or hypotheses[0].fit.score < self.config.plausible:
+            return "not_found", 0.0
+        sure = confidence(Evidence.of(hypotheses, len(query.aligned.walls_m)))
+        if sure >= self.config.accept:
+            return "located", sure
+        rivals = sum(h.fit.score >= self.config.plausible for h in hypotheses)
+        return ("ambiguous" if rivals > 1 else "not_found"), sure
+
+
+def free_squares(grid: OccupancyGrid, side_m: float = 0.8) -> F64:
+    """Centres (K, 2) of the squares of `side_m` of a grid that hold any free space, map frame."""
+    n = max(1, round(side_m / grid.resolution_m))
+    height, width = grid.cells.shape
+    if not height or not width:
+        return np.empty((0, 2))
+    rows, columns = np.arange(0, height, n), np.arange(0, width, n)
+    free = np.add.reduceat(np.add.reduceat(grid.free.astype(np.int32), rows, axis=0), columns, axis=1)
+    corners = np.argwhere(free > 0)[:, ::-1] * (n * grid.resolution_m)
+    return np.asarray(corners + 0.5 * n * grid.resolution_m + np.asarray(grid.origin_m))
+
+
+def relocalize(
+    query: Iterable[tuple[RegisteredScan, Sweep]],
+    database: SubmapDatabase,
+    config: Config,
+    progress: Callable[[int, float], None] | None = None,
+) -> Answer:
+    """Find where a registered recording was made.
+
+    query : scans with their sweeps, from `pc2grid.pipeline.follow`, in any frame of their own.
+    progress : called with (scans so far, metres driven).
+
+    Scans on which registration was lost are not used, and nothing seen before them is kept: what lies
+    between the two parts is unknown. Raises NoScans for a query without a usable scan.
+    """
+    clock = _Clock()
+    building = Building(database, config)
+    clock.lap("open")
+    window = Window(building.projection, config.relocalize)
+    hypotheses: tuple[Hypothesis, ...] = ()
+    history: list[Moment] = []
+    asked_m = -math.inf
+    scans = 0
+    for registered, sweep in query:
+        scans += 1
+        if registered.health is Health.LOST:
+            window, hypotheses, asked_m = Window(building.projection, config.relocalize), (), -math.inf
+            continue
+        window.add(sweep, SE2.flatten(registered.T_map_base))
+        if progress is not None:
+            progress(scans, window.path_m)
+        clock.lap("register")
+        if window.path_m - asked_m >= config.relocalize.step_m and window.path_m > 0:
+            driven = 0.0 if math.isinf(asked_m) else window.path_m - asked_m
+            asked_m = window.path_m
+            local = window.query(building.made_with.partition, building.made_with.signature)
+            clock.lap("describe")
+            hypotheses = building.look_up(local, hypotheses, driven_m=driven)
+            status, sure = building.judge(hypotheses, local)
+            history.append(_moment(local, status, sure, hypotheses))
+            clock.lap("look_up")
+    if not len(window):
+        raise NoScans(
+            "the query has no scan on which registration held", hint="see `pc2grid info` on the log"
+        )
+    local = window.query(building.made_with.partition, building.made_with.signature)
+    clock.lap("describe")
+    driven = 0.0 if math.isinf(asked_m) else max(local.path_m - asked_m, 0.0)
+    hypotheses = building.look_up(local, hypotheses, driven_m=driven)
+    status, sure = building.judge(hypotheses, local)
+    clock.lap("look_up")
+    if status != "located":
+        # Signatures did not settle it: leave no place out, neither the right one nor a rival.
+        hypotheses = building.look_everywhere(local, hypotheses)
+        status, sure = building.judge(hypotheses, local)
+        clock.lap("search_everywhere")
+    history.append(_moment(local, status, sure, hypotheses))
+    return _answer(building, local, status, sure, hypotheses, history, clock)
+
+
+def _moment(query: QueryMap, status: Status, sure: float, hypotheses: tuple[Hypothesis, ...]) -> Moment:
+    pose = hypotheses[0].fit.T_map_query @ query.T_odom_base if hypotheses else None
+    return Moment(stamp_ns=query.stamp_ns, path_m=query.path_m, status=status, pose=pose, confidence=sure)
+
+
+def _answer(
+    building: Building,
+    query: QueryMap,
+    status: Status,
+    sure: float,
+    hypotheses: tuple[Hypothesis, ...],
+    history: list[Moment],
+    clock: _Clock,
+) -> Answer:
+    located = hypotheses[0] if status == "located" else None
+    table = building.places.table
+    T_map_query = located.fit.T_map_query if located else None
+    return Answer(
+        status=status,
+        session=building.sessions[located.session_index] if located else None,
+        stamp_ns=query.stamp_ns,
+        T_map_base=T_map_query @ query.T_odom_base if T_map_query else None,
+        covariance=located.fit.covariance if located else None,
+        T_map_odom=T_map_query,
+        confidence=sure,
+        hypotheses=hypotheses,
+        history=tuple(history),
+        T_odom_base=query.T_odom_base,
+        path_m=query.path_m,
+        sessions=building.sessions,
+        submap_ids=tuple(int(table.submap_id[h.row]) if h.row >= 0 else -1 for h in hypotheses),
+        timing_ms=clock.total_ms,
+    )
+
+
+class _Clock:
+    """Where the time went, by name, milliseconds."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self.total_ms: dict[str, float] = {}
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.total_ms[name] = self.total_ms.get(name, 0.0) + 1000.0 * (now - self._last)
+        self._last = now

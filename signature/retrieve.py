@@ -1,0 +1,169 @@
+"""Which places of the database look like the query's views?
+
+Two steps, cheap first. The three signatures (Eq. 6) rank all places; they know no direction and no
+order, so one matrix product serves a million of them. For the places on that shortlist the isovists'
+ranges are laid over each other at every rotation, rays that either side has not observed left out; the
+best overlap re-ranks them, and says how the query would have to be turned.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.geometry import F64
+from pc2grid.model import F32, OccupancyGrid
+from pc2grid.visibility import HIDDEN, isovist
+from signature.config import RelocalizeConfig, SignatureConfig
+from signature.query import PROFILE_BEARINGS, QueryMap
+from signature.similarity import SignatureTable, distances
+
+RANGE_SCALE_M = 0.4
+"""Half of the likeness is gone at this difference of two ranges: about the offset between a view and the
+nearest place of the database."""
+PRIOR_SHARE = 0.15
+"""Rays' worth of doubt, as a share of the circle: a likeness of few common rays counts for less."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Places:
+    """The places of a database, ready for retrieval.
+
+    table : their signatures. sight_m : how far their isovists reach.
+    ranges_m : (N, B) float32, seen : (N, B) whether the ray's end is known.
+    """
+
+    table: SignatureTable
+    sight_m: float
+    ranges_m: F32
+    seen: NDArray[np.bool_]
+
+    @staticmethod
+    def of(table: SignatureTable, grids: Mapping[int, OccupancyGrid], sight_m: float) -> Places:
+        """Look around at every place of `table` in the grid of its session (by session_index)."""
+        n = len(table)
+        ranges = np.zeros((n, PROFILE_BEARINGS), np.float32)
+        seen = np.zeros((n, PROFILE_BEARINGS), np.bool_)
+        for i in range(n):
+            x, y = table.center_m[i]
+            view = isovist(
+                grids[int(table.session_index[i])], (float(x), float(y)), sight_m, bearings=PROFILE_BEARINGS
+            )
+            ranges[i], seen[i] = view.ranges_m, view.ends != HIDDEN
+        return Places(table=table, sight_m=sight_m, ranges_m=ranges, seen=seen)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Proposal:
+    """A view of the query may be at a place of the database.
+
+    view : index into the query's views. row : row of the table. likeness : 0..1.
+    yaw_rad : rotations from the query's frame into the map's under which they look alike, best first.
+    """
+
+    view: int
+    row: int
+    likeness: float
+    yaw_rad: tuple[float, ...]
+
+
+def retrieve(
+    query: QueryMap,
+    places: Places,
+    *,
+    signature: SignatureConfig,
+    config: RelocalizeConfig,
+    top_k: int | None = None,
+) -> tuple[Proposal, ...]:
+    """The `top_k` (default `config.top_k`) most promising places, each with the view that likes it best.
+
+    Ties are broken by row, so equal inputs give equal answers.
+    """
+    if not query.views or not len(places.table):
+        return ()
+    best: dict[int, Proposal] = {}
+    for index, view in enumerate(query.views):
+        score = distances(view.signature, places.table, signature)
+        rows = np.argsort(score, kind="stable")[: config.shortlist]
+        overlap = rotate_and_compare(
+            view.profile.ranges_m, view.profile.ends != HIDDEN, places.ranges_m[rows], places.seen[rows]
+        )
+        # The signatures keep their say: two places whose ranges agree are told apart by what lies between.
+        likeness = overlap.max(axis=1) * np.exp(-config.signature_weight * _standardised(score)[rows])
+        for position, row in enumerate(rows):
+            value = float(likeness[position])
+            if int(row) not in best or value > best[int(row)].likeness:
+                best[int(row)] = Proposal(
+                    view=index, row=int(row), likeness=value, yaw_rad=_peaks(overlap[position])
+                )
+    ranked = sorted(best.values(), key=lambda p: (-p.likeness, p.row))
+    return tuple(ranked[: top_k or config.top_k])
+
+
+def _standardised(score: F64) -> F64:
+    spread = float(score.std())
+    return (score - score.mean()) / spread if spread > 0 else np.zeros_like(score)
+
+
+def _peaks(overlap: F32, most: int = 4) -> tuple[float, ...]:
+    """The rotations at which the overlap (B,) has its highest local maxima, radians."""
+    local = (overlap >= np.roll(overlap, 1)) & (overlap >= np.roll(overlap, -1))
+    shifts = np.flatnonzero(local)
+    shifts = shifts[np.argsort(-overlap[shifts], kind="stable")[:most]]
+    return tuple(float(s) * 2.0 * math.pi / len(overlap) for s in shifts)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _overlap(
+    ranges: F32,
+    seen: NDArray[np.bool_],
+    others: F32,
+    others_seen: NDArray[np.bool_],
+    scale: float,
+    doubt: float,
+) -> F32:
+    n, bearings = others.shape
+    rays = np.flatnonzero(seen)
+    out = np.zeros((n, bearings), np.float32)
+    inverse = np.float32(1.0 / scale)
+    for i in range(n):
+        for shift in range(bearings):
+            total, count = np.float32(0.0), 0
+            for k in rays:
+                j = k + shift
+                if j >= bearings:
+                    j -= bearings
+                if others_seen[i, j]:
+                    d = (ranges[k] - others[i, j]) * inverse
+                    total += np.float32(1.0) / (np.float32(1.0) + d * d)
+                    count += 1
+            out[i, shift] = total / (count + doubt)
+    return out
+
+
+def rotate_and_compare(
+    ranges_m: F32, seen: NDArray[np.bool_], others_m: F32, others_seen: NDArray[np.bool_]
+) -> F32:
+    """Likeness (N, B), 0..1, of one isovist (B,) with others (N, B), for each rotation by 2 pi s / B.
+
+    Only rays whose ends both sides know are compared, by a Cauchy kernel of their difference.
+    """
+    result: F32 = _overlap(
+        np.ascontiguousarray(ranges_m),
+        np.ascontiguousarray(seen),
+        np.ascontiguousarray(others_m),
+        np.ascontiguousarray(others_seen),
+        RANGE_SCALE_M,
+        PRIOR_SHARE * len(ranges_m),
+    )
+    return result
+
+
+def ranked_places(proposals: Sequence[Proposal]) -> NDArray[np.int64]:
+    """Rows of the table in the order they were retrieved, for recall at k."""
+    return np.array([p.row for p in proposals], dtype=np.int64)
