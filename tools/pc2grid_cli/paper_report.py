@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -18,7 +19,7 @@ _LEVELS = ("without noise", "noise level 1", "noise level 2")
 
 def published(result: Result) -> Measures | None:
     """The paper's number for a cell, if it printed one."""
-    if result.overrides or result.map_name not in MAPS:
+    if result.overrides or result.map_name not in MAPS or result.reading != "paper":
         return None
     if result.radius_m == 8.0:
         return TABLE_3[result.level].get(result.method, {}).get(result.map_name)
@@ -31,16 +32,17 @@ def print_tables(results: Sequence[Result], methods: Sequence[str]) -> None:
     """Tables I, III and IV on stdout: published, ours and the difference, in thousandths."""
     console = Console(width=120, highlight=False)
     plain = [r for r in results if not r.overrides]
+    console.print("Of three numbers: paper, ours, difference, in thousandths.")
     _print_submaps(console, plain)
     for offset_m in sorted({r.offset_m for r in plain}):
         here = [r for r in plain if r.offset_m == offset_m]
         where = f"queries within {offset_m:g} m of a submap centre"
         for measure in Measures._fields:
             table = _table(f"Table III, {measure.upper()}, {where}", "noise", "method")
-            for level, title in enumerate(_LEVELS):
+            for level in range(len(_LEVELS)):
                 for i, method in enumerate(methods):
                     row = [r for r in here if (r.method, r.level, r.radius_m) == (method, level, 8.0)]
-                    table.add_row(title if i == 0 else "", method, *_cells(row, measure))
+                    table.add_row(str(level) if i == 0 else "", method, *_cells(row, measure))
                 table.add_section()
             console.print(table)
         table = _table(f"Table IV (proposed, noise level 1), {where}", "radius", "measure")
@@ -57,7 +59,8 @@ def print_tables(results: Sequence[Result], methods: Sequence[str]) -> None:
 
 
 def _table(title: str, *heads: str) -> Table:
-    table = Table(title=title, caption="paper, ours, difference; thousandths", title_justify="left")
+    """A table with a column a map; killian* is killian at its true size."""
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for head in (*heads, *MAPS, "killian*"):
         table.add_column(head, no_wrap=True, justify="left" if head in heads else "right")
     return table
@@ -73,7 +76,7 @@ def _cells(row: Sequence[Result], measure: str) -> list[str]:
             continue
         ours, paper = round(1000 * getattr(found[0], measure)), published(found[0])
         if paper is None:
-            texts.append(f"    {ours:4d}     ")
+            texts.append(str(ours))
         else:
             there = round(1000 * getattr(paper, measure))
             texts.append(f"{there:3d} {ours:4d} {ours - there:+4d}")
@@ -81,7 +84,7 @@ def _cells(row: Sequence[Result], measure: str) -> list[str]:
 
 
 def _print_submaps(console: Console, results: Sequence[Result]) -> None:
-    table = Table(title="Table I, number of submaps", title_justify="left")
+    table = Table(title="Table I, number of submaps", title_justify="left", box=SIMPLE_HEAD)
     for head in ("map", "paper", "ours", "difference"):
         table.add_column(head, justify="right")
     counts = {(r.map_name, r.reading): r.submaps for r in results if r.radius_m == 8.0}
@@ -128,9 +131,7 @@ def _print_open_choices(console: Console, results: Sequence[Result], where: str)
     if not changed:
         return
     base = {(r.map_name, r.level): r.auc for r in results if _is_base(r)}
-    table = Table(
-        title=f"What open choices move: AUC x 1000 against the default, {where}", title_justify="left"
-    )
+    table = Table(title=f"What open choices move, AUC x 1000, {where}", title_justify="left", box=SIMPLE_HEAD)
     for head in ("choice", "noise", *MAPS):
         table.add_column(head, justify="left" if head == "choice" else "right")
     for choice in dict.fromkeys(r.overrides for r in changed):
