@@ -97,7 +97,7 @@ def find_ground(
 
 
 def assumed_ground(T_base_sensor: F64) -> Ground:
-    """The floor where none is seen: z = 0 of the base if the sensor is mounted above it, else one metre down."""
+    """The floor where none is seen: z = 0 of the base if the sensor is mounted above it, else 1 m down."""
     mounted = float(T_base_sensor[2, 3]) > 0.05
     return Ground(np.array([0.0, 0.0, 1.0]), 0.0 if mounted else 1.0, None, seen=False)
 

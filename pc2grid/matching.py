@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from pc2grid.geometry import SE2, F64, wrap_angle
+from pc2grid.geometry import F64, SE2, wrap_angle
 
 CELL_M = 0.1
 RESIDUAL_SCALE_M = 0.05  # beyond this a point is more likely something else (Cauchy)
@@ -41,22 +41,25 @@ class Match:
 
 
 class PointGrid:
-    """A square map of point moments around a centre.
+    """A map of point moments over the rectangle from `low_m` to `high_m` (each x, y).
 
-    Points outside the square are ignored, both when adding and when matching.
+    Points outside are ignored, both when adding and when matching.
     """
 
-    def __init__(self, center_m: tuple[float, float], half_width_m: float, cell_m: float = CELL_M) -> None:
-        cells = 2 * math.ceil(half_width_m / cell_m)
+    def __init__(self, low_m: ArrayLike, high_m: ArrayLike, cell_m: float = CELL_M) -> None:
         self.cell_m = cell_m
-        self.low_m = np.array(center_m, dtype=np.float64) - 0.5 * cells * cell_m
-        self._moments = np.zeros((cells, cells, 6), dtype=np.float64)
-        self.scans = 0
+        self.low_m = np.asarray(low_m, dtype=np.float64)
+        width, height = np.ceil((np.asarray(high_m) - self.low_m) / cell_m).astype(int)
+        self._moments = np.zeros((height, width, 6), dtype=np.float64)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows (y) and columns (x)."""
+        return self._moments.shape[0], self._moments.shape[1]
 
     def add(self, points_m: NDArray[np.floating]) -> None:
         """Add points (N, 2) given in the map frame."""
         _add_moments(self._moments, np.asarray(points_m, dtype=np.float64), self.low_m, self.cell_m)
-        self.scans += 1
 
     def match(
         self,
@@ -98,7 +101,7 @@ def _add_moments(moments: F64, points: F64, low: F64, cell_m: float) -> None:
     height, width = moments.shape[0], moments.shape[1]
     for k in range(points.shape[0]):
         x, y = points[k, 0] - low[0], points[k, 1] - low[1]
-        column, row = int(math.floor(x / cell_m)), int(math.floor(y / cell_m))
+        column, row = math.floor(x / cell_m), math.floor(y / cell_m)
         if 0 <= row < height and 0 <= column < width:
             m = moments[row, column]
             m[0] += 1.0
@@ -113,7 +116,7 @@ def _add_moments(moments: F64, points: F64, low: F64, cell_m: float) -> None:
 def _line_at(moments: F64, x: float, y: float, cell_m: float, radius: int, line: F64) -> bool:
     """Mean, normal and straightness (5 values) of the points within `radius` cells; False if too few."""
     height, width = moments.shape[0], moments.shape[1]
-    column, row = int(math.floor(x / cell_m)), int(math.floor(y / cell_m))
+    column, row = math.floor(x / cell_m), math.floor(y / cell_m)
     if row < radius or column < radius or row >= height - radius or column >= width - radius:
         return False
     n = sx = sy = sxx = sxy = syy = 0.0
@@ -201,3 +204,71 @@ def _gauss_newton(
         if radius == radii[-1] and abs(delta[0]) + abs(delta[1]) + abs(delta[2]) < 1e-4:
             break
     return pose, information, overlap, residual
+
+
+def best_placements(
+    field: NDArray[np.float32],
+    low_m: F64,
+    cell_m: float,
+    points_m: F64,
+    guess: SE2,
+    window_m: float,
+    window_rad: float,
+    *,
+    step_m: float = 0.2,
+    step_rad: float = math.radians(2.0),
+    count: int = 3,
+) -> list[tuple[float, SE2]]:
+    """Correlative matching (Olson 2009) by exhaustion: placements of points (N, 2) on a likelihood field.
+
+    field : (H, W) in 0..1, cell (0, 0) at `low_m`. The window is searched around `guess` in equal steps;
+    returned are the best `count` placements no two of which are neighbours, best first, with the mean
+    likelihood of the points.
+    """
+    across = np.arange(-math.ceil(window_m / step_m), math.ceil(window_m / step_m) + 1) * step_m
+    turns = np.arange(-math.ceil(window_rad / step_rad), math.ceil(window_rad / step_rad) + 1) * step_rad
+    points = np.asarray(points_m, dtype=np.float64)
+    scores = _scores(field, low_m, cell_m, points, guess.x, guess.y, guess.yaw + turns, across)
+    found: list[tuple[float, SE2]] = []
+    while len(found) < count:
+        a, r, c = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        score = float(scores[a, r, c])
+        if score <= 0.0:
+            break
+        found.append(
+            (score, SE2(guess.x + across[c], guess.y + across[r], wrap_angle(guess.yaw + float(turns[a]))))
+        )
+        scores[max(a - 2, 0) : a + 3, max(r - 2, 0) : r + 3, max(c - 2, 0) : c + 3] = 0.0
+    return found
+
+
+@njit(cache=True)
+def _scores(
+    field: NDArray[np.float32],
+    low: F64,
+    cell_m: float,
+    points: F64,
+    x: float,
+    y: float,
+    yaws: F64,
+    across: F64,
+) -> NDArray[np.float32]:
+    height, width = field.shape
+    n = len(across)
+    scores = np.zeros((len(yaws), n, n), dtype=np.float32)
+    step = max(int(round((across[1] - across[0]) / cell_m)), 1) if n > 1 else 1
+    first = int(round(across[0] / cell_m))
+    for a in range(len(yaws)):
+        cos, sin = math.cos(yaws[a]), math.sin(yaws[a])
+        for k in range(points.shape[0]):
+            column = math.floor((cos * points[k, 0] - sin * points[k, 1] + x - low[0]) / cell_m) + first
+            row = math.floor((sin * points[k, 0] + cos * points[k, 1] + y - low[1]) / cell_m) + first
+            for r in range(n):
+                at_row = row + r * step
+                if at_row < 0 or at_row >= height:
+                    continue
+                for c in range(n):
+                    at_column = column + c * step
+                    if 0 <= at_column < width:
+                        scores[a, r, c] += field[at_row, at_column]
+    return scores / np.float32(max(points.shape[0], 1))

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from pc2grid.config import PartitionConfig, ProjectionConfig, RegistrationConfig
 from pc2grid.errors import NoScans
-from pc2grid.geometry import SE2
-from pc2grid.model import Health, RegisteredScan, Scan, SessionMap, Trajectory
+from pc2grid.geometry import F64, SE2
+from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, SessionMap, Trajectory
 from pc2grid.projection import GridBuilder
 from pc2grid.sweep import Sweep
 
 if TYPE_CHECKING:
     from pc2grid.io import Log
-
-DRAW_TRAVEL_M = 0.1
-DRAW_TURN_RAD = math.radians(5.0)
 
 
 class PipelineConfig(Protocol):
@@ -34,23 +29,14 @@ class PipelineConfig(Protocol):
     def partition(self) -> PartitionConfig: ...
 
 
-@dataclass(frozen=True, slots=True)
-class Keyframe:
-    """A sweep worth keeping: the robot had moved since the one before. T_map_base as tracked."""
-
-    index: int
-    sweep: Sweep
-    T_map_base: SE2
-    health: Health
-
-
 def follow(scans: Iterable[Scan], config: PipelineConfig) -> Iterator[tuple[RegisteredScan, Sweep]]:
     """Each scan with its pose and its sweep, as they come. Memory is one local map, whatever the length."""
     from pc2grid.tracking import Tracker
 
     tracker = Tracker(config.registration, config.projection)
     for scan in scans:
-        yield tracker.track(scan)
+        tracked = tracker.track(scan)
+        yield tracked.registered, tracked.sweep
 
 
 def build_map(
@@ -71,23 +57,14 @@ def build_map(
 
     begin_ns = log.info.start_ns + int(start_s * 1e9)
     span_ns = max(log.info.end_ns - begin_ns if duration_s is None else int(duration_s * 1e9), 1)
-    stamps, poses, health, keyframes = [], [], [], []
-    for registered, sweep in follow(log.scans(start_s, duration_s), config):
-        pose = SE2.flatten(registered.T_map_base)
-        if _moved(keyframes[-1].T_map_base if keyframes else None, pose):
-            keyframes.append(Keyframe(len(stamps), sweep, pose, registered.health))
-        stamps.append(registered.scan.stamp_ns)
-        poses.append(registered.T_map_base)
-        health.append(registered.health)
+
+    def advance(stamp_ns: int) -> None:
         if progress is not None:
-            progress(min(0.9 * (registered.scan.stamp_ns - begin_ns) / span_ns, 0.9))
-    if not stamps:
+            progress(min(0.8 * (stamp_ns - begin_ns) / span_ns, 0.8))
+
+    grid, trajectory = map_scans(log.scans(start_s, duration_s), config, advance)
+    if not len(trajectory):
         raise NoScans(f"{log.info.path}: no scans in the part asked for", hint="check --start and --duration")
-    builder = GridBuilder(config.projection)
-    for keyframe in keyframes:
-        if keyframe.health is not Health.LOST:
-            builder.add(keyframe.sweep, keyframe.T_map_base)
-    grid = builder.grid()
     submaps = partition(grid, config.partition)
     if progress is not None:
         progress(1.0)
@@ -96,15 +73,63 @@ def build_map(
         sensor=log.choose().sensor,
         grid=grid,
         submaps=submaps,
-        trajectory=Trajectory(
-            stamps_ns=np.array(stamps, dtype=np.int64), T_map_base=np.array(poses), health=tuple(health)
-        ),
+        trajectory=trajectory,
         report=log.report(),
     )
 
 
-def _moved(last: SE2 | None, now: SE2) -> bool:
-    if last is None:
-        return True
-    step = last.inverse() @ now
-    return math.hypot(step.x, step.y) >= DRAW_TRAVEL_M or abs(step.yaw) >= DRAW_TURN_RAD
+def map_scans(
+    scans: Iterable[Scan], config: PipelineConfig, advance: Callable[[int], None] = lambda stamp_ns: None
+) -> tuple[OccupancyGrid, Trajectory]:
+    """Grid and trajectory of scans, loops closed. `advance` is called with each scan's stamp.
+
+    Only keyframes are kept, as sweeps of a few kilobytes; a robot that stands still adds nothing.
+    """
+    from pc2grid.loops import close_loops, spread
+    from pc2grid.pieces import Keyframe
+    from pc2grid.tracking import Tracker
+
+    tracker = Tracker(config.registration, config.projection)
+    stamps: list[int] = []
+    poses: list[F64] = []
+    health: list[Health] = []
+    keyframes: list[Keyframe] = []
+    for scan in scans:
+        tracked = tracker.track(scan)
+        registered = tracked.registered
+        if tracked.keyframe:
+            pose = SE2.flatten(registered.T_map_base)
+            keyframes.append(Keyframe(len(stamps), tracked.sweep, pose, tracked.information))
+        stamps.append(scan.stamp_ns)
+        poses.append(registered.T_map_base)
+        health.append(registered.health)
+        advance(scan.stamp_ns)
+    builder = GridBuilder(config.projection)
+    if not stamps:
+        return builder.grid(), Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
+    T_map_base = np.array(poses)
+    if len(keyframes) > 2:
+        flat = np.array([(p.x, p.y, p.yaw) for p in map(SE2.flatten, poses)])
+        closed = close_loops(keyframes)
+        settled = spread(flat, [k.index for k in keyframes], closed.poses)
+        T_map_base = _replant(T_map_base, flat, settled)
+    for keyframe in keyframes:
+        if health[keyframe.index] is not Health.LOST:
+            builder.add(keyframe.sweep, SE2.flatten(T_map_base[keyframe.index]))
+    trajectory = Trajectory(
+        stamps_ns=np.array(stamps, dtype=np.int64), T_map_base=T_map_base, health=tuple(health)
+    )
+    return builder.grid(), trajectory
+
+
+def _replant(T_map_base: F64, flat: F64, settled: F64) -> F64:
+    """Spatial poses (N, 4, 4) moved in the plane from `flat` (N, 3) to `settled` (N, 3); tilt and height stay."""
+    turn = settled[:, 2] - flat[:, 2]
+    c, s = np.cos(turn), np.sin(turn)
+    rotation = np.zeros((len(turn), 3, 3))
+    rotation[:, 0, 0], rotation[:, 0, 1], rotation[:, 1, 0], rotation[:, 1, 1] = c, -s, s, c
+    rotation[:, 2, 2] = 1.0
+    moved = T_map_base.copy()
+    moved[:, :3, :3] = rotation @ T_map_base[:, :3, :3]
+    moved[:, :2, 3] = settled[:, :2]
+    return moved

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pc2grid.config import ProjectionConfig
 from pc2grid.errors import LimitExceeded
-from pc2grid.geometry import SE2, F64
+from pc2grid.geometry import F64, SE2
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.sweep import Sweep
 

@@ -114,12 +114,10 @@ def thin(points_m: NDArray[np.floating], count: int = _MAX_POINTS) -> NDArray[np
     )
 
 
-def register(
-    scans: Iterable[Scan], config: RegistrationConfig = RegistrationConfig()
-) -> Iterator[RegisteredScan]:  # noqa: B008
+def register(scans: Iterable[Scan], config: RegistrationConfig | None = None) -> Iterator[RegisteredScan]:
     """Registered scans, one for each scan, as they come: the streaming front half without its sweeps."""
     from pc2grid.tracking import Tracker
 
-    tracker = Tracker(config)
+    tracker = Tracker(config or RegistrationConfig())
     for scan in scans:
-        yield tracker.track(scan)[0]
+        yield tracker.track(scan).registered

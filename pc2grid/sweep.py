@@ -38,10 +38,11 @@ class Sweep:
     origin_m: F64
     free_m: F32
 
-    def free_polygon(self) -> F64:
-        """(B, 2) outline of the free space in the levelled base frame, metres."""
+    def free_polygon(self, limit_m: float = np.inf) -> F64:
+        """(B, 2) outline in the levelled base frame of the free space no farther than `limit_m`, metres."""
         bearings = np.arange(len(self.free_m)) * (2.0 * np.pi / len(self.free_m))
-        return self.origin_m + self.free_m[:, None] * np.column_stack((np.cos(bearings), np.sin(bearings)))
+        free_m = np.minimum(self.free_m, limit_m)
+        return self.origin_m + free_m[:, None] * np.column_stack((np.cos(bearings), np.sin(bearings)))
 
 
 def flatten(

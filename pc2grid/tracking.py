@@ -10,24 +10,43 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.deskew import deskew
 from pc2grid.floor import Ground, assumed_ground, find_ground
-from pc2grid.geometry import SE2, F64, invert_pose, rotation_vector
+from pc2grid.geometry import F64, SE2, invert_pose, rotation_vector
 from pc2grid.matching import PointGrid
 from pc2grid.model import F32, Health, RegisteredScan, Scan
 from pc2grid.registration import KissRegistration, thin
 from pc2grid.sweep import Sweep, flatten
 
-KEYFRAME_TRAVEL_M = 0.25
-KEYFRAME_TURN_RAD = math.radians(12.0)
+KEYFRAME_TRAVEL_M = 0.2
+KEYFRAME_TURN_RAD = math.radians(10.0)
 LOCAL_MAP_TRAVEL_M = 5.0
 _ROLLING_GAIN = 0.05  # how fast the floor follows what is seen of it
 _CARRIED_GAIN = 0.3
+_DISAGREE_M = 0.03
+_DISAGREE_RAD = 0.02
 _MAX_POINTS = 40_000  # of a camera's 300 000 pixels
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tracked:
+    """What became of one scan.
+
+    sweep : the scan reduced to the plane.
+    information : (3, 3) of the planar pose (x, y, yaw in the map frame) relative to the local map, from
+        what the scan sees; what it does not see rests on the odometry.
+    keyframe : whether the robot had moved enough for the scan to become part of the local map.
+    """
+
+    registered: RegisteredScan
+    sweep: Sweep
+    information: F64
+    keyframe: bool
 
 
 class Tracker:
@@ -50,8 +69,8 @@ class Tracker:
         self._rolling = True
         self._height_m = 0.0
 
-    def track(self, scan: Scan) -> tuple[RegisteredScan, Sweep]:
-        """Pose and sweep of the next scan; stamps must increase."""
+    def track(self, scan: Scan) -> Tracked:
+        """Follow the next scan; stamps must increase."""
         motion, motion_s, measured = self._predict(scan)
         points = self._usable(scan, motion, motion_s)
         predicted: F64 = self._last_pose @ motion
@@ -70,16 +89,19 @@ class Tracker:
         planar = SE2.flatten(pose)
         T_level_base = planar.inverse().lift() @ pose
         sweep = self._flatten(points, scan, T_level_base)
+        information = np.zeros((3, 3))
         if self._last is not None and len(sweep.hits_m) >= 10:
-            planar = self._refine(sweep, planar, predicted, motion, measured)
+            planar, information = self._refine(sweep, planar, predicted, motion, measured)
             pose = planar.lift() @ T_level_base
-        if self._extend_maps(sweep, planar):
+        keyframe = self._extend_maps(sweep, planar)
+        if keyframe:
             self._kiss.integrate(pose)
         if self._last is not None:
             self._velocity = invert_pose(self._last_pose) @ pose
         self._last, self._last_pose = scan, pose
         deskewed = dataclasses.replace(scan, points_m=points, offsets_s=None)
-        return RegisteredScan(scan=deskewed, T_map_base=pose, health=Health.FINE), sweep
+        registered = RegisteredScan(scan=deskewed, T_map_base=pose, health=Health.FINE)
+        return Tracked(registered=registered, sweep=sweep, information=information, keyframe=keyframe)
 
     def _predict(self, scan: Scan) -> tuple[F64, float, bool]:
         """Motion since the last scan, over how many seconds, and whether odometry measured it."""
@@ -146,7 +168,9 @@ class Tracker:
             ground = self._ground.moved(R)
         return flatten(level, stamp_ns=scan.stamp_ns, sensor_m=sensor, ground=ground, config=self._projection)
 
-    def _refine(self, sweep: Sweep, guess: SE2, predicted: F64, motion: F64, measured: bool) -> SE2:
+    def _refine(
+        self, sweep: Sweep, guess: SE2, predicted: F64, motion: F64, measured: bool
+    ) -> tuple[SE2, F64]:
         distance = float(np.linalg.norm(motion[:3, 3]))
         turn = float(np.linalg.norm(rotation_vector(motion)))
         prior = SE2.flatten(predicted) if measured else guess
@@ -155,10 +179,16 @@ class Tracker:
         else:
             sigma_m, sigma_rad = 0.03, 0.01
         information = np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
-        match = self._maps[0][0].match(sweep.hits_m, guess, prior, information)
+        grid = self._maps[0][0]
+        match = grid.match(sweep.hits_m, guess, prior, information)
+        apart = SE2.flatten(predicted).inverse() @ guess
+        if math.hypot(apart.x, apart.y) > _DISAGREE_M or abs(apart.yaw) > _DISAGREE_RAD:
+            # KISS-ICP and the prediction differ: let each lead the refinement, and the walls decide.
+            other = grid.match(sweep.hits_m, SE2.flatten(predicted), prior, information)
+            match = max(match, other, key=lambda m: m.overlap - 5.0 * m.residual_m)
         if match.overlap < 0.3:
-            return guess if not measured else prior
-        return match.pose
+            return (prior if measured else guess), np.zeros((3, 3))
+        return match.pose, match.information
 
     def _extend_maps(self, sweep: Sweep, pose: SE2) -> bool:
         """Two overlapping local maps: the older one is matched against, the younger takes over in time.
@@ -173,7 +203,9 @@ class Tracker:
             self._travel_m += math.hypot(step.x, step.y)
         if not self._maps or self._travel_m - self._maps[-1][1] > LOCAL_MAP_TRAVEL_M:
             half = self._projection.max_range_m + 2 * LOCAL_MAP_TRAVEL_M
-            self._maps.append((PointGrid((pose.x, pose.y), half), self._travel_m))
+            self._maps.append(
+                (PointGrid((pose.x - half, pose.y - half), (pose.x + half, pose.y + half)), self._travel_m)
+            )
         if len(self._maps) > 2:
             del self._maps[0]
         hits = pose.apply(sweep.hits_m)
