@@ -31,7 +31,7 @@ SIGMA_M = 0.10
 NEUTRAL = 0.35
 """What a point on unknown cells scores: about what a random point of a building scores, so that ground
 one side has not seen speaks neither for nor against a pose."""
-REACHES_M = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+REACHES_M = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.3, 1.6)
 """Radii of the sliding maxima; the first is the field itself."""
 
 
@@ -40,7 +40,8 @@ class LikelihoodField:
     """A map prepared for alignment.
 
     levels : (L, H, W) uint8, sliding maxima of the field over `reaches_m`; 255 = on a wall.
-    walls_m : (K, 2) float32 occupied cell centres, map frame, sorted by tile of `TILE_M`.
+    known : (H, W) cells that are occupied or free.
+    walls_m : (K, 2) float32 occupied cell centres, map frame, one per 0.1 m square.
     """
 
     levels: U8
@@ -91,7 +92,8 @@ def prepare(grid: OccupancyGrid) -> LikelihoodField:
         n = math.ceil(reach_m / grid.resolution_m)
         kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * n + 1, 2 * n + 1))
         levels.append(np.asarray(cv2.dilate(field, kernel, borderType=cv2.BORDER_REPLICATE), np.uint8))
-    walls = padded.to_point(np.argwhere(padded.occupied)).astype(np.float32)
+    walls = padded.to_point(np.argwhere(padded.occupied))
+    walls = walls[thin_evenly(walls, 0.1)].astype(np.float32)
     return LikelihoodField(
         levels=np.stack(levels),
         reaches_m=REACHES_M,
@@ -409,49 +411,51 @@ def refine(target: LikelihoodField, query: Query, T_map_query: SE2, *, steps: in
     return center @ SE2(-cx, -cy, 0.0), np.asarray(np.linalg.inv(information), np.float64)
 
 
-def _sample(field: NDArray[np.generic], cells: NDArray[np.int64], outside: float) -> F64:
-    """Values of a grid (H, W) at cells (N, 2) given as (column, row), `outside` beyond its edge."""
+@numba.njit(cache=True, nogil=True)
+def _agreement(
+    walls: F32, pose: F64, field: U8, known: NDArray[np.bool_], resolution: float, origin: F64
+) -> tuple[int, float, int]:
+    """Of walls (K, 2) moved by `pose` (x, y, yaw): how many land on known ground, the sum of their
+    likelihood 0..1 there, and how many of them contradict it."""
     height, width = field.shape
-    columns, rows = cells[:, 0], cells[:, 1]
-    inside = (rows >= 0) & (columns >= 0) & (rows < height) & (columns < width)
-    values = np.full(len(cells), outside)
-    values[inside] = field[rows[inside], columns[inside]]
-    return values
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    count, total, conflicts = 0, 0.0, 0
+    for p in range(len(walls)):
+        x, y = walls[p, 0], walls[p, 1]
+        j = math.floor((c * x - s * y + pose[0] - origin[0]) / resolution)
+        i = math.floor((s * x + c * y + pose[1] - origin[1]) / resolution)
+        if 0 <= i < height and 0 <= j < width and known[i, j]:
+            count += 1
+            total += field[i, j] / 255.0
+            if field[i, j] < 5:
+                conflicts += 1
+    return count, total, conflicts
 
 
 def assess(target: LikelihoodField, query: Query, T_map_query: SE2, covariance: F64) -> Fit:
     """Score a pose both ways: query walls on the map, and map walls on what the query has looked at."""
-    res = target.resolution_m
-    there = np.floor((T_map_query.apply(query.walls_m) - target.origin_m) / res).astype(np.int64)
-    known = _sample(target.known, there, 0.0) > 0
-    fits = _sample(target.levels[0], there, 0.0)[known] / 255.0
-    forward = float(fits.mean()) if len(fits) else 0.0
-
-    height, width = query.known.shape
-    corners = (
-        np.array([[0, 0], [width, 0], [0, height], [width, height]]) * query.resolution_m + query.origin_m
+    there = np.array([T_map_query.x, T_map_query.y, T_map_query.yaw])
+    back = T_map_query.inverse()
+    seen, total, clash = _agreement(
+        query.walls_m, there, target.levels[0], target.known, target.resolution_m, np.array(target.origin_m)
     )
-    low, high = (f(T_map_query.apply(corners), axis=0) for f in (np.min, np.max))
-    walls = target.walls_m
-    walls = walls[((walls >= low) & (walls <= high)).all(axis=1)]
-    if len(walls):
-        walls = walls[thin_evenly(walls, 0.1)]
-    back = np.floor((T_map_query.inverse().apply(walls) - query.origin_m) / query.resolution_m).astype(
-        np.int64
+    looked, echoed, contradicted = _agreement(
+        target.walls_m,
+        np.array([back.x, back.y, back.yaw]),
+        query.field,
+        query.known,
+        query.resolution_m,
+        np.array(query.origin_m),
     )
-    looked = _sample(query.known, back, 0.0) > 0
-    echoes = _sample(query.field, back, 0.0)[looked] / 255.0
-    backward = float(echoes.mean()) if len(echoes) else 0.0
-
-    seen = len(fits) + len(echoes)
-    conflict = float((np.sum(fits < 0.02) + np.sum(echoes < 0.02)) / seen) if seen else 1.0
-    overlap = len(fits) / max(len(query.walls_m), 1)
+    forward = total / seen if seen else 0.0
+    backward = echoed / looked if looked else 0.0
+    overlap = seen / max(len(query.walls_m), 1)
     return Fit(
         T_map_query=T_map_query,
         forward=forward,
         backward=backward,
         overlap=overlap,
-        conflict=conflict,
+        conflict=(clash + contradicted) / (seen + looked) if seen + looked else 1.0,
         score=math.sqrt(forward * backward) * min(1.0, overlap / 0.5),
         covariance=covariance,
     )

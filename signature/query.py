@@ -19,11 +19,13 @@ from pc2grid.geometry import F64, SE2
 from pc2grid.model import OccupancyGrid
 from pc2grid.partition import view_at
 from pc2grid.projection import GridBuilder
+from pc2grid.skeleton import sample_evenly, skeleton_of
 from pc2grid.sweep import Sweep
 from pc2grid.visibility import Isovist, isovist
 from signature.config import RelocalizeConfig, SignatureConfig
 from signature.describe import Signature, describe
 
+_CLEARANCE_M = 0.3
 PROFILE_BEARINGS = 90
 """Rays of the isovists that are compared by their ranges: one every four degrees."""
 
@@ -150,18 +152,24 @@ def query_of(
 def best_observed(
     grid: OccupancyGrid, path_xy_m: F64, sight_m: float, config: RelocalizeConfig
 ) -> tuple[tuple[float, float], ...]:
-    """Up to `config.views` points of the path, `config.view_spacing_m` apart, best observed first.
+    """Up to `config.views` points, `config.view_spacing_m` apart, best observed first.
 
-    How well a place is observed is the share of the rays from it that end on something known.
+    Half of them lie on the path, where the robot has looked around; the others on the middle lines of all
+    the free space seen, because much of what surrounds a place is seen from elsewhere. How well a place
+    is observed is the share of the rays from it that end on something known.
     """
-    if not len(path_xy_m):
-        return ()
-    points = [(float(x), float(y)) for x, y in path_xy_m[:: max(1, len(path_xy_m) // 40)]]
-    observed = [isovist(grid, p, sight_m, bearings=PROFILE_BEARINGS).observed for p in points]
+    middle = skeleton_of(grid.free, grid.resolution_m, _CLEARANCE_M)
+    spaced = sample_evenly(np.argwhere(middle), 0.5 / grid.resolution_m)
     chosen: list[tuple[float, float]] = []
-    for i in np.argsort(-np.asarray(observed), kind="stable"):
-        if all(math.dist(points[i], c) >= config.view_spacing_m for c in chosen):
-            chosen.append(points[i])
-        if len(chosen) == config.views:
-            break
+    for points, most in (
+        (path_xy_m[:: max(1, len(path_xy_m) // 40)], (config.views + 1) // 2),
+        (grid.to_point(spaced), config.views),
+    ):
+        places = [(float(x), float(y)) for x, y in points]
+        observed = [isovist(grid, p, sight_m, bearings=PROFILE_BEARINGS).observed for p in places]
+        for i in np.argsort(-np.asarray(observed), kind="stable"):
+            if len(chosen) == most:
+                break
+            if all(math.dist(places[i], c) >= config.view_spacing_m for c in chosen):
+                chosen.append(places[i])
     return tuple(chosen)

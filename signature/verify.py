@@ -58,7 +58,7 @@ def verify(
 
     fields : likelihood field of each session, by session_index.
     """
-    found: list[Hypothesis] = []
+    coarse: list[tuple[float, int, int, SE2]] = []
     best = 0.0
     groups: dict[tuple[int, int], list[Proposal]] = {}
     for proposal in proposals:
@@ -68,7 +68,7 @@ def verify(
         center = query.views[view].center_m
         points = coarse_points(query, center)
         rows = np.array([p.row for p in members])
-        starts = np.concatenate([_boxes(places.table.center_m[row]) for row in rows])
+        starts = np.concatenate([_boxes(places.table.center_m[p.row], p.yaw_rad) for p in members])
         poses = search(
             fields[session],
             points,
@@ -83,7 +83,12 @@ def verify(
             best = max(best, float(score))
             T_map_query = SE2(float(x), float(y), float(yaw)) @ SE2(-center[0], -center[1], 0.0)
             nearest = int(rows[np.argmin(np.hypot(*(places.table.center_m[rows] - (x, y)).T))])
-            found.append(_fitted(query, session, nearest, fields[session], T_map_query))
+            coarse.append((float(score), session, nearest, T_map_query))
+    coarse.sort(key=lambda c: -c[0])
+    found = [
+        _fitted(query, session, row, fields[session], T_map_query)
+        for _, session, row, T_map_query in coarse[: 2 * config.hypotheses]
+    ]
     return distinct(found, query.T_odom_base)
 
 
@@ -162,10 +167,9 @@ def coarse_points(query: QueryMap, center_m: tuple[float, float]) -> F32:
     return local
 
 
-def _boxes(center_m: F64) -> F64:
-    """Boxes of poses (24, 3) around one place: every heading, half a metre each way."""
-    yaws = np.arange(-math.pi, math.pi, 2 * _HALF_A_RAD) + _HALF_A_RAD
-    return np.column_stack((np.full(len(yaws), center_m[0]), np.full(len(yaws), center_m[1]), yaws))
+def _boxes(center_m: F64, yaw_rad: Sequence[float]) -> F64:
+    """Boxes of poses (K, 3) around one place: half a metre each way, at each of the proposed headings."""
+    return np.array([(center_m[0], center_m[1], yaw) for yaw in yaw_rad])
 
 
 def _fitted(
