@@ -23,6 +23,7 @@ CELL_M = 0.1
 RESIDUAL_SCALE_M = 0.05  # beyond this a point is more likely something else (Cauchy)
 # One point is worth its noise, but neighbours on one wall err together: count every point as a fraction.
 _POINT_SIGMA_M = 0.1
+_MAX_RADIUS = 3  # cells
 _PRIOR_SCALE = 2.0  # standard deviations
 
 
@@ -51,6 +52,9 @@ class PointGrid:
         self.low_m = np.asarray(low_m, dtype=np.float64)
         width, height = np.ceil((np.asarray(high_m) - self.low_m) / cell_m).astype(int)
         self._moments = np.zeros((height, width, 6), dtype=np.float64)
+        # Lines are worked out when first asked for and forgotten when points arrive near by.
+        self._lines = np.empty((_MAX_RADIUS, height, width, 5), dtype=np.float32)
+        self._known = np.zeros((_MAX_RADIUS, height, width), dtype=np.uint8)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -59,7 +63,8 @@ class PointGrid:
 
     def add(self, points_m: NDArray[np.floating]) -> None:
         """Add points (N, 2) given in the map frame."""
-        _add_moments(self._moments, np.asarray(points_m, dtype=np.float64), self.low_m, self.cell_m)
+        points = np.asarray(points_m, dtype=np.float64)
+        _add_moments(self._moments, self._known, points, self.low_m, self.cell_m)
 
     def match(
         self,
@@ -80,6 +85,8 @@ class PointGrid:
         held = np.array([prior.x, prior.y, prior.yaw])
         pose, information, overlap, residual = _gauss_newton(
             self._moments,
+            self._lines,
+            self._known,
             self.low_m,
             self.cell_m,
             points,
@@ -97,7 +104,7 @@ class PointGrid:
 
 
 @njit(cache=True)
-def _add_moments(moments: F64, points: F64, low: F64, cell_m: float) -> None:
+def _add_moments(moments: F64, known: NDArray[np.uint8], points: F64, low: F64, cell_m: float) -> None:
     height, width = moments.shape[0], moments.shape[1]
     for k in range(points.shape[0]):
         x, y = points[k, 0] - low[0], points[k, 1] - low[1]
@@ -110,15 +117,15 @@ def _add_moments(moments: F64, points: F64, low: F64, cell_m: float) -> None:
             m[3] += x * x
             m[4] += x * y
             m[5] += y * y
+            for radius in range(1, known.shape[0] + 1):
+                for r in range(max(row - radius, 0), min(row + radius + 1, height)):
+                    for c in range(max(column - radius, 0), min(column + radius + 1, width)):
+                        known[radius - 1, r, c] = 0
 
 
 @njit(cache=True)
-def _line_at(moments: F64, x: float, y: float, cell_m: float, radius: int, line: F64) -> bool:
+def _line_at(moments: F64, row: int, column: int, radius: int, line: NDArray[np.float32]) -> bool:
     """Mean, normal and straightness (5 values) of the points within `radius` cells; False if too few."""
-    height, width = moments.shape[0], moments.shape[1]
-    column, row = math.floor(x / cell_m), math.floor(y / cell_m)
-    if row < radius or column < radius or row >= height - radius or column >= width - radius:
-        return False
     n = sx = sy = sxx = sxy = syy = 0.0
     for r in range(row - radius, row + radius + 1):
         for c in range(column - radius, column + radius + 1):
@@ -149,6 +156,8 @@ def _line_at(moments: F64, x: float, y: float, cell_m: float, radius: int, line:
 @njit(cache=True)
 def _gauss_newton(
     moments: F64,
+    lines: NDArray[np.float32],
+    known: NDArray[np.uint8],
     low: F64,
     cell_m: float,
     points: F64,
@@ -158,7 +167,7 @@ def _gauss_newton(
     radii: NDArray[np.int64],
 ) -> tuple[F64, F64, float, float]:
     pose = start.copy()
-    line = np.zeros(5)
+    height, width = moments.shape[0], moments.shape[1]
     information = np.zeros((3, 3))
     overlap = residual = 0.0
     unit = 1.0 / (_POINT_SIGMA_M * _POINT_SIGMA_M)
@@ -174,7 +183,15 @@ def _gauss_newton(
             rx = c * points[k, 0] - s * points[k, 1]
             ry = s * points[k, 0] + c * points[k, 1]
             x, y = rx + pose[0] - low[0], ry + pose[1] - low[1]
-            if not _line_at(moments, x, y, cell_m, radius, line):
+            column, row = math.floor(x / cell_m), math.floor(y / cell_m)
+            if row < radius or column < radius or row >= height - radius or column >= width - radius:
+                continue
+            line = lines[radius - 1, row, column]
+            state = known[radius - 1, row, column]
+            if state == 0:
+                state = 2 if _line_at(moments, row, column, radius, line) else 1
+                known[radius - 1, row, column] = state
+            if state == 1:
                 continue
             nx, ny = line[2], line[3]
             r = nx * (x - line[0]) + ny * (y - line[1])
@@ -256,8 +273,8 @@ def _scores(
     height, width = field.shape
     n = len(across)
     scores = np.zeros((len(yaws), n, n), dtype=np.float32)
-    step = max(int(round((across[1] - across[0]) / cell_m)), 1) if n > 1 else 1
-    first = int(round(across[0] / cell_m))
+    step = max(round((across[1] - across[0]) / cell_m), 1) if n > 1 else 1
+    first = round(across[0] / cell_m)
     for a in range(len(yaws)):
         cos, sin = math.cos(yaws[a]), math.sin(yaws[a])
         for k in range(points.shape[0]):
