@@ -58,8 +58,8 @@ def symmetry_axes(segments: F64, config: SignatureConfig) -> Axes | None:
     rest = np.where(_apart_deg(degrees, alpha) >= config.axis_separation_deg, smooth, 0.0)
     beta = int(np.argmax(rest)) if rest.max() > 1e-6 * smooth[alpha] else (alpha + 90) % 180
     return Axes(
-        _refined(alpha, angles, lengths, config.axis_smoothing_deg),
-        _refined(beta, angles, lengths, config.axis_smoothing_deg),
+        _refined(alpha, angles, lengths, 2 * config.axis_smoothing_deg),
+        _refined(beta, angles, lengths, 2 * config.axis_smoothing_deg),
     )
 
 
@@ -69,11 +69,14 @@ def _apart_deg(a_deg: I64, b_deg: int) -> I64:
 
 
 def _refined(peak_deg: int, angles_rad: F64, lengths: F64, window_deg: float) -> float:
-    """Mean direction of the segments within a window around a whole degree, finer than the vote."""
+    """Mean direction of the segments within a window around a whole degree, finer than the vote.
+
+    A segment's direction is the surer the longer it is: weights are squared lengths, inverse variances.
+    """
     away = (angles_rad - math.radians(peak_deg) + math.pi / 2) % math.pi - math.pi / 2
     near = np.abs(away) <= math.radians(window_deg)
-    weight = lengths[near].sum()
-    shift = float((away[near] * lengths[near]).sum() / weight) if weight > 0 else 0.0
+    weights = lengths[near] ** 2
+    shift = float((away[near] * weights).sum() / weights.sum()) if near.any() else 0.0
     return (math.radians(peak_deg) + shift) % math.pi
 
 

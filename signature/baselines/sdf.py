@@ -75,9 +75,9 @@ class DistanceFeatures:
         )
 
     def features(self, submap: Submap) -> Features:
-        """Keypoints of a submap and their descriptors; none where nothing is occupied."""
+        """Keypoints of a submap and their descriptors; none where nothing is occupied or curved."""
         resolution = submap.grid.resolution_m
-        if not submap.grid.occupied.any():
+        if not submap.grid.occupied.any() or min(submap.grid.cells.shape) < 3:
             return Features(np.empty((0, 2), np.float32), np.empty((0, 129), np.float32))
         distance = distance_function(submap, self.smooth_m)
         keypoints = self._keypoints(distance, submap)
