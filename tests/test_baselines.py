@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from tests.rooms import cross, degenerate, disc, l_shape, polygon, random_rooms, rectangle, submap_of
 
 from pc2grid.model import Submap
 from signature.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES, Matcher, Method, make_methods
@@ -15,6 +14,7 @@ from signature.baselines.sdf import DistanceFeatures, _consensus, _directions
 from signature.baselines.shape_context import ShapeContext
 from signature.baselines.words import Words, sift, submap_image, surf
 from signature.evaluate import rotated_submap
+from tests.rooms import cross, degenerate, disc, l_shape, polygon, random_rooms, rectangle, submap_of
 
 ALL = METHOD_NAMES + EXTRA_METHOD_NAMES
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.rooms import RESOLUTION_M, disc, random_rooms, rectangle, submap_of
 
 from signature.boundary import boundary_bins, boundary_edges, boundary_histogram, boundary_points
 from signature.config import SignatureConfig
+from tests.rooms import RESOLUTION_M, disc, random_rooms, rectangle, submap_of
 
 CONFIG = SignatureConfig()
 

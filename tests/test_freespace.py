@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.rooms import RESOLUTION_M, canvas, cross, grid_of, l_shape, random_rooms, rectangle, submap_of
 
 from pc2grid.model import OCCUPIED
 from signature.config import SignatureConfig
@@ -21,6 +20,7 @@ from signature.freespace import (
     freespace_nodes,
     shortest_paths,
 )
+from tests.rooms import RESOLUTION_M, canvas, cross, grid_of, l_shape, random_rooms, rectangle, submap_of
 
 CONFIG = SignatureConfig()
 

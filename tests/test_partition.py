@@ -8,11 +8,11 @@ from pathlib import Path
 import networkx as nx
 import numpy as np
 import pytest
-from tests.rooms import canvas, cross, grid_of, rectangle
 
 from pc2grid.config import PartitionConfig
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN
 from pc2grid.partition import junction_graph, partition, submap_at
+from tests.rooms import canvas, cross, grid_of, rectangle
 
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).parents[1] / "../shared/data"))
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.rooms import cross, degenerate, disc, l_shape, random_rooms, rectangle, submap_of
 
 from signature.config import SignatureConfig
 from signature.describe import Signature, describe
 from signature.similarity import SignatureTable, distances, histogram_distance, similarity, structural_factor
+from tests.rooms import cross, degenerate, disc, l_shape, random_rooms, rectangle, submap_of
 
 CONFIG = SignatureConfig()
 

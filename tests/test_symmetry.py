@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.rooms import RESOLUTION_M, canvas, cross, l_shape, polygon, random_rooms, rectangle, submap_of
 
 from signature.boundary import boundary_edges
 from signature.config import SignatureConfig
 from signature.symmetry import blurred, line_segments, reflection_score, symmetry_axes, symmetry_scores
+from tests.rooms import RESOLUTION_M, canvas, cross, l_shape, polygon, random_rooms, rectangle, submap_of
 
 CONFIG = SignatureConfig()
 

@@ -1,0 +1,215 @@
+"""How a submap becomes its three signatures: figures 2 to 6 of the paper for one place, as one picture.
+
+python examples/signature_of_a_submap.py path/to/map.yaml            # the submap nearest the map's middle
+python examples/signature_of_a_submap.py path/to/map.yaml --submap 12 --out submap.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from pc2grid.config import PartitionConfig
+from pc2grid.io.nav2_map import load_map
+from pc2grid.model import OccupancyGrid, Submap
+from pc2grid.partition import junction_graph, map_skeleton, partition
+from signature.boundary import boundary_edges, boundary_histogram, boundary_points
+from signature.config import SignatureConfig
+from signature.describe import describe
+from signature.freespace import (
+    adjacency,
+    freespace_graph,
+    freespace_histogram,
+    freespace_nodes,
+    shortest_paths,
+)
+from signature.noise import NOISE_LEVELS, add_noise
+from signature.symmetry import blurred, line_segments, symmetry_axes
+
+FREE, WALL, UNSEEN = (1.0, 1.0, 1.0), (0.1, 0.1, 0.1), (0.86, 0.86, 0.86)
+BLUE, ORANGE, GREEN, RED = "#1f77b4", "#e6842a", "#2ca02c", "#d62728"
+
+
+def picture(grid: OccupancyGrid) -> np.ndarray:
+    """(H, W, 3) colours of a grid, row 0 at the bottom."""
+    image = np.full((*grid.cells.shape, 3), UNSEEN)
+    image[grid.free], image[grid.occupied] = FREE, WALL
+    return image
+
+
+def show(axis: Any, grid: OccupancyGrid, title: str) -> None:
+    """Draw a grid in metres of its map frame."""
+    x, y = grid.origin_m
+    height, width = np.array(grid.cells.shape) * grid.resolution_m
+    axis.imshow(picture(grid), origin="lower", extent=(x, x + width, y, y + height), interpolation="nearest")
+    axis.set_title(title, fontsize=10, loc="left")
+    axis.set_xticks([])
+    axis.set_yticks([])
+
+
+def draw_partition(axis: Any, grid: OccupancyGrid, submaps: tuple[Submap, ...], chosen: Submap) -> None:
+    """Figure 2: the map, its skeleton, the junctions and the submap looked at."""
+    config = PartitionConfig()
+    show(
+        axis,
+        grid,
+        f"The map: its skeleton, {len(submaps)} clustered junctions (dots), one submap each (III-A)",
+    )
+    skeleton = grid.to_point(np.argwhere(map_skeleton(grid, config)))
+    axis.plot(*skeleton.T, ",", color=BLUE)
+    graph = junction_graph(grid, config)
+    places = [data["center_m"] for _, data in graph.nodes(data=True) if data["kind"] == "junction"]
+    axis.plot(*np.array(places).T, "o", color=RED, markersize=3)
+    turns = np.linspace(0, 2 * math.pi, 100)
+    x, y = chosen.center_m
+    axis.plot(
+        x + chosen.radius_m * np.cos(turns), y + chosen.radius_m * np.sin(turns), color=ORANGE, linewidth=2.5
+    )
+
+
+def draw_boundary(axes: Any, submap: Submap, config: SignatureConfig) -> None:
+    """Figure 3: sampled boundary points, and how far they are from each other."""
+    points = boundary_points(boundary_edges(submap, config), submap.grid.resolution_m, config)
+    show(axes[0], submap.grid, f"Boundary: {len(points)} points (III-B)")
+    places = submap.grid.to_point(points)
+    axes[0].plot(*places.T, ".", color=BLUE, markersize=2.5)
+    histogram = boundary_histogram(points, submap.radius_m, submap.grid.resolution_m, config)
+    bars(axes[1], histogram, config.boundary_bin_m, BLUE, "Distances between boundary points (Eq. 2)")
+
+
+def draw_freespace(axes: Any, submap: Submap, config: SignatureConfig) -> None:
+    """Figures 4 and 5: nodes that see each other, how long the ways are, and what obstacles change."""
+    graph = freespace_graph(submap, config)
+    show(axes[0], submap.grid, f"Free space: {len(graph)} nodes, joined in sight (III-C)")
+    places = {node: data["center_m"] for node, data in graph.nodes(data=True)}
+    lines = [(places[a], places[b]) for a, b in graph.edges]
+    axes[0].add_collection(LineCollection(lines, colors=GREEN, linewidths=0.4, alpha=0.25))
+    if places:
+        axes[0].plot(*np.array(list(places.values())).T, "o", color=GREEN, markersize=3.5)
+    bars(
+        axes[1],
+        path_histogram(submap, config),
+        config.freespace_bin_m,
+        GREEN,
+        "Lengths of the shortest ways (Eq. 4)",
+    )
+    noisy = add_noise(submap, NOISE_LEVELS[1], np.random.default_rng(0))
+    changed = path_histogram(noisy, config)
+    at = (np.arange(len(changed)) + 0.5) * config.freespace_bin_m
+    axes[1].step(
+        at,
+        changed,
+        where="mid",
+        color=WALL,
+        linewidth=1,
+        label="with 10 obstacles and 50 speckles (Figure 5)",
+    )
+    axes[1].legend(fontsize=8, frameon=False)
+
+
+def path_histogram(submap: Submap, config: SignatureConfig) -> np.ndarray:
+    """H^f of a submap."""
+    grid = submap.grid
+    weights = adjacency(freespace_nodes(submap, config), grid.occupied, grid.resolution_m, config)
+    return freespace_histogram(shortest_paths(weights), submap.radius_m, config)
+
+
+def draw_symmetry(axes: Any, submap: Submap, config: SignatureConfig) -> None:
+    """Figure 6: line segments with both axes, and how bright each wall's mirror image is at either axis."""
+    grid = submap.grid
+    edges = boundary_edges(submap, config)
+    segments = line_segments(edges, grid.resolution_m, config)
+    found = symmetry_axes(segments, config)
+    show(axes[0], grid, f"Symmetry: {len(segments)} segments, two axes (III-D)")
+    ends = grid.to_point(segments.reshape(-1, 2)[:, ::-1].astype(np.int64)).reshape(-1, 2, 2)
+    axes[0].add_collection(LineCollection(list(ends), colors=ORANGE, linewidths=1.5))
+    if found is None:
+        return
+    scores = describe(submap, config).symmetry
+    center = np.array(submap.center_m)
+    for angle, name, score, color in zip(found, ("α", "β"), scores, (RED, BLUE), strict=True):
+        reach = submap.radius_m * np.array([math.cos(angle), math.sin(angle)])
+        axes[0].plot(
+            *np.array([center - reach, center + reach]).T,
+            "--",
+            color=color,
+            label=f"{name}: score {score:.1f}",
+        )
+    axes[0].legend(fontsize=8, loc="lower right")
+    field = blurred(edges, grid.resolution_m, config)
+    # What Eq. 5 averages: the blurred walls, read where the mirror images of the walls at alpha lie.
+    middle = (np.array(edges.shape) - 1) / 2
+    rows, columns = (np.argwhere(edges) - middle).T
+    c, s = math.cos(2 * found.alpha_rad), math.sin(2 * found.alpha_rad)
+    mirrored = np.stack((s * columns - c * rows, c * columns + s * rows), axis=1) + middle
+    inside = np.clip(np.rint(mirrored).astype(int), 0, np.array(edges.shape) - 1)
+    values = field[inside[:, 0], inside[:, 1]]
+    x, y = grid.origin_m
+    size = np.array(grid.cells.shape) * grid.resolution_m
+    extent = (x, x + size[1], y, y + size[0])
+    axes[1].imshow(field, origin="lower", extent=extent, cmap="Greys", vmax=2 * config.symmetry_peak)
+    places = (mirrored[:, ::-1] + 0.5) * grid.resolution_m + grid.origin_m
+    dots = axes[1].scatter(*places.T, c=values, s=2, cmap="plasma", vmin=0, vmax=config.symmetry_peak)
+    axes[1].figure.colorbar(dots, ax=axes[1], shrink=0.8, label="brightness met (Eq. 5 is its mean)")
+    axes[1].set_title("Walls mirrored at α (dots) over the blurred walls (grey)", fontsize=10, loc="left")
+    axes[1].set_xlim(extent[:2])
+    axes[1].set_ylim(extent[2:])
+    axes[1].set_xticks([])
+    axes[1].set_yticks([])
+
+
+def bars(axis: Any, histogram: np.ndarray, bin_m: float, color: str, title: str) -> None:
+    """A histogram over metres."""
+    axis.bar(np.arange(len(histogram)) * bin_m, histogram, width=bin_m, align="edge", color=color, alpha=0.7)
+    axis.set_title(title, fontsize=10, loc="left")
+    axis.set_xlabel("metres")
+    axis.set_ylabel("share of pairs")
+    filled = np.flatnonzero(histogram)
+    axis.set_xlim(0, (filled[-1] + 2) * bin_m if len(filled) else len(histogram) * bin_m)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def draw(grid: OccupancyGrid, submaps: tuple[Submap, ...], chosen: Submap, name: str) -> Figure:
+    """The whole picture."""
+    config = SignatureConfig()
+    figure = Figure(figsize=(17, 14), layout="constrained")
+    top, bottom = figure.subfigures(2, 1, height_ratios=(1.0, 1.9))
+    draw_partition(top.subplots(), grid, submaps, chosen)
+    axes = bottom.subplots(2, 3)
+    draw_boundary(axes[:, 0], chosen, config)
+    draw_freespace(axes[:, 1], chosen, config)
+    draw_symmetry(axes[:, 2], chosen, config)
+    figure.suptitle(
+        f"{name}, submap {chosen.submap_id}: how a place becomes its three signatures", fontsize=14
+    )
+    return figure
+
+
+def main() -> None:
+    """Read the arguments and write the picture."""
+    parser = argparse.ArgumentParser(description="Draw how a submap becomes its three signatures.")
+    parser.add_argument("map", type=Path, help="a nav2 map.yaml")
+    parser.add_argument("--submap", type=int, help="its number; without it the one nearest the map's middle")
+    parser.add_argument("--out", type=Path, default=Path("signature_of_a_submap.png"))
+    arguments = parser.parse_args()
+    grid = load_map(arguments.map)
+    submaps = partition(grid)
+    if not submaps:
+        parser.error(f"{arguments.map} has no free space")
+    if arguments.submap is not None and not 0 <= arguments.submap < len(submaps):
+        parser.error(f"--submap: {arguments.map} has submaps 0 to {len(submaps) - 1}")
+    centers = np.array([submap.center_m for submap in submaps])
+    middle = int(np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1)))
+    chosen = submaps[middle if arguments.submap is None else arguments.submap]
+    draw(grid, submaps, chosen, arguments.map.stem).savefig(arguments.out, dpi=90)
+    print(f"wrote {arguments.out}")
+
+
+if __name__ == "__main__":
+    main()
