@@ -118,6 +118,8 @@ class Config(Section):
     read: ReadConfig = ReadConfig()
     registration: RegistrationConfig = RegistrationConfig()
     projection: ProjectionConfig = ProjectionConfig()
-    partition: PartitionConfig = PartitionConfig()
+    # A robot that has driven a few metres knows part of a disc of III-A, so by default submaps hold what is
+    # seen from their centre, nearby, and lie close enough for every place to have one.
+    partition: PartitionConfig = PartitionConfig(view="isovist", radius_m=5.0, spacing_m=1.0)
     signature: SignatureConfig = SignatureConfig()
     relocalize: RelocalizeConfig = RelocalizeConfig()

@@ -7,9 +7,8 @@ support. The answer is `located` only when one hypothesis stands clear of all ot
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -28,6 +27,7 @@ from signature.verify import Hypothesis, carry_on, distinct, search_everywhere, 
 
 if TYPE_CHECKING:
     from signature.database import SubmapDatabase
+    from signature.similarity import SignatureTable
 
 SCHEMA_VERSION = 1
 
@@ -117,24 +117,33 @@ def _plain(pose: SE2) -> dict[str, float]:
 
 
 class Building:
-    """A database made ready to be asked again and again: isovists and likelihood fields of its maps.
+    """Maps and their places made ready to be asked again and again: isovists and likelihood fields.
 
-    Nothing of the database is changed. Made once (tens of milliseconds a map), used for every query.
+    Made once (tens of milliseconds a map), used for every query; it changes nothing.
     """
 
-    def __init__(self, database: SubmapDatabase, config: Config) -> None:
-        """`config` gives the relocalize section; how to cut and describe comes from the database."""
-        self.made_with = database.config()
+    def __init__(
+        self, grids: Mapping[str, OccupancyGrid], table: SignatureTable, made_with: Config, config: Config
+    ) -> None:
+        """grids : map of each session, in the order that `table.session_index` counts.
+
+        made_with : how the places were cut and described; queries are treated alike.
+        config : its relocalize section says how to search and when to be sure.
+        """
+        self.made_with = made_with
         self.config = config.relocalize
-        self.projection = self.made_with.projection
-        self.sessions = tuple(info.name for info in database.sessions())
-        grids = {i: database.grid(name) for i, name in enumerate(self.sessions)}
-        self.places = Places.of(database.signatures(), grids, self.made_with.partition.radius_m)
-        self.fields: list[LikelihoodField] = [prepare(grids[i]) for i in range(len(self.sessions))]
-        self._free = [free_squares(grids[i]) for i in range(len(self.sessions))]
-        self._area_m2 = [
-            float(grids[i].free.sum()) * grids[i].resolution_m ** 2 for i in range(len(self.sessions))
-        ]
+        self.sessions = tuple(grids)
+        maps = tuple(grids.values())
+        self.places = Places.of(table, dict(enumerate(maps)), made_with.partition.radius_m)
+        self.fields: tuple[LikelihoodField, ...] = tuple(prepare(grid) for grid in maps)
+        self._free = tuple(free_squares(grid) for grid in maps)
+        self._area_m2 = tuple(float(grid.free.sum()) * grid.resolution_m**2 for grid in maps)
+
+    @staticmethod
+    def of(database: SubmapDatabase, config: Config) -> Building:
+        """Everything that is in a database."""
+        grids = {info.name: database.grid(info.name) for info in database.sessions()}
+        return Building(grids, database.signatures(), database.config(), config)
 
     def look_up(
         self, query: QueryMap, carried: tuple[Hypothesis, ...] = (), *, driven_m: float = 0.0
@@ -181,6 +190,68 @@ def free_squares(grid: OccupancyGrid, side_m: float = 0.8) -> F64:
     return np.asarray(corners + 0.5 * n * grid.resolution_m + np.asarray(grid.origin_m))
 
 
+class Relocalizer:
+    """Takes in a query scan by scan and can say at any time where it is.
+
+    Scans on which registration was lost are not used, and nothing seen before them is kept: what lies
+    between the two parts is unknown.
+    """
+
+    def __init__(self, building: Building) -> None:
+        self._building = building
+        self._clock = _Clock()
+        self._history: list[Moment] = []
+        self._forget()
+
+    def _forget(self) -> None:
+        self._window = Window(self._building.made_with.projection, self._building.config)
+        self._hypotheses: tuple[Hypothesis, ...] = ()
+        self._asked_m: float | None = None
+
+    @property
+    def path_m(self) -> float:
+        """Metres driven since the start, or since registration was lost."""
+        return self._window.path_m
+
+    def add(self, registered: RegisteredScan, sweep: Sweep) -> None:
+        """The next scan. Every `relocalize.step_m` of travel the database is asked again."""
+        self._clock.lap("register")
+        if registered.health is Health.LOST:
+            self._forget()
+            return
+        self._window.add(sweep, SE2.flatten(registered.T_map_base))
+        if self.path_m - (self._asked_m or 0.0) >= self._building.config.step_m:
+            query, status, sure = self._ask()
+            self._history.append(_moment(query, status, sure, self._hypotheses))
+
+    def answer(self) -> Answer:
+        """Where the query is by all that it has seen. Raises NoScans if no scan could be used."""
+        self._clock.lap("register")
+        if not len(self._window):
+            raise NoScans("no scan of the query could be registered", hint="look at it with `pc2grid info`")
+        query, status, sure = self._ask()
+        if status != "located":
+            # Signatures did not settle it: leave no place out, neither the right one nor a rival.
+            self._hypotheses = self._building.look_everywhere(query, self._hypotheses)
+            status, sure = self._building.judge(self._hypotheses, query)
+            self._clock.lap("search_everywhere")
+        history = (*self._history, _moment(query, status, sure, self._hypotheses))
+        return _answer(
+            self._building, query, status, sure, self._hypotheses, history, dict(self._clock.total_ms)
+        )
+
+    def _ask(self) -> tuple[QueryMap, Status, float]:
+        building = self._building
+        query = self._window.query(building.made_with.partition, building.made_with.signature)
+        self._clock.lap("describe")
+        driven = 0.0 if self._asked_m is None else self.path_m - self._asked_m
+        self._asked_m = self.path_m
+        self._hypotheses = building.look_up(query, self._hypotheses, driven_m=driven)
+        status, sure = building.judge(self._hypotheses, query)
+        self._clock.lap("look_up")
+        return query, status, sure
+
+
 def relocalize(
     query: Iterable[tuple[RegisteredScan, Sweep]],
     database: SubmapDatabase,
@@ -192,52 +263,14 @@ def relocalize(
     query : scans with their sweeps, from `pc2grid.pipeline.follow`, in any frame of their own.
     progress : called with (scans so far, metres driven).
 
-    Scans on which registration was lost are not used, and nothing seen before them is kept: what lies
-    between the two parts is unknown. Raises NoScans for a query without a usable scan.
+    Raises NoScans for a query without a usable scan.
     """
-    clock = _Clock()
-    building = Building(database, config)
-    clock.lap("open")
-    window = Window(building.projection, config.relocalize)
-    hypotheses: tuple[Hypothesis, ...] = ()
-    history: list[Moment] = []
-    asked_m = -math.inf
-    scans = 0
-    for registered, sweep in query:
-        scans += 1
-        if registered.health is Health.LOST:
-            window, hypotheses, asked_m = Window(building.projection, config.relocalize), (), -math.inf
-            continue
-        window.add(sweep, SE2.flatten(registered.T_map_base))
+    relocalizer = Relocalizer(Building.of(database, config))
+    for count, (registered, sweep) in enumerate(query, start=1):
+        relocalizer.add(registered, sweep)
         if progress is not None:
-            progress(scans, window.path_m)
-        clock.lap("register")
-        if window.path_m - asked_m >= config.relocalize.step_m and window.path_m > 0:
-            driven = 0.0 if math.isinf(asked_m) else window.path_m - asked_m
-            asked_m = window.path_m
-            local = window.query(building.made_with.partition, building.made_with.signature)
-            clock.lap("describe")
-            hypotheses = building.look_up(local, hypotheses, driven_m=driven)
-            status, sure = building.judge(hypotheses, local)
-            history.append(_moment(local, status, sure, hypotheses))
-            clock.lap("look_up")
-    if not len(window):
-        raise NoScans(
-            "the query has no scan on which registration held", hint="see `pc2grid info` on the log"
-        )
-    local = window.query(building.made_with.partition, building.made_with.signature)
-    clock.lap("describe")
-    driven = 0.0 if math.isinf(asked_m) else max(local.path_m - asked_m, 0.0)
-    hypotheses = building.look_up(local, hypotheses, driven_m=driven)
-    status, sure = building.judge(hypotheses, local)
-    clock.lap("look_up")
-    if status != "located":
-        # Signatures did not settle it: leave no place out, neither the right one nor a rival.
-        hypotheses = building.look_everywhere(local, hypotheses)
-        status, sure = building.judge(hypotheses, local)
-        clock.lap("search_everywhere")
-    history.append(_moment(local, status, sure, hypotheses))
-    return _answer(building, local, status, sure, hypotheses, history, clock)
+            progress(count, relocalizer.path_m)
+    return relocalizer.answer()
 
 
 def _moment(query: QueryMap, status: Status, sure: float, hypotheses: tuple[Hypothesis, ...]) -> Moment:
@@ -251,8 +284,8 @@ def _answer(
     status: Status,
     sure: float,
     hypotheses: tuple[Hypothesis, ...],
-    history: list[Moment],
-    clock: _Clock,
+    history: tuple[Moment, ...],
+    timing_ms: dict[str, float],
 ) -> Answer:
     located = hypotheses[0] if status == "located" else None
     table = building.places.table
@@ -266,12 +299,12 @@ def _answer(
         T_map_odom=T_map_query,
         confidence=sure,
         hypotheses=hypotheses,
-        history=tuple(history),
+        history=history,
         T_odom_base=query.T_odom_base,
         path_m=query.path_m,
         sessions=building.sessions,
         submap_ids=tuple(int(table.submap_id[h.row]) if h.row >= 0 else -1 for h in hypotheses),
-        timing_ms=clock.total_ms,
+        timing_ms=timing_ms,
     )
 
 
