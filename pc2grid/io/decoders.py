@@ -1,0 +1,17 @@
+"""The decoder for a topic's messages, by their encoding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from pc2grid.io import ros_messages
+from pc2grid.io.source import TopicInfo
+
+
+def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
+    """A function from a message's bytes to one of the classes of `ros_messages`.
+
+    Raises UnsupportedSchema if the type or encoding is not one that pc2grid reads.
+    """
+    return ros_messages.decoder_for(channel)

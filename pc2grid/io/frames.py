@@ -1,0 +1,185 @@
+"""The tree of coordinate frames of a log (tf), and looking up where one frame is in another."""
+
+from __future__ import annotations
+
+import bisect
+import difflib
+import math
+
+import numpy as np
+
+from pc2grid.errors import FrameError
+from pc2grid.geometry import F64, interpolate_pose, invert_pose, pose_from_xyz_quat
+from pc2grid.io.ros_messages import Seven, Transform
+
+# Between two samples farther apart than this nothing is known (a gap in the log).
+MAX_GAP_NS = 2_000_000_000
+# Before the first and after the last sample, it counts for this long.
+_HOLD_NS = 100_000_000
+_KEEP = 20_000
+
+
+def valid_pose(pose: Seven) -> bool:
+    """Whether translation and quaternion are finite and the quaternion has a direction."""
+    return all(map(math.isfinite, pose)) and sum(v * v for v in pose[3:]) > 1e-12
+
+
+class PoseTrack:
+    """Poses over time, of which the recent ones are kept; interpolated on demand."""
+
+    def __init__(self) -> None:
+        self._stamps: list[int] = []
+        self._poses: list[Seven] = []
+
+    def add(self, stamp_ns: int, pose: Seven) -> bool:
+        """Insert a sample by its stamp; a second one of the same stamp, or an invalid one, is not taken."""
+        if not valid_pose(pose):
+            return False
+        at = len(self._stamps)
+        if at and stamp_ns <= self._stamps[-1]:
+            at = bisect.bisect_left(self._stamps, stamp_ns)
+            if self._stamps[at] == stamp_ns:
+                return True
+        self._stamps.insert(at, stamp_ns)
+        self._poses.insert(at, pose)
+        if len(self._stamps) > 2 * _KEEP:
+            del self._stamps[:_KEEP], self._poses[:_KEEP]
+        return True
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def at(self, stamp_ns: int) -> F64 | None:
+        """Pose (4, 4) at a time: between two samples, or within 0.1 s of the nearest; None elsewhere."""
+        stamps = self._stamps
+        after = bisect.bisect_left(stamps, stamp_ns)
+        if after < len(stamps) and stamps[after] == stamp_ns:
+            return self._pose(after)
+        if 0 < after < len(stamps) and stamps[after] - stamps[after - 1] <= MAX_GAP_NS:
+            fraction = (stamp_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+            return interpolate_pose(self._pose(after - 1), self._pose(after), fraction)
+        near = [i for i in (after - 1, after) if 0 <= i < len(stamps)]
+        nearest = min(near, key=lambda i: abs(stamps[i] - stamp_ns), default=None)
+        if nearest is None or abs(stamps[nearest] - stamp_ns) > _HOLD_NS:
+            return None
+        return self._pose(nearest)
+
+    def _pose(self, index: int) -> F64:
+        values = self._poses[index]
+        return pose_from_xyz_quat(values[:3], values[3:])
+
+
+class FrameTree:
+    """Frames and their parents; edges are static or sampled over time."""
+
+    def __init__(self) -> None:
+        self._parent: dict[str, str] = {}
+        self._static: dict[str, F64] = {}
+        self._moving: dict[str, PoseTrack] = {}
+        self.warnings: list[str] = []
+        self._cache: dict[tuple[str, str], F64] = {}
+
+    def __contains__(self, frame: str) -> bool:
+        return frame in self._parent or frame in self._parent.values()
+
+    @property
+    def frames(self) -> list[str]:
+        """All known frames."""
+        return sorted({*self._parent, *self._parent.values()})
+
+    def add(self, edge: Transform, *, static: bool, log_time_ns: int = 0) -> None:
+        """Take up one transform; as in tf2, the latest parent of a frame counts."""
+        parent, child = edge.header.frame, edge.child
+        if not parent or not child or parent == child or not valid_pose(edge.pose):
+            self._warn(
+                f"a transform {parent or '?'} -> {child or '?'} of the log makes no sense and is ignored"
+            )
+            return
+        known = self._parent.get(child)
+        if known is not None and known != parent:
+            self._warn(f"frame {child} has two parents, {known} and {parent}: the latest counts")
+            self._moving.pop(child, None)
+            self._static.pop(child, None)
+        if known != parent:
+            self._cache.clear()
+        self._parent[child] = parent
+        if static:
+            self._static[child] = pose_from_xyz_quat(edge.pose[:3], edge.pose[3:])
+            self._cache.clear()
+        elif child not in self._static:
+            track = self._moving.setdefault(child, PoseTrack())
+            track.add(edge.header.stamp_ns or log_time_ns, edge.pose)
+
+    def chain(self, frame: str) -> list[str]:
+        """The frame, its parent, and so on to the root. Raises FrameError if that goes in a circle."""
+        chain = [frame]
+        while (parent := self._parent.get(chain[-1])) is not None:
+            if parent in chain:
+                raise FrameError(f"tf goes in a circle: {' -> '.join([*chain, parent])}")
+            chain.append(parent)
+        return chain
+
+    def connected(self, target: str, source: str) -> bool:
+        """Whether there is a path between two frames."""
+        return target == source or bool(set(self.chain(target)) & set(self.chain(source)))
+
+    def moving(self, target: str, source: str) -> bool:
+        """Whether a transform between two connected frames depends on time."""
+        return any(child not in self._static for child in self._path(target, source))
+
+    def lookup(self, target: str, source: str, stamp_ns: int) -> F64 | None:
+        """`T_target_source` (4, 4) at a time; None if a moving part of it is not known then.
+
+        Raises FrameError if the frames are not connected.
+        """
+        if target == source:
+            return np.eye(4)
+        cached = self._cache.get((target, source))
+        if cached is not None:
+            return cached
+        if not self.connected(target, source):
+            raise self.missing(source, target)
+        up, down = self.chain(source), self.chain(target)
+        common = next(frame for frame in up if frame in down)
+        T_common_source = self._climb(up[: up.index(common)], stamp_ns)
+        T_common_target = self._climb(down[: down.index(common)], stamp_ns)
+        if T_common_source is None or T_common_target is None:
+            return None
+        result = invert_pose(T_common_target) @ T_common_source
+        if not self.moving(target, source):
+            self._cache[target, source] = result
+        return result
+
+    def missing(self, frame: str, target: str) -> FrameError:
+        """The error for a frame that tf does not connect to `target`."""
+        known = self.frames
+        close = difflib.get_close_matches(frame, known, n=1)
+        guess = f"; did the driver mean {close[0]}?" if close and close[0] != frame else ""
+        listed = ", ".join(known[:12]) + (" ..." if len(known) > 12 else "") if known else "none"
+        return FrameError(
+            f"tf does not connect frame {frame or '(empty)'} to {target}{guess}; frames in the log: {listed}",
+            hint="--set read.assume_identity=true takes the sensor for the base, "
+            "--set read.base_frame=NAME chooses another base",
+        )
+
+    def _path(self, target: str, source: str) -> list[str]:
+        """Children of the edges between two connected frames."""
+        up, down = self.chain(source), self.chain(target)
+        common = next(frame for frame in up if frame in down)
+        return up[: up.index(common)] + down[: down.index(common)]
+
+    def _climb(self, children: list[str], stamp_ns: int) -> F64 | None:
+        """`T_top_bottom` from the first of `children` to the parent of the last."""
+        pose = np.eye(4)
+        for child in children:
+            edge = self._static.get(child)
+            if edge is None:
+                edge = self._moving[child].at(stamp_ns)
+            if edge is None:
+                return None
+            pose = edge @ pose
+        return pose
+
+    def _warn(self, sentence: str) -> None:
+        if sentence not in self.warnings:
+            self.warnings.append(sentence)

@@ -1,0 +1,54 @@
+"""LaserScan to points in the plane of the laser."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+
+from pc2grid.errors import LimitExceeded, PointCloudError
+from pc2grid.io.pointcloud2 import Points
+from pc2grid.io.ros_messages import LaserScan
+from pc2grid.model import F32
+
+
+def decode(scan: LaserScan, *, max_points: int = 20_000_000) -> Points:
+    """Returns of a scan: beams with NaN, inf, or a range outside [range_min, range_max) are dropped.
+
+    A range of exactly range_max is what most drivers write when nothing came back.
+    Offsets come from `time_increment` where it is set.
+
+    Raises PointCloudError if the angles contradict the number of ranges.
+    """
+    count = len(scan.ranges)
+    if count > max_points:
+        raise LimitExceeded(f"a scan of {count} beams; the limit is {max_points}")
+    numbers = (scan.angle_min, scan.angle_max, scan.angle_increment)
+    if not all(map(math.isfinite, numbers)):
+        raise PointCloudError(f"angles that are not finite: {numbers}")
+    if count > 1 and scan.angle_increment == 0:
+        raise PointCloudError("field angle_increment: 0")
+    if count > 1:
+        declared = (scan.angle_max - scan.angle_min) / scan.angle_increment + 1
+        if abs(declared - count) > max(2.0, 0.02 * count):
+            raise PointCloudError(f"{count} ranges where the angles make {declared:.0f}")
+    ranges = scan.ranges.astype(np.float32)
+    with np.errstate(invalid="ignore"):
+        keep = np.isfinite(ranges) & (ranges > 0) & (ranges >= scan.range_min)
+        if math.isfinite(scan.range_max) and scan.range_max > 0:
+            keep &= ranges < np.float32(scan.range_max)
+    kept = ranges[keep]
+    points = np.zeros((len(kept), 3), dtype=np.float32)
+    points[:, :2] = kept[:, None] * _directions(count, scan.angle_min, scan.angle_increment)[keep]
+    offsets = None
+    if math.isfinite(scan.time_increment) and abs(scan.time_increment) > 1e-9:
+        offsets = (np.flatnonzero(keep) * scan.time_increment).astype(np.float32)
+    return Points(points, offsets, count - len(kept))
+
+
+@functools.lru_cache(maxsize=16)
+def _directions(count: int, angle_min: float, angle_increment: float) -> F32:
+    """(count, 2) unit vectors of the beams."""
+    angles = angle_min + np.arange(count) * angle_increment
+    return np.column_stack((np.cos(angles), np.sin(angles))).astype(np.float32)

@@ -1,0 +1,344 @@
+"""MCAP files as a message source.
+
+With a sound summary, chunks are found by the index, so a part of a huge log costs what that part costs.
+Without one (a recorder that was killed, a damaged summary, `recover`), the file is surveyed once from the
+start and the index is made from what is there.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from pc2grid.config import ReadConfig
+from pc2grid.errors import LogCorrupt, LogTruncated
+from pc2grid.io import mcap_records as rec
+from pc2grid.io.mcap_records import ChunkIndex, Damage, Definitions, Fields
+from pc2grid.io.mcap_survey import Survey, survey
+from pc2grid.io.ros_definitions import short_name
+from pc2grid.io.source import Losses, LogInfo, RawMessage, TopicInfo
+
+_ENCODINGS = {"cdr": "cdr", "ros1": "ros1", "protobuf": "protobuf", "json": "json"}
+_PENDING_BYTES = 512 << 20
+
+
+class McapSource:
+    """One MCAP file, open.
+
+    Raises LogTruncated, LogCorrupt or LimitExceeded when it is opened or read; with `recover`, whatever is
+    whole is read and the rest is counted in `losses`.
+    """
+
+    def __init__(self, path: Path, config: ReadConfig, *, recover: bool = False) -> None:
+        self.files = (path,)
+        self.losses = Losses()
+        self._path = path
+        self._limits = rec.Limits(config.max_chunk_bytes, config.max_record_bytes)
+        self._recover = recover
+        self._stream: BinaryIO = path.open("rb")
+        try:
+            self._survey = self._look()
+            self.info = self._describe()
+        except BaseException:
+            self._stream.close()
+            raise
+        self._loose_checked = False
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+
+    # --- opening --------------------------------------------------------------------------------------
+
+    def _look(self) -> Survey:
+        """The index of the file: its own if it is sound, else one made by reading everything."""
+        size = self._path.stat().st_size
+        if not self._recover:
+            try:
+                found = read_summary(self._stream, size, self._limits)
+            except Damage as damage:
+                self.losses.warn(f"the index is not usable ({damage.what}); the log was read in full instead")
+            else:
+                if isinstance(found, Survey):
+                    self.losses.warnings += found.warnings
+                    return found
+                self.losses.warn(f"the log has no index ({found}); it was read in full instead")
+        made = survey(self._stream, size, self._limits, resync=self._recover)
+        self.losses.warnings += made.warnings
+        self.losses.bytes_lost += made.bytes_lost
+        if made.damage is not None and not self._recover:
+            seconds = (made.end_ns - made.start_ns) * 1e-9
+            count = sum(made.counts.values())
+            kind = LogTruncated if made.damage.truncated else LogCorrupt
+            raise kind(
+                f"{self._path}: {made.damage.what}, at byte {made.damage.offset} of {size}; "
+                f"{count} messages ({seconds:.1f} s) before it are readable",
+                hint="--recover reads what is whole",
+            )
+        return made
+
+    def _describe(self) -> LogInfo:
+        found = self._survey
+        self._topic_of: dict[int, TopicInfo] = {}
+        merged: dict[tuple[str, str, str], list[int]] = {}
+        for key, channel in found.definitions.channels.items():
+            schema = found.definitions.schemas.get(channel.schema_id, rec.RawSchema("", "", b""))
+            merged.setdefault((channel.topic, schema.name, channel.message_encoding), []).append(key)
+        for (topic, schema_name, encoding), keys in merged.items():
+            schema = found.definitions.schemas.get(
+                found.definitions.channels[keys[0]].schema_id, rec.RawSchema("", "", b"")
+            )
+            topic_info = TopicInfo(
+                topic=topic,
+                type=short_name(schema_name),
+                encoding=_ENCODINGS.get(encoding, encoding),
+                schema_encoding=schema.encoding,
+                schema=schema.data,
+                message_count=sum(found.counts.get(k, 0) for k in keys) if found.counted else None,
+            )
+            self._topic_of.update(dict.fromkeys(keys, topic_info))
+        topics = sorted(dict.fromkeys(self._topic_of.values()), key=lambda t: (t.topic, t.type))
+        dialects = Counter(t.encoding for t in topics)
+        dialect = {"cdr": "ros2"}.get(name := dialects.most_common(1)[0][0], name) if dialects else "empty"
+        return LogInfo(
+            path=self._path,
+            format=f"mcap/{dialect}",
+            size_bytes=self._path.stat().st_size,
+            start_ns=found.start_ns,
+            end_ns=found.end_ns,
+            message_count=sum(found.counts.values()) if found.counted else None,
+            topics=tuple(topics),
+            warnings=tuple(self.losses.warnings),
+        )
+
+    # --- reading --------------------------------------------------------------------------------------
+
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """See Source.messages. Chunks that overlap in time are merged, up to a bound in memory."""
+        wanted = frozenset(
+            key for key, channel in self._survey.definitions.channels.items() if channel.topic in topics
+        )
+        low = -1 if start_ns is None else start_ns
+        high = 1 << 64 if end_ns is None else end_ns
+        try:
+            yield from self._loose_messages(wanted, low, high)
+            yield from self._chunk_messages(wanted, low, high)
+        except Damage as damage:
+            raise LogCorrupt(
+                f"{self._path}: {damage.what}, at byte {damage.offset}", hint="--recover reads what is whole"
+            ) from damage
+
+    def _chunk_messages(self, wanted: frozenset[int], low: int, high: int) -> Iterator[RawMessage]:
+        chunks = [
+            chunk
+            for chunk in sorted(self._survey.chunks, key=lambda c: (c.start_ns, c.offset))
+            if chunk.end_ns >= low
+            and chunk.start_ns < high
+            and (chunk.channels is None or chunk.channels & wanted)
+        ]
+        pending: list[RawMessage] = []
+        pending_bytes = 0
+        for chunk in chunks:
+            if pending and (pending[0].log_time_ns < chunk.start_ns or pending_bytes > _PENDING_BYTES):
+                ready = len(pending)
+                if pending_bytes <= _PENDING_BYTES and pending[-1].log_time_ns >= chunk.start_ns:
+                    ready = next(i for i, m in enumerate(pending) if m.log_time_ns >= chunk.start_ns)
+                yield from pending[:ready]
+                del pending[:ready]
+                pending_bytes = sum(len(m.data) for m in pending)
+            for channel_id, log_time_ns, data in self._load(chunk, wanted):
+                if low <= log_time_ns < high:
+                    pending.append(RawMessage(self._topic_of[channel_id], log_time_ns, data))
+                    pending_bytes += len(data)
+            pending.sort(key=lambda m: m.log_time_ns)  # stable: equal times stay in file order
+        yield from pending
+
+    def _load(self, chunk: ChunkIndex, wanted: frozenset[int]) -> list[rec.ChunkMessage]:
+        try:
+            self._stream.seek(chunk.offset)
+            head = self._stream.read(rec.RECORD_HEAD)
+            if len(head) < rec.RECORD_HEAD or head[0] != rec.CHUNK:
+                raise Damage(chunk.offset, "the index points to something else")
+            length = int.from_bytes(head[1:], "little")
+            if length + rec.RECORD_HEAD != chunk.size:
+                raise Damage(chunk.offset, "the index gives another length")
+            data = self._stream.read(length)
+            if len(data) < length:
+                raise Damage(chunk.offset, "the file ends within it", truncated=True)
+            fields = rec.chunk_head(data, chunk.offset)
+            if (fields.start_ns, fields.end_ns) != (chunk.start_ns, chunk.end_ns):
+                raise Damage(chunk.offset, "the index gives other times")
+            if fields.crc == 0 and fields.uncompressed_size:
+                self.losses.warn("chunks of the log carry no checksum: damage would not be seen")
+            content = rec.decompress(data, fields, chunk.offset, self._limits)
+            return rec.chunk_messages(content, chunk.offset, self._survey.definitions, wanted)
+        except Damage as damage:
+            number = self._survey.chunks.index(chunk) + 1
+            where = f"chunk {number} ({self._when(chunk.start_ns)} to {self._when(chunk.end_ns)})"
+            raise Damage(damage.offset, f"{where}: {damage.what}", truncated=damage.truncated) from damage
+
+    def _when(self, stamp_ns: int) -> str:
+        return f"{(stamp_ns - self.info.start_ns) * 1e-9:.1f} s"
+
+    def _loose_messages(self, wanted: frozenset[int], low: int, high: int) -> Iterator[RawMessage]:
+        """Messages outside chunks, in file order; only the data section's checksum protects them."""
+        spans = self._survey.loose
+        if not spans:
+            return
+        if not self._loose_checked:
+            self._check_data_section()
+        kinds = frozenset({rec.MESSAGE})
+        for start, end in spans:
+            for record in rec.read_records(self._stream, start, end, self._limits, wanted=kinds):
+                if record.opcode != rec.MESSAGE:
+                    continue
+                view = memoryview(record.data)
+                fields = Fields(view, record.offset)
+                channel_id, _, log_time_ns = fields.number("<H"), fields.number("<I"), fields.number("<Q")
+                fields.number("<Q")
+                if channel_id in wanted and low <= log_time_ns < high:
+                    yield RawMessage(self._topic_of[channel_id], log_time_ns, view[fields.at :])
+
+    def _check_data_section(self) -> None:
+        found = self._survey
+        self._loose_checked = True
+        if not found.data_crc:
+            self.losses.warn("messages of the log carry no checksum: damage would not be seen")
+            return
+        crc, left = 0, found.data_end
+        self._stream.seek(0)
+        while left > 0 and (block := self._stream.read(min(left, 1 << 20))):
+            crc = zlib.crc32(block, crc)
+            left -= len(block)
+        if crc != found.data_crc:
+            if not self._recover:
+                raise Damage(found.data_end, "the checksum (CRC) of the data section is wrong")
+            doubtful = sum(end - start for start, end in found.loose)
+            self.losses.bytes_lost += doubtful
+            self.losses.warn(f"{doubtful} bytes of messages fail their checksum and may be wrong")
+
+
+def read_summary(stream: BinaryIO, size: int, limits: rec.Limits) -> Survey | str:
+    """The summary section as an index; a string says why there is none.
+
+    Raises Damage if there is one that cannot be trusted.
+    """
+    least = len(rec.MAGIC) + rec.FOOTER_SIZE + len(rec.MAGIC)
+    if size < least:
+        return "the recording was not finished"
+    foot = size - len(rec.MAGIC) - rec.FOOTER_SIZE
+    stream.seek(foot)
+    tail = stream.read(rec.FOOTER_SIZE + len(rec.MAGIC))
+    if tail[-8:] != rec.MAGIC or tail[0] != rec.FOOTER or int.from_bytes(tail[1:9], "little") != 20:
+        return "the recording was not finished"
+    summary_at = int.from_bytes(tail[9:17], "little")
+    crc = int.from_bytes(tail[25:29], "little")
+    if summary_at == 0:
+        return "its writer made none"
+    if not len(rec.MAGIC) <= summary_at <= foot:
+        raise Damage(foot, "the footer points outside of the file")
+    if foot - summary_at > limits.record_bytes:
+        raise Damage(foot, "the summary is larger than the limit")
+    stream.seek(summary_at)
+    section = stream.read(foot - summary_at)
+    if crc and zlib.crc32(tail[:25], zlib.crc32(section)) != crc:
+        raise Damage(summary_at, "its checksum (CRC) is wrong")
+
+    definitions = Definitions()
+    chunks: list[ChunkIndex] = []
+    statistics: tuple[int, ...] | None = None
+    counts: dict[int, int] = {}
+    kinds = frozenset({rec.SCHEMA, rec.CHANNEL, rec.CHUNK_INDEX, rec.STATISTICS})
+    for record in rec.read_records(stream, summary_at, foot, limits, wanted=kinds):
+        if record.opcode in (rec.SCHEMA, rec.CHANNEL):
+            definitions.take(record.opcode, record.data, record.offset)
+        elif record.opcode == rec.CHUNK_INDEX:
+            chunks.append(_chunk_index(record, summary_at))
+        elif record.opcode == rec.STATISTICS:
+            fields = Fields(record.data, record.offset)
+            statistics = tuple(
+                fields.number(code) for code in ("<Q", "<H", "<I", "<I", "<I", "<I", "<Q", "<Q")
+            )
+            pairs = Fields(fields.blob(), record.offset)
+            while not pairs.done:
+                key = pairs.number("<H")
+                counts[key] = pairs.number("<Q")
+    if statistics is None:
+        return "it has no statistics"
+    message_count, _, channel_count, _, _, chunk_count, start_ns, end_ns = statistics
+    if chunk_count != len(chunks):
+        return "it does not list the chunks"
+    if channel_count > len(definitions.channels):
+        return "it does not list the channels"
+    if any(c.channels is not None and not c.channels <= definitions.channels.keys() for c in chunks):
+        raise Damage(summary_at, "it names channels that are missing")
+    if message_count and not (chunks or definitions.channels):
+        return "it does not list the channels"
+    counted = sum(counts.values()) == message_count
+    chunks.sort(key=lambda c: c.offset)
+    loose, data_end, data_crc = _between_chunks(stream, chunks, summary_at, limits)
+    return Survey(
+        definitions=definitions,
+        chunks=chunks,
+        loose=loose,
+        counts=counts,
+        counted=counted,
+        start_ns=start_ns,
+        end_ns=end_ns,
+        data_end=data_end,
+        data_crc=data_crc,
+    )
+
+
+def _chunk_index(record: rec.Record, summary_at: int) -> ChunkIndex:
+    fields = Fields(record.data, record.offset)
+    start_ns, end_ns, offset, size = (fields.number("<Q") for _ in range(4))
+    offsets = Fields(fields.blob(), record.offset)
+    channels: set[int] = set()
+    while not offsets.done:
+        channels.add(offsets.number("<H"))
+        offsets.number("<Q")
+    index_size = fields.number("<Q")
+    after = offset + size + index_size
+    if offset < len(rec.MAGIC) or size < rec.RECORD_HEAD or after > summary_at:
+        raise Damage(record.offset, "it places a chunk outside of the data")
+    return ChunkIndex(offset, size, start_ns, end_ns, frozenset(channels) if channels else None, after)
+
+
+def _between_chunks(
+    stream: BinaryIO, chunks: list[ChunkIndex], data_end: int, limits: rec.Limits
+) -> tuple[list[tuple[int, int]], int, int]:
+    """Spans of the data section that hold messages outside chunks, its end, and its checksum."""
+    loose: list[tuple[int, int]] = []
+    at, crc = len(rec.MAGIC), 0
+    end_of_data = data_end
+    for stop, after in [*((c.offset, c.after) for c in chunks), (data_end, data_end)]:
+        if stop < at:
+            raise Damage(stop, "it lists chunks that overlap")
+        kinds = frozenset({rec.DATA_END})
+        if not chunks:
+            # A file without chunks: everything is one span, and walking it now would cost too much.
+            end_of_data, crc = _data_end(stream, data_end)
+            return [(at, end_of_data)], end_of_data, crc
+        for record in rec.read_records(stream, at, stop, limits, wanted=kinds):
+            if record.opcode == rec.DATA_END:
+                end_of_data, crc = record.offset, Fields(record.data, record.offset).number("<I")
+            elif record.opcode == rec.MESSAGE and (not loose or loose[-1] != (at, stop)):
+                loose.append((at, stop))
+        at = after
+    return loose, end_of_data, crc
+
+
+def _data_end(stream: BinaryIO, summary_at: int) -> tuple[int, int]:
+    """Offset and checksum of the DataEnd record, which stands right before the summary."""
+    offset = summary_at - rec.RECORD_HEAD - 4
+    stream.seek(max(offset, 0))
+    head = stream.read(rec.RECORD_HEAD + 4)
+    if offset < len(rec.MAGIC) or head[0] != rec.DATA_END or int.from_bytes(head[1:9], "little") != 4:
+        raise Damage(offset, "the data section has no end")
+    return offset, int.from_bytes(head[9:13], "little")

@@ -1,0 +1,178 @@
+"""PointCloud2 to points and per-point times, in every layout that the message allows.
+
+Points and times come out of one row selection, so they cannot fall out of step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.errors import LimitExceeded, PointCloudError
+from pc2grid.geometry import F64
+from pc2grid.io.ros_messages import PointCloud2
+from pc2grid.model import F32
+
+# sensor_msgs/PointField; 9 to 11 are PCL's, absent from the definition (ros2/common_interfaces#300).
+_DATATYPES = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    8: "f8",
+    9: "i8",
+    10: "u8",
+    11: "u1",
+}
+_TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "offset_time", "time_offset", "time_stamp", "ts")
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+# A sweep takes between 2 ms and 2 s, so the span of its times tells the unit: no two of them overlap.
+_SWEEP_S = (2e-3, 2.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """Returns of one scan in the sensor's frame.
+
+    xyz_m : (N, 3) finite. offsets_s : (N,) relative to the stamp, or None. dropped : returns left out.
+    note : a sentence for the user on how the times were understood, or None.
+    """
+
+    xyz_m: F32 | F64
+    offsets_s: F32 | None
+    dropped: int
+    note: str | None = None
+
+
+def decode(cloud: PointCloud2, *, unit: str = "auto", max_points: int = 20_000_000) -> Points:
+    """Points of a cloud: finite, without the returns at the exact origin that drivers write for "nothing".
+
+    unit : of the time field: `s`, `ms`, `us`, `ns`, `auto` (told by the span), `none` (ignore times).
+
+    Raises PointCloudError if the message contradicts itself, LimitExceeded above `max_points`.
+    """
+    rows = _rows(cloud, max_points)
+    xyz = _xyz(cloud, rows)
+    keep = np.isfinite(xyz).all(axis=1) & xyz.any(axis=1)
+    name = _time_field(cloud) if unit != "none" else None
+    seconds: F64 | None = None
+    note: str | None = None
+    if name is not None:
+        seconds, note = _offsets(rows[name].reshape(-1), cloud.header.stamp_ns, unit, keep, name)
+        if seconds is not None:
+            keep &= np.isfinite(seconds)
+    total = len(xyz)
+    everything = bool(keep.all())
+    points = xyz if everything else xyz[keep]
+    if points.dtype != np.float32:
+        points = points.astype(np.float64)
+    offsets = None if seconds is None else seconds[keep].astype(np.float32)
+    return Points(points, offsets, total - len(points), note)
+
+
+def _rows(cloud: PointCloud2, max_points: int) -> NDArray[Any]:
+    """The message's data as a structured (H, W) view of the fields that are used; nothing is copied."""
+    height, width, step = cloud.height, cloud.width, cloud.point_step
+    if height * width > max_points:
+        raise LimitExceeded(
+            f"a scan of {height * width} points; the limit is {max_points}",
+            hint="--set read.max_points=N raises it",
+        )
+    names, formats, offsets = [], [], []
+    seen: set[str] = set()
+    for name, offset, datatype, count in cloud.fields:
+        if name not in ("x", "y", "z") and name.lower() not in _TIME_FIELDS:
+            continue
+        if name in seen:
+            raise PointCloudError(f"field {name}: defined twice")
+        seen.add(name)
+        if datatype not in _DATATYPES:
+            raise PointCloudError(f"field {name}: unknown datatype {datatype}")
+        kind = np.dtype(("<", ">")[cloud.is_bigendian] + _DATATYPES[datatype])
+        if count > 1:
+            raise PointCloudError(f"field {name}: {count} values per point instead of one")
+        if offset + kind.itemsize > step:
+            raise PointCloudError(
+                f"field {name}: ends at byte {offset + kind.itemsize} of a {step}-byte point"
+            )
+        names.append(name)
+        formats.append(kind)
+        offsets.append(offset)
+    for name in ("x", "y", "z"):
+        if name not in seen:
+            raise PointCloudError(f"field {name}: missing")
+    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    if height * width == 0:
+        return np.empty((0, 0), dtype=dtype)
+    row_step = cloud.row_step if height > 1 and cloud.row_step else width * step
+    if row_step < width * step:
+        raise PointCloudError(f"rows of {row_step} bytes cannot hold {width} points of {step} bytes")
+    needed = (height - 1) * row_step + width * step
+    if len(cloud.data) < needed:
+        raise PointCloudError(f"{len(cloud.data)} bytes of data where {needed} are declared")
+    return np.ndarray((height, width), dtype=dtype, buffer=cloud.data, strides=(row_step, step))
+
+
+def _xyz(cloud: PointCloud2, rows: NDArray[Any]) -> F32 | F64:
+    """(N, 3): float32 if that is what the message holds (or fits in), else float64."""
+    formats = [rows.dtype[name] for name in ("x", "y", "z")]
+    exact = all(np.can_cast(f, np.float32) for f in formats)
+    xyz = np.empty((rows.size, 3), dtype=np.float32 if exact else np.float64)
+    for column, name in enumerate(("x", "y", "z")):
+        xyz[:, column] = rows[name].reshape(-1)
+    return xyz
+
+
+def _time_field(cloud: PointCloud2) -> str | None:
+    names = {name.lower(): name for name, *_ in cloud.fields}
+    return next((names[n] for n in _TIME_FIELDS if n in names), None)
+
+
+def _offsets(
+    values: NDArray[Any], stamp_ns: int, unit: str, keep: NDArray[np.bool_], name: str
+) -> tuple[F64 | None, str | None]:
+    """Seconds relative to the stamp, and how they were understood; None if all times are the same.
+
+    Raises PointCloudError if the unit cannot be told.
+    """
+    whole = values.dtype.kind in "iu"
+    usable = values[keep] if whole else values[keep & np.isfinite(values)]
+    if not len(usable):
+        return None, None
+    first, last = usable.min(), usable.max()
+    span = int(last) - int(first) if whole else float(last) - float(first)
+    if span == 0:
+        return None, f"the per-point times in field {name} are all the same: no deskewing"
+    if unit == "auto":
+        fitting = [u for u, s in _SECONDS.items() if _SWEEP_S[0] <= span * s <= _SWEEP_S[1]]
+        if not fitting:
+            raise PointCloudError(
+                f"field {name}: times that span {span} fit no unit",
+                hint="--set read.point_time=s|ms|us|ns|none says which",
+            )
+        unit = fitting[0]
+    scale = _SECONDS[unit]
+    stamp = stamp_ns * 1e-9
+    if abs(float(first) * scale) <= 10.0 and abs(float(last) * scale) <= 10.0:
+        with np.errstate(invalid="ignore"):
+            return values.astype(np.float64) * scale, None
+    note = None
+    if abs(float(first) * scale - stamp) <= 10.0:
+        if whole and scale == 1e-9:
+            relative = (values.astype(np.int64) - stamp_ns).astype(np.float64)  # in integers: exact
+        else:
+            relative = values.astype(np.float64) - stamp / scale
+    else:
+        note = f"the times in field {name} are of another clock: the first point is taken to be at the stamp"
+        if whole:
+            # Wraps round for unsigned types where an unused row lies before the first point: harmless.
+            relative = (values - first).astype(np.float64)
+        else:
+            relative = values.astype(np.float64) - float(first)
+    return relative * scale, note
