@@ -246,7 +246,8 @@ class Log:
             return base
         if not frames.frames and self._config.base_frame is None:
             self.note(
-                f"the log has no tf: frame {sensor_frame or '(empty)'} of the scans is taken for the robot's base"
+                f"the log has no tf: frame {sensor_frame or '(empty)'} of the scans "
+                "is taken for the robot's base"
             )
             return None
         if self._config.assume_identity:
@@ -256,7 +257,8 @@ class Log:
             return None
         if base is None and frames.frames:
             raise FrameError(
-                f"tf has none of the frames {', '.join(_BASE_FRAMES)}; there is: {', '.join(frames.frames[:12])}",
+                f"tf has none of the frames {', '.join(_BASE_FRAMES)}; "
+                f"there is: {', '.join(frames.frames[:12])}",
                 hint="--set read.base_frame=NAME says which is the robot's base",
             )
         raise frames.missing(sensor_frame, base or "the base")
@@ -489,7 +491,8 @@ class _Stream:
         assert self._error is not None
         kind = PointCloudError if self._good == 0 else LogCorrupt
         return kind(
-            f"{self._plan.scans.topic}: {self._bad} of {self._count} scans are unreadable: {self._error.message}",
+            f"{self._plan.scans.topic}: {self._bad} of {self._count} scans are unreadable: "
+            f"{self._error.message}",
             hint=self._error.hint,
         )
 
@@ -499,7 +502,7 @@ def _is_static(topic: TopicInfo) -> bool:
 
 
 def _tolerant(decode: Callable[[Any], Any], data: Any, otherwise: Any) -> Any:
-    """Decode a message that is only a help (tf, odometry); one that is too short is as if it was not there."""
+    """Decode a message that only helps (tf, odometry); one that is too short counts as not there."""
     try:
         return decode(data)
     except PointCloudError:

@@ -19,7 +19,7 @@ from pc2grid.io import mcap_records as rec
 from pc2grid.io.mcap_records import ChunkIndex, Damage, Definitions, Fields
 from pc2grid.io.mcap_survey import Survey, survey
 from pc2grid.io.ros_definitions import short_name
-from pc2grid.io.source import Losses, LogInfo, RawMessage, TopicInfo
+from pc2grid.io.source import LogInfo, Losses, RawMessage, TopicInfo
 
 _ENCODINGS = {"cdr": "cdr", "ros1": "ros1", "protobuf": "protobuf", "json": "json"}
 _PENDING_BYTES = 512 << 20
@@ -33,7 +33,7 @@ class McapSource:
     """
 
     def __init__(self, path: Path, config: ReadConfig, *, recover: bool = False) -> None:
-        self.files = (path,)
+        self.files: tuple[Path, ...] = (path,)
         self.losses = Losses()
         self._path = path
         self._limits = rec.Limits(config.max_chunk_bytes, config.max_record_bytes)

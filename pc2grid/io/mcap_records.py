@@ -250,7 +250,7 @@ def _unzstd(stored: memoryview, head: ChunkHead, offset: int) -> bytes:
 
 
 def _unlz4(stored: memoryview, head: ChunkHead, offset: int) -> bytes:
-    import lz4.frame
+    import lz4.frame  # type: ignore[import-untyped]
 
     try:
         decompressor = lz4.frame.LZ4FrameDecompressor()

@@ -59,7 +59,9 @@ def decode(cloud: PointCloud2, *, unit: str = "auto", max_points: int = 20_000_0
     """
     rows = _rows(cloud, max_points)
     xyz = _xyz(cloud, rows)
-    keep = np.isfinite(xyz).all(axis=1) & xyz.any(axis=1)
+    x, y, z = xyz.T  # by column: a reduction along rows of three is ten times slower
+    keep: NDArray[np.bool_] = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+    keep &= (x != 0) | (y != 0) | (z != 0)
     name = _time_field(cloud) if unit != "none" else None
     seconds: F64 | None = None
     note: str | None = None
@@ -170,9 +172,6 @@ def _offsets(
             relative = values.astype(np.float64) - stamp / scale
     else:
         note = f"the times in field {name} are of another clock: the first point is taken to be at the stamp"
-        if whole:
-            # Wraps round for unsigned types where an unused row lies before the first point: harmless.
-            relative = (values - first).astype(np.float64)
-        else:
-            relative = values.astype(np.float64) - float(first)
+        # Wraps round for unsigned types where an unused row lies before the first point: harmless.
+        relative = (values - first).astype(np.float64)
     return relative * scale, note

@@ -160,7 +160,7 @@ class Reader:
 
     def array(self, code: str, count: int | None = None) -> NDArray[Any]:
         """Numbers as a numpy array in the byte order of the message."""
-        dtype = np.dtype(code).newbyteorder(self.order)
+        dtype = np.dtype(self.order + code)
         return np.frombuffer(self.blob(dtype.itemsize, count), dtype=dtype)
 
     def text(self) -> str:
@@ -201,7 +201,8 @@ def _point_cloud(r: Reader) -> PointCloud2:
 
 def _laser_scan(r: Reader) -> LaserScan:
     header = r.header()
-    return LaserScan(header, *r.take("fffffff"), r.array("f4"))
+    low, high, step, time_step, scan_time, near, far = r.take("fffffff")
+    return LaserScan(header, low, high, step, time_step, scan_time, near, far, r.array("f4"))
 
 
 def _image(r: Reader) -> Image:

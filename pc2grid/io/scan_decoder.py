@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import PointCloudError
@@ -89,7 +90,8 @@ def _to_base(found: Points, T_base_sensor: F64, max_range_m: float) -> tuple[F32
         if float(squared.max()) > max_range_m**2:
             near = np.flatnonzero(squared <= max_range_m**2)
             xyz = np.where((squared <= max_range_m**2)[:, None], xyz, 0)
-    T = T_base_sensor.astype(xyz.dtype)
-    points = xyz @ T[:3, :3].T
-    points += T[:3, 3]
-    return points.astype(np.float32, copy=False), near
+    # Small coordinates stay in float32: half the memory traffic, and a rounding of micrometres.
+    kind: type = np.float32 if xyz.dtype == np.float32 else np.float64
+    T: NDArray[Any] = T_base_sensor.astype(kind)
+    points: F32 = (xyz @ T[:3, :3].T + T[:3, 3]).astype(np.float32, copy=False)
+    return points, near
