@@ -244,7 +244,9 @@ class Log:
                         break
         if base is not None and (sensor_frame == base or frames.connected(base, sensor_frame)):
             return base
-        if not frames.frames and self._config.base_frame is None:
+        # Where parts of the file are lost, tf may be among them: a guess would shift every scan.
+        lost = self._source.losses.bytes_lost and any(t.type in choosing.TF for t in self.info.topics)
+        if not frames.frames and self._config.base_frame is None and not lost:
             self.note(
                 f"the log has no tf: frame {sensor_frame or '(empty)'} of the scans "
                 "is taken for the robot's base"

@@ -7,6 +7,7 @@ start and the index is made from what is there.
 
 from __future__ import annotations
 
+import contextlib
 import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -66,7 +67,13 @@ class McapSource:
                     self.losses.warnings += found.warnings
                     return found
                 self.losses.warn(f"the log has no index ({found}); it was read in full instead")
-        made = survey(self._stream, size, self._limits, resync=self._recover)
+        known = Definitions()
+        if self._recover:
+            # A chunk may rest on definitions in an earlier one that is lost; the summary repeats them.
+            with contextlib.suppress(Damage):
+                found = read_summary(self._stream, size, self._limits)
+                known = found.definitions if isinstance(found, Survey) else known
+        made = survey(self._stream, size, self._limits, resync=self._recover, known=known)
         self.losses.warnings += made.warnings
         self.losses.bytes_lost += made.bytes_lost
         if made.damage is not None and not self._recover:

@@ -46,13 +46,14 @@ class Survey:
         self.end_ns = max(self.end_ns, log_time_ns)
 
 
-def survey(stream: BinaryIO, size: int, limits: rec.Limits, *, resync: bool) -> Survey:
+def survey(stream: BinaryIO, size: int, limits: rec.Limits, *, resync: bool, known: Definitions) -> Survey:
     """Read an MCAP from its start to its end and say what is in it.
 
+    known : definitions that are certain already.
     resync : go on behind damage, at the next whole chunk, and count the bytes between; else stop there.
     Raises LimitExceeded and UnsupportedSchema as `mcap_records.decompress` does (unless `resync`).
     """
-    found = Survey()
+    found = Survey(definitions=known)
     at = len(rec.MAGIC)
     while at < size:
         try:
