@@ -47,12 +47,10 @@ def sift(image: NDArray[np.uint8]) -> F32:
 
 
 def surf(image: NDArray[np.uint8]) -> F32:
-    """Up to 300 SURF descriptors (K, 64), the ones of strongest response; mahotas's."""
-    from mahotas.features import surf as mahotas_surf
+    """Up to 300 SURF descriptors (K, 64), the ones of strongest response."""
+    from signature.baselines.surf import surf_descriptors
 
-    # mahotas answers (K, 70): place, scale, score, sign and angle, then the descriptor.
-    descriptors = mahotas_surf.surf(image, max_points=MAX_FEATURES)[:, 6:]
-    return np.nan_to_num(np.asarray(descriptors, np.float32)).reshape(-1, 64)
+    return surf_descriptors(image, MAX_FEATURES)
 
 
 FEATURES: dict[str, Feature] = {"sift": sift, "surf": surf}
