@@ -55,6 +55,7 @@ class Answer:
     T_map_odom : puts the whole query trajectory into the map.
     confidence : probability that the best hypothesis is right.
     hypotheses : all that fit, best first. history : how the answer came to be.
+    evidence : features the confidence rests on (`signature.confidence.Evidence`); empty without hypotheses.
     """
 
     status: Status
@@ -70,6 +71,7 @@ class Answer:
     path_m: float
     sessions: tuple[str, ...]
     submap_ids: tuple[int, ...]
+    evidence: tuple[float, ...] = ()
     timing_ms: dict[str, float] = field(default_factory=dict)
 
     def to_json(
@@ -240,9 +242,13 @@ class Relocalizer:
             self._building, query, status, sure, self._hypotheses, history, dict(self._clock.total_ms)
         )
 
+    def query(self) -> QueryMap:
+        """What the query has seen over its last metres, described as the database is."""
+        return self._window.query(self._building.made_with.partition, self._building.made_with.signature)
+
     def _ask(self) -> tuple[QueryMap, Status, float]:
         building = self._building
-        query = self._window.query(building.made_with.partition, building.made_with.signature)
+        query = self.query()
         self._clock.lap("describe")
         driven = 0.0 if self._asked_m is None else self.path_m - self._asked_m
         self._asked_m = self.path_m
@@ -304,6 +310,7 @@ def _answer(
         path_m=query.path_m,
         sessions=building.sessions,
         submap_ids=tuple(int(table.submap_id[h.row]) if h.row >= 0 else -1 for h in hypotheses),
+        evidence=Evidence.of(hypotheses, len(query.aligned.walls_m)).features() if hypotheses else (),
         timing_ms=timing_ms,
     )
 
