@@ -46,18 +46,7 @@ def test_published_f1_shows_what_recall_is_of() -> None:
 
 
 def test_a_run_writes_its_cells_and_the_next_one_only_reads_them(maps: Path, tmp_path: Path) -> None:
-    arguments = [
-        "--maps",
-        str(maps),
-        "--out",
-        str(tmp_path),
-        "--queries",
-        "4",
-        "--jobs",
-        "1",
-        "--offset",
-        "0.5",
-    ]
+    arguments = ["--maps", str(maps), "--out", str(tmp_path), "--queries", "4", "--jobs", "1"]
     arguments += ["--offset", "0.5", "--methods", "proposed", "--methods", "shape_context"]
     first = runner.invoke(app, [*arguments, "--json"])
     assert first.exit_code == 0, first.output
