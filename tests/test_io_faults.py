@@ -136,7 +136,7 @@ def test_killed_recorder_reads_in_full_with_a_warning(
 
 def test_bit_flip_in_a_chunk(damaged: Callable[[bytes], Path], log_bytes: bytes) -> None:
     flipped = bytearray(log_bytes)
-    flipped[len(flipped) // 3] ^= 0x10
+    flipped[3 * len(flipped) // 4] ^= 0x10  # the second chunk: the first holds tf
     path = damaged(bytes(flipped))
     with pytest.raises(LogCorrupt, match=r"chunk \d+ \(.* s to .* s\).*--recover"):
         read(path)
