@@ -1,0 +1,134 @@
+"""What every engine of the submap database promises."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+from pc2grid.model import OccupancyGrid, SessionMap, Submap, Trajectory
+
+if TYPE_CHECKING:
+    from signature.config import Config
+    from signature.describe import Signature
+    from signature.similarity import SignatureTable
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Provenance:
+    """What made a session: enough to make it again. Holds no clock, so equal inputs give equal bytes.
+
+    source : file name of the recording or map (no folder: databases travel).
+    digest : sha256 of the recording, hex.
+    config : the whole effective configuration.
+    start_s, duration_s : which part of the recording, seconds from its start; duration None: to the end.
+    versions : program and library -> version.
+    """
+
+    source: str
+    digest: str
+    config: Config
+    start_s: float = 0.0
+    duration_s: float | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionInfo:
+    """A session as `db info` shows it.
+
+    name : unique within the database.
+    sensor : kind that made it, or "map".
+    submaps : how many.
+    area_m2 : free space in its grid.
+    path_m : distance driven; 0 for an imported map.
+    duration_s : time between first and last pose.
+    scans : poses in its trajectory.
+    warnings : what reading and mapping had to say.
+    lossy : whether data was lost on the way.
+    """
+
+    name: str
+    sensor: str
+    digest: str
+    submaps: int
+    resolution_m: float
+    area_m2: float
+    path_m: float
+    duration_s: float
+    scans: int
+    warnings: tuple[str, ...]
+    lossy: bool
+    provenance: Provenance
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing that `check` found: where (table and session) and what."""
+
+    where: str
+    what: str
+
+
+class SubmapDatabase(Protocol):
+    """Sessions and their submaps. Reading never changes it; `add` changes all or nothing.
+
+    Every read raises DatabaseCorrupt where a row does not match its checksum.
+    """
+
+    @property
+    def location(self) -> str:
+        """Path or URL, for messages."""
+        ...
+
+    def sessions(self) -> tuple[SessionInfo, ...]:
+        """All sessions in the order they were added."""
+        ...
+
+    def config(self) -> Config:
+        """The configuration that its sessions share (of the first); the default if there is none."""
+        ...
+
+    def signatures(self) -> SignatureTable:
+        """All signatures; `session_index` counts in the order of `sessions()`."""
+        ...
+
+    def grid(self, session: str) -> OccupancyGrid:
+        """Whole occupancy grid of a session."""
+        ...
+
+    def trajectory(self, session: str) -> Trajectory:
+        """Poses of the base in the session's map frame; empty for an imported map."""
+        ...
+
+    def submap(self, session: str, submap_id: int) -> Submap:
+        """One submap."""
+        ...
+
+    def submaps(self, session: str) -> Iterable[Submap]:
+        """All submaps of a session, by id."""
+        ...
+
+    def add(
+        self,
+        session_map: SessionMap,
+        signatures: Sequence[Signature],
+        provenance: Provenance,
+        *,
+        force: bool = False,
+    ) -> None:
+        """Store a session in one transaction. The same session again changes nothing; another one of the
+        same name is refused with DatabaseError, or replaced with `force`."""
+        ...
+
+    def check(self) -> tuple[Problem, ...]:
+        """Everything that is wrong with it; empty if sound."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the file or connection."""
+        ...
+
+    def __enter__(self) -> SubmapDatabase: ...
+
+    def __exit__(self, *_: Any) -> None: ...

@@ -1,0 +1,111 @@
+"""Changing a database as a whole: on a copy that takes the file's place at the end.
+
+A finished `*.submaps` file is never written to again. Readers keep the file they opened, complete and
+unlocked, on any file system and any read-only medium; whoever opens it later sees the next state. A
+writer that dies at any moment leaves the old state. One writer at a time: it holds a lock file beside
+the database, which the system releases with the process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+import socket
+import sqlite3
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from pc2grid.errors import DatabaseBusy, OutputError
+from pc2grid.io.atomic import replace_file
+from signature.database import schema
+
+BUSY_TIMEOUT_S = 30.0
+
+
+@contextlib.contextmanager
+def rewrite(path: Path, *, keep: bool, timeout_s: float = BUSY_TIMEOUT_S) -> Iterator[sqlite3.Connection]:
+    """Give the body a connection to change; when it ends well, `path` holds the result.
+
+    keep : start from what `path` holds; otherwise, or if there is nothing yet, from an empty database.
+
+    Raises DatabaseBusy if another writer does not finish within `timeout_s`, OutputError if the file
+    cannot be written, NotADatabase and its like if `path` cannot be kept.
+    """
+    target = Path(os.path.realpath(path))
+    with hold(target, timeout_s), replace_file(target) as copy:
+        kept = keep and target.exists() and target.stat().st_size > 0
+        if kept:
+            schema.inspect_header(target)
+            shutil.copyfile(target, copy)
+        connection = sqlite3.connect(copy, isolation_level=None)
+        try:
+            # The copy is nobody's yet: neither journal nor flushing has anything to protect.
+            connection.execute("PRAGMA journal_mode = OFF")
+            connection.execute("PRAGMA synchronous = OFF")
+            connection.execute("PRAGMA trusted_schema = OFF")
+            if kept:
+                schema.inspect_tables(connection, path)
+            else:
+                schema.initialise(connection)
+            connection.execute("BEGIN")
+            yield connection
+            connection.execute("COMMIT")
+        except sqlite3.OperationalError as error:
+            if "full" in str(error) or "disk I/O" in str(error):
+                raise OutputError(
+                    f"{path}: cannot write: {error}", hint="free some space, or write to another disk"
+                ) from error
+            raise
+        finally:
+            connection.close()
+
+
+@contextlib.contextmanager
+def hold(target: Path, timeout_s: float) -> Iterator[None]:
+    """Be the only writer of `target`; wait up to `timeout_s` for the one before.
+
+    Raises DatabaseBusy naming the holder, OutputError if the folder is not writable.
+    """
+    lock_path = target.with_name(f".{target.name}.lock")
+    deadline = time.monotonic() + timeout_s
+    while True:
+        try:
+            descriptor = os.open(lock_path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            raise OutputError(
+                f"{target}: cannot write: {error.strerror}",
+                hint="choose a folder that exists and you may write to",
+            ) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.pread(descriptor, 200, 0).decode("utf-8", "replace").strip()
+            os.close(descriptor)
+            if time.monotonic() >= deadline:
+                raise DatabaseBusy(
+                    f"{target}: being written by {holder or 'another process'}",
+                    hint="try again when it is done",
+                ) from None
+            time.sleep(0.05)
+            continue
+        if _is_at(descriptor, lock_path):
+            break
+        os.close(descriptor)  # the holder before us removed it: lock the new one
+    try:
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+        yield
+    finally:
+        lock_path.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    """Whether `path` still names the file that is open."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False

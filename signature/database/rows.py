@@ -1,0 +1,265 @@
+"""A session as rows of the file, and back."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sqlite3
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pc2grid.errors import DatabaseCorrupt, DatabaseError, DatabaseVersion
+from pc2grid.model import OccupancyGrid, SessionMap, Submap, Trajectory
+from signature.database import codec, schema
+from signature.database.protocol import Provenance, SessionInfo
+
+if TYPE_CHECKING:
+    from signature.config import Config
+    from signature.describe import Signature
+
+Row = dict[str, Any]
+
+
+def insert(connection: sqlite3.Connection, table: str, row: Row) -> None:
+    """Add a row with its checksum."""
+    columns = schema.COLUMNS[table]
+    values = [row[column] for column in columns]
+    marks = ", ".join("?" * (len(columns) + 1))
+    connection.execute(
+        f"INSERT INTO {table} ({', '.join(columns)}, crc32) VALUES ({marks})",
+        [*values, codec.row_crc(values)],
+    )
+
+
+def select(
+    connection: sqlite3.Connection, table: str, where: str = "1", *values: Any
+) -> Iterator[tuple[Row, bool]]:
+    """Rows with whether they match their checksum."""
+    columns = schema.COLUMNS[table]
+    order = "submap_id" if table == "submap" else columns[0]
+    query = f"SELECT {', '.join(columns)}, crc32 FROM {table} WHERE {where} ORDER BY {order}"
+    for *row, crc in connection.execute(query, values):
+        yield dict(zip(columns, row, strict=True)), codec.row_crc(row) == crc
+
+
+def insert_session(
+    connection: sqlite3.Connection,
+    session_id: int,
+    session_map: SessionMap,
+    signatures: Sequence[Signature],
+    provenance: Provenance,
+) -> None:
+    """Store everything of one session."""
+    trajectory, submaps = session_map.trajectory, session_map.submaps
+    if len(signatures) != len(submaps):
+        raise ValueError(f"{len(submaps)} submaps but {len(signatures)} signatures")
+    session = {
+        "id": session_id,
+        "name": session_map.session,
+        "sensor": session_map.sensor,
+        "document": document(session_map, provenance),
+    }
+    insert(connection, "session", session)
+    insert(connection, "grid", {"session_id": session_id, **_grid_row(session_map.grid)})
+    insert(
+        connection,
+        "trajectory",
+        {
+            "session_id": session_id,
+            "count": len(trajectory),
+            "stamps_ns": codec.pack_array(trajectory.stamps_ns, "<i8"),
+            "poses": codec.pack_poses(trajectory),
+            "health": codec.pack_health(trajectory),
+        },
+    )
+    for submap in submaps:
+        insert(connection, "submap", {"session_id": session_id, **_submap_row(submap)})
+    insert(connection, "signature", {"session_id": session_id, **signature_row(submaps, signatures)})
+
+
+def document(session_map: SessionMap, provenance: Provenance) -> str:
+    """What is known about a session besides its data, as canonical JSON: equal content, equal bytes."""
+    grid, trajectory, report = session_map.grid, session_map.trajectory, session_map.report
+    path_m = trajectory.path_m()
+    stamps = trajectory.stamps_ns
+    content = {
+        "digest": provenance.digest,
+        "source": provenance.source,
+        "start_s": provenance.start_s,
+        "duration_s": provenance.duration_s,
+        "versions": dict(provenance.versions),
+        "config": provenance.config.model_dump(mode="json"),
+        "submaps": len(session_map.submaps),
+        "area_m2": round(int(np.count_nonzero(grid.free)) * grid.resolution_m**2, 3),
+        "path_m": round(float(path_m[-1]), 3) if len(path_m) else 0.0,
+        "driven_s": round(float(stamps[-1] - stamps[0]) / 1e9, 3) if len(stamps) else 0.0,
+        "report": {
+            "scans_read": report.scans_read,
+            "points_dropped": report.points_dropped,
+            "scans_skipped": dict(report.scans_skipped),
+            "bytes_lost": report.bytes_lost,
+            "warnings": list(report.warnings),
+        },
+    }
+    return json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+
+
+def read_info(row: Row, resolution_m: float, scans: int, path: Path) -> SessionInfo:
+    """A session row as the caller sees it. Raises DatabaseVersion if its settings are from the future."""
+    from pydantic import ValidationError
+
+    from signature.config import Config
+
+    content = json.loads(row["document"])
+    try:
+        config = Config.model_validate(content["config"])
+    except ValidationError as error:
+        what = ".".join(map(str, error.errors()[0]["loc"]))
+        made_by = content["versions"].get("pc2grid", "an unknown version")
+        raise DatabaseVersion(
+            f"{path}: session {row['name']!r} was made by pc2grid {made_by} with the setting {what},"
+            " which this version does not understand",
+            hint="convert the recording again, or use that version",
+        ) from None
+    report = content["report"]
+    return SessionInfo(
+        name=row["name"],
+        sensor=row["sensor"],
+        digest=content["digest"],
+        submaps=content["submaps"],
+        resolution_m=resolution_m,
+        area_m2=content["area_m2"],
+        path_m=content["path_m"],
+        duration_s=content["driven_s"],
+        scans=scans,
+        warnings=tuple(report["warnings"]),
+        lossy=bool(report["scans_skipped"]) or report["bytes_lost"] > 0,
+        provenance=Provenance(
+            source=content["source"],
+            digest=content["digest"],
+            config=config,
+            start_s=content["start_s"],
+            duration_s=content["duration_s"],
+            versions=content["versions"],
+        ),
+    )
+
+
+def signature_row(submaps: Sequence[Submap], signatures: Sequence[Signature]) -> Row:
+    """All signatures of a session in one row."""
+
+    def stack(name: str, width: int) -> Any:
+        rows = [getattr(signature, name) for signature in signatures]
+        return np.stack(rows) if rows else np.empty((0, width), np.float32)
+
+    boundary, freespace = stack("boundary", 0), stack("freespace", 0)
+    return {
+        "count": len(submaps),
+        "boundary_bins": boundary.shape[1],
+        "freespace_bins": freespace.shape[1],
+        "submap_id": codec.pack_array(np.array([s.submap_id for s in submaps], np.int32), "<i4"),
+        "center_m": codec.pack_array(
+            np.array([s.center_m for s in submaps], np.float64).reshape(-1, 2), "<f8"
+        ),
+        "boundary": codec.pack_array(boundary, "<f4"),
+        "freespace": codec.pack_array(freespace, "<f4"),
+        "symmetry": codec.pack_array(stack("symmetry", 2), "<f4"),
+    }
+
+
+def read_signature_arrays(row: Row) -> dict[str, Any]:
+    """The arrays of a signature row by the names of SignatureTable. ValueError if they do not fit."""
+    n = row["count"]
+    return {
+        "submap_id": codec.unpack_array(row["submap_id"], "<i4", (n,)),
+        "center_m": codec.unpack_array(row["center_m"], "<f8", (n, 2)),
+        "boundary": codec.unpack_array(row["boundary"], "<f4", (n, row["boundary_bins"])),
+        "freespace": codec.unpack_array(row["freespace"], "<f4", (n, row["freespace_bins"])),
+        "symmetry": codec.unpack_array(row["symmetry"], "<f4", (n, 2)),
+    }
+
+
+def read_grid(row: Row) -> OccupancyGrid:
+    """A grid row, or the grid half of a submap row."""
+    return OccupancyGrid(
+        cells=codec.unpack_cells(row["cells"], row["height"], row["width"]),
+        resolution_m=row["resolution_m"],
+        origin_m=(row["origin_x_m"], row["origin_y_m"]),
+    )
+
+
+def read_submap(row: Row) -> Submap:
+    """A submap row."""
+    return Submap(
+        submap_id=row["submap_id"],
+        center_m=(row["center_x_m"], row["center_y_m"]),
+        radius_m=row["radius_m"],
+        grid=read_grid(row),
+    )
+
+
+def read_trajectory(row: Row) -> Trajectory:
+    """A trajectory row."""
+    n = row["count"]
+    return Trajectory(
+        stamps_ns=codec.unpack_array(row["stamps_ns"], "<i8", (n,)),  # type: ignore[arg-type]
+        T_map_base=codec.unpack_poses(row["poses"], n),
+        health=codec.unpack_health(row["health"]),
+    )
+
+
+def refuse_other_settings(known: SessionInfo, config: Config, resolution_m: float, path: Path) -> None:
+    """Signatures made differently must never be compared: all sessions share what shapes them.
+
+    Raises DatabaseError naming the first setting that differs.
+    """
+    pairs = [
+        (f"{section}.{key}", getattr(getattr(known.provenance.config, section), key), value)
+        for section in ("signature", "partition")
+        for key, value in getattr(config, section)
+    ]
+    pairs.append(("the map's resolution", known.resolution_m, resolution_m))
+    for name, was, now in pairs:
+        if was != now:
+            raise DatabaseError(
+                f"{path}: sessions made with {name} = {was!r} and with {now!r} cannot be compared",
+                hint="use the same settings, or another database",
+            )
+
+
+def corrupt(path: Path, where: str, what: str) -> DatabaseCorrupt:
+    """The error for a row that cannot be believed."""
+    return DatabaseCorrupt(f"{path}: damaged: {where}: {what}", hint=schema.SALVAGE)
+
+
+@contextlib.contextmanager
+def explained(path: Path, where: str) -> Iterator[None]:
+    """Whatever SQLite, the decoding or a model says about unbelievable content is DatabaseCorrupt."""
+    try:
+        yield
+    except (sqlite3.Error, ValueError, TypeError, OverflowError, LookupError, AttributeError) as error:
+        raise corrupt(path, where, f"{type(error).__name__}: {error}") from error
+
+
+def _grid_row(grid: OccupancyGrid) -> Row:
+    return {
+        "height": grid.cells.shape[0],
+        "width": grid.cells.shape[1],
+        "resolution_m": float(grid.resolution_m),
+        "origin_x_m": float(grid.origin_m[0]),
+        "origin_y_m": float(grid.origin_m[1]),
+        "cells": codec.pack_cells(grid),
+    }
+
+
+def _submap_row(submap: Submap) -> Row:
+    return {
+        "submap_id": int(submap.submap_id),
+        "center_x_m": float(submap.center_m[0]),
+        "center_y_m": float(submap.center_m[1]),
+        "radius_m": float(submap.radius_m),
+        **_grid_row(submap.grid),
+    }

@@ -1,0 +1,258 @@
+"""The submap database as one SQLite file."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+import numpy as np
+
+from pc2grid.errors import DatabaseError
+from pc2grid.io.atomic import refuse_existing
+from pc2grid.model import OccupancyGrid, SessionMap, Submap, Trajectory
+from signature.database import rows, schema
+from signature.database.protocol import Problem, Provenance, SessionInfo
+from signature.database.rewrite import BUSY_TIMEOUT_S, rewrite
+
+if TYPE_CHECKING:
+    from signature.config import Config
+    from signature.describe import Signature
+    from signature.similarity import SignatureTable
+
+Entry = tuple[SessionMap, "Sequence[Signature]", Provenance]
+
+
+def store(
+    path: Path,
+    entries: Sequence[Entry],
+    *,
+    keep: bool,
+    force: bool = False,
+    timeout_s: float = BUSY_TIMEOUT_S,
+) -> None:
+    """Write sessions to a file, all or none.
+
+    keep : add them to what the file holds; otherwise they become its whole content.
+    force : a session of the same name is replaced instead of refused.
+
+    Raises DatabaseError for a session of that name with other content, or with signatures that cannot be
+    compared with the others'; DatabaseBusy; OutputError.
+    """
+    with rewrite(path, keep=keep, timeout_s=timeout_s) as connection:
+        for session_map, signatures, provenance in entries:
+            present = read_sessions(connection, path)
+            name = session_map.session
+            old = next((session_id for session_id, info in present if info.name == name), None)
+            others = [info for session_id, info in present if session_id != old]
+            if others:
+                resolution_m = session_map.grid.resolution_m
+                rows.refuse_other_settings(others[0], provenance.config, resolution_m, path)
+            if old is not None:
+                if not force and _same(connection, old, session_map, provenance):
+                    continue
+                if not force:
+                    raise DatabaseError(
+                        f"{path}: holds another session named {name!r} already",
+                        hint="--force replaces it; --name gives this one another name",
+                    )
+                remove(connection, old)
+            taken = [session_id for session_id, _ in present]
+            new = old if old is not None else max(taken, default=0) + 1
+            rows.insert_session(connection, new, session_map, signatures, provenance)
+
+
+def remove(connection: sqlite3.Connection, session_id: int) -> None:
+    """Delete all rows of a session."""
+    for table in schema.TABLES:
+        column = "id" if table == "session" else "session_id"
+        connection.execute(f"DELETE FROM {table} WHERE {column} = ?", (session_id,))
+
+
+def read_sessions(connection: sqlite3.Connection, path: Path) -> list[tuple[int, SessionInfo]]:
+    """All sessions with their numbers. Raises DatabaseCorrupt."""
+    sessions = []
+    with rows.explained(path, "session"):
+        # The sizes come from rows whose own checksum is looked at when they are used.
+        resolution_m = dict(connection.execute("SELECT session_id, resolution_m FROM grid"))
+        scans = dict(connection.execute("SELECT session_id, count FROM trajectory"))
+        for row, sound in rows.select(connection, "session"):
+            if not sound:
+                raise rows.corrupt(path, f"session {row['id']}", "wrong checksum")
+            info = rows.read_info(row, resolution_m[row["id"]], scans[row["id"]], path)
+            sessions.append((row["id"], info))
+    return sessions
+
+
+class SqliteDatabase:
+    """A `*.submaps` file. See `SubmapDatabase` for what the methods promise.
+
+    Open handles see the file as it was when they were opened; `add` moves its own handle on.
+    """
+
+    def __init__(self, path: Path, *, writable: bool = False) -> None:
+        self._path = path
+        self._writable = writable
+        self._open()
+
+    @classmethod
+    def create(cls, path: Path, *, force: bool = False) -> SqliteDatabase:
+        """See `create_database`."""
+        if not (path.exists() and path.stat().st_size == 0):
+            refuse_existing(path, force)
+        store(path, (), keep=False)
+        return cls(path, writable=True)
+
+    def _open(self) -> None:
+        schema.inspect_header(self._path)
+        real = os.path.realpath(self._path)
+        # Finished files are never written again, so no locks are needed and none are taken; unless
+        # another program left its journal beside the file.
+        journals = [Path(real + suffix) for suffix in ("-wal", "-journal")]
+        immutable = "" if any(journal.exists() for journal in journals) else "&immutable=1"
+        uri = f"file:{quote(real)}?mode=ro{immutable}"
+        with rows.explained(self._path, "header"):
+            self._connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+            try:
+                self._connection.execute("PRAGMA trusted_schema = OFF")
+                self._connection.execute("PRAGMA mmap_size = 1073741824")
+                schema.inspect_tables(self._connection, self._path)
+            except BaseException:
+                self._connection.close()
+                raise
+
+    @property
+    def location(self) -> str:
+        """Path of the file."""
+        return str(self._path)
+
+    def sessions(self) -> tuple[SessionInfo, ...]:
+        """All sessions in the order they were added."""
+        return tuple(info for _, info in read_sessions(self._connection, self._path))
+
+    def config(self) -> Config:
+        """The configuration of the first session; the default if there is none."""
+        from signature.config import Config
+
+        sessions = self.sessions()
+        return sessions[0].provenance.config if sessions else Config()
+
+    def signatures(self) -> SignatureTable:
+        """All signatures; `session_index` counts in the order of `sessions()`."""
+        from signature.similarity import SignatureTable
+
+        parts: list[dict[str, Any]] = []
+        index = {session_id: i for i, session_id in enumerate(self._ids().values())}
+        with rows.explained(self._path, "signatures"):
+            for row, sound in rows.select(self._connection, "signature"):
+                where = f"signatures of session {row['session_id']}"
+                if not sound:
+                    raise rows.corrupt(self._path, where, "wrong checksum")
+                if row["count"]:
+                    arrays = rows.read_signature_arrays(row)
+                    arrays["session_index"] = np.full(row["count"], index[row["session_id"]], np.int32)
+                    parts.append(arrays)
+            if not parts:
+                return SignatureTable.of((), np.empty((0, 2)))
+            names = ("boundary", "freespace", "symmetry", "session_index", "submap_id", "center_m")
+            return SignatureTable(**{name: _joined([part[name] for part in parts]) for name in names})
+
+    def grid(self, session: str) -> OccupancyGrid:
+        """Whole occupancy grid of a session."""
+        row = self._row("grid", session, "session_id = ?", self._id(session))
+        with rows.explained(self._path, f"grid of session {session!r}"):
+            return rows.read_grid(row)
+
+    def trajectory(self, session: str) -> Trajectory:
+        """Poses of the base in the session's map frame."""
+        row = self._row("trajectory", session, "session_id = ?", self._id(session))
+        with rows.explained(self._path, f"trajectory of session {session!r}"):
+            return rows.read_trajectory(row)
+
+    def submap(self, session: str, submap_id: int) -> Submap:
+        """One submap. Raises DatabaseError if the session has none of that number."""
+        where = "session_id = ? AND submap_id = ?"
+        row = self._row("submap", session, where, self._id(session), int(submap_id))
+        with rows.explained(self._path, f"submap {submap_id} of session {session!r}"):
+            return rows.read_submap(row)
+
+    def submaps(self, session: str) -> Iterator[Submap]:
+        """All submaps of a session, by id."""
+        session_id = self._id(session)
+        with rows.explained(self._path, f"submaps of session {session!r}"):
+            for row, sound in rows.select(self._connection, "submap", "session_id = ?", session_id):
+                if not sound:
+                    where = f"submap {row['submap_id']} of session {session!r}"
+                    raise rows.corrupt(self._path, where, "wrong checksum")
+                yield rows.read_submap(row)
+
+    def add(
+        self,
+        session_map: SessionMap,
+        signatures: Sequence[Signature],
+        provenance: Provenance,
+        *,
+        force: bool = False,
+    ) -> None:
+        """Store a session in one transaction; see `SubmapDatabase.add`."""
+        if not self._writable:
+            raise DatabaseError(f"{self._path}: opened for reading only")
+        store(self._path, [(session_map, signatures, provenance)], keep=True, force=force)
+        self.close()
+        self._open()
+
+    def check(self) -> tuple[Problem, ...]:
+        """Everything that is wrong with the file."""
+        from signature.database.upkeep import check
+
+        return check(self._path)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._connection.close()
+
+    def __enter__(self) -> SqliteDatabase:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+    def _ids(self) -> dict[str, int]:
+        with rows.explained(self._path, "session"):
+            return dict(self._connection.execute("SELECT name, id FROM session ORDER BY id"))
+
+    def _id(self, session: str) -> int:
+        ids = self._ids()
+        if session not in ids:
+            there = ", ".join(map(repr, ids)) or "none"
+            raise DatabaseError(f"{self._path}: no session {session!r}", hint=f"there are: {there}")
+        return ids[session]
+
+    def _row(self, table: str, session: str, where: str, *values: Any) -> rows.Row:
+        with rows.explained(self._path, f"{table} of session {session!r}"):
+            found = next(rows.select(self._connection, table, where, *values), None)
+            if found is None and table == "submap":
+                raise DatabaseError(f"{self._path}: session {session!r} has no submap {values[-1]}")
+            if found is None:
+                raise rows.corrupt(self._path, f"{table} of session {session!r}", "missing")
+            row, sound = found
+            if not sound:
+                what = f"submap {values[-1]}" if table == "submap" else table
+                raise rows.corrupt(self._path, f"{what} of session {session!r}", "wrong checksum")
+            return row
+
+
+def _joined(parts: list[Any]) -> Any:
+    """One array of several; a single one stays where it is."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _same(
+    connection: sqlite3.Connection, session_id: int, session_map: SessionMap, provenance: Provenance
+) -> bool:
+    """Whether a stored session came from the same recording, settings and versions as this one."""
+    (stored,) = connection.execute("SELECT document FROM session WHERE id = ?", (session_id,)).fetchone()
+    return bool(stored == rows.document(session_map, provenance))

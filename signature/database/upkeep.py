@@ -1,0 +1,224 @@
+"""Looking after databases: find damage, copy what is whole, put several together."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+
+from pc2grid.errors import DatabaseCorrupt, DatabaseError, Pc2GridError
+from signature.database import codec, rows, schema
+from signature.database.protocol import Problem
+from signature.database.rewrite import rewrite
+from signature.database.sqlite import read_sessions
+
+
+def check(path: Path) -> tuple[Problem, ...]:
+    """Read everything and list what is wrong; empty if the file is sound.
+
+    Raises NotADatabase or DatabaseVersion if it is not a file of this format at all.
+    """
+    problems: list[Problem] = []
+    try:
+        schema.inspect_header(path)
+    except DatabaseCorrupt as error:
+        problems.append(Problem("file", error.message))
+    with _read_only(path) as connection:
+        problems += _structure(connection, path)
+        for table in schema.TABLES:
+            problems += [problem for _, problem in _read_table(connection, path, table) if problem]
+        if not problems:
+            problems += _counts(connection, path)
+    return tuple(dict.fromkeys(problems))
+
+
+def copy(source: Path, target: Path, *, recover: bool = False, force: bool = False) -> tuple[Problem, ...]:
+    """Write a compact copy. With `recover`, damaged submaps and sessions are left out and returned.
+
+    Raises DatabaseCorrupt for damage without `recover`; OutputError if `target` exists without `force`.
+    """
+    from pc2grid.io.atomic import refuse_existing
+
+    refuse_existing(target, force)
+    problems = check(source)
+    if problems and not recover:
+        more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
+        raise rows.corrupt(source, problems[0].where, problems[0].what + more)
+    with rewrite(target, keep=False) as out, _read_only(source) as connection:
+        _copy_sessions(connection, source, out)
+    return problems
+
+
+def merge(sources: Sequence[Path], target: Path, *, force: bool = False) -> int:
+    """Put the sessions of several databases into a new one; returns how many.
+
+    A session that several of them hold is taken once. Raises DatabaseError if two different sessions
+    share a name, or were made with settings whose submaps cannot be compared.
+    """
+    from pc2grid.io.atomic import refuse_existing
+    from signature.database.sqlite import SqliteDatabase
+
+    refuse_existing(target, force)
+    seen: dict[str, tuple[str, Path]] = {}
+    with rewrite(target, keep=False) as out:
+        for source in sources:
+            with SqliteDatabase(source) as database, _read_only(source) as connection:
+                skip = set()
+                first = read_sessions(out, target)
+                for info in database.sessions():
+                    if first:
+                        rows.refuse_other_settings(
+                            first[0][1], info.provenance.config, info.resolution_m, source
+                        )
+                    document = _document(connection, info.name)
+                    known = seen.setdefault(info.name, (document, source))
+                    if known[0] != document:
+                        raise DatabaseError(
+                            f"{source}: its session {info.name!r} is not the {info.name!r} of {known[1]}",
+                            hint="convert one of them again under another name (--name)",
+                        )
+                    if known[1] != source:
+                        skip.add(info.name)
+                _copy_sessions(connection, source, out, skip=skip, strict=True)
+    return len(seen)
+
+
+@contextlib.contextmanager
+def _read_only(path: Path) -> Iterator[sqlite3.Connection]:
+    uri = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
+    with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
+        yield connection
+
+
+def _structure(connection: sqlite3.Connection, path: Path) -> list[Problem]:
+    problems = []
+    try:
+        schema.inspect_tables(connection, path)
+        for (message,) in connection.execute("PRAGMA integrity_check"):
+            problems += [Problem("file", line) for line in str(message).splitlines() if line != "ok"]
+        for table, rowid, *_ in connection.execute("PRAGMA foreign_key_check"):
+            problems.append(Problem(f"{table} row {rowid}", "belongs to no session"))
+    except Pc2GridError as error:
+        problems.append(Problem("file", error.message))
+    except sqlite3.Error as error:
+        problems.append(Problem("file", str(error)))
+    return problems
+
+
+def _read_table(
+    connection: sqlite3.Connection, path: Path, table: str, where: str = "1", *values: int
+) -> Iterator[tuple[rows.Row | None, Problem | None]]:
+    """Each row, and what is wrong with it: it must match its checksum and decode."""
+    try:
+        for row, sound in rows.select(connection, table, where, *values):
+            number = row["submap_id"] if table == "submap" else row.get("id", row.get("session_id"))
+            name = f"{table} {number}" + (f" of session {row['session_id']}" if table == "submap" else "")
+            try:
+                if not sound:
+                    raise ValueError("wrong checksum")
+                _decode(table, row, path)
+            except Exception as error:
+                # Whatever the decoding of damaged content stumbles over is the finding.
+                yield row, Problem(name, str(error))
+            else:
+                yield row, None
+    except sqlite3.Error as error:
+        yield None, Problem(table, str(error))
+
+
+def _decode(table: str, row: rows.Row, path: Path) -> None:
+    if table == "session":
+        rows.read_info(row, 1.0, 0, path)
+    elif table == "grid":
+        rows.read_grid(row)
+    elif table == "trajectory":
+        rows.read_trajectory(row)
+    elif table == "submap":
+        rows.read_submap(row)
+    else:
+        rows.read_signature_arrays(row)
+
+
+def _counts(connection: sqlite3.Connection, path: Path) -> Iterator[Problem]:
+    """Every session must be complete: no row lost as a whole."""
+    for session_id, info in read_sessions(connection, path):
+        for table in ("grid", "trajectory", "signature"):
+            query = f"SELECT count(*) FROM {table} WHERE session_id = ?"
+            if connection.execute(query, (session_id,)).fetchone() != (1,):
+                yield Problem(f"session {info.name!r}", f"has no {table}")
+        query = "SELECT submap_id FROM submap WHERE session_id = ? ORDER BY id"
+        ids = [submap_id for (submap_id,) in connection.execute(query, (session_id,))]
+        row = next(rows.select(connection, "signature", "session_id = ?", session_id), None)
+        described = list(rows.read_signature_arrays(row[0])["submap_id"]) if row else []
+        if not len(ids) == len(described) == info.submaps or ids != described:
+            yield Problem(
+                f"session {info.name!r}",
+                f"has {len(ids)} submaps and {len(described)} signatures where {info.submaps} were stored",
+            )
+
+
+def _copy_sessions(
+    connection: sqlite3.Connection,
+    source: Path,
+    out: sqlite3.Connection,
+    *,
+    skip: set[str] | frozenset[str] = frozenset(),
+    strict: bool = False,
+) -> None:
+    """Append the sessions of one file to another, row by row; what is damaged stays behind.
+
+    strict : raise DatabaseCorrupt instead of leaving anything behind.
+    """
+    (last,) = out.execute("SELECT coalesce(max(id), 0) FROM session").fetchone()
+    for session, problem in list(_read_table(connection, source, "session")):
+        if strict and problem:
+            raise rows.corrupt(source, problem.where, problem.what)
+        if session is None or problem or session["name"] in skip:
+            continue
+        parts = {
+            table: list(_read_table(connection, source, table, "session_id = ?", session["id"]))
+            for table in ("grid", "trajectory", "submap", "signature")
+        }
+        bad = [p for part in parts.values() for _, p in part if p]
+        if strict and bad:
+            raise rows.corrupt(source, bad[0].where, bad[0].what)
+        if any(len(parts[t]) != 1 or parts[t][0][1] for t in ("grid", "trajectory", "signature")):
+            continue
+        submaps = [row for row, fault in parts["submap"] if row is not None and fault is None]
+        signature = parts["signature"][0][0]
+        assert signature is not None
+        kept = {row["submap_id"] for row in submaps}
+        last += 1
+        rows.insert(
+            out, "session", {**session, "id": last, "document": _with_count(session["document"], len(kept))}
+        )
+        for table in ("grid", "trajectory"):
+            rows.insert(out, table, {**(parts[table][0][0] or {}), "session_id": last})
+        for row in submaps:
+            rows.insert(out, "submap", {**row, "session_id": last})
+        rows.insert(out, "signature", {**_only(signature, kept), "session_id": last})
+
+
+def _with_count(document: str, submaps: int) -> str:
+    import json
+
+    content = {**json.loads(document), "submaps": submaps}
+    return json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+
+
+def _only(signature: rows.Row, kept: set[int]) -> rows.Row:
+    """A signature row without the submaps that are not in `kept`."""
+    arrays = rows.read_signature_arrays(signature)
+    mask = np.isin(arrays["submap_id"], sorted(kept))
+    types = {"submap_id": "<i4", "center_m": "<f8", "boundary": "<f4", "freespace": "<f4", "symmetry": "<f4"}
+    packed = {name: codec.pack_array(arrays[name][mask], dtype) for name, dtype in types.items()}
+    return {**signature, "count": int(mask.sum()), **packed}
+
+
+def _document(connection: sqlite3.Connection, name: str) -> str:
+    (document,) = connection.execute("SELECT document FROM session WHERE name = ?", (name,)).fetchone()
+    return str(document)

@@ -1,0 +1,514 @@
+"""The submap database: what goes in comes out, whole or not at all, and damage is found."""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import os
+import sqlite3
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from pc2grid.errors import (
+    DatabaseBusy,
+    DatabaseCorrupt,
+    DatabaseError,
+    DatabaseVersion,
+    NotADatabase,
+    OutputError,
+    Pc2GridError,
+)
+from pc2grid.geometry import SE2
+from pc2grid.model import Health, OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
+from signature.config import Config
+from signature.database import Provenance, create_database, open_database
+from signature.database.rewrite import hold
+from signature.database.sqlite import store
+from signature.database.upkeep import check, copy, merge
+from signature.describe import Signature
+
+
+def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Config | None = None):
+    rng = np.random.default_rng(seed)
+    cells = rng.choice(np.array([-1, 0, 100, 37], np.int8), size=(40, 60))
+    grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-1.25, 2.0 / 3.0))
+    poses = np.stack([SE2(0.1 * i, 0.01 * i * i, 0.02 * i).lift() for i in range(7)])
+    trajectory = Trajectory(
+        stamps_ns=np.arange(7, dtype=np.int64) * 100_000_000 + 1_700_000_000_000_000_001,
+        T_map_base=poses,
+        health=(Health.FINE, Health.DEGENERATE, *[Health.FINE] * 4, Health.LOST),
+    )
+    parts = tuple(
+        Submap(
+            submap_id=i,
+            center_m=(0.1 * i + 1 / 3, -0.2 * i),
+            radius_m=0.4,
+            grid=grid.crop((0.1 * i, 1.0), 0.4),
+        )
+        for i in range(submaps)
+    )
+    signatures = [
+        Signature(
+            boundary=rng.random(20).astype(np.float32),
+            freespace=rng.random(10).astype(np.float32),
+            symmetry=rng.random(2).astype(np.float32),
+        )
+        for _ in parts
+    ]
+    session_map = SessionMap(
+        session=name,
+        sensor="lidar",
+        grid=grid,
+        submaps=parts,
+        trajectory=trajectory,
+        report=ReadReport(scans_read=7, warnings=("no per-point time",)),
+    )
+    digest = hashlib.sha256(f"{name}{seed}".encode()).hexdigest()
+    origin = Provenance(
+        source=f"{name}.mcap", digest=digest, config=config or Config(), versions={"pc2grid": "0.1.0"}
+    )
+    return session_map, signatures, origin
+
+
+def assert_holds(database, entry) -> None:
+    session_map, signatures, origin = entry
+    name = session_map.session
+    index = [info.name for info in database.sessions()].index(name)
+    info = database.sessions()[index]
+    assert (info.digest, info.provenance.config, info.submaps) == (
+        origin.digest,
+        origin.config,
+        len(signatures),
+    )
+    assert info.warnings == session_map.report.warnings
+    grid = database.grid(name)
+    assert np.array_equal(grid.cells, session_map.grid.cells)
+    assert (grid.resolution_m, grid.origin_m) == (session_map.grid.resolution_m, session_map.grid.origin_m)
+    trajectory = database.trajectory(name)
+    assert np.array_equal(trajectory.stamps_ns, session_map.trajectory.stamps_ns)
+    assert np.array_equal(trajectory.T_map_base, session_map.trajectory.T_map_base)
+    assert trajectory.health == session_map.trajectory.health
+    for wanted, got in zip(session_map.submaps, database.submaps(name), strict=True):
+        assert (got.submap_id, got.center_m, got.radius_m) == (
+            wanted.submap_id,
+            wanted.center_m,
+            wanted.radius_m,
+        )
+        assert np.array_equal(got.grid.cells, wanted.grid.cells)
+        assert np.array_equal(database.submap(name, wanted.submap_id).grid.cells, wanted.grid.cells)
+    table = database.signatures()
+    mine = table.session_index == index
+    for field in ("boundary", "freespace", "symmetry"):
+        stored = getattr(table, field)[mine]
+        assert np.array_equal(stored, np.array([getattr(s, field) for s in signatures]).reshape(stored.shape))
+    assert [tuple(c) for c in table.center_m[mine]] == [s.center_m for s in session_map.submaps]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    file = tmp_path / "odd name #1?%41.submaps"
+    store(file, [make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)], keep=False)
+    return file
+
+
+def test_what_goes_in_comes_out(path: Path) -> None:
+    with open_database(path) as database:
+        assert [info.name for info in database.sessions()] == ["monday", "tuesday"]
+        assert_holds(database, make_entry("monday", 0))
+        assert_holds(database, make_entry("tuesday", 1, submaps=5))
+        assert database.check() == ()
+        with pytest.raises(DatabaseError, match="no session 'sunday'"):
+            database.grid("sunday")
+        with pytest.raises(DatabaseError, match="has no submap 99"):
+            database.submap("monday", 99)
+
+
+def test_queries_leave_bytes_and_folder_as_they_are(path: Path) -> None:
+    before, folder = path.read_bytes(), sorted(path.parent.iterdir())
+    path.chmod(0o444)
+    with open_database(path) as database:
+        database.signatures()
+        database.grid("monday")
+        database.check()
+        assert sorted(path.parent.iterdir()) == folder
+        with pytest.raises(DatabaseError, match="reading only"):
+            database.add(*make_entry("wednesday", 2))
+    assert path.read_bytes() == before
+    assert sorted(path.parent.iterdir()) == folder == [path]
+
+
+def test_same_sessions_give_same_bytes(path: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.submaps"
+    store(other, [make_entry("monday", 0)], keep=False)
+    with open_database(other, writable=True) as database:
+        database.add(*make_entry("tuesday", 1, submaps=5))
+    copied = tmp_path / "copy.submaps"
+    copy(path, copied)
+    rebuilt = tmp_path / "rebuilt.submaps"
+    store(rebuilt, [make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)], keep=False)
+    assert path.read_bytes() == rebuilt.read_bytes()
+    with open_database(other) as a, open_database(copied) as b:
+        for database in (a, b):
+            assert_holds(database, make_entry("monday", 0))
+            assert_holds(database, make_entry("tuesday", 1, submaps=5))
+
+
+def test_adding_again_changes_nothing_and_another_of_the_name_needs_force(path: Path) -> None:
+    before = path.read_bytes()
+    with open_database(path, writable=True) as database:
+        database.add(*make_entry("monday", 0))
+        assert len(database.sessions()) == 2
+        with pytest.raises(DatabaseError, match="another session named 'monday'") as caught:
+            database.add(*make_entry("monday", 7))
+        assert "--force" in str(caught.value)
+        assert_holds(database, make_entry("monday", 0))
+        database.add(*make_entry("monday", 7), force=True)
+        assert_holds(database, make_entry("monday", 7))
+        assert_holds(database, make_entry("tuesday", 1, submaps=5))
+        assert database.check() == ()
+    assert path.read_bytes() != before
+
+
+def test_create_refuses_to_overwrite_and_leaves_the_file(path: Path) -> None:
+    before = path.read_bytes()
+    with pytest.raises(OutputError, match="exists"):
+        create_database(path)
+    assert path.read_bytes() == before
+    with create_database(path, force=True) as database:
+        assert database.sessions() == ()
+        assert len(database.signatures()) == 0
+
+
+def test_sessions_made_with_other_settings_are_not_mixed(path: Path) -> None:
+    config = Config.model_validate({"signature": {"boundary_bin_m": 0.3}})
+    before = path.read_bytes()
+    with (
+        open_database(path, writable=True) as database,
+        pytest.raises(DatabaseError, match=r"signature\.boundary_bin_m = 0\.2 and with 0\.3"),
+    ):
+        database.add(*make_entry("wednesday", 3, config=config))
+    assert path.read_bytes() == before
+
+
+def test_failure_in_the_middle_leaves_the_old_file_and_no_litter(path: Path) -> None:
+    before = path.read_bytes()
+    session_map, signatures, origin = make_entry("wednesday", 3)
+    with pytest.raises(ValueError, match="3 submaps but 2 signatures"):
+        store(path, [make_entry("friday", 4), (session_map, signatures[:-1], origin)], keep=True)
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+
+
+# --- faults 43 and 44 ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "error", "words"),
+    [
+        (b"", NotADatabase, "empty file"),
+        (b"hello", NotADatabase, "not a pc2grid database"),
+        (os.urandom(4096), NotADatabase, "not a pc2grid database"),
+        (b"SQLite format 3\0" + b"\0" * 20, DatabaseCorrupt, "truncated"),
+    ],
+)
+def test_what_is_not_a_database_is_said_to_be_none(tmp_path: Path, content, error, words) -> None:
+    file = tmp_path / "x.submaps"
+    file.write_bytes(content)
+    with pytest.raises(error, match=words):
+        open_database(file)
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_missing_file_folder_and_url(tmp_path: Path) -> None:
+    with pytest.raises(NotADatabase, match="no such database"):
+        open_database(tmp_path / "none.submaps")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(NotADatabase, match="folder"):
+        open_database(tmp_path)
+    with pytest.raises(DatabaseError, match="mongodb:// databases"):
+        open_database("mongodb://host/db")
+
+
+def test_sqlite_file_of_another_program(tmp_path: Path) -> None:
+    file = tmp_path / "places.sqlite"
+    connection = sqlite3.connect(file)
+    connection.execute("CREATE TABLE bookmarks (url TEXT)")
+    connection.commit()
+    connection.close()
+    with pytest.raises(NotADatabase, match="another program's SQLite file"):
+        open_database(file)
+
+
+def test_zero_byte_file_is_filled_without_force(tmp_path: Path) -> None:
+    file = tmp_path / "new.submaps"
+    file.touch()
+    with create_database(file) as database:
+        database.add(*make_entry())
+        assert_holds(database, make_entry())
+
+
+def test_newer_format_is_refused_by_number(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[60:64] = (99).to_bytes(4, "big")
+    path.write_bytes(data)
+    with pytest.raises(DatabaseVersion, match="format 99; this pc2grid reads up to 1"):
+        open_database(path)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.99])
+def test_truncated_file_is_seen_at_opening(path: Path, share: float) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises((DatabaseCorrupt, NotADatabase), match="truncated"):
+        open_database(path)
+
+
+def test_strangers_trigger_is_refused(path: Path) -> None:
+    connection = sqlite3.connect(path)
+    connection.execute("CREATE TRIGGER t AFTER INSERT ON session BEGIN DELETE FROM submap; END")
+    connection.commit()
+    connection.close()
+    with pytest.raises(DatabaseCorrupt, match="tables are not those"):
+        open_database(path)
+
+
+@pytest.mark.parametrize(
+    ("table", "column"),
+    [
+        ("grid", "cells"),
+        ("trajectory", "poses"),
+        ("submap", "cells"),
+        ("signature", "boundary"),
+        ("signature", "center_m"),
+    ],
+)
+def test_flipped_bit_in_any_blob_is_found_where_integrity_check_is_blind(path: Path, table, column) -> None:
+    connection = sqlite3.connect(path)
+    (blob,) = connection.execute(f"SELECT {column} FROM {table} LIMIT 1").fetchone()
+    connection.close()
+    data = bytearray(path.read_bytes())
+    at = data.find(blob[:64]) + min(len(blob), 64) // 2
+    data[at] ^= 4
+    path.write_bytes(data)
+    connection = sqlite3.connect(path)
+    assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    connection.close()
+
+    problems = check(path)
+    assert len(problems) == 1
+    assert table in problems[0].where
+    assert "checksum" in problems[0].what
+    with open_database(path) as database, pytest.raises(DatabaseCorrupt, match="checksum") as caught:
+        for info in database.sessions():
+            database.grid(info.name)
+            database.trajectory(info.name)
+            list(database.submaps(info.name))
+        database.signatures()
+    assert "db check" in str(caught.value)
+
+
+def test_copy_leaves_damaged_submaps_behind_only_when_told(path: Path, tmp_path: Path) -> None:
+    connection = sqlite3.connect(path)
+    connection.execute("UPDATE submap SET center_x_m = center_x_m + 1 WHERE session_id = 2 AND submap_id = 3")
+    connection.commit()
+    connection.close()
+    target = tmp_path / "good.submaps"
+    with pytest.raises(DatabaseCorrupt, match="submap 3 of session 2"):
+        copy(path, target)
+    assert not target.exists()
+    problems = copy(path, target, recover=True)
+    assert [p.where for p in problems] == ["submap 3 of session 2"]
+    assert check(target) == ()
+    with open_database(target) as database:
+        assert_holds(database, make_entry("monday", 0))
+        assert [s.submap_id for s in database.submaps("tuesday")] == [0, 1, 2, 4]
+        assert list(database.signatures().submap_id) == [0, 1, 2, 0, 1, 2, 4]
+
+
+def test_lost_row_is_found(path: Path) -> None:
+    connection = sqlite3.connect(path)
+    connection.execute("DELETE FROM submap WHERE session_id = 1 AND submap_id = 0")
+    connection.commit()
+    connection.close()
+    assert any("monday" in p.where and "3 were stored" in p.what for p in check(path))
+
+
+def test_fuzz_database_bytes(path: Path) -> None:
+    """A mutated file gives the same content or our error; never other content, never another exception."""
+    rounds = int(os.environ.get("PC2GRID_FUZZ", "300"))
+    clean = path.read_bytes()
+    with open_database(path) as database:
+        wanted = _everything(database)
+    rng = np.random.default_rng(43)
+    seen = {"same": 0, "refused": 0}
+    for _ in range(rounds):
+        data = bytearray(clean)
+        kind = rng.integers(4)
+        at = int(rng.integers(len(data)))
+        if kind == 0:
+            data = data[:at]
+        elif kind == 1:
+            data[at] ^= 1 << int(rng.integers(8))
+        elif kind == 2:
+            data[at : at + 16] = rng.bytes(len(data[at : at + 16]))
+        else:
+            other = int(rng.integers(len(data)))
+            data[at : at + 64] = data[other : other + 64][: len(data[at : at + 64])]
+        path.write_bytes(data)
+        try:
+            with open_database(path) as database:
+                got = _everything(database)
+        except Pc2GridError:
+            seen["refused"] += 1
+            continue
+        assert got == wanted
+        seen["same"] += 1
+    assert seen["refused"] > rounds // 2, seen
+
+
+def _everything(database) -> str:
+    digest = hashlib.sha256()
+    for info in database.sessions():
+        digest.update(repr(info).encode())
+        digest.update(database.grid(info.name).cells.tobytes())
+        digest.update(database.trajectory(info.name).T_map_base.tobytes())
+        for submap in database.submaps(info.name):
+            digest.update(repr((submap.submap_id, submap.center_m, submap.radius_m)).encode())
+            digest.update(submap.grid.cells.tobytes())
+    table = database.signatures()
+    for field in ("boundary", "freespace", "symmetry", "session_index", "submap_id", "center_m"):
+        digest.update(getattr(table, field).tobytes())
+    return digest.hexdigest()
+
+
+# --- merge --------------------------------------------------------------------------------------------
+
+
+def test_merge_takes_equal_sessions_once_and_refuses_namesakes(path: Path, tmp_path: Path) -> None:
+    second, third, out = (tmp_path / f"{name}.submaps" for name in ("second", "third", "out"))
+    store(second, [make_entry("tuesday", 1, submaps=5), make_entry("friday", 5)], keep=False)
+    assert merge([path, second], out) == 3
+    assert check(out) == ()
+    with open_database(out) as database:
+        for entry in (make_entry("monday", 0), make_entry("tuesday", 1, submaps=5), make_entry("friday", 5)):
+            assert_holds(database, entry)
+    store(third, [make_entry("monday", 9)], keep=False)
+    with pytest.raises(DatabaseError, match="'monday' is not the 'monday' of"):
+        merge([path, third], tmp_path / "no.submaps")
+    assert not (tmp_path / "no.submaps").exists()
+
+
+# --- fault 45: readers and writers --------------------------------------------------------------------
+
+
+def _write_sessions(file: str, names: list[str]) -> None:
+    for i, name in enumerate(names):
+        store(Path(file), [make_entry(name, i)], keep=True)
+
+
+def test_readers_see_whole_sessions_while_two_write(path: Path) -> None:
+    names = [[f"{writer}{i}" for i in range(12)] for writer in "ab"]
+    context = multiprocessing.get_context("spawn")
+    writers = [context.Process(target=_write_sessions, args=(str(path), part)) for part in names]
+    for writer in writers:
+        writer.start()
+    reads = 0
+    while any(writer.is_alive() for writer in writers):
+        with open_database(path) as database:
+            counts = [info.submaps for info in database.sessions()]
+            assert len(database.signatures()) == sum(counts)
+            assert len(list(database.submaps(database.sessions()[-1].name))) == counts[-1]
+        reads += 1
+    assert [writer.exitcode for writer in writers] == [0, 0]
+    assert reads > 0
+    with open_database(path) as database:
+        assert sorted(info.name for info in database.sessions()) == sorted(
+            ["monday", "tuesday", *names[0], *names[1]]
+        )
+    assert check(path) == ()
+    assert list(path.parent.iterdir()) == [path]
+
+
+def _hold_forever(file: str, ready) -> None:
+    with hold(Path(file), 1.0):
+        ready.set()
+        time.sleep(60)
+
+
+def test_second_writer_is_told_who_holds_it_and_a_killed_holder_is_no_obstacle(path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    ready = context.Event()
+    holder = context.Process(target=_hold_forever, args=(str(path.resolve()), ready))
+    holder.start()
+    assert ready.wait(30)
+    with pytest.raises(DatabaseBusy, match=f"being written by process {holder.pid} on "):
+        store(path, [make_entry("friday", 5)], keep=True, timeout_s=0.2)
+    with open_database(path) as database:
+        assert len(database.sessions()) == 2
+    holder.kill()
+    holder.join()
+    store(path, [make_entry("friday", 5)], keep=True, timeout_s=5)
+    assert check(path) == ()
+    assert list(path.parent.iterdir()) == [path]
+
+
+# --- the database against a dict ----------------------------------------------------------------------
+
+
+class DatabaseModel(RuleBasedStateMachine):
+    @initialize()
+    def start(self) -> None:
+        import tempfile
+
+        self.folder = tempfile.TemporaryDirectory()
+        self.path = Path(self.folder.name) / "model.submaps"
+        create_database(self.path).close()
+        self.model: dict[str, int] = {}
+
+    @rule(name=st.sampled_from("abc"), seed=st.integers(0, 2), force=st.booleans())
+    def add(self, name: str, seed: int, force: bool) -> None:
+        known = self.model.get(name)
+        with open_database(self.path, writable=True) as database:
+            if known is not None and known != seed and not force:
+                with pytest.raises(DatabaseError):
+                    database.add(*make_entry(name, seed), force=force)
+                return
+            database.add(*make_entry(name, seed), force=force)
+        self.model[name] = seed
+
+    @rule(name=st.sampled_from("abc"))
+    def fail(self, name: str) -> None:
+        session_map, signatures, origin = make_entry(name, 99)
+        with pytest.raises((ValueError, DatabaseError)):
+            store(self.path, [(session_map, signatures[:-1], origin)], keep=True, force=True)
+
+    @rule()
+    def compact(self) -> None:
+        other = self.path.with_name("other.submaps")
+        assert copy(self.path, other, force=True) == ()
+        other.replace(self.path)
+
+    @invariant()
+    def agrees(self) -> None:
+        if not hasattr(self, "model"):
+            return
+        with open_database(self.path) as database:
+            assert {info.name for info in database.sessions()} == set(self.model)
+            for name, seed in self.model.items():
+                assert_holds(database, make_entry(name, seed))
+        assert list(self.path.parent.iterdir()) == [self.path]
+
+    def teardown(self) -> None:
+        self.folder.cleanup()
+
+
+DatabaseModel.TestCase.settings = settings(
+    max_examples=15, stateful_step_count=12, deadline=None, suppress_health_check=list(HealthCheck)
+)
+TestDatabaseModel = DatabaseModel.TestCase

@@ -1,0 +1,133 @@
+"""What the user sees: one-line errors, exit codes, notes, progress. stdout is the result, stderr the rest."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any
+
+OK, FAILED, USAGE, LOSSY, UNSURE, INTERRUPTED = 0, 1, 2, 3, 4, 130
+
+
+class State:
+    """What the global options say; set once by `main`."""
+
+    verbosity = 0
+    debug = bool(os.environ.get("PC2GRID_DEBUG"))
+
+
+def note(message: str, *, level: int = 0) -> None:
+    """A line for the user; level 0 unless -q, level 1 with -v."""
+    if State.verbosity >= level:
+        print(f"pc2grid: {message}", file=sys.stderr)
+
+
+def warn(message: str) -> None:
+    """Something that the user should know although it worked; shown even with -q."""
+    print(f"pc2grid: warning: {_one_line(message)}", file=sys.stderr)
+
+
+def print_json(document: Any) -> None:
+    """The one document on stdout."""
+    print(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False))
+
+
+@contextlib.contextmanager
+def progress(what: str) -> Iterator[Callable[[float], None]]:
+    """Report a share 0..1 of the work: a bar on a terminal, otherwise a line every ten seconds."""
+    if State.verbosity < 0:
+        yield lambda share: None
+        return
+    if not sys.stderr.isatty():
+        yield _plain_progress(what)
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+
+
+def _plain_progress(what: str) -> Callable[[float], None]:
+    last = time.monotonic()
+
+    def update(share: float) -> None:
+        nonlocal last
+        if time.monotonic() - last >= 10.0:
+            last = time.monotonic()
+            print(f"pc2grid: {what}: {share:.0%}", file=sys.stderr)
+
+    return update
+
+
+def report_error(error: BaseException) -> int:
+    """Say what went wrong in one line, and what to do next in another; returns the exit code."""
+    from pc2grid.errors import Pc2GridError
+
+    if State.debug:
+        import traceback
+
+        traceback.print_exception(error)
+    if isinstance(error, Pc2GridError):
+        message, hint, code = error.message, error.hint, error.exit_code
+    elif isinstance(error, MemoryError):
+        message, hint, code = "out of memory", "try a shorter part: --start and --duration", FAILED
+    elif isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        message, hint, code = f"{where}{error.strerror or error}", None, FAILED
+    else:
+        message = f"internal error: {type(error).__name__}: {error}"
+        hint, code = "this is a bug; run again with --debug and report what it prints", FAILED
+    print(f"pc2grid: error: {_one_line(message)}", file=sys.stderr)
+    if hint:
+        print(f"hint: {_one_line(hint)}", file=sys.stderr)
+    return code
+
+
+def run(command: Callable[[], Any]) -> int:
+    """Run a command and turn everything that can happen into an exit code."""
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        result = command()
+        sys.stdout.flush()
+        return result if isinstance(result, int) else OK
+    except KeyboardInterrupt:
+        print("pc2grid: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read our output has seen enough. Python must not complain at exit either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    except Exception as error:
+        if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of typer's
+            return _report_usage(error)
+        return report_error(error)
+
+
+def _report_usage(error: Any) -> int:
+    context = getattr(error, "ctx", None)
+    if not error.format_message():
+        if context is not None:
+            print(context.get_help(), file=sys.stderr)
+        return USAGE
+    print(f"pc2grid: error: {_one_line(error.format_message())}", file=sys.stderr)
+    if context is not None:
+        print(f"hint: {context.command_path} --help", file=sys.stderr)
+    return USAGE
+
+
+def _terminate(signum: int, frame: FrameType | None) -> None:
+    raise SystemExit(128 + signum)
+
+
+def _one_line(text: str) -> str:
+    """No line breaks or control characters of a file's making reach the terminal."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(text))

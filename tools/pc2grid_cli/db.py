@@ -1,0 +1,106 @@
+"""`pc2grid db`: look after databases."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pc2grid_cli import console
+from pc2grid_cli.settings import AsJson, Force
+
+Database = Annotated[Path, typer.Argument(metavar="BUILDING.submaps", help="the database")]
+Output = Annotated[Path, typer.Option("--output", "-o", metavar="OUT.submaps", help="what to write")]
+
+
+def info_command(database: Database, json: AsJson = False) -> None:
+    """Show the sessions of a database.
+
+    Example: pc2grid db info building.submaps
+    """
+    from signature.database import open_database
+
+    with open_database(database) as opened:
+        sessions = opened.sessions()
+    if json:
+        documents = [
+            {
+                "name": s.name,
+                "sensor": s.sensor,
+                "source": s.provenance.source,
+                "digest": s.digest,
+                "submaps": s.submaps,
+                "resolution_m": s.resolution_m,
+                "area_m2": s.area_m2,
+                "path_m": s.path_m,
+                "duration_s": s.duration_s,
+                "scans": s.scans,
+                "lossy": s.lossy,
+                "warnings": list(s.warnings),
+                "versions": dict(s.provenance.versions),
+                "config": s.provenance.config.model_dump(mode="json"),
+            }
+            for s in sessions
+        ]
+        console.print_json({"schema_version": 1, "database": str(database), "sessions": documents})
+        return
+    print(f"{database}: {len(sessions)} sessions, {sum(s.submaps for s in sessions)} submaps")
+    for s in sessions:
+        travel = f", {s.scans} scans, {s.path_m:.1f} m in {s.duration_s:.0f} s" if s.scans else ""
+        print(f"  {s.name} ({s.sensor}): {s.submaps} submaps, {s.area_m2:.0f} m2 free{travel}")
+
+
+def check_command(database: Database, json: AsJson = False) -> None:
+    """Read everything in a database and list all damage; exit code 1 if there is any.
+
+    Example: pc2grid db check building.submaps
+    """
+    from signature.database.upkeep import check
+
+    problems = check(database)
+    if json:
+        found = [{"where": p.where, "what": p.what} for p in problems]
+        console.print_json({"schema_version": 1, "database": str(database), "problems": found})
+    elif not problems:
+        print(f"{database}: sound")
+    else:
+        for problem in problems:
+            print(f"{problem.where}: {problem.what}")
+    if problems:
+        raise typer.Exit(console.FAILED)
+
+
+def merge_command(
+    databases: Annotated[list[Path], typer.Argument(metavar="A.submaps B.submaps...", help="what to merge")],
+    output: Output,
+    force: Force = False,
+) -> None:
+    """Put the sessions of several databases into a new one.
+
+    Example: pc2grid db merge monday.submaps tuesday.submaps -o week.submaps
+    """
+    from signature.database.upkeep import merge
+
+    count = merge(databases, output, force=force)
+    print(f"{output}: {count} sessions")
+
+
+def copy_command(
+    database: Database,
+    output: Output,
+    recover: Annotated[bool, typer.Option("--recover", help="leave damaged parts out; exit code 3")] = False,
+    force: Force = False,
+) -> None:
+    """Write a compact copy of a database.
+
+    Example: pc2grid db copy --recover damaged.submaps -o good.submaps
+    """
+    from signature.database.upkeep import copy
+
+    problems = copy(database, output, recover=recover, force=force)
+    for problem in problems:
+        console.warn(f"left out: {problem.where}: {problem.what}")
+    print(f"{output}: {output.stat().st_size / 1e6:.1f} MB")
+    if problems:
+        raise typer.Exit(console.LOSSY)

@@ -1,0 +1,81 @@
+"""`pc2grid demo`: the whole way with simulated robots: map, query, answer, picture."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pc2grid_cli import console
+from pc2grid_cli.settings import Force
+
+BUILDING_SEED = 3
+MAP_LENGTH_M = 110.0
+QUERY_LENGTH_M = 18.0
+
+
+def demo_command(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="where to leave the files")] = Path(
+        "demo_out"
+    ),
+    force: Force = False,
+) -> None:
+    """Map a simulated office with a lidar, then find a robot with a depth camera in it.
+
+    Example: pc2grid demo
+    """
+    from pc2grid.io import open_log
+    from pc2grid.io.atomic import refuse_existing
+    from pc2grid.io.trajectory import read_tum
+    from pc2grid.simulate import SimulationConfig, simulate_session
+    from pc2grid_cli.convert import build_session
+    from pc2grid_cli.picture import draw_answer
+    from pc2grid_cli.relocalize import as_text, locate
+    from signature.build import add_sessions
+    from signature.config import Config
+    from signature.database import open_database
+
+    begin = time.monotonic()
+    lidar, depth = out / "lidar.mcap", out / "depth.mcap"
+    database, picture = out / "office.submaps", out / "answer.png"
+    for path in (lidar, depth, database, picture):
+        refuse_existing(path, force)
+    out.mkdir(parents=True, exist_ok=True)
+
+    console.note("1/4 simulate a robot with a lidar, and days later one with a depth camera")
+    with console.progress("simulate lidar") as update:
+        mapper = SimulationConfig(length_m=MAP_LENGTH_M, seed=1, building_seed=BUILDING_SEED)
+        simulate_session(lidar, sensor="lidar", grid=None, config=mapper, progress=update, force=force)
+    with console.progress("simulate depth") as update:
+        visitor = SimulationConfig(length_m=QUERY_LENGTH_M, seed=12, building_seed=BUILDING_SEED)
+        simulate_session(depth, sensor="depth", grid=None, config=visitor, progress=update, force=force)
+
+    console.note("2/4 convert the lidar's recording into a database")
+    config = Config()
+    session, origin = build_session(lidar, "lidar", config)
+    add_sessions(database, [(session, origin)], config, keep=False)
+
+    console.note("3/4 relocalize the depth camera's recording in it")
+    truth_map, truth_query = read_tum(lidar.with_suffix(".tum")), read_tum(depth.with_suffix(".tum"))
+    with open_database(database) as opened, open_log(depth, config.read) as query:
+        answer, poses = locate(query, opened, config)
+        # The database's frame is the lidar robot's first pose, the truth is in the floor plan's.
+        T_map_plan = next(truth_map.poses()).inverse()
+        true_poses = [T_map_plan @ pose for pose in truth_query.poses()]
+        console.note("4/4 draw it")
+        import numpy as np
+
+        draw_answer(picture, opened, answer, poses, np.array([(p.x, p.y) for p in true_poses]))
+    print(f"map: {len(session.trajectory)} lidar scans, {len(session.submaps)} submaps: {database}")
+    print(as_text(answer))
+    if answer.T_map_base is not None:
+        found, true = answer.T_map_base, true_poses[-1]
+        distance = math.hypot(found.x - true.x, found.y - true.y)
+        turn = abs(math.degrees(math.remainder(found.yaw - true.yaw, 2 * math.pi)))
+        print(f"truth: x {true.x:.2f} m, y {true.y:.2f} m: off by {distance:.2f} m and {turn:.1f} deg")
+    print(f"picture: {picture}   ({time.monotonic() - begin:.0f} s)")
+    if answer.status != "located":
+        raise typer.Exit(console.UNSURE)

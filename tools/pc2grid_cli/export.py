@@ -1,0 +1,81 @@
+"""`pc2grid export`: what is in a database, in the formats of others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pc2grid_cli import console
+from pc2grid_cli.settings import Force
+
+
+def export_command(
+    database: Annotated[Path, typer.Argument(metavar="BUILDING.submaps", help="the database")],
+    map_: Annotated[
+        Path | None, typer.Option("--map", metavar="STEM", help="STEM.yaml and STEM.pgm for nav2")
+    ] = None,
+    trajectory: Annotated[
+        Path | None, typer.Option("--trajectory", metavar="OUT.tum", help="poses of the base, for evo")
+    ] = None,
+    mcap: Annotated[
+        Path | None, typer.Option("--mcap", metavar="OUT.mcap", help="map and path for Foxglove")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", metavar="OUT.png", help="a picture of the map")
+    ] = None,
+    session: Annotated[str | None, typer.Option("--session", help="which, if there are several")] = None,
+    force: Force = False,
+) -> None:
+    """Write a session's map, trajectory or picture.
+
+    Example: pc2grid export building.submaps --map building --trajectory building.tum
+    """
+    from pc2grid.errors import ConfigError, DatabaseError
+    from pc2grid.io.atomic import refuse_existing
+    from signature.database import open_database
+
+    if map_ is None and trajectory is None and mcap is None and plot is None:
+        raise ConfigError(
+            "nothing to export", hint="name at least one of --map, --trajectory, --mcap, --plot"
+        )
+    targets = [path for path in (trajectory, mcap, plot) if path is not None]
+    if map_ is not None:
+        targets += [map_.with_name(map_.name + ".yaml"), map_.with_name(map_.name + ".pgm")]
+    for path in targets:
+        refuse_existing(path, force)
+    with open_database(database) as opened:
+        names = [info.name for info in opened.sessions()]
+        if session is None and len(names) != 1:
+            there = ", ".join(names) or "none"
+            raise DatabaseError(
+                f"{database}: holds {len(names)} sessions: {there}", hint="choose one with --session"
+            )
+        name = session or names[0]
+        grid, poses = opened.grid(name), opened.trajectory(name)
+        if map_ is not None:
+            from pc2grid.io.nav2_map import save_map
+
+            save_map(grid, map_)
+        if trajectory is not None:
+            if not len(poses):
+                raise DatabaseError(f"{database}: session {name!r} is an imported map and has no trajectory")
+            from pc2grid.io.trajectory import write_tum
+
+            write_tum(poses, trajectory)
+        if mcap is not None:
+            from pc2grid.io.mcap_out import LogWriter
+
+            with LogWriter(mcap, force=force) as writer:
+                writer.occupancy_grid("/map", int(poses.stamps_ns[0]) if len(poses) else 0, grid)
+                if len(poses):
+                    writer.path("/path", poses)
+                for stamp_ns, T_map_base in zip(poses.stamps_ns, poses.T_map_base, strict=True):
+                    writer.tf(int(stamp_ns), "map", "base_link", T_map_base)
+        if plot is not None:
+            from pc2grid_cli.picture import draw_session
+
+            draw_session(plot, opened, name)
+    for path in targets:
+        console.note(f"wrote {path}")
