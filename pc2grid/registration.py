@@ -17,27 +17,33 @@ from pc2grid.config import RegistrationConfig
 from pc2grid.geometry import F64
 from pc2grid.model import RegisteredScan, Scan
 
-_MAX_POINTS = 20_000  # per scan; voxelisation throws more away in any case
+_BRISK_MPS = 1.0  # how fast a robot or a person may move
 
 
 class KissRegistration:
     """KissICP.register_frame with a prior, single-threaded, hence repeatable.
 
-    The voxel and the range come from the first frame with returns, unless `config` fixes them: the range
-    of a room wants 0.1 m voxels, that of a hall 0.3 m.
+    carried : the sensor is in somebody's hands: six degrees of freedom, and nothing but ICP to find them.
+
+    The voxel and the range come from the first frame with returns and the time to the next, unless
+    `config` fixes them: the range of a room wants 0.1 m voxels, that of a hall, or two scans a second, more.
     """
 
-    def __init__(self, config: RegistrationConfig) -> None:
+    def __init__(self, config: RegistrationConfig, *, carried: bool = False) -> None:
         self._config = config
+        self._carried = carried
         self._kiss: Any = None
+        self._first: tuple[NDArray[np.float64], F64] | None = None
         self._pending: NDArray[np.float64] | None = None
 
-    def register(self, points_m: NDArray[np.floating], T_map_last: F64, predicted_motion: F64) -> F64:
+    def register(
+        self, points_m: NDArray[np.floating], T_map_last: F64, predicted_motion: F64, period_s: float
+    ) -> F64:
         """Align one frame.
 
         points_m : (N, 3) deskewed, without floor and ceiling, in the base frame.
         T_map_last : (4, 4) the pose that was settled on for the frame before.
-        predicted_motion : (4, 4) T_last_now.
+        predicted_motion : (4, 4) T_last_now. period_s : time since that frame.
 
         Returns T_map_base (4, 4). Frames without enough points return the prediction. The frame becomes
         part of KISS-ICP's map only by `integrate`.
@@ -46,7 +52,10 @@ class KissRegistration:
         predicted: F64 = T_map_last @ predicted_motion
         if len(points_m) < 10:
             return predicted
-        kiss = self._kiss or self._start(points_m)
+        if self._first is None:
+            self._first = np.ascontiguousarray(points_m, dtype=np.float64), predicted
+            return predicted
+        kiss = self._kiss or self._start(period_s)
         kiss.last_pose = T_map_last
         kiss.last_delta = predicted_motion
         kiss.register_frame(np.ascontiguousarray(points_m, dtype=np.float64), np.empty(0))
@@ -59,25 +68,32 @@ class KissRegistration:
             self._kiss.local_map.inner.update(self._pending, T_map_base)
             self._pending = None
 
-    def _start(self, points_m: NDArray[np.floating]) -> Any:
+    def _start(self, period_s: float) -> Any:
+        assert self._first is not None
+        points, pose = self._first
         from kiss_icp.config import KISSConfig
         from kiss_icp.kiss_icp import KissICP
 
-        ranges = np.linalg.norm(points_m, axis=1)
+        ranges = np.linalg.norm(points, axis=1)
         config = KISSConfig()
         config.data.deskew = False
         config.data.min_range = 0.0  # applied before, to all that a scan is used for
         config.data.max_range = self._config.max_range_m or float(
             np.clip(1.5 * np.percentile(ranges, 98), 10.0, 100.0)
         )
+        # ICP finds partners no farther than a voxel away, so it must span the motion between two frames.
+        finest = max(float(np.percentile(ranges, 75)) / 40.0, min(_BRISK_MPS * period_s, 0.5))
         config.mapping.voxel_size = self._config.voxel_m or float(
-            np.clip(np.percentile(ranges, 75) / 40.0, 0.1, 1.0)
+            np.clip(finest, 0.05 if self._carried else 0.1, 1.0)
         )
         config.registration.max_num_threads = 1
-        config.registration.max_num_iterations = 30  # what is left after that, the refinement does better
-        config.registration.convergence_criterion = 1e-3
-        config.adaptive_threshold.initial_threshold = 1.0
+        if not self._carried:
+            # What is left after that, the refinement in the plane does better.
+            config.registration.max_num_iterations = 30
+            config.registration.convergence_criterion = 1e-3
+            config.adaptive_threshold.initial_threshold = 1.0
         kiss = KissICP(config)
+        kiss.local_map.update(kiss.voxelize(points)[1], pose)
         kiss.local_map = _DeferredMap(kiss.local_map, self)
         self._kiss = kiss
         return kiss
@@ -102,7 +118,7 @@ class _DeferredMap:
         self._owner._pending = points
 
 
-def thin(points_m: NDArray[np.floating], count: int = _MAX_POINTS) -> NDArray[np.intp]:
+def thin(points_m: NDArray[np.floating], count: int) -> NDArray[np.intp]:
     """Indices of at most `count` of the points (N, 3), random but always the same, in order.
 
     Random, because a camera's regular pixel grid pulls ICP towards standing still as a lidar's rings do.

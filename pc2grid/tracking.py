@@ -67,7 +67,6 @@ class Tracker:
         self._last_keyframe: SE2 | None = None
         self._travel_m = 0.0
         self._rolling = True
-        self._height_m = 0.0
 
     def track(self, scan: Scan) -> Tracked:
         """Follow the next scan; stamps must increase."""
@@ -75,24 +74,26 @@ class Tracker:
         points = self._usable(scan, motion, motion_s)
         predicted: F64 = self._last_pose @ motion
         if self._last is None:
-            self._rolling = scan.sensor == "laser" or _is_planar(scan.T_odom_base)
+            self._rolling = scan.sensor == "laser" or _rolls(scan)
+            self._kiss = KissRegistration(self._config, carried=not self._rolling)
             if scan.sensor != "laser":
                 self._ground = _ground_at_start(points, scan.T_base_sensor)
-                self._height_m = self._ground.offset_m
                 predicted = self._ground.leveling()
             pose = predicted
-            self._kiss.register(self._without_floor(points), pose, np.eye(4))
+            self._kiss.register(self._without_floor(points), pose, np.eye(4), 0.0)
         else:
             self._follow_ground(points, scan, motion)
-            pose = self._kiss.register(self._without_floor(points), self._last_pose, motion)
+            pose = self._kiss.register(self._without_floor(points), self._last_pose, motion, motion_s)
             pose = self._hold_to_floor(pose)
         planar = SE2.flatten(pose)
         T_level_base = planar.inverse().lift() @ pose
         sweep = self._flatten(points, scan, T_level_base)
         information = np.zeros((3, 3))
         if self._last is not None and len(sweep.hits_m) >= 10:
-            planar, information = self._refine(sweep, planar, predicted, motion, measured)
-            pose = planar.lift() @ T_level_base
+            refined, information = self._refine(sweep, planar, predicted, motion, measured)
+            if self._rolling:
+                planar = refined
+                pose = planar.lift() @ T_level_base
         keyframe = self._extend_maps(sweep, planar)
         if keyframe:
             self._kiss.integrate(pose)
@@ -133,8 +134,8 @@ class Tracker:
         self._ground = expected if found is None else expected.toward(found, gain)
 
     def _without_floor(self, points: F32) -> F32:
-        if self._ground is None or not len(points):
-            return points
+        if self._ground is None or not len(points) or not self._rolling:
+            return points  # in the hand, the floor is what holds tilt and height
         heights = self._ground.heights(points)
         slack = 0.1 + 0.01 * np.hypot(points[:, 0], points[:, 1])
         keep = heights > slack
@@ -147,11 +148,9 @@ class Tracker:
         heading = SE2.flatten(pose).lift()
         if self._ground is None:
             return heading
-        if not self._ground.seen:
+        if not self._rolling:
             return pose
         held: F64 = heading @ self._ground.leveling()
-        if not self._rolling:
-            held[2, 3] = self._ground.offset_m - self._height_m
         # Levelling turns the shortest way; the heading must survive it.
         held[:3, :3] = (
             SE2(0.0, 0.0, SE2.flatten(pose).yaw - SE2.flatten(held).yaw).lift()[:3, :3] @ held[:3, :3]
@@ -223,5 +222,9 @@ def _ground_at_start(points: F32, T_base_sensor: F64) -> Ground:
     return mounted or find_ground(points, sensor) or assumed
 
 
-def _is_planar(T_odom_base: F64 | None) -> bool:
-    return T_odom_base is not None and abs(T_odom_base[2, 3]) < 1e-3 and T_odom_base[2, 2] > 1.0 - 1e-6
+def _rolls(scan: Scan) -> bool:
+    """Whether the base stays upright: its odometry is planar, or without odometry it carries the sensor."""
+    T = scan.T_odom_base
+    if T is None:
+        return float(scan.T_base_sensor[2, 3]) > 0.05
+    return abs(float(T[2, 3])) < 1e-3 and float(T[2, 2]) > 1.0 - 1e-6
