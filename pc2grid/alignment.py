@@ -214,7 +214,7 @@ class Fit:
     """How a query lies on a map at one pose.
 
     T_map_query : pose of the query's frame in the map.
-    forward : 0..1, mean likelihood of the query's walls where the map is known.
+    forward : 0..1, mean likelihood of the query's walls, neutral where the map is unknown.
     backward : 0..1, mean likelihood of the map's walls where the query has looked.
     overlap : 0..1, share of the query's walls that fall on known ground of the map.
     conflict : 0..1, share of known ground on which the two sides contradict each other clearly.
@@ -301,7 +301,8 @@ def search(
     apart_m, apart_rad : two reported poses differ by more than one of these.
     budget : boxes opened at most.
 
-    Returns (H, 4): x, y, yaw, score (mean likelihood over all points, 0..1, at the box centre).
+    Returns (H, 4): x, y, yaw of the centres of the smallest boxes, and the most (mean likelihood over the
+    points, 0..1) that any pose in the box can score.
     """
     if not len(walls_m) or not len(starts):
         return np.empty((0, 4))
@@ -447,7 +448,8 @@ def assess(target: LikelihoodField, query: Query, T_map_query: SE2, covariance: 
         query.resolution_m,
         np.array(query.origin_m),
     )
-    forward = total / seen if seen else 0.0
+    unseen = len(query.walls_m) - seen
+    forward = (total + NEUTRAL * unseen) / max(len(query.walls_m), 1)
     backward = echoed / looked if looked else 0.0
     overlap = seen / max(len(query.walls_m), 1)
     return Fit(
@@ -456,6 +458,6 @@ def assess(target: LikelihoodField, query: Query, T_map_query: SE2, covariance: 
         backward=backward,
         overlap=overlap,
         conflict=(clash + contradicted) / (seen + looked) if seen + looked else 1.0,
-        score=math.sqrt(forward * backward) * min(1.0, overlap / 0.5),
+        score=math.sqrt(forward * backward),
         covariance=covariance,
     )

@@ -1,58 +1,79 @@
-"""How sure is the best hypothesis? A calibrated probability from what can be seen of the hypotheses.
+"""How sure is the best hypothesis? A calibrated probability over all that fit, and over none of them.
 
-A logistic model of five plain features, fitted on simulated sessions in floor plans that its evaluation
-does not use (`tools/bench/fit_confidence.py` writes the coefficients and the reliability diagram).
+Every hypothesis competes with its rivals and with the possibility that the query was made elsewhere:
+
+    p_i = exp(k (s_i - s_0)) / (1 + sum_j exp(k (s_j - s_0)))
+
+with s the two-way score of `pc2grid.alignment.Fit`. s_0 is the score at which a lone hypothesis is as
+likely right as wrong, and k says how much a lead is worth; more walls seen make a lead worth more. The
+coefficients are fitted by maximum likelihood on simulated sessions (`fit`).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from pc2grid.geometry import F64
 from signature.verify import Hypothesis
+
+RIVALS = 5
+"""Hypotheses that take part; further ones add next to nothing."""
+MANY_WALLS = 1000.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """What the decision looks at.
+    """What the decision rests on.
 
-    score : of the best hypothesis (mean likelihood both ways), 0..1.
-    margin : its lead over the best rival elsewhere; the whole score if there is none.
-    conflict : share of common ground on which query and map contradict each other.
-    evidence : log10 of the query's wall points on known ground.
-    supported_m : travel over which the best hypothesis has been seen to fit, at most 10 m.
+    scores : of the best hypotheses, best first, at most `RIVALS`.
+    walls : wall points (0.1 m apart) of the query that lie on ground known to the best one.
     """
 
-    score: float
-    margin: float
-    conflict: float
-    evidence: float
-    supported_m: float
+    scores: tuple[float, ...]
+    walls: float
 
     @staticmethod
     def of(hypotheses: Sequence[Hypothesis], wall_points: int) -> Evidence:
-        """Evidence for the first of `hypotheses`, best first; there must be one."""
-        best = hypotheses[0]
-        rival = hypotheses[1].fit.score if len(hypotheses) > 1 else 0.0
+        """Evidence of hypotheses, best first, for a query of so many wall points."""
         return Evidence(
-            score=best.fit.score,
-            margin=best.fit.score - rival,
-            conflict=best.fit.conflict,
-            evidence=math.log10(1.0 + best.fit.overlap * wall_points),
-            supported_m=min(best.supported_m, 10.0),
+            scores=tuple(h.fit.score for h in hypotheses[:RIVALS]),
+            walls=hypotheses[0].fit.overlap * wall_points if hypotheses else 0.0,
         )
 
-    def features(self) -> tuple[float, ...]:
-        """In the order of `WEIGHTS`. The margin counts up to 0.3: more lead is not more truth."""
-        return (self.score, min(self.margin, 0.3), self.conflict, self.evidence, self.supported_m)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """Coefficients of the model: neutral score s_0, worth k of a lead seen with `MANY_WALLS`, and the
+    power with which k grows with the walls seen."""
+
+    neutral: float = 0.60
+    worth: float = 55.0
+    power: float = 0.3
+
+    def probabilities(self, evidence: Evidence) -> F64:
+        """(H + 1,) probabilities: of each hypothesis in order, and last of none of them."""
+        k = self.worth * min(1.0, max(evidence.walls, 1.0) / MANY_WALLS) ** self.power
+        logits = np.array([k * (score - self.neutral) for score in evidence.scores] + [0.0])
+        weights = np.exp(logits - logits.max())
+        return np.asarray(weights / weights.sum())
 
 
-WEIGHTS = (18.0, 20.0, -4.0, 1.5, 0.1)
-BIAS = -15.5
+CALIBRATION = Calibration()
 
 
-def confidence(evidence: Evidence) -> float:
-    """Probability, 0..1, that the best hypothesis is right."""
-    logit = BIAS + sum(w * f for w, f in zip(WEIGHTS, evidence.features(), strict=True))
-    return 1.0 / (1.0 + math.exp(-max(-40.0, min(40.0, logit))))
+def fit(evidence: Sequence[Evidence], right: Sequence[bool]) -> Calibration:
+    """Coefficients under which `right` (whether the best hypothesis was right) is most likely."""
+    from scipy.optimize import minimize
+
+    def loss(x: F64) -> float:
+        model = Calibration(neutral=float(x[0]), worth=float(np.exp(x[1])), power=float(x[2]))
+        p = np.array([model.probabilities(e)[0] if e.scores else 0.0 for e in evidence])
+        p = np.clip(p, 1e-4, 1 - 1e-4)
+        truth = np.asarray(right, dtype=bool)
+        return float(-np.log(np.where(truth, p, 1 - p)).mean() + 1e-3 * float(x[2]) ** 2)
+
+    best = minimize(loss, np.array([0.6, np.log(50.0), 0.3]), method="Nelder-Mead").x
+    return Calibration(neutral=float(best[0]), worth=float(np.exp(best[1])), power=float(best[2]))

@@ -109,7 +109,6 @@ class RelocalizeConfig(Section):
         description="where signatures do not settle it, maps up to this free area are searched as a whole",
     )
     accept: float = Field(0.9, gt=0, lt=1, description="least confidence to answer located")
-    plausible: float = Field(0.55, gt=0, lt=1, description="least score for a hypothesis to be named at all")
 
 
 class Config(Section):

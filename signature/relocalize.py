@@ -19,7 +19,7 @@ from pc2grid.errors import NoScans
 from pc2grid.geometry import F64, SE2
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from pc2grid.sweep import Sweep
-from signature.confidence import Evidence, confidence
+from signature.confidence import CALIBRATION, Evidence
 from signature.config import Config
 from signature.query import QueryMap, Window
 from signature.retrieve import Places, retrieve
@@ -55,7 +55,7 @@ class Answer:
     T_map_odom : puts the whole query trajectory into the map.
     confidence : probability that the best hypothesis is right.
     hypotheses : all that fit, best first. history : how the answer came to be.
-    evidence : features the confidence rests on (`signature.confidence.Evidence`); empty without hypotheses.
+    evidence : what the confidence rests on.
     """
 
     status: Status
@@ -71,7 +71,7 @@ class Answer:
     path_m: float
     sessions: tuple[str, ...]
     submap_ids: tuple[int, ...]
-    evidence: tuple[float, ...] = ()
+    evidence: Evidence
     timing_ms: dict[str, float] = field(default_factory=dict)
 
     def to_json(
@@ -170,14 +170,14 @@ class Building:
         return tuple(h for h in kept if h.fit.score >= floor)[: self.config.hypotheses]
 
     def judge(self, hypotheses: tuple[Hypothesis, ...], query: QueryMap) -> tuple[Status, float]:
-        """The status and the confidence in the best hypothesis."""
-        if not hypotheses or hypotheses[0].fit.score < self.config.plausible:
+        """The status and the probability that the best hypothesis is right."""
+        if not hypotheses:
             return "not_found", 0.0
-        sure = confidence(Evidence.of(hypotheses, len(query.aligned.walls_m)))
-        if sure >= self.config.accept:
-            return "located", sure
-        rivals = sum(h.fit.score >= self.config.plausible for h in hypotheses)
-        return ("ambiguous" if rivals > 1 else "not_found"), sure
+        p = CALIBRATION.probabilities(Evidence.of(hypotheses, len(query.aligned.walls_m)))
+        best, none = float(p[0]), float(p[-1])
+        if best >= self.config.accept:
+            return "located", best
+        return ("not_found" if none >= 0.5 else "ambiguous"), best
 
 
 def free_squares(grid: OccupancyGrid, side_m: float = 0.8) -> F64:
@@ -310,7 +310,7 @@ def _answer(
         path_m=query.path_m,
         sessions=building.sessions,
         submap_ids=tuple(int(table.submap_id[h.row]) if h.row >= 0 else -1 for h in hypotheses),
-        evidence=Evidence.of(hypotheses, len(query.aligned.walls_m)).features() if hypotheses else (),
+        evidence=Evidence.of(hypotheses, len(query.aligned.walls_m)),
         timing_ms=timing_ms,
     )
 

@@ -42,7 +42,7 @@ class Trial:
     in_building : False if the query comes from another building, where nothing is right.
     status, confidence, error_m, error_rad : of the answer's best hypothesis (errors NaN if there is none).
     right : the best hypothesis is within 0.25 m and 3 degrees. rank : of the first right place, -1 if none.
-    evidence : features of the decision, in the order of `signature.confidence.WEIGHTS`; empty if none.
+    scores, walls : `signature.confidence.Evidence` of the decision.
     """
 
     building: str
@@ -57,7 +57,8 @@ class Trial:
     error_m: float
     error_rad: float
     rank: int
-    evidence: tuple[float, ...]
+    scores: tuple[float, ...]
+    walls: float
     look_up_ms: float
 
     def to_json(self) -> dict[str, Any]:
@@ -182,7 +183,8 @@ def _trial(
         error_m=error_m,
         error_rad=error_rad,
         rank=_rank(mapped, relocalizer, answer, T_map_base) if inside else -1,
-        evidence=answer.evidence,
+        scores=answer.evidence.scores,
+        walls=answer.evidence.walls,
         look_up_ms=elapsed_ms,
     )
 

@@ -1,0 +1,129 @@
+"""The decision: located, ambiguous, not found, and whether each is deserved."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from pc2grid.errors import NoScans
+from pc2grid.geometry import SE2
+from pc2grid.model import Health, OccupancyGrid, RegisteredScan
+from signature.relocalize import Answer, Building, Relocalizer
+from tests.drives import building, drive, office, plan
+
+OFFICE = building({"office": office()})
+ROUTE = [(1.5, 7.0), (9.5, 7.0), (9.5, 4.0)]
+
+
+def ask(
+    where: Building, grid: OccupancyGrid, corners: list[tuple[float, float]], **kind: float
+) -> tuple[Answer, SE2]:
+    relocalizer = Relocalizer(where)
+    for registered, sweep, truth in drive(grid, corners, **kind):
+        relocalizer.add(registered, sweep)
+    return relocalizer.answer(), truth
+
+
+@pytest.mark.parametrize("field_deg", [360.0, 270.0, 90.0])
+def test_a_drive_through_a_known_building_is_located(field_deg: float) -> None:
+    answer, truth = ask(OFFICE, office(), ROUTE, field_rad=math.radians(field_deg))
+    assert answer.status == "located" and answer.session == "office"
+    pose = answer.T_map_base
+    assert pose is not None and math.dist((pose.x, pose.y), (truth.x, truth.y)) < 0.1
+    assert abs(math.remainder(pose.yaw - truth.yaw, 2 * math.pi)) < math.radians(1.5)
+    assert answer.confidence >= 0.9
+    whole = answer.T_map_odom @ answer.T_odom_base if answer.T_map_odom else None
+    assert whole is not None and math.dist((whole.x, whole.y), (pose.x, pose.y)) < 1e-9
+
+
+def test_certainty_grows_with_travel_and_history_tells_it() -> None:
+    answer, _ = ask(OFFICE, office(), ROUTE, field_rad=math.radians(90))
+    travelled = [m.path_m for m in answer.history]
+    assert travelled == sorted(travelled) and len(travelled) >= 8
+    assert answer.history[-1].confidence >= answer.history[0].confidence
+
+
+def test_another_building_is_not_found() -> None:
+    other = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
+    answer, _ = ask(OFFICE, other, [(2, 2), (2, 9), (7, 8)])
+    assert answer.status == "not_found" and answer.T_map_base is None and answer.session is None
+
+
+def test_two_identical_rooms_are_ambiguous_with_both_named() -> None:
+    bent = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]
+    twins = plan(12, 6, [(6, 0, 6, 6), *bent, *[(x0 + 6, y0, x1 + 6, y1) for x0, y0, x1, y1 in bent]])
+    answer, truth = ask(building({"twins": twins}), twins, [(1.0, 1.0), (5.0, 1.0), (5.0, 2.4)])
+    assert answer.status == "ambiguous" and answer.T_map_base is None
+    places = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
+    for expected in (truth, SE2(truth.x + 6, truth.y, truth.yaw)):
+        assert any(math.dist((p.x, p.y), (expected.x, expected.y)) < 0.25 for p in places)
+
+
+def test_a_symmetric_room_reports_both_headings() -> None:
+    room = plan(8, 5, [])
+    answer, truth = ask(building({"room": room}), room, [(2.0, 2.0), (6.0, 2.0)])
+    assert answer.status == "ambiguous"
+    poses = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
+    turned = SE2(8 - truth.x, 5 - truth.y, truth.yaw + math.pi)
+    for expected in (truth, turned):
+        assert any(
+            math.dist((p.x, p.y), (expected.x, expected.y)) < 0.25
+            and abs(math.remainder(p.yaw - expected.yaw, 2 * math.pi)) < 0.1
+            for p in poses
+        )
+
+
+def test_an_empty_database_finds_nothing() -> None:
+    answer, _ = ask(building({}), office(), ROUTE)
+    assert answer.status == "not_found" and answer.hypotheses == () and answer.confidence == 0.0
+
+
+def test_the_session_is_named_and_its_frame_kept() -> None:
+    other = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
+    both = building({"other": other, "office": office()})
+    answer, truth = ask(both, office(), ROUTE)
+    assert answer.session == "office"
+    assert answer.T_map_base is not None
+    assert math.dist((answer.T_map_base.x, answer.T_map_base.y), (truth.x, truth.y)) < 0.1
+
+
+def test_the_answer_does_not_depend_on_where_the_query_starts() -> None:
+    late = Relocalizer(OFFICE)
+    early = Relocalizer(OFFICE)
+    scans = list(drive(office(), [(18.0, 1.5), (18.0, 2.4), (18.5, 7.0), *ROUTE[1:]]))
+    for k, (registered, sweep, truth) in enumerate(scans):
+        early.add(registered, sweep)
+        if k >= 20:
+            late.add(registered, sweep)
+    a, b = early.answer(), late.answer()
+    assert a.status == b.status == "located"
+    for answer in (a, b):
+        assert answer.T_map_base is not None
+        assert math.dist((answer.T_map_base.x, answer.T_map_base.y), (truth.x, truth.y)) < 0.1
+
+
+def test_lost_scans_end_what_was_known_and_a_query_of_nothing_else_is_refused() -> None:
+    relocalizer = Relocalizer(OFFICE)
+    for registered, sweep, _ in drive(office(), ROUTE[:2]):
+        lost = RegisteredScan(scan=registered.scan, T_map_base=registered.T_map_base, health=Health.LOST)
+        relocalizer.add(lost, sweep)
+    assert relocalizer.path_m == 0.0
+    with pytest.raises(NoScans):
+        relocalizer.answer()
+
+
+def test_the_json_document_keeps_its_contract() -> None:
+    answer, _ = ask(OFFICE, office(), ROUTE)
+    document = json.loads(json.dumps(answer.to_json()))
+    assert document["schema_version"] == 1 and document["status"] == "located"
+    assert set(document["pose"]) == {"stamp_ns", "x", "y", "yaw", "covariance"}
+    assert np.array(document["pose"]["covariance"]).shape == (3, 3)
+    assert set(document["T_map_odom"]) == {"x", "y", "yaw"}
+    first = document["hypotheses"][0]
+    assert {"session", "submap_id", "x", "y", "yaw", "score", "overlap"} <= set(first)
+    assert {"stamp_ns", "path_m", "status", "x", "y", "yaw", "confidence"} == set(document["history"][0])
+    assert isinstance(document["pose"]["stamp_ns"], int)
+    assert {"query", "database", "timing_ms"} <= set(document)
