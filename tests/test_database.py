@@ -369,7 +369,7 @@ def test_fuzz_database_bytes(path: Path) -> None:
             continue
         assert got == wanted
         seen["same"] += 1
-    assert seen["refused"] > rounds // 2, seen
+    assert min(seen.values()) > rounds // 20, seen  # both ends were visited
 
 
 def _everything(database) -> str:

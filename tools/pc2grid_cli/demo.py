@@ -13,8 +13,8 @@ from pc2grid_cli import console
 from pc2grid_cli.settings import Force
 
 BUILDING_SEED = 3
-MAP_LENGTH_M = 110.0
-QUERY_LENGTH_M = 18.0
+MAP_LENGTH_M = 60.0
+QUERY_LENGTH_M = 15.0
 
 
 def demo_command(
@@ -31,6 +31,7 @@ def demo_command(
     from pc2grid.io.atomic import refuse_existing
     from pc2grid.io.trajectory import read_tum
     from pc2grid.simulate import SimulationConfig, simulate_session
+    from pc2grid.simulate.config import LidarConfig
     from pc2grid_cli.convert import build_session
     from pc2grid_cli.picture import draw_answer
     from pc2grid_cli.relocalize import as_text, locate
@@ -47,7 +48,13 @@ def demo_command(
 
     console.note("1/4 simulate a robot with a lidar, and days later one with a depth camera")
     with console.progress("simulate lidar") as update:
-        mapper = SimulationConfig(length_m=MAP_LENGTH_M, seed=1, building_seed=BUILDING_SEED)
+        # Half of a VLP-16's turns and firings: enough for an indoor map, and the demo stays short.
+        mapper = SimulationConfig(
+            length_m=MAP_LENGTH_M,
+            seed=1,
+            building_seed=BUILDING_SEED,
+            lidar=LidarConfig(rate_hz=5.0, columns=450),
+        )
         simulate_session(lidar, sensor="lidar", grid=None, config=mapper, progress=update, force=force)
     with console.progress("simulate depth") as update:
         visitor = SimulationConfig(length_m=QUERY_LENGTH_M, seed=12, building_seed=BUILDING_SEED)

@@ -63,7 +63,7 @@ def export_command(
                 raise DatabaseError(f"{database}: session {name!r} is an imported map and has no trajectory")
             from pc2grid.io.trajectory import write_tum
 
-            write_tum(poses, trajectory)
+            write_tum(trajectory, poses)
         if mcap is not None:
             from pc2grid.io.mcap_out import LogWriter
 

@@ -9,9 +9,6 @@ from typing import Annotated, Any
 
 import typer
 
-from pc2grid.config import ReadConfig
-from pc2grid.errors import Pc2GridError
-
 
 def info_command(
     log: Annotated[Path, typer.Argument(help="Recording to look at.", show_default=False)],
@@ -33,6 +30,8 @@ def describe(path: Path, *, topic: str | None = None, recover: bool = False) -> 
     Reads the log's summary and a few messages only, unless it has no summary.
     Raises LogError if the file cannot be opened.
     """
+    from pc2grid.config import ReadConfig
+    from pc2grid.errors import Pc2GridError
     from pc2grid.io import open_log
 
     with open_log(path, ReadConfig(topic=topic), recover=recover) as log:

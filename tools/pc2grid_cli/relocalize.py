@@ -90,7 +90,7 @@ def relocalize_command(
         if trajectory is not None and located is not None:
             from pc2grid.io.trajectory import write_tum
 
-            write_tum(located, trajectory)
+            write_tum(trajectory, located)
         if output is not None and located is not None:
             _write_mcap(output, opened, answer, located, force)
         if plot is not None:
@@ -170,7 +170,8 @@ def as_text(answer: Answer) -> str:
         pose = answer.T_map_base
         return (
             f"located in {answer.session}: x {pose.x:.2f} m, y {pose.y:.2f} m,"
-            f" yaw {math.degrees(pose.yaw):.1f} deg at the last scan, confidence {answer.confidence:.2f}, after {answer.path_m:.1f} m of travel"
+            f" yaw {math.degrees(pose.yaw):.1f} deg at the last scan,"
+            f" confidence {answer.confidence:.2f}, after {answer.path_m:.1f} m of travel"
         )
     lines = [
         {
@@ -204,6 +205,7 @@ def _write_mcap(
     assert answer.session is not None
     assert answer.T_map_base is not None
     assert answer.T_map_odom is not None
+    assert answer.covariance is not None
     first, last = int(located.stamps_ns[0]), int(located.stamps_ns[-1])
     with LogWriter(path, force=force) as writer:
         writer.occupancy_grid("/map", first, database.grid(answer.session))
