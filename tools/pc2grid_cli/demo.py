@@ -15,6 +15,7 @@ from pc2grid_cli.settings import Force
 BUILDING_SEED = 3
 MAP_LENGTH_M = 60.0
 QUERY_LENGTH_M = 15.0
+QUERY_START_M = (7.6, 8.0)
 
 
 def demo_command(
@@ -57,7 +58,9 @@ def demo_command(
         )
         simulate_session(lidar, sensor="lidar", grid=None, config=mapper, progress=update, force=force)
     with console.progress("simulate depth") as update:
-        visitor = SimulationConfig(length_m=QUERY_LENGTH_M, seed=12, building_seed=BUILDING_SEED)
+        visitor = SimulationConfig(
+            length_m=QUERY_LENGTH_M, seed=12, start_m=QUERY_START_M, building_seed=BUILDING_SEED
+        )
         simulate_session(depth, sensor="depth", grid=None, config=visitor, progress=update, force=force)
 
     console.note("2/4 convert the lidar's recording into a database")

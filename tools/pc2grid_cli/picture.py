@@ -54,11 +54,11 @@ def draw_answer(
     if answer.T_map_odom is not None:
         found = answer.T_map_odom.apply(poses.planar()[:, :2])
         axes.plot(found[:, 0], found[:, 1], color=VERMILLION, lw=1.6, label="query: as located")
-    rivals = answer.hypotheses[1:] if answer.status == "located" else answer.hypotheses
+    rivals = answer.hypotheses[1:6] if answer.status == "located" else answer.hypotheses[:6]
     for number, hypothesis in enumerate(h for h in rivals if answer.sessions[h.session_index] == session):
         pose = hypothesis.fit.T_map_query @ answer.T_odom_base
-        label = "other hypotheses" if number == 0 else None
-        axes.plot(pose.x, pose.y, "s", color=PURPLE, ms=6, mfc="none", mew=1.5, label=label)
+        label = ("other hypotheses" if answer.status == "located" else "hypotheses") if number == 0 else None
+        axes.plot(pose.x, pose.y, "s", clip_on=True, color=PURPLE, ms=6, mfc="none", mew=1.5, label=label)
     if answer.T_map_base is not None:
         pose = answer.T_map_base
         length = 0.035 * max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
@@ -97,6 +97,7 @@ def _canvas(grid: OccupancyGrid) -> tuple[Any, Any]:
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
     axes.set_aspect("equal")
+    axes.autoscale(False)
     return figure, axes
 
 
@@ -108,9 +109,6 @@ def _draw_submaps(axes: Any, database: SubmapDatabase, session: str) -> None:
 
 
 def _finish(figure: Any, axes: Any, path: Path) -> None:
-    limits = axes.get_xlim(), axes.get_ylim()
-    axes.set_xlim(limits[0])
-    axes.set_ylim(limits[1])
     figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     with replace_file(path) as temporary:
         figure.savefig(temporary, format="png", metadata={"Software": "pc2grid"})
