@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pc2grid.geometry import F64, SE2
 from pc2grid.pieces import Keyframe, PieceStore, cut, thin_points
@@ -49,7 +50,7 @@ class LoopProposer(Protocol):
     """Whoever recognises places: by nearness here, by signatures elsewhere."""
 
     def propose(self, pieces: PieceStore, newest: int, drift_m: float) -> Iterable[Proposal]:
-        """Overlaps of piece `newest` with older ones; `drift_m` was travelled since its pose was last sure."""
+        """Overlaps of piece `newest` with older ones; `drift_m` metres since its pose was last sure."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,12 +274,13 @@ def spread(tracked: F64, keyframe_index: Sequence[int], corrected: F64) -> F64:
     return mixed
 
 
-def _moved(tracked: F64, index: F64, corrected: F64, which: F64) -> F64:
+def _moved(tracked: F64, index: NDArray[np.integer], corrected: F64, which: NDArray[np.integer]) -> F64:
     """Every scan as if rigidly attached to keyframe number `which`."""
     old, new = tracked[index[which]], corrected[which]
     turn = new[:, 2] - old[:, 2]
     c, s = np.cos(turn), np.sin(turn)
     d = tracked[:, :2] - old[:, :2]
-    return np.column_stack(
+    moved: F64 = np.column_stack(
         (new[:, 0] + c * d[:, 0] - s * d[:, 1], new[:, 1] + s * d[:, 0] + c * d[:, 1], tracked[:, 2] + turn)
     )
+    return moved

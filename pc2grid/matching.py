@@ -242,8 +242,8 @@ def best_placements(
     returned are the best `count` placements no two of which are neighbours, best first, with the mean
     likelihood of the points.
     """
-    across = np.arange(-math.ceil(window_m / step_m), math.ceil(window_m / step_m) + 1) * step_m
-    turns = np.arange(-math.ceil(window_rad / step_rad), math.ceil(window_rad / step_rad) + 1) * step_rad
+    across: F64 = np.arange(-math.ceil(window_m / step_m), math.ceil(window_m / step_m) + 1) * step_m
+    turns: F64 = np.arange(-math.ceil(window_rad / step_rad), math.ceil(window_rad / step_rad) + 1) * step_rad
     points = np.asarray(points_m, dtype=np.float64)
     scores = _scores(field, low_m, cell_m, points, guess.x, guess.y, guess.yaw + turns, across)
     found: list[tuple[float, SE2]] = []

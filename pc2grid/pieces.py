@@ -28,14 +28,13 @@ class Keyframe:
 
     index : number of its scan in the session. T_map_base : as tracked, before loops are closed.
     information : (3, 3) of that pose relative to the local map it was tracked on, in the map's axes.
-    T_odom_base : planar odometry, or None.
+    restart : the first after a lost stretch: its place relative to those before is a guess.
     """
 
     index: int
     sweep: Sweep
     T_map_base: SE2
     information: F64
-    T_odom_base: SE2 | None = None
     restart: bool = False
 
 
@@ -81,6 +80,8 @@ class Piece:
         cells = self._cells(points)
         occupied = np.ones(shape, dtype=np.uint8)
         occupied[cells[:, 0], cells[:, 1]] = 0
+        if not len(cells):
+            occupied[0, 0] = 0  # an obstacle far off the corner, so that distances stay finite
         distance = cv2.distanceTransform(occupied, cv2.DIST_L2, 5) * CELL_M
         self._seen = np.where(distance < 0.25, _HIT, free)
         self._field = np.exp(-0.5 * (distance / 0.15) ** 2).astype(np.float32)
@@ -94,7 +95,7 @@ class Piece:
     def search(
         self, points_m: F64, guess: SE2, window_m: float, window_rad: float
     ) -> list[tuple[float, SE2]]:
-        """The best few placements of points (N, 2) within a window around `guess`, with their scores 0..1."""
+        """The best few placements of points (N, 2) in a window around `guess`, with their scores 0..1."""
         return best_placements(self._field, self._low_m, CELL_M, points_m, guess, window_m, window_rad)
 
     def agreement(self, points_m: F64, pose: SE2) -> tuple[float, float]:
@@ -110,7 +111,8 @@ class Piece:
         return looked / max(len(points_m), 1), float((seen == _HIT).sum()) / max(looked, 1)
 
     def _cells(self, points: F64) -> I64:
-        return np.floor((points - self._low_m) / CELL_M)[:, ::-1].astype(np.int64)
+        cells: I64 = np.floor((points - self._low_m) / CELL_M)[:, ::-1].astype(np.int64)
+        return cells
 
 
 class PieceStore:

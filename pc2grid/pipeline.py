@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Protocol
 
@@ -10,7 +11,7 @@ import numpy as np
 from pc2grid.config import PartitionConfig, ProjectionConfig, RegistrationConfig
 from pc2grid.errors import NoScans
 from pc2grid.geometry import F64, SE2
-from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, SessionMap, Trajectory
+from pc2grid.model import Health, OccupancyGrid, ReadReport, RegisteredScan, Scan, SessionMap, Trajectory
 from pc2grid.projection import GridBuilder
 from pc2grid.sweep import Sweep
 
@@ -74,7 +75,7 @@ def build_map(
         grid=grid,
         submaps=submaps,
         trajectory=trajectory,
-        report=log.report(),
+        report=_with_health(log.report(), trajectory),
     )
 
 
@@ -99,7 +100,9 @@ def map_scans(
         registered = tracked.registered
         if tracked.keyframe:
             pose = SE2.flatten(registered.T_map_base)
-            keyframes.append(Keyframe(len(stamps), tracked.sweep, pose, tracked.information))
+            keyframes.append(
+                Keyframe(len(stamps), tracked.sweep, pose, tracked.information, restart=tracked.restart)
+            )
         stamps.append(scan.stamp_ns)
         poses.append(registered.T_map_base)
         health.append(registered.health)
@@ -122,8 +125,29 @@ def map_scans(
     return builder.grid(), trajectory
 
 
+def _with_health(report: ReadReport, trajectory: Trajectory) -> ReadReport:
+    """The reader's report and what registration has to confess."""
+    lost = sum(h is Health.LOST for h in trajectory.health)
+    weak = sum(h is Health.DEGENERATE for h in trajectory.health)
+    total, skipped, warnings = len(trajectory), dict(report.scans_skipped), list(report.warnings)
+    if lost:
+        skipped["registration lost"] = lost
+        first = next(k for k, h in enumerate(trajectory.health) if h is Health.LOST)
+        seconds = (trajectory.stamps_ns[first] - trajectory.stamps_ns[0]) * 1e-9
+        warnings.append(
+            f"registration was lost for {lost} of {total} scans, first {seconds:.1f} s after the first scan; "
+            "they are not in the map"
+        )
+    if weak > 0.1 * total:
+        warnings.append(
+            f"{weak} of {total} scans did not fix the pose in every direction: there it rests on odometry "
+            "or on the motion before"
+        )
+    return dataclasses.replace(report, scans_skipped=skipped, warnings=tuple(warnings))
+
+
 def _replant(T_map_base: F64, flat: F64, settled: F64) -> F64:
-    """Spatial poses (N, 4, 4) moved in the plane from `flat` (N, 3) to `settled` (N, 3); tilt and height stay."""
+    """Spatial poses (N, 4, 4) moved in the plane from `flat` to `settled` (N, 3); tilt, height stay."""
     turn = settled[:, 2] - flat[:, 2]
     c, s = np.cos(turn), np.sin(turn)
     rotation = np.zeros((len(turn), 3, 3))

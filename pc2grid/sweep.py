@@ -42,7 +42,8 @@ class Sweep:
         """(B, 2) outline in the levelled base frame of the free space no farther than `limit_m`, metres."""
         bearings = np.arange(len(self.free_m)) * (2.0 * np.pi / len(self.free_m))
         free_m = np.minimum(self.free_m, limit_m)
-        return self.origin_m + free_m[:, None] * np.column_stack((np.cos(bearings), np.sin(bearings)))
+        outline: F64 = self.origin_m + free_m[:, None] * np.column_stack((np.cos(bearings), np.sin(bearings)))
+        return outline
 
 
 def flatten(

@@ -18,7 +18,7 @@ from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.deskew import deskew
 from pc2grid.floor import Ground, assumed_ground, find_ground
 from pc2grid.geometry import F64, SE2, invert_pose, rotation_vector
-from pc2grid.matching import PointGrid
+from pc2grid.matching import Match, PointGrid
 from pc2grid.model import F32, Health, RegisteredScan, Scan
 from pc2grid.registration import KissRegistration, thin
 from pc2grid.sweep import Sweep, flatten
@@ -28,6 +28,13 @@ KEYFRAME_TURN_RAD = math.radians(10.0)
 LOCAL_MAP_TRAVEL_M = 5.0
 _ROLLING_GAIN = 0.05  # how fast the floor follows what is seen of it
 _CARRIED_GAIN = 0.3
+_MIN_HITS = 10
+_MIN_OVERLAP = 0.3
+_MIN_OVERLAP_CARRIED = 0.1  # the plane shows less of a scene when the sensor tilts
+_MAX_RESIDUAL_M = 0.1
+_MAX_SIGMA_M = 0.15  # a direction known worse than this rests on odometry or on the motion model
+_BRIDGED_SCANS = 10
+_GIVE_UP_SCANS = 10
 _DISAGREE_M = 0.03
 _DISAGREE_RAD = 0.02
 _MAX_POINTS = 40_000  # of a camera's 300 000 pixels
@@ -41,12 +48,14 @@ class Tracked:
     information : (3, 3) of the planar pose (x, y, yaw in the map frame) relative to the local map, from
         what the scan sees; what it does not see rests on the odometry.
     keyframe : whether the robot had moved enough for the scan to become part of the local map.
+    restart : the first keyframe after a lost stretch: where it is relative to those before is a guess.
     """
 
     registered: RegisteredScan
     sweep: Sweep
     information: F64
     keyframe: bool
+    restart: bool = False
 
 
 class Tracker:
@@ -67,6 +76,9 @@ class Tracker:
         self._last_keyframe: SE2 | None = None
         self._travel_m = 0.0
         self._rolling = True
+        self._poor_scans = 0
+        self._lost_scans = 0
+        self._restarted = False
 
     def track(self, scan: Scan) -> Tracked:
         """Follow the next scan; stamps must increase."""
@@ -88,21 +100,37 @@ class Tracker:
         planar = SE2.flatten(pose)
         T_level_base = planar.inverse().lift() @ pose
         sweep = self._flatten(points, scan, T_level_base)
-        information = np.zeros((3, 3))
-        if self._last is not None and len(sweep.hits_m) >= 10:
-            refined, information = self._refine(sweep, planar, predicted, motion, measured)
+        information, health = np.zeros((3, 3)), Health.FINE
+        if self._maps:
+            refined, match = self._refine(sweep, planar, predicted, motion, measured)
+            if match is not None:
+                information = match.information
             if self._rolling:
                 planar = refined
                 pose = planar.lift() @ T_level_base
-        keyframe = self._extend_maps(sweep, planar)
+            health = self._judge(match, measured)
+        was_restarted = self._restarted
+        restart = self._lost_scans > _GIVE_UP_SCANS
+        if restart:
+            # Nothing fits any more: begin anew from here, and say so by `restart`.
+            self._maps, self._last_keyframe, self._lost_scans = [], None, 0
+            self._kiss = KissRegistration(self._config, carried=not self._rolling)
+        keyframe = health is not Health.LOST and len(sweep.hits_m) > 0 and self._extend_maps(sweep, planar)
         if keyframe:
             self._kiss.integrate(pose)
         if self._last is not None:
             self._velocity = invert_pose(self._last_pose) @ pose
         self._last, self._last_pose = scan, pose
         deskewed = dataclasses.replace(scan, points_m=points, offsets_s=None)
-        registered = RegisteredScan(scan=deskewed, T_map_base=pose, health=Health.FINE)
-        return Tracked(registered=registered, sweep=sweep, information=information, keyframe=keyframe)
+        registered = RegisteredScan(scan=deskewed, T_map_base=pose, health=health)
+        self._restarted = (self._restarted or restart) and not keyframe
+        return Tracked(
+            registered=registered,
+            sweep=sweep,
+            information=information,
+            keyframe=keyframe,
+            restart=keyframe and was_restarted,
+        )
 
     def _predict(self, scan: Scan) -> tuple[F64, float, bool]:
         """Motion since the last scan, over how many seconds, and whether odometry measured it."""
@@ -169,7 +197,9 @@ class Tracker:
 
     def _refine(
         self, sweep: Sweep, guess: SE2, predicted: F64, motion: F64, measured: bool
-    ) -> tuple[SE2, F64]:
+    ) -> tuple[SE2, Match | None]:
+        if len(sweep.hits_m) < _MIN_HITS:
+            return SE2.flatten(predicted), None
         distance = float(np.linalg.norm(motion[:3, 3]))
         turn = float(np.linalg.norm(rotation_vector(motion)))
         prior = SE2.flatten(predicted) if measured else guess
@@ -185,9 +215,25 @@ class Tracker:
             # KISS-ICP and the prediction differ: let each lead the refinement, and the walls decide.
             other = grid.match(sweep.hits_m, SE2.flatten(predicted), prior, information)
             match = max(match, other, key=lambda m: m.overlap - 5.0 * m.residual_m)
-        if match.overlap < 0.3:
-            return (prior if measured else guess), np.zeros((3, 3))
-        return match.pose, match.information
+        return (match.pose if match.overlap >= _MIN_OVERLAP else prior), match
+
+    def _judge(self, match: Match | None, measured: bool) -> Health:
+        """What the match against the local map is worth.
+
+        A scan that shows too little is bridged by odometry for a while (DEGENERATE); one that does not fit,
+        without odometry or for too long, is LOST.
+        """
+        floor = _MIN_OVERLAP if self._rolling else _MIN_OVERLAP_CARRIED
+        if match is None or match.overlap < floor or match.residual_m > _MAX_RESIDUAL_M:
+            self._poor_scans += 1
+            lost = not measured or self._poor_scans > _BRIDGED_SCANS
+            self._lost_scans += lost
+            return Health.LOST if lost else Health.DEGENERATE
+        self._poor_scans = self._lost_scans = 0
+        J = match.information
+        across = J[:2, :2] - np.outer(J[:2, 2], J[2, :2]) / max(J[2, 2], 1e-9)
+        weakest = float(np.linalg.eigvalsh(across)[0])
+        return Health.FINE if weakest > _MAX_SIGMA_M**-2 else Health.DEGENERATE
 
     def _extend_maps(self, sweep: Sweep, pose: SE2) -> bool:
         """Two overlapping local maps: the older one is matched against, the younger takes over in time.
