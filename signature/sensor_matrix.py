@@ -16,14 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.model import OccupancyGrid, SensorKind
+from pc2grid.model import OccupancyGrid, Scan, SensorKind, SessionMap
 from pc2grid.partition import partition
 from pc2grid.pipeline import follow, map_scans
 from signature.config import Config
-from signature.describe import describe
 from signature.relocalize import Answer, Building, Relocalizer
 from signature.retrieve import retrieve
-from signature.similarity import SignatureTable
 
 if TYPE_CHECKING:
     from pc2grid.simulate import SimulationConfig
@@ -67,44 +65,110 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Cell:
+    """One cell of the matrix after some metres: shares of its trials, 0..1, and errors of the right ones.
+
+    located_right : answered located, and it was. wrong : of those answered located, how many were not.
+    recall : of the first right place among the first 1, 5 and 20 retrieved.
+    """
+
+    map_sensor: str
+    query_sensor: str
+    travel_m: float
+    trials: int
+    located_right: float
+    wrong: float
+    ambiguous: float
+    not_found: float
+    recall: dict[int, float]
+    median_error_m: float
+    p95_error_m: float
+    look_up_ms: float
+
+
+def matrix(trials: Sequence[Trial]) -> list[Cell]:
+    """The trials in their own building as cells, by map sensor, query sensor and travel."""
+    groups: dict[tuple[str, str, float], list[Trial]] = {}
+    for trial in trials:
+        if trial.in_building:
+            groups.setdefault((trial.map_sensor, trial.query_sensor, trial.travel_m), []).append(trial)
+    cells = []
+    for (map_sensor, query_sensor, travel_m), members in sorted(groups.items()):
+        located = [t for t in members if t.status == "located"]
+        errors = np.array([t.error_m for t in located if t.right]) if located else np.empty(0)
+        ranks = np.array([t.rank if t.rank >= 0 else 10**6 for t in members])
+        cells.append(
+            Cell(
+                map_sensor=map_sensor,
+                query_sensor=query_sensor,
+                travel_m=travel_m,
+                trials=len(members),
+                located_right=sum(t.right for t in located) / len(members),
+                wrong=sum(not t.right for t in located) / max(len(located), 1),
+                ambiguous=sum(t.status == "ambiguous" for t in members) / len(members),
+                not_found=sum(t.status == "not_found" for t in members) / len(members),
+                recall={k: float(np.mean(ranks < k)) for k in (1, 5, 20)},
+                median_error_m=float(np.median(errors)) if len(errors) else math.nan,
+                p95_error_m=float(np.percentile(errors, 95)) if len(errors) else math.nan,
+                look_up_ms=float(np.median([t.look_up_ms for t in members])),
+            )
+        )
+    return cells
+
+
+def reliability(trials: Sequence[Trial], bins: int = 10) -> list[tuple[float, float, int]]:
+    """For each band of confidence with trials in it: mean confidence, share that was right, how many."""
+    rows = []
+    for k in range(bins):
+        members = [
+            t
+            for t in trials
+            if k / bins <= t.confidence < (k + 1) / bins or (k + 1 == bins and t.confidence == 1)
+        ]
+        if members:
+            rows.append(
+                (
+                    float(np.mean([t.confidence for t in members])),
+                    sum(t.right for t in members) / len(members),
+                    len(members),
+                )
+            )
+    return rows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Mapped:
     """A building as one sensor mapped it. T_plan_map : where the map's frame lies in the true plan."""
 
     name: str
     sensor: SensorKind
-    grid: OccupancyGrid
     T_plan_map: SE2
     building: Building
 
 
 def map_building(
     name: str, plan: OccupancyGrid, sensor: SensorKind, simulation: SimulationConfig, config: Config
-) -> Mapped:
-    """Drive through the plan with a sensor and make its map ready for queries."""
+) -> tuple[SessionMap, SE2]:
+    """Drive through the plan with a sensor: the session's map, and where its frame lies in the plan."""
     from pc2grid.simulate import iter_session
 
     first: list[SE2] = []
 
-    def scans() -> Iterator[Any]:
+    def scans() -> Iterator[Scan]:
         for scan, truth in iter_session(sensor=sensor, grid=plan, config=simulation):
             if not first:
                 first.append(truth)
             yield scan
 
-    grid, _ = map_scans(scans(), config)
-    submaps = partition(grid, config.partition)
-    table = SignatureTable.of(
-        [describe(s, config.signature) for s in submaps],
-        [s.center_m for s in submaps],
-        submap_id=[s.submap_id for s in submaps],
-    )
-    return Mapped(
-        name=name,
+    grid, trajectory = map_scans(scans(), config)
+    session_map = SessionMap(
+        session=f"{name}-{sensor}",
         sensor=sensor,
         grid=grid,
-        T_plan_map=first[0],
-        building=Building({f"{name}-{sensor}": grid}, table, config, config),
+        submaps=partition(grid, config.partition),
+        trajectory=trajectory,
     )
+    return session_map, first[0]
 
 
 def query_trials(
@@ -124,7 +188,7 @@ def query_trials(
 
     truths: list[SE2] = []
 
-    def scans() -> Iterator[Any]:
+    def scans() -> Iterator[Scan]:
         for scan, truth in iter_session(sensor=sensor, grid=plan, config=simulation):
             truths.append(truth)
             yield scan

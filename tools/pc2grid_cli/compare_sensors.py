@@ -1,0 +1,183 @@
+"""`pc2grid compare sensors`: maps by each sensor, queries by each, in real floor plans."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from pc2grid.model import SensorKind
+    from signature.sensor_matrix import Cell, Mapped, Trial
+
+MAP_SEED = 1000
+"""Map sessions and query sessions never share a seed: other clutter, start, direction and noise."""
+
+
+def compare_sensors_command(
+    plans: Annotated[list[Path], typer.Argument(help="Floor plans: MAP.yaml files, two or more.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for results; run again to go on.")] = Path(
+        "sensor-matrix"
+    ),
+    queries: Annotated[int, typer.Option("--queries", min=1, help="Query sessions a plan and sensor.")] = 10,
+    map_length: Annotated[float, typer.Option("--map-length", help="Metres driven to make a map.")] = 200.0,
+    clutter: Annotated[
+        int, typer.Option("--clutter", help="Things in the way, different in each session.")
+    ] = 30,
+    seed: Annotated[int, typer.Option("--seed", help="Of the first query session.")] = 1,
+    jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="Processes. [one a core]")] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document instead of tables.")
+    ] = False,
+) -> None:
+    """Map plans with lidar, laser and depth camera, locate sessions of each in each: nine cells.
+
+    Example: pc2grid compare sensors maps/fr079.yaml maps/intel.yaml --queries 40 --out matrix
+    """
+    from pc2grid.errors import ConfigError, MapFileError, OutputError
+    from pc2grid_cli.console import print_json, progress
+    from pc2grid_cli.matrix_report import draw, tables
+    from signature.sensor_matrix import SENSORS, matrix, reliability
+
+    names = [plan.stem for plan in plans]
+    if len(set(names)) != len(names):
+        raise ConfigError(f"two plans share a name: {', '.join(names)}", hint="rename one of the files")
+    for plan in plans:
+        if not plan.is_file():
+            raise MapFileError(f"{plan}: no such file", hint="give the path of a map.yaml")
+    try:
+        for folder in ("maps", "trials"):
+            (out / folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{out}: {error.strerror}", hint="choose another --out") from error
+    setting = {"map_length": map_length, "clutter": clutter}
+    mapping = [(str(p), sensor, str(out), setting) for p in plans for sensor in SENSORS]
+    asking = [
+        (str(p), sensor, seed + i, [str(q) for q in plans], str(out), setting)
+        for i in range(queries)
+        for p in plans
+        for sensor in SENSORS
+    ]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs or os.cpu_count(), mp_context=context) as pool:
+        for what, function, tasks in (("map", _map, mapping), ("locate", _ask, asking)):
+            with progress(what) as advance:
+                waiting = [pool.submit(function, *task) for task in tasks]
+                for done, future in enumerate(as_completed(waiting), start=1):
+                    future.result()
+                    advance(done / len(waiting))
+    trials = [t for task in asking for t in _read(_trial_file(*task[:3], out=out, setting=setting))]
+    cells = matrix(trials)
+    elsewhere = [t for t in trials if not t.in_building]
+    document = {
+        "schema_version": 1,
+        "plans": names,
+        "queries": queries,
+        "setting": {**setting, "seed": seed},
+        "cells": [_plain(cell) for cell in cells],
+        "reliability": reliability(trials),
+        "elsewhere": {
+            "trials": len(elsewhere),
+            "not_found": sum(t.status == "not_found" for t in elsewhere),
+            "located": sum(t.status == "located" for t in elsewhere),
+        },
+    }
+    (out / "matrix.json").write_text(json.dumps(document, indent=1))
+    draw(out / "matrix.png", cells, reliability(trials))
+    if as_json:
+        print_json(document)
+    else:
+        tables(cells, elsewhere)
+        print(f"{out / 'matrix.json'}\n{out / 'matrix.png'}")
+
+
+def _plain(cell: Cell) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    return asdict(cell)
+
+
+def _map_file(plan: str, sensor: str, out: str | Path, setting: dict[str, Any]) -> Path:
+    return Path(out) / "maps" / f"{Path(plan).stem}.{sensor}.{_tag(setting)}.submaps"
+
+
+def _trial_file(plan: str, sensor: str, seed: int, *, out: str | Path, setting: dict[str, Any]) -> Path:
+    return Path(out) / "trials" / f"{Path(plan).stem}.{sensor}.{seed}.{_tag(setting)}.json"
+
+
+def _tag(setting: dict[str, Any]) -> str:
+    return ".".join(f"{key}{value:g}" for key, value in sorted(setting.items()))
+
+
+def _map(plan: str, sensor: SensorKind, out: str, setting: dict[str, Any]) -> None:
+    """Make the map of one plan by one sensor, unless it is there."""
+    from pc2grid.io.atomic import replace_file
+    from pc2grid.io.nav2_map import load_map
+    from pc2grid.simulate import SimulationConfig
+    from signature.build import add_session, provenance
+    from signature.config import Config
+    from signature.sensor_matrix import map_building
+
+    target = _map_file(plan, sensor, out, setting)
+    frame = target.with_suffix(".json")
+    if target.exists() and frame.exists():
+        return
+    simulation = SimulationConfig(
+        length_m=setting["map_length"], seed=MAP_SEED, clutter=int(setting["clutter"])
+    )
+    config = Config()
+    session_map, T_plan_map = map_building(Path(plan).stem, load_map(Path(plan)), sensor, simulation, config)
+    target.unlink(missing_ok=True)
+    add_session(target, session_map, config, provenance(Path(plan), "0" * 64, config))
+    with replace_file(frame) as draft:
+        draft.write_text(json.dumps([T_plan_map.x, T_plan_map.y, T_plan_map.yaw]))
+
+
+@cache
+def _mapped(plan: str, sensor: SensorKind, out: str, tag: tuple[tuple[str, Any], ...]) -> Mapped:
+    from pc2grid.geometry import SE2
+    from signature.config import Config
+    from signature.database import open_database
+    from signature.relocalize import Building
+    from signature.sensor_matrix import Mapped
+
+    target = _map_file(plan, sensor, out, dict(tag))
+    with open_database(target) as database:
+        building = Building.of(database, Config())
+    frame = json.loads(target.with_suffix(".json").read_text())
+    return Mapped(name=Path(plan).stem, sensor=sensor, T_plan_map=SE2(*frame), building=building)
+
+
+def _ask(
+    plan: str, sensor: SensorKind, seed: int, plans: Sequence[str], out: str, setting: dict[str, Any]
+) -> None:
+    """Locate one query session in the maps of all plans, unless it was done before."""
+    from pc2grid.io.atomic import replace_file
+    from pc2grid.io.nav2_map import load_map
+    from pc2grid.simulate import SimulationConfig
+    from signature.config import Config
+    from signature.sensor_matrix import DISTANCES_M, SENSORS, query_trials
+
+    target = _trial_file(plan, sensor, seed, out=out, setting=setting)
+    if target.exists():
+        return
+    tag = tuple(sorted(setting.items()))
+    maps = [_mapped(p, s, out, tag) for p in plans for s in SENSORS]
+    simulation = SimulationConfig(length_m=max(DISTANCES_M) + 3.0, seed=seed, clutter=int(setting["clutter"]))
+    trials = query_trials(Path(plan).stem, load_map(Path(plan)), sensor, simulation, maps, Config())
+    with replace_file(target) as draft:
+        draft.write_text(json.dumps([trial.to_json() for trial in trials]))
+
+
+def _read(path: Path) -> list[Trial]:
+    from signature.sensor_matrix import Trial
+
+    rows = json.loads(path.read_text())
+    return [Trial(**{**row, "scores": tuple(row["scores"])}) for row in rows]

@@ -1,0 +1,103 @@
+"""Tables and pictures of the sensor matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from signature.sensor_matrix import Cell, Trial
+
+_SENSORS = ("lidar", "laser", "depth")
+
+
+def tables(cells: Sequence[Cell], elsewhere: Sequence[Trial]) -> None:
+    """Print located-and-right by metres driven, and what else there is to know of each cell."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    distances = sorted({cell.travel_m for cell in cells})
+    shares = Table(title="located and right, by metres driven")
+    for heading in ("map", "query", *(f"{d:g} m" for d in distances), "n"):
+        shares.add_column(heading, justify="left" if heading in ("map", "query") else "right")
+    last = distances[-1] if distances else 0.0
+    detail = Table(title=f"after {last:g} m")
+    for heading in (
+        "map",
+        "query",
+        "wrong",
+        "ambiguous",
+        "not found",
+        "recall 1/5/20",
+        "median",
+        "95 %",
+        "ms",
+    ):
+        detail.add_column(heading, justify="left" if heading in ("map", "query") else "right")
+    for map_sensor, query_sensor in ((m, q) for m in _SENSORS for q in _SENSORS):
+        row = {c.travel_m: c for c in cells if (c.map_sensor, c.query_sensor) == (map_sensor, query_sensor)}
+        if not row:
+            continue
+        shares.add_row(
+            map_sensor,
+            query_sensor,
+            *(f"{row[d].located_right:.2f}" if d in row else "" for d in distances),
+            str(max(c.trials for c in row.values())),
+        )
+        if last in row:
+            cell = row[last]
+            detail.add_row(
+                map_sensor,
+                query_sensor,
+                f"{cell.wrong:.3f}",
+                f"{cell.ambiguous:.2f}",
+                f"{cell.not_found:.2f}",
+                "/".join(f"{value:.2f}" for value in cell.recall.values()),
+                f"{cell.median_error_m:.3f} m",
+                f"{cell.p95_error_m:.3f} m",
+                f"{cell.look_up_ms:.0f}",
+            )
+    console.print(shares)
+    console.print(detail)
+    if elsewhere:
+        right = sum(t.status == "not_found" for t in elsewhere)
+        console.print(f"queries from another building: {right} of {len(elsewhere)} answered not_found")
+
+
+def draw(path: Path, cells: Sequence[Cell], reliability: Sequence[tuple[float, float, int]]) -> None:
+    """One picture: located-and-right against metres for each map sensor, and how far confidence is true."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from pc2grid.io.atomic import replace_file
+    from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
+
+    colours = dict(zip(_SENSORS, (BLUE, ORANGE, VERMILLION), strict=True))
+    figure, axes = plt.subplots(1, 4, figsize=(15, 3.8), constrained_layout=True)
+    for ax, map_sensor in zip(axes, _SENSORS, strict=False):
+        for query_sensor, marker in zip(_SENSORS, "os^", strict=True):
+            row = [c for c in cells if (c.map_sensor, c.query_sensor) == (map_sensor, query_sensor)]
+            ax.plot(
+                [c.travel_m for c in row],
+                [c.located_right for c in row],
+                marker=marker,
+                color=colours[query_sensor],
+                label=f"{query_sensor} query",
+            )
+        ax.set(title=f"{map_sensor} map", xlabel="driven, m", ylim=(0, 1.03))
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("located and right")
+    axes[0].legend(loc="lower right")
+    axes[3].plot([0, 1], [0, 1], color="0.6", lw=1)
+    if reliability:
+        said, true, count = zip(*reliability, strict=True)
+        axes[3].scatter(said, true, s=[20 + 2 * min(n, 200) for n in count], color=BLUE, alpha=0.7)
+    axes[3].set(title="is confidence true?", xlabel="confidence", ylabel="share that was right")
+    axes[3].grid(alpha=0.3)
+    with replace_file(path) as draft:
+        figure.savefig(draft, format="png", dpi=130)
+    plt.close(figure)
