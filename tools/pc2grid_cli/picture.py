@@ -55,10 +55,14 @@ def draw_answer(
         found = answer.T_map_odom.apply(poses.planar()[:, :2])
         axes.plot(found[:, 0], found[:, 1], color=VERMILLION, lw=1.6, label="query: as located")
     rivals = answer.hypotheses[1:6] if answer.status == "located" else answer.hypotheses[:6]
-    for number, hypothesis in enumerate(h for h in rivals if answer.sessions[h.session_index] == session):
-        pose = hypothesis.fit.T_map_query @ answer.T_odom_base
-        label = ("other hypotheses" if answer.status == "located" else "hypotheses") if number == 0 else None
-        axes.plot(pose.x, pose.y, "s", clip_on=True, color=PURPLE, ms=6, mfc="none", mew=1.5, label=label)
+    places = [
+        h.fit.T_map_query @ answer.T_odom_base for h in rivals if answer.sessions[h.session_index] == session
+    ]
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    shown = [(p.x, p.y) for p in places if left < p.x < right and bottom < p.y < top]
+    if shown:
+        label = "other hypotheses" if answer.status == "located" else "hypotheses"
+        axes.plot(*zip(*shown, strict=True), "s", color=PURPLE, ms=6, mfc="none", mew=1.5, label=label)
     if answer.T_map_base is not None:
         pose = answer.T_map_base
         length = 0.035 * max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
