@@ -28,34 +28,9 @@ from pc2grid.io import open_log
 from pc2grid.io.mcap_out import LogWriter
 from pc2grid.io.mcap_records import MAGIC
 from pc2grid.io.ros_definitions import schema_text
-from pc2grid.model import ReadReport, Scan
+from tests.builders import T0, raw_log, read, write_clouds
 
-T0 = 1_700_000_000_000_000_000
 SCANS = 40
-
-
-def write_clouds(path: Path, scans: int = SCANS, points: int = 4000) -> Path:
-    """A small lidar log of several chunks, with tf and odometry that moves 0.1 m a scan."""
-    rng = np.random.default_rng(7)
-    mount = np.eye(4)
-    mount[:3, 3] = 0.2, 0.0, 0.5
-    with LogWriter(path) as out:
-        out.tf_static(T0, "base_link", "lidar", mount)
-        for i in range(scans):
-            pose = np.eye(4)
-            pose[0, 3] = 0.1 * i
-            stamp = T0 + i * 100_000_000
-            out.point_cloud("/points", stamp, "lidar", rng.uniform(1, 9, (points, 3)).astype(np.float32))
-            out.odometry("/odom", stamp + 10_000_000, pose)
-    return path
-
-
-def read(
-    path: Path, config: ReadConfig | None = None, *, recover: bool = False
-) -> tuple[list[Scan], ReadReport]:
-    with open_log(path, config, recover=recover) as log:
-        scans = list(log.scans())
-        return scans, log.report()
 
 
 @pytest.fixture(scope="module")
@@ -184,20 +159,6 @@ def test_mutations_never_give_wrong_data_silently(damaged: Callable[[bytes], Pat
                 assert set(found) <= set(clean)
                 outcomes["loss"] += 1
     assert min(outcomes.values()) > 5
-
-
-def raw_log(path: Path, records: list[tuple[str, str, str, bytes, bytes]], **options: object) -> Path:
-    """(topic, type, schema encoding, schema text, payload) as an MCAP; one channel per record."""
-    with path.open("wb") as stream:
-        writer = Writer(stream, **options)  # type: ignore[arg-type]
-        writer.start(profile="ros2")
-        for i, (topic, type_name, encoding, text, payload) in enumerate(records):
-            schema = writer.register_schema(type_name, encoding, text)
-            channel = writer.register_channel(topic, "cdr", schema)
-            if payload:
-                writer.add_message(channel, T0 + i, payload, T0 + i)
-        writer.finish()
-    return path
 
 
 def test_topics(tmp_path: Path) -> None:

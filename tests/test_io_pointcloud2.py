@@ -15,6 +15,7 @@ from pc2grid.io.pointcloud2 import decode
 from pc2grid.io.ros_messages import Header, PointCloud2
 
 STAMP = 1_700_000_000_123_456_789
+XYZ = (("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1))
 CODES = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d", 9: "q", 10: "Q", 11: "B"}
 
 
@@ -75,18 +76,48 @@ def test_round_trip_against_the_oracle(case: tuple[PointCloud2, list[list[float]
         (10, [STAMP, STAMP + 50_000_000, STAMP + 100_000_000]),
         (8, [0.0, 5e7, 1e8]),
         (10, [77 * 10**9, 77 * 10**9 + 50_000_000, 77 * 10**9 + 100_000_000]),
+        (7, [0.0, 50.0, 100.0]),
+        (5, [0, 50, 100]),
+        (8, [STAMP * 1e-6, STAMP * 1e-6 + 50, STAMP * 1e-6 + 100]),
+        (10, [STAMP // 1000, STAMP // 1000 + 50_000, STAMP // 1000 + 100_000]),
     ],
 )
-@pytest.mark.parametrize("name", ["t", "time", "timestamp", "timestamps", "offset_time"])
+@pytest.mark.parametrize(
+    "name", ["t", "time", "timestamp", "timestamps", "offset_time", "Time", "time_stamp"]
+)
 def test_per_point_times_in_every_spelling(kind: int, values: list[float], name: str) -> None:
     data = b"".join(struct.pack("<3f" + CODES[kind], 1, 2, 3, v) for v in values)
     fields = (("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1), (name, 12, kind, 1))
     found = decode(PointCloud2(Header(STAMP, ""), 1, 3, fields, False, len(data) // 3, len(data), data))
     assert found.offsets_s is not None
-    np.testing.assert_allclose(found.offsets_s, [0, 0.05, 0.1], atol=1e-6)
+    np.testing.assert_allclose(found.offsets_s, [0, 0.05, 0.1], atol=2e-6)
 
 
-XYZ = (("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1))
+def test_times_that_decrease_or_end_at_the_stamp_keep_their_signs() -> None:
+    fields = (*XYZ, ("t", 12, 5, 1))
+    data = b"".join(struct.pack("<3fi", 1, 2, 3, v) for v in (0, -50_000_000, -100_000_000))
+    found = decode(PointCloud2(Header(STAMP, ""), 1, 3, fields, False, 16, 48, data))
+    assert found.offsets_s is not None
+    np.testing.assert_allclose(found.offsets_s, [0, -0.05, -0.1], atol=1e-7)
+
+
+def test_times_stay_with_their_points_where_rows_are_dropped() -> None:
+    rows = [(1, 0, 0, 0.0), (math.nan, 0, 0, 0.03), (2, 0, 0, 0.05), (3, 0, 0, math.nan), (4, 0, 0, 0.1)]
+    data = b"".join(struct.pack("<4f", *row) for row in rows)
+    found = decode(PointCloud2(Header(STAMP, ""), 1, 5, (*XYZ, ("t", 12, 7, 1)), False, 16, 80, data))
+    assert found.offsets_s is not None
+    np.testing.assert_allclose(found.xyz_m[:, 0], [1, 2, 4])
+    np.testing.assert_allclose(found.offsets_s, [0, 0.05, 0.1])
+    assert found.dropped == 2
+
+
+def test_no_times_or_all_the_same_is_no_offsets() -> None:
+    data = b"".join(struct.pack("<4f", 1, 2, 3, 0.5) for _ in range(3))
+    same = decode(PointCloud2(Header(STAMP, ""), 1, 3, (*XYZ, ("t", 12, 7, 1)), False, 16, 48, data))
+    assert same.offsets_s is None
+    assert same.note is not None
+    assert "all the same" in same.note
+    assert decode(PointCloud2(Header(STAMP, ""), 1, 3, XYZ, False, 16, 48, data)).offsets_s is None
 
 
 @pytest.mark.parametrize(

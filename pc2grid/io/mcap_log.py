@@ -20,7 +20,7 @@ from pc2grid.io import mcap_records as rec
 from pc2grid.io.mcap_records import ChunkIndex, Damage, Definitions, Fields
 from pc2grid.io.mcap_survey import Survey, survey
 from pc2grid.io.ros_definitions import short_name
-from pc2grid.io.source import LogInfo, Losses, RawMessage, TopicInfo
+from pc2grid.io.source import LogInfo, RawMessage, Tally, TopicInfo
 
 _ENCODINGS = {"cdr": "cdr", "ros1": "ros1", "protobuf": "protobuf", "json": "json"}
 _PENDING_BYTES = 512 << 20
@@ -30,12 +30,12 @@ class McapSource:
     """One MCAP file, open.
 
     Raises LogTruncated, LogCorrupt or LimitExceeded when it is opened or read; with `recover`, whatever is
-    whole is read and the rest is counted in `losses`.
+    whole is read and the rest is counted in `tally`.
     """
 
     def __init__(self, path: Path, config: ReadConfig, *, recover: bool = False) -> None:
         self.files: tuple[Path, ...] = (path,)
-        self.losses = Losses()
+        self.tally = Tally()
         self._path = path
         self._limits = rec.Limits(config.max_chunk_bytes, config.max_record_bytes)
         self._recover = recover
@@ -61,12 +61,12 @@ class McapSource:
             try:
                 found = read_summary(self._stream, size, self._limits)
             except Damage as damage:
-                self.losses.warn(f"the index is not usable ({damage.what}); the log was read in full instead")
+                self.tally.warn(f"the index is not usable ({damage.what}); the log was read in full instead")
             else:
                 if isinstance(found, Survey):
-                    self.losses.warnings += found.warnings
+                    self.tally.warnings += found.warnings
                     return found
-                self.losses.warn(f"the log has no index ({found}); it was read in full instead")
+                self.tally.warn(f"the log has no index ({found}); it was read in full instead")
         known = Definitions()
         if self._recover:
             # A chunk may rest on definitions in an earlier one that is lost; the summary repeats them.
@@ -74,8 +74,8 @@ class McapSource:
                 found = read_summary(self._stream, size, self._limits)
                 known = found.definitions if isinstance(found, Survey) else known
         made = survey(self._stream, size, self._limits, resync=self._recover, known=known)
-        self.losses.warnings += made.warnings
-        self.losses.bytes_lost += made.bytes_lost
+        self.tally.warnings += made.warnings
+        self.tally.bytes_lost += made.bytes_lost
         if made.damage is not None and not self._recover:
             seconds = (made.end_ns - made.start_ns) * 1e-9
             count = sum(made.counts.values())
@@ -118,7 +118,7 @@ class McapSource:
             end_ns=found.end_ns,
             message_count=sum(found.counts.values()) if found.counted else None,
             topics=tuple(topics),
-            warnings=tuple(self.losses.warnings),
+            warnings=tuple(self.tally.warnings),
         )
 
     # --- reading --------------------------------------------------------------------------------------
@@ -181,7 +181,7 @@ class McapSource:
             if (fields.start_ns, fields.end_ns) != (chunk.start_ns, chunk.end_ns):
                 raise Damage(chunk.offset, "the index gives other times")
             if fields.crc == 0 and fields.uncompressed_size:
-                self.losses.warn("chunks of the log carry no checksum: damage would not be seen")
+                self.tally.warn("chunks of the log carry no checksum: damage would not be seen")
             content = rec.decompress(data, fields, chunk.offset, self._limits)
             return rec.chunk_messages(content, chunk.offset, self._survey.definitions, wanted)
         except Damage as damage:
@@ -215,7 +215,7 @@ class McapSource:
         found = self._survey
         self._loose_checked = True
         if not found.data_crc:
-            self.losses.warn("messages of the log carry no checksum: damage would not be seen")
+            self.tally.warn("messages of the log carry no checksum: damage would not be seen")
             return
         crc, left = 0, found.data_end
         self._stream.seek(0)
@@ -226,8 +226,8 @@ class McapSource:
             if not self._recover:
                 raise Damage(found.data_end, "the checksum (CRC) of the data section is wrong")
             doubtful = sum(end - start for start, end in found.loose)
-            self.losses.bytes_lost += doubtful
-            self.losses.warn(f"{doubtful} bytes of messages fail their checksum and may be wrong")
+            self.tally.bytes_lost += doubtful
+            self.tally.warn(f"{doubtful} bytes of messages fail their checksum and may be wrong")
 
 
 def read_summary(stream: BinaryIO, size: int, limits: rec.Limits) -> Survey | str:

@@ -47,7 +47,7 @@ class ScanDecoder:
         if near is not None:
             points = points[near]
             offsets = None if offsets is None else offsets[near]
-            if not len(points) and len(near):
+            if not len(near):
                 raise PointCloudError(
                     f"every point is farther than {self._config.max_range_m:g} m from the sensor",
                     hint="are the coordinates in a global frame such as UTM?",

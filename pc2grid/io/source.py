@@ -83,9 +83,11 @@ class RawMessage(NamedTuple):
 
 
 @dataclass(slots=True)
-class Losses:
-    """What a source could not read, counted while it reads."""
+class Tally:
+    """What has been read and what could not be, counted on the way."""
 
+    scans_read: int = 0
+    points_dropped: int = 0
     bytes_lost: int = 0
     skipped: dict[str, int] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -104,7 +106,7 @@ class Source(Protocol):
     """A container of timed messages."""
 
     info: LogInfo
-    losses: Losses
+    tally: Tally
     files: tuple[Path, ...]
 
     def messages(
