@@ -44,8 +44,8 @@ METHOD_NAMES = (
 )
 """In the order of Table III."""
 
-EXTRA_METHOD_NAMES = ("point_contexts",)
-"""Rivals that the paper does not have."""
+EXTRA_METHOD_NAMES = ("point_contexts", "verified")
+"""What the paper does not have: Belongie's form of the shape context, and its own method with alignment."""
 
 
 def make_methods(names: Iterable[str]) -> dict[str, Method]:
@@ -72,6 +72,10 @@ def _make(name: str, vocabularies: dict[str, Vocabulary]) -> Method:
         from signature.baselines.point_contexts import PointContexts
 
         return PointContexts()
+    if name == "verified":
+        from signature.baselines.verified import Verified
+
+        return Verified()
     if name == "sdf":
         from signature.baselines.sdf import DistanceFeatures
 
