@@ -11,12 +11,14 @@ import typer
 import pc2grid
 from pc2grid_cli import console
 from pc2grid_cli.compare_paper import compare_paper_command
+from pc2grid_cli.compare_sensors import compare_sensors_command
 from pc2grid_cli.config import dump_command
 from pc2grid_cli.convert import convert_command
 from pc2grid_cli.db import check_command, copy_command, merge_command
 from pc2grid_cli.db import info_command as db_info_command
 from pc2grid_cli.demo import demo_command
 from pc2grid_cli.export import export_command
+from pc2grid_cli.info import info_command
 from pc2grid_cli.relocalize import relocalize_command
 from pc2grid_cli.simulate import simulate_command
 
@@ -51,24 +53,14 @@ def options(
 
 app.command("demo")(demo_command)
 app.command("simulate")(simulate_command)
-try:
-    from pc2grid_cli.info import info_command
-
-    app.command("info")(info_command)
-except ModuleNotFoundError:  # not there yet
-    pass
+app.command("info")(info_command)
 app.command("convert")(convert_command)
 app.command("relocalize")(relocalize_command)
 app.command("export")(export_command)
 
 compare = typer.Typer(help="The paper's tables, sensors against sensors.", no_args_is_help=True)
 compare.command("paper")(compare_paper_command)
-try:
-    from pc2grid_cli.compare_sensors import compare_sensors_command
-
-    compare.command("sensors")(compare_sensors_command)
-except ModuleNotFoundError:  # not there yet
-    pass
+compare.command("sensors")(compare_sensors_command)
 app.add_typer(compare, name="compare")
 
 db = typer.Typer(help="Look into databases, check, merge and copy them.", no_args_is_help=True)
