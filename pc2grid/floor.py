@@ -131,7 +131,14 @@ def _search(points: F64, sensor_m: F64) -> tuple[F64, float] | None:
     best = int(np.argmax(inliers - 3 * beneath))
     if inliers[best] < 0.02 * len(points) or beneath[best] > 0.1 * len(points):
         return None
-    return _refine(points, normals[best], float(offsets[best]), tolerance_m=2 * FLOOR_THICKNESS_M)
+    plane = _refine(points, normals[best], float(offsets[best]), tolerance_m=2 * FLOOR_THICKNESS_M)
+    if plane is None:
+        return None
+    # A level cut through walls holds no more points than the cut above it.
+    heights_m = points @ plane[0] + plane[1]
+    slab = (np.abs(heights_m) < FLOOR_THICKNESS_M).sum()
+    above = (np.abs(heights_m - 3 * FLOOR_THICKNESS_M) < FLOOR_THICKNESS_M).sum()
+    return plane if slab > 1.5 * above else None
 
 
 def _refine(points: F64, normal: F64, offset: float, tolerance_m: float) -> tuple[F64, float] | None:

@@ -269,7 +269,7 @@ def spread(tracked: F64, keyframe_index: Sequence[int], corrected: F64) -> F64:
     span = np.maximum(index[right] - index[left], 1)
     share = np.clip((scans - index[left]) / span, 0.0, 1.0)[:, None]
     turn = np.arctan2(np.sin(b[:, 2] - a[:, 2]), np.cos(b[:, 2] - a[:, 2]))
-    mixed = a + share * np.column_stack((b[:, :2] - a[:, :2], turn))
+    mixed: F64 = a + share * np.column_stack((b[:, :2] - a[:, :2], turn))
     mixed[:, 2] = np.arctan2(np.sin(mixed[:, 2]), np.cos(mixed[:, 2]))
     return mixed
 

@@ -242,8 +242,10 @@ def best_placements(
     returned are the best `count` placements no two of which are neighbours, best first, with the mean
     likelihood of the points.
     """
-    across: F64 = np.arange(-math.ceil(window_m / step_m), math.ceil(window_m / step_m) + 1) * step_m
-    turns: F64 = np.arange(-math.ceil(window_rad / step_rad), math.ceil(window_rad / step_rad) + 1) * step_rad
+    steps = math.ceil(window_m / step_m)
+    across = step_m * np.arange(-steps, steps + 1, dtype=np.float64)
+    steps = math.ceil(window_rad / step_rad)
+    turns = step_rad * np.arange(-steps, steps + 1, dtype=np.float64)
     points = np.asarray(points_m, dtype=np.float64)
     scores = _scores(field, low_m, cell_m, points, guess.x, guess.y, guess.yaw + turns, across)
     found: list[tuple[float, SE2]] = []

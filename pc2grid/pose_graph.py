@@ -39,7 +39,7 @@ class Solution:
 
 
 def optimise(
-    poses: F64, edges: Sequence[Edge], *, iterations: int = 20, robust_scale: float = 3.0
+    poses: F64, edges: Sequence[Edge], *, iterations: int = 25, robust_scale: float = 3.0
 ) -> Solution:
     """Poses (N, 3) that agree best with the edges; the first pose stays where it is.
 
@@ -61,9 +61,13 @@ def optimise(
     column = np.tile(rows, (1, 6)).ravel()
     size = 3 * len(poses)
     error, jacobian = _linearise(poses, i, j, z)
+    # Graduated: all loops are believed at first, else large drift would make every true one an outlier.
+    scale = max(
+        robust_scale, float(np.sqrt(np.einsum("ea,eab,eb->e", error, omega, error)[loop].max(initial=0.0)))
+    )
     for _ in range(iterations):
         chi2 = np.einsum("ea,eab,eb->e", error, omega, error)
-        weight = np.where(loop, 1.0 / (1.0 + chi2 / robust_scale**2), 1.0)
+        weight = np.where(loop, 1.0 / (1.0 + chi2 / scale**2), 1.0)
         weighted = omega * weight[:, None, None]
         JtO = jacobian.transpose(0, 2, 1) @ weighted
         H = coo_matrix(((JtO @ jacobian).ravel(), (row, column)), shape=(size, size)).tocsc()
@@ -74,8 +78,9 @@ def optimise(
         poses += delta.reshape(-1, 3)
         poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
         error, jacobian = _linearise(poses, i, j, z)
-        if np.abs(delta).max() < 1e-5:
+        if np.abs(delta).max() < 1e-5 and scale == robust_scale:
             break
+        scale = max(0.5 * scale, robust_scale)
     return Solution(poses, np.einsum("ea,eab,eb->e", error, omega, error))
 
 

@@ -17,11 +17,12 @@ from pc2grid.sweep import Sweep
 
 _TILE = 256
 _SUBPIXEL = 4  # fractional bits of cv2's polygon corners
-# Log-odds in hundredths, as int16. A hit weighs about two misses, so a thin wall that is grazed by
-# passing rays stays, and a person who left is cleared by the third look.
-_HIT = 85
-_MISS = -40
-_CLAMP = 350
+# Log-odds in hundredths, as int16. Two looks make a cell free by nav2's threshold, one hit makes it
+# occupied. A hit weighs two misses, so a thin wall that passing rays graze stays, and a person who left is
+# cleared by the third look.
+_HIT = 150
+_MISS = -75
+_CLAMP = 500
 
 
 class GridBuilder:

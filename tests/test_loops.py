@@ -1,0 +1,120 @@
+"""The pose graph, and maps that agree with themselves."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pc2grid.geometry import SE2
+from pc2grid.loops import close_loops, spread
+from pc2grid.pieces import Keyframe
+from pc2grid.pose_graph import Edge, optimise
+from pc2grid.sweep import BEARINGS, Sweep
+
+INFORMATION = np.diag([1e4, 1e4, 1e5])
+
+
+def square(count=40, side=10.0):
+    """True poses around a square of corridors."""
+    poses = []
+    for k in range(count):
+        s = 4 * side * k / count
+        edge, along = divmod(s, side)
+        corner = [(0, 0), (side, 0), (side, side), (0, side)][int(edge)]
+        yaw = edge * math.pi / 2
+        poses.append(
+            SE2(
+                corner[0] + along * math.cos(yaw),
+                corner[1] + along * math.sin(yaw),
+                math.remainder(yaw, 2 * math.pi),
+            )
+        )
+    return poses
+
+
+def drifting(truth, veer=0.01):
+    poses, edges = [truth[0]], []
+    for k in range(1, len(truth)):
+        step = truth[k - 1].inverse() @ truth[k]
+        measured = SE2(step.x * 1.01, step.y, step.yaw + veer)
+        edges.append(Edge(k - 1, k, measured, INFORMATION))
+        poses.append(poses[-1] @ measured)
+    return poses, edges
+
+
+def array(poses):
+    return np.array([(p.x, p.y, p.yaw) for p in poses])
+
+
+def test_one_loop_takes_the_drift_out_and_a_false_one_is_outvoted():
+    truth = square()
+    poses, edges = drifting(truth)
+    before = np.linalg.norm(array(poses)[-1, :2] - array(truth)[-1, :2])
+    loops = [Edge(k, 39 - k, truth[k].inverse() @ truth[39 - k], INFORMATION, loop=True) for k in range(3)]
+    false = Edge(5, 25, SE2(0.5, 0.0, 0.0), INFORMATION, loop=True)
+    solved = optimise(array(poses), [*edges, *loops, false])
+    after = np.linalg.norm(solved.poses[-1, :2] - array(truth)[-1, :2])
+    assert before > 1.0 and after < 0.1
+    assert solved.chi2[-1] > 100 * solved.chi2[-2]
+    assert np.array_equal(solved.poses[0], array(truth)[0])
+
+
+def test_exact_edges_are_solved_exactly_from_a_bad_start():
+    truth = square(12)
+    edges = [Edge(k, k + 1, truth[k].inverse() @ truth[k + 1], INFORMATION) for k in range(11)]
+    start = array(truth) + np.random.default_rng(0).normal(0, 0.2, (12, 3)) * (np.arange(12) > 0)[:, None]
+    solved = optimise(start, edges).poses
+    assert np.abs(solved[:, :2] - array(truth)[:, :2]).max() < 1e-4
+
+
+def test_no_edges_nothing_moves():
+    assert np.array_equal(optimise(np.ones((3, 3)), []).poses, np.ones((3, 3)))
+
+
+def test_corrections_pass_smoothly_between_keyframes():
+    tracked = np.column_stack((np.arange(5.0), np.zeros(5), np.zeros(5)))
+    corrected = np.array([[0.0, 0.0, 0.0], [4.0, 0.4, 0.0]])
+    assert spread(tracked, [0, 4], corrected)[:, 1] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
+    assert spread(tracked, [0, 2], np.array([[0, 0, 0], [2, 1.0, 0]]))[4] == pytest.approx((4, 1, 0))
+
+
+def ring_sweep(pose, walls):
+    """What a laser all around sees of walls, each a segment ((x, y), (x, y))."""
+    bearings = np.arange(BEARINGS) * (2 * np.pi / BEARINGS)
+    directions = np.column_stack((np.cos(bearings + pose.yaw), np.sin(bearings + pose.yaw)))
+    ranges = np.full(BEARINGS, np.inf)
+    for a, b in walls:
+        a, b = np.array(a, float), np.array(b, float)
+        d, o = b - a, a - (pose.x, pose.y)
+        cross = directions[:, 0] * d[1] - directions[:, 1] * d[0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (o[0] * d[1] - o[1] * d[0]) / cross
+            u = (o[0] * directions[:, 1] - o[1] * directions[:, 0]) / cross
+        ranges = np.where((t > 0) & (u >= 0) & (u <= 1) & (t < ranges), t, ranges)
+    seen = np.isfinite(ranges)
+    hits = np.column_stack((np.cos(bearings), np.sin(bearings)))[seen] * ranges[seen, None]
+    return Sweep(
+        stamp_ns=0,
+        hits_m=hits.astype(np.float32),
+        origin_m=np.zeros(2),
+        free_m=np.where(seen, ranges, 0).astype(np.float32),
+    )
+
+
+def test_two_laps_around_a_block_with_drift_agree_after_closing():
+    outer = [((-2, -2), (14, -2)), ((14, -2), (14, 12)), ((14, 12), (-2, 12)), ((-2, 12), (-2, -2))]
+    block = [((2, 2), (8, 2)), ((8, 2), (8, 5)), ((8, 5), (5, 8)), ((5, 8), (2, 8)), ((2, 8), (2, 2))]
+    truth = square(100) * 2
+    walls = outer + block
+    poses, _ = drifting(truth, veer=0.0015)
+    keyframes = [
+        Keyframe(k, ring_sweep(true, walls), pose, INFORMATION)
+        for k, (true, pose) in enumerate(zip(truth, poses, strict=True))
+    ]
+    before = np.linalg.norm(array(poses)[:, :2] - array(truth)[:, :2], axis=1)
+    closed = close_loops(keyframes)
+    after = np.linalg.norm(closed.poses[:, :2] - array(truth)[:, :2], axis=1)
+    assert before.max() > 0.5 and len(closed.pairs) > 3
+    lap = closed.poses[100:, :2] - closed.poses[:100, :2]
+    assert np.linalg.norm(lap, axis=1).max() < 0.08
+    assert after.max() < 0.5 * before.max()

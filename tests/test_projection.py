@@ -1,0 +1,77 @@
+"""Sweeps drawn into a growing grid."""
+
+import numpy as np
+import pytest
+
+from pc2grid.config import ProjectionConfig
+from pc2grid.errors import LimitExceeded
+from pc2grid.geometry import SE2
+from pc2grid.projection import GridBuilder
+from pc2grid.sweep import BEARINGS, Sweep
+
+
+def disc(radius_m, *, hits=True):
+    """A sweep that looks all around a round room."""
+    bearings = np.arange(BEARINGS) * (2 * np.pi / BEARINGS)
+    rim = radius_m * np.column_stack((np.cos(bearings), np.sin(bearings)))
+    return Sweep(
+        stamp_ns=0,
+        hits_m=(rim if hits else np.zeros((0, 2))).astype(np.float32),
+        origin_m=np.zeros(2),
+        free_m=np.full(BEARINGS, radius_m, np.float32),
+    )
+
+
+def state(grid, x, y):
+    row, column = grid.to_cell(np.array([[x, y]]))[0]
+    return int(grid.cells[row, column])
+
+
+def test_round_room_is_free_inside_occupied_at_its_wall_unknown_outside():
+    builder = GridBuilder(ProjectionConfig())
+    for _ in range(3):
+        builder.add(disc(2.0), SE2(10.0, -3.0, 0.7))
+    grid = builder.grid()
+    y, x = np.mgrid[: grid.cells.shape[0], : grid.cells.shape[1]]
+    centres = grid.to_point(np.column_stack((y.ravel(), x.ravel())))
+    distance = np.linalg.norm(centres - (10.0, -3.0), axis=1).reshape(grid.cells.shape)
+    assert grid.free[distance < 1.9].all()
+    assert (grid.cells[distance > 2.1] == -1).all()
+    wall = grid.occupied
+    assert wall.sum() > 200 and np.abs(distance[wall] - 2.0).max() < 0.05
+
+
+def test_someone_who_left_is_cleared():
+    builder = GridBuilder(ProjectionConfig())
+    person = Sweep(
+        stamp_ns=0,
+        hits_m=np.array([[1.02, 0.02]], np.float32),
+        origin_m=np.zeros(2),
+        free_m=np.where(np.arange(BEARINGS) < 4, 1.0, 0.0).astype(np.float32),
+    )
+    builder.add(person, SE2())
+    assert state(builder.grid(), 1.02, 0.02) >= 65
+    for _ in range(6):
+        builder.add(disc(2.0), SE2())
+    assert 0 <= state(builder.grid(), 1.02, 0.02) < 20
+
+
+def test_a_map_may_span_half_a_kilometre_between_two_rooms():
+    builder = GridBuilder(ProjectionConfig())
+    builder.add(disc(2.0), SE2(0.0, 0.0, 0.0))
+    builder.add(disc(2.0), SE2(-130.0, 70.0, 0.0))
+    grid = builder.grid()
+    assert state(grid, 0.5, 0.5) < 50 and state(grid, -130.5, 70.5) < 50 and state(grid, -60.0, 30.0) == -1
+
+
+def test_a_map_past_the_limit_is_refused():
+    builder = GridBuilder(ProjectionConfig(max_cells=600_000))
+    builder.add(disc(2.0), SE2())
+    with pytest.raises(LimitExceeded, match="max_cells"):
+        for k in range(1, 10):
+            builder.add(disc(2.0), SE2(100.0 * k, 0.0, 0.0))
+        builder.grid()
+
+
+def test_nothing_seen_gives_an_empty_grid():
+    assert GridBuilder(ProjectionConfig()).grid().cells.size == 0

@@ -1,0 +1,157 @@
+"""Following a robot: pose, health, and what it costs to be wrong."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from pc2grid.config import ProjectionConfig, RegistrationConfig
+from pc2grid.deskew import deskew
+from pc2grid.geometry import SE2, invert_pose, transform_points
+from pc2grid.model import Health, Scan
+from pc2grid.registration import KissRegistration, register, thin
+from pc2grid.simulate import SimulationConfig, iter_session
+from pc2grid.tracking import Tracker
+
+
+def session(sensor, *, length_m=6.0, seed=4):
+    return list(iter_session(sensor=sensor, config=SimulationConfig(length_m=length_m, seed=seed)))
+
+
+@pytest.fixture(scope="module")
+def laser():
+    return session("laser", length_m=8.0)
+
+
+def errors(pairs, poses):
+    """Distance of each pose from the truth, both seen from the first scan."""
+    first = pairs[0][1].inverse()
+    truth = np.array([((first @ p).x, (first @ p).y) for _, p in pairs[: len(poses)]])
+    return np.linalg.norm(np.array([T[:2, 3] for T in poses]) - truth, axis=1)
+
+
+def blind(scan):
+    return dataclasses.replace(scan, T_odom_base=None)
+
+
+@pytest.mark.parametrize(("sensor", "limit_m"), [("laser", 0.06), ("lidar", 0.06), ("depth", 0.10)])
+def test_each_sensor_is_followed(sensor, limit_m):
+    pairs = session(sensor)
+    registered = list(register(scan for scan, _ in pairs))
+    assert len(registered) == len(pairs)
+    assert errors(pairs, [r.T_map_base for r in registered]).max() < limit_m
+    assert sum(r.health is Health.LOST for r in registered) == 0
+    assert np.array_equal(registered[0].T_map_base, np.eye(4)) or sensor != "laser"
+
+
+def test_odometry_that_says_forward_while_the_robot_reverses_is_overruled(laser):
+    lying = []
+    for k, (scan, pose) in enumerate(laser):
+        odometry = scan.T_odom_base
+        if k:  # every step negated, as a log does whose encoder counts without a sign
+            true_step = invert_pose(laser[k - 1][0].T_odom_base) @ odometry
+            step = true_step.copy()
+            step[:2, 3] *= -1.0
+            odometry = lying[-1][0].T_odom_base @ step
+        lying.append((dataclasses.replace(scan, T_odom_base=odometry), pose))
+    poses = [r.T_map_base for r in register(scan for scan, _ in lying)]
+    assert errors(laser, poses).max() < 0.25
+
+
+def test_laser_without_odometry_is_followed_or_says_that_it_is_lost(laser):
+    registered = list(register(blind(scan) for scan, _ in laser))
+    lost = [r.health is Health.LOST for r in registered]
+    assert any(lost) or errors(laser, [r.T_map_base for r in registered]).max() < 0.3
+
+
+def test_carried_off_without_odometry_is_noticed_and_restarts(laser):
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    elsewhere = session("laser", length_m=3.0, seed=11)
+    tracked = [tracker.track(blind(scan)) for scan, _ in laser[:40]]
+    end_ns = laser[39][0].stamp_ns
+    for k, (scan, _) in enumerate(elsewhere):
+        moved = dataclasses.replace(blind(scan), stamp_ns=end_ns + (k + 1) * 100_000_000)
+        tracked.append(tracker.track(moved))
+    health = [t.registered.health for t in tracked]
+    assert Health.LOST not in health[:40]
+    assert Health.LOST in health[40:45] or any(t.restart for t in tracked)
+    assert health[-1] is not Health.LOST
+
+
+def test_a_single_wall_is_degenerate_along_itself():
+    y = np.linspace(-4, 4, 200)
+    wall = np.column_stack((np.full(200, 2.0), y, np.zeros(200)))
+    rng = np.random.default_rng(0)
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    health = []
+    for k in range(8):
+        odometry = SE2(0.0, 0.02 * k, 0.0).lift()
+        points = wall + np.array([0.0, -0.02 * k, 0.0]) + rng.normal(0, 0.005, (200, 1)) * (1, 0, 0)
+        points = points[np.abs(points[:, 1]) < 3]
+        scan = Scan(
+            stamp_ns=k * 100_000_000,
+            points_m=points,
+            T_base_sensor=np.eye(4),
+            sensor="laser",
+            T_odom_base=odometry,
+        )
+        tracked = tracker.track(scan)
+        health.append(tracked.registered.health)
+    assert set(health[2:]) == {Health.DEGENERATE}
+    assert tracked.registered.T_map_base[1, 3] == pytest.approx(0.14, abs=0.03)
+
+
+def test_empty_scans_pass_time_and_nothing_else(laser):
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    results = []
+    for k, (scan, _) in enumerate(laser[:30]):
+        if k % 3 == 1:
+            scan = dataclasses.replace(scan, points_m=np.zeros((0, 3), np.float32), offsets_s=None)
+        results.append(tracker.track(scan))
+    assert errors(laser, [t.registered.T_map_base for t in results]).max() < 0.05
+    assert not any(t.keyframe for t in results[1::3])
+    assert all(len(t.sweep.hits_m) == 0 for t in results[1::3])
+
+
+def test_standing_still_adds_no_keyframes(laser):
+    scan = laser[0][0]
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    still = (dataclasses.replace(scan, stamp_ns=scan.stamp_ns + k) for k in range(0, 10**9, 10**8))
+    assert sum(tracker.track(s).keyframe for s in still) == 1
+
+
+def test_same_scans_same_bytes(laser):
+    def run():
+        return np.array([r.T_map_base for r in register(s for s, _ in itertools.islice(laser, 40))]).tobytes()
+
+    assert run() == run()
+
+
+def test_deskew_puts_points_back_where_they_were():
+    rng = np.random.default_rng(5)
+    world = rng.uniform(-5, 5, (500, 3))
+    offsets = rng.uniform(-0.05, 0.1, 500).astype(np.float32)
+    motion = SE2(0.08, 0.01, 0.09).lift()  # in 0.1 s, from standing at the origin at the stamp
+    seen = np.empty_like(world)
+    for k, t in enumerate(offsets):
+        pose = np.eye(4)
+        yaw = 0.09 * t / 0.1
+        pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+        pose[:2, 3] = 0.08 * t / 0.1, 0.01 * t / 0.1
+        seen[k] = transform_points(invert_pose(pose), world[k : k + 1])[0]
+    assert np.abs(deskew(seen.astype(np.float32), offsets, motion, 0.1) - world).max() < 0.005
+    assert np.abs(seen - world).max() > 0.3
+
+
+def test_thin_keeps_order_and_repeats():
+    points = np.zeros((1000, 3))
+    kept = thin(points, 100)
+    assert len(kept) == 100 and (np.diff(kept) > 0).all() and np.array_equal(kept, thin(points, 100))
+    assert len(thin(points, 5000)) == 1000
+
+
+def test_kiss_icp_without_points_returns_the_prediction():
+    kiss = KissRegistration(RegistrationConfig())
+    motion = SE2(0.1, 0.0, 0.05).lift()
+    assert np.allclose(kiss.register(np.zeros((3, 3)), np.eye(4), motion, 0.1), motion)
