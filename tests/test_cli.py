@@ -233,6 +233,8 @@ def test_interrupted_convert_leaves_nothing(house: Path, tmp_path: Path, number,
         [sys.executable, "-c", "from pc2grid_cli.main import main; main()", "convert",
          str(house / "drive.mcap"), "-o", "x.submaps"],
         cwd=tmp_path, stderr=subprocess.PIPE, text=True,
+        # A shell that runs the tests in the background lets its children ignore Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"},
     )  # fmt: skip
     time.sleep(1.0)
