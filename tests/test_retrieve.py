@@ -1,0 +1,118 @@
+"""Views, retrieval by signatures and isovists, and what the probabilities promise."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pc2grid.geometry import SE2
+from signature.confidence import Calibration, Evidence, fit
+from signature.query import Window
+from signature.retrieve import retrieve, rotate_and_compare
+from tests.drives import building, drive, office
+
+OFFICE = building({"office": office()})
+
+
+def window(corners: list[tuple[float, float]], field_deg: float = 360.0) -> tuple[Window, SE2]:
+    """What is seen on a drive, and where its frame lies in the office."""
+    seen = Window(OFFICE.made_with.projection, OFFICE.config)
+    first: SE2 | None = None
+    for registered, sweep, truth in drive(office(), corners, field_rad=math.radians(field_deg)):
+        first = first or truth
+        seen.add(sweep, SE2.flatten(registered.T_map_base))
+    assert first is not None
+    return seen, first
+
+
+@pytest.mark.parametrize("field_deg", [360.0, 270.0, 90.0])
+def test_the_right_place_is_among_the_first_twenty(field_deg: float) -> None:
+    seen, T_map_query = window([(1.5, 7.0), (9.5, 7.0)], field_deg)
+    made_with = OFFICE.made_with
+    query = seen.query(made_with.partition, made_with.signature)
+    found = retrieve(query, OFFICE.places, signature=made_with.signature, config=OFFICE.config, top_k=20)
+    assert len({p.row for p in found}) == len(found) == 20
+    assert [p.likeness for p in found] == sorted((p.likeness for p in found), reverse=True)
+    right = [
+        p
+        for p in found
+        if math.dist(
+            T_map_query.apply(np.array([query.views[p.view].center_m]))[0],
+            OFFICE.places.table.center_m[p.row],
+        )
+        <= 1.0
+    ]
+    assert right
+    turns = [abs(math.remainder(yaw - T_map_query.yaw, 2 * math.pi)) for p in right for yaw in p.yaw_rad]
+    assert min(turns) < math.radians(10)
+
+
+def test_views_lie_apart_and_on_what_was_seen() -> None:
+    seen, _ = window([(1.5, 7.0), (9.5, 7.0)], 90.0)
+    query = seen.query(OFFICE.made_with.partition, OFFICE.made_with.signature)
+    centers = np.array([v.center_m for v in query.views])
+    apart = np.hypot(*(centers[:, None] - centers[None]).transpose(2, 0, 1))
+    assert 2 <= len(centers) <= OFFICE.config.views
+    assert apart[~np.eye(len(centers), dtype=bool)].min() >= OFFICE.config.view_spacing_m
+    cells = query.grid.to_cell(centers)
+    assert (query.grid.cells[cells[:, 0], cells[:, 1]] >= 0).all()
+
+
+def test_a_window_forgets_what_lies_farther_back() -> None:
+    config = OFFICE.config.model_copy(update={"window_m": 3.0})
+    long, short = (
+        Window(OFFICE.made_with.projection, OFFICE.config),
+        Window(OFFICE.made_with.projection, config),
+    )
+    for registered, sweep, _ in drive(office(), [(1.5, 7.0), (9.5, 7.0)]):
+        for seen in (long, short):
+            seen.add(sweep, SE2.flatten(registered.T_map_base))
+    assert long.path_m == pytest.approx(short.path_m) == pytest.approx(7.8, abs=0.3)
+    assert len(short) < 20 < len(long)
+
+
+def test_standing_still_adds_nothing() -> None:
+    seen = Window(OFFICE.made_with.projection, OFFICE.config)
+    registered, sweep, _ = next(drive(office(), [(1.5, 7.0), (9.5, 7.0)]))
+    for _ in range(50):
+        seen.add(sweep, SE2.flatten(registered.T_map_base))
+    assert len(seen) == 1 and seen.path_m == 0.0
+
+
+def test_isovists_are_compared_at_every_rotation_like_a_slow_oracle() -> None:
+    rng = np.random.default_rng(0)
+    ranges, others = rng.uniform(1, 5, 90).astype(np.float32), rng.uniform(1, 5, (7, 90)).astype(np.float32)
+    seen, others_seen = rng.random(90) < 0.8, rng.random((7, 90)) < 0.8
+    others[3], others_seen[3] = np.roll(ranges, 20), np.roll(seen, 20)
+    fast = rotate_and_compare(ranges, seen, others, others_seen)
+    for i in range(7):
+        for shift in (0, 1, 20, 89):
+            other, known = np.roll(others[i], -shift), np.roll(others_seen[i], -shift)
+            both = seen & known
+            kernel = 1 / (1 + ((ranges - other)[both] / 0.4) ** 2)
+            assert fast[i, shift] == pytest.approx(kernel.sum() / (both.sum() + 0.15 * 90), abs=1e-4)
+    assert np.unravel_index(np.argmax(fast), fast.shape) == (3, 20)
+
+
+def test_probabilities_sum_to_one_and_a_tie_is_halved() -> None:
+    model = Calibration()
+    p = model.probabilities(Evidence(scores=(0.9, 0.9), walls=2000))
+    assert p.sum() == pytest.approx(1.0)
+    assert p[0] == pytest.approx(p[1]) == pytest.approx(0.5, abs=1e-3)
+    assert model.probabilities(Evidence(scores=(), walls=0))[-1] == 1.0
+    lone = [model.probabilities(Evidence(scores=(s,), walls=1000))[0] for s in (0.3, 0.6, 0.9)]
+    assert lone == sorted(lone) and lone[0] < 0.05 and lone[2] > 0.99
+
+
+def test_the_fit_recovers_the_model_that_made_the_data() -> None:
+    rng = np.random.default_rng(0)
+    truth = Calibration(neutral=0.55, worth=30.0, power=0.3)
+    scores = np.sort(rng.uniform(0.35, 0.85, (4000, 3)), axis=1)[:, ::-1]
+    walls = rng.uniform(50, 2000, 4000)
+    evidence = [Evidence(scores=tuple(s), walls=float(w)) for s, w in zip(scores, walls, strict=True)]
+    right = [rng.random() < truth.probabilities(e)[0] for e in evidence]
+    found = fit(evidence, right)
+    assert found.neutral == pytest.approx(truth.neutral, abs=0.03)
+    assert found.worth == pytest.approx(truth.worth, rel=0.25)
