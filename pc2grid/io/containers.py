@@ -7,10 +7,11 @@ from pathlib import Path
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogNotFound, LogTruncated, NotALog
+from pc2grid.io import rosbag2_folder
 from pc2grid.io.mcap_records import MAGIC
 from pc2grid.io.source import Source
 
-_BAG = b"#ROSBAG V"
+_BAG = b"#ROSBAG V2.0\n"
 _SQLITE = b"SQLite format 3\0"
 
 
@@ -20,6 +21,8 @@ def open_source(path: Path, config: ReadConfig, *, recover: bool) -> Source:
     Raises LogNotFound, NotALog, LogTruncated, or what the container's reader raises.
     """
     try:
+        if path.name == rosbag2_folder.METADATA and path.is_file():
+            path = path.parent
         if path.is_dir():
             return _open_folder(path, config, recover)
         if not path.exists():
@@ -46,17 +49,32 @@ def _open_file(path: Path, head: bytes, config: ReadConfig, recover: bool) -> So
         return McapSource(path, config, recover=recover)
     if MAGIC.startswith(head):
         raise LogTruncated(f"{path}: an MCAP that ends after {len(head)} bytes", hint="nothing to recover")
-    raise NotALog(f"{path}: not an MCAP file; looks like {_looks_like(head)}", hint=_advice(head))
+    if head.startswith(_BAG):
+        from pc2grid.io.bag_log import BagSource
+
+        return BagSource(path, config)
+    if head.startswith(_SQLITE):
+        from pc2grid.io.db3_log import Db3Source
+
+        return Db3Source(path, config)
+    raise NotALog(f"{path}: not a recording; looks like {_looks_like(head)}", hint=_advice(head))
 
 
 def _open_folder(path: Path, config: ReadConfig, recover: bool) -> Source:
-    raise LogNotFound(f"{path}: a folder without a recording", hint="name the .mcap file")
+    names = sorted(entry.name for entry in path.iterdir())
+    if rosbag2_folder.METADATA in names or any(name.endswith(rosbag2_folder.SUFFIXES) for name in names):
+        return rosbag2_folder.open_folder(
+            path,
+            lambda file: open_source(file, config, recover=recover),
+            recover=recover,
+            max_chunk_bytes=config.max_chunk_bytes,
+        )
+    raise LogNotFound(f"{path}: a folder without a recording", hint="name the file of the recording")
 
 
 def _looks_like(head: bytes) -> str:
     kinds = {
-        _BAG: "a ROS 1 bag",
-        _SQLITE: "an SQLite file (a rosbag2 .db3?)",
+        b"#ROSBAG V": "a ROS 1 bag of an old format",
         b"\x89PNG": "a PNG image",
         b"P5": "a PGM image",
         b"\x1f\x8b": "a gzip archive",
@@ -79,6 +97,6 @@ def _looks_like(head: bytes) -> str:
 def _advice(head: bytes) -> str:
     if head.startswith((b"\x1f\x8b", b"PK\x03\x04", b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18")):
         return "unpack it first"
-    if head.startswith((_BAG, _SQLITE)):
-        return "convert it with `mcap convert`"
-    return "pc2grid reads MCAP recordings"
+    if head.startswith(b"#ROSBAG V"):
+        return "`rosbag migrate` or `rosbag fix` makes it one of format 2.0"
+    return "pc2grid reads MCAP, ROS 1 bags, rosbag2 folders and .db3"

@@ -1,0 +1,123 @@
+"""ROS 1 bags as a message source, read by `rosbags`.
+
+The format has no checksums, so all that can be seen of damage is structure: record lengths are checked
+against the file before `rosbags` is let at it, and what it unpacks is bounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+from pc2grid.config import ReadConfig
+from pc2grid.errors import LogCorrupt, LogTruncated
+from pc2grid.io.ros_definitions import short_name
+from pc2grid.io.source import LogInfo, RawMessage, Tally, TopicInfo
+from pc2grid.io.unpack import unpacker
+
+MAGIC = b"#ROSBAG V2.0\n"
+_REINDEX = "`rosbag reindex` recovers what is whole"
+
+
+class BagSource:
+    """One ROS 1 bag (format 2.0), open.
+
+    Raises LogTruncated or LogCorrupt when it is opened or read. Damaged bags are not recovered here.
+    """
+
+    def __init__(self, path: Path, config: ReadConfig) -> None:
+        from rosbags.rosbag1 import Reader, ReaderError
+
+        self.files: tuple[Path, ...] = (path,)
+        self.tally = Tally()
+        self.tally.warn("a ROS 1 bag carries no checksum: damage to its data would not be seen")
+        self._path = path
+        _check_records(path)
+        self._reader = Reader(path)
+        try:
+            self._reader.open()
+        except ReaderError as error:
+            # A recorder writes the index last; without one it was interrupted.
+            kind = LogTruncated if "not indexed" in str(error) else LogCorrupt
+            raise kind(f"{path}: {error}", hint=_REINDEX) from error
+        for place, chunk in self._reader.chunks.items():
+            kind_of = _compression(chunk)
+            bounded = unpacker(kind_of, config.max_chunk_bytes)
+            self._reader.chunks[place] = chunk._replace(decompressor=bounded)
+        self._topic_of = _topics(self._reader.connections)
+        topics = sorted(set(self._topic_of.values()), key=lambda t: (t.topic, t.type))
+        count = sum(t.message_count or 0 for t in topics)
+        self.info = LogInfo(
+            path=path,
+            format="bag/ros1",
+            size_bytes=path.stat().st_size,
+            start_ns=self._reader.start_time if count else 0,
+            end_ns=self._reader.end_time - 1 if count else 0,
+            message_count=count,
+            topics=tuple(topics),
+            warnings=tuple(self.tally.warnings),
+        )
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._reader.bio is not None:
+            self._reader.close()
+
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """See Source.messages; exactly by log time."""
+        from rosbags.rosbag1 import ReaderError
+
+        wanted = [c for c in self._reader.connections if self._topic_of[c.id].topic in topics]
+        if not wanted:
+            return  # an empty choice would mean everything
+        try:
+            for connection, time_ns, data in self._reader.messages(wanted, start_ns, end_ns):
+                yield RawMessage(self._topic_of[connection.id], time_ns, data)
+        except (ReaderError, AssertionError) as error:
+            raise LogCorrupt(f"{self._path}: a chunk is damaged: {error}", hint=_REINDEX) from error
+
+
+def _compression(chunk: Any) -> str:
+    from rosbags.rosbag1.reader import decompressors
+
+    return next(name for name, function in decompressors.items() if function is chunk.decompressor)
+
+
+def _topics(connections: list[Any]) -> dict[int, TopicInfo]:
+    """The topic of each connection; a topic has one per publisher."""
+    counts: dict[tuple[str, str], int] = {}
+    for c in connections:
+        counts[c.topic, c.msgtype] = counts.get((c.topic, c.msgtype), 0) + c.msgcount
+    first: dict[tuple[str, str], TopicInfo] = {}
+    for c in connections:
+        first.setdefault(
+            (c.topic, c.msgtype),
+            TopicInfo(
+                topic=c.topic,
+                type=short_name(c.msgtype),
+                encoding="ros1",
+                schema_encoding="ros1msg",
+                schema=c.msgdef.data.encode(),
+                message_count=counts[c.topic, c.msgtype],
+            ),
+        )
+    return {c.id: first[c.topic, c.msgtype] for c in connections}
+
+
+def _check_records(path: Path) -> None:
+    """Walk over all records by their lengths: header and data, a u32 length in front of each."""
+    size = path.stat().st_size
+    at = len(MAGIC)
+    with path.open("rb") as stream:
+        while at < size:
+            for _ in range(2):
+                stream.seek(at)
+                length = stream.read(4)
+                at += 4 + int.from_bytes(length, "little")
+                if len(length) < 4 or at > size:
+                    raise LogTruncated(
+                        f"{path}: the bag ends within a record ({size} bytes, {at} needed)", hint=_REINDEX
+                    )
