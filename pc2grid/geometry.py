@@ -62,6 +62,18 @@ class SE2:
         return matrix
 
     @staticmethod
+    def fit(source_m: ArrayLike, target_m: ArrayLike) -> SE2:
+        """T_target_source that brings points (N, 2) nearest to their partners (N, 2), least squares.
+
+        Without scale (Umeyama 1991): what remains is the absolute trajectory error.
+        """
+        source, target = np.asarray(source_m, np.float64), np.asarray(target_m, np.float64)
+        a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+        yaw = math.atan2(float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()), float((a * b).sum()))
+        x, y = target.mean(axis=0) - SE2(0.0, 0.0, yaw).apply(source.mean(axis=0))
+        return SE2(float(x), float(y), yaw)
+
+    @staticmethod
     def flatten(T_target_source: F64) -> SE2:
         """The planar part of a spatial pose (4, 4): x, y and the heading of its x axis."""
         return SE2(

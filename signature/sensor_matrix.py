@@ -149,15 +149,18 @@ class Mapped:
 def map_building(
     name: str, plan: OccupancyGrid, sensor: SensorKind, simulation: SimulationConfig, config: Config
 ) -> tuple[SessionMap, SE2]:
-    """Drive through the plan with a sensor: the session's map, and where its frame lies in the plan."""
+    """Drive through the plan with a sensor: the session's map, and where its frame lies in the plan.
+
+    The frame is fitted over the whole trajectory, as for an absolute trajectory error: the heading of the
+    first scan alone would carry a small error far.
+    """
     from pc2grid.simulate import iter_session
 
-    first: list[SE2] = []
+    truths: list[tuple[float, float]] = []
 
     def scans() -> Iterator[Scan]:
         for scan, truth in iter_session(sensor=sensor, grid=plan, config=simulation):
-            if not first:
-                first.append(truth)
+            truths.append((truth.x, truth.y))
             yield scan
 
     grid, trajectory = map_scans(scans(), config)
@@ -168,7 +171,7 @@ def map_building(
         submaps=partition(grid, config.partition),
         trajectory=trajectory,
     )
-    return session_map, first[0]
+    return session_map, SE2.fit(trajectory.planar()[:, :2], np.array(truths))
 
 
 def query_trials(

@@ -1,0 +1,77 @@
+"""The sensor matrix: its numbers from hand-made trials, and one small run of the real thing."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from pc2grid.simulate import SimulationConfig, office_floorplan
+from signature.config import Config
+from signature.describe import describe
+from signature.relocalize import Building
+from signature.sensor_matrix import Mapped, Trial, map_building, matrix, query_trials, reliability
+from signature.similarity import SignatureTable
+
+
+def trial(**changes: Any) -> Trial:
+    fields: dict[str, Any] = {
+        "building": "a",
+        "map_sensor": "lidar",
+        "query_sensor": "depth",
+        "seed": 0,
+        "travel_m": 10.0,
+        "in_building": True,
+        "status": "located",
+        "confidence": 0.95,
+        "right": True,
+        "error_m": 0.05,
+        "error_rad": 0.01,
+        "rank": 0,
+        "scores": (0.8,),
+        "walls": 500.0,
+        "look_up_ms": 10.0,
+    }
+    return Trial(**{**fields, **changes})
+
+
+def test_a_cell_counts_what_it_says() -> None:
+    trials = [
+        trial(),
+        trial(error_m=0.15, rank=7),
+        trial(right=False, error_m=5.0, rank=-1),
+        trial(status="ambiguous", right=True, rank=30),
+        trial(status="not_found", right=False, error_m=math.nan, rank=3),
+        trial(building="b", in_building=False, right=False),
+    ]
+    (cell,) = matrix(trials)
+    assert cell.trials == 5
+    assert cell.located_right == pytest.approx(2 / 5)
+    assert cell.wrong == pytest.approx(1 / 3)
+    assert cell.ambiguous == cell.not_found == pytest.approx(1 / 5)
+    assert cell.recall == {1: pytest.approx(1 / 5), 5: pytest.approx(2 / 5), 20: pytest.approx(3 / 5)}
+    assert cell.median_error_m == pytest.approx(0.10)
+
+
+def test_reliability_compares_confidence_with_truth() -> None:
+    rows = reliability([trial(confidence=0.95), trial(confidence=0.91, right=False), trial(confidence=1.0)])
+    assert rows == [(pytest.approx((0.95 + 0.91 + 1.0) / 3), pytest.approx(2 / 3), 3)]
+
+
+def test_a_laser_finds_itself_in_a_map_made_by_another_session() -> None:
+    plan = office_floorplan(3, 22.0, 20.0)
+    config = Config()
+    session, T_plan_map = map_building(
+        "office", plan, "laser", SimulationConfig(length_m=40, seed=1000, clutter=8), config
+    )
+    table = SignatureTable.of(
+        [describe(s, config.signature) for s in session.submaps], [s.center_m for s in session.submaps]
+    )
+    building = Building({session.session: session.grid}, table, config, config)
+    mapped = Mapped(name="office", sensor="laser", T_plan_map=T_plan_map, building=building)
+    trials = query_trials(
+        "office", plan, "laser", SimulationConfig(length_m=8, seed=4, clutter=8), [mapped], config, (2.0, 6.0)
+    )
+    assert [t.travel_m for t in trials] == [2.0, 6.0]
+    assert trials[-1].status == "located" and trials[-1].right and trials[-1].error_m < 0.15
