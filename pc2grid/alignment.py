@@ -93,12 +93,12 @@ def prepare(grid: OccupancyGrid) -> LikelihoodField:
         kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * n + 1, 2 * n + 1))
         levels.append(np.asarray(cv2.dilate(field, kernel, borderType=cv2.BORDER_REPLICATE), np.uint8))
     walls = padded.to_point(np.argwhere(padded.occupied))
-    walls = walls[thin_evenly(walls, 0.1)].astype(np.float32)
+    walls = walls[thin_evenly(walls, 0.1)]
     return LikelihoodField(
         levels=np.stack(levels),
         reaches_m=REACHES_M,
         known=known,
-        walls_m=walls,
+        walls_m=walls.astype(np.float32),
         resolution_m=padded.resolution_m,
         origin_m=padded.origin_m,
     )

@@ -47,7 +47,8 @@ class SE2:
         """Map points (N, 2) of the source frame into the target frame, (N, 2)."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         points = np.asarray(points_m, dtype=np.float64)
-        return points @ np.array([[c, s], [-s, c]]) + np.array([self.x, self.y])
+        moved: F64 = points @ np.array([[c, s], [-s, c]]) + np.array([self.x, self.y])
+        return moved
 
     def matrix(self) -> F64:
         """Homogeneous (3, 3)."""
