@@ -44,10 +44,14 @@ class ReadConfig(Section):
 class RegistrationConfig(Section):
     """Scans -> poses."""
 
-    voxel_m: float | None = Field(default=None, gt=0, description="KISS-ICP voxel; null: chosen from the data")
+    voxel_m: float | None = Field(
+        default=None, gt=0, description="KISS-ICP voxel; null: chosen from the data"
+    )
     min_range_m: float = Field(default=0.3, ge=0, description="nearer returns are the robot itself")
     max_range_m: float | None = Field(default=None, gt=0, description="null: chosen from the data")
-    deskew: bool = Field(default=True, description="undo the motion within a scan where per-point times exist")
+    deskew: bool = Field(
+        default=True, description="undo the motion within a scan where per-point times exist"
+    )
 
 
 class ProjectionConfig(Section):
@@ -56,7 +60,9 @@ class ProjectionConfig(Section):
     resolution_m: float = Field(default=0.05, gt=0.005, le=1.0, description="edge of a grid cell")
     band_min_m: float = Field(default=0.2, description="lower edge of the obstacle band above the floor")
     band_max_m: float = Field(default=1.8, description="upper edge of the obstacle band above the floor")
-    max_range_m: float = Field(default=20.0, gt=0, description="returns farther than this do not draw the map")
+    max_range_m: float = Field(
+        default=20.0, gt=0, description="returns farther than this do not draw the map"
+    )
     max_cells: int = Field(default=100_000_000, gt=0, description="a map larger than this is refused")
 
 

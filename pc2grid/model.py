@@ -29,7 +29,7 @@ OCCUPIED = 100
 
 def _freeze(owner: object, name: str, dtype: type, shape: tuple[int | None, ...]) -> None:
     """Check shape and type of an array field once, at the seam, and make it read-only."""
-    value = np.asarray(getattr(owner, name), dtype=dtype)
+    value: NDArray[np.generic] = np.asarray(getattr(owner, name), dtype=dtype)
     if value.ndim != len(shape) or any(
         want is not None and want != got for want, got in zip(shape, value.shape, strict=True)
     ):
@@ -113,7 +113,9 @@ class Trajectory:
         _freeze(self, "stamps_ns", np.int64, (None,))
         _freeze(self, "T_map_base", np.float64, (len(self.stamps_ns), 4, 4))
         if self.health and len(self.health) != len(self.stamps_ns):
-            raise ValueError(f"Trajectory.health: expected {len(self.stamps_ns)} entries, got {len(self.health)}")
+            raise ValueError(
+                f"Trajectory.health: expected {len(self.stamps_ns)} entries, got {len(self.health)}"
+            )
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
