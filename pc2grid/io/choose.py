@@ -20,7 +20,7 @@ SENSORS: dict[str, SensorKind] = {
     "foxglove.CompressedImage": "depth",
 }
 CAMERA_INFOS = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
-ODOMETRY = ("nav_msgs/Odometry",)
+ODOMETRY = ("nav_msgs/Odometry", "foxglove.Odometry", "foxglove.PoseInFrame")
 TF = ("tf2_msgs/TFMessage", "tf/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
 
 
@@ -82,7 +82,12 @@ def odometry_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[Top
                 hint="--odometry none goes without",
             )
         return found, f"odometry from {wanted} as asked"
-    candidates = [t for t in candidates if t.message_count != 0]
+    # A pose in a frame may be anything: a goal, a landmark. Its name has to say what it is.
+    candidates = [
+        t
+        for t in candidates
+        if t.message_count != 0 and (t.type != "foxglove.PoseInFrame" or "odom" in t.topic.lower())
+    ]
     if not candidates:
         return None, "no odometry topic"
     best = min(candidates, key=lambda t: (t.topic not in ("/odom", "/odometry"), len(t.topic), t.topic))

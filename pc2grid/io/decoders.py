@@ -14,4 +14,8 @@ def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
 
     Raises UnsupportedSchema if the type or encoding is not one that pc2grid reads.
     """
+    if channel.encoding in ("protobuf", "json"):
+        from pc2grid.io import foxglove
+
+        return foxglove.decoder_for(channel)
     return ros_messages.decoder_for(channel)

@@ -25,9 +25,13 @@ def valid_pose(pose: Seven) -> bool:
 
 
 class PoseTrack:
-    """Poses over time, of which the recent ones are kept; interpolated on demand."""
+    """Poses over time, of which the recent ones are kept; interpolated on demand.
 
-    def __init__(self) -> None:
+    lasting : a pose holds until the next one, and a single one always.
+    """
+
+    def __init__(self, *, lasting: bool = False) -> None:
+        self._lasting = lasting
         self._stamps: list[int] = []
         self._poses: list[Seven] = []
 
@@ -58,6 +62,8 @@ class PoseTrack:
         if 0 < after < len(stamps) and stamps[after] - stamps[after - 1] <= MAX_GAP_NS:
             fraction = (stamp_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
             return interpolate_pose(self._pose(after - 1), self._pose(after), fraction)
+        if self._lasting and stamps and (after or len(stamps) == 1):
+            return self._pose(max(after - 1, 0))
         near = [i for i in (after - 1, after) if 0 <= i < len(stamps)]
         nearest = min(near, key=lambda i: abs(stamps[i] - stamp_ns), default=None)
         if nearest is None or abs(stamps[nearest] - stamp_ns) > _HOLD_NS:
@@ -107,7 +113,7 @@ class FrameTree:
             self._static[child] = pose_from_xyz_quat(edge.pose[:3], edge.pose[3:])
             self._cache.clear()
         elif child not in self._static:
-            track = self._moving.setdefault(child, PoseTrack())
+            track = self._moving.setdefault(child, PoseTrack(lasting=edge.lasting))
             track.add(edge.header.stamp_ns or log_time_ns, edge.pose)
 
     def chain(self, frame: str) -> list[str]:

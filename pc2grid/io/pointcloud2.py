@@ -86,6 +86,8 @@ def _rows(cloud: PointCloud2, max_points: int) -> NDArray[Any]:
             f"a scan of {height * width} points; the limit is {max_points}",
             hint="--set read.max_points=N raises it",
         )
+    if step >= 1 << 31:
+        raise PointCloudError(f"points of {step} bytes")
     names, formats, offsets = [], [], []
     seen: set[str] = set()
     for name, offset, datatype, count in cloud.fields:

@@ -34,7 +34,10 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class PointCloud2:
-    """sensor_msgs/PointCloud2; fields as (name, offset, datatype, count)."""
+    """sensor_msgs/PointCloud2; fields as (name, offset, datatype, count).
+
+    origin : of the points in the header's frame; None for the frame itself.
+    """
 
     header: Header
     height: int
@@ -44,11 +47,12 @@ class PointCloud2:
     point_step: int
     row_step: int
     data: Bytes
+    origin: Seven | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class LaserScan:
-    """sensor_msgs/LaserScan without intensities; radians, seconds, metres."""
+    """sensor_msgs/LaserScan without intensities; radians, seconds, metres. origin as in PointCloud2."""
 
     header: Header
     angle_min: float
@@ -59,6 +63,7 @@ class LaserScan:
     range_min: float
     range_max: float
     ranges: NDArray[Any]
+    origin: Seven | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,11 +103,15 @@ class CameraInfo:
 
 @dataclass(frozen=True, slots=True)
 class Transform:
-    """One edge of tf: the pose of `child` in `header.frame`."""
+    """One edge of tf: the pose of `child` in `header.frame`.
+
+    lasting : holds until there is a newer one, and not for a moment only.
+    """
 
     header: Header
     child: str
     pose: Seven
+    lasting: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,7 +277,7 @@ def decoder_for(channel: TopicInfo) -> Callable[[Bytes], Any]:
     if channel.encoding not in ("cdr", "ros1"):
         raise UnsupportedSchema(
             f"{channel.topic}: message encoding {channel.encoding!r:.40} is not read",
-            hint="supported: cdr (ROS 2) and ros1",
+            hint="supported: cdr (ROS 2), ros1, and protobuf or json of Foxglove's types",
         )
     ros1 = channel.encoding == "ros1"
     check_schema(channel, ros1)

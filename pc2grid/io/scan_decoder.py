@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import PointCloudError
-from pc2grid.geometry import F64
+from pc2grid.geometry import F64, pose_from_xyz_quat
 from pc2grid.io import depth, laserscan, pointcloud2
+from pc2grid.io.frames import valid_pose
 from pc2grid.io.pointcloud2 import Points
 from pc2grid.io.ros_messages import CameraInfo, Header
 from pc2grid.model import F32, I64, Scan, SensorKind
@@ -39,7 +40,13 @@ class ScanDecoder:
 
     def scan(self, data: Any, stamp_ns: int, T_base_sensor: F64, T_odom_base: F64 | None) -> Scan:
         """The whole scan. Raises PointCloudError, LimitExceeded or UnsupportedSchema."""
-        found = self._points(self._decode(data))
+        message = self._decode(data)
+        found = self._points(message)
+        origin = getattr(message, "origin", None)
+        if origin is not None:
+            if not valid_pose(origin):
+                raise PointCloudError("the origin of the points is not finite")
+            T_base_sensor = T_base_sensor @ pose_from_xyz_quat(origin[:3], origin[3:])
         if found.note and found.note not in self.notes:
             self.notes.append(found.note)
         points, near = _to_base(found, T_base_sensor, self._config.max_range_m)
