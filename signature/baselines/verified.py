@@ -78,7 +78,8 @@ class _Verifier:
                 best = max(best, float(score))
                 pose, covariance = refine(self.fields[index], prepared, SE2(float(x), float(y), float(yaw)))
                 fit = assess(self.fields[index], prepared, pose, covariance)
-                nearest = int(np.argmin(np.hypot(*(self.centers_m - (pose.x, pose.y)).T)))
+                away = np.hypot(*(self.centers_m - (pose.x, pose.y)).T)
+                nearest = int(index if away[index] <= away.min() else np.argmin(away))
                 result[nearest] = max(result[nearest], fit.score)
         return np.asarray(result)
 
