@@ -39,11 +39,17 @@ class Solution:
 
 
 def optimise(
-    poses: F64, edges: Sequence[Edge], *, iterations: int = 25, robust_scale: float = 3.0
+    poses: F64,
+    edges: Sequence[Edge],
+    *,
+    iterations: int = 25,
+    robust_scale: float = 3.0,
+    graduated: bool = False,
 ) -> Solution:
     """Poses (N, 3) that agree best with the edges; the first pose stays where it is.
 
     robust_scale : standard deviations at which a loop edge has lost half of its say.
+    graduated : believe all loops at first and doubt them by and by: for large drift and few false loops.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
@@ -61,10 +67,10 @@ def optimise(
     column = np.tile(rows, (1, 6)).ravel()
     size = 3 * len(poses)
     error, jacobian = _linearise(poses, i, j, z)
-    # Graduated: all loops are believed at first, else large drift would make every true one an outlier.
-    scale = max(
-        robust_scale, float(np.sqrt(np.einsum("ea,eab,eb->e", error, omega, error)[loop].max(initial=0.0)))
-    )
+    scale = robust_scale
+    if graduated:
+        start = np.einsum("ea,eab,eb->e", error, omega, error)[loop]
+        scale = max(robust_scale, float(np.sqrt(start.max(initial=0.0))))
     for _ in range(iterations):
         chi2 = np.einsum("ea,eab,eb->e", error, omega, error)
         weight = np.where(loop, 1.0 / (1.0 + chi2 / scale**2), 1.0)
