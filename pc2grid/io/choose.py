@@ -15,12 +15,15 @@ SENSORS: dict[str, SensorKind] = {
     "sensor_msgs/Image": "depth",
     "sensor_msgs/CompressedImage": "depth",
     "foxglove.PointCloud": "lidar",
+    "cloud/pcd": "lidar",
+    "cloud/ply": "lidar",
+    "cloud/bin": "lidar",
     "foxglove.LaserScan": "laser",
     "foxglove.RawImage": "depth",
     "foxglove.CompressedImage": "depth",
 }
 CAMERA_INFOS = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
-ODOMETRY = ("nav_msgs/Odometry", "foxglove.Odometry", "foxglove.PoseInFrame")
+ODOMETRY = ("nav_msgs/Odometry", "foxglove.Odometry", "foxglove.PoseInFrame", "cloud/pose")
 TF = ("tf2_msgs/TFMessage", "tf/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
 
 

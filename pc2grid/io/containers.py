@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogNotFound, LogTruncated, NotALog
-from pc2grid.io import rosbag2_folder
+from pc2grid.io import cloud_folder, rosbag2_folder
 from pc2grid.io.mcap_records import MAGIC
 from pc2grid.io.source import Source
 
@@ -69,7 +69,12 @@ def _open_folder(path: Path, config: ReadConfig, recover: bool) -> Source:
             recover=recover,
             max_chunk_bytes=config.max_chunk_bytes,
         )
-    raise LogNotFound(f"{path}: a folder without a recording", hint="name the file of the recording")
+    if any(name.lower().endswith(cloud_folder.SUFFIXES) for name in names):
+        return cloud_folder.CloudFolder(path, config)
+    raise LogNotFound(
+        f"{path}: a folder without a recording",
+        hint="it holds neither metadata.yaml, .mcap or .db3 nor .pcd, .ply or .bin",
+    )
 
 
 def _looks_like(head: bytes) -> str:
@@ -99,4 +104,6 @@ def _advice(head: bytes) -> str:
         return "unpack it first"
     if head.startswith(b"#ROSBAG V"):
         return "`rosbag migrate` or `rosbag fix` makes it one of format 2.0"
+    if head.startswith((b"ply", b"# .PCD")):
+        return "name the folder of the clouds, one file per scan"
     return "pc2grid reads MCAP, ROS 1 bags, rosbag2 folders and .db3"

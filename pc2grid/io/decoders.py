@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from pc2grid.io import ros_messages
+from pc2grid.io import cloud_folder, ros_messages
 from pc2grid.io.source import TopicInfo
 
 
@@ -18,4 +18,6 @@ def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
         from pc2grid.io import foxglove
 
         return foxglove.decoder_for(channel)
+    if channel.type.startswith("cloud/"):
+        return cloud_folder.decoder_for(channel)
     return ros_messages.decoder_for(channel)

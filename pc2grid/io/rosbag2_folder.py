@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
 from pc2grid.errors import LogCorrupt, LogNotFound
+from pc2grid.io.cloud_folder import natural
 from pc2grid.io.source import Source, Tally
 from pc2grid.io.split_log import SplitSource
 
@@ -63,7 +63,7 @@ def _files(folder: Path, tally: Tally, recover: bool) -> list[Path]:
         tally.warn(f"the folder has no {METADATA}: its files are read in the order of their numbers")
     names = [path.name for path in folder.iterdir() if path.suffix in SUFFIXES]
     kind = max(SUFFIXES, key=lambda suffix: sum(name.endswith(suffix) for name in names))
-    return [folder / name for name in sorted(names, key=_natural) if name.endswith(kind)]
+    return [folder / name for name in sorted(names, key=natural) if name.endswith(kind)]
 
 
 def listed_files(metadata: Path) -> list[str]:
@@ -99,8 +99,3 @@ def _unpacked(folder: Path, name: str) -> Path:
             f"{folder}: {name} is compressed as a whole", hint=f"`zstd -d {name}` unpacks it next to it"
         )
     return path.with_suffix("")
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """`log_10` behind `log_9`."""
-    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", name)]
