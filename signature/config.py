@@ -101,7 +101,7 @@ class RelocalizeConfig(Section):
     )
     top_k: int = Field(50, gt=0, description="places that retrieval hands to alignment")
     coarse_floor: float = Field(0.4, ge=0, le=1, description="coarse scores below this are not looked at")
-    coarse_keep: float = Field(0.75, gt=0, le=1, description="nor those below this share of the best")
+    coarse_keep: float = Field(0.8, gt=0, le=1, description="nor those below this share of the best")
     hypotheses: int = Field(20, gt=0, description="hypotheses kept at most")
     exhaustive_m2: float = Field(
         20_000.0,

@@ -9,7 +9,7 @@ best overlap re-ranks them, and says how the query would have to be turned.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numba
@@ -93,13 +93,14 @@ def retrieve(
         overlap = rotate_and_compare(
             view.profile.ranges_m, view.profile.ends != HIDDEN, places.ranges_m[rows], places.seen[rows]
         )
+        turns = peaks(overlap)
         # The signatures keep their say: two places whose ranges agree are told apart by what lies between.
         likeness = overlap.max(axis=1) * np.exp(-config.signature_weight * _standardised(score)[rows])
         for position, row in enumerate(rows):
             value = float(likeness[position])
             if int(row) not in best or value > best[int(row)].likeness:
                 best[int(row)] = Proposal(
-                    view=index, row=int(row), likeness=value, yaw_rad=_peaks(overlap[position])
+                    view=index, row=int(row), likeness=value, yaw_rad=tuple(turns[position].tolist())
                 )
     ranked = sorted(best.values(), key=lambda p: (-p.likeness, p.row))
     return tuple(ranked[: top_k or config.top_k])
@@ -108,14 +109,6 @@ def retrieve(
 def _standardised(score: F64) -> F64:
     spread = float(score.std())
     return (score - score.mean()) / spread if spread > 0 else np.zeros_like(score)
-
-
-def _peaks(overlap: F32, most: int = 4) -> tuple[float, ...]:
-    """The rotations at which the overlap (B,) has its highest local maxima, radians."""
-    local = (overlap >= np.roll(overlap, 1)) & (overlap >= np.roll(overlap, -1))
-    shifts = np.flatnonzero(local)
-    shifts = shifts[np.argsort(-overlap[shifts], kind="stable")[:most]]
-    return tuple(float(s) * 2.0 * math.pi / len(overlap) for s in shifts)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
@@ -164,6 +157,14 @@ def rotate_and_compare(
     return result
 
 
-def ranked_places(proposals: Sequence[Proposal]) -> NDArray[np.int64]:
-    """Rows of the table in the order they were retrieved, for recall at k."""
-    return np.array([p.row for p in proposals], dtype=np.int64)
+def peaks(overlap: F32, most: int = 4) -> F64:
+    """The rotations (N, most), radians, at which each row of `overlap` (N, B) has its highest local maxima.
+
+    A row with fewer maxima repeats its highest one.
+    """
+    local = (overlap >= np.roll(overlap, 1, axis=1)) & (overlap >= np.roll(overlap, -1, axis=1))
+    height = np.where(local, overlap, -1.0)
+    shifts = np.argsort(-height, axis=1, kind="stable")[:, :most]
+    missing = np.take_along_axis(height, shifts, axis=1) < 0
+    shifts = np.where(missing, shifts[:, :1], shifts)
+    return np.asarray(shifts * (2.0 * math.pi / overlap.shape[1]))

@@ -16,8 +16,9 @@ from signature.query import QueryMap
 from signature.retrieve import Places, Proposal
 
 _HALF_T_M = 0.5
-_HALF_A_RAD = math.radians(7.5)
-_FEW_POINTS = 160
+_HALF_A_RAD = math.radians(5.0)
+_EVERY_RAD = math.radians(7.5)
+_FEW_POINTS = 128
 """Enough to rank poses coarsely; all points are used in the refinement."""
 _NEAR_M = 8.0
 """Walls farther than this from where the query rotates are left out of the coarse search: a small error
@@ -101,14 +102,14 @@ def search_everywhere(
     """
     center = (query.T_odom_base.x, query.T_odom_base.y)
     half_t = 0.4
-    yaws = np.arange(-math.pi, math.pi, 2 * _HALF_A_RAD) + _HALF_A_RAD
+    yaws = np.arange(-math.pi, math.pi, 2 * _EVERY_RAD) + _EVERY_RAD
     starts = np.column_stack((np.repeat(free_xy_m, len(yaws), axis=0), np.tile(yaws, len(free_xy_m))))
     poses = search(
         field,
         coarse_points(query, center),
         starts,
         half_t_m=half_t,
-        half_a_rad=_HALF_A_RAD,
+        half_a_rad=_EVERY_RAD,
         floor=config.coarse_floor,
         keep=config.coarse_keep,
         most=config.hypotheses,
@@ -169,7 +170,7 @@ def coarse_points(query: QueryMap, center_m: tuple[float, float]) -> F32:
 
 def _boxes(center_m: F64, yaw_rad: Sequence[float]) -> F64:
     """Boxes of poses (K, 3) around one place: half a metre each way, at each of the proposed headings."""
-    return np.array([(center_m[0], center_m[1], yaw) for yaw in yaw_rad])
+    return np.array([(center_m[0], center_m[1], yaw) for yaw in dict.fromkeys(yaw_rad)])
 
 
 def _fitted(
