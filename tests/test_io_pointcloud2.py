@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pc2grid.errors import LimitExceeded, PointCloudError
+from pc2grid.io.messages import Header, PointCloud2
 from pc2grid.io.pointcloud2 import decode
-from pc2grid.io.ros_messages import Header, PointCloud2
 
 STAMP = 1_700_000_000_123_456_789
 XYZ = (("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1))

@@ -1,6 +1,16 @@
 """Files in and out: recordings, maps, trajectories. Nothing here knows what a submap is.
 
-`open_log` is the way in for recordings of any container; the rest is imported by module.
+`open_log` is the way in for recordings; the rest is imported by module.
+
+Containers, each a `source.Source` of bytes, told apart by `containers`:
+    mcap_log (mcap_records, mcap_summary, mcap_survey), bag_log, db3_log, rosbag2_folder (split_log),
+    cloud_folder
+Encodings, each to the classes of `messages`, told apart by `decoders`:
+    ros_messages (ros_definitions), foxglove, cloud_files (lzf)
+Sensors, each to points, told apart by `scan_decoder`:
+    pointcloud2, laserscan, depth
+From messages to scans: choose and plan, frames, stream, log.
+Out: mcap_out, nav2_map, trajectory, all through atomic.
 """
 
 from __future__ import annotations

@@ -42,7 +42,9 @@ def replace_file(path: Path) -> Iterator[Path]:
         os.replace(temporary, target)  # noqa: PTH105 - Path.replace hides which of the two is missing
         _fsync_folder(target.parent)
     except OSError as error:
-        if error.filename not in (None, temporary, str(temporary)):
+        ours = (None, temporary, str(temporary))
+        # copyfile names its source first, and complains about a full disk with both names.
+        if error.filename not in ours and error.filename2 not in ours[1:]:
             raise  # the body failed on some other file: not ours to explain
         raise OutputError(f"{path}: cannot write: {error.strerror or error}", hint=_advice(error)) from error
     finally:

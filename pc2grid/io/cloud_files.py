@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pc2grid.errors import PointCloudError, UnsupportedSchema
-from pc2grid.io.ros_messages import Header, PointCloud2
+from pc2grid.io.messages import Header, PointCloud2
 
 Fields = tuple[tuple[str, int, int, int], ...]  # name, offset, datatype, count
 

@@ -19,7 +19,7 @@ from pc2grid.config import ReadConfig
 from pc2grid.errors import LimitExceeded, LogCorrupt, TrajectoryFileError
 from pc2grid.geometry import F64, invert_pose, quat_xyzw_from_pose
 from pc2grid.io import cloud_files
-from pc2grid.io.ros_messages import Header, Odometry
+from pc2grid.io.messages import Header, Odometry
 from pc2grid.io.source import LogInfo, RawMessage, Tally, TopicInfo
 from pc2grid.io.trajectory import read_kitti, read_tum, stamp_ns_from_text
 from pc2grid.model import Trajectory

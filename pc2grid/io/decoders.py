@@ -10,7 +10,7 @@ from pc2grid.io.source import TopicInfo
 
 
 def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
-    """A function from a message's bytes to one of the classes of `ros_messages`.
+    """A function from a message's bytes to one of the classes of `messages`.
 
     Raises UnsupportedSchema if the type or encoding is not one that pc2grid reads.
     """

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from pc2grid.errors import LimitExceeded, PointCloudError, UnsupportedSchema
 from pc2grid.geometry import F64
+from pc2grid.io.messages import CameraInfo, CompressedImage, Image
 from pc2grid.io.pointcloud2 import Points
-from pc2grid.io.ros_messages import CameraInfo, CompressedImage, Image
 from pc2grid.model import F32
 
 # REP-103: body x forward, y left, z up from optical z forward, x right, y down.

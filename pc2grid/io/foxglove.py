@@ -1,6 +1,6 @@
 """Foxglove's own messages (`foxglove.PointCloud` and others), in protobuf or JSON.
 
-Both become the classes of `ros_messages`, so that nothing behind knows where a scan came from. Protobuf is
+Both become the classes of `messages`, so that nothing behind knows where a scan came from. Protobuf is
 parsed by the descriptor that the log itself carries.
 """
 
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pc2grid.errors import PointCloudError, UnsupportedSchema
-from pc2grid.io.ros_messages import (
+from pc2grid.io.messages import (
     CameraInfo,
     CompressedImage,
     Header,
@@ -44,7 +44,7 @@ _NUMERIC_NAMES = ("UNKNOWN", *_NUMERIC)
 
 
 def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
-    """A function from the bytes of this topic's messages to one of the classes of `ros_messages`.
+    """A function from the bytes of this topic's messages to one of the classes of `messages`.
 
     Raises UnsupportedSchema if the type is not one that we read, or its descriptor is broken. The function
     raises PointCloudError for a message that is not of its type.

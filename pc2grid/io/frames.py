@@ -10,7 +10,7 @@ import numpy as np
 
 from pc2grid.errors import FrameError
 from pc2grid.geometry import F64, interpolate_pose, invert_pose, pose_from_xyz_quat
-from pc2grid.io.ros_messages import Seven, Transform
+from pc2grid.io.messages import Seven, Transform
 
 # Between two samples farther apart than this nothing is known (a gap in the log).
 MAX_GAP_NS = 2_000_000_000

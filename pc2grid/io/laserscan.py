@@ -8,8 +8,8 @@ import math
 import numpy as np
 
 from pc2grid.errors import LimitExceeded, PointCloudError
+from pc2grid.io.messages import LaserScan
 from pc2grid.io.pointcloud2 import Points
-from pc2grid.io.ros_messages import LaserScan
 from pc2grid.model import F32
 
 

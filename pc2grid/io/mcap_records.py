@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import BinaryIO, NamedTuple
 
 from pc2grid.errors import LimitExceeded, UnsupportedSchema
+from pc2grid.io.unpack import expand
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -217,46 +218,23 @@ def decompress(data: bytes, head: ChunkHead, offset: int, limits: Limits) -> byt
             hint="--set read.max_chunk_bytes=N raises it",
         )
     stored = memoryview(data)[head.data_at :]
-    expanded: bytes | memoryview
-    if head.compression == "":
-        expanded = stored
-    elif head.compression == "zstd":
-        expanded = _unzstd(stored, head, offset)
-    elif head.compression == "lz4":
-        expanded = _unlz4(stored, head, offset)
-    else:
-        raise UnsupportedSchema(
-            f"the chunk at byte {offset} is compressed with {head.compression!r:.40}",
-            hint="pc2grid reads zstd, lz4 and uncompressed chunks; `mcap convert` can change it",
-        )
+    expanded: bytes | memoryview = stored
+    if head.compression:
+        if head.compression not in ("zstd", "lz4"):
+            raise UnsupportedSchema(
+                f"the chunk at byte {offset} is compressed with {head.compression!r:.40}",
+                hint="pc2grid reads zstd, lz4 and uncompressed chunks; `mcap convert` can change it",
+            )
+        try:
+            # One byte more than wanted: so it shows if there is more than the chunk says.
+            expanded = expand(head.compression, stored, head.uncompressed_size + 1)
+        except ValueError as error:
+            raise Damage(offset, f"a chunk cannot be decompressed ({error})") from error
     if len(expanded) != head.uncompressed_size:
         raise Damage(offset, f"a chunk has {len(expanded)} bytes instead of {head.uncompressed_size}")
     if head.crc and zlib.crc32(expanded) != head.crc:
         raise Damage(offset, "a chunk's checksum (CRC) is wrong")
     return expanded
-
-
-def _unzstd(stored: memoryview, head: ChunkHead, offset: int) -> bytes:
-    import zstandard
-
-    try:
-        # The frame's own claim is what zstandard allocates, whatever limit it is given.
-        if zstandard.frame_content_size(stored) > head.uncompressed_size:
-            raise Damage(offset, "a chunk expands to more than it says")
-        # One byte more than wanted: zstandard takes 0 for "no limit".
-        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=head.uncompressed_size + 1)
-    except zstandard.ZstdError as error:
-        raise Damage(offset, f"a chunk cannot be decompressed ({error})") from error
-
-
-def _unlz4(stored: memoryview, head: ChunkHead, offset: int) -> bytes:
-    import lz4.frame  # type: ignore[import-untyped]
-
-    try:
-        decompressor = lz4.frame.LZ4FrameDecompressor()
-        return bytes(decompressor.decompress(bytes(stored), max_length=head.uncompressed_size + 1))
-    except (RuntimeError, EOFError) as error:
-        raise Damage(offset, f"a chunk cannot be decompressed ({error})") from error
 
 
 def chunk_messages(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pc2grid.errors import LimitExceeded, PointCloudError
 from pc2grid.geometry import F64
-from pc2grid.io.ros_messages import PointCloud2
+from pc2grid.io.messages import PointCloud2
 from pc2grid.model import F32
 
 # sensor_msgs/PointField; 9 to 11 are PCL's, absent from the definition (ros2/common_interfaces#300).

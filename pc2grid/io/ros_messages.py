@@ -1,4 +1,4 @@
-"""The ROS messages that matter here, decoded from CDR (ROS 2) or ROS 1 serialisation.
+"""ROS messages, decoded from CDR (ROS 2) or ROS 1 serialisation.
 
 Decoded by hand, field by field in the order of `ros_definitions`, because a generic decoder is one to two
 orders of magnitude slower on clouds and images. `decoder_for` first checks that the log's own schema is
@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,109 +17,19 @@ from numpy.typing import NDArray
 
 from pc2grid.errors import PointCloudError, UnsupportedSchema
 from pc2grid.io import ros_definitions
+from pc2grid.io.messages import (
+    Bytes,
+    CameraInfo,
+    CompressedImage,
+    Header,
+    Image,
+    LaserScan,
+    Odometry,
+    PointCloud2,
+    Seven,
+    Transform,
+)
 from pc2grid.io.source import TopicInfo
-
-Bytes = memoryview | bytes
-Seven = tuple[float, float, float, float, float, float, float]  # x y z, qx qy qz qw
-
-
-@dataclass(frozen=True, slots=True)
-class Header:
-    """std_msgs/Header."""
-
-    stamp_ns: int
-    frame: str
-
-
-@dataclass(frozen=True, slots=True)
-class PointCloud2:
-    """sensor_msgs/PointCloud2; fields as (name, offset, datatype, count).
-
-    origin : of the points in the header's frame; None for the frame itself.
-    """
-
-    header: Header
-    height: int
-    width: int
-    fields: tuple[tuple[str, int, int, int], ...]
-    is_bigendian: bool
-    point_step: int
-    row_step: int
-    data: Bytes
-    origin: Seven | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class LaserScan:
-    """sensor_msgs/LaserScan without intensities; radians, seconds, metres. origin as in PointCloud2."""
-
-    header: Header
-    angle_min: float
-    angle_max: float
-    angle_increment: float
-    time_increment: float
-    scan_time: float
-    range_min: float
-    range_max: float
-    ranges: NDArray[Any]
-    origin: Seven | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Image:
-    """sensor_msgs/Image."""
-
-    header: Header
-    height: int
-    width: int
-    encoding: str
-    is_bigendian: bool
-    step: int
-    data: Bytes
-
-
-@dataclass(frozen=True, slots=True)
-class CompressedImage:
-    """sensor_msgs/CompressedImage."""
-
-    header: Header
-    format: str
-    data: Bytes
-
-
-@dataclass(frozen=True, slots=True)
-class CameraInfo:
-    """sensor_msgs/CameraInfo: distortion d, intrinsics k (9 numbers), projection p (12 numbers)."""
-
-    header: Header
-    height: int
-    width: int
-    distortion_model: str
-    d: tuple[float, ...]
-    k: tuple[float, ...]
-    p: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Transform:
-    """One edge of tf: the pose of `child` in `header.frame`.
-
-    lasting : holds until there is a newer one, and not for a moment only.
-    """
-
-    header: Header
-    child: str
-    pose: Seven
-    lasting: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Odometry:
-    """nav_msgs/Odometry without covariance and twist: the pose of `child` in `header.frame`."""
-
-    header: Header
-    child: str
-    pose: Seven
 
 
 class Reader:
@@ -263,7 +172,7 @@ _PARSERS: dict[str, Callable[[Reader], Any]] = {
 
 
 def decoder_for(channel: TopicInfo) -> Callable[[Bytes], Any]:
-    """A function from the bytes of this topic's messages to one of the classes above.
+    """A function from the bytes of this topic's messages to one of the classes of `messages`.
 
     Raises UnsupportedSchema if the type, the encoding or the log's own definition of the type is not one
     that we read. The function raises PointCloudError for a message that is too short.

@@ -14,8 +14,8 @@ from pc2grid.errors import PointCloudError
 from pc2grid.geometry import F64, pose_from_xyz_quat
 from pc2grid.io import depth, laserscan, pointcloud2
 from pc2grid.io.frames import valid_pose
+from pc2grid.io.messages import CameraInfo, Header
 from pc2grid.io.pointcloud2 import Points
-from pc2grid.io.ros_messages import CameraInfo, Header
 from pc2grid.model import F32, I64, Scan, SensorKind
 
 

@@ -22,8 +22,8 @@ from pc2grid.io import choose
 from pc2grid.io.decoders import decoder_for
 from pc2grid.io.depth import T_BODY_OPTICAL
 from pc2grid.io.frames import FrameTree, PoseTrack
+from pc2grid.io.messages import Odometry, Transform
 from pc2grid.io.plan import Plan, is_static, tolerant
-from pc2grid.io.ros_messages import Odometry, Transform
 from pc2grid.io.scan_decoder import ScanDecoder
 from pc2grid.io.source import Source, TopicInfo
 from pc2grid.model import Scan

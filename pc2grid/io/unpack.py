@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 from collections.abc import Callable
+from typing import Any
 
 from pc2grid.errors import LimitExceeded, LogCorrupt
 
@@ -11,16 +12,12 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
 def unpacker(compression: str, limit: int) -> Callable[[bytes], bytes]:
-    """A function that unpacks `none`, `bz2`, `lz4` or `zstd`, and raises LimitExceeded above `limit` bytes.
-
-    What is damaged raises LogCorrupt. Raises KeyError for another compression.
-    """
-    unpack = {"none": _stored, "bz2": _bz2, "lz4": _lz4, "zstd": _zstd}[compression]
+    """A function that unpacks, and raises LimitExceeded above `limit` bytes and LogCorrupt for damage."""
 
     def bounded(data: bytes) -> bytes:
         try:
-            found = unpack(bytes(data), limit + 1)
-        except (OSError, EOFError, RuntimeError, ValueError) as error:
+            found = expand(compression, data, limit + 1)
+        except ValueError as error:
             raise LogCorrupt(f"{compression} data cannot be decompressed ({error})") from error
         if len(found) > limit:
             raise LimitExceeded(
@@ -32,22 +29,32 @@ def unpacker(compression: str, limit: int) -> Callable[[bytes], bytes]:
     return bounded
 
 
-def _stored(data: bytes, most: int) -> bytes:
-    return data
+def expand(compression: str, data: bytes | memoryview, most: int) -> bytes:
+    """The first `most` bytes (> 0) of what was compressed by `bz2`, `lz4` or `zstd`; `none` as it is.
+
+    Raises ValueError for damage.
+    """
+    try:
+        return _EXPAND[compression](bytes(data), most)
+    except (OSError, EOFError, RuntimeError) as error:
+        raise ValueError(error) from error
+
+
+def _none(data: bytes, most: int) -> bytes:
+    return data[:most]
 
 
 def _bz2(data: bytes, most: int) -> bytes:
-    decompressor = bz2.BZ2Decompressor()
-    found = decompressor.decompress(data, max_length=most)
-    if not decompressor.eof and len(found) < most:
-        raise EOFError("it ends too early")
-    return found
+    return _whole(bz2.BZ2Decompressor(), data, most)
 
 
 def _lz4(data: bytes, most: int) -> bytes:
     import lz4.frame  # type: ignore[import-untyped]
 
-    decompressor = lz4.frame.LZ4FrameDecompressor()
+    return _whole(lz4.frame.LZ4FrameDecompressor(), data, most)
+
+
+def _whole(decompressor: Any, data: bytes, most: int) -> bytes:
     found = bytes(decompressor.decompress(data, max_length=most))
     if not decompressor.eof and len(found) < most:
         raise EOFError("it ends too early")
@@ -64,3 +71,6 @@ def _zstd(data: bytes, most: int) -> bytes:
         return zstandard.ZstdDecompressor().decompress(data, max_output_size=most)
     except zstandard.ZstdError as error:
         raise ValueError(error) from error
+
+
+_EXPAND = {"none": _none, "bz2": _bz2, "lz4": _lz4, "zstd": _zstd}
