@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -21,7 +21,7 @@ from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from pc2grid.sweep import Sweep
 from signature.confidence import CALIBRATION, Evidence
 from signature.config import Config
-from signature.query import QueryMap, Window
+from signature.query import QueryMap, Window, query_of
 from signature.retrieve import Places, retrieve
 from signature.verify import Hypothesis, carry_on, distinct, search_everywhere, verify
 
@@ -277,6 +277,52 @@ def relocalize(
         if progress is not None:
             progress(count, relocalizer.path_m)
     return relocalizer.answer()
+
+
+def locate_map(grid: OccupancyGrid, building: Building) -> Answer:
+    """Find where a drawn map, say a nav2 map or a part of one, lies in the building.
+
+    grid : the query, in any frame of its own; what it does not know is unknown, not empty.
+
+    There is no robot in it, so the "base" of the answer is the map's own frame: `T_map_base` and
+    `T_map_odom` both are T_map_query, and no way has been travelled.
+    """
+    clock = _Clock()
+    made_with = building.made_with
+    query = query_of(
+        grid,
+        np.empty((0, 2)),
+        partition=made_with.partition,
+        signature=made_with.signature,
+        config=building.config,
+        T_odom_base=SE2(),
+    )
+    # A map's origin may lie anywhere, far outside its walls too. Poses turn about the best observed
+    # point instead: it is free, and the walls around it are known.
+    if query.views:
+        center = query.views[0].center_m
+        query = replace(query, T_odom_base=SE2(*center), aligned=replace(query.aligned, center_m=center))
+    clock.lap("describe")
+    hypotheses = building.look_up(query)
+    status, sure = building.judge(hypotheses, query)
+    clock.lap("look_up")
+    if status != "located":
+        hypotheses = building.look_everywhere(query, hypotheses)
+        status, sure = building.judge(hypotheses, query)
+        clock.lap("search_everywhere")
+    hypotheses = tuple(_at_origin(h, query.T_odom_base) for h in hypotheses)
+    query = replace(query, T_odom_base=SE2())
+    history = (_moment(query, status, sure, hypotheses),)
+    return _answer(building, query, status, sure, hypotheses, history, dict(clock.total_ms))
+
+
+def _at_origin(hypothesis: Hypothesis, at: SE2) -> Hypothesis:
+    """Its covariance, known for the point `at` of the query, as that of the query's own frame."""
+    fit = hypothesis.fit
+    there = fit.T_map_query @ at
+    J = np.eye(3)
+    J[:2, 2] = there.y - fit.T_map_query.y, fit.T_map_query.x - there.x
+    return replace(hypothesis, fit=replace(fit, covariance=J @ fit.covariance @ J.T))
 
 
 def _moment(query: QueryMap, status: Status, sure: float, hypotheses: tuple[Hypothesis, ...]) -> Moment:
