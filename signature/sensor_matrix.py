@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pc2grid.alignment import assess
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.model import OccupancyGrid, Scan, SensorKind, SessionMap
 from pc2grid.partition import partition
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 SENSORS: tuple[SensorKind, ...] = ("lidar", "laser", "depth")
 DISTANCES_M = (1.0, 3.0, 5.0, 8.0, 10.0, 15.0)
 RIGHT_M, RIGHT_RAD = 0.25, math.radians(3.0)
+MAPPED = 0.5
+"""A query counts as lying in the map if at least this share of its walls lies on ground the map knows; no
+answer could be right where the mapping robot has never been."""
 RETRIEVED_M = 1.0
 """A retrieved place is right within this of where the view that retrieved it truly lies."""
 
@@ -38,6 +42,7 @@ class Trial:
     """One answer, with the truth beside it.
 
     in_building : False if the query comes from another building, where nothing is right.
+    mapped : share of the query's walls, truly placed, that lie on ground the map knows, 0..1.
     status, confidence, error_m, error_rad : of the answer's best hypothesis (errors NaN if there is none).
     right : the best hypothesis is within 0.25 m and 3 degrees. rank : of the first right place, -1 if none.
     scores, walls : `signature.confidence.Evidence` of the decision.
@@ -49,6 +54,7 @@ class Trial:
     seed: int
     travel_m: float
     in_building: bool
+    mapped: float
     status: str
     confidence: float
     right: bool
@@ -87,10 +93,10 @@ class Cell:
 
 
 def matrix(trials: Sequence[Trial]) -> list[Cell]:
-    """The trials in their own building as cells, by map sensor, query sensor and travel."""
+    """The trials in mapped parts of their own building, by map sensor, query sensor and travel."""
     groups: dict[tuple[str, str, float], list[Trial]] = {}
     for trial in trials:
-        if trial.in_building:
+        if trial.in_building and trial.mapped >= MAPPED:
             groups.setdefault((trial.map_sensor, trial.query_sensor, trial.travel_m), []).append(trial)
     cells = []
     for (map_sensor, query_sensor, travel_m), members in sorted(groups.items()):
@@ -233,6 +239,8 @@ def _trial(
     elapsed_ms = 1000.0 * (time.perf_counter() - begin)
     inside = mapped.name == name
     T_map_base = mapped.T_plan_map.inverse() @ T_plan_base
+    truly = T_map_base @ answer.T_odom_base.inverse()
+    known = assess(mapped.building.fields[0], relocalizer.query().aligned, truly, np.eye(3)).overlap
     error_m = error_rad = math.nan
     if answer.hypotheses:
         error = T_map_base.inverse() @ (answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base)
@@ -244,6 +252,7 @@ def _trial(
         seed=seed,
         travel_m=travel_m,
         in_building=inside,
+        mapped=known if inside else 0.0,
         status=answer.status,
         confidence=answer.confidence,
         right=inside and error_m <= RIGHT_M and error_rad <= RIGHT_RAD,

@@ -23,6 +23,7 @@ def trial(**changes: Any) -> Trial:
         "seed": 0,
         "travel_m": 10.0,
         "in_building": True,
+        "mapped": 1.0,
         "status": "located",
         "confidence": 0.95,
         "right": True,
@@ -43,7 +44,8 @@ def test_a_cell_counts_what_it_says() -> None:
         trial(right=False, error_m=5.0, rank=-1),
         trial(status="ambiguous", right=True, rank=30),
         trial(status="not_found", right=False, error_m=math.nan, rank=3),
-        trial(building="b", in_building=False, right=False),
+        trial(building="b", in_building=False, mapped=0.0, right=False),
+        trial(mapped=0.2, status="not_found", right=False),
     ]
     (cell,) = matrix(trials)
     assert cell.trials == 5

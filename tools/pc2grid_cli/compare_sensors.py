@@ -44,7 +44,7 @@ def compare_sensors_command(
     from pc2grid.errors import ConfigError, MapFileError, OutputError
     from pc2grid_cli.console import print_json, progress
     from pc2grid_cli.matrix_report import draw, tables
-    from signature.sensor_matrix import SENSORS, matrix, reliability
+    from signature.sensor_matrix import MAPPED, SENSORS, matrix, reliability
 
     names = [plan.stem for plan in plans]
     if len(set(names)) != len(names):
@@ -83,6 +83,7 @@ def compare_sensors_command(
         "setting": {**setting, "seed": seed},
         "cells": [_plain(cell) for cell in cells],
         "reliability": reliability(trials),
+        "outside_the_map": sum(t.in_building and t.mapped < MAPPED for t in trials),
         "elsewhere": {
             "trials": len(elsewhere),
             "not_found": sum(t.status == "not_found" for t in elsewhere),
