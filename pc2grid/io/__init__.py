@@ -10,7 +10,7 @@ Encodings, each to the classes of `messages`, told apart by `decoders`:
 Sensors, each to points, told apart by `scan_decoder`:
     pointcloud2, laserscan, depth
 From messages to scans: choose and plan, frames, stream, log.
-Out: mcap_out, nav2_map, trajectory, all through atomic.
+Out: mcap_out (cdr), nav2_map (map_image), trajectory, all through atomic.
 """
 
 from __future__ import annotations

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pc2grid import __version__
-from pc2grid.geometry import F64, SE2, quat_xyzw_from_pose
+from pc2grid.geometry import F64, SE2
 from pc2grid.io.atomic import refuse_existing, replace_file
+from pc2grid.io.cdr import Cdr
 from pc2grid.io.ros_definitions import schema_text
 from pc2grid.model import F32, OccupancyGrid, Trajectory
 
@@ -22,48 +22,6 @@ if TYPE_CHECKING:
     from mcap.writer import Writer
 
 _FLOAT32 = 7
-
-
-class _Cdr:
-    """Little-endian XCDR1 encoder: primitives aligned to their size, counted from behind the 4-byte head."""
-
-    def __init__(self) -> None:
-        self._parts = bytearray(b"\x00\x01\x00\x00")
-
-    def __bytes__(self) -> bytes:
-        return bytes(self._parts)
-
-    def put(self, code: str, *values: Any) -> _Cdr:
-        """Append values of one struct format character each ("I", "d", ...)."""
-        for value in values:
-            self._align(struct.calcsize(code))
-            self._parts += struct.pack("<" + code, value)
-        return self
-
-    def text(self, value: str) -> _Cdr:
-        raw = value.encode() + b"\0"
-        self.put("I", len(raw))
-        self._parts += raw
-        return self
-
-    def array(self, values: NDArray[Any], *, counted: bool = True) -> _Cdr:
-        """Append a sequence (counted) or a fixed array of a numpy dtype."""
-        if counted:
-            self.put("I", values.size)
-        if values.size:
-            self._align(values.dtype.itemsize)
-            self._parts += np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes()
-        return self
-
-    def header(self, stamp_ns: int, frame: str) -> _Cdr:
-        seconds, rest = divmod(int(stamp_ns), 1_000_000_000)
-        return self.put("i", seconds).put("I", rest).text(frame)
-
-    def pose(self, T: F64) -> _Cdr:
-        return self.put("d", *(float(v) for v in T[:3, 3]), *(float(v) for v in quat_xyzw_from_pose(T)))
-
-    def _align(self, size: int) -> None:
-        self._parts += bytes(-(len(self._parts) - 4) % size)
 
 
 class LogWriter:
@@ -125,7 +83,7 @@ class LogWriter:
         columns = np.asarray(points, dtype=np.float32).reshape(-1, 3)
         if offsets_s is not None:
             columns = np.column_stack((columns, np.asarray(offsets_s, dtype=np.float32)))
-        cdr = _Cdr().header(stamp_ns, frame).put("I", 1, len(columns), len(names))
+        cdr = Cdr().header(stamp_ns, frame).put("I", 1, len(columns), len(names))
         for index, name in enumerate(names):
             cdr.text(name).put("I", 4 * index).put("B", _FLOAT32).put("I", 1)
         step = 4 * len(names)
@@ -148,7 +106,7 @@ class LogWriter:
         """sensor_msgs/LaserScan; `inf` in ranges means no return."""
         values = np.asarray(ranges, dtype=np.float32).reshape(-1)
         angle_max = angle_min + angle_increment * (len(values) - 1)
-        cdr = _Cdr().header(stamp_ns, frame)
+        cdr = Cdr().header(stamp_ns, frame)
         cdr.put("f", angle_min, angle_max, angle_increment, time_increment, time_increment * len(values))
         cdr.put("f", range_min, range_max).array(values).array(np.empty(0, np.float32))
         self._add(topic, "sensor_msgs/msg/LaserScan", stamp_ns, cdr)
@@ -160,14 +118,14 @@ class LogWriter:
         good = np.isfinite(depth) & (depth > 0) & (depth < 65.0)
         millimetres[good] = np.rint(depth[good] * 1000.0).astype(np.uint16)
         height, width = depth.shape
-        cdr = _Cdr().header(stamp_ns, frame).put("I", height, width).text("16UC1").put("B", 0)
+        cdr = Cdr().header(stamp_ns, frame).put("I", height, width).text("16UC1").put("B", 0)
         cdr.put("I", 2 * width).array(millimetres.astype("<u2").view(np.uint8).reshape(-1))
         self._add(topic, "sensor_msgs/msg/Image", stamp_ns, cdr)
 
     def camera_info(self, topic: str, stamp_ns: int, frame: str, K: ArrayLike, W: int, H: int) -> None:
         """sensor_msgs/CameraInfo of an undistorted camera with intrinsics K (3, 3) and W x H pixels."""
         k = np.asarray(K, dtype=np.float64).reshape(3, 3)
-        cdr = _Cdr().header(stamp_ns, frame).put("I", H, W).text("plumb_bob").array(np.zeros(5))
+        cdr = Cdr().header(stamp_ns, frame).put("I", H, W).text("plumb_bob").array(np.zeros(5))
         cdr.array(k.reshape(-1), counted=False).array(np.eye(3).reshape(-1), counted=False)
         cdr.array(np.column_stack((k, np.zeros(3))).reshape(-1), counted=False)
         cdr.put("I", 0, 0).put("I", 0, 0, 0, 0).put("?", False)
@@ -179,7 +137,7 @@ class LogWriter:
         self, topic: str, stamp_ns: int, T_odom_base: F64, frame: str = "odom", child: str = "base_link"
     ) -> None:
         """nav_msgs/Odometry with a pose (4, 4); covariance and twist zero (unknown)."""
-        cdr = _Cdr().header(stamp_ns, frame).text(child).pose(T_odom_base)
+        cdr = Cdr().header(stamp_ns, frame).text(child).pose(T_odom_base)
         cdr.array(np.zeros(36), counted=False).put("d", *[0.0] * 6).array(np.zeros(36), counted=False)
         self._add(topic, "nav_msgs/msg/Odometry", stamp_ns, cdr)
 
@@ -196,7 +154,7 @@ class LogWriter:
         if not len(trajectory):
             return
         last_ns = int(trajectory.stamps_ns[-1])
-        cdr = _Cdr().header(last_ns, frame).put("I", len(trajectory))
+        cdr = Cdr().header(last_ns, frame).put("I", len(trajectory))
         for stamp_ns, T_map_base in zip(trajectory.stamps_ns, trajectory.T_map_base, strict=True):
             cdr.header(int(stamp_ns), frame).pose(T_map_base)
         self._add(topic, "nav_msgs/msg/Path", last_ns, cdr)
@@ -207,7 +165,7 @@ class LogWriter:
         """geometry_msgs/PoseWithCovarianceStamped of a planar pose; covariance (3, 3) of x, y, yaw."""
         full = np.zeros((6, 6))
         full[np.ix_((0, 1, 5), (0, 1, 5))] = np.asarray(covariance, dtype=np.float64).reshape(3, 3)
-        cdr = _Cdr().header(stamp_ns, frame).pose(pose.lift()).array(full.reshape(-1), counted=False)
+        cdr = Cdr().header(stamp_ns, frame).pose(pose.lift()).array(full.reshape(-1), counted=False)
         self._add(topic, "geometry_msgs/msg/PoseWithCovarianceStamped", stamp_ns, cdr)
 
     # --- maps and notes -------------------------------------------------------------------------------
@@ -217,7 +175,7 @@ class LogWriter:
         height, width = grid.cells.shape
         origin = SE2(*grid.origin_m).lift()
         seconds, rest = divmod(int(stamp_ns), 1_000_000_000)
-        cdr = _Cdr().header(stamp_ns, frame).put("i", seconds).put("I", rest)
+        cdr = Cdr().header(stamp_ns, frame).put("i", seconds).put("I", rest)
         cdr.put("f", grid.resolution_m).put("I", width, height).pose(origin).array(grid.cells.reshape(-1))
         self._add(topic, "nav_msgs/msg/OccupancyGrid", stamp_ns, cdr)
 
@@ -226,7 +184,7 @@ class LogWriter:
         self._open().add_metadata(name, values)
 
     def _transforms(self, topic: str, stamp_ns: int, edges: Sequence[tuple[str, str, F64]]) -> None:
-        cdr = _Cdr().put("I", len(edges))
+        cdr = Cdr().put("I", len(edges))
         for parent, child, T_parent_child in edges:
             cdr.header(stamp_ns, parent).text(child).pose(T_parent_child)
         self._add(topic, "tf2_msgs/msg/TFMessage", stamp_ns, cdr)
@@ -236,7 +194,7 @@ class LogWriter:
             raise RuntimeError("LogWriter is used outside of its with block")
         return self._writer
 
-    def _add(self, topic: str, type_name: str, stamp_ns: int, cdr: _Cdr) -> None:
+    def _add(self, topic: str, type_name: str, stamp_ns: int, cdr: Cdr) -> None:
         writer = self._open()
         if type_name not in self._schemas:
             self._schemas[type_name] = writer.register_schema(
