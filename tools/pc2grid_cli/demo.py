@@ -34,16 +34,18 @@ def demo_command(
     from pc2grid.simulate import SimulationConfig, simulate_session
     from pc2grid.simulate.config import LidarConfig
     from pc2grid_cli.convert import build_session
+    from pc2grid_cli.finding import Found, locate
     from pc2grid_cli.picture import draw_answer
-    from pc2grid_cli.relocalize import as_text, locate
+    from pc2grid_cli.relocalize import as_text
+    from pc2grid_cli.report import write_report
     from signature.build import add_sessions
     from signature.config import Config
     from signature.database import open_database
 
     begin = time.monotonic()
     lidar, depth = out / "lidar.mcap", out / "depth.mcap"
-    database, picture = out / "office.submaps", out / "answer.png"
-    for path in (lidar, depth, database, picture):
+    database, picture, page = out / "office.submaps", out / "answer.png", out / "report.html"
+    for path in (lidar, depth, database, picture, page):
         refuse_existing(path, force)
     out.mkdir(parents=True, exist_ok=True)
 
@@ -78,14 +80,18 @@ def demo_command(
         console.note("4/4 draw it")
         import numpy as np
 
-        draw_answer(picture, opened, answer, poses, np.array([(p.x, p.y) for p in true_poses]))
+        truth_m = np.array([(p.x, p.y) for p in true_poses])
+        draw_answer(picture, opened, answer, poses, truth_m)
+        about = {"source": depth.name, "sensor": "depth"}
+        found = Found(answer=answer, poses=poses, about=about)
+        write_report(page, opened, found=found, accept=config.relocalize.accept, truth_m=truth_m)
     print(f"map: {len(session.trajectory)} lidar scans, {len(session.submaps)} submaps: {database}")
     print(as_text(answer))
     if answer.T_map_base is not None:
-        found, true = answer.T_map_base, true_poses[-1]
-        distance = math.hypot(found.x - true.x, found.y - true.y)
-        turn = abs(math.degrees(math.remainder(found.yaw - true.yaw, 2 * math.pi)))
+        pose, true = answer.T_map_base, true_poses[-1]
+        distance = math.hypot(pose.x - true.x, pose.y - true.y)
+        turn = abs(math.degrees(math.remainder(pose.yaw - true.yaw, 2 * math.pi)))
         print(f"truth: x {true.x:.2f} m, y {true.y:.2f} m: off by {distance:.2f} m and {turn:.1f} deg")
-    print(f"picture: {picture}   ({time.monotonic() - begin:.0f} s)")
+    print(f"picture: {picture}, page to look into it: {page}   ({time.monotonic() - begin:.0f} s)")
     if answer.status != "located":
         raise typer.Exit(console.UNSURE)

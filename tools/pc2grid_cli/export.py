@@ -25,10 +25,13 @@ def export_command(
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="OUT.png", help="a picture of the map")
     ] = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", metavar="OUT.html", help="a page to look into the database")
+    ] = None,
     session: Annotated[str | None, typer.Option("--session", help="which, if there are several")] = None,
     force: Force = False,
 ) -> None:
-    """Write a session's map, trajectory or picture.
+    """Write a session's map, trajectory or picture, or a page that shows all sessions.
 
     Example: pc2grid export building.submaps --map building --trajectory building.tum
     """
@@ -36,17 +39,24 @@ def export_command(
     from pc2grid.io.atomic import refuse_existing
     from signature.database import open_database
 
-    if map_ is None and trajectory is None and mcap is None and plot is None:
-        raise ConfigError(
-            "nothing to export", hint="name at least one of --map, --trajectory, --mcap, --plot"
-        )
-    targets = [path for path in (trajectory, mcap, plot) if path is not None]
+    targets = [path for path in (trajectory, mcap, plot, report) if path is not None]
     if map_ is not None:
         targets += [map_.with_name(map_.name + ".yaml"), map_.with_name(map_.name + ".pgm")]
+    if not targets:
+        raise ConfigError(
+            "nothing to export", hint="name at least one of --map, --trajectory, --mcap, --plot, --report"
+        )
     for path in targets:
         refuse_existing(path, force)
     with open_database(database) as opened:
         names = [info.name for info in opened.sessions()]
+        if report is not None:
+            from pc2grid_cli.report import write_report
+
+            write_report(report, opened)
+        if targets == [report] and session is None:
+            console.note(f"wrote {report}")
+            return
         if session is None and len(names) != 1:
             there = ", ".join(names) or "none"
             raise DatabaseError(

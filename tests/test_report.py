@@ -1,0 +1,144 @@
+"""The page: everything in it, nothing fetched, and what it says is what the database and the answer say."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pc2grid.geometry import SE2
+from pc2grid.io.nav2_map import save_map
+from pc2grid.model import Health, OccupancyGrid, SessionMap, Trajectory
+from pc2grid.partition import partition
+from pc2grid_cli.answer_files import initialpose
+from pc2grid_cli.finding import Found, find_map
+from pc2grid_cli.report import contents, runs, write_report
+from signature.build import add_sessions, provenance
+from signature.config import Config
+from signature.database import SubmapDatabase, open_database
+from tests.drives import office, plan
+from tests.test_map_query import cut
+
+NASTY = "</script><b>&"
+
+
+def way(n: int = 40) -> Trajectory:
+    poses = np.array([SE2(1.0 + 0.2 * k, 7.0).lift() for k in range(n)])
+    health = [Health.FINE] * 10 + [Health.DEGENERATE] * 5 + [Health.LOST] * 5 + [Health.FINE] * (n - 20)
+    return Trajectory(stamps_ns=np.arange(n) * 10**8, T_map_base=poses, health=tuple(health))
+
+
+def session(name: str, grid: OccupancyGrid, trajectory: Trajectory) -> SessionMap:
+    submaps = partition(grid, Config().partition)
+    return SessionMap(session=name, sensor="laser", grid=grid, submaps=submaps, trajectory=trajectory)
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory: pytest.TempPathFactory) -> SubmapDatabase:
+    folder = tmp_path_factory.mktemp("report")
+    config = Config()
+    sessions = [
+        (session("office", office(), way()), provenance(Path("office.mcap"), "a" * 64, config)),
+        (session(NASTY, plan(8, 5, []), way(25)), provenance(Path("room.mcap"), "b" * 64, config)),
+    ]
+    add_sessions(folder / "two.submaps", sessions, config, keep=False)
+    return open_database(folder / "two.submaps")
+
+
+@pytest.fixture(scope="module")
+def found(database: SubmapDatabase, tmp_path_factory: pytest.TempPathFactory) -> Found:
+    stem = tmp_path_factory.mktemp("query") / "part"
+    save_map(cut(office(), 4.0, 3.0, 15.0, 12.0), stem)
+    return find_map(stem.with_suffix(".yaml"), database, Config())
+
+
+def embedded(page: str) -> dict:
+    return json.loads(re.search(r"const D = (\{.*?\}), A = D\.answer", page, re.S)[1])
+
+
+def test_the_page_is_whole_and_fetches_nothing(
+    database: SubmapDatabase, found: Found, tmp_path: Path
+) -> None:
+    write_report(tmp_path / "page.html", database, found=found)
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    outside = re.findall(r"(?:https?:)?//[a-z][^\s\"'`)]*", page.replace("http://www.w3.org/2000/svg", ""))
+    assert [u for u in outside if u.startswith(("http", "//www"))] == []
+    assert "default-src 'none'" in page
+    assert not re.search(r"<(?:script|link|img|iframe)[^>]*(?:src|href)=", page)
+    # A session's name cannot end the script: only the template's own end tag is there.
+    assert page.count("</script>") == 1
+    assert embedded(page) == contents(database, found=found)
+    assert embedded(page)["sessions"][1]["name"] == NASTY
+
+
+def test_the_same_database_gives_the_same_page(database: SubmapDatabase, tmp_path: Path) -> None:
+    for name in ("a.html", "b.html"):
+        write_report(tmp_path / name, database)
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+
+
+def test_submaps_graph_and_path_are_those_of_the_database(database: SubmapDatabase) -> None:
+    first = contents(database)["sessions"][0]
+    table = database.signatures()
+    rows = np.flatnonzero(table.session_index == 0)
+    assert [s["id"] for s in first["submaps"]] == table.submap_id[rows].tolist()
+    assert np.allclose([s["xy"] for s in first["submaps"]], table.center_m[rows], atol=0.006)
+    assert np.allclose([s["boundary"] for s in first["submaps"]], table.boundary[rows], atol=1e-4)
+    nodes, edges = first["graph"]["nodes"], first["graph"]["edges"]
+    assert len(nodes) > 5 and len(edges) > 5
+    assert all(0 <= i < len(nodes) for edge in edges for i in edge)
+    assert all(office().free[tuple(c)] for c in office().to_cell(np.array(nodes)[:, :2]))
+
+
+def test_the_picture_lies_where_the_grid_lies(database: SubmapDatabase) -> None:
+    image = contents(database)["sessions"][0]["image"]
+    raw = np.frombuffer(base64.b64decode(image["png"].split(",")[1]), np.uint8)
+    pixels = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED)
+    grid = office()
+    assert pixels.shape[:2] == grid.cells.shape
+    assert (image["x"], image["y"], image["w"], image["h"]) == (0.0, 0.0, 20.0, 14.0)
+    # The highest row of the picture is the one with the largest y.
+    assert np.array_equal(pixels[::-1, :, 0] < 60, grid.occupied)
+
+
+def test_a_path_is_cut_where_its_health_changes_and_stays_connected() -> None:
+    pieces = runs(way())
+    assert [p["health"] for p in pieces] == ["fine", "degenerate", "lost", "fine"]
+    for before, after in itertools.pairwise(pieces):
+        assert before["xy"][-2:] == after["xy"][:2]
+    assert pieces[-1]["xy"][-2:] == [8.8, 7.0]
+
+
+def test_standing_still_costs_no_points() -> None:
+    still = Trajectory(stamps_ns=np.arange(500), T_map_base=np.tile(np.eye(4), (500, 1, 1)))
+    (piece,) = runs(still)
+    assert piece["health"] == "fine" and len(piece["xy"]) == 4
+
+
+def test_the_answer_on_the_page_is_the_answer(database: SubmapDatabase, found: Found) -> None:
+    shown = contents(database, found=found, accept=0.8)["answer"]
+    assert shown["status"] == "located" == found.answer.status
+    assert shown["session"] == "office" and shown["accept"] == 0.8
+    assert (shown["pose"]["x"], shown["pose"]["y"]) == pytest.approx((4.0, 3.0), abs=0.05)
+    assert shown["query"]["is_map"] and shown["query"]["source"] == "part.yaml"
+    assert shown["image"]["T"] == found.answer.to_json()["T_map_odom"]
+    assert len(shown["hypotheses"]) == len(found.answer.hypotheses)
+
+
+def test_an_initial_pose_is_what_nav2_takes() -> None:
+    covariance = np.array([[0.1, 0.01, 0.02], [0.01, 0.2, 0.03], [0.02, 0.03, 0.3]])
+    message = initialpose(1_700_000_000_123_456_789, SE2(1.0, -2.0, np.pi / 2), covariance)
+    assert message["header"] == {"stamp": {"sec": 1_700_000_000, "nanosec": 123_456_789}, "frame_id": "map"}
+    pose = message["pose"]["pose"]
+    assert pose["position"] == {"x": 1.0, "y": -2.0, "z": 0.0}
+    assert pose["orientation"] == pytest.approx({"x": 0, "y": 0, "z": 0.5**0.5, "w": 0.5**0.5})
+    full = np.array(message["pose"]["covariance"]).reshape(6, 6)
+    assert np.array_equal(full[np.ix_((0, 1, 5), (0, 1, 5))], covariance)
+    assert np.count_nonzero(full) == 9
+    assert json.loads(json.dumps(message)) == message

@@ -1,0 +1,200 @@
+"""A database, and an answer found in it, as one page that needs no network: `report.html` filled with data.
+
+Everything shown is in the page as one JSON document; the template draws it. Metres and radians, in the map
+frame of each session.
+"""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pc2grid.io.atomic import replace_file
+
+if TYPE_CHECKING:
+    from pc2grid.geometry import F64
+    from pc2grid.model import OccupancyGrid, Trajectory
+    from pc2grid_cli.finding import Found
+    from signature.config import Config
+    from signature.database import SubmapDatabase
+    from signature.similarity import SignatureTable
+
+_LARGEST_PIXELS = 3000
+_STEP_M = 0.05
+"""Poses nearer than this to the last one drawn are left out: nobody sees them."""
+
+
+def write_report(
+    path: Path,
+    database: SubmapDatabase,
+    *,
+    found: Found | None = None,
+    accept: float = 0.9,
+    truth_m: F64 | None = None,
+) -> None:
+    """Write the page. Raises OutputError if it cannot be written.
+
+    found : an answer to show over the map. accept : the confidence it needed to be `located`.
+    truth_m : (N, 2) the query's true path in the map frame, if known.
+    """
+    page = files("pc2grid_cli").joinpath("report.html").read_text(encoding="utf-8")
+    document = contents(database, found=found, accept=accept, truth_m=truth_m)
+    # "<" is the only character with which text could leave the script element.
+    data = json.dumps(document, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    with replace_file(path) as temporary:
+        temporary.write_text(page.replace("/*DATA*/null", data, 1), encoding="utf-8")
+
+
+def contents(
+    database: SubmapDatabase,
+    *,
+    found: Found | None = None,
+    accept: float = 0.9,
+    truth_m: F64 | None = None,
+) -> dict[str, Any]:
+    """What the page shows, plain types only."""
+    config, table = database.config(), database.signatures()
+    return {
+        "title": Path(database.location).name,
+        "radius_m": config.partition.radius_m,
+        "boundary_bin_m": config.signature.boundary_bin_m,
+        "freespace_bin_m": config.signature.freespace_bin_m,
+        "sessions": [
+            {
+                **_facts(info),
+                "image": _picture(database.grid(info.name)),
+                "submaps": _submaps(table, index),
+                "graph": _graph(database.grid(info.name), config),
+                "path": runs(database.trajectory(info.name)),
+            }
+            for index, info in enumerate(database.sessions())
+        ],
+        "answer": None if found is None else _answer(found, accept, truth_m),
+    }
+
+
+def _facts(info: Any) -> dict[str, Any]:
+    return {
+        "name": info.name,
+        "source": info.provenance.source,
+        "sensor": info.sensor,
+        "count": info.submaps,
+        "area_m2": round(info.area_m2, 1),
+        "path_m": round(info.path_m, 1),
+        "duration_s": round(info.duration_s, 1),
+        "scans": info.scans,
+        "lossy": info.lossy,
+        "warnings": list(info.warnings),
+    }
+
+
+def _submaps(table: SignatureTable, session_index: int) -> list[dict[str, Any]]:
+    return [
+        {
+            "id": int(table.submap_id[row]),
+            "xy": _short(table.center_m[row], 2),
+            "boundary": _short(table.boundary[row], 4),
+            "freespace": _short(table.freespace[row], 4),
+            "symmetry": _short(table.symmetry[row], 2),
+        }
+        for row in np.flatnonzero(table.session_index == session_index)
+    ]
+
+
+def _graph(grid: OccupancyGrid, config: Config) -> dict[str, Any]:
+    """Where ways meet or end (x, y, whether a junction), and which of them are joined."""
+    from pc2grid.partition import junction_graph
+
+    graph = junction_graph(grid, config.partition)
+    return {
+        "nodes": [
+            [*_short(node["center_m"], 2), int(node["kind"] == "junction")] for _, node in graph.nodes.items()
+        ],
+        "edges": [[int(a), int(b)] for a, b in graph.edges],
+    }
+
+
+def runs(poses: Trajectory) -> list[dict[str, Any]]:
+    """Pieces of a path of equal health, as x, y, x, y, ...; each starts where the last one ends."""
+    xy = poses.planar()[:, :2]
+    health = [h.value for h in poses.health] or ["fine"] * len(xy)
+    pieces: list[dict[str, Any]] = []
+    last: F64 | None = None
+    for k, (kind, members) in enumerate(itertools.groupby(range(len(xy)), key=lambda i: health[i])):
+        indices = list(members)
+        points = [] if k == 0 or last is None else [last]
+        for i in indices:
+            if last is None or i == indices[-1] or np.hypot(*(xy[i] - last)) >= _STEP_M:
+                points.append(xy[i])
+                last = xy[i]
+        pieces.append({"health": kind, "xy": _short(np.ravel(points), 2)})
+    return pieces
+
+
+def _answer(found: Found, accept: float, truth_m: F64 | None) -> dict[str, Any]:
+    from pc2grid_cli.finding import in_map
+
+    answer = found.answer
+    document = answer.to_json(query=found.about)
+    located = in_map(found.poses, answer)
+    pose = document["pose"]
+    return {
+        "status": answer.status,
+        "session": answer.session,
+        "pose": pose and {key: pose[key] for key in ("x", "y", "yaw")},
+        "deviation": None if answer.covariance is None else _short(np.sqrt(np.diag(answer.covariance)), 4),
+        "confidence": round(answer.confidence, 4),
+        "accept": accept,
+        "query": {**document["query"], "is_map": found.drawn is not None},
+        "hypotheses": document["hypotheses"],
+        "history": document["history"],
+        "path": [] if located is None else runs(located),
+        "truth": [] if truth_m is None else _short(np.ravel(truth_m), 2),
+        "image": None
+        if found.drawn is None or answer.T_map_odom is None
+        else {**_picture(found.drawn, tint=(0, 94, 213)), "T": document["T_map_odom"]},
+    }
+
+
+def _picture(grid: OccupancyGrid, tint: tuple[int, int, int] | None = None) -> dict[str, Any]:
+    """The known part of a grid as a PNG: free white, walls dark, in between grey, unknown transparent.
+
+    tint : (blue, green, red) to show walls only, for a map laid over another. Large grids are reduced so
+    that walls stay.
+    """
+    import cv2
+
+    known = np.argwhere(grid.cells >= 0)
+    (r0, c0), (r1, c1) = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else ((0, 0), (1, 1))
+    cells = grid.cells[r0:r1, c0:c1]
+    n = -(-max(cells.shape) // _LARGEST_PIXELS)
+    for axis in (0, 1):
+        cells = np.maximum.reduceat(cells, np.arange(0, cells.shape[axis], n), axis=axis)
+    pixels = np.zeros((*cells.shape, 4), np.uint8)
+    if tint is None:
+        pixels[..., :3] = np.clip(255 - 2.2 * np.maximum(cells, 0.0), 30, 255)[..., None]
+        pixels[..., 3] = np.where(cells < 0, 0, 255)
+    else:
+        pixels[..., :3] = tint
+        pixels[..., 3] = np.where(cells >= 65, 255, 0)
+    # Row 0 of a grid is its lowest, row 0 of a picture its highest.
+    data = cv2.imencode(".png", np.ascontiguousarray(pixels[::-1]))[1].tobytes()
+    size = grid.resolution_m * n
+    return {
+        "png": "data:image/png;base64," + base64.b64encode(data).decode(),
+        "x": round(float(grid.origin_m[0] + c0 * grid.resolution_m), 4),
+        "y": round(float(grid.origin_m[1] + r0 * grid.resolution_m), 4),
+        "w": round(cells.shape[1] * size, 4),
+        "h": round(cells.shape[0] * size, 4),
+    }
+
+
+def _short(values: Any, digits: int) -> list[float]:
+    """Plain numbers with no more digits than anybody can see."""
+    return [round(float(v), digits) for v in np.asarray(values, np.float64)]
