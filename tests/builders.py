@@ -180,11 +180,14 @@ def write_mcap(path: Path, messages: Iterable[Message], dialect: Dialect = "ros2
     return path
 
 
-def write_bag(path: Path, messages: Iterable[Message], compression: str = "") -> Path:
+def write_bag(
+    path: Path, messages: Iterable[Message], compression: str = "", chunk_bytes: int = 1 << 20
+) -> Path:
     """The messages (of dialect ros1) as a ROS 1 bag; compression: "", "bz2" or "lz4"."""
     from rosbags.rosbag1 import Writer as BagWriter
 
     bag = BagWriter(path)
+    bag.chunk_threshold = chunk_bytes
     if compression:
         bag.set_compression(BagWriter.CompressionFormat[compression.upper()])
     with bag as out:

@@ -74,15 +74,46 @@ def test_what_is_no_whole_bag(tmp_path: Path) -> None:
         path.write_bytes(content)
         return path
 
-    with pytest.raises(LogTruncated, match=r"ends within a record.*reindex"):
+    with pytest.raises(LogTruncated, match=r"ends within a record.*--recover"):
         read(bag(whole[: len(whole) // 2]))
-    with pytest.raises(LogCorrupt, match="reindex"):
+    with pytest.raises(LogCorrupt, match="--recover"):
         read(bag(whole[:13]))
-    with pytest.raises(LogTruncated, match=r"not indexed.*reindex"):  # a recorder that was killed
+    with pytest.raises(LogTruncated, match=r"not indexed.*--recover"):  # a recorder that was killed
         at = whole.index(b"index_pos=") + 10
         read(bag(whole[:at] + bytes(8) + whole[at + 8 :]))
     with pytest.raises(NotALog, match="ROS 1 bag of an old format"):
         read(bag(b"#ROSBAG V1.2\n" + bytes(50)))
+
+
+@pytest.mark.parametrize("compression", ["", "bz2", "lz4"])
+def test_recover_reads_the_whole_chunks_of_a_damaged_bag(tmp_path: Path, compression: str) -> None:
+    path = tmp_path / "a.bag"
+    whole = write_bag(path, drive("ros1", scans=120), compression, chunk_bytes=4096).read_bytes()
+    assert whole.count(b"compression=") > 10
+    clean = [s.points_m.tobytes() for s in read(path)[0]]
+    found, report = read(path, recover=True)
+    assert [s.points_m.tobytes() for s in found] == clean
+    assert not report.lossy
+
+    at = whole.index(b"index_pos=") + 10  # a recorder that was killed: no index, last chunk cut off
+    path.write_bytes(whole[:at] + bytes(8) + whole[at + 8 : len(whole) // 2])
+    with pytest.raises(LogTruncated, match="--recover"):
+        read(path)
+    found, report = read(path, recover=True)
+    assert 30 < len(found) < 90
+    assert [s.points_m.tobytes() for s in found] == clean[: len(found)]
+    assert report.bytes_lost > 0
+
+    middle = whole.index(b"compression=", len(whole) // 3)
+    for place in (middle - 16, middle - 8, middle):  # the header's length, the kind, the compression
+        content = bytearray(whole)
+        content[place : place + 4] = b"\xff\xff\xff\xff"
+        path.write_bytes(content)
+        found, report = read(path, recover=True)
+        assert 100 < len(found) < 120
+        assert {s.points_m.tobytes() for s in found} <= set(clean)
+        assert found[-1].points_m.tobytes() == clean[-1]
+        assert report.bytes_lost > 1000
 
 
 def test_a_bag_that_unpacks_without_end_is_refused(tmp_path: Path) -> None:
@@ -314,10 +345,11 @@ def test_mutations_end_in_our_errors_or_in_scans(tmp_path: Path, kind: str) -> N
         else:
             content[a : a + 4] = struct.pack("<I", int(rng.integers(0, 1 << 32)))
         path.write_bytes(content)
-        try:
-            read(path)
-        except Pc2GridError:
-            outcomes["refused"] += 1
-        else:
-            outcomes["read"] += 1
+        for recover in (False, True):
+            try:
+                read(path, recover=recover)
+            except Pc2GridError:
+                outcomes["refused"] += 1
+            else:
+                outcomes["read"] += 1
     assert min(outcomes.values()) > 5

@@ -3,8 +3,8 @@
 `open_log` is the way in for recordings; the rest is imported by module.
 
 Containers, each a `source.Source` of bytes, told apart by `containers`:
-    mcap_log (mcap_records, mcap_summary, mcap_survey), bag_log, db3_log, rosbag2_folder (split_log),
-    cloud_folder
+    mcap_log (mcap_records, mcap_summary, mcap_survey), bag_log (bag_salvage), db3_log,
+    rosbag2_folder (split_log), cloud_folder
 Encodings, each to the classes of `messages`, told apart by `decoders`:
     ros_messages (ros_definitions), foxglove, cloud_files (lzf)
 Sensors, each to points, told apart by `scan_decoder`:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogCorrupt, LogTruncated
@@ -17,13 +17,27 @@ from pc2grid.io.source import LogInfo, RawMessage, Tally, TopicInfo
 from pc2grid.io.unpack import unpacker
 
 MAGIC = b"#ROSBAG V2.0\n"
-_REINDEX = "`rosbag reindex` recovers what is whole"
+_RECOVER = "--recover reads what is whole"
+
+
+class Connection(NamedTuple):
+    """A publisher of a topic: type and definition of its messages, and how many there are."""
+
+    topic: str
+    type: str
+    definition: str
+    messages: int
+
+    def one_more(self) -> Connection:
+        """The same with another message."""
+        return self._replace(messages=self.messages + 1)
 
 
 class BagSource:
     """One ROS 1 bag (format 2.0), open.
 
-    Raises LogTruncated or LogCorrupt when it is opened or read. Damaged bags are not recovered here.
+    Raises LogTruncated or LogCorrupt when it is opened or read. What is whole of a
+    damaged one is read by `bag_salvage`.
     """
 
     def __init__(self, path: Path, config: ReadConfig) -> None:
@@ -40,12 +54,17 @@ class BagSource:
         except ReaderError as error:
             # A recorder writes the index last; without one it was interrupted.
             kind = LogTruncated if "not indexed" in str(error) else LogCorrupt
-            raise kind(f"{path}: {error}", hint=_REINDEX) from error
+            raise kind(f"{path}: {error}", hint=_RECOVER) from error
         for place, chunk in self._reader.chunks.items():
             kind_of = _compression(chunk)
             bounded = unpacker(kind_of, config.max_chunk_bytes)
             self._reader.chunks[place] = chunk._replace(decompressor=bounded)
-        self._topic_of = _topics(self._reader.connections)
+        self._topic_of = topics_of(
+            {
+                c.id: Connection(c.topic, c.msgtype, c.msgdef.data, c.msgcount)
+                for c in self._reader.connections
+            }
+        )
         topics = sorted(set(self._topic_of.values()), key=lambda t: (t.topic, t.type))
         count = sum(t.message_count or 0 for t in topics)
         self.info = LogInfo(
@@ -77,7 +96,7 @@ class BagSource:
             for connection, time_ns, data in self._reader.messages(wanted, start_ns, end_ns):
                 yield RawMessage(self._topic_of[connection.id], time_ns, data)
         except (ReaderError, AssertionError) as error:
-            raise LogCorrupt(f"{self._path}: a chunk is damaged: {error}", hint=_REINDEX) from error
+            raise LogCorrupt(f"{self._path}: a chunk is damaged: {error}", hint=_RECOVER) from error
 
 
 def _compression(chunk: Any) -> str:
@@ -86,25 +105,23 @@ def _compression(chunk: Any) -> str:
     return next(name for name, function in decompressors.items() if function is chunk.decompressor)
 
 
-def _topics(connections: list[Any]) -> dict[int, TopicInfo]:
+def topics_of(connections: dict[int, Connection]) -> dict[int, TopicInfo]:
     """The topic of each connection; a topic has one per publisher."""
     counts: dict[tuple[str, str], int] = {}
-    for c in connections:
-        counts[c.topic, c.msgtype] = counts.get((c.topic, c.msgtype), 0) + c.msgcount
+    for c in connections.values():
+        counts[c.topic, c.type] = counts.get((c.topic, c.type), 0) + c.messages
     first: dict[tuple[str, str], TopicInfo] = {}
-    for c in connections:
-        first.setdefault(
-            (c.topic, c.msgtype),
-            TopicInfo(
-                topic=c.topic,
-                type=short_name(c.msgtype),
-                encoding="ros1",
-                schema_encoding="ros1msg",
-                schema=c.msgdef.data.encode(),
-                message_count=counts[c.topic, c.msgtype],
-            ),
+    for c in connections.values():
+        info = TopicInfo(
+            topic=c.topic,
+            type=short_name(c.type),
+            encoding="ros1",
+            schema_encoding="ros1msg",
+            schema=c.definition.encode(),
+            message_count=counts[c.topic, c.type],
         )
-    return {c.id: first[c.topic, c.msgtype] for c in connections}
+        first.setdefault((c.topic, c.type), info)
+    return {key: first[c.topic, c.type] for key, c in connections.items()}
 
 
 def _check_records(path: Path) -> None:
@@ -119,5 +136,5 @@ def _check_records(path: Path) -> None:
                 at += 4 + int.from_bytes(length, "little")
                 if len(length) < 4 or at > size:
                     raise LogTruncated(
-                        f"{path}: the bag ends within a record ({size} bytes, {at} needed)", hint=_REINDEX
+                        f"{path}: the bag ends within a record ({size} bytes, {at} needed)", hint=_RECOVER
                     )

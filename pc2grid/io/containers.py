@@ -51,8 +51,9 @@ def _open_file(path: Path, head: bytes, config: ReadConfig, recover: bool) -> So
         raise LogTruncated(f"{path}: an MCAP that ends after {len(head)} bytes", hint="nothing to recover")
     if head.startswith(_BAG):
         from pc2grid.io.bag_log import BagSource
+        from pc2grid.io.bag_salvage import SalvagedBag
 
-        return BagSource(path, config)
+        return SalvagedBag(path, config) if recover else BagSource(path, config)
     if head.startswith(_SQLITE):
         from pc2grid.io.db3_log import Db3Source
 

@@ -1,0 +1,196 @@
+"""What is whole of a damaged ROS 1 bag, or of one whose recorder was killed before it wrote the index.
+
+The bag is surveyed once, chunk by chunk (http://wiki.ros.org/Bags/Format/2.0): a chunk counts if it unpacks
+to whole records; behind damage the survey goes on at the next chunk that is there.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from pc2grid.config import ReadConfig
+from pc2grid.errors import LimitExceeded, LogCorrupt
+from pc2grid.io.bag_log import MAGIC, Connection, topics_of
+from pc2grid.io.source import LogInfo, RawMessage, Tally
+from pc2grid.io.unpack import unpacker
+
+_KINDS = (b"\x02", b"\x03", b"\x04", b"\x05", b"\x06", b"\x07")
+_MESSAGE, _CHUNK, _CONNECTION = b"\x02", b"\x05", b"\x07"
+# Only a chunk has this field; writers differ in where in its header it stands.
+_CHUNK_MARK = b"compression="
+_MAX_HEADER = 80
+_WINDOW = 4 << 20
+
+
+class _Chunk(NamedTuple):
+    at: int
+    size: int
+    compression: str
+    start_ns: int
+    end_ns: int
+
+
+class _Broken(ValueError):
+    """A record does not fit."""
+
+
+class SalvagedBag:
+    """The whole chunks of a bag as a message source; the rest is counted in `tally`."""
+
+    def __init__(self, path: Path, config: ReadConfig) -> None:
+        self.files: tuple[Path, ...] = (path,)
+        self.tally = Tally()
+        self._config = config
+        self._chunks: list[_Chunk] = []
+        self._connections: dict[int, Connection] = {}
+        self._stream: BinaryIO = path.open("rb")
+        size = path.stat().st_size
+        self._survey(size)
+        self._topic_of = topics_of(self._connections)
+        topics = sorted(set(self._topic_of.values()), key=lambda t: (t.topic, t.type))
+        self.info = LogInfo(
+            path=path,
+            format="bag/ros1",
+            size_bytes=size,
+            start_ns=min((c.start_ns for c in self._chunks), default=0),
+            end_ns=max((c.end_ns for c in self._chunks), default=0),
+            message_count=sum(t.message_count or 0 for t in topics),
+            topics=tuple(topics),
+            warnings=tuple(self.tally.warnings),
+        )
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """See Source.messages; chunk by chunk, in each by log time."""
+        low = -1 if start_ns is None else start_ns
+        high = 1 << 64 if end_ns is None else end_ns
+        wanted = {key for key, topic in self._topic_of.items() if topic.topic in topics}
+        for chunk in sorted(self._chunks, key=lambda c: c.start_ns):
+            if chunk.end_ns < low or chunk.start_ns >= high:
+                continue
+            self._stream.seek(chunk.at)
+            found = self._messages_in(self._stream.read(chunk.size), chunk.compression)
+            for key, time_ns, data in sorted(found, key=lambda m: m[1]):
+                if key in wanted and low <= time_ns < high:
+                    yield RawMessage(self._topic_of[key], time_ns, data)
+
+    def _survey(self, size: int) -> None:
+        at = len(MAGIC)
+        while at < size:
+            try:
+                at = self._take_record(at, size)
+            except (_Broken, LogCorrupt, LimitExceeded) as error:
+                after = self._next_chunk(at + 1, size)
+                self.tally.bytes_lost += after - at
+                self.tally.warn(f"{error}, at byte {at}: {after - at} bytes were skipped")
+                at = after
+
+    def _take_record(self, at: int, size: int) -> int:
+        """Take up the record at a place in the file; returns where the next one is."""
+        head_size = self._length(at, size)
+        data_at = at + 4 + head_size + 4
+        data_size = self._length(data_at - 4, size)
+        self._stream.seek(at + 4)
+        fields = _fields(memoryview(self._stream.read(head_size)))
+        kind = fields.get(b"op")
+        if kind not in _KINDS or (b"compression" in fields) != (kind == _CHUNK):
+            raise _Broken("a record of unknown kind")
+        if kind == _CHUNK:
+            self._stream.seek(data_at)
+            compression = fields.get(b"compression", b"").decode("ascii", "replace")
+            found = self._messages_in(self._stream.read(data_size), compression)
+            times = [time_ns for _, time_ns, _ in found]
+            if times:
+                self._chunks.append(_Chunk(data_at, data_size, compression, min(times), max(times)))
+            for key, _, _ in found:
+                self._connections[key] = self._connections[key].one_more()
+        return data_at + data_size
+
+    def _length(self, at: int, size: int) -> int:
+        self._stream.seek(at)
+        raw = self._stream.read(4)
+        length = int.from_bytes(raw, "little")
+        if len(raw) < 4 or at + 4 + length > size:
+            raise _Broken("the bag ends within a record")
+        return length
+
+    def _messages_in(self, stored: bytes, compression: str) -> list[tuple[int, int, memoryview]]:
+        """Connection, time and data of the messages of a chunk; connections are taken up on the way."""
+        if compression not in ("none", "bz2", "lz4"):
+            raise _Broken(f"a chunk of unknown compression {compression!r:.20}")
+        content = memoryview(unpacker(compression, self._config.max_chunk_bytes)(stored))
+        found, at, new = [], 0, {}
+        while at < len(content):
+            head, at = _blob(content, at)
+            data, at = _blob(content, at)
+            fields = _fields(head)
+            key = int.from_bytes(fields.get(b"conn", b""), "little")
+            if fields.get(b"op") == _CONNECTION:
+                inner = _fields(data)
+                new[key] = Connection(
+                    topic=fields.get(b"topic", b"").decode("utf-8", "replace"),
+                    type=inner.get(b"type", b"").decode("utf-8", "replace"),
+                    definition=inner.get(b"message_definition", b"").decode("utf-8", "replace"),
+                    messages=0,
+                )
+            elif fields.get(b"op") == _MESSAGE:
+                time = fields.get(b"time", b"")
+                seconds, rest = (int.from_bytes(time[i : i + 4], "little") for i in (0, 4))
+                if len(time) != 8 or b"conn" not in fields:
+                    raise _Broken("a message without its time or connection")
+                found.append((key, seconds * 1_000_000_000 + rest, data))
+            else:
+                raise _Broken("a record of unknown kind in a chunk")
+        known = new | self._connections
+        if any(key not in known for key, _, _ in found):
+            raise _Broken("a chunk rests on a connection that is lost")
+        self._connections = known
+        return found
+
+    def _next_chunk(self, start: int, size: int) -> int:
+        """Where the next chunk record begins, or the end of the file."""
+        at = start
+        while at < size:
+            self._stream.seek(at)
+            window = memoryview(self._stream.read(_WINDOW + 2 * _MAX_HEADER))
+            for mark in re.finditer(re.escape(_CHUNK_MARK), window):
+                for begin in range(max(mark.start() - _MAX_HEADER, 0), mark.start() - 7):
+                    if _is_chunk(window, begin):
+                        return at + begin
+            at += _WINDOW
+        return size
+
+
+def _is_chunk(view: memoryview, at: int) -> bool:
+    """Whether a chunk record's header could begin here."""
+    length = int.from_bytes(view[at : at + 4], "little")
+    try:
+        return length <= _MAX_HEADER and _fields(_blob(view, at)[0]).get(b"op") == _CHUNK
+    except _Broken:
+        return False
+
+
+def _blob(view: memoryview, at: int) -> tuple[memoryview, int]:
+    """The bytes behind a length, and where they end."""
+    stop = at + 4 + int.from_bytes(view[at : at + 4], "little")
+    if at + 4 > len(view) or stop > len(view):
+        raise _Broken("a chunk ends within a record")
+    return view[at + 4 : stop], stop
+
+
+def _fields(head: memoryview) -> dict[bytes, bytes]:
+    """`name=value` fields, each behind its length."""
+    found, at = {}, 0
+    while at < len(head):
+        field, at = _blob(head, at)
+        name, _, value = bytes(field).partition(b"=")
+        found[name] = value
+    return found
