@@ -7,15 +7,29 @@ of `signature` is `signature.config.Config`.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class Section(BaseModel):
     """Base of all sections: frozen, no unknown keys, finite numbers only."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, data: Any) -> Any:
+        """A section given in part keeps the other defaults of this tree, which may not be its class's."""
+        if not isinstance(data, dict):
+            return data
+        parts = {name: field.default for name, field in cls.model_fields.items()}
+        return {
+            key: parts[key].model_dump() | value
+            if isinstance(value, dict) and isinstance(parts.get(key), Section)
+            else value
+            for key, value in data.items()
+        }
 
 
 class ReadConfig(Section):

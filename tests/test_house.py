@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -76,6 +77,14 @@ def test_every_setting_is_explained() -> None:
         assert section is not None
         unexplained = [key for key, info in section.model_fields.items() if not info.description]
         assert unexplained == [], f"in section {name}"
+
+
+def test_one_setting_leaves_the_others_of_its_section_alone() -> None:
+    """Also where the tree's defaults differ from the section's own."""
+    for name, section in Config():
+        for key, value in section:
+            text = "null" if value is None else json.dumps(value)
+            assert load_settings(Config, None, [f"{name}.{key}={text}"], {}) == Config()
 
 
 def test_order_of_precedence(tmp_path: Path) -> None:
