@@ -13,6 +13,7 @@ from types import FrameType
 from typing import Any
 
 OK, FAILED, USAGE, LOSSY, UNSURE, INTERRUPTED = 0, 1, 2, 3, 4, 130
+PIPE_CLOSED = 128 + signal.SIGPIPE
 
 
 class State:
@@ -103,13 +104,25 @@ def run(command: Callable[[], Any]) -> int:
         print("pc2grid: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        # Whoever read our output has seen enough. Python must not complain at exit either.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OK
+        return _pipe_closed()
+    except SystemExit as stop:
+        if isinstance(stop.__context__, BrokenPipeError):  # click turns it into exit code 1
+            return _pipe_closed()
+        raise
     except Exception as error:
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of typer's
             return _report_usage(error)
         return report_error(error)
+
+
+def _pipe_closed() -> int:
+    """Whoever read our output has seen enough: end like any other program whose reader has gone.
+
+    Quietly, and not with 0: what the rest would have said (`db check`) is not known to anybody.
+    """
+    # Python must not complain at exit either.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return PIPE_CLOSED
 
 
 def _report_usage(error: Any) -> int:
