@@ -23,7 +23,7 @@ from pc2grid_cli.settings import (
 )
 
 if TYPE_CHECKING:
-    from pc2grid.model import SessionMap
+    from pc2grid.model import OccupancyGrid, SessionMap
     from signature.config import Config
     from signature.database import Provenance
 
@@ -50,8 +50,7 @@ def convert_command(
 
     Example: pc2grid convert monday.mcap -o building.submaps
     """
-    from pc2grid.errors import ConfigError
-    from pc2grid.io.atomic import refuse_existing
+    from pc2grid.errors import ConfigError, OutputError
     from signature.build import add_sessions
 
     settings = make_config(config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity)
@@ -63,15 +62,12 @@ def convert_command(
         raise ConfigError(
             f"two inputs would both be the session {twice[0]!r}", hint="convert one later with --add --name"
         )
-    if not add and not (output.is_file() and output.stat().st_size == 0):
-        try:
-            refuse_existing(output, force)
-        except Exception as error:
-            error.hint = "--force replaces it, --add adds to it"  # type: ignore[attr-defined]
-            raise
+    if not add and not force and output.exists() and not (output.is_file() and output.stat().st_size == 0):
+        raise OutputError(
+            f"{output}: exists already{_difference(output, inputs, names, settings, start, duration)}",
+            hint="--force replaces it, --add adds to it",
+        )
     if not output.parent.is_dir():
-        from pc2grid.errors import OutputError
-
         raise OutputError(
             f"{output}: cannot write: no folder {output.parent}", hint="create the folder first"
         )
@@ -157,10 +153,65 @@ def summary(session: SessionMap, origin: Provenance) -> dict[str, Any]:
     }
 
 
-def _import_map(path: Path, name: str, config: Config) -> tuple[SessionMap, str]:
-    """A nav2 map as a session in the map's own frame."""
+def _difference(
+    output: Path,
+    inputs: list[Path],
+    names: list[str],
+    config: Config,
+    start_s: float,
+    duration_s: float | None,
+) -> str:
+    """What tells an existing database from the one that was asked for, as the end of a sentence."""
+    from pc2grid.errors import DatabaseError, Pc2GridError
+    from signature.database import open_database
+
+    try:
+        with open_database(output) as opened:
+            present = {info.name: info.provenance for info in opened.sessions()}
+    except DatabaseError:
+        return ""
+    if present.keys() != set(names):
+        there = ", ".join(map(repr, sorted(present))) or "no session"
+        return f" and holds {there} instead of {', '.join(map(repr, sorted(names)))}"
+    for path, name in zip(inputs, names, strict=True):
+        origin = present[name]
+        part = (origin.start_s, origin.duration_s)
+        if path.suffix not in (".yaml", ".yml") and part != (start_s, duration_s):
+            return f", {name!r} made from another part of the recording (--start, --duration)"
+        for section, settings in config:
+            for key, value in settings:
+                was = getattr(getattr(origin.config, section), key)
+                if was != value:
+                    return f", {name!r} made with {section}.{key} = {was!r}, not {value!r}"
+        try:
+            digest = _digest(path, config)
+        except Pc2GridError:
+            return ""  # an input that cannot be read: the next attempt with --force says so
+        if digest != origin.digest:
+            return f", {name!r} made from a file {origin.source!r} with other content"
+    return " and is made from the same input with the same settings"
+
+
+def _digest(path: Path, config: Config) -> str:
+    if path.suffix in (".yaml", ".yml") and not path.is_dir():
+        from pc2grid.io.nav2_map import load_map
+
+        return _map_digest(path, load_map(path))
+    from pc2grid.io import open_log
+
+    with open_log(path, config.read) as log:
+        return log.digest()
+
+
+def _map_digest(path: Path, grid: OccupancyGrid) -> str:
+    """Of the text and of the cells: the image may be of another format and say the same."""
     import hashlib
 
+    return hashlib.sha256(path.read_bytes() + grid.cells.tobytes()).hexdigest()
+
+
+def _import_map(path: Path, name: str, config: Config) -> tuple[SessionMap, str]:
+    """A nav2 map as a session in the map's own frame."""
     import numpy as np
 
     from pc2grid.io.nav2_map import load_map
@@ -168,7 +219,7 @@ def _import_map(path: Path, name: str, config: Config) -> tuple[SessionMap, str]
     from pc2grid.partition import partition
 
     grid = load_map(path)
-    digest = hashlib.sha256(path.read_bytes() + grid.cells.tobytes()).hexdigest()
+    digest = _map_digest(path, grid)
     empty = Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
     submaps = partition(grid, config.partition)
     return SessionMap(session=name, sensor="map", grid=grid, submaps=submaps, trajectory=empty), digest
