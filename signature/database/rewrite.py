@@ -18,7 +18,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from pc2grid.errors import DatabaseBusy, OutputError
+from pc2grid.errors import DatabaseBusy, DatabaseCorrupt, OutputError
 from pc2grid.io.atomic import replace_file
 from signature.database import schema
 
@@ -32,7 +32,7 @@ def rewrite(path: Path, *, keep: bool, timeout_s: float = BUSY_TIMEOUT_S) -> Ite
     keep : start from what `path` holds; otherwise, or if there is nothing yet, from an empty database.
 
     Raises DatabaseBusy if another writer does not finish within `timeout_s`, OutputError if the file
-    cannot be written, NotADatabase and its like if `path` cannot be kept.
+    cannot be written, NotADatabase, DatabaseCorrupt and their like if `path` cannot be kept.
     """
     target = Path(os.path.realpath(path))
     with hold(target, timeout_s), replace_file(target) as copy:
@@ -54,11 +54,13 @@ def rewrite(path: Path, *, keep: bool, timeout_s: float = BUSY_TIMEOUT_S) -> Ite
             yield connection
             connection.execute("COMMIT")
         except sqlite3.OperationalError as error:
-            if "full" in str(error) or "disk I/O" in str(error):
-                raise OutputError(
-                    f"{path}: cannot write: {error}", hint="free some space, or write to another disk"
-                ) from error
-            raise
+            raise OutputError(
+                f"{path}: cannot write: {error}", hint="free some space, or write to another disk"
+            ) from error
+        except sqlite3.DatabaseError as error:
+            if not kept:
+                raise  # what we wrote ourselves cannot be damaged: a mistake of ours
+            raise DatabaseCorrupt(f"{path}: damaged: {error}", hint=schema.SALVAGE) from error
         finally:
             connection.close()
 
@@ -95,8 +97,9 @@ def hold(target: Path, timeout_s: float) -> Iterator[None]:
             break
         os.close(descriptor)  # the holder before us removed it: lock the new one
     try:
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+        with contextlib.suppress(OSError):  # on a full disk the lock still holds, it only has no name
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
         yield
     finally:
         lock_path.unlink(missing_ok=True)

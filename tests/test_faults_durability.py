@@ -1,0 +1,392 @@
+"""Interrupted at any moment, a database is the old one or the new one, and the next run finishes the work.
+
+`PC2GRID_FUZZ=N` makes the random tests long.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pc2grid.errors import DatabaseError, OutputError
+from pc2grid.io.nav2_map import save_map
+from pc2grid.model import OccupancyGrid
+from pc2grid.simulate import SimulationConfig, simulate_session
+from signature.database import open_database
+from signature.database.sqlite import store
+from signature.database.upkeep import check, copy
+from tests.test_database import assert_holds, make_entry
+
+ROOT = Path(__file__).resolve().parent.parent
+FUZZ = int(os.environ.get("PC2GRID_FUZZ", "0"))
+WRITER = tuple(str(ROOT / name) for name in ("signature/database/", "pc2grid/io/atomic.py"))
+
+
+def small_house() -> OccupancyGrid:
+    """8 m x 6 m, three rooms."""
+    cells = np.zeros((120, 160), np.int8)
+    cells[:3], cells[-3:], cells[:, :3], cells[:, -3:] = 100, 100, 100, 100
+    cells[58:61, :70], cells[58:61, 85:], cells[:40, 100:103] = 100, 100, 100
+    return OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-2.0, -3.0))
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a map, a laser recording of a few metres, and the databases of both."""
+    folder = tmp_path_factory.mktemp("inputs")
+    save_map(small_house(), folder / "house")
+    config = SimulationConfig(length_m=1.5, seed=5, clutter=0)
+    simulate_session(folder / "drive.mcap", sensor="laser", grid=small_house(), config=config)
+    for source, made in (("drive.mcap", "drive.submaps"), ("house.yaml", "house.submaps")):
+        done = convert(folder / source, "-o", made, cwd=folder).wait()
+        assert done == 0
+    shutil.copyfile(folder / "drive.submaps", folder / "both.submaps")
+    assert convert(folder / "house.yaml", "-o", "both.submaps", "--add", cwd=folder).wait() == 0
+    return folder
+
+
+def convert(
+    *arguments: object, cwd: Path, before: str = "", limit_bytes: int | None = None
+) -> subprocess.Popen[str]:
+    """Start `pc2grid convert`; `before` is code to run first, `limit_bytes` the largest file it may write."""
+
+    def prepare() -> None:
+        # A shell that runs the tests in the background lets its children ignore Ctrl-C.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        if limit_bytes is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, limit_bytes))
+
+    code = f"{before}\nfrom pc2grid_cli.main import main; main()"
+    environment = {
+        **os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}", "PC2GRID_CONFIG": "",
+        "PC2GRID_DEBUG": "", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
+    }  # fmt: skip
+    return subprocess.Popen(
+        [sys.executable, "-c", code, "convert", *map(str, arguments)], cwd=cwd, text=True, env=environment,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, preexec_fn=prepare,
+    )  # fmt: skip
+
+
+def in_child(body: Callable[[], object]) -> tuple[int, str]:
+    """Run in a forked process: what `waitpid` says of its end, and the traceback if it raised."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            body()
+            code = 0
+        except BaseException:
+            os.write(writing, traceback.format_exc().encode()[-4000:])
+        finally:
+            os._exit(code)
+    os.close(writing)
+    with os.fdopen(reading) as pipe:
+        said = pipe.read()
+    return os.waitpid(child, 0)[1], said
+
+
+# --- fault 40: kill -9 --------------------------------------------------------------------------------
+
+
+def test_fuzz_kill_at_random_moments_of_convert(inputs: Path, tmp_path: Path) -> None:
+    """Every second one while the temporary file is there, the others anywhere from the start."""
+    rng = np.random.default_rng(40)
+    source, made = ("drive.mcap", "drive.submaps") if FUZZ else ("house.yaml", "house.submaps")
+    source, wanted = inputs / source, (inputs / made).read_bytes()
+    output = tmp_path / "x.submaps"
+    begin = time.monotonic()
+    assert convert(source, "-o", output, cwd=tmp_path).wait() == 0
+    usual_s = time.monotonic() - begin
+    assert output.read_bytes() == wanted
+    output.unlink()
+    killed = 0
+    for turn in range(min(FUZZ, 200) or 6):
+        process = convert(source, "-o", output, cwd=tmp_path)
+        if turn % 2:
+            while process.poll() is None and not any(tmp_path.iterdir()):
+                time.sleep(0.0005)
+            time.sleep(float(rng.uniform(0, 0.01)))
+        else:
+            time.sleep(float(rng.uniform(0.0, usual_s)))
+        process.kill()
+        killed += process.wait() == -signal.SIGKILL
+        if output.exists():
+            assert output.read_bytes() == wanted
+        rerun = convert(source, "-o", output, "--force", cwd=tmp_path)
+        assert rerun.wait() == 0, rerun.stderr
+        assert output.read_bytes() == wanted
+        assert list(tmp_path.iterdir()) == [output]
+        output.unlink()
+    assert killed > 0
+
+
+def test_fuzz_kill_at_every_line_of_the_writer(tmp_path: Path) -> None:
+    """Exact where the clock is not: a forked writer kills itself before the N-th line it would run."""
+    path = tmp_path / "x.submaps"
+    store(path, [make_entry("monday", 0)], keep=False)
+    old = path.read_bytes()
+    added = make_entry("tuesday", 1)
+    store(path, [added], keep=True)
+    new = path.read_bytes()
+
+    def die_before_line(number: int) -> tuple[int, str]:
+        seen = 0
+
+        def trace(frame: FrameType, event: str, argument: Any) -> Any:
+            nonlocal seen
+            if not frame.f_code.co_filename.startswith(WRITER):
+                return None
+            if event == "line":
+                seen += 1
+                if seen == number:
+                    os.kill(os.getpid(), signal.SIGKILL)
+            return trace
+
+        def body() -> None:
+            sys.settrace(trace)
+            store(path, [added], keep=True)
+
+        return in_child(body)
+
+    rng = np.random.default_rng(41)
+    states = {"old": 0, "new": 0}
+    number = 1
+    while True:
+        path.write_bytes(old)
+        status, said = die_before_line(number)
+        if status == 0:
+            break
+        assert os.WIFSIGNALED(status), said
+        assert path.read_bytes() in (old, new)
+        states["old" if path.read_bytes() == old else "new"] += 1
+        store(path, [added], keep=True, timeout_s=1.0)
+        assert path.read_bytes() == new
+        assert list(tmp_path.iterdir()) == [path]
+        number += 1 if FUZZ else int(rng.integers(5, 25))
+    assert path.read_bytes() == new
+    assert number > 100
+    assert states["old"] > 5
+    if FUZZ:
+        assert states["new"] > 0
+
+
+# --- fault 41: signals --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signal_in_the_middle_of_writing(inputs: Path, tmp_path: Path, number: int, code: int) -> None:
+    output = tmp_path / "x.submaps"
+    shutil.copyfile(inputs / "drive.submaps", output)
+    at_the_second_row = (
+        "import os\n"
+        "from signature.database import rows\n"
+        "plain, calls = rows.insert, []\n"
+        "def insert(*arguments):\n"
+        f"    calls.append(1); len(calls) == 2 and os.kill(os.getpid(), {int(number)})\n"
+        "    return plain(*arguments)\n"
+        "rows.insert = insert\n"
+    )
+    process = convert(inputs / "house.yaml", "-o", output, "--add", cwd=tmp_path, before=at_the_second_row)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == code, said
+    assert "Traceback" not in said
+    assert output.read_bytes() == (inputs / "drive.submaps").read_bytes()
+    assert list(tmp_path.iterdir()) == [output]
+    assert convert(inputs / "house.yaml", "-o", output, "--add", cwd=tmp_path).wait() == 0
+    assert output.read_bytes() == (inputs / "both.submaps").read_bytes()
+
+
+@pytest.mark.parametrize("arguments", ["db info both.submaps --json", "db check both.submaps"])
+def test_reader_that_has_seen_enough_is_no_error(inputs: Path, arguments: str) -> None:
+    """`| head`, at its earliest: nobody reads at all."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(
+        [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *arguments.split()],
+        cwd=inputs, stdout=writing, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"},
+    )  # fmt: skip
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
+
+
+# --- fault 39: what the system refuses ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO, errno.EDQUOT, errno.EACCES])
+def test_fail_the_nth_call_of_a_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    path = tmp_path / "x.submaps"
+    store(path, [make_entry("monday", 0)], keep=False)
+    old = path.read_bytes()
+    store(path, [make_entry("tuesday", 1)], keep=True)
+    new = path.read_bytes()
+    outcomes: list[str] = []
+    reached = fail_at = 0
+
+    def failing(name: str) -> Callable[..., Any]:
+        plain = getattr(os, name)
+
+        def call(*arguments: Any, **options: Any) -> Any:
+            nonlocal reached
+            reached += 1
+            if reached == fail_at:
+                outcomes.append(name)
+                raise OSError(number, os.strerror(number))
+            return plain(*arguments, **options)
+
+        return call
+
+    for name in ("open", "fsync", "replace", "ftruncate", "pwrite", "sendfile", "copy_file_range"):
+        if hasattr(os, name):
+            monkeypatch.setattr(os, name, failing(name))
+    refused = set()
+    while True:
+        path.write_bytes(old)
+        reached, fail_at = 0, fail_at + 1
+        try:
+            store(path, [make_entry("tuesday", 1)], keep=True)
+        except OutputError as error:
+            assert path.read_bytes() == old
+            assert str(path) in error.message
+            assert os.strerror(number) in error.message
+            assert error.hint
+            refused.add(outcomes[-1])
+        else:
+            # Neither the holder's name nor the flushing of the folder's entry is worth a failure.
+            assert path.read_bytes() == new
+        assert list(tmp_path.iterdir()) == [path]
+        if reached < fail_at:
+            break
+    assert refused >= {"open", "fsync", "replace"}
+
+
+def test_disk_full_at_every_page_of_a_write(tmp_path: Path) -> None:
+    """A limit on the size of files stops SQLite's own writing, from the first page to the last."""
+    path = tmp_path / "x.submaps"
+    store(path, [make_entry("monday", 0)], keep=False)
+    old = path.read_bytes()
+    added = make_entry("tuesday", 1)
+    store(path, [added], keep=True)
+    new = path.read_bytes()
+
+    def write_with(limit: int) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+        with pytest.raises(OutputError, match="cannot write") as caught:
+            store(path, [added], keep=True)
+        assert str(path) in caught.value.message
+        assert caught.value.hint
+
+    path.write_bytes(old)
+    for limit in [0, 100, *range(4096, len(new), 4096), len(new) - 1]:
+        status, said = in_child(lambda limit=limit: write_with(limit))
+        assert status == 0, said
+        assert path.read_bytes() == old
+        assert list(tmp_path.iterdir()) == [path]
+    store(path, [added], keep=True)
+    assert path.read_bytes() == new
+
+
+def test_disk_full_is_one_line_and_exit_1(inputs: Path, tmp_path: Path) -> None:
+    process = convert(inputs / "house.yaml", "-o", "x.submaps", cwd=tmp_path, limit_bytes=8192)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 1, said
+    lines = said.splitlines()
+    assert lines[0].startswith("pc2grid: error: x.submaps: cannot write")
+    assert lines[1].startswith("hint: ")
+    assert len(lines) == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folder_that_refuses(tmp_path: Path) -> None:
+    if os.geteuid() == 0:
+        folder = Path("/proc")  # nobody creates files there
+        if not folder.is_dir():
+            pytest.skip("root may write everywhere, and there is no /proc")
+    else:
+        folder = tmp_path / "closed"
+        folder.mkdir(mode=0o555)
+    with pytest.raises(OutputError, match=r"new\.submaps: cannot write") as caught:
+        store(folder / "new.submaps", [make_entry()], keep=False)
+    assert caught.value.hint
+    file = tmp_path / "file"
+    file.write_text("mine")
+    with pytest.raises(OutputError, match="Not a directory"):
+        store(file / "new.submaps", [make_entry()], keep=False)
+    with pytest.raises(OutputError, match="folder"):
+        store(tmp_path, [make_entry()], keep=False)
+    assert file.read_text() == "mine"
+
+
+def test_reader_keeps_what_it_opened(tmp_path: Path) -> None:
+    path = tmp_path / "x.submaps"
+    store(path, [make_entry("monday", 0)], keep=False)
+    with open_database(path) as database:
+        store(path, [make_entry("tuesday", 1)], keep=False)
+        assert_holds(database, make_entry("monday", 0))
+    with open_database(path) as database:
+        assert_holds(database, make_entry("tuesday", 1))
+    copy(path, tmp_path / "y.submaps")
+    assert check(tmp_path / "y.submaps") == ()
+
+
+def test_symbolic_link_is_followed(tmp_path: Path) -> None:
+    path, link = tmp_path / "x.submaps", tmp_path / "link.submaps"
+    link.symlink_to(path.name)
+    store(link, [make_entry("monday", 0)], keep=False)
+    store(link, [make_entry("tuesday", 1)], keep=True)
+    assert link.is_symlink()
+    with open_database(path) as database:
+        assert [info.name for info in database.sessions()] == ["monday", "tuesday"]
+    assert sorted(tmp_path.iterdir()) == [link, path]
+
+
+# --- fault 42: not the run that was interrupted -------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("drive.mcap", "made from the same input with the same settings"),
+        ("drive.mcap --set partition.radius_m=3.5", "made with partition.radius_m = 5.0, not 3.5"),
+        ("drive.mcap --start 0.5", "another part of the recording"),
+        ("house.yaml", "holds 'drive' instead of 'house'"),
+        ("house.yaml --name drive", "made from a file 'drive.mcap' with other content"),
+    ],
+)
+def test_another_run_onto_the_same_file_is_refused_with_the_difference(
+    inputs: Path, arguments: str, words: str
+) -> None:
+    before, folder = (inputs / "drive.submaps").read_bytes(), sorted(inputs.iterdir())
+    process = convert(*arguments.split(), "-o", "drive.submaps", cwd=inputs)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 1, said
+    assert said.startswith("pc2grid: error: drive.submaps: exists already")
+    assert words in said
+    assert "--force" in said.splitlines()[1]
+    assert (inputs / "drive.submaps").read_bytes() == before
+    assert sorted(inputs.iterdir()) == folder
+
+
+def test_adding_another_session_of_the_name_is_refused(inputs: Path, tmp_path: Path) -> None:
+    path = tmp_path / "x.submaps"
+    store(path, [make_entry("monday", 0)], keep=False)
+    before = path.read_bytes()
+    with pytest.raises(DatabaseError, match="another session named 'monday'"):
+        store(path, [make_entry("monday", 1)], keep=True)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
