@@ -51,6 +51,7 @@ def test_a_bag_of_every_compression(tmp_path: Path, compression: str) -> None:
         check_drive(list(log.scans()))
         assert not log.report().lossy
         assert [s.stamp_ns for s in log.scans(0.5, 0.2)] == [T0 + 5 * STEP, T0 + 6 * STEP]
+        assert any("no checksum" in w for w in log.report().warnings) == (compression != "bz2")
 
 
 @pytest.mark.skipif(not (DATA / "laser/aces_ros1.bag").exists(), reason="no recorded data (PC2GRID_DATA)")

@@ -128,8 +128,11 @@ def test_transforms_that_make_no_sense_are_ignored_and_said(tmp_path: Path) -> N
     to = ros()
     good = to.tf(T0, "base_link", "lidar", 0.2, topic="/tf_static")
     bad = to.tf(T0, "base_link", "lidar", float("nan"), topic="/tf_static")
+    far = to.tf(T0, "base_link", "lidar", 0.7, topic="/tf_static")
+    w = np.float64(1.0).tobytes()
+    far = far._replace(data=far.data.replace(w, np.float64(1e200).tobytes()))
     own = to.tf(T0, "lidar", "lidar", 1.0, topic="/tf_static")
-    scans, report = read(write_mcap(tmp_path / "a.mcap", [good, bad, own, *clouds(1)]))
+    scans, report = read(write_mcap(tmp_path / "a.mcap", [good, bad, far, own, *clouds(1)]))
     assert scans[0].T_base_sensor[0, 3] == 0.2
     assert sum("makes no sense" in w for w in report.warnings) == 2
 

@@ -20,6 +20,9 @@ MAGIC = b"#ROSBAG V2.0\n"
 _RECOVER = "--recover reads what is whole"
 
 
+UNCHECKED = "the bag carries no checksum: damage to its data would not be seen"
+
+
 class Connection(NamedTuple):
     """A publisher of a topic: type and definition of its messages, and how many there are."""
 
@@ -45,7 +48,6 @@ class BagSource:
 
         self.files: tuple[Path, ...] = (path,)
         self.tally = Tally()
-        self.tally.warn("a ROS 1 bag carries no checksum: damage to its data would not be seen")
         self._path = path
         _check_records(path)
         self._reader = Reader(path)
@@ -58,6 +60,8 @@ class BagSource:
         for place, chunk in self._reader.chunks.items():
             kind_of = _compression(chunk)
             bounded = unpacker(kind_of, config.max_chunk_bytes)
+            if kind_of != "bz2":
+                self.tally.warn(UNCHECKED)
             self._reader.chunks[place] = chunk._replace(decompressor=bounded)
         self._topic_of = topics_of(
             {

@@ -13,7 +13,7 @@ from typing import BinaryIO, NamedTuple
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LimitExceeded, LogCorrupt
-from pc2grid.io.bag_log import MAGIC, Connection, topics_of
+from pc2grid.io.bag_log import MAGIC, UNCHECKED, Connection, topics_of
 from pc2grid.io.source import LogInfo, RawMessage, Tally
 from pc2grid.io.unpack import unpacker
 
@@ -107,6 +107,8 @@ class SalvagedBag:
             self._stream.seek(data_at)
             compression = fields.get(b"compression", b"").decode("ascii", "replace")
             found = self._messages_in(self._stream.read(data_size), compression)
+            if compression != "bz2":
+                self.tally.warn(UNCHECKED)
             times = [time_ns for _, time_ns, _ in found]
             if times:
                 self._chunks.append(_Chunk(data_at, data_size, compression, min(times), max(times)))

@@ -21,7 +21,7 @@ _KEEP = 20_000
 
 def valid_pose(pose: Seven) -> bool:
     """Whether translation and quaternion are finite and the quaternion has a direction."""
-    return all(map(math.isfinite, pose)) and sum(v * v for v in pose[3:]) > 1e-12
+    return all(map(math.isfinite, pose)) and 1e-12 < sum(v * v for v in pose[3:]) < 1e12
 
 
 class PoseTrack:
