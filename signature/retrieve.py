@@ -26,6 +26,7 @@ from signature.similarity import SignatureTable, distances
 RANGE_SCALE_M = 0.4
 """Half of the likeness is gone at this difference of two ranges: about the offset between a view and the
 nearest place of the database."""
+_SPREAD_FLOOR = 1e-3
 PRIOR_SHARE = 0.15
 """Rays' worth of doubt, as a share of the circle: a likeness of few common rays counts for less."""
 
@@ -62,7 +63,8 @@ class Places:
 class Proposal:
     """A view of the query may be at a place of the database.
 
-    view : index into the query's views. row : row of the table. likeness : 0..1.
+    view : index into the query's views. row : row of the table.
+    likeness : standard deviations above what the view finds on its whole shortlist.
     yaw_rad : rotations from the query's frame into the map's under which they look alike, best first.
     """
 
@@ -96,6 +98,8 @@ def retrieve(
         turns = peaks(overlap)
         # The signatures keep their say: two places whose ranges agree are told apart by what lies between.
         likeness = overlap.max(axis=1) * np.exp(-config.signature_weight * _standardised(score)[rows])
+        # A view that looks like everywhere says little, so each speaks by how far a place stands out to it.
+        likeness = (likeness - likeness.mean()) / (likeness.std() + _SPREAD_FLOOR)
         for position, row in enumerate(rows):
             value = float(likeness[position])
             if int(row) not in best or value > best[int(row)].likeness:
