@@ -138,11 +138,8 @@ def runs(poses: Trajectory) -> list[dict[str, Any]]:
 
 
 def _answer(found: Found, accept: float, truth_m: F64 | None) -> dict[str, Any]:
-    from pc2grid_cli.finding import in_map
-
     answer = found.answer
     document = answer.to_json(query=found.about)
-    located = in_map(found.poses, answer)
     pose = document["pose"]
     return {
         "status": answer.status,
@@ -152,13 +149,14 @@ def _answer(found: Found, accept: float, truth_m: F64 | None) -> dict[str, Any]:
         "confidence": round(answer.confidence, 4),
         "accept": accept,
         "query": {**document["query"], "is_map": found.drawn is not None},
-        "hypotheses": document["hypotheses"],
+        "hypotheses": [
+            {**shown, "T": [h.fit.T_map_query.x, h.fit.T_map_query.y, h.fit.T_map_query.yaw]}
+            for shown, h in zip(document["hypotheses"], answer.hypotheses, strict=True)
+        ],
         "history": document["history"],
-        "path": [] if located is None else runs(located),
+        "path": runs(found.poses),
         "truth": [] if truth_m is None else _short(np.ravel(truth_m), 2),
-        "image": None
-        if found.drawn is None or answer.T_map_odom is None
-        else {**_picture(found.drawn, tint=(0, 94, 213)), "T": document["T_map_odom"]},
+        "image": None if found.drawn is None else _picture(found.drawn, tint=(0, 94, 213)),
     }
 
 
