@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -72,14 +72,18 @@ def remove(connection: sqlite3.Connection, session_id: int) -> None:
         connection.execute(f"DELETE FROM {table} WHERE {column} = ?", (session_id,))
 
 
-def read_sessions(connection: sqlite3.Connection, path: Path) -> list[tuple[int, SessionInfo]]:
-    """All sessions with their numbers. Raises DatabaseCorrupt."""
+def read_sessions(
+    connection: sqlite3.Connection, path: Path, without: Collection[int] = ()
+) -> list[tuple[int, SessionInfo]]:
+    """All sessions but those of the numbers `without`, with their numbers. Raises DatabaseCorrupt."""
     sessions = []
     with rows.explained(path, "session"):
         # The sizes come from rows whose own checksum is looked at when they are used.
         resolution_m = dict(connection.execute("SELECT session_id, resolution_m FROM grid"))
         scans = dict(connection.execute("SELECT session_id, count FROM trajectory"))
         for row, sound in rows.select(connection, "session"):
+            if row["id"] in without:
+                continue
             if not sound:
                 raise rows.corrupt(path, f"session {row['id']}", "wrong checksum")
             info = rows.read_info(row, resolution_m[row["id"]], scans[row["id"]], path)
@@ -96,6 +100,7 @@ class SqliteDatabase:
     def __init__(self, path: Path, *, writable: bool = False) -> None:
         self._path = path
         self._writable = writable
+        self._left_out: Collection[int] = ()
         self._open()
 
     @classmethod
@@ -131,7 +136,7 @@ class SqliteDatabase:
 
     def sessions(self) -> tuple[SessionInfo, ...]:
         """All sessions in the order they were added."""
-        return tuple(info for _, info in read_sessions(self._connection, self._path))
+        return tuple(info for _, info in read_sessions(self._connection, self._path, self._left_out))
 
     def config(self) -> Config:
         """The configuration of the first session; the default if there is none."""
@@ -148,6 +153,8 @@ class SqliteDatabase:
         index = {session_id: i for i, session_id in enumerate(self._ids().values())}
         with rows.explained(self._path, "signatures"):
             for row, sound in rows.select(self._connection, "signature"):
+                if row["session_id"] in self._left_out:
+                    continue
                 where = f"signatures of session {row['session_id']}"
                 if not sound:
                     raise rows.corrupt(self._path, where, "wrong checksum")
@@ -183,11 +190,17 @@ class SqliteDatabase:
         """All submaps of a session, by id."""
         session_id = self._id(session)
         with rows.explained(self._path, f"submaps of session {session!r}"):
+            query = "SELECT count FROM signature WHERE session_id = ?"
+            (missing,) = self._connection.execute(query, (session_id,)).fetchone() or (0,)
             for row, sound in rows.select(self._connection, "submap", "session_id = ?", session_id):
                 if not sound:
                     where = f"submap {row['submap_id']} of session {session!r}"
                     raise rows.corrupt(self._path, where, "wrong checksum")
                 yield rows.read_submap(row)
+                missing -= 1
+            # A row that no longer says whose it is would not be found, and not be missed either.
+            if missing:
+                raise rows.corrupt(self._path, f"submaps of session {session!r}", f"{missing} missing")
 
     def add(
         self,
@@ -203,6 +216,21 @@ class SqliteDatabase:
         store(self._path, [(session_map, signatures, provenance)], keep=True, force=force)
         self.close()
         self._open()
+
+    def leave_out_damaged(self) -> tuple[Problem, ...]:
+        """From now on, do without the sessions that cannot be searched because they are damaged.
+
+        Returns what is wrong with each of them. Raises DatabaseCorrupt if none is left, or if the file
+        itself cannot be read.
+        """
+        from signature.database.upkeep import damaged_sessions
+
+        damaged = damaged_sessions(self._connection, self._path)
+        problems = tuple(damaged.values())
+        self._left_out = damaged.keys()
+        if problems and not self._ids():
+            raise rows.corrupt(self._path, problems[0].where, problems[0].what)
+        return problems
 
     def check(self) -> tuple[Problem, ...]:
         """Everything that is wrong with the file."""
@@ -222,7 +250,8 @@ class SqliteDatabase:
 
     def _ids(self) -> dict[str, int]:
         with rows.explained(self._path, "session"):
-            return dict(self._connection.execute("SELECT name, id FROM session ORDER BY id"))
+            found = self._connection.execute("SELECT name, id FROM session ORDER BY id")
+            return {name: number for name, number in found if number not in self._left_out}
 
     def _id(self, session: str) -> int:
         ids = self._ids()

@@ -36,6 +36,34 @@ def check(path: Path) -> tuple[Problem, ...]:
     return tuple(dict.fromkeys(problems))
 
 
+def damaged_sessions(connection: sqlite3.Connection, path: Path) -> dict[int, Problem]:
+    """Numbers of the sessions whose own row, grid or signatures are damaged or missing, and what it is.
+
+    These are what a search reads; damaged submaps and trajectories are not looked for. Raises
+    DatabaseCorrupt if a table cannot be read to its end.
+    """
+    damaged: dict[int, Problem] = {}
+    present: dict[str, set[int]] = {}
+    for table, key in (("session", "id"), ("grid", "session_id"), ("signature", "session_id")):
+        present[table] = set()
+        for row, problem in _read_table(connection, path, table):
+            if row is None:
+                assert problem is not None
+                raise rows.corrupt(path, problem.where, problem.what)
+            present[table].add(row[key])
+            if problem is not None:
+                damaged.setdefault(row[key], problem)
+    with rows.explained(path, "trajectory"):
+        present["trajectory"] = {
+            number for (number,) in connection.execute("SELECT session_id FROM trajectory")
+        }
+    for number in sorted(set().union(*present.values())):
+        lost = [table for table, numbers in present.items() if number not in numbers]
+        if lost:
+            damaged.setdefault(number, Problem(f"session {number}", f"has no {' and no '.join(lost)}"))
+    return damaged
+
+
 def copy(source: Path, target: Path, *, recover: bool = False, force: bool = False) -> tuple[Problem, ...]:
     """Write a compact copy. With `recover`, damaged submaps and sessions are left out and returned.
 

@@ -83,6 +83,7 @@ def relocalize_command(
             update={"relocalize": settings.relocalize.model_copy(update={"top_k": top_k})}
         )
     with open_database(database) as opened:
+        left_out = [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
         if is_map(log):
             found = find_map(log, opened, settings)
         else:
@@ -112,14 +113,17 @@ def relocalize_command(
         if path is not None and located is None:
             console.warn(f"{path}: not written, there is no answer to put into it")
     if json:
-        console.print_json(answer.to_json(query=found.about, database={"path": database}))
+        about_database = {"path": database, "left_out": left_out}
+        console.print_json(answer.to_json(query=found.about, database=about_database))
     else:
         print(as_text(answer, is_map=found.drawn is not None))
     for warning in found.about["warnings"]:
         console.warn(warning)
+    for damage in left_out:
+        console.warn(f"{database}: damaged and left out: {damage}")
     if answer.status != "located":
         raise typer.Exit(console.UNSURE)
-    if found.about["lossy"]:
+    if found.about["lossy"] or left_out:
         raise typer.Exit(console.LOSSY)
 
 

@@ -1,0 +1,381 @@
+"""Damaged, foreign and contended databases: refused by name, or searched without what is damaged."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pc2grid.errors import (
+    DatabaseBusy,
+    DatabaseCorrupt,
+    DatabaseVersion,
+    NotADatabase,
+    OutputError,
+    Pc2GridError,
+)
+from pc2grid.io.nav2_map import save_map
+from signature.build import add_session, provenance
+from signature.config import Config
+from signature.database import open_database
+from signature.database.rewrite import hold
+from signature.database.schema import APPLICATION_ID, COLUMNS
+from signature.database.sqlite import store
+from signature.database.upkeep import check, copy, merge
+from tests.test_database import assert_holds, make_entry
+from tests.test_faults_durability import small_house
+
+ROOT = Path(__file__).resolve().parent.parent
+FUZZ = int(os.environ.get("PC2GRID_FUZZ", "0"))
+BLOBS = {
+    "grid": ["cells"],
+    "trajectory": ["stamps_ns", "poses", "health"],
+    "submap": ["cells"],
+    "signature": ["submap_id", "center_m", "boundary", "freespace", "symmetry"],
+}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    file = tmp_path / "x.submaps"
+    store(file, [make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)], keep=False)
+    return file
+
+
+def pc2grid(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *map(str, arguments)],
+        cwd=cwd, capture_output=True, text=True, timeout=120,
+        env={
+            **os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}", "PC2GRID_CONFIG": "",
+            "PC2GRID_DEBUG": "", "OMP_NUM_THREADS": "1",
+        },
+    )  # fmt: skip
+
+
+def read_all(file: Path) -> dict[str, str]:
+    """A digest of everything of each session."""
+    digests = {}
+    with open_database(file) as database:
+        table = database.signatures()
+        for index, info in enumerate(database.sessions()):
+            digest = hashlib.sha256(repr(info).encode())
+            digest.update(database.grid(info.name).cells.tobytes())
+            trajectory = database.trajectory(info.name)
+            digest.update(trajectory.stamps_ns.tobytes() + trajectory.T_map_base.tobytes())
+            digest.update(repr(trajectory.health).encode())
+            for submap in database.submaps(info.name):
+                digest.update(repr((submap.submap_id, submap.center_m, submap.radius_m)).encode())
+                digest.update(submap.grid.cells.tobytes())
+            for field in ("boundary", "freespace", "symmetry", "submap_id", "center_m"):
+                digest.update(np.ascontiguousarray(getattr(table, field)[table.session_index == index]))
+            digests[info.name] = digest.hexdigest()
+    return digests
+
+
+def set_header(offset: int, value: int) -> Callable[[bytes], bytes]:
+    return lambda data: data[:offset] + value.to_bytes(4, "big") + data[offset + 4 :]
+
+
+# --- faults 43 and 44: what is not a whole database of this format ------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("damage", "error", "words"),
+    [
+        (lambda data: b"", NotADatabase, "empty file"),
+        (lambda data: data[:15], NotADatabase, "not a pc2grid database"),
+        (lambda data: data[:99], DatabaseCorrupt, "truncated to 99 bytes"),
+        (lambda data: data[:100], DatabaseCorrupt, "100 bytes where its header promises"),
+        (lambda data: data[:-1], DatabaseCorrupt, "truncated or damaged"),
+        (lambda data: data[:-4096], DatabaseCorrupt, "truncated or damaged"),
+        (lambda data: data + b"\0", DatabaseCorrupt, "truncated or damaged"),
+        (lambda data: data[:4096] + bytes(len(data) - 4096), DatabaseCorrupt, "x.submaps"),
+        (lambda data: data[:100] + bytes(len(data) - 100), DatabaseCorrupt, "x.submaps"),
+        (lambda data: bytes(range(256)) * 64, NotADatabase, "not a pc2grid database"),
+        (set_header(68, 0), NotADatabase, "another program's SQLite file (application id 0x0)"),
+        (set_header(60, 2), DatabaseVersion, "database format 2; this pc2grid reads up to 1"),
+        (set_header(60, 2**31 - 1), DatabaseVersion, "database format 2147483647"),
+        (set_header(60, 0), DatabaseCorrupt, "database format 0 never existed"),
+    ],
+)
+def test_every_command_refuses_it_and_leaves_it(
+    path: Path, tmp_path: Path, damage: Callable[[bytes], bytes], error: type[Pc2GridError], words: str
+) -> None:
+    content = damage(path.read_bytes())
+    path.write_bytes(content)
+    uses: list[Callable[[], object]] = [
+        lambda: read_all(path),
+        lambda: copy(path, tmp_path / "copy.submaps"),
+        lambda: merge([path], tmp_path / "merged.submaps"),
+    ]
+    if content:  # an empty file may be filled
+        uses.append(lambda: store(path, [make_entry("friday", 5)], keep=True))
+    for use in uses:
+        with pytest.raises(error) as caught:
+            use()
+        assert words in caught.value.message
+        assert str(path) in caught.value.message
+        assert path.read_bytes() == content
+        assert list(tmp_path.iterdir()) == [path]
+    if error is DatabaseCorrupt:
+        assert check(path) != ()
+
+
+def test_files_of_other_programs(tmp_path: Path) -> None:
+    stranger = tmp_path / "places.sqlite"
+    connection = sqlite3.connect(stranger)
+    connection.execute("CREATE TABLE session (id INTEGER PRIMARY KEY, name TEXT)")
+    connection.commit()
+    with pytest.raises(NotADatabase, match="another program's SQLite file"):
+        open_database(stranger)
+    # Even one that calls itself ours.
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    connection.execute("PRAGMA user_version = 1")
+    connection.commit()
+    connection.close()
+    before = stranger.read_bytes()
+    with pytest.raises(DatabaseCorrupt, match="its tables are not those of format 1"):
+        open_database(stranger)
+    with pytest.raises(DatabaseCorrupt, match="its tables are not those of format 1"):
+        store(stranger, [make_entry()], keep=True)
+    assert stranger.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [stranger]
+
+
+def test_command_line_refuses_a_newer_format_in_one_line(path: Path) -> None:
+    path.write_bytes(set_header(60, 7)(path.read_bytes()))
+    done = pc2grid("db", "info", path.name, cwd=path.parent)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.splitlines() == [
+        "pc2grid: error: x.submaps: database format 7; this pc2grid reads up to 1",
+        "hint: use a newer pc2grid",
+    ]
+
+
+# --- fault 43: flipped bits ---------------------------------------------------------------------------
+
+
+def flip(path: Path, table: str, column: str, position: float, bit: int, session: int = 2) -> None:
+    """Flip one bit inside a blob, in the file's bytes."""
+    with sqlite3.connect(path) as connection:
+        query = f"SELECT rowid FROM {table} WHERE session_id = ? ORDER BY rowid DESC"
+        (rowid,) = connection.execute(query, (session,)).fetchone()
+        with connection.blobopen(table, column, rowid) as blob:
+            at = int(position * (len(blob) - 1))
+            blob[at] = blob[at] ^ (1 << bit)
+    connection.close()
+
+
+def test_fuzz_flipped_bit_anywhere_in_any_blob_is_found(path: Path) -> None:
+    clean = path.read_bytes()
+    rng = np.random.default_rng(43)
+    for _ in range(min(FUZZ, 200) or 4):
+        for table, columns in BLOBS.items():
+            for column in columns:
+                path.write_bytes(clean)
+                flip(path, table, column, float(rng.random()), int(rng.integers(8)))
+                problems = check(path)
+                assert len(problems) == 1, problems
+                assert problems[0].where.startswith(table)
+                assert problems[0].what == "wrong checksum"
+                with pytest.raises(DatabaseCorrupt, match=r"damaged: .*wrong checksum") as caught:
+                    read_all(path)
+                assert "--recover" in str(caught.value)
+
+
+@pytest.mark.parametrize("table", list(COLUMNS))
+def test_any_changed_value_of_any_row_is_found(path: Path, table: str) -> None:
+    """Not only blobs: every number, name and document stands under the checksum."""
+    clean = path.read_bytes()
+    for column in COLUMNS[table]:
+        path.write_bytes(clean)
+        connection = sqlite3.connect(path)
+        (kind,) = connection.execute(f"SELECT typeof({column}) FROM {table} LIMIT 1").fetchone()
+        change = {
+            "integer": f"{column} + 8",
+            "real": f"{column} + 0.5",
+            "text": f"{column} || ' '",
+            "blob": f"zeroblob(length({column}))",
+        }[kind]
+        connection.execute(f"UPDATE {table} SET {column} = {change} WHERE rowid = 1")
+        connection.commit()
+        connection.close()
+        assert any("wrong checksum" in problem.what for problem in check(path)), column
+        with pytest.raises(Pc2GridError):
+            read_all(path)
+
+
+@pytest.mark.parametrize("table", ["session", "grid", "signature"])
+@pytest.mark.parametrize("how", ["changed", "lost"])
+def test_damaged_session_is_left_out_and_the_others_answer(path: Path, table: str, how: str) -> None:
+    column, number = ("document", "id") if table == "session" else ("crc32", "session_id")
+    connection = sqlite3.connect(path)
+    if how == "changed":
+        connection.execute(f"UPDATE {table} SET {column} = {column} || '1' WHERE {number} = 1")
+    else:
+        connection.execute(f"DELETE FROM {table} WHERE {number} = 1")
+    connection.commit()
+    connection.close()
+    before = path.read_bytes()
+    with open_database(path) as database:
+        problems = database.leave_out_damaged()
+        assert len(problems) == 1
+        assert "1" in problems[0].where
+        assert table in problems[0].where + problems[0].what
+        assert ("checksum" if how == "changed" else f"no {table}") in problems[0].what
+        assert_holds(database, make_entry("tuesday", 1, submaps=5))
+        assert [info.name for info in database.sessions()] == ["tuesday"]
+        assert set(database.signatures().session_index) == {0}
+        assert database.config() == Config()
+        with pytest.raises(Pc2GridError, match="no session 'monday'"):
+            database.grid("monday")
+    assert path.read_bytes() == before
+
+
+def test_sound_database_leaves_nothing_out_and_a_wholly_damaged_one_is_refused(path: Path) -> None:
+    with open_database(path) as database:
+        assert database.leave_out_damaged() == ()
+        assert len(database.sessions()) == 2
+    for session in (1, 2):
+        flip(path, "signature", "boundary", 0.5, 3, session)
+    with (
+        open_database(path) as database,
+        pytest.raises(DatabaseCorrupt, match="signature 1: wrong checksum"),
+    ):
+        database.leave_out_damaged()
+
+
+def test_relocalize_goes_on_without_a_damaged_session_and_says_so(tmp_path: Path) -> None:
+    """A map is looked for in a database of itself and of a damaged neighbour."""
+    from pc2grid_cli.convert import build_session
+
+    yaml, _ = save_map(small_house(), tmp_path / "house")
+    config, database = Config(), tmp_path / "x.submaps"
+    house, origin = build_session(yaml, "house", config)
+    cellar, _ = build_session(yaml, "cellar", config)
+    for session in (cellar, house):
+        add_session(database, session, config, provenance(yaml, origin.digest, config))
+    flip(database, "signature", "boundary", 0.3, 5, session=1)
+    damaged = database.read_bytes()
+    done = pc2grid("relocalize", "house.yaml", "--database", "x.submaps", "--json", cwd=tmp_path)
+    answer = json.loads(done.stdout)
+    assert answer["status"] == "located", answer
+    assert done.returncode == 3, done.stderr
+    assert answer["database"]["left_out"] == ["signature 1: wrong checksum"]
+    assert "warning: x.submaps: damaged and left out: signature 1: wrong checksum" in done.stderr
+    assert database.read_bytes() == damaged
+
+
+# --- fault 45: many readers, two writers --------------------------------------------------------------
+
+
+def _write(file: str, mine: str, until: float, results: Any) -> None:
+    """Add sessions and replace them with others of the name, as fast as it goes."""
+    done = busy = number = 0
+    while time.time() < until:
+        number += 1
+        try:
+            seed = 100 + number % 3
+            store(Path(file), [make_entry(f"{mine}{number % 4}", seed)], keep=True, force=True, timeout_s=0.5)
+            done += 1
+        except DatabaseBusy:
+            busy += 1
+    results.put(("written", done, busy))
+
+
+def _read(file: str, known: dict[str, set[str]], until: float, results: Any) -> None:
+    """Read everything, over and over: always whole sessions that somebody wrote."""
+    done = 0
+    while time.time() < until:
+        for name, digest in read_all(Path(file)).items():
+            assert digest in known[name], f"a session {name!r} that nobody wrote"
+        done += 1
+    results.put(("read", done, 0))
+
+
+def test_fuzz_eight_readers_and_two_writers(path: Path, tmp_path: Path) -> None:
+    """No error but busy, no torn read; what nobody touched is still there."""
+    known: dict[str, set[str]] = {}
+    for seed in (100, 101, 102):
+        scratch = tmp_path / "scratch.submaps"
+        names = [f"{writer}{i}" for writer in "ab" for i in range(4)]
+        store(scratch, [make_entry(name, seed) for name in names], keep=False)
+        for name, digest in read_all(scratch).items():
+            known.setdefault(name, set()).add(digest)
+        scratch.unlink()
+    known |= {name: {digest} for name, digest in read_all(path).items()}
+
+    context = multiprocessing.get_context("fork")  # ten interpreters would spend the time on starting
+    results = context.Queue()
+    until = time.time() + (60.0 if FUZZ else 3.0)
+    parts = [context.Process(target=_write, args=(str(path), mine, until, results)) for mine in "ab"]
+    parts += [context.Process(target=_read, args=(str(path), known, until, results)) for _ in range(8)]
+    for part in parts:
+        part.start()
+    said = [results.get(timeout=120) for _ in parts]
+    for part in parts:
+        part.join(60)
+    assert [part.exitcode for part in parts] == [0] * len(parts)
+    written = [entry for entry in said if entry[0] == "written"]
+    assert len(written) == 2
+    assert sum(entry[1] for entry in written) > 0
+    assert sum(entry[1] for entry in said if entry[0] == "read") > 0
+    assert check(path) == ()
+    for name, digest in read_all(path).items():
+        assert digest in known[name]
+    with open_database(path) as database:
+        assert_holds(database, make_entry("monday", 0))
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def _hold_until(file: str, ready: Event, leave: Event) -> None:
+    with hold(Path(file), 1.0):
+        ready.set()
+        leave.wait(60)
+
+
+def test_second_writer_waits_for_the_first(path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    ready, leave = context.Event(), context.Event()
+    holder = context.Process(target=_hold_until, args=(str(path.resolve()), ready, leave))
+    holder.start()
+    assert ready.wait(60)
+    with pytest.raises(DatabaseBusy, match=f"being written by process {holder.pid} on ") as caught:
+        store(path, [make_entry("friday", 5)], keep=True, timeout_s=0.1)
+    assert caught.value.hint == "try again when it is done"
+    leave.set()
+    store(path, [make_entry("friday", 5)], keep=True, timeout_s=60)
+    holder.join(60)
+    with open_database(path) as database:
+        assert_holds(database, make_entry("friday", 5))
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_adding_to_a_damaged_database_names_the_damage(path: Path) -> None:
+    """A page of the tree overwritten: neither an error of SQLite's own nor a file that is worse off."""
+    data = bytearray(path.read_bytes())
+    refused = 0
+    for page in range(4096, len(data), 4096):
+        broken = data[:page] + b"\xa5" * 64 + data[page + 64 :]
+        path.write_bytes(broken)
+        try:
+            store(path, [make_entry("tuesday", 9, submaps=5)], keep=True, force=True)
+        except (DatabaseCorrupt, OutputError) as error:
+            assert str(path) in error.message
+            assert path.read_bytes() == broken
+            refused += 1
+        assert list(path.parent.iterdir()) == [path]
+    assert refused > 3
