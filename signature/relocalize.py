@@ -177,7 +177,7 @@ class Building:
         best, none = float(p[0]), float(p[-1])
         if best >= self.config.accept:
             return "located", best
-        return ("not_found" if none >= 0.5 else "ambiguous"), best
+        return ("ambiguous" if best > none else "not_found"), best
 
 
 def free_squares(grid: OccupancyGrid, side_m: float = 0.8) -> F64:
