@@ -6,9 +6,6 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pc2grid.io.atomic import replace_file
-from pc2grid.io.mcap_out import LogWriter
-
 if TYPE_CHECKING:
     from pc2grid.geometry import F64, SE2
     from pc2grid.model import OccupancyGrid, Trajectory
@@ -18,6 +15,8 @@ if TYPE_CHECKING:
 
 def write_initialpose(path: Path, answer: Answer) -> None:
     """The pose as JSON that `ros2 topic pub --once /initialpose` takes. The answer must be located."""
+    from pc2grid.io.atomic import replace_file
+
     assert answer.T_map_base is not None
     assert answer.covariance is not None
     message = initialpose(answer.stamp_ns, answer.T_map_base, answer.covariance)
@@ -54,6 +53,8 @@ def write_mcap(
     path: Path, database: SubmapDatabase, answer: Answer, located: Trajectory, force: bool
 ) -> None:
     """What Foxglove's 3D panel shows at once: map, path, pose and map -> odom -> base_link."""
+    from pc2grid.io.mcap_out import LogWriter
+
     assert answer.session is not None
     assert answer.T_map_base is not None
     assert answer.T_map_odom is not None
@@ -74,6 +75,8 @@ def write_map_mcap(
     path: Path, database: SubmapDatabase, answer: Answer, query: OccupancyGrid, force: bool
 ) -> None:
     """A map that was located in another one: both grids, and map -> query_map between them."""
+    from pc2grid.io.mcap_out import LogWriter
+
     assert answer.session is not None
     assert answer.T_map_odom is not None
     assert answer.covariance is not None
