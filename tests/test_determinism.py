@@ -1,0 +1,63 @@
+"""Same input, configuration and version: the same bytes, however many threads there are."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pc2grid.io.nav2_map import save_map
+from pc2grid.model import SensorKind
+from pc2grid.simulate import SimulationConfig, simulate_session
+from tests.test_faults_durability import small_house
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def convert(log: Path, output: Path, threads: int, hash_seed: int) -> bytes:
+    """A fresh process, as sets and dictionaries must not leave their order in the result either."""
+    done = subprocess.run(
+        [sys.executable, "-c", "from pc2grid_cli.main import main; main()", "convert", log, "-o", output],
+        cwd=output.parent, capture_output=True, text=True, timeout=240,
+        env={
+            **os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}", "PC2GRID_CONFIG": "",
+            "PYTHONHASHSEED": str(hash_seed), "OMP_NUM_THREADS": str(threads),
+            "OPENBLAS_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads),
+            "TBB_NUM_THREADS": str(threads),
+        },
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return output.read_bytes()
+
+
+@pytest.mark.parametrize(("sensor", "length_m"), [("laser", 1.5), ("lidar", 0.4), ("depth", 0.8)])
+def test_a_recording_gives_the_same_database_again(
+    tmp_path: Path, sensor: SensorKind, length_m: float
+) -> None:
+    config = SimulationConfig(length_m=length_m, seed=3, clutter=2)
+    simulate_session(tmp_path / "drive.mcap", sensor=sensor, grid=small_house(), config=config)
+    first = convert(tmp_path / "drive.mcap", tmp_path / "a.submaps", threads=1, hash_seed=1)
+    again = convert(tmp_path / "drive.mcap", tmp_path / "b.submaps", threads=2, hash_seed=2)
+    assert first == again
+
+
+def test_a_map_gives_the_same_database_wherever_it_lies(tmp_path: Path) -> None:
+    """Two folders, two working directories: no path, clock or process number is in the bytes."""
+    results = []
+    for number in (1, 2):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        yaml, _ = save_map(small_house(), folder / "house")
+        os.utime(yaml, (number * 1000, number * 1000))
+        results.append(convert(yaml, folder / "x.submaps", threads=number, hash_seed=number))
+    assert results[0] == results[1]
+
+
+def test_a_simulated_recording_is_the_same_again(tmp_path: Path) -> None:
+    config = SimulationConfig(length_m=0.6, seed=3, clutter=2)
+    for name in ("a", "b"):
+        simulate_session(tmp_path / f"{name}.mcap", sensor="laser", grid=small_house(), config=config)
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()

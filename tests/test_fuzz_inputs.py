@@ -1,0 +1,289 @@
+"""Seeded mutations of inputs: what is inside the messages of a recording, databases, nav2 maps.
+
+The containers of recordings are mutated in test_io_fuzz.py, where checksums catch most of it. Here the
+container stays sound and its content lies, so that the decoders behind the checksums are reached.
+Whatever is changed, the result is whole and possible, or a Pc2GridError; never another exception.
+PC2GRID_FUZZ is the number of mutations of all kinds together.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import resource
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from pc2grid.errors import DatabaseError, MapFileError, Pc2GridError
+from pc2grid.io.nav2_map import load_map, save_map
+from pc2grid.model import OccupancyGrid
+from signature.database import SubmapDatabase, open_database
+from signature.database.sqlite import store
+from signature.database.upkeep import check, copy
+from tests import test_io_foxglove as foxglove
+from tests.builders import STEP, T0, drive, read, ros, write_mcap
+from tests.test_database import make_entry
+
+FUZZ = int(os.environ.get("PC2GRID_FUZZ", "0"))
+RECORDINGS = ["lidar", "lidar ros1", "laser", "depth", "foxglove protobuf", "foxglove json"]
+PARTS = len(RECORDINGS) + 3
+ROUNDS = FUZZ // PARTS if FUZZ else 120
+# A round takes milliseconds; a decoder that is talked into a loop or a huge allocation takes far longer.
+PATIENCE_S = 10.0
+
+
+def mutated(whole: bytes, rng: np.random.Generator) -> bytes:
+    """The bytes truncated, flipped, spliced, shifted, or with two of their lengths swapped."""
+    content = bytearray(whole)
+    a, b = sorted(int(v) for v in rng.integers(0, len(content), 2))
+    kind = int(rng.integers(7))
+    if kind == 0:
+        del content[a:]
+    elif kind == 1:
+        content[a] ^= 1 << int(rng.integers(8))
+    elif kind == 2:
+        content[a : a + 16] = content[b : b + 16]
+    elif kind == 3:
+        del content[a : min(b, a + 40)]
+    elif kind == 4:
+        content[a:a] = content[a : min(b, a + 40)]
+    elif kind == 5:
+        extreme = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x7FC00000, 0x7F800000)
+        content[a : a + 4] = extreme[int(rng.integers(len(extreme)))].to_bytes(4, "little")
+    elif len(whole) >= 8:  # what looks like a length or an offset into the content
+        words = np.lib.stride_tricks.sliding_window_view(np.frombuffer(whole, np.uint8), 4)
+        values = words.astype(np.int64) @ np.array([1, 1 << 8, 1 << 16, 1 << 24])
+        places = np.flatnonzero((values > 0) & (values <= len(whole)))
+        if len(places) >= 2:
+            a, b = (int(v) for v in rng.choice(places, 2, replace=False))
+            content[a : a + 4], content[b : b + 4] = whole[b : b + 4], whole[a : a + 4]
+    return bytes(content)
+
+
+def patiently(rounds: int) -> Iterator[int]:
+    """Count, and watch the time of each round and the memory of all."""
+    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for number in range(rounds):
+        begin = time.process_time()
+        yield number
+        assert time.process_time() - begin < PATIENCE_S, f"mutation {number}"
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb < 500 * 1024
+
+
+# --- recordings ---------------------------------------------------------------------------------------
+
+
+class Record(NamedTuple):
+    """A message with all that a log says about it."""
+
+    topic: str
+    type: str
+    schema_encoding: str
+    schema: bytes
+    encoding: str
+    log_time_ns: int
+    data: bytes
+
+
+def recording(folder: Path, kind: str) -> Path:
+    """A small log of six scans."""
+    path, to, rng = folder / "clean.mcap", ros(), np.random.default_rng(1)
+    stamps = [T0 + i * STEP for i in range(6)]
+    if kind.startswith("lidar"):
+        dialect = "ros1" if kind == "lidar ros1" else "ros2"
+        return write_mcap(path, drive(dialect, 6), dialect)
+    if kind == "laser":
+        mount = to.tf(T0, "base_link", "laser", 0.2, topic="/tf_static")
+        return write_mcap(path, [mount, *(to.laser("/scan", t, rng.uniform(1, 9, 30)) for t in stamps)])
+    if kind == "depth":
+        camera = [to.camera("/camera/depth/camera_info", t, 8, 6, 10.0) for t in stamps]
+        images = [
+            to.image("/camera/depth/image", t, rng.integers(500, 3000, (6, 8)).astype("<u2"), "16UC1")
+            for t in stamps
+        ]
+        return write_mcap(path, [m for pair in zip(camera, images, strict=True) for m in pair])
+    contents = [foxglove.cloud(t, rng.uniform(1, 9, (5, 3))) for t in stamps]
+    mount = ("/tf", "FrameTransform", T0, foxglove.edge(T0, "base_link", "lidar", 0.2))
+    return foxglove.write(path, [mount, *contents], kind.split()[1])
+
+
+def records(path: Path) -> list[Record]:
+    with path.open("rb") as stream:
+        return [
+            Record(c.topic, s.name, s.encoding, s.data, c.message_encoding, m.log_time, m.data)
+            for s, c, m in make_reader(stream).iter_messages()
+            if s is not None
+        ]
+
+
+def write(path: Path, entries: list[Record]) -> None:
+    """A sound container around whatever the entries are."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.NONE)
+        writer.start()
+        schemas: dict[tuple[str, str, bytes], int] = {}
+        channels: dict[tuple[str, str, int], int] = {}
+        for entry in entries:
+            key = (entry.type, entry.schema_encoding, entry.schema)
+            schema = schemas.get(key) or schemas.setdefault(key, writer.register_schema(*key))
+            line = (entry.topic, entry.encoding, schema)
+            channel = channels.get(line) or channels.setdefault(line, writer.register_channel(*line))
+            writer.add_message(channel, entry.log_time_ns, entry.data, entry.log_time_ns)
+        writer.finish()
+
+
+def assert_possible(path: Path, recover: bool) -> None:
+    """What is read can be what a robot saw: finite, in order, fields aligned."""
+    scans, report = read(path, recover=recover)
+    assert report.scans_read == len(scans)
+    last = -1
+    for scan in scans:
+        assert scan.stamp_ns > last
+        last = scan.stamp_ns
+        assert scan.points_m.ndim == 2
+        assert scan.points_m.shape[1] == 3
+        if np.abs(scan.T_base_sensor).max() < 1e6:  # a mount at 1e300 m is passed on as it stands
+            assert np.isfinite(scan.points_m).all()
+        assert scan.offsets_s is None or len(scan.offsets_s) == len(scan.points_m)
+        assert np.isfinite(scan.T_base_sensor).all()
+        assert scan.T_odom_base is None or np.isfinite(scan.T_odom_base).all()
+
+
+@pytest.mark.parametrize("kind", RECORDINGS)
+def test_fuzz_content_of_recordings(tmp_path: Path, kind: str) -> None:
+    clean = records(recording(tmp_path, kind))
+    path = tmp_path / "x.mcap"
+    write(path, clean)
+    assert len(read(path)[0]) == 6
+    rng = np.random.default_rng(RECORDINGS.index(kind))
+    outcomes = {"read": 0, "refused": 0}
+    for number in patiently(ROUNDS):
+        entries = list(clean)
+        at = int(rng.integers(len(entries)))
+        if rng.random() < 0.2:  # the schema, everywhere that it is used
+            schema = mutated(entries[at].schema, rng)
+            kind_of_it = entries[at].type
+            entries = [e._replace(schema=schema) if e.type == kind_of_it else e for e in entries]
+        else:
+            entries[at] = entries[at]._replace(data=mutated(entries[at].data, rng))
+        write(path, entries)
+        try:
+            assert_possible(path, recover=bool(number % 2))
+        except Pc2GridError as error:
+            assert error.message
+            assert "\n" not in error.message
+            outcomes["refused"] += 1
+        except Exception as error:
+            raise AssertionError(f"{kind}, mutation {number}: {error!r}") from error
+        else:
+            outcomes["read"] += 1
+    assert min(outcomes.values()) > 0, outcomes
+
+
+# --- databases ----------------------------------------------------------------------------------------
+
+
+def sessions_of(database: SubmapDatabase) -> dict[str, str]:
+    """A digest of everything of each session, but not of what is said about the others."""
+    digests = {}
+    table = database.signatures()
+    for index, info in enumerate(database.sessions()):
+        digest = hashlib.sha256(repr(info).encode())
+        digest.update(database.grid(info.name).cells.tobytes())
+        digest.update(database.trajectory(info.name).T_map_base.tobytes())
+        for submap in database.submaps(info.name):
+            digest.update(repr((submap.submap_id, submap.center_m, submap.radius_m)).encode())
+            digest.update(submap.grid.cells.tobytes())
+        for field in ("boundary", "freespace", "symmetry", "submap_id", "center_m"):
+            digest.update(np.ascontiguousarray(getattr(table, field)[table.session_index == index]))
+        digests[info.name] = digest.hexdigest()
+    return digests
+
+
+def test_fuzz_databases(tmp_path: Path) -> None:
+    """Mutated files are read whole, or refused; what is left of them is searched, saved or added to."""
+    path, saved = tmp_path / "x.submaps", tmp_path / "saved.submaps"
+    names = ["monday", "tuesday", "friday"]
+    store(path, [make_entry(name, i) for i, name in enumerate(names)], keep=False)
+    whole = path.read_bytes()
+    with open_database(path) as database:
+        clean = sessions_of(database)
+    rng = np.random.default_rng(44)
+    outcomes = {"whole": 0, "refused": 0, "left out": 0, "saved": 0, "added": 0}
+    for _ in patiently(ROUNDS):
+        content = mutated(whole, rng)
+        path.write_bytes(content)
+        try:
+            with open_database(path) as database:
+                assert sessions_of(database) == clean
+            outcomes["whole"] += 1
+        except DatabaseError:
+            outcomes["refused"] += 1
+        try:
+            with open_database(path) as database:
+                left_out = database.leave_out_damaged()
+                rest = sessions_of(database)
+            assert rest.items() <= clean.items()
+            assert len(rest) >= len(names) - len(left_out)
+            outcomes["left out"] += bool(left_out)
+        except DatabaseError:
+            pass
+        try:
+            problems = check(path)
+            copy(path, saved, recover=True, force=True)
+            assert check(saved) == ()
+            with open_database(saved) as database:
+                found = sessions_of(database)
+            assert found.keys() <= clean.keys()
+            assert found == clean or problems
+            outcomes["saved"] += bool(found) and bool(problems)
+        except DatabaseError:
+            pass
+        try:
+            store(path, [make_entry("sunday", 9)], keep=True)
+            outcomes["added"] += 1
+        except DatabaseError:
+            assert path.read_bytes() == content
+        assert set(tmp_path.iterdir()) <= {path, saved}
+    assert min(outcomes.values()) > 0, outcomes
+
+
+# --- maps ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("image_format", ["pgm", "png"])
+def test_fuzz_maps(tmp_path: Path, image_format: str) -> None:
+    """A map has no checksum: what loads must at least be a map, and what is not says which file it is."""
+    cells = np.random.default_rng(2).choice(np.array([-1, 0, 100], np.int8), (12, 17))
+    grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-1.5, 2.0))
+    yaml_path, image_path = save_map(grid, tmp_path / "map", image_format=image_format)
+    texts = {file: file.read_bytes() for file in (yaml_path, image_path)}
+    rng = np.random.default_rng(46)
+    outcomes = {"loaded": 0, "refused": 0}
+    for number in patiently(ROUNDS):
+        for file, text in texts.items():
+            file.write_bytes(text)
+        victim = (yaml_path, image_path)[number % 2]
+        victim.write_bytes(mutated(texts[victim], rng))
+        try:
+            loaded = load_map(yaml_path)
+        except MapFileError as error:
+            assert str(tmp_path) in error.message
+            assert "\n" not in error.message
+            outcomes["refused"] += 1
+            continue
+        except Exception as error:
+            raise AssertionError(f"{victim.name}, mutation {number}: {error!r}") from error
+        assert loaded.cells.dtype == np.int8
+        assert -1 <= loaded.cells.min() <= loaded.cells.max() <= 100
+        assert loaded.resolution_m > 0
+        assert np.isfinite([loaded.resolution_m, *loaded.origin_m]).all()
+        outcomes["loaded"] += 1
+    assert min(outcomes.values()) > 0, outcomes
