@@ -27,6 +27,11 @@ _MAX_YAML_BYTES = 65_536
 _log = logging.getLogger(__name__)
 
 
+def is_map_file(path: Path) -> bool:
+    """Whether an input is a nav2 map rather than a recording (a rosbag2 folder's metadata.yaml is one)."""
+    return path.suffix in (".yaml", ".yml") and path.name != "metadata.yaml" and not path.is_dir()
+
+
 def load_map(yaml_path: Path) -> OccupancyGrid:
     """Read a `map.yaml` with its image, as nav2_map_server's map_io does.
 

@@ -110,9 +110,10 @@ def build_session(
     recover: bool = False,
 ) -> tuple[SessionMap, Provenance]:
     """One input as a session map and what it came from."""
+    from pc2grid.io.nav2_map import is_map_file
     from signature.build import provenance
 
-    if path.suffix in (".yaml", ".yml") and not path.is_dir():
+    if is_map_file(path):
         session_map, digest = _import_map(path, name, config)
         return session_map, provenance(path, digest, config)
 
@@ -163,6 +164,7 @@ def _difference(
 ) -> str:
     """What tells an existing database from the one that was asked for, as the end of a sentence."""
     from pc2grid.errors import DatabaseError, Pc2GridError
+    from pc2grid.io.nav2_map import is_map_file
     from signature.database import open_database
 
     try:
@@ -176,7 +178,7 @@ def _difference(
     for path, name in zip(inputs, names, strict=True):
         origin = present[name]
         part = (origin.start_s, origin.duration_s)
-        if path.suffix not in (".yaml", ".yml") and part != (start_s, duration_s):
+        if not is_map_file(path) and part != (start_s, duration_s):
             return f", {name!r} made from another part of the recording (--start, --duration)"
         for section, settings in config:
             for key, value in settings:
@@ -193,9 +195,9 @@ def _difference(
 
 
 def _digest(path: Path, config: Config) -> str:
-    if path.suffix in (".yaml", ".yml") and not path.is_dir():
-        from pc2grid.io.nav2_map import load_map
+    from pc2grid.io.nav2_map import is_map_file, load_map
 
+    if is_map_file(path):
         return _map_digest(path, load_map(path))
     from pc2grid.io import open_log
 

@@ -30,11 +30,6 @@ class Found:
     drawn: OccupancyGrid | None = None
 
 
-def is_map(path: Path) -> bool:
-    """Whether an input is a nav2 map and not a recording."""
-    return path.suffix in (".yaml", ".yml") and not path.is_dir()
-
-
 def find_log(
     path: Path,
     database: SubmapDatabase,

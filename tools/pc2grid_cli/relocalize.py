@@ -10,7 +10,7 @@ import typer
 
 from pc2grid_cli import console
 from pc2grid_cli.answer_files import write_initialpose, write_map_mcap, write_mcap
-from pc2grid_cli.finding import find_log, find_map, in_map, is_map
+from pc2grid_cli.finding import find_log, find_map, in_map
 from pc2grid_cli.settings import (
     AsJson,
     Assignments,
@@ -67,13 +67,14 @@ def relocalize_command(
     """
     from pc2grid.errors import ConfigError
     from pc2grid.io.atomic import refuse_existing
+    from pc2grid.io.nav2_map import is_map_file
     from signature.database import open_database
 
     for path in (trajectory, initialpose, output, plot, report):
         if path is not None:
             refuse_existing(path, force)
     for option, path in (("--trajectory", trajectory), ("--initialpose", initialpose)):
-        if path is not None and is_map(log):
+        if path is not None and is_map_file(log):
             raise ConfigError(
                 f"{option}: there is no robot in a map", hint="--json and --output have its pose"
             )
@@ -84,7 +85,7 @@ def relocalize_command(
         )
     with open_database(database) as opened:
         left_out = [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
-        if is_map(log):
+        if is_map_file(log):
             found = find_map(log, opened, settings)
         else:
             found = find_log(log, opened, settings, start_s=start, duration_s=duration, recover=recover)
