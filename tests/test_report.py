@@ -143,3 +143,13 @@ def test_an_initial_pose_is_what_nav2_takes() -> None:
     assert np.array_equal(full[np.ix_((0, 1, 5), (0, 1, 5))], covariance)
     assert np.count_nonzero(full) == 9
     assert json.loads(json.dumps(message)) == message
+
+
+def test_a_map_of_nothing_still_has_a_page(tmp_path: Path) -> None:
+    nothing = OccupancyGrid(cells=np.full((9, 9), -1, np.int8), resolution_m=0.05, origin_m=(0.0, 0.0))
+    still = Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
+    origin = provenance(Path("nothing.mcap"), "c" * 64, Config())
+    add_sessions(tmp_path / "x.submaps", [(session("x", nothing, still), origin)], Config(), keep=False)
+    with open_database(tmp_path / "x.submaps") as opened:
+        (only,) = contents(opened)["sessions"]
+    assert only["submaps"] == [] and only["path"] == [] and only["graph"] == {"nodes": [], "edges": []}

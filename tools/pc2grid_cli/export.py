@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pc2grid_cli import console
 from pc2grid_cli.settings import Force
+
+if TYPE_CHECKING:
+    from signature.database import SubmapDatabase
 
 
 def export_command(
@@ -50,42 +53,56 @@ def export_command(
         refuse_existing(path, force)
     with open_database(database) as opened:
         names = [info.name for info in opened.sessions()]
-        if report is not None:
-            from pc2grid_cli.report import write_report
-
-            write_report(report, opened)
-        if targets == [report] and session is None:
-            console.note(f"wrote {report}")
-            return
-        if session is None and len(names) != 1:
+        if targets != [report] and session is None and len(names) != 1:
             there = ", ".join(names) or "none"
             raise DatabaseError(
                 f"{database}: holds {len(names)} sessions: {there}", hint="choose one with --session"
             )
-        name = session or names[0]
-        grid, poses = opened.grid(name), opened.trajectory(name)
-        if map_ is not None:
-            from pc2grid.io.nav2_map import save_map
+        if report is not None:
+            from pc2grid_cli.report import write_report
 
-            save_map(grid, map_)
-        if trajectory is not None:
-            if not len(poses):
-                raise DatabaseError(f"{database}: session {name!r} is an imported map and has no trajectory")
-            from pc2grid.io.trajectory import write_tum
-
-            write_tum(trajectory, poses)
-        if mcap is not None:
-            from pc2grid.io.mcap_out import LogWriter
-
-            with LogWriter(mcap, force=force) as writer:
-                writer.occupancy_grid("/map", int(poses.stamps_ns[0]) if len(poses) else 0, grid)
-                if len(poses):
-                    writer.path("/path", poses)
-                for stamp_ns, T_map_base in zip(poses.stamps_ns, poses.T_map_base, strict=True):
-                    writer.tf(int(stamp_ns), "map", "base_link", T_map_base)
-        if plot is not None:
-            from pc2grid_cli.picture import draw_session
-
-            draw_session(plot, opened, name)
+            write_report(report, opened)
+        if targets != [report]:
+            _export_session(opened, session or names[0], map_, trajectory, mcap, plot, force)
     for path in targets:
         console.note(f"wrote {path}")
+
+
+def _export_session(
+    database: SubmapDatabase,
+    name: str,
+    map_: Path | None,
+    trajectory: Path | None,
+    mcap: Path | None,
+    plot: Path | None,
+    force: bool,
+) -> None:
+    """One session in the formats of others."""
+    from pc2grid.errors import DatabaseError
+
+    grid, poses = database.grid(name), database.trajectory(name)
+    if map_ is not None:
+        from pc2grid.io.nav2_map import save_map
+
+        save_map(grid, map_)
+    if trajectory is not None:
+        if not len(poses):
+            raise DatabaseError(
+                f"{database.location}: session {name!r} is an imported map and has no trajectory"
+            )
+        from pc2grid.io.trajectory import write_tum
+
+        write_tum(trajectory, poses)
+    if mcap is not None:
+        from pc2grid.io.mcap_out import LogWriter
+
+        with LogWriter(mcap, force=force) as writer:
+            writer.occupancy_grid("/map", int(poses.stamps_ns[0]) if len(poses) else 0, grid)
+            if len(poses):
+                writer.path("/path", poses)
+            for stamp_ns, T_map_base in zip(poses.stamps_ns, poses.T_map_base, strict=True):
+                writer.tf(int(stamp_ns), "map", "base_link", T_map_base)
+    if plot is not None:
+        from pc2grid_cli.picture import draw_session
+
+        draw_session(plot, database, name)

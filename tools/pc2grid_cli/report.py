@@ -170,7 +170,7 @@ def _picture(grid: OccupancyGrid, tint: tuple[int, int, int] | None = None) -> d
 
     known = np.argwhere(grid.cells >= 0)
     (r0, c0), (r1, c1) = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else ((0, 0), (1, 1))
-    cells = grid.cells[r0:r1, c0:c1]
+    cells = grid.cells[r0:r1, c0:c1] if len(known) else np.full((1, 1), -1, np.int8)
     n = -(-max(cells.shape) // _LARGEST_PIXELS)
     for axis in (0, 1):
         cells = np.maximum.reduceat(cells, np.arange(0, cells.shape[axis], n), axis=axis)
