@@ -379,3 +379,28 @@ def test_adding_to_a_damaged_database_names_the_damage(path: Path) -> None:
             refused += 1
         assert list(path.parent.iterdir()) == [path]
     assert refused > 3
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (b"tablegridgrid", b"table\xffridgrid"),  # SQLite's message quotes the name
+        (b"CREATE TABLE grid", b"CREATE \xffABLE grid"),
+        (
+            b"CREATE TABLE grid (session_id INTEGER PRIMARY",
+            b"CREATE TABLE grid (s\xffssion_id INTEGER PRIMARY",
+        ),
+    ],
+)
+def test_table_definitions_that_are_no_text(path: Path, before: bytes, after: bytes) -> None:
+    content = path.read_bytes()
+    assert content.count(before) == 1
+    content = content.replace(before, after)
+    path.write_bytes(content)
+    with pytest.raises(DatabaseCorrupt):
+        open_database(path)
+    with pytest.raises(DatabaseCorrupt):
+        store(path, [make_entry("friday", 5)], keep=True)
+    assert check(path) != ()
+    assert path.read_bytes() == content
+    assert list(path.parent.iterdir()) == [path]

@@ -53,16 +53,20 @@ def rewrite(path: Path, *, keep: bool, timeout_s: float = BUSY_TIMEOUT_S) -> Ite
             connection.execute("BEGIN")
             yield connection
             connection.execute("COMMIT")
-        except sqlite3.OperationalError as error:
-            raise OutputError(
-                f"{path}: cannot write: {error}", hint="free some space, or write to another disk"
-            ) from error
-        except sqlite3.DatabaseError as error:
-            if not kept:
-                raise  # what we wrote ourselves cannot be damaged: a mistake of ours
-            raise DatabaseCorrupt(f"{path}: damaged: {error}", hint=schema.SALVAGE) from error
+        except schema.COMPLAINTS as error:
+            raise _explained(error, path, kept) from error
         finally:
             connection.close()
+
+
+def _explained(error: Exception, path: Path, kept: bool) -> Exception:
+    """SQLite's complaint as ours: about the disk, or about the content that was to be kept."""
+    disk = any(words in str(error) for words in ("is full", "disk I/O", "unable to open", "readonly"))
+    if isinstance(error, sqlite3.OperationalError) and (disk or not kept):
+        return OutputError(f"{path}: cannot write: {error}", hint="free some space, or write to another disk")
+    if kept:
+        return DatabaseCorrupt(f"{path}: damaged: {error}", hint=schema.SALVAGE)
+    return error  # what we wrote ourselves cannot be damaged: a mistake of ours
 
 
 @contextlib.contextmanager

@@ -12,6 +12,9 @@ FORMAT = 1
 CONVERT = "make one with `pc2grid convert LOG -o BUILDING.submaps`"
 SALVAGE = "`pc2grid db check` lists all damage, `pc2grid db copy --recover` keeps what is whole"
 
+# What reading damaged content raises: the second where SQLite's own message quotes bytes that are no text.
+COMPLAINTS = (sqlite3.Error, UnicodeDecodeError)
+
 # Every row ends with the crc32 of its other columns: SQLite itself does not notice a flipped bit in a blob.
 # Units are in the names; *_m metres, *_ns nanoseconds. Arrays are little-endian, row by row.
 TABLES = {

@@ -132,7 +132,7 @@ def _structure(connection: sqlite3.Connection, path: Path) -> list[Problem]:
             problems.append(Problem(f"{table} row {rowid}", "belongs to no session"))
     except Pc2GridError as error:
         problems.append(Problem("file", error.message))
-    except sqlite3.Error as error:
+    except schema.COMPLAINTS as error:
         problems.append(Problem("file", str(error)))
     return problems
 
@@ -154,7 +154,7 @@ def _read_table(
                 yield row, Problem(name, str(error))
             else:
                 yield row, None
-    except sqlite3.Error as error:
+    except schema.COMPLAINTS as error:
         yield None, Problem(table, str(error))
 
 
