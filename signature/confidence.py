@@ -5,8 +5,12 @@ Every hypothesis competes with its rivals and with the possibility that the quer
     p_i = exp(k (s_i - s_0)) / (1 + sum_j exp(k (s_j - s_0)))
 
 with s the two-way score of `pc2grid.alignment.Fit`. s_0 is the score at which a lone hypothesis is as
-likely right as wrong, and k says how much a lead is worth; more walls seen make a lead worth more. The
-coefficients are fitted by maximum likelihood on simulated sessions (`fit`).
+likely right as wrong, and k says how much a lead is worth; more walls seen make a lead worth more.
+
+`fit` finds the coefficients of greatest likelihood for the trials of `compare sensors`. On 434 trials in
+the plans fr079 and intel right and wrong separate so well that k grows without bound (neutral 0.564; the
+best score in a wrong building was 0.50). Buildings of bare straight walls fit each other better than that,
+up to 0.59 in the tests, so the defaults keep a distance: confidence errs towards doubt.
 """
 
 from __future__ import annotations
