@@ -111,11 +111,11 @@ def test_fuzz_kill_at_random_moments_of_convert(inputs: Path, tmp_path: Path) ->
     output = tmp_path / "x.submaps"
     usual_s = 1.0
     killed = 0
-    for turn in range(min(FUZZ, 200) or 6):
+    for turn in range(min(FUZZ, 200) or 5):
         process = convert(source, "-o", output, cwd=tmp_path)
         if turn % 2:
             while process.poll() is None and not any(tmp_path.iterdir()):
-                time.sleep(0.0005)
+                time.sleep(0.002)
             time.sleep(float(rng.uniform(0, 0.01)))
         else:
             time.sleep(float(rng.uniform(0.0, usual_s)))
