@@ -71,6 +71,7 @@ class Tracker:
         self._ground: Ground | None = None
         self._last: Scan | None = None
         self._last_pose = np.eye(4)
+        self._measured: tuple[F64, F64] | None = None  # T_odom_base, T_map_base when odometry was last known
         self._velocity = np.eye(4)
         self._maps: list[tuple[PointGrid, float]] = []
         self._last_keyframe: SE2 | None = None
@@ -82,7 +83,7 @@ class Tracker:
 
     def track(self, scan: Scan) -> Tracked:
         """Follow the next scan; stamps must increase."""
-        motion, motion_s, measured = self._predict(scan)
+        motion, motion_s, odometry = self._predict(scan)
         points = self._usable(scan, motion, motion_s)
         predicted: F64 = self._last_pose @ motion
         if self._last is None:
@@ -102,13 +103,13 @@ class Tracker:
         sweep = self._flatten(points, scan, T_level_base)
         information, health = np.zeros((3, 3)), Health.FINE
         if self._maps:
-            refined, match = self._refine(sweep, planar, predicted, motion, measured)
+            refined, match = self._refine(sweep, planar, predicted, odometry)
             if match is not None:
                 information = match.information
             if self._rolling:
                 planar = refined
                 pose = planar.lift() @ T_level_base
-            health = self._judge(match, measured)
+            health = self._judge(match, odometry is not None)
         was_restarted = self._restarted
         restart = self._lost_scans > _GIVE_UP_SCANS
         if restart:
@@ -121,6 +122,8 @@ class Tracker:
         if self._last is not None:
             self._velocity = invert_pose(self._last_pose) @ pose
         self._last, self._last_pose = scan, pose
+        if scan.T_odom_base is not None:
+            self._measured = scan.T_odom_base, pose
         deskewed = dataclasses.replace(scan, points_m=points, offsets_s=None)
         registered = RegisteredScan(scan=deskewed, T_map_base=pose, health=health)
         self._restarted = (self._restarted or restart) and not keyframe
@@ -132,14 +135,22 @@ class Tracker:
             restart=keyframe and was_restarted,
         )
 
-    def _predict(self, scan: Scan) -> tuple[F64, float, bool]:
-        """Motion since the last scan, over how many seconds, and whether odometry measured it."""
+    def _predict(self, scan: Scan) -> tuple[F64, float, F64 | None]:
+        """Motion since the last scan, over how many seconds, and the odometry that it rests on, if any.
+
+        The odometry spans the scans that had none: where those were put was a guess, and what is built on
+        a guess is lost for good. Only for such a scan itself is the motion before all there is.
+        """
         if self._last is None:
-            return np.eye(4), 0.0, False
+            return np.eye(4), 0.0, None
         seconds = (scan.stamp_ns - self._last.stamp_ns) * 1e-9
-        if scan.T_odom_base is not None and self._last.T_odom_base is not None:
-            return invert_pose(self._last.T_odom_base) @ scan.T_odom_base, seconds, True
-        return self._velocity, seconds, False
+        if scan.T_odom_base is None or self._measured is None:
+            return self._velocity, seconds, None
+        T_odom_then, T_map_then = self._measured
+        odometry: F64 = invert_pose(T_odom_then) @ scan.T_odom_base
+        if self._last.T_odom_base is not None:
+            return odometry, seconds, odometry
+        return invert_pose(self._last_pose) @ T_map_then @ odometry, seconds, odometry
 
     def _usable(self, scan: Scan, motion: F64, motion_s: float) -> F32:
         points, offsets = scan.points_m, scan.offsets_s
@@ -196,14 +207,14 @@ class Tracker:
         return flatten(level, stamp_ns=scan.stamp_ns, sensor_m=sensor, ground=ground, config=self._projection)
 
     def _refine(
-        self, sweep: Sweep, guess: SE2, predicted: F64, motion: F64, measured: bool
+        self, sweep: Sweep, guess: SE2, predicted: F64, odometry: F64 | None
     ) -> tuple[SE2, Match | None]:
         if len(sweep.hits_m) < _MIN_HITS:
             return SE2.flatten(predicted), None
-        distance = float(np.linalg.norm(motion[:3, 3]))
-        turn = float(np.linalg.norm(rotation_vector(motion)))
-        prior = SE2.flatten(predicted) if measured else guess
-        if measured:
+        prior = guess if odometry is None else SE2.flatten(predicted)
+        if odometry is not None:
+            distance = float(np.linalg.norm(odometry[:3, 3]))
+            turn = float(np.linalg.norm(rotation_vector(odometry)))
             sigma_m, sigma_rad = 0.01 + 0.1 * distance + 0.05 * turn, 0.01 + 0.1 * turn + 0.1 * distance
         else:
             sigma_m, sigma_rad = 0.03, 0.01

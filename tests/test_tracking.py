@@ -65,6 +65,15 @@ def test_laser_without_odometry_is_followed_or_says_that_it_is_lost(laser):
     assert any(lost) or errors(laser, [r.T_map_base for r in registered]).max() < 0.3
 
 
+def test_odometry_bridges_a_scan_without_any_at_the_edge_of_a_gap(laser):
+    gap = [*laser[:31], (blind(laser[31][0]), laser[31][1]), *laser[61:]]
+    unseen = laser[31][1].inverse() @ laser[61][1]
+    assert np.hypot(unseen.x, unseen.y) > 1.0 and abs(unseen.yaw) > 0.3
+    registered = list(register(scan for scan, _ in gap))
+    assert not any(r.health is Health.LOST for r in registered)
+    assert errors(gap, [r.T_map_base for r in registered]).max() < 0.06
+
+
 def test_carried_off_without_odometry_is_noticed_and_restarts(laser):
     tracker = Tracker(RegistrationConfig(), ProjectionConfig())
     elsewhere = session("laser", length_m=3.0, seed=11)
