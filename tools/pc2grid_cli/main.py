@@ -12,7 +12,6 @@ import pc2grid
 from pc2grid_cli import console
 from pc2grid_cli.compare_paper import compare_paper_command
 from pc2grid_cli.compare_sensors import compare_sensors_command
-from pc2grid_cli.compare_sensors import compare_sensors_command
 from pc2grid_cli.config import dump_command
 from pc2grid_cli.convert import convert_command
 from pc2grid_cli.db import check_command, copy_command, merge_command
