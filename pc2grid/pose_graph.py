@@ -44,12 +44,10 @@ def optimise(
     *,
     iterations: int = 25,
     robust_scale: float = 3.0,
-    graduated: bool = False,
 ) -> Solution:
     """Poses (N, 3) that agree best with the edges; the first pose stays where it is.
 
     robust_scale : standard deviations at which a loop edge has lost half of its say.
-    graduated : believe all loops at first and doubt them by and by: for large drift and few false loops.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
@@ -67,13 +65,9 @@ def optimise(
     column = np.tile(rows, (1, 6)).ravel()
     size = 3 * len(poses)
     error, jacobian = _linearise(poses, i, j, z)
-    scale = robust_scale
-    if graduated:
-        start = np.einsum("ea,eab,eb->e", error, omega, error)[loop]
-        scale = max(robust_scale, float(np.sqrt(start.max(initial=0.0))))
     for _ in range(iterations):
         chi2 = np.einsum("ea,eab,eb->e", error, omega, error)
-        weight = np.where(loop, 1.0 / (1.0 + chi2 / scale**2), 1.0)
+        weight = np.where(loop, 1.0 / (1.0 + chi2 / robust_scale**2), 1.0)
         weighted = omega * weight[:, None, None]
         JtO = jacobian.transpose(0, 2, 1) @ weighted
         H = coo_matrix(((JtO @ jacobian).ravel(), (row, column)), shape=(size, size)).tocsc()
@@ -84,9 +78,8 @@ def optimise(
         poses += delta.reshape(-1, 3)
         poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
         error, jacobian = _linearise(poses, i, j, z)
-        if np.abs(delta).max() < 1e-5 and scale == robust_scale:
+        if np.abs(delta).max() < 1e-5:
             break
-        scale = max(0.5 * scale, robust_scale)
     return Solution(poses, np.einsum("ea,eab,eb->e", error, omega, error))
 
 
