@@ -19,8 +19,9 @@ from pc2grid.alignment import assess
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.model import OccupancyGrid, Scan, SensorKind, SessionMap
 from pc2grid.partition import partition
-from pc2grid.pipeline import follow, map_scans
+from pc2grid.pipeline import map_scans
 from signature.config import Config
+from signature.driven import Driven
 from signature.relocalize import Answer, Building, Relocalizer
 from signature.retrieve import retrieve
 
@@ -180,46 +181,37 @@ def map_building(
     return session_map, SE2.fit(trajectory.planar()[:, :2], np.array(truths))
 
 
+def start_of(plan: OccupancyGrid, mapping: SimulationConfig, seed: int) -> tuple[float, float]:
+    """Where query session `seed` starts: (x, y) in the plan, anywhere on the way of the session that maps it.
+
+    A query from where the mapping robot has never been has no right answer.
+    """
+    from pc2grid.simulate import prepare_session
+
+    way = prepare_session(sensor="laser", grid=plan, config=mapping).drive
+    rng = np.random.default_rng([seed, mapping.seed])
+    x, y, _ = way.at(np.array([rng.uniform(0.0, way.duration_s)]))[0]
+    return float(x), float(y)
+
+
 def query_trials(
-    name: str,
-    plan: OccupancyGrid,
-    sensor: SensorKind,
-    simulation: SimulationConfig,
-    maps: Sequence[Mapped],
-    config: Config,
-    distances_m: Sequence[float] = DISTANCES_M,
+    name: str, seed: int, driven: Driven, maps: Sequence[Mapped], distances_m: Sequence[float] = DISTANCES_M
 ) -> list[Trial]:
     """One query session against all `maps`, asked after each of `distances_m` of travel.
 
     Maps of another building than `name` have no right answer; only the longest distance is asked there.
     """
-    from pc2grid.simulate import iter_session
-
-    truths: list[SE2] = []
-
-    def scans() -> Iterator[Scan]:
-        for scan, truth in iter_session(sensor=sensor, grid=plan, config=simulation):
-            truths.append(truth)
-            yield scan
-
     relocalizers = [Relocalizer(m.building) for m in maps]
     trials: list[Trial] = []
     left = sorted(distances_m)
-    driven_m, last = 0.0, None
-    for registered, sweep in follow(scans(), config):
-        pose = SE2.flatten(registered.T_map_base)
-        if last is not None:
-            driven_m += math.hypot(pose.x - last.x, pose.y - last.y)
-        last = pose
+    for driven_m, (registered, sweep, truth) in zip(driven.path_m(), driven.scans(), strict=True):
         for relocalizer in relocalizers:
             relocalizer.add(registered, sweep)
-        if left and driven_m >= left[0]:
+        if driven_m >= left[0]:
             travel_m = left.pop(0)
             for mapped, relocalizer in zip(maps, relocalizers, strict=True):
                 if mapped.name == name or not left:
-                    trials.append(
-                        _trial(mapped, relocalizer, name, sensor, simulation.seed, travel_m, truths[-1])
-                    )
+                    trials.append(_trial(mapped, relocalizer, name, driven.sensor, seed, travel_m, truth))
         if not left:
             break
     return trials

@@ -15,7 +15,10 @@ import typer
 
 if TYPE_CHECKING:
     from pc2grid.model import SensorKind
+    from pc2grid.simulate import SimulationConfig
     from signature.sensor_matrix import Cell, Mapped, Trial
+
+Setting = dict[str, float]
 
 MAP_SEED = 1000
 """Map sessions and query sessions never share a seed: other clutter, start, direction and noise."""
@@ -53,27 +56,32 @@ def compare_sensors_command(
         if not plan.is_file():
             raise MapFileError(f"{plan}: no such file", hint="give the path of a map.yaml")
     try:
-        for folder in ("maps", "trials"):
+        for folder in ("maps", "drives", "trials"):
             (out / folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{out}: {error.strerror}", hint="choose another --out") from error
     setting = {"map_length": map_length, "clutter": clutter}
-    mapping = [(str(p), sensor, str(out), setting) for p in plans for sensor in SENSORS]
+    here = [(str(p), sensor, str(out), setting) for p in plans for sensor in SENSORS]
     asking = [
-        (str(p), sensor, seed + i, [str(q) for q in plans], str(out), setting)
+        (str(p), sensor, seed + i, str(out), setting)
         for i in range(queries)
         for p in plans
         for sensor in SENSORS
     ]
+    everywhere = [str(p) for p in plans]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs or os.cpu_count(), mp_context=context) as pool:
-        for what, function, tasks in (("map", _map, mapping), ("locate", _ask, asking)):
+        for what, function, tasks in (
+            ("map", _map, here),
+            ("drive", _drive, asking),
+            ("locate", _locate, [(*task, everywhere) for task in asking]),
+        ):
             with progress(what) as advance:
                 waiting = [pool.submit(function, *task) for task in tasks]
                 for done, future in enumerate(as_completed(waiting), start=1):
                     future.result()
                     advance(done / len(waiting))
-    trials = [t for task in asking for t in _read(_trial_file(*task[:3], out=out, setting=setting))]
+    trials = [t for task in asking for t in _read(_file("trials", *task))]
     cells = matrix(trials)
     elsewhere = [t for t in trials if not t.in_building]
     document = {
@@ -105,23 +113,30 @@ def _plain(cell: Cell) -> dict[str, Any]:
     return asdict(cell)
 
 
-def _map_file(plan: str, sensor: str, out: str | Path, setting: dict[str, Any]) -> Path:
+def _map_file(plan: str, sensor: str, out: str, setting: Setting) -> Path:
     return Path(out) / "maps" / f"{Path(plan).stem}.{sensor}.{_tag(setting)}.submaps"
 
 
-def _trial_file(plan: str, sensor: str, seed: int, *, out: str | Path, setting: dict[str, Any]) -> Path:
-    return Path(out) / "trials" / f"{Path(plan).stem}.{sensor}.{seed}.{_tag(setting)}.json"
+def _file(kind: str, plan: str, sensor: str, seed: int, out: str, setting: Setting) -> Path:
+    """What is kept of a query session: its "drives" (registered, .npz) or its "trials" (.json)."""
+    suffix = {"drives": "npz", "trials": "json"}[kind]
+    return Path(out) / kind / f"{Path(plan).stem}.{sensor}.{seed}.{_tag(setting)}.{suffix}"
 
 
-def _tag(setting: dict[str, Any]) -> str:
+def _tag(setting: Setting) -> str:
     return ".".join(f"{key}{value:g}" for key, value in sorted(setting.items()))
 
 
-def _map(plan: str, sensor: SensorKind, out: str, setting: dict[str, Any]) -> None:
+def _mapping(setting: Setting) -> SimulationConfig:
+    from pc2grid.simulate import SimulationConfig
+
+    return SimulationConfig(length_m=setting["map_length"], seed=MAP_SEED, clutter=int(setting["clutter"]))
+
+
+def _map(plan: str, sensor: SensorKind, out: str, setting: Setting) -> None:
     """Make the map of one plan by one sensor, unless it is there."""
     from pc2grid.io.atomic import replace_file
     from pc2grid.io.nav2_map import load_map
-    from pc2grid.simulate import SimulationConfig
     from signature.build import add_session, provenance
     from signature.config import Config
     from signature.sensor_matrix import map_building
@@ -130,15 +145,35 @@ def _map(plan: str, sensor: SensorKind, out: str, setting: dict[str, Any]) -> No
     frame = target.with_suffix(".json")
     if target.exists() and frame.exists():
         return
-    simulation = SimulationConfig(
-        length_m=setting["map_length"], seed=MAP_SEED, clutter=int(setting["clutter"])
-    )
     config = Config()
-    session_map, T_plan_map = map_building(Path(plan).stem, load_map(Path(plan)), sensor, simulation, config)
+    session_map, T_plan_map = map_building(
+        Path(plan).stem, load_map(Path(plan)), sensor, _mapping(setting), config
+    )
     target.unlink(missing_ok=True)
     add_session(target, session_map, config, provenance(Path(plan), "0" * 64, config))
     with replace_file(frame) as draft:
         draft.write_text(json.dumps([T_plan_map.x, T_plan_map.y, T_plan_map.yaw]))
+
+
+def _drive(plan: str, sensor: SensorKind, seed: int, out: str, setting: Setting) -> None:
+    """Simulate and register one query session, unless it was done before."""
+    from pc2grid.io.nav2_map import load_map
+    from pc2grid.simulate import SimulationConfig
+    from signature.config import Config
+    from signature.driven import drive
+    from signature.sensor_matrix import DISTANCES_M, start_of
+
+    target = _file("drives", plan, sensor, seed, out, setting)
+    if target.exists():
+        return
+    grid, until_m = load_map(Path(plan)), max(DISTANCES_M)
+    simulation = SimulationConfig(
+        length_m=until_m + 3.0,
+        seed=seed,
+        clutter=int(setting["clutter"]),
+        start_m=start_of(grid, _mapping(setting), seed),
+    )
+    drive(grid, sensor, simulation, Config(), until_m=until_m).save(target)
 
 
 @cache
@@ -156,23 +191,21 @@ def _mapped(plan: str, sensor: SensorKind, out: str, tag: tuple[tuple[str, Any],
     return Mapped(name=Path(plan).stem, sensor=sensor, T_plan_map=SE2(*frame), building=building)
 
 
-def _ask(
-    plan: str, sensor: SensorKind, seed: int, plans: Sequence[str], out: str, setting: dict[str, Any]
+def _locate(
+    plan: str, sensor: SensorKind, seed: int, out: str, setting: Setting, plans: Sequence[str]
 ) -> None:
     """Locate one query session in the maps of all plans, unless it was done before."""
     from pc2grid.io.atomic import replace_file
-    from pc2grid.io.nav2_map import load_map
-    from pc2grid.simulate import SimulationConfig
-    from signature.config import Config
-    from signature.sensor_matrix import DISTANCES_M, SENSORS, query_trials
+    from signature.driven import Driven
+    from signature.sensor_matrix import SENSORS, query_trials
 
-    target = _trial_file(plan, sensor, seed, out=out, setting=setting)
+    target = _file("trials", plan, sensor, seed, out, setting)
     if target.exists():
         return
     tag = tuple(sorted(setting.items()))
     maps = [_mapped(p, s, out, tag) for p in plans for s in SENSORS]
-    simulation = SimulationConfig(length_m=max(DISTANCES_M) + 3.0, seed=seed, clutter=int(setting["clutter"]))
-    trials = query_trials(Path(plan).stem, load_map(Path(plan)), sensor, simulation, maps, Config())
+    driven = Driven.load(_file("drives", plan, sensor, seed, out, setting))
+    trials = query_trials(Path(plan).stem, seed, driven, maps)
     with replace_file(target) as draft:
         draft.write_text(json.dumps([trial.to_json() for trial in trials]))
 
