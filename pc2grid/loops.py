@@ -78,11 +78,11 @@ class Nearness:
 
 @dataclass(frozen=True, slots=True)
 class Closed:
-    """poses (K, 3): x, y, yaw of each keyframe in the map frame. pairs: pieces found to overlap.
-    proposals: how many were verified to get them."""
+    """poses (K, 3): x, y, yaw of each keyframe in the map frame. loops: keyframes, older and newer, in the
+    middle of pieces found to overlap. proposals: how many were verified to get them."""
 
     poses: F64
-    pairs: tuple[tuple[int, int], ...]
+    loops: tuple[tuple[int, int], ...]
     proposals: int
 
 
@@ -102,7 +102,8 @@ def close_loops(keyframes: Sequence[Keyframe], proposers: Sequence[LoopProposer]
         ]
         poses = optimise(poses, chain + loops).poses
         store.move(poses, redraw=True)
-    return Closed(poses, tuple(pairs), proposals)
+    loops_at = tuple((store.anchor(older), store.anchor(newer)) for older, newer in pairs)
+    return Closed(poses, loops_at, proposals)
 
 
 # --- finding overlaps, piece by piece ---------------------------------------------------------------------

@@ -52,6 +52,11 @@ class Scan:
     T_odom_base : (4, 4) odometry at `stamp_ns`, or None if the log has none there.
     sensor : which of the three kinds made it.
     dropped : how many returns were left out while decoding (NaN, inf, no return, out of range).
+
+    >>> import numpy as np
+    >>> scan = Scan(stamp_ns=0, points_m=np.ones((5, 3)), T_base_sensor=np.eye(4), sensor="lidar")
+    >>> scan.points_m.dtype.name, scan.T_odom_base is None
+    ('float32', True)
     """
 
     stamp_ns: int
@@ -86,6 +91,11 @@ class RegisteredScan:
     scan : the scan, its points deskewed to `scan.stamp_ns` (base frame at that time).
     T_map_base : (4, 4) pose of the base at `scan.stamp_ns`. The map frame is the base at the first scan.
     health : FINE; DEGENERATE (some direction rests on odometry or the motion model); LOST (do not map).
+
+    >>> import numpy as np
+    >>> scan = Scan(stamp_ns=0, points_m=np.ones((5, 3)), T_base_sensor=np.eye(4), sensor="lidar")
+    >>> RegisteredScan(scan=scan, T_map_base=np.eye(4)).health.value
+    'fine'
     """
 
     scan: Scan
@@ -103,6 +113,13 @@ class Trajectory:
     stamps_ns : (N,) int64, increasing.
     T_map_base : (N, 4, 4) float64.
     health : N entries, parallel to `stamps_ns`; empty means all fine.
+
+    >>> import numpy as np
+    >>> from pc2grid import SE2
+    >>> poses = np.array([SE2(x, 0.0, 0.0).lift() for x in (0.0, 1.0, 3.0)])
+    >>> way = Trajectory(stamps_ns=np.array([0, 10, 20]), T_map_base=poses)
+    >>> way.path_m().tolist(), way.planar()[-1].tolist()
+    ([0.0, 1.0, 3.0], [3.0, 0.0, 0.0])
     """
 
     stamps_ns: I64
@@ -144,6 +161,13 @@ class OccupancyGrid:
         smallest x.
     resolution_m : edge of a cell.
     origin_m : (x, y) in the map frame of the lower-left corner of cell (0, 0).
+
+    >>> import numpy as np
+    >>> grid = OccupancyGrid(cells=np.array([[0, 100], [-1, 0]]), resolution_m=0.5, origin_m=(-1.0, 2.0))
+    >>> grid.to_cell(np.array([[-0.4, 2.1]])).tolist()
+    [[0, 1]]
+    >>> grid.to_point(np.argwhere(grid.occupied)).tolist()
+    [[-0.25, 2.25]]
     """
 
     cells: NDArray[np.int8]
@@ -199,6 +223,11 @@ class Submap:
     center_m : (x, y) in the map frame.
     radius_m : what lies farther from the centre is unknown in `grid`.
     grid : square crop around the centre, cells outside the radius unknown.
+
+    >>> import pc2grid
+    >>> submap = pc2grid.submaps_of(pc2grid.load_map("map.yaml"))[0]
+    >>> submap.submap_id, submap.radius_m, submap.grid.cells.shape
+    (0, 8.0, (321, 321))
     """
 
     submap_id: int
@@ -235,6 +264,17 @@ class SessionMap:
     grid : the whole occupancy grid in the session's map frame.
     submaps : its partition.
     trajectory : poses of the base; empty for an imported map.
+    loops : (L, 2) int64, pairs of indices of the trajectory that saw the same place and were made to agree.
+
+    >>> import numpy as np
+    >>> import pc2grid
+    >>> grid = pc2grid.load_map("map.yaml")
+    >>> none = Trajectory(stamps_ns=np.empty(0), T_map_base=np.empty((0, 4, 4)))
+    >>> plan = SessionMap(
+    ...     session="plan", sensor="map", grid=grid, submaps=pc2grid.submaps_of(grid), trajectory=none
+    ... )
+    >>> plan.report.lossy
+    False
     """
 
     session: str
@@ -242,4 +282,8 @@ class SessionMap:
     grid: OccupancyGrid
     submaps: tuple[Submap, ...]
     trajectory: Trajectory
+    loops: I64 = field(default_factory=lambda: np.empty((0, 2), np.int64))
     report: ReadReport = field(default_factory=ReadReport)
+
+    def __post_init__(self) -> None:
+        _freeze(self, "loops", np.int64, (None, 2))

@@ -11,7 +11,16 @@ import numpy as np
 from pc2grid.config import PartitionConfig, ProjectionConfig, RegistrationConfig
 from pc2grid.errors import NoScans
 from pc2grid.geometry import F64, SE2
-from pc2grid.model import Health, OccupancyGrid, ReadReport, RegisteredScan, Scan, SessionMap, Trajectory
+from pc2grid.model import (
+    I64,
+    Health,
+    OccupancyGrid,
+    ReadReport,
+    RegisteredScan,
+    Scan,
+    SessionMap,
+    Trajectory,
+)
 from pc2grid.projection import GridBuilder
 from pc2grid.sweep import Sweep
 
@@ -31,7 +40,14 @@ class PipelineConfig(Protocol):
 
 
 def follow(scans: Iterable[Scan], config: PipelineConfig) -> Iterator[tuple[RegisteredScan, Sweep]]:
-    """Each scan with its pose and its sweep, as they come. Memory is one local map, whatever the length."""
+    """Each scan with its pose and its sweep, as they come. Memory is one local map, whatever the length.
+
+    >>> import pc2grid, signature
+    >>> with pc2grid.open_log("tuesday.mcap") as log:
+    ...     poses = [scan.T_map_base for scan, _ in follow(log.scans(0.0, 1.0), signature.Config())]
+    >>> poses[0].shape, float(poses[0][0, 3])
+    ((4, 4), 0.0)
+    """
     from pc2grid.tracking import Tracker
 
     tracker = Tracker(config.registration, config.projection)
@@ -53,6 +69,12 @@ def build_map(
 
     progress : called with the share that is done, 0..1.
     Raises NoScans if there is nothing to make a map from.
+
+    >>> import pc2grid, signature
+    >>> with pc2grid.open_log("monday.mcap") as log:
+    ...     monday = build_map(log, signature.Config(), session="monday", duration_s=2.0)
+    >>> monday.sensor, len(monday.trajectory) > 10, monday.trajectory.planar()[0].tolist()
+    ('laser', True, [0.0, 0.0, 0.0])
     """
     from pc2grid.partition import partition
 
@@ -63,7 +85,7 @@ def build_map(
         if progress is not None:
             progress(min(0.8 * (stamp_ns - begin_ns) / span_ns, 0.8))
 
-    grid, trajectory = map_scans(log.scans(start_s, duration_s), config, advance)
+    grid, trajectory, loops = map_scans(log.scans(start_s, duration_s), config, advance)
     if not len(trajectory):
         raise NoScans(f"{log.info.path}: no scans in the part asked for", hint="check --start and --duration")
     submaps = partition(grid, config.partition)
@@ -75,16 +97,24 @@ def build_map(
         grid=grid,
         submaps=submaps,
         trajectory=trajectory,
+        loops=loops,
         report=_with_health(log.report(), trajectory),
     )
 
 
 def map_scans(
     scans: Iterable[Scan], config: PipelineConfig, advance: Callable[[int], None] = lambda stamp_ns: None
-) -> tuple[OccupancyGrid, Trajectory]:
-    """Grid and trajectory of scans, loops closed. `advance` is called with each scan's stamp.
+) -> tuple[OccupancyGrid, Trajectory, I64]:
+    """Grid and trajectory of scans, and the loops closed on the way: (L, 2) indices of poses that saw the
+    same place. `advance` is called with each scan's stamp.
 
     Only keyframes are kept, as sweeps of a few kilobytes; a robot that stands still adds nothing.
+
+    >>> import pc2grid, signature
+    >>> with pc2grid.open_log("monday.mcap") as log:
+    ...     grid, trajectory, loops = map_scans(log.scans(0.0, 2.0), signature.Config())
+    >>> grid.resolution_m, bool(grid.occupied.any())
+    (0.05, True)
     """
     from pc2grid.loops import close_loops, spread
     from pc2grid.pieces import Keyframe
@@ -109,20 +139,24 @@ def map_scans(
         advance(scan.stamp_ns)
     builder = GridBuilder(config.projection)
     if not stamps:
-        return builder.grid(), Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
+        nothing = Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
+        return builder.grid(), nothing, np.empty((0, 2), np.int64)
     T_map_base = np.array(poses)
+    loops = np.empty((0, 2), np.int64)
     if len(keyframes) > 2:
         flat = np.array([(p.x, p.y, p.yaw) for p in map(SE2.flatten, poses)])
         closed = close_loops(keyframes)
         settled = spread(flat, [k.index for k in keyframes], closed.poses)
         T_map_base = _replant(T_map_base, flat, settled)
+        index = np.array([k.index for k in keyframes])
+        loops = index[np.array(closed.loops, np.int64).reshape(-1, 2)]
     for keyframe in keyframes:
         if health[keyframe.index] is not Health.LOST:
             builder.add(keyframe.sweep, SE2.flatten(T_map_base[keyframe.index]))
     trajectory = Trajectory(
         stamps_ns=np.array(stamps, dtype=np.int64), T_map_base=T_map_base, health=tuple(health)
     )
-    return builder.grid(), trajectory
+    return builder.grid(), trajectory, loops
 
 
 def _with_health(report: ReadReport, trajectory: Trajectory) -> ReadReport:

@@ -99,6 +99,25 @@ class KissRegistration:
         return kiss
 
 
+class BareKissIcp:
+    """KISS-ICP as it comes: its own defaults, all points of each scan, nothing else. To compare with."""
+
+    def __init__(self) -> None:
+        from kiss_icp.config import load_config
+        from kiss_icp.kiss_icp import KissICP
+
+        config = load_config(None)
+        config.registration.max_num_threads = 1
+        self._kiss: Any = KissICP(config)
+
+    def register(self, scan: Scan) -> F64:
+        """T_start_base (4, 4) at the end of a scan: KISS-ICP deskews to where its last point was taken."""
+        times = np.empty(0) if scan.offsets_s is None else scan.offsets_s.astype(np.float64)
+        if len(scan.points_m):
+            self._kiss.register_frame(scan.points_m.astype(np.float64), times)
+        return np.array(self._kiss.last_pose, dtype=np.float64)
+
+
 class _DeferredMap:
     """KISS-ICP's voxel map, except that a frame waits until its pose is settled.
 

@@ -170,13 +170,14 @@ def map_building(
             truths.append((truth.x, truth.y))
             yield scan
 
-    grid, trajectory = map_scans(scans(), config)
+    grid, trajectory, loops = map_scans(scans(), config)
     session_map = SessionMap(
         session=f"{name}-{sensor}",
         sensor=sensor,
         grid=grid,
         submaps=partition(grid, config.partition),
         trajectory=trajectory,
+        loops=loops,
     )
     return session_map, SE2.fit(trajectory.planar()[:, :2], np.array(truths))
 

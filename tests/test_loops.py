@@ -114,7 +114,7 @@ def test_two_laps_around_a_block_with_drift_agree_after_closing():
     before = np.linalg.norm(array(poses)[:, :2] - array(truth)[:, :2], axis=1)
     closed = close_loops(keyframes)
     after = np.linalg.norm(closed.poses[:, :2] - array(truth)[:, :2], axis=1)
-    assert before.max() > 0.5 and len(closed.pairs) > 3
+    assert before.max() > 0.5 and len(closed.loops) > 3
     lap = closed.poses[100:, :2] - closed.poses[:100, :2]
     assert np.linalg.norm(lap, axis=1).max() < 0.08
     assert after.max() < 0.5 * before.max()

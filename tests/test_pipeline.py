@@ -36,7 +36,7 @@ def session():
 @pytest.fixture(scope="module")
 def mapped(session):
     pairs = list(session.scans())
-    grid, trajectory = map_scans((scan for scan, _ in pairs), Config())
+    grid, trajectory, _ = map_scans((scan for scan, _ in pairs), Config())
     return session, pairs, grid, trajectory
 
 
@@ -67,8 +67,8 @@ def test_follow_streams_one_sweep_a_scan(session):
 
 
 def test_no_scans_no_trajectory():
-    grid, trajectory = map_scans(iter(()), Config())
-    assert grid.cells.size == 0 and len(trajectory) == 0
+    grid, trajectory, loops = map_scans(iter(()), Config())
+    assert grid.cells.size == 0 and len(trajectory) == 0 and loops.shape == (0, 2)
 
 
 @needs_data
