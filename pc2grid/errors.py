@@ -118,5 +118,13 @@ class DatabaseBusy(DatabaseError):
     """Another process holds the database for writing."""
 
 
+class DatabaseUnreachable(DatabaseError):
+    """The server of a database does not answer, turns us away, or went away."""
+
+
+class ClusterError(Pc2GridError):
+    """The cluster that should convert recordings cannot be used."""
+
+
 class OutputError(Pc2GridError):
     """A result cannot be written: it exists already, the disk is full, or permission is missing."""

@@ -6,12 +6,26 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from pc2grid.model import OccupancyGrid, SessionMap, Submap, Trajectory
+from pc2grid.model import OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
 
 if TYPE_CHECKING:
     from signature.config import Config
     from signature.describe import Signature
     from signature.similarity import SignatureTable
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Label:
+    """Where a session was recorded, in the user's words; None: not said."""
+
+    building: str | None = None
+    floor: str | None = None
+
+    def contradicts(self, other: Label) -> bool:
+        """Whether the two name different buildings, or different floors; what was not said rules nothing
+        out."""
+        pairs = ((self.building, other.building), (self.floor, other.floor))
+        return any(a is not None and b is not None and a != b for a, b in pairs)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,6 +37,7 @@ class Provenance:
     config : the whole effective configuration.
     start_s, duration_s : which part of the recording, seconds from its start; duration None: to the end.
     versions : program and library -> version.
+    label : building and floor.
     """
 
     source: str
@@ -31,6 +46,7 @@ class Provenance:
     start_s: float = 0.0
     duration_s: float | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
+    label: Label = Label()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,8 +60,7 @@ class SessionInfo:
     path_m : distance driven; 0 for an imported map.
     duration_s : time between first and last pose.
     scans : poses in its trajectory.
-    warnings : what reading and mapping had to say.
-    lossy : whether data was lost on the way.
+    report : what was read, and lost on the way.
     """
 
     name: str
@@ -57,9 +72,18 @@ class SessionInfo:
     path_m: float
     duration_s: float
     scans: int
-    warnings: tuple[str, ...]
-    lossy: bool
+    report: ReadReport
     provenance: Provenance
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What reading and mapping had to say."""
+        return self.report.warnings
+
+    @property
+    def lossy(self) -> bool:
+        """Whether data was lost on the way."""
+        return self.report.lossy
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError, DatabaseVersion
-from pc2grid.model import OccupancyGrid, SessionMap, Submap, Trajectory
+from pc2grid.model import OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
 from signature.database import codec, schema
-from signature.database.protocol import Provenance, SessionInfo
+from signature.database.protocol import Label, Provenance, SessionInfo
 
 if TYPE_CHECKING:
     from signature.config import Config
@@ -53,7 +53,7 @@ def insert_session(
     provenance: Provenance,
 ) -> None:
     """Store everything of one session."""
-    trajectory, submaps = session_map.trajectory, session_map.submaps
+    submaps = session_map.submaps
     if len(signatures) != len(submaps):
         raise ValueError(f"{len(submaps)} submaps but {len(signatures)} signatures")
     session = {
@@ -63,20 +63,10 @@ def insert_session(
         "document": document(session_map, provenance),
     }
     insert(connection, "session", session)
-    insert(connection, "grid", {"session_id": session_id, **_grid_row(session_map.grid)})
-    insert(
-        connection,
-        "trajectory",
-        {
-            "session_id": session_id,
-            "count": len(trajectory),
-            "stamps_ns": codec.pack_array(trajectory.stamps_ns, "<i8"),
-            "poses": codec.pack_poses(trajectory),
-            "health": codec.pack_health(trajectory),
-        },
-    )
+    insert(connection, "grid", {"session_id": session_id, **grid_row(session_map.grid)})
+    insert(connection, "trajectory", {"session_id": session_id, **trajectory_row(session_map.trajectory)})
     for submap in submaps:
-        insert(connection, "submap", {"session_id": session_id, **_submap_row(submap)})
+        insert(connection, "submap", {"session_id": session_id, **submap_row(submap)})
     insert(connection, "signature", {"session_id": session_id, **signature_row(submaps, signatures)})
 
 
@@ -91,6 +81,8 @@ def document(session_map: SessionMap, provenance: Provenance) -> str:
         "start_s": provenance.start_s,
         "duration_s": provenance.duration_s,
         "versions": dict(provenance.versions),
+        "building": provenance.label.building,
+        "floor": provenance.label.floor,
         "config": provenance.config.model_dump(mode="json"),
         "submaps": len(session_map.submaps),
         "area_m2": round(int(np.count_nonzero(grid.free)) * grid.resolution_m**2, 3),
@@ -107,7 +99,7 @@ def document(session_map: SessionMap, provenance: Provenance) -> str:
     return json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
 
 
-def read_info(row: Row, resolution_m: float, scans: int, path: Path) -> SessionInfo:
+def read_info(row: Row, resolution_m: float, scans: int, path: Path | str) -> SessionInfo:
     """A session row as the caller sees it. Raises DatabaseVersion if its settings are from the future."""
     from pydantic import ValidationError
 
@@ -135,8 +127,13 @@ def read_info(row: Row, resolution_m: float, scans: int, path: Path) -> SessionI
         path_m=content["path_m"],
         duration_s=content["driven_s"],
         scans=scans,
-        warnings=tuple(report["warnings"]),
-        lossy=bool(report["scans_skipped"]) or report["bytes_lost"] > 0,
+        report=ReadReport(
+            scans_read=report["scans_read"],
+            points_dropped=report["points_dropped"],
+            scans_skipped=report["scans_skipped"],
+            bytes_lost=report["bytes_lost"],
+            warnings=tuple(report["warnings"]),
+        ),
         provenance=Provenance(
             source=content["source"],
             digest=content["digest"],
@@ -144,6 +141,7 @@ def read_info(row: Row, resolution_m: float, scans: int, path: Path) -> SessionI
             start_s=content["start_s"],
             duration_s=content["duration_s"],
             versions=content["versions"],
+            label=Label(building=content.get("building"), floor=content.get("floor")),
         ),
     )
 
@@ -211,7 +209,7 @@ def read_trajectory(row: Row) -> Trajectory:
     )
 
 
-def refuse_other_settings(known: SessionInfo, config: Config, resolution_m: float, path: Path) -> None:
+def refuse_other_settings(known: SessionInfo, config: Config, resolution_m: float, path: Path | str) -> None:
     """Signatures made differently must never be compared: all sessions share what shapes them.
 
     Raises DatabaseError naming the first setting that differs.
@@ -230,13 +228,13 @@ def refuse_other_settings(known: SessionInfo, config: Config, resolution_m: floa
             )
 
 
-def corrupt(path: Path, where: str, what: str) -> DatabaseCorrupt:
+def corrupt(path: Path | str, where: str, what: str) -> DatabaseCorrupt:
     """The error for a row that cannot be believed."""
     return DatabaseCorrupt(f"{path}: damaged: {where}: {what}", hint=schema.SALVAGE)
 
 
 @contextlib.contextmanager
-def explained(path: Path, where: str) -> Iterator[None]:
+def explained(path: Path | str, where: str) -> Iterator[None]:
     """Whatever SQLite, the decoding or a model says about unbelievable content is DatabaseCorrupt."""
     try:
         yield
@@ -244,7 +242,8 @@ def explained(path: Path, where: str) -> Iterator[None]:
         raise corrupt(path, where, f"{type(error).__name__}: {error}") from error
 
 
-def _grid_row(grid: OccupancyGrid) -> Row:
+def grid_row(grid: OccupancyGrid) -> Row:
+    """The other way round of `read_grid`."""
     return {
         "height": grid.cells.shape[0],
         "width": grid.cells.shape[1],
@@ -255,11 +254,22 @@ def _grid_row(grid: OccupancyGrid) -> Row:
     }
 
 
-def _submap_row(submap: Submap) -> Row:
+def trajectory_row(trajectory: Trajectory) -> Row:
+    """The other way round of `read_trajectory`."""
+    return {
+        "count": len(trajectory),
+        "stamps_ns": codec.pack_array(trajectory.stamps_ns, "<i8"),
+        "poses": codec.pack_poses(trajectory),
+        "health": codec.pack_health(trajectory),
+    }
+
+
+def submap_row(submap: Submap) -> Row:
+    """The other way round of `read_submap`."""
     return {
         "submap_id": int(submap.submap_id),
         "center_x_m": float(submap.center_m[0]),
         "center_y_m": float(submap.center_m[1]),
         "radius_m": float(submap.radius_m),
-        **_grid_row(submap.grid),
+        **grid_row(submap.grid),
     }
