@@ -23,7 +23,15 @@ def wrap_angle(angle_rad: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class SE2:
-    """A planar rigid transform: rotate by `yaw`, then translate by (`x`, `y`). Metres and radians."""
+    """A planar rigid transform: rotate by `yaw`, then translate by (`x`, `y`). Metres and radians.
+
+    >>> T_map_base, T_base_sensor = SE2(1.0, 2.0, math.pi / 2), SE2(0.5, 0.0, 0.0)
+    >>> T_map_sensor = T_map_base @ T_base_sensor
+    >>> round(T_map_sensor.x, 9), round(T_map_sensor.y, 9)
+    (1.0, 2.5)
+    >>> (T_map_base.inverse() @ T_map_sensor).x
+    0.5
+    """
 
     x: float = 0.0
     y: float = 0.0

@@ -21,6 +21,11 @@ def partition(grid: OccupancyGrid, config: PartitionConfig = PartitionConfig()) 
     Submaps are numbered from 0 by (y, x) of their centre. A map with free space but without any junction
     (one room, one corridor) gets one submap, where it is widest; a map without free space gets none.
     With `config.spacing_m`, points of the skeleton that far apart become centres as well.
+
+    >>> import pc2grid
+    >>> submaps = partition(pc2grid.load_map("map.yaml"), PartitionConfig(radius_m=4.0))
+    >>> [submap.submap_id for submap in submaps] == list(range(len(submaps)))
+    True
     """
     centers_m = submap_centers(grid, config)
     return tuple(

@@ -112,7 +112,14 @@ class RelocalizeConfig(Section):
 
 
 class Config(Section):
-    """All sections; what `pc2grid config dump` prints."""
+    """All sections; what `pc2grid config dump` prints.
+
+    >>> config = Config()
+    >>> config.partition.radius_m, config.relocalize.accept
+    (5.0, 0.9)
+    >>> Config(relocalize=RelocalizeConfig(accept=0.99)).relocalize.accept
+    0.99
+    """
 
     read: ReadConfig = ReadConfig()
     registration: RegistrationConfig = RegistrationConfig()

@@ -38,7 +38,16 @@ class Signature:
 
 
 def describe(submap: Submap, config: SignatureConfig = SignatureConfig()) -> Signature:
-    """The three signatures of a submap; defined for every submap, never NaN."""
+    """The three signatures of a submap; defined for every submap, never NaN.
+
+    >>> import pc2grid
+    >>> submaps = pc2grid.submaps_of(pc2grid.load_map("map.yaml"))
+    >>> signature = describe(submaps[0])
+    >>> signature.boundary.shape, signature.freespace.shape, signature.symmetry.shape
+    ((80,), (80,), (2,))
+    >>> round(float(signature.boundary.sum()), 5)
+    1.0
+    """
     grid, radius_m = submap.grid, submap.radius_m
     edges = boundary_edges(submap, config)
     points = boundary_points(edges, grid.resolution_m, config)

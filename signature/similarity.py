@@ -79,6 +79,13 @@ def distances(query: Signature, table: SignatureTable, config: SignatureConfig =
 
     s = Omega * (omega_b d(H^b) + omega_f d(H^f)). A histogram without entries knows nothing and shares no
     bin with any, not even with another empty one: its distance is the largest there is.
+
+    >>> import pc2grid, signature
+    >>> submaps = pc2grid.submaps_of(pc2grid.load_map("map.yaml"))
+    >>> signatures = [signature.signature_of(submap) for submap in submaps]
+    >>> table = SignatureTable.of(signatures, [submap.center_m for submap in submaps])
+    >>> int(distances(signatures[2], table).argmin())
+    2
     """
     scores = score_matrix(query.boundary[None], query.freespace[None], query.symmetry[None], table, config)
     return np.asarray(scores[0])

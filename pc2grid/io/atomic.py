@@ -18,7 +18,7 @@ _MARK = ".pc2grid-"
 
 
 @contextlib.contextmanager
-def replace_file(path: Path) -> Iterator[Path]:
+def replace_file(path: str | Path) -> Iterator[Path]:
     """Give the body a temporary path; when it ends well, that file becomes `path`.
 
     The body may open, write and close the temporary file as it likes. If the body raises, or the process
@@ -51,7 +51,7 @@ def replace_file(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def refuse_existing(path: Path, force: bool) -> None:
+def refuse_existing(path: str | Path, force: bool) -> None:
     """Raise OutputError if `path` exists and `force` is not set."""
     if not force and Path(path).exists():
         raise OutputError(f"{path}: exists already", hint="--force replaces it")

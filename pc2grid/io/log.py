@@ -20,12 +20,19 @@ from pc2grid.io.stream import Stream
 from pc2grid.model import ReadReport, Scan
 
 
-def open_log(path: Path, config: ReadConfig | None = None, *, recover: bool = False) -> Log:
+def open_log(path: str | Path, config: ReadConfig | None = None, *, recover: bool = False) -> Log:
     """Open a recording: an MCAP (ROS 2 or ROS 1), a ROS 1 bag, a rosbag2 folder or db3, a folder of clouds.
 
     recover : read what is whole of a damaged file and count the rest, instead of refusing it.
 
     Raises LogNotFound, NotALog, LogTruncated, LogCorrupt, LimitExceeded.
+
+    >>> with open_log("monday.mcap") as log:
+    ...     log.choose().topic, [t.topic for t in log.info.topics]
+    ...     scan = next(log.scans())
+    ('/scan', ['/odom', '/scan', '/tf', '/tf_static'])
+    >>> scan.sensor, scan.points_m.shape[1]
+    ('laser', 3)
     """
     config = config or ReadConfig()
     path = Path(path)

@@ -44,10 +44,14 @@ def stamp_text(stamp_ns: int) -> str:
     return f"{sign}{seconds}.{rest:09d}"
 
 
-def read_tum(path: Path) -> Trajectory:
+def read_tum(path: str | Path) -> Trajectory:
     """Read a TUM file; stamps must increase.
 
     Raises TrajectoryFileError with the line that is wrong.
+
+    >>> truth = read_tum("tuesday.tum")
+    >>> truth.T_map_base.shape[1:], bool((truth.stamps_ns[1:] > truth.stamps_ns[:-1]).all())
+    ((4, 4), True)
     """
     stamps: list[int] = []
     poses: list[F64] = []
@@ -71,15 +75,20 @@ def read_tum(path: Path) -> Trajectory:
     return _trajectory(stamps, poses)
 
 
-def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write a TUM file: 9 decimals on the time, full precision on the rest, no trailing space."""
+def write_tum(path: str | Path, trajectory: Trajectory) -> None:
+    """Write a TUM file: 9 decimals on the time, full precision on the rest, no trailing space.
+
+    >>> write_tum("copy.tum", read_tum("tuesday.tum"))
+    >>> len(read_tum("copy.tum")) == len(read_tum("tuesday.tum"))
+    True
+    """
     with replace_file(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
         for stamp_ns, T_map_base in zip(trajectory.stamps_ns, trajectory.T_map_base, strict=True):
             values = (*T_map_base[:3, 3], *quat_xyzw_from_pose(T_map_base))
             out.write(" ".join((stamp_text(int(stamp_ns)), *(f"{v:.9f}" for v in values))) + "\n")
 
 
-def read_kitti(path: Path) -> F64:
+def read_kitti(path: str | Path) -> F64:
     """Read a KITTI pose file; returns (N, 4, 4).
 
     Raises TrajectoryFileError with the line that is wrong.
@@ -102,14 +111,19 @@ def read_kitti(path: Path) -> F64:
     return np.array(poses).reshape(-1, 4, 4)
 
 
-def write_kitti(path: Path, trajectory: Trajectory) -> None:
-    """Write a KITTI pose file: 12 numbers per line, row-major."""
+def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
+    """Write a KITTI pose file: 12 numbers per line, row-major.
+
+    >>> write_kitti("poses.txt", read_tum("tuesday.tum"))
+    >>> len(read_kitti("poses.txt")) == len(read_tum("tuesday.tum"))
+    True
+    """
     with replace_file(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
         for T_map_base in trajectory.T_map_base:
             out.write(" ".join(f"{v:.9e}" for v in T_map_base[:3].ravel()) + "\n")
 
 
-def _lines(path: Path) -> list[str]:
+def _lines(path: str | Path) -> list[str]:
     try:
         return Path(path).read_text(encoding="utf-8").splitlines()
     except OSError as error:

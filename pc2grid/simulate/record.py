@@ -45,7 +45,7 @@ class SimulatedSession:
 
 
 def simulate_session(
-    out: Path,
+    out: str | Path,
     *,
     sensor: SensorKind,
     grid: OccupancyGrid | None = None,
@@ -62,6 +62,10 @@ def simulate_session(
     Topics: the sensor's (TOPICS; a camera has INFO_TOPIC too), /tf_static base_link -> sensor and, unless
     switched off, nav_msgs/Odometry with /tf odom -> base_link. The same arguments give the same bytes.
     Raises ConfigError when the robot has no room, OutputError when a file cannot be written.
+
+    >>> made = simulate_session("drive.mcap", sensor="laser", config=SimulationConfig(length_m=1.0))
+    >>> made.truth_path.name, made.scans > 10
+    ('drive.tum', True)
     """
     out = Path(out)
     truth_path = out.with_suffix(".tum")
