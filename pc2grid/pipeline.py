@@ -32,11 +32,19 @@ class PipelineConfig(Protocol):
     """The sections that the point-cloud half reads; `signature.config.Config` is one."""
 
     @property
-    def registration(self) -> RegistrationConfig: ...
+    def registration(self) -> RegistrationConfig:
+        """How scans are registered."""
+        ...
+
     @property
-    def projection(self) -> ProjectionConfig: ...
+    def projection(self) -> ProjectionConfig:
+        """How they are drawn."""
+        ...
+
     @property
-    def partition(self) -> PartitionConfig: ...
+    def partition(self) -> PartitionConfig:
+        """How the map is divided."""
+        ...
 
 
 def follow(scans: Iterable[Scan], config: PipelineConfig) -> Iterator[tuple[RegisteredScan, Sweep]]:
