@@ -138,7 +138,7 @@ def test_no_camera_info(tmp_path: Path) -> None:
         (ros().image(TOPIC, T0, np.ones((5, 6), np.float32), "32FC1"), PointCloudError, "6 x 5 .* of 6 x 4"),
         (ros().image(TOPIC, T0, np.ones((4, 6), np.uint8), "16UC1"), PointCloudError, "24 bytes .rows of 6."),
         (ros().image(TOPIC, T0, np.ones((4, 6), np.uint8), "rgb8"), UnsupportedSchema, "'rgb8' is not"),
-        (ros().compressed(TOPIC, T0, b"\0" * 40, "16UC1; compressedDepth png"), PointCloudError, "a png"),
+        (ros().compressed(TOPIC, T0, b"\0" * 40, "16UC1; compressedDepth png"), PointCloudError, "not a PNG"),
         (ros().compressed(TOPIC, T0, b"\0" * 4, "16UC1; compressedDepth png"), PointCloudError, "its header"),
         (ros().compressed(TOPIC, T0, bytes(12) + png(MILLIMETRES)[:60], "16UC1; compressedDepth png"),
          PointCloudError, "png of a depth image is damaged"),
@@ -150,14 +150,6 @@ def test_no_camera_info(tmp_path: Path) -> None:
 def test_images_that_do_not_fit(tmp_path: Path, image: Message, error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         read(with_camera(tmp_path / "a.mcap", image), EVERY_PIXEL)
-
-
-def test_an_absurd_png_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
-    data = bytearray(bytes(12) + png(MILLIMETRES))
-    data[28:36] = struct.pack(">II", 60_000, 60_000)
-    image = ros().compressed(TOPIC, T0, bytes(data), "16UC1; compressedDepth png")
-    with pytest.raises((LimitExceeded, PointCloudError), match="60000 x 60000"):
-        read(with_camera(tmp_path / "a.mcap", image))
 
 
 def test_a_camera_without_focal_length(tmp_path: Path) -> None:

@@ -115,7 +115,7 @@ def test_exponents_read_as_in_nav2(tmp_path: Path) -> None:
 
 
 def test_a_short_image_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(MapFileError, match="3 x 2 pixels declared, 5 usable"):
+    with pytest.raises(MapFileError, match="3 x 2 pixels declared, 5 found"):
         load_map(write_map(tmp_path, GOOD, bytes(5)))
 
 

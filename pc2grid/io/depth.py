@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pc2grid.errors import LimitExceeded, PointCloudError, UnsupportedSchema
 from pc2grid.geometry import F64
+from pc2grid.io import png
 from pc2grid.io.messages import CameraInfo, CompressedImage, Image
 from pc2grid.io.pointcloud2 import Points
 from pc2grid.model import F32
@@ -19,7 +20,7 @@ from pc2grid.model import F32
 T_BODY_OPTICAL: F64 = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-_PNG = b"\x89PNG\r\n\x1a\n"
+_STEEPEST = 1e3  # of a ray, as x / z or y / z: less than 0.06 degrees off the image plane
 _CONFIG_HEADER = struct.Struct("<iff")  # compressed_depth_image_transport: format, depth_param a and b
 
 
@@ -98,25 +99,27 @@ def _compressed_depth(image: CompressedImage, max_points: int, stride: int) -> t
         )
     data = memoryview(image.data)
     a = b = 0.0
-    if "compressedDepth" in transport or bytes(data[:8]) != _PNG:
+    if "compressedDepth" in transport or bytes(data[:8]) != png.MAGIC:
         if len(data) < _CONFIG_HEADER.size:
             raise PointCloudError("a compressedDepth image is shorter than its header")
         _, a, b = _CONFIG_HEADER.unpack_from(data)
         data = data[_CONFIG_HEADER.size :]
-    if bytes(data[:8]) != _PNG or len(data) < 33:
-        raise PointCloudError("a compressed depth image does not hold a png")
-    width, height = struct.unpack(">II", data[16:24])
+    try:
+        found = png.inspect(data)
+    except ValueError as error:
+        raise PointCloudError(f"the png of a depth image is damaged: {error}") from error
+    height, width = found.height, found.width
     _check_size(height, width, max_points)
+    if (found.bits, found.channels) != (16, 1):
+        raise PointCloudError("the png of a depth image has not one channel of 16 bits")
     import cv2
 
     try:
-        values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        values = cv2.imdecode(np.frombuffer(found.data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         values = None
-    if values is None or values.shape[:2] != (height, width):
+    if values is None or values.shape != (height, width) or values.dtype != np.uint16:
         raise PointCloudError("the png of a depth image is damaged")
-    if values.dtype != np.uint16 or values.ndim != 2:
-        raise PointCloudError("the png of a depth image has not one channel of 16 bits")
     values = values[::stride, ::stride]
     if encoding != "32FC1":
         return _metres(values), (height, width)
@@ -156,6 +159,8 @@ def _rays(
     x, y = ((u - cx) / fx).reshape(-1), ((v - cy) / fy).reshape(-1)
     if any(d):
         x, y = _undistorted(u, v, np.reshape(k, (3, 3)), np.asarray(d), distortion_model)
+    if not max(np.abs(x).max(initial=0.0), np.abs(y).max(initial=0.0)) < _STEEPEST:
+        raise PointCloudError("a CameraInfo whose camera looks sideways or backwards")
     return np.column_stack((x, y, np.ones_like(x))).astype(np.float32)
 
 

@@ -17,11 +17,14 @@ MAX_GAP_NS = 2_000_000_000
 # Before the first and after the last sample, it counts for this long.
 _HOLD_NS = 100_000_000
 _KEEP = 20_000
+# Twice around the earth: beyond all coordinates in metres, and far from where floats overflow.
+_FARTHEST_M = 1e8
 
 
 def valid_pose(pose: Seven) -> bool:
-    """Whether translation and quaternion are finite and the quaternion has a direction."""
-    return all(map(math.isfinite, pose)) and 1e-12 < sum(v * v for v in pose[3:]) < 1e12
+    """Whether the quaternion has a direction, all is finite, and the translation is one on earth."""
+    finite = all(map(math.isfinite, pose))
+    return finite and max(map(abs, pose[:3])) <= _FARTHEST_M and 1e-12 < sum(v * v for v in pose[3:]) < 1e12
 
 
 class PoseTrack:
@@ -93,6 +96,15 @@ class FrameTree:
         """All known frames."""
         return sorted({*self._parent, *self._parent.values()})
 
+    def add_all(
+        self, edges: tuple[Transform, ...] | None, *, static: bool = False, log_time_ns: int = 0
+    ) -> None:
+        """Take up the transforms of one message; None is one that could not be decoded."""
+        if edges is None:
+            self._warn("some tf messages are unreadable and were ignored")
+        for edge in edges or ():
+            self.add(edge, static=static, log_time_ns=log_time_ns)
+
     def add(self, edge: Transform, *, static: bool, log_time_ns: int = 0) -> None:
         """Take up one transform; as in tf2, the latest parent of a frame counts."""
         parent, child = edge.header.frame, edge.child
@@ -162,8 +174,10 @@ class FrameTree:
         close = difflib.get_close_matches(frame, known, n=1)
         guess = f"; did the driver mean {close[0]}?" if close and close[0] != frame else ""
         listed = ", ".join(known[:12]) + (" ..." if len(known) > 12 else "") if known else "none"
+        why = "".join(f"; {warning}" for warning in self.warnings[:1])
         return FrameError(
-            f"tf does not connect frame {frame or '(empty)'} to {target}{guess}; frames in the log: {listed}",
+            f"tf does not connect frame {frame or '(empty)'} to {target}{guess}; "
+            f"frames in the log: {listed}{why}",
             hint="--set read.assume_identity=true takes the sensor for the base, "
             "--set read.base_frame=NAME chooses another base",
         )

@@ -1,31 +1,49 @@
-"""The image of a nav2 map: grey, 8 bits, PGM or PNG."""
+"""The image of a nav2 map: grey, 8 bits, PGM, PNG or BMP."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.errors import MapFileError
+from pc2grid.io import png
 
 MAX_CELLS = 100_000_000
+_MAX_TEXT_CELLS = 10_000_000  # a number as text becomes an object of its own
 
 
-def read_image(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Grey and alpha of an image, each (H, W) in 0..1; alpha None if it has none.
+class GreyImage(NamedTuple):
+    """Pixels as they stand in the file: an image may be large, so shades are made of values, not of pixels.
 
-    Raises MapFileError for what is not an image of 8 bits and grey, or is larger than MAX_CELLS.
+    values : (H, W) 0 (black) .. top (white). alpha : (H, W) 0 .. 255, or None if it has none.
+    """
+
+    values: NDArray[np.unsignedinteger[Any]]
+    top: int
+    alpha: NDArray[np.uint8] | None = None
+
+
+def read_image(path: Path) -> GreyImage:
+    """Read an image.
+
+    Raises MapFileError for what is not a whole image of 8 bits and grey, or is larger than MAX_CELLS.
     """
     try:
         data = path.read_bytes()
     except (OSError, ValueError) as error:
         raise MapFileError(f"{path}: cannot read the map's image: {error}") from error
     if data[:2] in (b"P5", b"P2"):
-        return _decode_pgm(path, data), None
-    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
-        _check_size(path, int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"))
+        return _decode_pgm(path, data)
+    if data[:8] == png.MAGIC:
+        data = _checked_png(path, data)
+    elif data[:2] == b"BM":
+        _check_bmp(path, data)
+    else:
+        raise MapFileError(f"{path}: not an image of a map", hint="nav2 maps are 8-bit pgm, png or bmp")
     import cv2
 
     try:
@@ -33,18 +51,14 @@ def read_image(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | N
     except cv2.error:
         image = None
     if image is None or image.size == 0:
-        raise MapFileError(f"{path}: not an image (or a damaged one)", hint="nav2 maps are 8-bit pgm or png")
-    if image.dtype != np.uint8:
-        raise MapFileError(f"{path}: {8 * image.itemsize} bits per channel", hint="save the map with 8 bits")
-    _check_size(path, image.shape[1], image.shape[0])
+        raise MapFileError(f"{path}: a damaged image", hint="copy or save the map again")
     if image.ndim == 2:
-        return np.asarray(image, dtype=np.float64) / 255.0, None
-    alpha = np.asarray(image[..., -1], dtype=np.float64) / 255.0 if image.shape[2] in (2, 4) else None
-    colours = image[..., : min(3, image.shape[2])].astype(np.int16)
-    if image.shape[2] >= 3 and int(np.ptp(colours, axis=2).max()) > 2:
+        return GreyImage(image, 255)
+    colours = image[..., : min(3, image.shape[2])]
+    alpha = image[..., -1] if image.shape[2] == 4 else None
+    if int((colours.max(axis=2) - colours.min(axis=2)).max()) > 2:
         raise MapFileError(f"{path}: a colour image", hint="maps are grey: 254 free, 0 occupied, 205 unknown")
-    grey = image[..., 0] if image.shape[2] == 2 else colours.mean(axis=2)
-    return np.asarray(grey, dtype=np.float64) / 255.0, alpha
+    return GreyImage(colours.sum(axis=2, dtype=np.uint16), 255 * colours.shape[2], alpha)
 
 
 def _check_size(path: Path, width: int, height: int) -> None:
@@ -52,8 +66,29 @@ def _check_size(path: Path, width: int, height: int) -> None:
         raise MapFileError(f"{path}: {width} x {height} pixels; the limit is {MAX_CELLS} cells")
 
 
-def _decode_pgm(path: Path, data: bytes) -> NDArray[np.float64]:
-    """Binary (P5) or text (P2) PGM to (H, W) in 0..1."""
+def _checked_png(path: Path, data: bytes) -> bytes:
+    try:
+        found = png.inspect(data)
+    except ValueError as error:
+        raise MapFileError(f"{path}: a damaged PNG: {error}", hint="copy or save the map again") from error
+    if found.bits > 8:
+        raise MapFileError(f"{path}: {found.bits} bits per channel", hint="save the map with 8 bits")
+    _check_size(path, found.width, found.height)
+    return found.data
+
+
+def _check_bmp(path: Path, data: bytes) -> None:
+    """Uncompressed, and as large as its header says (BITMAPINFOHEADER)."""
+    width, height = (int.from_bytes(data[at : at + 4], "little", signed=True) for at in (18, 22))
+    _check_size(path, width, abs(height))
+    pixels, bits, packing = (int.from_bytes(data[a:b], "little") for a, b in ((10, 14), (28, 30), (30, 34)))
+    row = (width * bits + 31) // 32 * 4
+    if bits not in (8, 24, 32) or packing not in (0, 3) or len(data) < pixels + row * abs(height):
+        raise MapFileError(f"{path}: a damaged or compressed BMP", hint="save the map as pgm or png")
+
+
+def _decode_pgm(path: Path, data: bytes) -> GreyImage:
+    """Binary (P5) or text (P2) PGM."""
     number = rb"(?:\s|#[^\n]*\n)+(\d{1,9})"
     header = re.match(rb"P[25]" + number * 3 + rb"\s", data)
     if header is None:
@@ -62,19 +97,26 @@ def _decode_pgm(path: Path, data: bytes) -> NDArray[np.float64]:
     _check_size(path, width, height)
     if not 0 < top <= 255:
         raise MapFileError(f"{path}: PGM with maximum {top}", hint="save the map with 8 bits")
-    body = data[header.end() :]
     if data[:2] == b"P2":
-        try:
-            values = np.array(re.sub(rb"#[^\n]*", b"", body).split(), dtype=np.int64)
-        except (ValueError, OverflowError) as error:
-            raise MapFileError(f"{path}: the PGM text is damaged") from error
+        values = _text_values(path, data[header.end() :], width * height)
     else:
-        values = np.frombuffer(body, dtype=np.uint8)[: width * height].astype(np.int64)
-    if len(values) != width * height or (
-        values.size and not 0 <= int(values.min()) <= int(values.max()) <= top
-    ):
-        raise MapFileError(f"{path}: {width} x {height} pixels declared, {len(values)} usable found")
-    return values.reshape(height, width) / float(top)
+        values = np.frombuffer(data, np.uint8, offset=header.end())[: width * height]
+    if len(values) != width * height:
+        raise MapFileError(f"{path}: {width} x {height} pixels declared, {len(values)} found")
+    if int(values.max()) > top:
+        raise MapFileError(f"{path}: a pixel of {values.max()} in a PGM with maximum {top}")
+    return GreyImage(values.reshape(height, width), top)
+
+
+def _text_values(path: Path, body: bytes, count: int) -> NDArray[np.uint8]:
+    """Numbers as text; a comment goes to the end of its line."""
+    if count > _MAX_TEXT_CELLS:
+        raise MapFileError(f"{path}: {count} pixels as text", hint="save the map as binary pgm (P5)")
+    words = re.sub(rb"#[^\n]*", b"", body).split(maxsplit=count)[:count]
+    try:
+        return np.frombuffer(bytes(map(int, words)), np.uint8)
+    except ValueError as error:
+        raise MapFileError(f"{path}: the PGM text is damaged") from error
 
 
 def encode_image(pixels: NDArray[np.uint8], suffix: str, resolution_m: float) -> bytes:

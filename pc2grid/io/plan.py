@@ -121,8 +121,8 @@ class _Planner:
         decoders = {t: decoder_for(t) for t in topics}
         for message in self._source.messages({t.topic for t in topics}):
             if message.channel in decoders:
-                for edge in tolerant(decoders[message.channel], message.data, ()):
-                    self._frames.add(edge, static=True)
+                edges = tolerant(decoders[message.channel], message.data, None)
+                self._frames.add_all(edges, static=True)
 
     def _odometry_child(self, odometry: TopicInfo | None) -> str | None:
         if odometry is None or odometry.type in choose.TF:
@@ -152,8 +152,8 @@ class _Planner:
                 break
             if message.channel in decoders:
                 size = len(frames.frames)
-                for edge in tolerant(decoders[message.channel], message.data, ()):
-                    frames.add(edge, static=False, log_time_ns=message.log_time_ns)
+                edges = tolerant(decoders[message.channel], message.data, None)
+                frames.add_all(edges, log_time_ns=message.log_time_ns)
                 if len(frames.frames) > size:
                     base = self._connected_base(sensor_frame, child)
         if base is not None:
@@ -162,8 +162,9 @@ class _Planner:
         if base is not None and sensor_frame == base:
             return base
         name = sensor_frame or "(empty)"
-        # Where parts of the file are lost, tf may be among them: a guess would shift every scan.
+        # Where parts of the file or of tf are lost, a guess would shift every scan.
         lost = self._source.tally.bytes_lost and any(t.type in choose.TF for t in self._topics)
+        lost = lost or bool(frames.warnings)
         if not frames.frames and self._config.base_frame is None and not lost:
             self._source.tally.warn(
                 f"the log has no tf: frame {name} of the scans is taken for the robot's base"

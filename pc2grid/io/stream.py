@@ -108,6 +108,9 @@ class Stream:
         elif stamp_ns <= 0:
             self._skip(PointCloudError("stamp is zero or negative"))
             return
+        if stamp_ns >= 1 << 63:
+            self._skip(PointCloudError("stamp is past the year 2262"))
+            return
         heapq.heappush(self._waiting, (stamp_ns, self._count, log_time_ns, header.frame, data))
 
     def _take_odometry(self) -> Callable[[Any, int], None]:
@@ -157,9 +160,8 @@ class Stream:
         decode = decoder_for(topic)
 
         def take(data: Any, log_time_ns: int) -> None:
-            edges: tuple[Transform, ...] = tolerant(decode, data, ())
-            for edge in edges:
-                self._frames.add(edge, static=False, log_time_ns=log_time_ns)
+            edges: tuple[Transform, ...] | None = tolerant(decode, data, None)
+            self._frames.add_all(edges, log_time_ns=log_time_ns)
 
         return take
 

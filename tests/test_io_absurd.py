@@ -1,0 +1,321 @@
+"""Numbers that no robot and no map has: refused by name, and before anything is allocated for them."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from pc2grid.config import ReadConfig
+from pc2grid.errors import FrameError, MapFileError, PointCloudError
+from pc2grid.io import png
+from pc2grid.io.nav2_map import load_map, save_map
+from pc2grid.model import OccupancyGrid
+from tests import test_io_foxglove as foxglove
+from tests.builders import STEP, T0, Message, read, ros, write_mcap
+from tests.watching import peak_memory
+
+INFO, DEPTH = "/camera/depth/camera_info", "/camera/depth/image_raw"
+CELLS = np.random.default_rng(1).choice(np.array([-1, 0, 100], np.int8), (9, 13))
+GRID = OccupancyGrid(cells=CELLS, resolution_m=0.05, origin_m=(-1.0, 2.0))
+MIB = 1 << 20
+
+
+def chunk(kind: bytes, body: bytes) -> bytes:
+    """With the right checksum: damage is caught by it, a liar is not."""
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def lying_png(width: int, height: int, bits: int = 8, colour: int = 0, data: bytes = b"") -> bytes:
+    header = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
+    return (
+        png.MAGIC
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", data or zlib.compress(bytes(64)))
+        + chunk(b"IEND", b"")
+    )
+
+
+def map_with(folder: Path, image: bytes, suffix: str = "png", **keys: object) -> Path:
+    known: dict[str, object] = {
+        "image": f"m.{suffix}", "resolution": 0.05, "origin": "[0, 0, 0]", "negate": 0,
+        "occupied_thresh": 0.65, "free_thresh": 0.196,
+    }  # fmt: skip
+    (folder / f"m.{suffix}").write_bytes(image)
+    path = folder / "m.yaml"
+    path.write_text("".join(f"{k}: {v}\n" for k, v in (known | keys).items()))
+    return path
+
+
+# --- images of maps -----------------------------------------------------------------------------------
+
+
+def test_a_flipped_bit_anywhere_in_a_png_is_seen(tmp_path: Path) -> None:
+    yaml_path, image_path = save_map(GRID, tmp_path / "m", image_format="png")
+    whole = image_path.read_bytes()
+    for at in range(len(whole)):
+        image_path.write_bytes(whole[:at] + bytes([whole[at] ^ 1 << at % 8]) + whole[at + 1 :])
+        with pytest.raises(MapFileError, match=r"m\.png: "):
+            load_map(yaml_path)
+    for at in range(len(whole)):
+        with pytest.raises(ValueError, match=r"not a PNG|does not fit|checksum"):
+            png.inspect(whole[:at])
+    image_path.write_bytes(whole + b"more")
+    np.testing.assert_array_equal(load_map(yaml_path).cells, CELLS)
+
+
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        (lying_png(60_000, 60_000), "cannot hold 60000 x 60000 pixels"),
+        (lying_png(2**31, 2**31), "cannot hold"),
+        (lying_png(0, 5), "0 x 5 pixels"),
+        (lying_png(20_000, 20_000, data=zlib.compress(bytes(20_001 * 20_000))), "the limit is 100000000"),
+        (lying_png(4, 4, bits=16), "16 bits"),
+        (lying_png(4, 4, bits=3), "its header makes no sense"),
+        (lying_png(4, 4, colour=5), "its header makes no sense"),
+        (png.MAGIC + chunk(b"IHDR", b"short") + chunk(b"IEND", b""), "its header makes no sense"),
+        (png.MAGIC + chunk(b"IDAT", b"") + chunk(b"IEND", b""), "its header is not at its beginning"),
+        (png.MAGIC + struct.pack(">I", 2**31) + b"IHDR", "does not fit into 16 bytes"),
+        (b"\xff\xd8\xff\xe0 a photo", "not an image of a map"),
+        (b"BM" + bytes(100), "0 x 0 pixels"),
+        (b"BM" + bytes(16) + struct.pack("<iiHHI", 9000, 9000, 1, 24, 0), "compressed BMP"),
+        (b"P5 90000 90000 255\n" + bytes(99), "the limit is"),
+        (b"P5 9000 9000 255\n" + bytes(99), "declared, 99 found"),
+        (b"P2 9000 9000 255\n1 2 3", "save the map as binary pgm"),
+        (b"P2 2 2 255\n1 2 3 -4", "text is damaged"),
+        (b"P2 2 2 255\n1 2 3 400", "text is damaged"),
+        (b"P2 2 2 255\n1 2 3 " + b"9" * 5000, "text is damaged"),
+        (b"P2 2 2 9\n1 2 3 10", "a pixel of 10 in a PGM with maximum 9"),
+        (b"P2 2 2 255\n1 2 3", "declared, 3 found"),
+    ],
+)  # fmt: skip
+def test_images_that_lie_are_refused_before_they_are_decoded(
+    tmp_path: Path, image: bytes, words: str
+) -> None:
+    path = map_with(tmp_path, image)
+    with peak_memory() as peak, pytest.raises(MapFileError, match=words) as caught:
+        load_map(path)
+    assert str(tmp_path / "m.png") in caught.value.message
+    assert peak.grown_bytes() < 64 * MIB
+
+
+def test_what_a_decoder_would_unpack_besides_the_pixels_is_left_out(tmp_path: Path) -> None:
+    _, image_path = save_map(GRID, tmp_path / "m", image_format="png")
+    whole = image_path.read_bytes()
+    bomb = chunk(b"iCCP", b"x\0\0" + zlib.compress(bytes(64 * MIB), 9)) + chunk(b"tEXt", b"a\0b")
+    image_path.write_bytes(whole[:33] + bomb + whole[33:])
+    assert png.inspect(image_path.read_bytes()).data == whole
+    np.testing.assert_array_equal(load_map(tmp_path / "m.yaml").cells, CELLS)
+
+
+def test_a_large_map_takes_room_for_its_cells_only(tmp_path: Path) -> None:
+    """9 million cells: were shades computed per pixel, each of the arrays would take 72 MB."""
+    pixels = np.zeros((3000, 3000), np.uint8)
+    path = map_with(tmp_path, bytes(cv2.imencode(".png", pixels)[1]))
+    load_map(path)
+    with peak_memory() as peak:
+        assert load_map(path).cells.all()
+    assert peak.grown_bytes() < 60 * MIB
+
+
+@pytest.mark.parametrize(
+    ("suffix", "channels"), [("pgm", 1), ("bmp", 1), ("bmp", 3), ("png", 1), ("png", 3), ("png", 4)]
+)
+def test_formats_of_images(tmp_path: Path, suffix: str, channels: int) -> None:
+    grey = np.array([[254, 0, 205], [0, 254, 254]], np.uint8)
+    opaque = [np.full_like(grey, 255)] * (channels == 4)
+    image = grey if channels == 1 else np.dstack([grey, grey, grey, *opaque])
+    path = map_with(tmp_path, bytes(cv2.imencode(f".{suffix}", image)[1]), suffix)
+    unknown = 0 if channels == 4 else -1  # nav2 averages opacity in: (3 * 205 + 255) / 4 is free
+    assert load_map(path).cells.tolist() == [[100, 0, 0], [0, 100, unknown]]
+
+
+def test_colour_and_transparency(tmp_path: Path) -> None:
+    image = np.full((2, 3, 4), 254, np.uint8)
+    image[..., 3] = 255
+    image[0, 0, 3] = 0
+    image[1, 1] = 0, 0, 0, 255
+    path = map_with(tmp_path, bytes(cv2.imencode(".png", image)[1]), mode="scale", free_thresh=0)
+    # Shade 254 is 1/255 of the way from free to occupied at 0.65.
+    assert load_map(path).cells.tolist() == [[1, 100, 1], [-1, 1, 1]]
+    image[0, 0] = 0, 254, 254, 255
+    with pytest.raises(MapFileError, match="a colour image"):
+        load_map(map_with(tmp_path, bytes(cv2.imencode(".png", image)[1])))
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"resolution": "1e-300"}, "resolution: expected 0.001 .. 100 m per pixel, found 1e-300"),
+        ({"resolution": 0.0009}, "resolution"),
+        ({"resolution": "1e300"}, "resolution"),
+        ({"resolution": -0.05}, "resolution"),
+        ({"origin": "[1e300, 0, 0]"}, r"origin: 1e\+300, 0 m is nowhere on earth"),
+        ({"origin": "[0, -2e8, 0]"}, "origin"),
+    ],
+)
+def test_maps_of_absurd_sizes(tmp_path: Path, keys: dict[str, object], words: str) -> None:
+    with pytest.raises(MapFileError, match=words) as caught:
+        load_map(map_with(tmp_path, b"P5 2 2 255\n" + bytes(4), "pgm", **keys))
+    assert "m.yaml" in caught.value.message
+
+
+# --- depth images -------------------------------------------------------------------------------------
+
+
+def seen_by(camera: Message, image: Message, folder: Path, config: ReadConfig | None = None) -> list[Any]:
+    return read(write_mcap(folder / "a.mcap", [camera, image]), config)[0]
+
+
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        (lying_png(60_000, 60_000, 16), "cannot hold 60000 x 60000"),
+        (lying_png(6000, 6000, 16, data=zlib.compress(bytes(12_001 * 6000))), "max_points"),
+        (lying_png(6, 4, 8), "not one channel of 16 bits"),
+        (lying_png(6, 4, 16, data=zlib.compress(bytes(20))), "damaged"),
+    ],
+)
+def test_depth_images_that_unpack_without_end(tmp_path: Path, image: bytes, words: str) -> None:
+    message = ros().compressed(DEPTH, T0, bytes(12) + image, "16UC1; compressedDepth png")
+    with peak_memory() as peak, pytest.raises(PointCloudError, match=words):
+        seen_by(ros().camera(INFO, T0, 6, 4, 100.0), message, tmp_path)
+    assert peak.grown_bytes() < 64 * MIB
+
+
+@pytest.mark.parametrize("focal", [1e-300, 1e-30, 1e-3, float("nan"), float("inf"), -5.0])
+def test_cameras_with_absurd_focal_lengths(tmp_path: Path, focal: float) -> None:
+    image = ros().image(DEPTH, T0, np.full((4, 6), 1000, np.uint16), "16UC1")
+    with pytest.raises(PointCloudError, match="a CameraInfo"):
+        seen_by(ros().camera(INFO, T0, 6, 4, focal), image, tmp_path)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30, 1e300])
+@pytest.mark.parametrize("place", range(5))
+def test_cameras_with_absurd_distortion(tmp_path: Path, value: float, place: int) -> None:
+    """Refused, or points that are possible: never NaN."""
+    camera = ros().camera(INFO, T0, 6, 4, 100.0)
+    at = camera.data.index(struct.pack("<d", 100.0)) - 40 + 8 * place  # d stands right before k
+    assert camera.data[at : at + 8] == bytes(8)
+    camera = camera._replace(data=camera.data[:at] + struct.pack("<d", value) + camera.data[at + 8 :])
+    image = ros().image(DEPTH, T0, np.full((4, 6), 1000, np.uint16), "16UC1")
+    try:
+        (scan,) = seen_by(camera, image, tmp_path)
+    except PointCloudError as error:
+        assert "a CameraInfo" in error.message
+    else:
+        assert np.isfinite(scan.points_m).all()
+
+
+# --- poses --------------------------------------------------------------------------------------------
+
+
+def moved(message: Message, old: float, new: float) -> Message:
+    """The message with one of its numbers replaced."""
+    before = struct.pack("<d", old)
+    assert before in message.data
+    return message._replace(data=message.data.replace(before, struct.pack("<d", new), 1))
+
+
+ABSURD = [1e300, -1e300, 1e39, 1.1e8, float("nan"), float("inf")]
+
+
+@pytest.mark.parametrize("topic", ["/tf_static", "/tf"])
+@pytest.mark.parametrize("value", ABSURD)
+def test_a_mount_that_is_nowhere_on_earth_is_refused_by_name(
+    tmp_path: Path, value: float, topic: str
+) -> None:
+    to = ros()
+    mount = moved(to.tf(T0, "base_link", "lidar", 0.25, topic=topic), 0.25, value)
+    path = write_mcap(tmp_path / "a.mcap", [mount, to.cloud("/points", T0, [[1, 2, 3]])])
+    with pytest.raises(FrameError, match=r"a transform base_link -> lidar of the log makes no sense"):
+        read(path)
+    scans, report = read(path, ReadConfig(assume_identity=True))
+    assert scans[0].points_m.tolist() == [[1, 2, 3]]
+    assert any("base_link -> lidar" in warning for warning in report.warnings)
+
+
+@pytest.mark.parametrize("length", [0.0, 1e-200, 1e200, float("nan")])
+def test_a_quaternion_without_direction_is_refused_by_name(tmp_path: Path, length: float) -> None:
+    to = ros()
+    mount = moved(to.tf(T0, "base_link", "lidar", 0.25, topic="/tf_static"), 1.0, length)
+    path = write_mcap(tmp_path / "a.mcap", [mount, to.cloud("/points", T0, [[1, 2, 3]])])
+    with pytest.raises(FrameError, match="base_link -> lidar"):
+        read(path)
+
+
+def test_an_unreadable_tf_message_is_not_taken_for_no_tf(tmp_path: Path) -> None:
+    to = ros()
+    mount = to.tf(T0, "base_link", "lidar", 0.25, topic="/tf_static")
+    cloud = to.cloud("/points", T0, [[1, 2, 3]])
+    path = write_mcap(tmp_path / "a.mcap", [mount._replace(data=mount.data[:-20]), cloud])
+    with pytest.raises(FrameError, match="some tf messages are unreadable"):
+        read(path)
+    scans, report = read(write_mcap(tmp_path / "b.mcap", [cloud]))
+    assert len(scans) == 1
+    assert any("the log has no tf" in warning for warning in report.warnings)
+
+
+@pytest.mark.parametrize("value", ABSURD)
+def test_odometry_that_is_nowhere_on_earth_is_ignored_and_said(tmp_path: Path, value: float) -> None:
+    to = ros()
+    messages = []
+    for i in range(12):
+        odometry = to.odometry("/odom", T0 + i * STEP, 0.25 + i)
+        messages.append(moved(odometry, 5.25, value) if i == 5 else odometry)
+        messages.append(to.cloud("/points", T0 + i * STEP, [[1, 2, 3]]))
+    scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
+    found = [scan.T_odom_base[0, 3] for scan in scans if scan.T_odom_base is not None]
+    assert found == pytest.approx([0.25 + i for i in range(12)])  # between its neighbours
+    assert any("odometry messages are unreadable or not finite" in w for w in report.warnings)
+
+
+# --- times --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seconds", [10**10, 10**30, -(10**30)])
+def test_stamps_past_all_calendars_are_skipped(tmp_path: Path, seconds: int) -> None:
+    def change(fields: dict[str, Any]) -> None:
+        fields["timestamp"]["sec"] = seconds
+
+    path = json_clouds(tmp_path / "a.mcap", change)
+    scans, report = read(path)
+    assert len(scans) == 19
+    (reason,) = report.scans_skipped
+    assert "stamp" in reason
+
+
+def json_clouds(path: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    """20 clouds in JSON, of which the eleventh is changed."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="")
+        channel = writer.register_channel(
+            "/points", "json", writer.register_schema("foxglove.PointCloud", "jsonschema", b"{}")
+        )
+        for i in range(20):
+            fields = foxglove.jsonable(foxglove.cloud(T0 + i * STEP, [[1, 2, 3]])[3])
+            if i == 10:
+                change(fields)
+            writer.add_message(channel, T0 + i * STEP, json.dumps(fields).encode(), T0 + i * STEP)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("late", [1 << 63, (1 << 64) - 1])
+def test_times_of_recording_past_all_calendars(tmp_path: Path, late: int) -> None:
+    """Stamps are zero, so the times of recording have to do, and these do not."""
+    messages = [ros().cloud("/points", 0, [[1, 2, 3]])._replace(log_time_ns=T0 + i * STEP) for i in range(20)]
+    messages[-1] = messages[-1]._replace(log_time_ns=late)
+    scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
+    assert len(scans) == 19
+    assert report.scans_skipped == {"stamp is past the year 2262": 1}
