@@ -6,12 +6,14 @@ for the empty rectangle around it.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.config import ProjectionConfig
 from pc2grid.errors import LimitExceeded
-from pc2grid.geometry import F64, SE2
+from pc2grid.geometry import SE2
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.sweep import Sweep
 
@@ -23,6 +25,7 @@ _SUBPIXEL = 4  # fractional bits of cv2's polygon corners
 _HIT = 150
 _MISS = -75
 _CLAMP = 500
+_BODY_M = 0.15  # around the origin of the base nothing but the robot has room
 
 
 class GridBuilder:
@@ -46,12 +49,20 @@ class GridBuilder:
         hits = np.floor(T_map_base.apply(sweep.hits_m) / resolution).astype(np.int64)
         low = np.floor(outline.min(axis=0)).astype(np.int64) - 1
         high = np.floor(outline.max(axis=0)).astype(np.int64) + 2
+        here = np.floor(np.array([T_map_base.x, T_map_base.y]) / resolution).astype(np.int64)
+        around = math.ceil(_BODY_M / resolution) + 1
+        low, high = np.minimum(low, here - around), np.maximum(high, here + around + 1)
         if len(hits):
             low, high = np.minimum(low, hits.min(axis=0)), np.maximum(high, hits.max(axis=0) + 1)
         update = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.int16)
-        corners = np.rint((_shrink(outline, sweep, T_map_base, resolution) - low - 0.5) * (1 << _SUBPIXEL))
-        cv2.fillPoly(update, [corners.astype(np.int32)], _MISS, shift=_SUBPIXEL)
+        corners = np.rint((outline - low - 0.5) * (1 << _SUBPIXEL)).astype(np.int32)
+        cv2.fillPoly(update, [corners], _MISS, shift=_SUBPIXEL)
+        # The cells that the outline runs through belong to the obstacle, above all those of a wall that is
+        # seen along itself.
+        cv2.polylines(update, _rims(corners, sweep.free_m), False, 0, shift=_SUBPIXEL)
         update[hits[:, 1] - low[1], hits[:, 0] - low[0]] = _HIT
+        # Where the robot is there is nothing else.
+        cv2.circle(update, (here - low).tolist(), round(_BODY_M / resolution), 2 * _MISS, -1)
         self._add_window(update, int(low[0]), int(low[1]))
 
     def grid(self) -> OccupancyGrid:
@@ -109,10 +120,10 @@ class GridBuilder:
             )
 
 
-def _shrink(outline: F64, sweep: Sweep, T_map_base: SE2, resolution: float) -> F64:
-    """Pull the outline (in cells) half a cell towards the sensor: the last cell belongs to the obstacle."""
-    origin = T_map_base.apply(sweep.origin_m[None, :]) / resolution
-    rays = outline - origin
-    lengths = np.linalg.norm(rays, axis=1, keepdims=True)
-    shrunk: F64 = origin + rays * np.maximum(1.0 - 0.5 / np.maximum(lengths, 0.5), 0.0)
-    return shrunk
+def _rims(corners: NDArray[np.int32], free_m: NDArray[np.float32]) -> list[NDArray[np.int32]]:
+    """The parts of an outline (B, 2) where something was learned; elsewhere it runs through the sensor."""
+    known = np.flatnonzero(free_m > 0)
+    if len(known) == len(free_m):
+        return [np.concatenate((corners, corners[:1]))]
+    runs = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1)
+    return [corners[run] for run in runs if len(run)]

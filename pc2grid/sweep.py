@@ -6,9 +6,11 @@ plan: there is something here, and there is nothing up to here.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from pc2grid.config import ProjectionConfig
@@ -16,8 +18,8 @@ from pc2grid.floor import Ground
 from pc2grid.geometry import F64
 from pc2grid.model import F32
 
-BEARINGS = 720
-_GAP_BINS = 2  # beams up to 1.5 degrees apart count as looking in between
+BEARINGS = 1440  # a wall seen along itself needs them fine: a quarter of a degree is a cell at 12 m
+_GAP_BINS = 5  # beams up to 1.5 degrees apart count as looking in between
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,65 +64,88 @@ def flatten(
     A bearing is free up to its nearest obstacle; without an obstacle, as far as the farthest return on
     the floor or, for a ray that climbs to a ceiling or an overhang, to where it leaves the height band.
     """
-    points = np.asarray(points_m, dtype=np.float32)
     sensor = np.asarray(sensor_m, dtype=np.float64)
-    relative = points[:, :2] - sensor[:2].astype(np.float32)
-    ranges = np.hypot(relative[:, 0], relative[:, 1])
-    bins = _bearing_bins(relative)
-    reach = np.zeros(BEARINGS, dtype=np.float32)
-    nearest = np.full(BEARINGS, np.inf, dtype=np.float32)
-    limit = np.float32(config.max_range_m)
     if ground is None:
-        hit = ranges <= limit
-        np.minimum.at(nearest, bins, ranges)
+        plane, sensor_height = np.zeros(4), 0.0
+        band = (-np.inf, np.inf)
         cell_m = 0.5 * config.resolution_m  # a laser's beams are few: keep nearly all of them
     else:
-        heights = ground.heights(points)
-        in_band = (heights >= config.band_min_m) & (heights <= config.band_max_m)
-        hit = in_band & (ranges <= limit)
-        np.minimum.at(nearest, bins[in_band], ranges[in_band])
-        low = heights < config.band_min_m
-        np.maximum.at(reach, bins[low], ranges[low])
-        high = heights > config.band_max_m
-        sensor_height = np.float32(ground.heights(sensor[None, :])[0])
-        if sensor_height < config.band_max_m:
-            fraction = (config.band_max_m - sensor_height) / (heights[high] - sensor_height)
-            np.maximum.at(reach, bins[high], ranges[high] * fraction)
+        plane = np.array([*ground.normal, ground.offset_m])
+        sensor_height = float(ground.heights(sensor[None, :])[0])
+        band = (config.band_min_m, config.band_max_m)
         cell_m = config.resolution_m
-    obstacle = np.isfinite(nearest)
-    free = np.where(obstacle, nearest, reach)
-    free = np.minimum(_fill_gaps(free), limit).astype(np.float32)
-    return Sweep(
-        stamp_ns=stamp_ns,
-        hits_m=_one_per_cell(points[hit, :2], cell_m),
-        origin_m=sensor[:2].copy(),
-        free_m=free,
-    )
+    points = np.asarray(points_m, dtype=np.float32)
+    free, hits = _scatter(points, sensor, sensor_height, plane, *band, config.max_range_m, cell_m)
+    return Sweep(stamp_ns=stamp_ns, hits_m=hits, origin_m=sensor[:2].copy(), free_m=free)
 
 
-def _bearing_bins(relative: F32) -> NDArray[np.int64]:
-    turns = np.arctan2(relative[:, 1], relative[:, 0]) * np.float32(BEARINGS / (2.0 * np.pi))
-    return np.rint(turns).astype(np.int64) % BEARINGS
+@njit(cache=True)
+def _scatter(
+    points: F32,
+    sensor: F64,
+    sensor_height: float,
+    plane: F64,
+    band_min: float,
+    band_max: float,
+    limit: float,
+    cell_m: float,
+) -> tuple[F32, F32]:
+    """How far each bearing is free, and the mean of the obstacle points in each cell, first seen first."""
+    nearest = np.full(BEARINGS, np.inf)
+    reach = np.zeros(BEARINGS)
+    count = points.shape[0]
+    mask = 1
+    while mask < 2 * count + 2:
+        mask *= 2
+    slots = np.full(mask, -1, dtype=np.int32)  # a hash table of cells
+    mask -= 1
+    keys = np.empty(count, dtype=np.int64)
+    sums = np.zeros((count, 3))
+    used = 0
+    for k in range(count):
+        px, py = float(points[k, 0]), float(points[k, 1])
+        x, y = px - sensor[0], py - sensor[1]
+        distance = math.hypot(x, y)
+        bearing = round(math.atan2(y, x) * (BEARINGS / (2.0 * math.pi))) % BEARINGS
+        height = plane[0] * px + plane[1] * py + plane[2] * points[k, 2] + plane[3]
+        if height < band_min:
+            reach[bearing] = max(reach[bearing], distance)
+            continue
+        if height > band_max:
+            if sensor_height < band_max:
+                part = (band_max - sensor_height) / (height - sensor_height)
+                reach[bearing] = max(reach[bearing], distance * part)
+            continue
+        nearest[bearing] = min(nearest[bearing], distance)
+        if distance > limit:
+            continue
+        key = math.floor(px / cell_m) * (1 << 32) + math.floor(py / cell_m)
+        slot = (key * -7046029254386353131 >> 20) & mask
+        while slots[slot] >= 0 and keys[slots[slot]] != key:
+            slot = (slot + 1) & mask
+        if slots[slot] < 0:
+            slots[slot], keys[used] = used, key
+            used += 1
+        cell = sums[slots[slot]]
+        cell[0] += px
+        cell[1] += py
+        cell[2] += 1.0
+    free = np.where(np.isfinite(nearest), nearest, reach)
+    _fill_gaps(free)
+    hits = np.empty((used, 2), dtype=np.float32)
+    for k in range(used):
+        hits[k, 0] = sums[k, 0] / sums[k, 2]
+        hits[k, 1] = sums[k, 1] / sums[k, 2]
+    return np.minimum(free, limit).astype(np.float32), hits
 
 
-def _fill_gaps(free: F32) -> F32:
+@njit(cache=True)
+def _fill_gaps(free: F64) -> None:
     """Bearings between two that looked, at most `_GAP_BINS` wide, take the shorter of the two."""
-    filled = free.copy()
-    for width in range(1, _GAP_BINS + 1):
-        for lead in range(width):
-            left = np.roll(free, lead + 1)
-            right = np.roll(free, -(width - lead))
-            between = (filled == 0) & (left > 0) & (right > 0)
-            filled[between] = np.minimum(left, right)[between]
-    return filled
-
-
-def _one_per_cell(points: F32, cell_m: float) -> F32:
-    """The mean of the points (N, 2) in each cell, cells in a fixed order."""
-    if not len(points):
-        return points.reshape(0, 2)
-    cells = np.floor(points / np.float32(cell_m)).astype(np.int64)
-    keys = cells[:, 0] * (1 << 32) + cells[:, 1]
-    _, index, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    means = np.column_stack([np.bincount(index, weights=points[:, axis]) / counts for axis in (0, 1)])
-    return means.astype(np.float32)
+    looked = np.flatnonzero(free > 0.0)
+    for k in range(len(looked)):
+        left, right = looked[k - 1], looked[k]
+        between = (right - left - 1) % BEARINGS
+        if between <= _GAP_BINS:
+            for step in range(1, between + 1):
+                free[(left + step) % BEARINGS] = min(free[left], free[right])

@@ -51,7 +51,7 @@ def test_someone_who_left_is_cleared():
     )
     builder.add(person, SE2())
     assert state(builder.grid(), 1.02, 0.02) >= 65
-    for _ in range(6):
+    for _ in range(5):
         builder.add(disc(2.0), SE2())
     assert 0 <= state(builder.grid(), 1.02, 0.02) < 20
 
