@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from rosbags.typesys import Stores, get_typestore
 
 from pc2grid.errors import OutputError
 from pc2grid.geometry import SE2, pose_from_rotation_vector, pose_from_xyz_quat
-from pc2grid.io.mcap_out import LogWriter
+from pc2grid.io.mcap_out import LogWriter, Marker
 from pc2grid.model import OccupancyGrid, Trajectory
 
 STAMP = 1_700_000_000_123_456_789
@@ -41,6 +42,15 @@ def test_every_message_survives_the_reference_decoder(tmp_path: Path) -> None:
         out.path("/path", trajectory)
         out.pose_with_covariance("/pose", STAMP, SE2(1, 2, 0.5), np.diag([1.0, 2.0, 3.0]))
         out.occupancy_grid("/map", STAMP, grid)
+        marks = np.arange(12.0).reshape(4, 3)
+        out.markers(
+            "/marks",
+            STAMP,
+            [
+                Marker(name="none", kind="spheres", points_m=np.empty((0, 3)), size_m=1, color=(1, 0, 0, 1)),
+                Marker(name="four", kind="lines", points_m=marks, size_m=0.25, color=(0, 0.5, 1, 0.25)),
+            ],
+        )
         out.metadata("pc2grid", {"config": "{}"})
     got = decoded(path)
     cloud = got["/points"]
@@ -62,9 +72,37 @@ def test_every_message_survives_the_reference_decoder(tmp_path: Path) -> None:
     assert got["/tf_static"].transforms[0].child_frame_id == "lidar"
     assert len(got["/path"].poses) == 2
     assert got["/pose"].pose.covariance[35] == 3.0
+    none, four = got["/marks"].markers
+    assert (none.ns, none.id, none.type, none.points) == ("none", 0, 7, [])
+    assert [(p.x, p.y, p.z) for p in four.points] == [tuple(row) for row in marks]
+    assert (four.ns, four.id, four.type, four.action, four.scale.x) == ("four", 1, 5, 0, 0.25)
+    assert (four.color.g, four.color.a, four.pose.orientation.w, four.mesh_file.filename) == (
+        0.5,
+        0.25,
+        1,
+        "",
+    )
     assert list(got["/map"].data) == [0, 100, -1]
     assert (got["/map"].info.width, got["/map"].info.height) == (3, 1)
     assert got["/map"].info.origin.position.y == 2.0
+
+
+def test_markers_are_read_by_another_decoder_too(tmp_path: Path) -> None:
+    """rosbags has its own definitions: those of ROS 2 Humble, not ours."""
+    path = tmp_path / "out.mcap"
+    marker = Marker(name="m", kind="lines", points_m=np.eye(3)[:2], size_m=0.5, color=(1, 0.5, 0, 1))
+    with LogWriter(path) as out:
+        out.markers("/marks", STAMP, [marker, marker])
+    with path.open("rb") as stream:
+        ((_, _, message),) = make_reader(stream).iter_messages()
+    name = "visualization_msgs/msg/MarkerArray"
+    got = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(message.data, name)
+    assert [(m.ns, m.id, len(m.points), m.color.g) for m in got.markers] == [
+        ("m", 0, 2, 0.5),
+        ("m", 1, 2, 0.5),
+    ]
+    assert got.markers[1].points[1].y == 1.0
+    assert (got.markers[1].text, got.markers[1].mesh_use_embedded_materials) == ("", False)
 
 
 def test_the_same_calls_give_the_same_bytes(tmp_path: Path) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +23,22 @@ if TYPE_CHECKING:
     from mcap.writer import Writer
 
 _FLOAT32 = 7
+_MARKER_TYPES = {"lines": 5, "spheres": 7}  # LINE_LIST, SPHERE_LIST of visualization_msgs/Marker
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Marker:
+    """Spheres at points, or lines between each two of them, to be drawn in one colour.
+
+    points_m : (N, 3) in the frame they are written for. size_m : diameter or width.
+    color : red, green, blue, opacity, 0..1.
+    """
+
+    name: str
+    kind: Literal["spheres", "lines"]
+    points_m: F64
+    size_m: float
+    color: tuple[float, float, float, float]
 
 
 class LogWriter:
@@ -149,15 +166,20 @@ class LogWriter:
         """One transform (4, 4) on /tf_static: valid always."""
         self._transforms("/tf_static", stamp_ns, [(parent, child, T_parent_child)])
 
-    def path(self, topic: str, trajectory: Trajectory, frame: str = "map") -> None:
-        """nav_msgs/Path of a whole trajectory, stamped with its last pose."""
+    def path(
+        self, topic: str, trajectory: Trajectory, frame: str = "map", *, stamp_ns: int | None = None
+    ) -> None:
+        """nav_msgs/Path of a whole trajectory, stamped with its first pose, so that it is seen all along.
+
+        stamp_ns : another stamp, for a path that was driven at another time.
+        """
         if not len(trajectory):
             return
-        last_ns = int(trajectory.stamps_ns[-1])
-        cdr = Cdr().header(last_ns, frame).put("I", len(trajectory))
-        for stamp_ns, T_map_base in zip(trajectory.stamps_ns, trajectory.T_map_base, strict=True):
-            cdr.header(int(stamp_ns), frame).pose(T_map_base)
-        self._add(topic, "nav_msgs/msg/Path", last_ns, cdr)
+        at_ns = int(trajectory.stamps_ns[0]) if stamp_ns is None else stamp_ns
+        cdr = Cdr().header(at_ns, frame).put("I", len(trajectory))
+        for pose_ns, T_map_base in zip(trajectory.stamps_ns, trajectory.T_map_base, strict=True):
+            cdr.header(int(pose_ns), frame).pose(T_map_base)
+        self._add(topic, "nav_msgs/msg/Path", at_ns, cdr)
 
     def pose_with_covariance(
         self, topic: str, stamp_ns: int, pose: SE2, covariance: ArrayLike, frame: str = "map"
@@ -178,6 +200,21 @@ class LogWriter:
         cdr = Cdr().header(stamp_ns, frame).put("i", seconds).put("I", rest)
         cdr.put("f", grid.resolution_m).put("I", width, height).pose(origin).array(grid.cells.reshape(-1))
         self._add(topic, "nav_msgs/msg/OccupancyGrid", stamp_ns, cdr)
+
+    def markers(self, topic: str, stamp_ns: int, markers: Sequence[Marker], frame: str = "map") -> None:
+        """visualization_msgs/MarkerArray, of the layout since ROS 2 Humble; they stay until replaced."""
+        cdr = Cdr().put("I", len(markers))
+        for number, marker in enumerate(markers):
+            points = np.asarray(marker.points_m, np.float64).reshape(-1, 3)
+            size = (marker.size_m, marker.size_m, marker.size_m)
+            cdr.header(stamp_ns, frame).text(marker.name)
+            cdr.put("i", number, _MARKER_TYPES[marker.kind], 0).pose(np.eye(4)).put("d", *size)
+            cdr.put("f", *marker.color).put("i", 0).put("I", 0).put("?", False)
+            cdr.put("I", len(points)).array(points.reshape(-1), counted=False)
+            cdr.put("I", 0).text("")  # colours of single points, texture
+            cdr.header(0, "").text("").put("I", 0, 0)  # the texture's image, its coordinates
+            cdr.text("").text("").text("").put("I", 0).put("?", False)  # text, mesh, its file
+        self._add(topic, "visualization_msgs/msg/MarkerArray", stamp_ns, cdr)
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
         """An MCAP metadata record: the configuration, the digest of the input, and the like."""

@@ -75,6 +75,20 @@ DEFINITIONS: dict[str, str] = dict(
             "float64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\n"
             "sensor_msgs/RegionOfInterest roi",
         ),
+        ("std_msgs/ColorRGBA", "float32 r\nfloat32 g\nfloat32 b\nfloat32 a"),
+        ("builtin_interfaces/Duration", "int32 sec\nuint32 nanosec"),
+        ("visualization_msgs/UVCoordinate", "float32 u\nfloat32 v"),
+        ("visualization_msgs/MeshFile", "string filename\nuint8[] data"),
+        (
+            "visualization_msgs/Marker",
+            "std_msgs/Header header\nstring ns\nint32 id\nint32 type\nint32 action\ngeometry_msgs/Pose pose\n"
+            "geometry_msgs/Vector3 scale\nstd_msgs/ColorRGBA color\nbuiltin_interfaces/Duration lifetime\n"
+            "bool frame_locked\ngeometry_msgs/Point[] points\nstd_msgs/ColorRGBA[] colors\n"
+            "string texture_resource\nsensor_msgs/CompressedImage texture\n"
+            "visualization_msgs/UVCoordinate[] uv_coordinates\nstring text\nstring mesh_resource\n"
+            "visualization_msgs/MeshFile mesh_file\nbool mesh_use_embedded_materials",
+        ),
+        ("visualization_msgs/MarkerArray", "visualization_msgs/Marker[] markers"),
     ]
 )
 

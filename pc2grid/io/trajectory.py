@@ -7,6 +7,7 @@ KITTI: the first three rows of the pose, 12 numbers per line, no time.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from pc2grid.errors import TrajectoryFileError
 from pc2grid.geometry import F64, pose_from_xyz_quat, quat_xyzw_from_pose
 from pc2grid.io.atomic import replace_file
 from pc2grid.model import Trajectory
+
+TrajectoryFormat = Literal["tum", "kitti"]
 
 
 def stamp_ns_from_text(text: str) -> int:
@@ -121,6 +124,18 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     with replace_file(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
         for T_map_base in trajectory.T_map_base:
             out.write(" ".join(f"{v:.9e}" for v in T_map_base[:3].ravel()) + "\n")
+
+
+def write_trajectory(path: str | Path, trajectory: Trajectory, kind: TrajectoryFormat | None = None) -> None:
+    """Write a file of the given kind; without one KITTI for the suffix `.kitti`, else TUM, which has times.
+
+    >>> write_trajectory("way.kitti", read_tum("tuesday.tum"))
+    >>> read_kitti("way.kitti").shape[1:]
+    (4, 4)
+    """
+    if kind is None:
+        kind = "kitti" if Path(path).suffix.lower() == ".kitti" else "tum"
+    (write_kitti if kind == "kitti" else write_tum)(path, trajectory)
 
 
 def _lines(path: str | Path) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,19 +12,39 @@ from pc2grid_cli import console
 from pc2grid_cli.settings import Force
 
 if TYPE_CHECKING:
+    from pc2grid.model import Trajectory
     from signature.database import SubmapDatabase
 
 
+class TrajectoryKind(str, enum.Enum):
+    """Formats of trajectories."""
+
+    tum = "tum"
+    kitti = "kitti"
+
+
 def export_command(
-    database: Annotated[Path, typer.Argument(metavar="BUILDING.submaps", help="the database")],
+    database: Annotated[str, typer.Argument(metavar="BUILDING.submaps", help="the database")],
     map_: Annotated[
         Path | None, typer.Option("--map", metavar="STEM", help="STEM.yaml and STEM.pgm for nav2")
     ] = None,
     trajectory: Annotated[
         Path | None, typer.Option("--trajectory", metavar="OUT.tum", help="poses of the base, for evo")
     ] = None,
+    format_: Annotated[
+        TrajectoryKind | None,
+        typer.Option("--format", help="of the trajectory; default: kitti for OUT.kitti, else tum"),
+    ] = None,
+    cloud: Annotated[
+        Path | None,
+        typer.Option("--cloud", metavar="OUT.ply|.pcd", help="the map's walls as points at z = 0"),
+    ] = None,
+    graph: Annotated[
+        Path | None,
+        typer.Option("--graph", metavar="OUT.graphml|.json", help="junctions, ends, and the ways between"),
+    ] = None,
     mcap: Annotated[
-        Path | None, typer.Option("--mcap", metavar="OUT.mcap", help="map and path for Foxglove")
+        Path | None, typer.Option("--mcap", metavar="OUT.mcap", help="map, path, submaps for Foxglove")
     ] = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="OUT.png", help="a picture of the map")
@@ -42,67 +63,76 @@ def export_command(
     from pc2grid.io.atomic import refuse_existing
     from signature.database import open_database
 
-    targets = [path for path in (trajectory, mcap, plot, report) if path is not None]
+    of_session = [path for path in (trajectory, cloud, graph, mcap, plot) if path is not None]
     if map_ is not None:
-        targets += [map_.with_name(map_.name + ".yaml"), map_.with_name(map_.name + ".pgm")]
+        of_session += [map_.with_name(map_.name + ".yaml"), map_.with_name(map_.name + ".pgm")]
+    targets = of_session + ([report] if report is not None else [])
     if not targets:
         raise ConfigError(
-            "nothing to export", hint="name at least one of --map, --trajectory, --mcap, --plot, --report"
+            "nothing to export",
+            hint="name at least one of --map, --trajectory, --cloud, --graph, --mcap, --plot, --report",
         )
     for path in targets:
         refuse_existing(path, force)
     with open_database(database) as opened:
         names = [info.name for info in opened.sessions()]
-        if targets != [report] and session is None and len(names) != 1:
+        if of_session and session is None and len(names) != 1:
             there = ", ".join(names) or "none"
             raise DatabaseError(
                 f"{database}: holds {len(names)} sessions: {there}", hint="choose one with --session"
             )
+        name = session or (names[0] if names else "")
+        # What the session cannot give is refused before anything is written.
+        poses = _poses(opened, name) if trajectory is not None else None
+        if map_ is not None:
+            from pc2grid.io.nav2_map import save_map
+
+            save_map(opened.grid(name), map_)
+        if trajectory is not None and poses is not None:
+            from pc2grid.io.trajectory import write_trajectory
+
+            write_trajectory(trajectory, poses, None if format_ is None else format_.value)
+        if cloud is not None:
+            _write_cloud(cloud, opened, name)
+        if graph is not None:
+            from pc2grid.io.graph_out import write_graph
+            from pc2grid.partition import junction_graph
+
+            write_graph(graph, junction_graph(opened.grid(name), opened.config().partition))
+        if mcap is not None:
+            from pc2grid_cli.foxglove import write_session
+
+            write_session(mcap, opened, name, force)
+        if plot is not None:
+            from pc2grid_cli.picture import draw_session
+
+            draw_session(plot, opened, name)
         if report is not None:
             from pc2grid_cli.report import write_report
 
             write_report(report, opened)
-        if targets != [report]:
-            _export_session(opened, session or names[0], map_, trajectory, mcap, plot, force)
     for path in targets:
         console.note(f"wrote {path}")
 
 
-def _export_session(
-    database: SubmapDatabase,
-    name: str,
-    map_: Path | None,
-    trajectory: Path | None,
-    mcap: Path | None,
-    plot: Path | None,
-    force: bool,
-) -> None:
-    """One session in the formats of others."""
+def _poses(database: SubmapDatabase, session: str) -> Trajectory:
     from pc2grid.errors import DatabaseError
 
-    grid, poses = database.grid(name), database.trajectory(name)
-    if map_ is not None:
-        from pc2grid.io.nav2_map import save_map
+    poses = database.trajectory(session)
+    if not len(poses):
+        raise DatabaseError(
+            f"{database.location}: session {session!r} is an imported map and has no trajectory"
+        )
+    return poses
 
-        save_map(grid, map_)
-    if trajectory is not None:
-        if not len(poses):
-            raise DatabaseError(
-                f"{database.location}: session {name!r} is an imported map and has no trajectory"
-            )
-        from pc2grid.io.trajectory import write_tum
 
-        write_tum(trajectory, poses)
-    if mcap is not None:
-        from pc2grid.io.mcap_out import LogWriter
+def _write_cloud(path: Path, database: SubmapDatabase, session: str) -> None:
+    """A database keeps the map, not the recording's points: one point for each occupied cell."""
+    import numpy as np
 
-        with LogWriter(mcap, force=force) as writer:
-            writer.occupancy_grid("/map", int(poses.stamps_ns[0]) if len(poses) else 0, grid)
-            if len(poses):
-                writer.path("/path", poses)
-            for stamp_ns, T_map_base in zip(poses.stamps_ns, poses.T_map_base, strict=True):
-                writer.tf(int(stamp_ns), "map", "base_link", T_map_base)
-    if plot is not None:
-        from pc2grid_cli.picture import draw_session
+    from pc2grid.io.cloud_out import write_cloud
 
-        draw_session(plot, database, name)
+    grid = database.grid(session)
+    walls = grid.to_point(np.argwhere(grid.occupied))
+    write_cloud(path, np.column_stack((walls, np.zeros(len(walls)))))
+    console.note(f"{path}: {len(walls)} occupied cells at z = 0; a database holds no 3D points")

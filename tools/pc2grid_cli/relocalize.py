@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.answer_files import write_initialpose, write_map_mcap, write_mcap
+from pc2grid_cli.answer_files import write_initialpose
 from pc2grid_cli.finding import find_log, find_map, in_map
 from pc2grid_cli.settings import (
     AsJson,
@@ -93,15 +93,18 @@ def relocalize_command(
         located = in_map(found.poses, answer)
         if located is not None:
             if trajectory is not None:
-                from pc2grid.io.trajectory import write_tum
+                from pc2grid.io.trajectory import write_trajectory
 
-                write_tum(trajectory, located)
+                write_trajectory(trajectory, located)
             if initialpose is not None:
                 write_initialpose(initialpose, answer)
-            if output is not None and found.drawn is not None:
-                write_map_mcap(output, opened, answer, found.drawn, force)
-            elif output is not None:
-                write_mcap(output, opened, answer, located, force)
+            if output is not None:
+                from pc2grid_cli.foxglove import write_answer, write_located_map
+
+                if found.drawn is not None:
+                    write_located_map(output, opened, answer, found.drawn, force)
+                else:
+                    write_answer(output, opened, answer, located, force)
         if plot is not None:
             from pc2grid_cli.picture import draw_answer
 

@@ -1,0 +1,107 @@
+"""Databases and answers as MCAP for Foxglove: `examples/foxglove.json` is a layout that shows them.
+
+Topics: /map, /path, /submaps; for an answer /query_path, /hypotheses, /pose and /initialpose too, and
+map -> odom -> base_link over time. For a map located in another one /query_map.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pc2grid.io.mcap_out import LogWriter, Marker
+
+if TYPE_CHECKING:
+    from pc2grid.geometry import F64
+    from pc2grid.model import OccupancyGrid, Trajectory
+    from signature.answer import Answer
+    from signature.database import SubmapDatabase
+
+# Okabe and Ito's green, grey and purple.
+_GREEN, _GREY, _PURPLE = (0.0, 0.62, 0.45, 1.0), (0.4, 0.4, 0.4, 0.6), (0.8, 0.47, 0.65, 1.0)
+
+
+def write_session(path: Path, database: SubmapDatabase, session: str, force: bool) -> None:
+    """A session's map, path and submaps, and where its robot was when."""
+    poses = database.trajectory(session)
+    with LogWriter(path, force=force) as writer:
+        _write_map(writer, database, session, int(poses.stamps_ns[0]) if len(poses) else 0)
+        if len(poses):
+            writer.path("/path", poses)
+        for stamp_ns, T_map_base in zip(poses.stamps_ns, poses.T_map_base, strict=True):
+            writer.tf(int(stamp_ns), "map", "base_link", T_map_base)
+
+
+def write_answer(
+    path: Path, database: SubmapDatabase, answer: Answer, located: Trajectory, force: bool
+) -> None:
+    """A located recording in the map: `located` are its poses there."""
+    assert answer.session is not None
+    assert answer.T_map_base is not None
+    assert answer.T_map_odom is not None
+    assert answer.covariance is not None
+    first, last = int(located.stamps_ns[0]), int(located.stamps_ns[-1])
+    with LogWriter(path, force=force) as writer:
+        _write_map(writer, database, answer.session, first)
+        way = database.trajectory(answer.session)
+        if len(way):
+            writer.path("/path", way, stamp_ns=first)
+        writer.tf(first, "map", "odom", answer.T_map_odom.lift())
+        writer.path("/query_path", located, stamp_ns=first)
+        T_odom_map = answer.T_map_odom.inverse().lift()
+        for stamp_ns, T_map_base in zip(located.stamps_ns, located.T_map_base, strict=True):
+            writer.tf(int(stamp_ns), "odom", "base_link", T_odom_map @ T_map_base)
+        writer.markers("/hypotheses", last, [_hypotheses(answer)])
+        for topic in ("/pose", "/initialpose"):
+            writer.pose_with_covariance(topic, last, answer.T_map_base, answer.covariance)
+
+
+def write_located_map(
+    path: Path, database: SubmapDatabase, answer: Answer, query: OccupancyGrid, force: bool
+) -> None:
+    """A map that was located in another one: both grids, and map -> query_map between them."""
+    assert answer.session is not None
+    assert answer.T_map_odom is not None
+    assert answer.covariance is not None
+    with LogWriter(path, force=force) as writer:
+        _write_map(writer, database, answer.session, 0)
+        writer.occupancy_grid("/query_map", 0, query, frame="query_map")
+        writer.tf_static(0, "map", "query_map", answer.T_map_odom.lift())
+        writer.markers("/hypotheses", 0, [_hypotheses(answer)])
+        writer.pose_with_covariance("/pose", 0, answer.T_map_odom, answer.covariance)
+
+
+def _write_map(writer: LogWriter, database: SubmapDatabase, session: str, stamp_ns: int) -> None:
+    from pc2grid.partition import junction_graph
+
+    grid = database.grid(session)
+    writer.occupancy_grid("/map", stamp_ns, grid)
+    table = database.signatures()
+    index = [info.name for info in database.sessions()].index(session)
+    graph = junction_graph(grid, database.config().partition)
+    ways = [graph.nodes[node]["center_m"] for edge in graph.edges for node in edge]
+    centers = Marker(
+        name="submaps",
+        kind="spheres",
+        points_m=_lift(table.center_m[table.session_index == index]),
+        size_m=0.25,
+        color=_GREEN,
+    )
+    lines = Marker(name="ways", kind="lines", points_m=_lift(ways), size_m=0.06, color=_GREY)
+    writer.markers("/submaps", stamp_ns, [centers, lines])
+
+
+def _hypotheses(answer: Answer) -> Marker:
+    """Where else it could have been, the best first."""
+    poses = [hypothesis.fit.T_map_query @ answer.T_odom_base for hypothesis in answer.hypotheses]
+    same = [answer.sessions[h.session_index] == answer.session for h in answer.hypotheses]
+    points = [(pose.x, pose.y) for pose, here in zip(poses, same, strict=True) if here]
+    return Marker(name="hypotheses", kind="spheres", points_m=_lift(points), size_m=0.4, color=_PURPLE)
+
+
+def _lift(points_m: F64 | list[tuple[float, float]]) -> F64:
+    """Points (N, 2) as (N, 3) at z = 0."""
+    flat = np.asarray(points_m, np.float64).reshape(-1, 2)
+    return np.column_stack((flat, np.zeros(len(flat))))
