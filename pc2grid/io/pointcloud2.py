@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pc2grid.errors import LimitExceeded, PointCloudError
 from pc2grid.geometry import F64
 from pc2grid.io.messages import PointCloud2
-from pc2grid.model import F32
+from pc2grid.model import F32, I64
 
 # sensor_msgs/PointField; 9 to 11 are PCL's, absent from the definition (ros2/common_interfaces#300).
 _DATATYPES = {
@@ -58,24 +58,36 @@ def decode(cloud: PointCloud2, *, unit: str = "auto", max_points: int = 20_000_0
     Raises PointCloudError if the message contradicts itself, LimitExceeded above `max_points`.
     """
     rows = _rows(cloud, max_points)
-    xyz = _xyz(cloud, rows)
+    xyz, index = _returns(rows)
+    name = _time_field(cloud) if unit != "none" else None
+    offsets: F32 | None = None
+    note: str | None = None
+    if name is not None:
+        values = rows[name].reshape(-1)[index]
+        seconds, note = _offsets(values, cloud.header.stamp_ns, unit, name)
+        if seconds is not None:
+            timed = np.isfinite(seconds)
+            if not timed.all():
+                xyz, seconds = xyz[timed], seconds[timed]
+            offsets = seconds.astype(np.float32)
+    return Points(xyz, offsets, rows.size - len(xyz), note)
+
+
+def _returns(rows: NDArray[Any]) -> tuple[F32 | F64, I64]:
+    """Usable returns (N, 3), and which rows they are (N,); float32 if the message's numbers fit in it."""
+    kinds = [rows.dtype[name] for name in ("x", "y", "z")]
+    if all(kind == np.float32 for kind in kinds):
+        from pc2grid.io.compact import returns_of
+
+        return returns_of(rows["x"], rows["y"], rows["z"])
+    exact = all(np.can_cast(kind, np.float32) for kind in kinds)
+    xyz = np.empty((rows.size, 3), dtype=np.float32 if exact else np.float64)
+    for column, name in enumerate(("x", "y", "z")):
+        xyz[:, column] = rows[name].reshape(-1)
     x, y, z = xyz.T  # by column: a reduction along rows of three is ten times slower
     keep: NDArray[np.bool_] = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
     keep &= (x != 0) | (y != 0) | (z != 0)
-    name = _time_field(cloud) if unit != "none" else None
-    seconds: F64 | None = None
-    note: str | None = None
-    if name is not None:
-        seconds, note = _offsets(rows[name].reshape(-1), cloud.header.stamp_ns, unit, keep, name)
-        if seconds is not None:
-            keep &= np.isfinite(seconds)
-    total = len(xyz)
-    everything = bool(keep.all())
-    points = xyz if everything else xyz[keep]
-    if points.dtype != np.float32:
-        points = points.astype(np.float64)
-    offsets = None if seconds is None else seconds[keep].astype(np.float32)
-    return Points(points, offsets, total - len(points), note)
+    return xyz[keep], np.flatnonzero(keep)
 
 
 def _rows(cloud: PointCloud2, max_points: int) -> NDArray[Any]:
@@ -123,30 +135,18 @@ def _rows(cloud: PointCloud2, max_points: int) -> NDArray[Any]:
     return np.ndarray((height, width), dtype=dtype, buffer=cloud.data, strides=(row_step, step))
 
 
-def _xyz(cloud: PointCloud2, rows: NDArray[Any]) -> F32 | F64:
-    """(N, 3): float32 if that is what the message holds (or fits in), else float64."""
-    formats = [rows.dtype[name] for name in ("x", "y", "z")]
-    exact = all(np.can_cast(f, np.float32) for f in formats)
-    xyz = np.empty((rows.size, 3), dtype=np.float32 if exact else np.float64)
-    for column, name in enumerate(("x", "y", "z")):
-        xyz[:, column] = rows[name].reshape(-1)
-    return xyz
-
-
 def _time_field(cloud: PointCloud2) -> str | None:
     names = {name.lower(): name for name, *_ in cloud.fields}
     return next((names[n] for n in _TIME_FIELDS if n in names), None)
 
 
-def _offsets(
-    values: NDArray[Any], stamp_ns: int, unit: str, keep: NDArray[np.bool_], name: str
-) -> tuple[F64 | None, str | None]:
+def _offsets(values: NDArray[Any], stamp_ns: int, unit: str, name: str) -> tuple[F64 | None, str | None]:
     """Seconds relative to the stamp, and how they were understood; None if all times are the same.
 
     Raises PointCloudError if the unit cannot be told.
     """
     whole = values.dtype.kind in "iu"
-    usable = values[keep] if whole else values[keep & np.isfinite(values)]
+    usable = values if whole else values[np.isfinite(values)]
     if not len(usable):
         return None, None
     first, last = usable.min(), usable.max()
@@ -174,6 +174,5 @@ def _offsets(
             relative = values.astype(np.float64) - stamp / scale
     else:
         note = f"the times in field {name} are of another clock: the first point is taken to be at the stamp"
-        # Wraps round for unsigned types where an unused row lies before the first point: harmless.
         relative = (values - first).astype(np.float64)
     return relative * scale, note
