@@ -25,7 +25,8 @@ _SUBPIXEL = 4  # fractional bits of cv2's polygon corners
 _HIT = 150
 _MISS = -75
 _CLAMP = 500
-_BODY_M = 0.15  # around the origin of the base nothing but the robot has room
+BODY_M = 0.15
+"""Around the origin of the base nothing but the robot has room."""
 
 
 class GridBuilder:
@@ -50,7 +51,7 @@ class GridBuilder:
         low = np.floor(outline.min(axis=0)).astype(np.int64) - 1
         high = np.floor(outline.max(axis=0)).astype(np.int64) + 2
         here = np.floor(np.array([T_map_base.x, T_map_base.y]) / resolution).astype(np.int64)
-        around = math.ceil(_BODY_M / resolution) + 1
+        around = math.ceil(BODY_M / resolution) + 1
         low, high = np.minimum(low, here - around), np.maximum(high, here + around + 1)
         if len(hits):
             low, high = np.minimum(low, hits.min(axis=0)), np.maximum(high, hits.max(axis=0) + 1)
@@ -62,7 +63,7 @@ class GridBuilder:
         cv2.polylines(update, _rims(corners, sweep.free_m), False, 0, shift=_SUBPIXEL)
         update[hits[:, 1] - low[1], hits[:, 0] - low[0]] = _HIT
         # Where the robot is there is nothing else.
-        cv2.circle(update, (here - low).tolist(), round(_BODY_M / resolution), 2 * _MISS, -1)
+        cv2.circle(update, (here - low).tolist(), round(BODY_M / resolution), 2 * _MISS, -1)
         self._add_window(update, int(low[0]), int(low[1]))
 
     def grid(self) -> OccupancyGrid:

@@ -24,13 +24,15 @@ if TYPE_CHECKING:
 class Mapped:
     """One session, mapped as a user would, and what bare KISS-ICP made of the same scans.
 
-    bare : KISS-ICP's poses, each at the end of its scan. loops : how many were closed.
+    loops : how many were closed. T_base_sensor : (4, 4) of the first scan.
+    bare : KISS-ICP's poses, each at the end of its scan.
     map_ms, bare_ms : processor time a scan, for the whole map and for KISS-ICP's register_frame alone.
     """
 
     trajectory: Trajectory
     grid: OccupancyGrid
     loops: int
+    T_base_sensor: F64
     bare: Trajectory
     map_ms: float
     bare_ms: float
@@ -45,6 +47,7 @@ def map_beside_bare(scans: Iterable[Scan], config: Config) -> Mapped:
     bare = BareKissIcp()
     stamps: list[int] = []
     poses: list[F64] = []
+    mounts: list[F64] = []
     outside = spent = 0.0
 
     def tee() -> Iterator[Scan]:
@@ -55,6 +58,8 @@ def map_beside_bare(scans: Iterable[Scan], config: Config) -> Mapped:
             scan = next(source, None)
             if scan is None:
                 return
+            if not mounts:
+                mounts.append(scan.T_base_sensor)
             middle = time.process_time()
             poses.append(bare.register(scan))
             last_s = 0.0 if scan.offsets_s is None or not len(scan.offsets_s) else scan.offsets_s.max()
@@ -73,6 +78,7 @@ def map_beside_bare(scans: Iterable[Scan], config: Config) -> Mapped:
         bare=Trajectory(stamps_ns=np.array(stamps, np.int64), T_map_base=np.array(poses).reshape(-1, 4, 4)),
         grid=grid,
         loops=len(loops),
+        T_base_sensor=mounts[0] if mounts else np.eye(4),
         map_ms=1000 * total / count,
         bare_ms=1000 * spent / count,
     )

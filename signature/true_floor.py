@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pc2grid.config import ProjectionConfig
 from pc2grid.geometry import F64, SE2
 from pc2grid.model import F32, FREE, I64, OCCUPIED, UNKNOWN, BoolGrid, OccupancyGrid
+from pc2grid.projection import BODY_M
 from pc2grid.simulate.passage import outline_mask
 from pc2grid.visibility import isovist
 
@@ -43,7 +44,8 @@ class GridQuality:
 
 
 class TrueFloor:
-    """What a simulated drive could know: the solid cells in the height band, and all that came in sight.
+    """What a simulated drive could know: the solid cells in the height band, and all that came in sight
+    or that the robot stood on.
 
     Fed with every scan by `look`. A laser's world is what stands at its height; for the others it is what
     reaches into the band, and only walls block their sight, for they look over and under things.
@@ -108,6 +110,8 @@ class TrueFloor:
         pixels = (corners - self._open.origin_m) / self._open.resolution_m - 0.5
         mask = np.zeros(self._seen.shape, np.uint8)
         cv2.fillPoly(mask, [np.rint(pixels * 16).astype(np.int32)], 1, shift=4)
+        here = self._open.to_cell(np.array([(pose.x, pose.y)]))[0, ::-1]
+        cv2.circle(mask, here.tolist(), round(BODY_M / self._open.resolution_m), 1, -1)
         self._seen |= mask.astype(bool)
 
     def judge(self, grid: OccupancyGrid, T_plan_map: SE2) -> GridQuality:

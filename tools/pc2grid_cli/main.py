@@ -10,6 +10,7 @@ import typer
 
 import pc2grid
 from pc2grid_cli import console
+from pc2grid_cli.compare_maps import compare_maps_command
 from pc2grid_cli.compare_paper import compare_paper_command
 from pc2grid_cli.compare_sensors import compare_sensors_command
 from pc2grid_cli.config import dump_command
@@ -61,6 +62,7 @@ app.command("export")(export_command)
 compare = typer.Typer(help="The paper's tables, sensors against sensors.", no_args_is_help=True)
 compare.command("paper")(compare_paper_command)
 compare.command("sensors")(compare_sensors_command)
+compare.command("maps")(compare_maps_command)
 app.add_typer(compare, name="compare")
 
 db = typer.Typer(help="Look into databases, check, merge and copy them.", no_args_is_help=True)

@@ -1,0 +1,251 @@
+"""`pc2grid compare maps`: maps against the truth, beside bare KISS-ICP on the same scans."""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from signature.map_quality import Mapped
+
+Row = dict[str, Any]
+
+
+def compare_maps_command(
+    plans: Annotated[
+        list[Path] | None, typer.Argument(metavar="[MAP.yaml]...", help="floor plans to drive through")
+    ] = None,
+    log: Annotated[list[Path] | None, typer.Option("--log", help="a recording, with its --truth")] = None,
+    truth: Annotated[
+        list[Path] | None,
+        typer.Option("--truth", help="of the --log of the same rank: a TUM file, or *.relations"),
+    ] = None,
+    sensors: Annotated[str, typer.Option(help="which to simulate")] = "lidar,laser,depth",
+    length: Annotated[float, typer.Option(min=1.0, metavar="M", help="metres to drive")] = 200.0,
+    seeds: Annotated[str, typer.Option(help="of the simulated sessions, for example 1,2,3")] = "1",
+    no_odometry: Annotated[bool, typer.Option("--no-odometry", help="leave odometry out of them")] = False,
+    out: Annotated[Path, typer.Option("--out", help="folder for results; run again to go on")] = Path(
+        "map-quality"
+    ),
+    jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="processes [one a core]")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print one JSON document, not tables")] = False,
+) -> None:
+    """How good are the maps? Trajectory, health and cells of each against the truth.
+
+    Example: pc2grid compare maps fr079.yaml intel.yaml --log hall.mcap --truth hall.tum
+    """
+    from pc2grid.errors import ConfigError, OutputError
+    from pc2grid_cli.console import print_json, progress
+
+    logs, truths = log or [], truth or []
+    tasks = _simulated_tasks(plans or [], sensors, length, seeds, not no_odometry)
+    if len(logs) != len(truths):
+        raise ConfigError(
+            f"{len(logs)} times --log, but {len(truths)} times --truth", hint="give each log its truth"
+        )
+    tasks += [{"log": str(a), "truth": str(b)} for a, b in zip(logs, truths, strict=True)]
+    if not tasks:
+        raise ConfigError("nothing to compare", hint="name floor plans, or a --log with its --truth")
+    for task in tasks:
+        for file in (Path(task[key]) for key in ("plan", "log", "truth") if key in task):
+            if not file.exists():
+                raise ConfigError(f"{file}: no such file")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{out}: {error.strerror}", hint="choose another --out") from error
+    waiting = [task for task in tasks if not _result(task, out).exists()]
+    with progress("map") as advance:
+        for done, _ in enumerate(_run_all(waiting, str(out), jobs or os.cpu_count() or 1), start=1):
+            advance(done / len(waiting))
+    rows = [json.loads(_result(task, out).read_text()) for task in tasks]
+    if as_json:
+        print_json({"schema_version": 1, "rows": rows})
+        return
+    for title, columns, chosen in (
+        ("Simulated", _SIMULATED, [r for r in rows if "plan" in r]),
+        ("Recorded", _RECORDED, [r for r in rows if "log" in r]),
+    ):
+        if chosen:
+            print("\n".join((f"\n{title}\n", *_table(columns, chosen))))
+
+
+def _simulated_tasks(
+    plans: list[Path], sensors: str, length_m: float, seeds: str, odometry: bool
+) -> list[dict[str, Any]]:
+    """One task a plan, sensor and seed. Raises ConfigError for what cannot be read."""
+    from pc2grid.errors import ConfigError
+    from signature.sensor_matrix import SENSORS
+
+    kinds = [name.strip() for name in sensors.split(",")]
+    unknown = [name for name in kinds if name not in SENSORS]
+    if unknown:
+        raise ConfigError(f"--sensors: no sensor {unknown[0]!r}", hint=f"known are {', '.join(SENSORS)}")
+    try:
+        numbers = [int(text) for text in seeds.split(",")]
+    except ValueError:
+        raise ConfigError(f"--seeds: expected whole numbers, found {seeds!r}") from None
+    return [
+        {"plan": str(plan), "sensor": kind, "length_m": length_m, "seed": seed, "odometry": odometry}
+        for plan in plans
+        for kind in kinds
+        for seed in numbers
+    ]
+
+
+def _result(task: dict[str, Any], out: str | Path) -> Path:
+    if "log" in task:
+        return Path(out) / f"{Path(task['log']).stem}.{Path(task['truth']).suffix[1:]}.json"
+    wheels = "odometry" if task["odometry"] else "alone"
+    name = f"{Path(task['plan']).stem}.{task['sensor']}.{task['length_m']:g}m.{task['seed']}.{wheels}.json"
+    return Path(out) / name
+
+
+def _run_all(tasks: list[dict[str, Any]], out: str, jobs: int) -> Iterator[None]:
+    """Yields once for each task that is done; in processes of their own if there is more than one job."""
+    if jobs == 1 or len(tasks) < 2:
+        for task in tasks:
+            yield _run(task, out)
+        return
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(_run, task, out) for task in tasks]):
+            yield future.result()
+
+
+def _run(task: dict[str, Any], out: str) -> None:
+    """Map one session or log, and keep what came of it."""
+    from pc2grid.io.atomic import replace_file
+
+    row = _of_log(task) if "log" in task else _of_plan(task)
+    with replace_file(_result(task, out)) as draft:
+        draft.write_text(json.dumps({**task, **row}, indent=1))
+
+
+def _of_plan(task: dict[str, Any]) -> Row:
+    from dataclasses import asdict
+
+    from pc2grid.io.nav2_map import load_map
+    from pc2grid.simulate import SimulationConfig, prepare_session
+    from pc2grid.simulate.config import OdometryConfig
+    from signature.config import Config
+    from signature.map_quality import map_simulated
+    from signature.trajectory_error import trajectory_error
+
+    simulation = SimulationConfig(
+        length_m=task["length_m"], seed=task["seed"], odometry=OdometryConfig(enabled=task["odometry"])
+    )
+    session = prepare_session(sensor=task["sensor"], grid=load_map(Path(task["plan"])), config=simulation)
+    mapped, truth, quality = map_simulated(session, Config())
+    return {
+        **_health(mapped),
+        "ours": asdict(trajectory_error(mapped.trajectory, truth)),
+        "bare": asdict(trajectory_error(mapped.bare, truth)),
+        "grid": asdict(quality),
+    }
+
+
+def _of_log(task: dict[str, Any]) -> Row:
+    from dataclasses import asdict
+
+    from pc2grid.io import open_log
+    from pc2grid.io.trajectory import read_tum
+    from signature.config import Config
+    from signature.map_quality import map_beside_bare
+    from signature.relations import read_relations, relation_error
+    from signature.trajectory_error import trajectory_error
+
+    config = Config()
+    truth = Path(task["truth"])
+    with open_log(Path(task["log"]), config.read) as log:
+        mapped = map_beside_bare(log.scans(), config)
+        row = {**_health(mapped), "sensor": log.choose().sensor}
+    if truth.suffix != ".relations":
+        true = read_tum(truth)
+        return {
+            **row,
+            "ours": asdict(trajectory_error(mapped.trajectory, true)),
+            "bare": asdict(trajectory_error(mapped.bare, true)),
+        }
+    relations = read_relations(truth)
+    x, y = (float(v) for v in mapped.T_base_sensor[:2, 3])
+    return {
+        **row,
+        "ours": asdict(relation_error(mapped.trajectory, relations, base_to_reference_m=(x, y))),
+        "bare": asdict(relation_error(mapped.bare, relations, base_to_reference_m=(x, y))),
+    }
+
+
+def _health(mapped: Mapped) -> Row:
+    from pc2grid.model import Health
+
+    return {
+        "scans": len(mapped.trajectory),
+        "lost": mapped.share(Health.LOST),
+        "degenerate": mapped.share(Health.DEGENERATE),
+        "loops": mapped.loops,
+        "map_ms": mapped.map_ms,
+        "bare_ms": mapped.bare_ms,
+    }
+
+
+def _metres(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3f}"
+
+
+def _percent(value: float) -> str:
+    return "-" if math.isnan(value) else f"{100 * value:.2f}"
+
+
+def _errors(row: Row, who: str) -> str:
+    found = row[who]
+    if "ate_m" in found:
+        return f"{_metres(found['ate_m'])} m"
+    return f"{_metres(found['translation_m'])} m, {found['rotation_deg']:.2f} deg"
+
+
+_COMMON: list[tuple[str, Callable[[Row], str]]] = [
+    ("lost, %", lambda r: _percent(r["lost"])),
+    ("degenerate, %", lambda r: _percent(r["degenerate"])),
+    ("loops", lambda r: str(r["loops"])),
+    ("time / KISS-ICP's", lambda r: f"{r['map_ms'] / r['bare_ms']:.2f}"),
+]
+_SIMULATED: list[tuple[str, Callable[[Row], str]]] = [
+    ("plan", lambda r: Path(r["plan"]).stem),
+    ("sensor", lambda r: r["sensor"]),
+    ("seed", lambda r: str(r["seed"])),
+    ("odometry", lambda r: "yes" if r["odometry"] else "no"),
+    ("ATE, m", lambda r: _metres(r["ours"]["ate_m"])),
+    ("RPE, m/m", lambda r: _metres(r["ours"]["rpe_m"])),
+    ("ATE of bare KISS-ICP", lambda r: _metres(r["bare"]["ate_m"])),
+    ("occupied right, %", lambda r: _percent(r["grid"]["occupied_right"])),
+    ("walls found, %", lambda r: _percent(r["grid"]["walls_found"])),
+    ("free wrong, %", lambda r: _percent(r["grid"]["free_wrong"])),
+    ("unseen free, %", lambda r: _percent(r["grid"]["unseen_free"])),
+    *_COMMON,
+]
+_RECORDED: list[tuple[str, Callable[[Row], str]]] = [
+    ("log", lambda r: Path(r["log"]).stem),
+    ("sensor", lambda r: r["sensor"]),
+    ("truth", lambda r: Path(r["truth"]).name),
+    ("error", lambda r: _errors(r, "ours")),
+    ("error of bare KISS-ICP", lambda r: _errors(r, "bare")),
+    *_COMMON,
+]
+
+
+def _table(columns: list[tuple[str, Callable[[Row], str]]], rows: list[Row]) -> list[str]:
+    """Lines of a Markdown table, columns aligned."""
+    cells = [[name for name, _ in columns], *([show(row) for _, show in columns] for row in rows)]
+    widths = [max(len(line[k]) for line in cells) for k in range(len(columns))]
+    lines = [
+        "| " + " | ".join(t.ljust(w) for t, w in zip(line, widths, strict=True)) + " |" for line in cells
+    ]
+    return [lines[0], "|" + "|".join("-" * (w + 2) for w in widths) + "|", *lines[1:]]
