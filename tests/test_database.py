@@ -1,4 +1,4 @@
-"""The submap database: what goes in comes out, whole or not at all, and damage is found."""
+"""The submap database: what goes in comes out, whole or not at all, on every engine; damage is found."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import sqlite3
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +28,14 @@ from pc2grid.errors import (
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
 from signature.config import Config
-from signature.database import Provenance, create_database, open_database
+from signature.database import Label, Provenance, create_database, open_database, transfer
 from signature.database.rewrite import hold
 from signature.database.sqlite import store
+from signature.database.transfer import store as store_anywhere
 from signature.database.upkeep import check, copy, merge
 from signature.describe import Signature
+from signature.similarity import distances
+from tests import postgresql
 
 
 def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Config | None = None):
@@ -47,7 +51,7 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
     parts = tuple(
         Submap(
             submap_id=i,
-            center_m=(0.1 * i + 1 / 3, -0.2 * i),
+            center_m=(0.1 * i + 1 / 3, 0.7 - 0.2 * i),
             radius_m=0.4,
             grid=grid.crop((0.1 * i, 1.0), 0.4),
         )
@@ -117,16 +121,113 @@ def path(tmp_path: Path) -> Path:
     return file
 
 
-def test_what_goes_in_comes_out(path: Path) -> None:
-    with open_database(path) as database:
+# --- what every engine promises -----------------------------------------------------------------------
+
+
+@pytest.fixture(params=["sqlite", "postgres"])
+def empty(request, tmp_path: Path) -> str | Path:
+    """Where there is no database yet, on each engine."""
+    return tmp_path / "x.submaps" if request.param == "sqlite" else postgresql.new_database()
+
+
+@pytest.fixture
+def filled(empty: str | Path) -> str | Path:
+    store_anywhere(empty, [make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)], keep=False)
+    return empty
+
+
+def everything(place: str | Path) -> str:
+    with open_database(place) as database:
+        return _everything(database)
+
+
+def test_what_goes_in_comes_out(filled: str | Path) -> None:
+    with open_database(filled) as database:
         assert [info.name for info in database.sessions()] == ["monday", "tuesday"]
         assert_holds(database, make_entry("monday", 0))
         assert_holds(database, make_entry("tuesday", 1, submaps=5))
         assert database.check() == ()
+        assert database.leave_out_damaged() == ()
+        assert list(database.signatures("tuesday").session_index) == [1] * 5
         with pytest.raises(DatabaseError, match="no session 'sunday'"):
             database.grid("sunday")
         with pytest.raises(DatabaseError, match="has no submap 99"):
             database.submap("monday", 99)
+        with pytest.raises(DatabaseError, match="reading only"):
+            database.add(*make_entry("wednesday", 2))
+
+
+def test_nothing_there_is_no_database(empty: str | Path) -> None:
+    with pytest.raises(NotADatabase, match=r"no such database|no submap database yet") as caught:
+        open_database(empty)
+    assert "pc2grid convert" in str(caught.value)
+
+
+def test_a_handle_sees_what_was_there_when_it_was_opened(empty: str | Path) -> None:
+    with create_database(empty) as first:
+        assert (first.sessions(), len(first.signatures()), first.config()) == ((), 0, Config())
+        first.add(*make_entry("monday", 0))
+        with open_database(empty) as reader:
+            first.add(*make_entry("tuesday", 1, submaps=5))
+            assert [info.name for info in reader.sessions()] == ["monday"]
+            assert len(reader.signatures()) == 3
+        assert [info.name for info in first.sessions()] == ["monday", "tuesday"]
+        assert_holds(first, make_entry("tuesday", 1, submaps=5))
+
+
+def test_nearest_are_the_best_of_eq_6_and_filters_hold(empty: str | Path) -> None:
+    labels = {"a": Label(building="north", floor="1"), "b": Label(building="north"), "c": Label()}
+    entries = []
+    for seed, (name, label) in enumerate(labels.items()):
+        session_map, signatures, origin = make_entry(name, seed, submaps=30)
+        entries.append((session_map, signatures, replace(origin, label=label)))
+    store_anywhere(empty, entries, keep=False)
+    query = make_entry("q", 99)[1][0]
+    with open_database(empty) as database:
+        table = database.signatures()
+        scores = distances(query, table)
+        best = [
+            ("abc"[table.session_index[row]], table.submap_id[row], scores[row])
+            for row in np.argsort(scores, kind="stable")
+        ]
+        filters = [
+            {},
+            {"building": "north"},
+            {"floor": "1"},
+            {"building": "north", "floor": ""},
+            {"session": "c"},
+        ]
+        for wanted, sessions in zip(filters, ["abc", "ab", "a", "b", "c"], strict=True):
+            found = database.nearest(query, 7, **wanted)
+            expected = [item for item in best if item[0] in sessions][:7]
+            assert [(n.session, n.submap_id, n.score) for n in found] == expected, wanted
+        assert database.nearest(query, 5, building="south") == ()
+        assert found[0].center_m == database.submap("c", found[0].submap_id).center_m
+
+
+@pytest.mark.parametrize("other", ["sqlite", "postgres"])
+def test_copy_and_merge_between_engines(filled: str | Path, other: str, tmp_path: Path) -> None:
+    targets = (
+        (tmp_path / "y.submaps", tmp_path / "z.submaps")
+        if other == "sqlite"
+        else (postgresql.new_database(), postgresql.new_database())
+    )
+    assert transfer.copy(filled, targets[0]) == ()
+    assert transfer.check(targets[0]) == ()
+    assert everything(targets[0]) == everything(filled)
+    with pytest.raises(OutputError, match="exists"):
+        transfer.copy(filled, targets[0])
+    third = tmp_path / "third.submaps"
+    store(third, [make_entry("tuesday", 1, submaps=5), make_entry("friday", 5)], keep=False)
+    assert transfer.merge([filled, third], targets[1]) == 3
+    with open_database(targets[1]) as database:
+        assert [info.name for info in database.sessions()] == ["monday", "tuesday", "friday"]
+        assert_holds(database, make_entry("friday", 5))
+    store(third, [make_entry("monday", 9)], keep=False)
+    with pytest.raises(DatabaseError, match="'monday'"):
+        transfer.merge([filled, third], targets[1], force=True)
+    with open_database(targets[1]) as database:
+        assert len(database.sessions()) == 3
 
 
 def test_queries_leave_bytes_and_folder_as_they_are(path: Path) -> None:
@@ -159,10 +260,11 @@ def test_same_sessions_give_same_bytes(path: Path, tmp_path: Path) -> None:
             assert_holds(database, make_entry("tuesday", 1, submaps=5))
 
 
-def test_adding_again_changes_nothing_and_another_of_the_name_needs_force(path: Path) -> None:
-    before = path.read_bytes()
-    with open_database(path, writable=True) as database:
+def test_adding_again_changes_nothing_and_another_of_the_name_needs_force(filled: str | Path) -> None:
+    before = everything(filled)
+    with open_database(filled, writable=True) as database:
         database.add(*make_entry("monday", 0))
+        assert _everything(database) == before
         assert len(database.sessions()) == 2
         with pytest.raises(DatabaseError, match="another session named 'monday'") as caught:
             database.add(*make_entry("monday", 7))
@@ -171,29 +273,40 @@ def test_adding_again_changes_nothing_and_another_of_the_name_needs_force(path: 
         database.add(*make_entry("monday", 7), force=True)
         assert_holds(database, make_entry("monday", 7))
         assert_holds(database, make_entry("tuesday", 1, submaps=5))
+        assert [info.name for info in database.sessions()] == ["monday", "tuesday"]
         assert database.check() == ()
-    assert path.read_bytes() != before
 
 
-def test_create_refuses_to_overwrite_and_leaves_the_file(path: Path) -> None:
-    before = path.read_bytes()
+def test_create_refuses_to_overwrite_and_leaves_what_is_there(filled: str | Path) -> None:
+    before = everything(filled)
     with pytest.raises(OutputError, match="exists"):
-        create_database(path)
-    assert path.read_bytes() == before
-    with create_database(path, force=True) as database:
+        create_database(filled)
+    assert everything(filled) == before
+    with create_database(filled, force=True) as database:
         assert database.sessions() == ()
         assert len(database.signatures()) == 0
 
 
-def test_sessions_made_with_other_settings_are_not_mixed(path: Path) -> None:
+def test_sessions_made_with_other_settings_are_not_mixed(filled: str | Path) -> None:
     config = Config.model_validate({"signature": {"boundary_bin_m": 0.3}})
-    before = path.read_bytes()
+    before = everything(filled)
     with (
-        open_database(path, writable=True) as database,
+        open_database(filled, writable=True) as database,
         pytest.raises(DatabaseError, match=r"signature\.boundary_bin_m = 0\.2 and with 0\.3"),
     ):
         database.add(*make_entry("wednesday", 3, config=config))
-    assert path.read_bytes() == before
+    assert everything(filled) == before
+
+
+def test_failure_in_the_middle_leaves_what_was_there(filled: str | Path) -> None:
+    before = everything(filled)
+    session_map, signatures, origin = make_entry("wednesday", 3)
+    for keep in (True, False):
+        with pytest.raises(ValueError, match="3 submaps but 2 signatures"):
+            store_anywhere(
+                filled, [make_entry("friday", 4), (session_map, signatures[:-1], origin)], keep=keep
+            )
+        assert everything(filled) == before
 
 
 def test_failure_in_the_middle_leaves_the_old_file_and_no_litter(path: Path) -> None:

@@ -21,6 +21,9 @@ class Label:
     building: str | None = None
     floor: str | None = None
 
+    def __str__(self) -> str:
+        return ", ".join(word for word in (self.building, self.floor) if word) or "no label"
+
     def contradicts(self, other: Label) -> bool:
         """Whether the two name different buildings, or different floors; what was not said rules nothing
         out."""
@@ -94,6 +97,23 @@ class Problem:
     what: str
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Neighbour:
+    """A submap that looks like a query.
+
+    center_m : (x, y) in the map frame of its session. score : Eq. 6, smaller is more alike.
+    """
+
+    session: str
+    submap_id: int
+    center_m: tuple[float, float]
+    score: float
+
+
+Entry = tuple[SessionMap, "Sequence[Signature]", Provenance]
+"""All there is to store of one session."""
+
+
 class SubmapDatabase(Protocol):
     """Sessions and their submaps. Reading never changes it; `add` changes all or nothing.
 
@@ -113,8 +133,20 @@ class SubmapDatabase(Protocol):
         """The configuration that its sessions share (of the first); the default if there is none."""
         ...
 
-    def signatures(self) -> SignatureTable:
-        """All signatures; `session_index` counts in the order of `sessions()`."""
+    def signatures(self, session: str | None = None) -> SignatureTable:
+        """All signatures, or those of one session; `session_index` counts in the order of `sessions()`."""
+        ...
+
+    def nearest(
+        self,
+        query: Signature,
+        count: int,
+        *,
+        building: str | None = None,
+        floor: str | None = None,
+        session: str | None = None,
+    ) -> tuple[Neighbour, ...]:
+        """The `count` submaps most alike by Eq. 6, best first, of those that the filters let through."""
         ...
 
     def grid(self, session: str) -> OccupancyGrid:
@@ -147,6 +179,13 @@ class SubmapDatabase(Protocol):
 
     def check(self) -> tuple[Problem, ...]:
         """Everything that is wrong with it; empty if sound."""
+        ...
+
+    def leave_out_damaged(self) -> tuple[Problem, ...]:
+        """From now on, do without the sessions that cannot be searched because they are damaged.
+
+        Returns what is wrong with each of them. Raises DatabaseCorrupt if none is left.
+        """
         ...
 
     def close(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -15,7 +15,7 @@ from pc2grid.errors import DatabaseError
 from pc2grid.io.atomic import refuse_existing
 from pc2grid.model import OccupancyGrid, SessionMap, Submap, Trajectory
 from signature.database import rows, schema
-from signature.database.protocol import Problem, Provenance, SessionInfo
+from signature.database.protocol import Entry, Neighbour, Problem, Provenance, SessionInfo
 from signature.database.rewrite import BUSY_TIMEOUT_S, rewrite
 
 if TYPE_CHECKING:
@@ -23,12 +23,10 @@ if TYPE_CHECKING:
     from signature.describe import Signature
     from signature.similarity import SignatureTable
 
-Entry = tuple[SessionMap, "Sequence[Signature]", Provenance]
-
 
 def store(
     path: Path,
-    entries: Sequence[Entry],
+    entries: Iterable[Entry],
     *,
     keep: bool,
     force: bool = False,
@@ -145,14 +143,15 @@ class SqliteDatabase:
         sessions = self.sessions()
         return sessions[0].provenance.config if sessions else Config()
 
-    def signatures(self) -> SignatureTable:
-        """All signatures; `session_index` counts in the order of `sessions()`."""
+    def signatures(self, session: str | None = None) -> SignatureTable:
+        """All signatures, or those of one session; `session_index` counts in the order of `sessions()`."""
         from signature.similarity import SignatureTable
 
         parts: list[dict[str, Any]] = []
         index = {session_id: i for i, session_id in enumerate(self._ids().values())}
+        only = ("1",) if session is None else ("session_id = ?", self._id(session))
         with rows.explained(self._path, "signatures"):
-            for row, sound in rows.select(self._connection, "signature"):
+            for row, sound in rows.select(self._connection, "signature", *only):
                 if row["session_id"] in self._left_out:
                     continue
                 where = f"signatures of session {row['session_id']}"
@@ -166,6 +165,29 @@ class SqliteDatabase:
                 return SignatureTable.of((), np.empty((0, 2)))
             names = ("boundary", "freespace", "symmetry", "session_index", "submap_id", "center_m")
             return SignatureTable(**{name: _joined([part[name] for part in parts]) for name in names})
+
+    def nearest(
+        self,
+        query: Signature,
+        count: int,
+        *,
+        building: str | None = None,
+        floor: str | None = None,
+        session: str | None = None,
+    ) -> tuple[Neighbour, ...]:
+        """The `count` submaps most alike by Eq. 6; see `SubmapDatabase.nearest`."""
+        from signature.database.search import rank
+
+        table, sessions = self.signatures(session), self.sessions()
+        labels = [info.provenance.label for info in sessions]
+        wanted = [
+            (building is None or (label.building or "") == building)
+            and (floor is None or (label.floor or "") == floor)
+            for label in labels
+        ]
+        among = np.asarray(wanted, np.bool_)[table.session_index]
+        names = [info.name for info in sessions]
+        return rank(query, table, names, count, self.config().signature, among)
 
     def grid(self, session: str) -> OccupancyGrid:
         """Whole occupancy grid of a session."""

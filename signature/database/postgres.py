@@ -1,0 +1,576 @@
+"""The submap database in PostgreSQL with pgvector: one for a whole fleet, written by many at once."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pc2grid.errors import DatabaseError, DatabaseVersion, NotADatabase, OutputError
+from pc2grid.model import OccupancyGrid, SessionMap, Submap, Trajectory
+from signature.database import codec, postgres_schema, rows
+from signature.database.postgres_schema import served
+from signature.database.protocol import Entry, Neighbour, Problem, Provenance, SessionInfo
+from signature.database.search import embedding, rank
+
+if TYPE_CHECKING:
+    from psycopg import Connection
+
+    from signature.config import Config
+    from signature.describe import Signature
+    from signature.similarity import SignatureTable
+
+Key = tuple[str, int]
+"""Building and number of a session."""
+_ATTEMPTS = 5
+
+
+def store(url: str, entries: Iterable[Entry], *, keep: bool, force: bool = False) -> None:
+    """Write sessions in one transaction, all or none; see `signature.database.sqlite.store`.
+
+    Any number of writers may be at it at once; they wait for each other only for sessions of one name, or
+    while the database is empty.
+    """
+    psycopg = postgres_schema.driver()
+    where = postgres_schema.location(url)
+    again = (psycopg.errors.UniqueViolation, psycopg.errors.DeadlockDetected)
+    with postgres_schema.connect(url, where) as connection:
+        postgres_schema.initialise(connection, where)
+        postgres_schema.inspect(connection, where)
+        for attempt in range(1, _ATTEMPTS + 1):
+            try:
+                with served(where), connection.transaction():
+                    _store(connection, where, entries, keep=keep, force=force)
+                return
+            except DatabaseError as error:
+                # Somebody else stored a session of that name just now: look again what it is.
+                if attempt == _ATTEMPTS or not isinstance(error.__cause__, again):
+                    raise
+
+
+def _store(
+    connection: Connection[Any], where: str, entries: Iterable[Entry], *, keep: bool, force: bool
+) -> None:
+    if not keep:
+        connection.execute("SELECT 1 FROM pc2grid.about FOR UPDATE")
+        connection.execute("DELETE FROM pc2grid.session")
+    for session_map, signatures, provenance in entries:
+        name = session_map.session
+        other = _other_session(connection, where, name)
+        if other is not None:
+            resolution_m = session_map.grid.resolution_m
+            rows.refuse_other_settings(other, provenance.config, resolution_m, where)
+        elif signatures:
+            bins = len(signatures[0].boundary) + len(signatures[0].freespace)
+            postgres_schema.index_embeddings(connection, bins)
+        found = connection.execute(
+            "SELECT building, id, document FROM pc2grid.session WHERE name = %s FOR UPDATE", [name]
+        ).fetchone()
+        number: int | None = None
+        if found is not None:
+            old_building, number, document = found
+            if not force and document == rows.document(session_map, provenance):
+                continue
+            if not force:
+                raise DatabaseError(
+                    f"{where}: holds another session named {name!r} already",
+                    hint="--force replaces it; --name gives this one another name",
+                )
+            connection.execute(
+                "DELETE FROM pc2grid.session WHERE building = %s AND id = %s", [old_building, number]
+            )
+        if number is None:
+            (number,) = connection.execute("SELECT nextval('pc2grid.session_id')").fetchone() or (0,)
+        _insert_session(connection, int(number), session_map, signatures, provenance)
+
+
+def _other_session(connection: Connection[Any], where: str, name: str) -> SessionInfo | None:
+    """Any session but `name`, kept from being removed until this transaction ends.
+
+    None: there is no other, and nobody can add one until then.
+    """
+    psycopg = postgres_schema.driver()
+    query = "s.name <> %s ORDER BY s.id LIMIT 1"
+    with connection.transaction() as attempt:
+        # Shared, so that writers do not wait for each other once there is something to compare with.
+        connection.execute("SELECT 1 FROM pc2grid.about FOR SHARE")
+        found = [info for _, info in _read_sessions(connection, where, query, name)]
+        if not found:
+            raise psycopg.Rollback(attempt)  # and let go of the lock: two that share it cannot both have it
+    if found:
+        return found[0]
+    connection.execute("SELECT 1 FROM pc2grid.about FOR UPDATE")
+    return next((info for _, info in _read_sessions(connection, where, query, name)), None)
+
+
+def _insert_session(
+    connection: Connection[Any],
+    number: int,
+    session_map: SessionMap,
+    signatures: Sequence[Signature],
+    provenance: Provenance,
+) -> None:
+    submaps = session_map.submaps
+    if len(signatures) != len(submaps):
+        raise ValueError(f"{len(submaps)} submaps but {len(signatures)} signatures")
+    building, floor = provenance.label.building or "", provenance.label.floor or ""
+    session = {
+        "building": building,
+        "id": number,
+        "floor": floor,
+        "name": session_map.session,
+        "sensor": session_map.sensor,
+        "document": rows.document(session_map, provenance),
+    }
+    of_session = {"building": building, "session_id": number}
+    _copy_in(connection, "session", [session])
+    _copy_in(connection, "grid", [{**of_session, **rows.grid_row(session_map.grid)}])
+    _copy_in(connection, "trajectory", [{**of_session, **rows.trajectory_row(session_map.trajectory)}])
+    _copy_in(connection, "submap", [{**of_session, **rows.submap_row(submap)} for submap in submaps])
+    described = [
+        {
+            **of_session,
+            "submap_id": int(submap.submap_id),
+            "floor": floor,
+            "center_x_m": float(submap.center_m[0]),
+            "center_y_m": float(submap.center_m[1]),
+            "boundary": codec.pack_array(signature.boundary, "<f4"),
+            "freespace": codec.pack_array(signature.freespace, "<f4"),
+            "symmetry": codec.pack_array(signature.symmetry, "<f4"),
+        }
+        for submap, signature in zip(submaps, signatures, strict=True)
+    ]
+    copy_signatures(connection, described, provenance.config)
+
+
+def copy_signatures(connection: Connection[Any], described: Sequence[rows.Row], config: Config) -> None:
+    """Append rows to the table `signature`, with checksum and embedding."""
+    from pgvector import HalfVector
+
+    if not described:
+        return
+    vectors = _embeddings(described, config)
+    _copy_in(connection, "signature", described, embedding=[HalfVector(vector) for vector in vectors])
+
+
+def _copy_in(
+    connection: Connection[Any], table: str, content: Sequence[rows.Row], **more: Sequence[Any]
+) -> None:
+    """Append rows with their checksums, and what is in `more` besides."""
+    types = postgres_schema.TYPES[table]
+    columns = [*types, "crc32", *more]
+    query = f"COPY pc2grid.{table} ({', '.join(columns)}) FROM STDIN (FORMAT BINARY)"
+    with connection.cursor() as cursor, cursor.copy(query) as copy:
+        copy.set_types([*types.values(), "bigint", *("halfvec" for _ in more)])
+        for i, row in enumerate(content):
+            values = [row[column] for column in types]
+            copy.write_row([*values, codec.row_crc(values), *(column[i] for column in more.values())])
+
+
+def _embeddings(described: Sequence[rows.Row], config: Config) -> Any:
+    """(N, D) float16: what the index holds for these rows."""
+    boundary, freespace = (
+        np.frombuffer(b"".join(row[name] for row in described), "<f4").reshape(len(described), -1)
+        for name in ("boundary", "freespace")
+    )
+    return embedding(boundary, freespace, config.signature).astype(np.float16)
+
+
+def _select(
+    connection: Connection[Any], table: str, key: Key, submap_id: int | None = None
+) -> list[tuple[rows.Row, bool]]:
+    """The rows of a session with whether they match their checksum."""
+    columns = tuple(postgres_schema.TYPES[table])
+    order = " ORDER BY submap_id" if "submap_id" in columns else ""
+    number = "id" if table == "session" else "session_id"
+    only = "" if submap_id is None else " AND submap_id = %s"
+    query = (
+        f"SELECT {', '.join(columns)}, crc32 FROM pc2grid.{table}"
+        f" WHERE building = %s AND {number} = %s{only}{order}"
+    )
+    values = key if submap_id is None else (*key, submap_id)
+    with connection.cursor(binary=True) as cursor:
+        return [
+            (dict(zip(columns, row, strict=True)), codec.row_crc(row) == crc)
+            for *row, crc in cursor.execute(query, values)
+        ]
+
+
+def _read_sessions(
+    connection: Connection[Any], where: str, condition: str = "true ORDER BY s.id", *values: Any
+) -> list[tuple[Key, SessionInfo]]:
+    columns = tuple(postgres_schema.TYPES["session"])
+    # The sizes come from rows whose own checksum is looked at when they are used.
+    query = (
+        f"SELECT {', '.join(f's.{c}' for c in columns)}, s.crc32, g.resolution_m, t.count"
+        " FROM pc2grid.session s LEFT JOIN pc2grid.grid g ON (g.building, g.session_id) = (s.building, s.id)"
+        " LEFT JOIN pc2grid.trajectory t ON (t.building, t.session_id) = (s.building, s.id)"
+        f" WHERE {condition}"
+    )
+    found = []
+    for *row, crc, resolution_m, scans in connection.execute(query, values):
+        name = f"session {row[columns.index('id')]}"
+        if codec.row_crc(row) != crc:
+            raise rows.corrupt(where, name, "wrong checksum")
+        if resolution_m is None or scans is None:
+            raise rows.corrupt(where, name, f"has no {'grid' if resolution_m is None else 'trajectory'}")
+        session = dict(zip(columns, row, strict=True))
+        with rows.explained(where, name):
+            found.append(
+                ((session["building"], session["id"]), rows.read_info(session, resolution_m, scans, where))
+            )
+    return found
+
+
+class PostgresDatabase:
+    """A schema `pc2grid` on a PostgreSQL server. See `SubmapDatabase` for what the methods promise.
+
+    A handle sees the database as it was when it was opened (one snapshot, which costs the server a little
+    as long as it is held: services should open a new one now and then); `add` moves its own handle on.
+    """
+
+    def __init__(self, url: str, *, writable: bool = False) -> None:
+        self._url = url
+        self._where = postgres_schema.location(url)
+        self._writable = writable
+        self._left_out: Collection[Key] = ()
+        self._connection = postgres_schema.connect(url, self._where)
+        try:
+            postgres_schema.inspect(self._connection, self._where)
+            psycopg = postgres_schema.driver()
+            self._connection.set_autocommit(False)
+            self._connection.set_isolation_level(psycopg.IsolationLevel.REPEATABLE_READ)
+            self._connection.set_read_only(True)
+            self._look()
+        except BaseException:
+            self._connection.close()
+            raise
+
+    @classmethod
+    def create(cls, url: str, *, force: bool = False) -> PostgresDatabase:
+        """See `create_database`."""
+        if not force and is_filled(url):
+            where = postgres_schema.location(url)
+            raise OutputError(f"{where}: exists already", hint="--force replaces it")
+        store(url, (), keep=False)
+        return cls(url, writable=True)
+
+    def _look(self) -> None:
+        """Take a new snapshot."""
+        with served(self._where):
+            self._connection.rollback()
+            self._connection.execute("SELECT 1 FROM pc2grid.about")
+
+    @property
+    def location(self) -> str:
+        """The URL without its password."""
+        return self._where
+
+    def sessions(self) -> tuple[SessionInfo, ...]:
+        """All sessions in the order they were added."""
+        with served(self._where):
+            left_out = [number for _, number in self._left_out]
+            found = _read_sessions(self._connection, self._where, "s.id <> ALL(%s) ORDER BY s.id", left_out)
+        return tuple(info for _, info in found)
+
+    def config(self) -> Config:
+        """The configuration of the first session; the default if there is none."""
+        from signature.config import Config
+
+        with served(self._where):
+            left_out = [number for _, number in self._left_out]
+            found = _read_sessions(
+                self._connection, self._where, "s.id <> ALL(%s) ORDER BY s.id LIMIT 1", left_out
+            )
+        return found[0][1].provenance.config if found else Config()
+
+    def signatures(self, session: str | None = None) -> SignatureTable:
+        """All signatures, or those of one session; `session_index` counts in the order of `sessions()`."""
+        keys = self._keys()
+        index = {key: i for i, key in enumerate(keys.values())}
+        wanted = keys.values() if session is None else [self._key(session)]
+        kept = []
+        with served(self._where):
+            for key in wanted:
+                for row, sound in _select(self._connection, "signature", key):
+                    self._believe(row, sound)
+                    kept.append(row)
+        with rows.explained(self._where, "signatures"):
+            return _table(kept, index)
+
+    def nearest(
+        self,
+        query: Signature,
+        count: int,
+        *,
+        building: str | None = None,
+        floor: str | None = None,
+        session: str | None = None,
+    ) -> tuple[Neighbour, ...]:
+        """The `count` submaps most alike by Eq. 6; the index finds those that Eq. 6 is asked about."""
+        from pgvector import HalfVector
+
+        config = self.config().signature
+        vector = embedding(query.boundary[None], query.freespace[None], config)[0]
+        values: dict[str, Any] = {
+            "vector": HalfVector(vector),
+            "count": max(count, postgres_schema.SHORTLIST),
+        }
+        wanted = ["true"]
+        if session is not None:
+            values["own_building"], values["number"] = self._key(session)
+            wanted.append("building = %(own_building)s AND session_id = %(number)s")
+        if building is not None:
+            wanted.append("building = %(building)s")
+            values["building"] = building
+        if floor is not None:
+            wanted.append("floor = %(floor)s")
+            values["floor"] = floor
+        if self._left_out:
+            wanted.append("session_id <> ALL(%(left_out)s)")
+            values["left_out"] = [number for _, number in self._left_out]
+        columns = tuple(postgres_schema.TYPES["signature"])
+        inside = (
+            f"SELECT {', '.join(columns)}, crc32 FROM pc2grid.signature WHERE {' AND '.join(wanted)}"
+            f" ORDER BY embedding::halfvec({len(vector)}) <#> %(vector)s::halfvec({len(vector)})"
+            " LIMIT %(count)s"
+        )
+        outside = (
+            f"SELECT s.name, {', '.join(f'c.{column}' for column in columns)}, c.crc32 FROM ({inside}) c"
+            " JOIN pc2grid.session s ON (s.building, s.id) = (c.building, c.session_id)"
+            " ORDER BY c.session_id, c.submap_id"
+        )
+        candidates: list[rows.Row] = []
+        names: list[str] = []
+        index: dict[Key, int] = {}
+        with served(self._where), self._connection.cursor(binary=True) as cursor:
+            for name, *found, crc in cursor.execute(outside, values):
+                row = dict(zip(columns, found, strict=True))
+                self._believe(row, codec.row_crc(found) == crc)
+                key = (row["building"], row["session_id"])
+                if key not in index:
+                    index[key] = len(names)
+                    names.append(name)
+                candidates.append(row)
+        with rows.explained(self._where, "signatures"):
+            return rank(query, _table(candidates, index), names, count, config)
+
+    def grid(self, session: str) -> OccupancyGrid:
+        """Whole occupancy grid of a session."""
+        row = self._row("grid", session)
+        with rows.explained(self._where, f"grid of session {session!r}"):
+            return rows.read_grid(row)
+
+    def trajectory(self, session: str) -> Trajectory:
+        """Poses of the base in the session's map frame."""
+        row = self._row("trajectory", session)
+        with rows.explained(self._where, f"trajectory of session {session!r}"):
+            return rows.read_trajectory(row)
+
+    def submap(self, session: str, submap_id: int) -> Submap:
+        """One submap. Raises DatabaseError if the session has none of that number."""
+        row = self._row("submap", session, int(submap_id))
+        with rows.explained(self._where, f"submap {submap_id} of session {session!r}"):
+            return rows.read_submap(row)
+
+    def submaps(self, session: str) -> Iterator[Submap]:
+        """All submaps of a session, by id."""
+        key = self._key(session)
+        with served(self._where):
+            described = len(_select(self._connection, "signature", key))
+            found = _select(self._connection, "submap", key)
+        # A row that no longer says whose it is would not be found, and not be missed either.
+        if described > len(found):
+            what = f"{described - len(found)} missing"
+            raise rows.corrupt(self._where, f"submaps of session {session!r}", what)
+        for row, sound in found:
+            where = f"submap {row['submap_id']} of session {session!r}"
+            if not sound:
+                raise rows.corrupt(self._where, where, "wrong checksum")
+            with rows.explained(self._where, where):
+                submap = rows.read_submap(row)
+            yield submap
+
+    def add(
+        self,
+        session_map: SessionMap,
+        signatures: Sequence[Signature],
+        provenance: Provenance,
+        *,
+        force: bool = False,
+    ) -> None:
+        """Store a session in one transaction; see `SubmapDatabase.add`."""
+        if not self._writable:
+            raise DatabaseError(f"{self._where}: opened for reading only")
+        # Making the index waits for readers: not for ourselves.
+        with served(self._where):
+            self._connection.rollback()
+        try:
+            store(self._url, [(session_map, signatures, provenance)], keep=True, force=force)
+        finally:
+            self._look()
+
+    def leave_out_damaged(self) -> tuple[Problem, ...]:
+        """From now on, do without the sessions that cannot be searched because they are damaged.
+
+        Returns what is wrong with each of them. Raises DatabaseCorrupt if none is left.
+        """
+        damaged = self._damaged(("session", "grid", "signature"))
+        first = {key: found[0] for key, found in damaged.items()}
+        self._left_out = first.keys()
+        problems = tuple(first.values())
+        if problems and not self._keys():
+            raise rows.corrupt(self._where, problems[0].where, problems[0].what)
+        return problems
+
+    def check(self) -> tuple[Problem, ...]:
+        """Everything that is wrong with the database: each row against its checksum, none may be missing."""
+        damaged = self._damaged(tuple(postgres_schema.TABLES))
+        return tuple(dict.fromkeys(problem for found in damaged.values() for problem in found))
+
+    def close(self) -> None:
+        """Let go of the connection."""
+        self._connection.close()
+
+    def __enter__(self) -> PostgresDatabase:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+    def _keys(self) -> dict[str, Key]:
+        with served(self._where):
+            found = self._connection.execute("SELECT name, building, id FROM pc2grid.session ORDER BY id")
+            return {
+                name: (building, number)
+                for name, building, number in found
+                if (building, number) not in self._left_out
+            }
+
+    def _key(self, session: str) -> Key:
+        with served(self._where):
+            found = self._connection.execute(
+                "SELECT building, id FROM pc2grid.session WHERE name = %s", [session]
+            ).fetchone()
+        if found is None or tuple(found) in self._left_out:
+            there = ", ".join(map(repr, list(self._keys())[:20])) or "none"
+            raise DatabaseError(f"{self._where}: no session {session!r}", hint=f"there are: {there}")
+        return str(found[0]), int(found[1])
+
+    def _row(self, table: str, session: str, submap_id: int | None = None) -> rows.Row:
+        what = table if submap_id is None else f"submap {submap_id}"
+        with served(self._where):
+            found = _select(self._connection, table, self._key(session), submap_id)
+        if not found and submap_id is not None:
+            raise DatabaseError(f"{self._where}: session {session!r} has no submap {submap_id}")
+        if not found:
+            raise rows.corrupt(self._where, f"{what} of session {session!r}", "missing")
+        row, sound = found[0]
+        if not sound:
+            raise rows.corrupt(self._where, f"{what} of session {session!r}", "wrong checksum")
+        return row
+
+    def _damaged(self, tables: Sequence[str]) -> dict[Key, list[Problem]]:
+        """What is wrong with the rows of each session in these tables."""
+        with served(self._where):
+            keys = self._connection.execute("SELECT building, id FROM pc2grid.session ORDER BY id").fetchall()
+            problems = {
+                (building, number): [
+                    *(p for table in tables for p in self._damage(table, (building, number))),
+                    *self._missing((building, number)),
+                ]
+                for building, number in keys
+            }
+        return {key: found for key, found in problems.items() if found}
+
+    def _damage(self, table: str, key: Key) -> Iterator[Problem]:
+        for row, sound in _select(self._connection, table, key):
+            number = row["submap_id"] if "submap_id" in row else key[1]
+            name = f"{table} {number}" + (f" of session {key[1]}" if "submap_id" in row else "")
+            try:
+                if not sound:
+                    raise ValueError("wrong checksum")
+                _decode(table, row, self._where)
+            except DatabaseVersion:
+                raise
+            except Exception as error:
+                # Whatever the decoding of damaged content stumbles over is the finding.
+                yield Problem(name, str(error))
+
+    def _missing(self, key: Key) -> Iterator[Problem]:
+        """What a session should have and has not."""
+        counts = self._connection.execute(
+            "SELECT name, document, (SELECT count(*) FROM pc2grid.grid o WHERE o.building = s.building AND"
+            " o.session_id = s.id), (SELECT count(*) FROM pc2grid.trajectory o WHERE o.building = s.building"
+            " AND o.session_id = s.id), ARRAY(SELECT submap_id FROM pc2grid.submap o WHERE o.building ="
+            " s.building AND o.session_id = s.id ORDER BY 1), ARRAY(SELECT submap_id FROM pc2grid.signature o"
+            " WHERE o.building = s.building AND o.session_id = s.id ORDER BY 1)"
+            " FROM pc2grid.session s WHERE s.building = %s AND s.id = %s",
+            key,
+        ).fetchone()
+        if counts is None:
+            return
+        name, document, grids, trajectories, submaps, signatures = counts
+        for table, count in (("grid", grids), ("trajectory", trajectories)):
+            if not count:
+                yield Problem(f"session {name!r}", f"has no {table}")
+        stored = json.loads(document).get("submaps")
+        if not len(submaps) == len(signatures) == stored or submaps != signatures:
+            yield Problem(
+                f"session {name!r}",
+                f"has {len(submaps)} submaps and {len(signatures)} signatures where {stored} were stored",
+            )
+
+    def _believe(self, row: rows.Row, sound: bool) -> None:
+        if not sound:
+            where = f"signature {row['submap_id']} of session {row['session_id']}"
+            raise rows.corrupt(self._where, where, "wrong checksum")
+
+
+def is_filled(url: str) -> bool:
+    """Whether the database holds sessions. Raises DatabaseUnreachable and its like if it cannot be asked."""
+    where = postgres_schema.location(url)
+    with postgres_schema.connect(url, where) as connection:
+        try:
+            postgres_schema.inspect(connection, where)
+        except NotADatabase:
+            return False
+        with served(where):
+            return connection.execute("SELECT 1 FROM pc2grid.session LIMIT 1").fetchone() is not None
+
+
+def _decode(table: str, row: rows.Row, where: str) -> None:
+    if table == "session":
+        rows.read_info(row, 1.0, 0, where)
+    elif table == "grid":
+        rows.read_grid(row)
+    elif table == "trajectory":
+        rows.read_trajectory(row)
+    elif table == "submap":
+        rows.read_submap(row)
+    else:
+        _table([row], {(row["building"], row["session_id"]): 0})
+
+
+def _table(described: Sequence[rows.Row], index: Mapping[Key, int]) -> SignatureTable:
+    """Rows of the table `signature` as arrays. ValueError if they do not fit together."""
+    from signature.similarity import SignatureTable
+
+    if not described:
+        return SignatureTable.of((), np.empty((0, 2)))
+    n = len(described)
+
+    def joined(name: str) -> Any:
+        width = len(described[0][name]) // 4
+        return codec.unpack_array(b"".join(row[name] for row in described), "<f4", (n, width))
+
+    return SignatureTable(
+        boundary=joined("boundary"),
+        freespace=joined("freespace"),
+        symmetry=joined("symmetry"),
+        session_index=np.array([index[row["building"], row["session_id"]] for row in described], np.int32),
+        submap_id=np.array([row["submap_id"] for row in described], np.int32),
+        center_m=np.array([(row["center_x_m"], row["center_y_m"]) for row in described], np.float64),
+    )
