@@ -17,8 +17,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pc2grid.facing import facing
 from pc2grid.geometry import F64, SE2
-from pc2grid.pieces import Keyframe, PieceStore, cut, thin_points
+from pc2grid.pieces import Keyframe, PieceStore, cut, evenly
 from pc2grid.pose_graph import Edge, optimise
 
 _ROUNDS = 3
@@ -157,11 +158,12 @@ def _carry(tracked: F64, store: PieceStore, anchors: list[int], nodes: F64, newe
 def _verify(store: PieceStore, proposal: Proposal) -> Edge | None:
     """The measured relative pose of two pieces, or None if they do not overlap or fit in several ways."""
     older, newer = store[proposal.older], store[proposal.newer]
-    points = thin_points(newer.points_m, _SEARCH_POINTS)
-    back = thin_points(older.points_m, _SEARCH_POINTS)
+    chosen = evenly(len(newer.points_m), _SEARCH_POINTS)
+    points, face = newer.points_m[chosen], newer.facing_rad[chosen]
+    back = older.points_m[evenly(len(older.points_m), _SEARCH_POINTS)]
     fits = []
     for _, start in older.search(points, proposal.T_older_newer, proposal.window_m, proposal.window_rad):
-        match = older.match(points, start)
+        match = older.match(points, face, start)
         seen, agree = older.agreement(points, match.pose)
         seen_back, agree_back = newer.agreement(back, match.pose.inverse())
         if max(seen, seen_back) > _MIN_SEEN and min(seen, seen_back) > 0.15:
@@ -202,11 +204,12 @@ def _match_keyframes(store: PieceStore, older: int, newer: int) -> Iterable[Edge
         T_anchor_map = store.pose(anchor).inverse()
         for k in store.runs[source]:
             guess = T_anchor_map @ store.pose(k)
-            hits = store.keyframes[k].sweep.hits_m
-            points = thin_points(hits, _KEYFRAME_POINTS)
+            sweep = store.keyframes[k].sweep
+            chosen = evenly(len(sweep.hits_m), _KEYFRAME_POINTS)
+            points = sweep.hits_m[chosen].astype(np.float64)
             if len(points) < 30 or piece.agreement(points, guess)[0] < _MIN_SEEN:
                 continue
-            match = piece.match(points, guess)
+            match = piece.match(points, facing(sweep.hits_m, sweep.origin_m)[chosen], guess)
             seen, agree = piece.agreement(points, match.pose)
             apart = guess.inverse() @ match.pose
             if (

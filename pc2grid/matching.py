@@ -1,8 +1,9 @@
 """Points against a local map in the plane: point-to-line Gauss-Newton with a prior.
 
 The map is a grid of moments: each cell keeps number, sum and second moments of the points that fell into
-it. The line at a place is the principal axis of the cells around it, so that the accuracy is not bound
-by the cell size, and adding a scan costs one pass over its points.
+it, apart for each way that their surface faces, so that the two faces of a wall stay two. The line at a
+place is the principal axis of the cells around it, so that the accuracy is not bound by the cell size, and
+adding a scan costs one pass over its points.
 
 Point-to-line as in Censi, "An ICP variant using a point-to-line metric" (2008); the moments are those of
 Biber and Strasser's normal distributions transform (2003).
@@ -23,7 +24,7 @@ CELL_M = 0.1
 RESIDUAL_SCALE_M = 0.05  # beyond this a point is more likely something else (Cauchy)
 # One point is worth its noise, but neighbours on one wall err together: count every point as a fraction.
 _POINT_SIGMA_M = 0.1
-_MAX_RADIUS = 3  # cells
+_SECTORS = 8  # of the directions that surfaces face; a point sees its own and the two beside it
 _PRIOR_SCALE = 2.0  # standard deviations
 
 
@@ -51,31 +52,40 @@ class PointGrid:
         self.cell_m = cell_m
         self.low_m = np.asarray(low_m, dtype=np.float64)
         width, height = np.ceil((np.asarray(high_m) - self.low_m) / cell_m).astype(int)
-        self._moments = np.zeros((height, width, 6), dtype=np.float64)
-        # Lines are worked out when first asked for and forgotten when points arrive near by.
-        self._lines = np.empty((_MAX_RADIUS, height, width, 5), dtype=np.float32)
-        self._known = np.zeros((_MAX_RADIUS, height, width), dtype=np.uint8)
+        # Most cells are empty: moments are kept for those that are not, found by the index.
+        self._index = np.full((height, width), -1, dtype=np.int32)
+        self._moments = np.zeros((256, _SECTORS, 6), dtype=np.float64)
+        self._used = 0
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows (y) and columns (x)."""
-        return self._moments.shape[0], self._moments.shape[1]
+        return self._index.shape[0], self._index.shape[1]
 
-    def add(self, points_m: NDArray[np.floating]) -> None:
-        """Add points (N, 2) given in the map frame."""
+    def add(self, points_m: NDArray[np.floating], facing_rad: NDArray[np.floating]) -> None:
+        """Add points (N, 2), on surfaces that face (N,), given in the map frame."""
         points = np.asarray(points_m, dtype=np.float64)
-        _add_moments(self._moments, self._known, points, self.low_m, self.cell_m)
+        if self._used + len(points) > len(self._moments):
+            room = np.zeros((max(len(self._moments), len(points)), _SECTORS, 6), dtype=np.float64)
+            self._moments = np.concatenate((self._moments, room))
+        facing = np.asarray(facing_rad, dtype=np.float64)
+        self._used = _add_moments(
+            self._index, self._moments, self._used, points, facing, self.low_m, self.cell_m
+        )
 
     def match(
         self,
         points_m: NDArray[np.floating],
+        facing_rad: NDArray[np.floating],
         guess: SE2,
         prior: SE2,
         prior_information: F64,
         *,
         radii: tuple[int, ...] = (3, 3, 2, 2, 1, 1, 1, 1, 1, 1),
     ) -> Match:
-        """Align points (N, 2) to the map, starting at `guess`, held to `prior` by `prior_information` (3, 3).
+        """Align points (N, 2), on surfaces that face (N,) in the points' frame, to the map.
+
+        Starts at `guess`, held to `prior` by `prior_information` (3, 3).
 
         `radii` are the half widths, in cells, of the neighbourhood that gives each point its line, one
         entry an iteration: wide first, to catch, then narrow, to be exact.
@@ -84,12 +94,12 @@ class PointGrid:
         start = np.array([guess.x, guess.y, guess.yaw])
         held = np.array([prior.x, prior.y, prior.yaw])
         pose, information, overlap, residual = _gauss_newton(
+            self._index,
             self._moments,
-            self._lines,
-            self._known,
             self.low_m,
             self.cell_m,
             points,
+            np.asarray(facing_rad, dtype=np.float64),
             start,
             held,
             np.asarray(prior_information, dtype=np.float64),
@@ -104,33 +114,45 @@ class PointGrid:
 
 
 @njit(cache=True)
-def _add_moments(moments: F64, known: NDArray[np.uint8], points: F64, low: F64, cell_m: float) -> None:
-    height, width = moments.shape[0], moments.shape[1]
+def _sector(angle: float) -> int:
+    return round(angle * (_SECTORS / (2.0 * math.pi))) % _SECTORS
+
+
+@njit(cache=True)
+def _add_moments(
+    index: NDArray[np.int32], moments: F64, used: int, points: F64, facing: F64, low: F64, cell_m: float
+) -> int:
+    height, width = index.shape
     for k in range(points.shape[0]):
         x, y = points[k, 0] - low[0], points[k, 1] - low[1]
         column, row = math.floor(x / cell_m), math.floor(y / cell_m)
         if 0 <= row < height and 0 <= column < width:
-            m = moments[row, column]
+            if index[row, column] < 0:
+                index[row, column] = used
+                used += 1
+            m = moments[index[row, column], _sector(facing[k])]
             m[0] += 1.0
             m[1] += x
             m[2] += y
             m[3] += x * x
             m[4] += x * y
             m[5] += y * y
-            for radius in range(1, known.shape[0] + 1):
-                for r in range(max(row - radius, 0), min(row + radius + 1, height)):
-                    for c in range(max(column - radius, 0), min(column + radius + 1, width)):
-                        known[radius - 1, r, c] = 0
+    return used
 
 
 @njit(cache=True)
-def _line_at(moments: F64, row: int, column: int, radius: int, line: NDArray[np.float32]) -> bool:
+def _line_at(
+    index: NDArray[np.int32], moments: F64, row: int, column: int, radius: int, sector: int, line: F64
+) -> bool:
     """Mean, normal and straightness (5 values) of the points within `radius` cells; False if too few."""
     n = sx = sy = sxx = sxy = syy = 0.0
     for r in range(row - radius, row + radius + 1):
         for c in range(column - radius, column + radius + 1):
-            m = moments[r, c]
-            if m[0] > 0.0:
+            cell = index[r, c]
+            if cell < 0:
+                continue
+            for beside in (-1, 0, 1):
+                m = moments[cell, (sector + beside) % _SECTORS]
                 n += m[0]
                 sx += m[1]
                 sy += m[2]
@@ -155,19 +177,20 @@ def _line_at(moments: F64, row: int, column: int, radius: int, line: NDArray[np.
 
 @njit(cache=True)
 def _gauss_newton(
+    index: NDArray[np.int32],
     moments: F64,
-    lines: NDArray[np.float32],
-    known: NDArray[np.uint8],
     low: F64,
     cell_m: float,
     points: F64,
+    facing: F64,
     start: F64,
     prior: F64,
     prior_information: F64,
     radii: NDArray[np.int64],
 ) -> tuple[F64, F64, float, float]:
     pose = start.copy()
-    height, width = moments.shape[0], moments.shape[1]
+    height, width = index.shape
+    line = np.empty(5)
     information = np.zeros((3, 3))
     overlap = residual = 0.0
     unit = 1.0 / (_POINT_SIGMA_M * _POINT_SIGMA_M)
@@ -186,12 +209,7 @@ def _gauss_newton(
             column, row = math.floor(x / cell_m), math.floor(y / cell_m)
             if row < radius or column < radius or row >= height - radius or column >= width - radius:
                 continue
-            line = lines[radius - 1, row, column]
-            state = known[radius - 1, row, column]
-            if state == 0:
-                state = 2 if _line_at(moments, row, column, radius, line) else 1
-                known[radius - 1, row, column] = state
-            if state == 1:
+            if not _line_at(index, moments, row, column, radius, _sector(facing[k] + pose[2]), line):
                 continue
             nx, ny = line[2], line[3]
             r = nx * (x - line[0]) + ny * (y - line[1])

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pc2grid.facing import facing
 from pc2grid.geometry import F64, SE2
 from pc2grid.matching import Match, PointGrid, best_placements
 from pc2grid.model import I64
@@ -54,23 +55,24 @@ def cut(keyframes: Sequence[Keyframe]) -> list[range]:
 class Piece:
     """The local map of a run of keyframes, in the frame of its anchor, the keyframe in the middle.
 
-    points_m : (N, 2) obstacle points, thinned to one a cell.
+    points_m : (N, 2) obstacle points, thinned to one a cell. facing_rad : (N,) which way each one faces.
     """
 
     def __init__(self, keyframes: Sequence[Keyframe], T_anchor_base: Sequence[SE2]) -> None:
         import cv2
 
-        hits, outlines = [], []
+        hits, faces, outlines = [], [], []
         for keyframe, pose in zip(keyframes, T_anchor_base, strict=True):
             sweep = keyframe.sweep
             near = np.linalg.norm(sweep.hits_m - sweep.origin_m, axis=1) < RANGE_M
             hits.append(pose.apply(sweep.hits_m[near]))
+            faces.append(facing(sweep.hits_m, sweep.origin_m)[near] + pose.yaw)
             outlines.append(pose.apply(sweep.free_polygon(RANGE_M)))
-        points = np.concatenate(hits)
+        points, face = np.concatenate(hits), np.concatenate(faces)
         everything = np.concatenate((points, *outlines))
         low, high = everything.min(axis=0) - 0.6, everything.max(axis=0) + 0.6
         self._grid = PointGrid(low, high, CELL_M)
-        self._grid.add(points)
+        self._grid.add(points, face)
         self._low_m = low
         shape = self._grid.shape
         free = np.zeros(shape, dtype=np.uint8)
@@ -87,10 +89,13 @@ class Piece:
         self._field = np.exp(-0.5 * (distance / 0.15) ** 2).astype(np.float32)
         _, keep = np.unique(cells[:, 0] * shape[1] + cells[:, 1], return_index=True)
         self.points_m: F64 = points[keep]
+        self.facing_rad: F64 = face[keep]
 
-    def match(self, points_m: F64, guess: SE2, *, radii: tuple[int, ...] = (3, 2, 2, 1, 1, 1, 1, 1)) -> Match:
-        """Refine where points (N, 2) lie in this piece, from the points alone."""
-        return self._grid.match(points_m, guess, guess, np.zeros((3, 3)), radii=radii)
+    def match(
+        self, points_m: F64, facing_rad: F64, guess: SE2, *, radii: tuple[int, ...] = (3, 2, 2, 1, 1, 1, 1, 1)
+    ) -> Match:
+        """Refine where points (N, 2), facing (N,), lie in this piece, from the points alone."""
+        return self._grid.match(points_m, facing_rad, guess, guess, np.zeros((3, 3)), radii=radii)
 
     def search(
         self, points_m: F64, guess: SE2, window_m: float, window_rad: float
@@ -153,8 +158,6 @@ class PieceStore:
             self._made.clear()
 
 
-def thin_points(points_m: NDArray[np.floating], count: int) -> F64:
-    """At most `count` of the points (N, 2), evenly through their order."""
-    if len(points_m) <= count:
-        return np.asarray(points_m, dtype=np.float64)
-    return np.asarray(points_m[np.linspace(0, len(points_m) - 1, count).astype(int)], dtype=np.float64)
+def evenly(length: int, count: int) -> NDArray[np.intp]:
+    """At most `count` of the indices below `length`, evenly spread."""
+    return np.arange(length) if length <= count else np.linspace(0, length - 1, count).astype(np.intp)

@@ -16,6 +16,7 @@ import numpy as np
 
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.deskew import deskew
+from pc2grid.facing import facing
 from pc2grid.floor import Ground, assumed_ground, find_ground
 from pc2grid.geometry import F64, SE2, invert_pose, rotation_vector
 from pc2grid.matching import Match, PointGrid
@@ -220,11 +221,12 @@ class Tracker:
             sigma_m, sigma_rad = 0.03, 0.01
         information = np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
         grid = self._maps[0][0]
-        match = grid.match(sweep.hits_m, guess, prior, information)
+        face = facing(sweep.hits_m, sweep.origin_m)
+        match = grid.match(sweep.hits_m, face, guess, prior, information)
         apart = SE2.flatten(predicted).inverse() @ guess
         if math.hypot(apart.x, apart.y) > _DISAGREE_M or abs(apart.yaw) > _DISAGREE_RAD:
             # KISS-ICP and the prediction differ: let each lead the refinement, and the walls decide.
-            other = grid.match(sweep.hits_m, SE2.flatten(predicted), prior, information)
+            other = grid.match(sweep.hits_m, face, SE2.flatten(predicted), prior, information)
             match = max(match, other, key=lambda m: m.overlap - 5.0 * m.residual_m)
         return (match.pose if match.overlap >= _MIN_OVERLAP else prior), match
 
@@ -264,9 +266,9 @@ class Tracker:
             )
         if len(self._maps) > 2:
             del self._maps[0]
-        hits = pose.apply(sweep.hits_m)
+        hits, face = pose.apply(sweep.hits_m), facing(sweep.hits_m, sweep.origin_m) + pose.yaw
         for grid, _ in self._maps:
-            grid.add(hits)
+            grid.add(hits, face)
         self._last_keyframe = pose
         return True
 
