@@ -1,0 +1,31 @@
+"""A recording becomes a database: what `pc2grid convert` does, in Python.
+
+python examples/convert_a_log.py monday.mcap building.submaps
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pc2grid
+import signature
+
+
+def main(recording: str, database: str) -> None:
+    """Map a recording, describe its submaps, store both."""
+    config = signature.Config()
+    with pc2grid.open_log(recording) as log:
+        print(f"{log.choose().topic}: {log.choose().reason}")
+        session = pc2grid.build_map(log, config, session=Path(recording).stem)
+        origin = signature.provenance(recording, log.digest(), config)
+    signature.add_session(database, session, config, origin)
+
+    driven_m = session.trajectory.path_m()[-1]
+    print(f"{len(session.trajectory)} scans, {driven_m:.1f} m driven, {len(session.submaps)} submaps")
+    for warning in session.report.warnings:
+        print(f"warning: {warning}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
