@@ -10,24 +10,38 @@ from pathlib import Path
 import pc2grid
 from pc2grid.model import SessionMap
 from signature.config import Config
-from signature.database import Provenance
+from signature.database import Label, Provenance
 from signature.describe import Signature, describe
 
 
 def provenance(
-    source: Path, digest: str, config: Config, *, start_s: float = 0.0, duration_s: float | None = None
+    source: str | Path,
+    digest: str,
+    config: Config,
+    *,
+    start_s: float = 0.0,
+    duration_s: float | None = None,
+    label: Label | None = None,
 ) -> Provenance:
-    """What makes a session from `source` (its sha256 `digest`) here and now, without the time of day."""
+    """What makes a session from `source` (its sha256 `digest`) here and now, without the time of day.
+
+    >>> import pc2grid, signature
+    >>> with pc2grid.open_log("monday.mcap") as log:
+    ...     origin = provenance(log.info.path, log.digest(), signature.Config())
+    >>> origin.source, len(origin.digest), origin.versions["pc2grid"] == pc2grid.__version__
+    ('monday.mcap', 64, True)
+    """
     libraries = ("kiss-icp", "mcap", "numpy", "scipy", "opencv-python-headless", "scikit-image")
     versions = {"pc2grid": pc2grid.__version__, "python": platform.python_version()}
     versions |= {name: metadata.version(name) for name in libraries}
     return Provenance(
-        source=source.name,
+        source=Path(source).name,
         digest=digest,
         config=config,
         start_s=start_s,
         duration_s=duration_s,
         versions=versions,
+        label=label or Label(),
     )
 
 
@@ -44,7 +58,7 @@ def describe_all(
 
 
 def add_session(
-    database: Path,
+    database: str | Path,
     session_map: SessionMap,
     config: Config,
     provenance: Provenance,
@@ -54,12 +68,21 @@ def add_session(
     """Describe a session and add it to a database file, which is made if it is missing.
 
     `force` replaces a session of the same name. Raises as `SubmapDatabase.add`.
+
+    >>> import pc2grid, signature
+    >>> config = signature.Config()
+    >>> with pc2grid.open_log("monday.mcap") as log:
+    ...     monday = pc2grid.build_map(log, config, session="monday", duration_s=2.0)
+    ...     add_session("new.submaps", monday, config, provenance(log.info.path, log.digest(), config))
+    >>> with signature.open_database("new.submaps") as database:
+    ...     [session.name for session in database.sessions()]
+    ['monday']
     """
     add_sessions(database, [(session_map, provenance)], config, keep=True, force=force)
 
 
 def add_sessions(
-    database: Path,
+    database: str | Path,
     sessions: Sequence[tuple[SessionMap, Provenance]],
     config: Config,
     *,
@@ -74,4 +97,4 @@ def add_sessions(
     from signature.database.sqlite import store
 
     entries = [(m, describe_all(m, config, progress), origin) for m, origin in sessions]
-    store(database, entries, keep=keep, force=force)
+    store(Path(database), entries, keep=keep, force=force)

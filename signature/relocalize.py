@@ -8,188 +8,64 @@ support. The answer is `located` only when one hypothesis stands clear of all ot
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pc2grid.alignment import LikelihoodField, prepare
 from pc2grid.errors import NoScans
-from pc2grid.geometry import F64, SE2
+from pc2grid.geometry import SE2
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from pc2grid.sweep import Sweep
-from signature.confidence import CALIBRATION, Evidence
+from signature.answer import Answer, Moment, Verdict
+from signature.building import Building
 from signature.config import Config
 from signature.query import QueryMap, Window, query_of
-from signature.retrieve import Places, retrieve
-from signature.verify import Hypothesis, carry_on, distinct, search_everywhere, verify
+from signature.verify import Hypothesis
 
 if TYPE_CHECKING:
     from signature.database import SubmapDatabase
-    from signature.similarity import SignatureTable
 
-SCHEMA_VERSION = 1
-
-Status = Literal["located", "ambiguous", "not_found"]
+__all__ = ["Answer", "Building", "Relocalizer", "Search", "locate_map", "relocalize"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Moment:
-    """The answer as it stood after `path_m` of travel; the pose is of the best hypothesis, if any."""
+class Search:
+    """One query in one building: its hypotheses, carried from moment to moment."""
 
-    stamp_ns: int
-    path_m: float
-    status: Status
-    pose: SE2 | None
-    confidence: float
+    def __init__(self, building: Building) -> None:
+        self.building = building
+        self._clock = _Clock()
+        self._history: list[Moment] = []
+        self.forget()
 
+    def forget(self) -> None:
+        """Begin anew: what the query saw so far says nothing about where it is now."""
+        self._hypotheses: tuple[Hypothesis, ...] = ()
+        self._asked_m: float | None = None
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
-    """Where the query was.
+    def look(self, query: QueryMap) -> None:
+        """Ask the database with what the query has seen by now."""
+        verdict = self._look_up(query, self.building.judge)
+        self._history.append(_moment(query, verdict))
 
-    status : located, ambiguous (several places fit) or not_found (none does).
-    session : name of the session whose map frame `T_map_base` is in; None unless located.
-    T_map_base : base at the query's last scan. covariance : (3, 3) of x, y, yaw.
-    T_map_odom : puts the whole query trajectory into the map.
-    confidence : probability that the best hypothesis is right.
-    hypotheses : all that fit, best first. history : how the answer came to be.
-    evidence : what the confidence rests on.
-    """
+    def answer(self, query: QueryMap) -> Answer:
+        """Where the query is by all that it has seen."""
+        verdict = self._look_up(query, self.building.decide)
+        return _answer(self.building, query, verdict, tuple(self._history), dict(self._clock.total_ms))
 
-    status: Status
-    session: str | None
-    stamp_ns: int
-    T_map_base: SE2 | None
-    covariance: F64 | None
-    T_map_odom: SE2 | None
-    confidence: float
-    hypotheses: tuple[Hypothesis, ...]
-    history: tuple[Moment, ...]
-    T_odom_base: SE2
-    path_m: float
-    sessions: tuple[str, ...]
-    submap_ids: tuple[int, ...]
-    evidence: Evidence
-    timing_ms: dict[str, float] = field(default_factory=dict)
-
-    def to_json(
-        self, *, query: dict[str, Any] | None = None, database: dict[str, Any] | None = None
-    ) -> dict[str, Any]:
-        """The document that `pc2grid relocalize --json` prints (plain types only)."""
-        pose = self.T_map_base
-        return {
-            "schema_version": SCHEMA_VERSION,
-            "status": self.status,
-            "session": self.session,
-            "pose": None
-            if pose is None or self.covariance is None
-            else {"stamp_ns": self.stamp_ns, **_plain(pose), "covariance": self.covariance.tolist()},
-            "T_map_odom": None if self.T_map_odom is None else _plain(self.T_map_odom),
-            "confidence": self.confidence,
-            "hypotheses": [
-                {
-                    "session": self.sessions[h.session_index],
-                    "submap_id": submap_id if submap_id >= 0 else None,
-                    **_plain(h.fit.T_map_query @ self.T_odom_base),
-                    "score": h.fit.score,
-                    "overlap": h.fit.overlap,
-                }
-                for h, submap_id in zip(self.hypotheses, self.submap_ids, strict=True)
-            ],
-            "history": [
-                {
-                    "stamp_ns": m.stamp_ns,
-                    "path_m": m.path_m,
-                    "status": m.status,
-                    **(_plain(m.pose) if m.pose is not None else {"x": None, "y": None, "yaw": None}),
-                    "confidence": m.confidence,
-                }
-                for m in self.history
-            ],
-            "query": {"path_m": self.path_m, "stamp_ns": self.stamp_ns, **(query or {})},
-            "database": {"sessions": list(self.sessions), **(database or {})},
-            "timing_ms": self.timing_ms,
-        }
-
-
-def _plain(pose: SE2) -> dict[str, float]:
-    return {"x": float(pose.x), "y": float(pose.y), "yaw": float(pose.yaw)}
-
-
-class Building:
-    """Maps and their places made ready to be asked again and again: isovists and likelihood fields.
-
-    Made once (tens of milliseconds a map), used for every query; it changes nothing.
-    """
-
-    def __init__(
-        self, grids: Mapping[str, OccupancyGrid], table: SignatureTable, made_with: Config, config: Config
-    ) -> None:
-        """grids : map of each session, in the order that `table.session_index` counts.
-
-        made_with : how the places were cut and described; queries are treated alike.
-        config : its relocalize section says how to search and when to be sure.
-        """
-        self.made_with = made_with
-        self.config = config.relocalize
-        self.sessions = tuple(grids)
-        maps = tuple(grids.values())
-        self.places = Places.of(table, dict(enumerate(maps)), made_with.partition.radius_m)
-        self.fields: tuple[LikelihoodField, ...] = tuple(prepare(grid) for grid in maps)
-        self._free = tuple(free_squares(grid) for grid in maps)
-        self._area_m2 = tuple(float(grid.free.sum()) * grid.resolution_m**2 for grid in maps)
-
-    @staticmethod
-    def of(database: SubmapDatabase, config: Config) -> Building:
-        """Everything that is in a database."""
-        grids = {info.name: database.grid(info.name) for info in database.sessions()}
-        return Building(grids, database.signatures(), database.config(), config)
-
-    def look_up(
-        self, query: QueryMap, carried: tuple[Hypothesis, ...] = (), *, driven_m: float = 0.0
-    ) -> tuple[Hypothesis, ...]:
-        """Hypotheses for the query, best first: the carried ones, refined, and what retrieval proposes."""
-        old = [carry_on(query, h, self.fields[h.session_index], driven_m) for h in carried]
-        proposals = retrieve(query, self.places, signature=self.made_with.signature, config=self.config)
-        new = verify(query, proposals, self.places, self.fields, self.config)
-        return self._worth_keeping((*old, *new), query)
-
-    def look_everywhere(self, query: QueryMap, known: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
-        """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole."""
-        found = list(known)
-        for index, field_ in enumerate(self.fields):
-            if self._area_m2[index] <= self.config.exhaustive_m2:
-                found.extend(search_everywhere(query, index, field_, self._free[index], self.config))
-        return self._worth_keeping(tuple(found), query)
-
-    def _worth_keeping(self, found: tuple[Hypothesis, ...], query: QueryMap) -> tuple[Hypothesis, ...]:
-        kept = distinct(found, query.T_odom_base)
-        floor = 0.6 * kept[0].fit.score if kept else 0.0
-        return tuple(h for h in kept if h.fit.score >= floor)[: self.config.hypotheses]
-
-    def judge(self, hypotheses: tuple[Hypothesis, ...], query: QueryMap) -> tuple[Status, float]:
-        """The status and the probability that the best hypothesis is right."""
-        if not hypotheses:
-            return "not_found", 0.0
-        p = CALIBRATION.probabilities(Evidence.of(hypotheses, len(query.aligned.walls_m)))
-        best, none = float(p[0]), float(p[-1])
-        if best >= self.config.accept:
-            return "located", best
-        return ("ambiguous" if best > none else "not_found"), best
-
-
-def free_squares(grid: OccupancyGrid, side_m: float = 0.8) -> F64:
-    """Centres (K, 2) of the squares of `side_m` of a grid that hold any free space, map frame."""
-    n = max(1, round(side_m / grid.resolution_m))
-    height, width = grid.cells.shape
-    if not height or not width:
-        return np.empty((0, 2))
-    rows, columns = np.arange(0, height, n), np.arange(0, width, n)
-    free = np.add.reduceat(np.add.reduceat(grid.free.astype(np.int32), rows, axis=0), columns, axis=1)
-    corners = np.argwhere(free > 0)[:, ::-1] * (n * grid.resolution_m)
-    return np.asarray(corners + 0.5 * n * grid.resolution_m + np.asarray(grid.origin_m))
+    def _look_up(
+        self, query: QueryMap, judge: Callable[[QueryMap, tuple[Hypothesis, ...]], Verdict]
+    ) -> Verdict:
+        self._clock.start()
+        driven_m = 0.0 if self._asked_m is None else query.path_m - self._asked_m
+        self._asked_m = query.path_m
+        found = self.building.look_up(query, self._hypotheses, driven_m=driven_m)
+        self._clock.lap("look_up")
+        verdict = judge(query, found)
+        self._hypotheses = verdict.hypotheses
+        self._clock.lap("decide")
+        return verdict
 
 
 class Relocalizer:
@@ -197,18 +73,29 @@ class Relocalizer:
 
     Scans on which registration was lost are not used, and nothing seen before them is kept: what lies
     between the two parts is unknown.
+
+    >>> import pc2grid, signature
+    >>> with signature.open_database("building.submaps") as database, pc2grid.open_log("tuesday.mcap") as log:
+    ...     config = database.config()
+    ...     relocalizer = Relocalizer(Building.of(database, config))
+    ...     for registered, sweep in pc2grid.follow(log.scans(), config):
+    ...         relocalizer.add(registered, sweep)
+    >>> relocalizer.answer().status
+    'located'
     """
 
-    def __init__(self, building: Building) -> None:
-        self._building = building
+    def __init__(self, building: Building, *others: Building) -> None:
+        """others : made with the same settings; the query is searched in each of them for itself."""
+        self._made_with, self._config = building.made_with, building.config
+        self.searches = tuple(Search(b) for b in (building, *others))
         self._clock = _Clock()
-        self._history: list[Moment] = []
         self._forget()
 
     def _forget(self) -> None:
-        self._window = Window(self._building.made_with.projection, self._building.config)
-        self._hypotheses: tuple[Hypothesis, ...] = ()
-        self._asked_m: float | None = None
+        self._window = Window(self._made_with.projection, self._config)
+        self._asked_m = 0.0
+        for search in self.searches:
+            search.forget()
 
     @property
     def path_m(self) -> float:
@@ -222,40 +109,30 @@ class Relocalizer:
             self._forget()
             return
         self._window.add(sweep, SE2.flatten(registered.T_map_base))
-        if self.path_m - (self._asked_m or 0.0) >= self._building.config.step_m:
-            query, status, sure = self._ask()
-            self._history.append(_moment(query, status, sure, self._hypotheses))
+        if self.path_m - self._asked_m >= self._config.step_m:
+            self._asked_m = self.path_m
+            query = self.query()
+            for search in self.searches:
+                search.look(query)
+            self._clock.start()
 
     def answer(self) -> Answer:
         """Where the query is by all that it has seen. Raises NoScans if no scan could be used."""
         self._clock.lap("register")
-        if not len(self._window):
-            raise NoScans("no scan of the query could be registered", hint="look at it with `pc2grid info`")
-        query, status, sure = self._ask()
-        if status != "located":
-            # Signatures did not settle it: leave no place out, neither the right one nor a rival.
-            self._hypotheses = self._building.look_everywhere(query, self._hypotheses)
-            status, sure = self._building.judge(self._hypotheses, query)
-            self._clock.lap("search_everywhere")
-        history = (*self._history, _moment(query, status, sure, self._hypotheses))
-        return _answer(
-            self._building, query, status, sure, self._hypotheses, history, dict(self._clock.total_ms)
-        )
+        answer = self.searches[0].answer(self.query())
+        return replace(answer, timing_ms={**self._clock.total_ms, **answer.timing_ms})
 
     def query(self) -> QueryMap:
-        """What the query has seen over its last metres, described as the database is."""
-        return self._window.query(self._building.made_with.partition, self._building.made_with.signature)
+        """What the query has seen over its last metres, described as the database is.
 
-    def _ask(self) -> tuple[QueryMap, Status, float]:
-        building = self._building
-        query = self.query()
+        Raises NoScans if no scan could be used.
+        """
+        if not len(self._window):
+            raise NoScans("no scan of the query could be registered", hint="look at it with `pc2grid info`")
+        self._clock.start()
+        query = self._window.query(self._made_with.partition, self._made_with.signature)
         self._clock.lap("describe")
-        driven = 0.0 if self._asked_m is None else self.path_m - self._asked_m
-        self._asked_m = self.path_m
-        self._hypotheses = building.look_up(query, self._hypotheses, driven_m=driven)
-        status, sure = building.judge(self._hypotheses, query)
-        self._clock.lap("look_up")
-        return query, status, sure
+        return query
 
 
 def relocalize(
@@ -270,6 +147,13 @@ def relocalize(
     progress : called with (scans so far, metres driven).
 
     Raises NoScans for a query without a usable scan.
+
+    >>> import pc2grid, signature
+    >>> with signature.open_database("building.submaps") as database, pc2grid.open_log("tuesday.mcap") as log:
+    ...     config = database.config()
+    ...     answer = relocalize(pc2grid.follow(log.scans(), config), database, config)
+    >>> answer.status, answer.session, answer.covariance.shape
+    ('located', 'monday', (3, 3))
     """
     relocalizer = Relocalizer(Building.of(database, config))
     for count, (registered, sweep) in enumerate(query, start=1):
@@ -286,6 +170,12 @@ def locate_map(grid: OccupancyGrid, building: Building) -> Answer:
 
     There is no robot in it, so the "base" of the answer is the map's own frame: `T_map_base` and
     `T_map_odom` both are T_map_query, and no way has been travelled.
+
+    >>> import pc2grid, signature
+    >>> with signature.open_database("plan.submaps") as database:
+    ...     answer = locate_map(pc2grid.load_map("part.yaml"), Building.of(database, database.config()))
+    >>> answer.status, round(answer.T_map_base.x, 1), round(answer.T_map_base.y, 1)
+    ('located', 4.0, 3.0)
     """
     clock = _Clock()
     made_with = building.made_with
@@ -303,17 +193,13 @@ def locate_map(grid: OccupancyGrid, building: Building) -> Answer:
         center = query.views[0].center_m
         query = replace(query, T_odom_base=SE2(*center), aligned=replace(query.aligned, center_m=center))
     clock.lap("describe")
-    hypotheses = building.look_up(query)
-    status, sure = building.judge(hypotheses, query)
+    found = building.look_up(query)
     clock.lap("look_up")
-    if status != "located":
-        hypotheses = building.look_everywhere(query, hypotheses)
-        status, sure = building.judge(hypotheses, query)
-        clock.lap("search_everywhere")
-    hypotheses = tuple(_at_origin(h, query.T_odom_base) for h in hypotheses)
-    query = replace(query, T_odom_base=SE2())
-    history = (_moment(query, status, sure, hypotheses),)
-    return _answer(building, query, status, sure, hypotheses, history, dict(clock.total_ms))
+    verdict = building.decide(query, found)
+    clock.lap("decide")
+    at_origin = tuple(_at_origin(h, query.T_odom_base) for h in verdict.hypotheses)
+    verdict = replace(verdict, hypotheses=at_origin)
+    return _answer(building, replace(query, T_odom_base=SE2()), verdict, (), clock.total_ms)
 
 
 def _at_origin(hypothesis: Hypothesis, at: SE2) -> Hypothesis:
@@ -325,38 +211,44 @@ def _at_origin(hypothesis: Hypothesis, at: SE2) -> Hypothesis:
     return replace(hypothesis, fit=replace(fit, covariance=J @ fit.covariance @ J.T))
 
 
-def _moment(query: QueryMap, status: Status, sure: float, hypotheses: tuple[Hypothesis, ...]) -> Moment:
-    pose = hypotheses[0].fit.T_map_query @ query.T_odom_base if hypotheses else None
-    return Moment(stamp_ns=query.stamp_ns, path_m=query.path_m, status=status, pose=pose, confidence=sure)
+def _moment(query: QueryMap, verdict: Verdict) -> Moment:
+    best = verdict.hypotheses[0] if verdict.hypotheses else None
+    return Moment(
+        stamp_ns=query.stamp_ns,
+        path_m=query.path_m,
+        status=verdict.status,
+        pose=best.fit.T_map_query @ query.T_odom_base if best else None,
+        confidence=verdict.confidence,
+    )
 
 
 def _answer(
     building: Building,
     query: QueryMap,
-    status: Status,
-    sure: float,
-    hypotheses: tuple[Hypothesis, ...],
+    verdict: Verdict,
     history: tuple[Moment, ...],
     timing_ms: dict[str, float],
 ) -> Answer:
-    located = hypotheses[0] if status == "located" else None
+    located = verdict.hypotheses[0] if verdict.status == "located" else None
     table = building.places.table
     T_map_query = located.fit.T_map_query if located else None
     return Answer(
-        status=status,
+        status=verdict.status,
         session=building.sessions[located.session_index] if located else None,
         stamp_ns=query.stamp_ns,
         T_map_base=T_map_query @ query.T_odom_base if T_map_query else None,
         covariance=located.fit.covariance if located else None,
         T_map_odom=T_map_query,
-        confidence=sure,
-        hypotheses=hypotheses,
-        history=history,
+        confidence=verdict.confidence,
+        hypotheses=verdict.hypotheses,
+        places=verdict.places,
+        history=(*history, _moment(query, verdict)),
         T_odom_base=query.T_odom_base,
         path_m=query.path_m,
         sessions=building.sessions,
-        submap_ids=tuple(int(table.submap_id[h.row]) if h.row >= 0 else -1 for h in hypotheses),
-        evidence=Evidence.of(hypotheses, len(query.aligned.walls_m)),
+        labels=building.labels,
+        submap_ids=tuple(int(table.submap_id[h.row]) if h.row >= 0 else -1 for h in verdict.hypotheses),
+        evidence=verdict.evidence,
         timing_ms=timing_ms,
     )
 
@@ -365,10 +257,15 @@ class _Clock:
     """Where the time went, by name, milliseconds."""
 
     def __init__(self) -> None:
-        self._last = time.perf_counter()
         self.total_ms: dict[str, float] = {}
+        self.start()
+
+    def start(self) -> None:
+        """Count from now on."""
+        self._last = time.perf_counter()
 
     def lap(self, name: str) -> None:
+        """Add what has passed since the last lap to `name`."""
         now = time.perf_counter()
         self.total_ms[name] = self.total_ms.get(name, 0.0) + 1000.0 * (now - self._last)
         self._last = now

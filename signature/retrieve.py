@@ -35,18 +35,17 @@ PRIOR_SHARE = 0.15
 class Places:
     """The places of a database, ready for retrieval.
 
-    table : their signatures. sight_m : how far their isovists reach.
+    table : their signatures.
     ranges_m : (N, B) float32, seen : (N, B) whether the ray's end is known.
     """
 
     table: SignatureTable
-    sight_m: float
     ranges_m: F32
     seen: NDArray[np.bool_]
 
     @staticmethod
     def of(table: SignatureTable, grids: Mapping[int, OccupancyGrid], sight_m: float) -> Places:
-        """Look around at every place of `table` in the grid of its session (by session_index)."""
+        """Look around, as far as `sight_m`, at every place of `table` in the grid of its session."""
         n = len(table)
         ranges = np.zeros((n, PROFILE_BEARINGS), np.float32)
         seen = np.zeros((n, PROFILE_BEARINGS), np.bool_)
@@ -56,7 +55,7 @@ class Places:
                 grids[int(table.session_index[i])], (float(x), float(y)), sight_m, bearings=PROFILE_BEARINGS
             )
             ranges[i], seen[i] = view.ranges_m, view.ends != HIDDEN
-        return Places(table=table, sight_m=sight_m, ranges_m=ranges, seen=seen)
+        return Places(table=table, ranges_m=ranges, seen=seen)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

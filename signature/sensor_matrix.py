@@ -22,6 +22,7 @@ from pc2grid.partition import partition
 from pc2grid.pipeline import map_scans
 from signature.config import Config
 from signature.driven import Driven
+from signature.query import QueryMap
 from signature.relocalize import Answer, Building, Relocalizer
 from signature.retrieve import retrieve
 
@@ -202,38 +203,54 @@ def query_trials(
 
     Maps of another building than `name` have no right answer; only the longest distance is asked there.
     """
-    relocalizers = [Relocalizer(m.building) for m in maps]
+    relocalizer = Relocalizer(*(m.building for m in maps))
     trials: list[Trial] = []
     left = sorted(distances_m)
     for driven_m, (registered, sweep, truth) in zip(driven.path_m(), driven.scans(), strict=True):
-        for relocalizer in relocalizers:
-            relocalizer.add(registered, sweep)
-        if driven_m >= left[0]:
-            travel_m = left.pop(0)
-            for mapped, relocalizer in zip(maps, relocalizers, strict=True):
-                if mapped.name == name or not left:
-                    trials.append(_trial(mapped, relocalizer, name, driven.sensor, seed, travel_m, truth))
-        if not left:
-            break
+        relocalizer.add(registered, sweep)
+        if not left or driven_m < left[0]:
+            continue
+        travel_m = left.pop(0)
+        begin = time.perf_counter()
+        query = relocalizer.query()
+        describe_ms = 1000.0 * (time.perf_counter() - begin)
+        for mapped, search in zip(maps, relocalizer.searches, strict=True):
+            if mapped.name == name or not left:
+                begin = time.perf_counter()
+                answer = search.answer(query)
+                elapsed_ms = describe_ms + 1000.0 * (time.perf_counter() - begin)
+                trials.append(
+                    _trial(
+                        mapped,
+                        query,
+                        answer,
+                        truth,
+                        building=name,
+                        query_sensor=driven.sensor,
+                        seed=seed,
+                        travel_m=travel_m,
+                        look_up_ms=elapsed_ms,
+                    )
+                )
     return trials
 
 
 def _trial(
     mapped: Mapped,
-    relocalizer: Relocalizer,
-    name: str,
-    sensor: SensorKind,
+    query: QueryMap,
+    answer: Answer,
+    T_plan_base: SE2,
+    *,
+    building: str,
+    query_sensor: SensorKind,
     seed: int,
     travel_m: float,
-    T_plan_base: SE2,
+    look_up_ms: float,
 ) -> Trial:
-    begin = time.perf_counter()
-    answer = relocalizer.answer()
-    elapsed_ms = 1000.0 * (time.perf_counter() - begin)
-    inside = mapped.name == name
+    inside = mapped.name == building
     T_map_base = mapped.T_plan_map.inverse() @ T_plan_base
     truly = T_map_base @ answer.T_odom_base.inverse()
-    known = assess(mapped.building.fields[0], relocalizer.query().aligned, truly, np.eye(3)).overlap
+    known = assess(mapped.building.fields[0], query.aligned, truly, np.eye(3)).overlap
     error_m = error_rad = math.nan
     if answer.hypotheses:
         error = T_map_base.inverse() @ (answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base)
@@ -241,7 +258,7 @@ def _trial(
     return Trial(
         building=mapped.name,
         map_sensor=mapped.sensor,
-        query_sensor=sensor,
+        query_sensor=query_sensor,
         seed=seed,
         travel_m=travel_m,
         in_building=inside,
@@ -251,21 +268,19 @@ def _trial(
         right=inside and error_m <= RIGHT_M and error_rad <= RIGHT_RAD,
         error_m=error_m,
         error_rad=error_rad,
-        rank=_rank(mapped, relocalizer, answer, T_map_base) if inside else -1,
+        rank=_rank(mapped, query, truly) if inside else -1,
         scores=answer.evidence.scores,
         walls=answer.evidence.walls,
-        look_up_ms=elapsed_ms,
+        look_up_ms=look_up_ms,
     )
 
 
-def _rank(mapped: Mapped, relocalizer: Relocalizer, answer: Answer, T_map_base: SE2) -> int:
+def _rank(mapped: Mapped, query: QueryMap, T_map_query: SE2) -> int:
     """Rank of the first place that signatures and isovists retrieve where one of the views truly lies."""
     building = mapped.building
-    query = relocalizer.query()
     proposals = retrieve(
         query, building.places, signature=building.made_with.signature, config=building.config, top_k=50
     )
-    T_map_query = T_map_base @ answer.T_odom_base.inverse()
     for rank, proposal in enumerate(proposals):
         true = T_map_query.apply(np.array([query.views[proposal.view].center_m]))[0]
         if math.dist(true, building.places.table.center_m[proposal.row]) <= RETRIEVED_M:

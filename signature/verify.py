@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -130,12 +130,7 @@ def search_everywhere(
 def carry_on(query: QueryMap, hypothesis: Hypothesis, field: LikelihoodField, driven_m: float) -> Hypothesis:
     """The same hypothesis after more travel: refined on what has been seen since."""
     fitted = _fitted(query, hypothesis.session_index, hypothesis.row, field, hypothesis.fit.T_map_query)
-    return Hypothesis(
-        session_index=fitted.session_index,
-        row=fitted.row,
-        fit=fitted.fit,
-        supported_m=hypothesis.supported_m + driven_m,
-    )
+    return replace(fitted, supported_m=hypothesis.supported_m + driven_m)
 
 
 def distinct(hypotheses: Sequence[Hypothesis], at: SE2) -> tuple[Hypothesis, ...]:
@@ -147,12 +142,8 @@ def distinct(hypotheses: Sequence[Hypothesis], at: SE2) -> tuple[Hypothesis, ...
             kept.append(candidate)
         elif candidate.supported_m > kept[twin].supported_m:
             old = kept[twin]
-            kept[twin] = Hypothesis(
-                session_index=old.session_index,
-                row=old.row if old.row >= 0 else candidate.row,
-                fit=old.fit,
-                supported_m=candidate.supported_m,
-            )
+            row = old.row if old.row >= 0 else candidate.row
+            kept[twin] = replace(old, row=row, supported_m=candidate.supported_m)
     return tuple(kept)
 
 

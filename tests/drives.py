@@ -15,6 +15,7 @@ from pc2grid.partition import partition
 from pc2grid.sweep import BEARINGS, Sweep
 from pc2grid.visibility import WALL, isovist
 from signature.config import Config
+from signature.database import Label
 from signature.describe import describe
 from signature.relocalize import Building
 from signature.similarity import SignatureTable
@@ -105,7 +106,11 @@ def look(grid: OccupancyGrid, truth: SE2, stamp_ns: int, field_rad: float, reach
     return Sweep(stamp_ns=stamp_ns, hits_m=points[hit].astype(np.float32), origin_m=np.zeros(2), free_m=free)
 
 
-def building(grids: dict[str, OccupancyGrid], config: Config | None = None) -> Building:
+def building(
+    grids: dict[str, OccupancyGrid],
+    config: Config | None = None,
+    labels: dict[str, Label] | None = None,
+) -> Building:
     """A database in memory."""
     config = config or Config()
     signatures, centers, sessions, ids = [], [], [], []
@@ -116,4 +121,4 @@ def building(grids: dict[str, OccupancyGrid], config: Config | None = None) -> B
             sessions.append(index)
             ids.append(submap.submap_id)
     table = SignatureTable.of(signatures, centers, submap_id=ids, session_index=sessions)
-    return Building(grids, table, config, config)
+    return Building(grids, table, config, config, labels)

@@ -10,7 +10,8 @@ import pytest
 
 from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
-from pc2grid.model import Health, OccupancyGrid, RegisteredScan
+from pc2grid.model import FREE, Health, OccupancyGrid, RegisteredScan
+from signature.database import Label
 from signature.relocalize import Answer, Building, Relocalizer
 from tests.drives import building, drive, office, plan
 
@@ -89,6 +90,49 @@ def test_the_session_is_named_and_its_frame_kept() -> None:
     assert answer.session == "office"
     assert answer.T_map_base is not None
     assert math.dist((answer.T_map_base.x, answer.T_map_base.y), (truth.x, truth.y)) < 0.1
+
+
+def elsewhere(grid: OccupancyGrid, origin_m: tuple[float, float]) -> OccupancyGrid:
+    return OccupancyGrid(cells=grid.cells, resolution_m=grid.resolution_m, origin_m=origin_m)
+
+
+def test_two_sessions_of_one_floor_agree_instead_of_silencing_each_other() -> None:
+    tidied = office().cells.copy()
+    tidied[20:90, 130:150] = FREE  # between the sessions a wall went
+    second = elsewhere(OccupancyGrid(cells=tidied, resolution_m=0.05, origin_m=(0, 0)), (-30.0, 12.0))
+    answer, truth = ask(building({"monday": office(), "tuesday": second}), office(), ROUTE)
+    assert answer.status == "located" and answer.T_map_base is not None
+    there = [h.session_index for h, place in zip(answer.hypotheses, answer.places, strict=True) if place == 0]
+    assert sorted(there) == [0, 1]
+    moved = {"monday": SE2(), "tuesday": SE2(-30.0, 12.0, 0.0)}[answer.session or ""]
+    expected = moved @ truth
+    assert math.dist((answer.T_map_base.x, answer.T_map_base.y), (expected.x, expected.y)) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("floors", "status"), [(("1", "2"), "ambiguous"), (("1", "1"), "located"), ((None, None), "located")]
+)
+def test_labels_that_differ_keep_two_floors_apart(floors: tuple[str | None, str | None], status: str) -> None:
+    labels = {n: Label(building="hall" if f else None, floor=f) for n, f in zip("ab", floors, strict=True)}
+    twice = building({"a": office(), "b": elsewhere(office(), (5.0, 0.0))}, labels=labels)
+    answer, _ = ask(twice, office(), ROUTE)
+    assert answer.status == status
+    assert answer.label.floor == (floors[0] if status == "located" else None)
+    named = [(h["session"], h["floor"]) for h in answer.to_json()["hypotheses"]]
+    assert {("a", floors[0]), ("b", floors[1])} <= set(named)
+
+
+def test_like_rooms_of_two_buildings_are_told_apart_by_what_lies_around_them() -> None:
+    """The query saw one room only; nobody said that the sessions are of different buildings."""
+    room = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5), (6, 0, 6, 6)]
+    left = plan(14, 6, [*room, (6, 2, 10, 2), (9, 4, 9, 6)])
+    amid = [(0, 0, 6, 0), (0, 0, 0, 6), (0, 6, 6, 6), *room]
+    around = [(2, 2, 2, 9), (2, 12, 9, 12), (14, 4, 17, 4), (16, 8, 16, 14), (10, 0, 10, 3)]
+    right = plan(20, 15, [*around, *[(x0 + 6, y0 + 5, x1 + 6, y1 + 5) for x0, y0, x1, y1 in amid]])
+    answer, _ = ask(building({"left": left, "right": right}), left, [(1.0, 1.0), (5.0, 1.0), (5.0, 2.4)])
+    assert answer.status == "ambiguous"
+    best = {h.session_index for h in answer.hypotheses[:2]}
+    assert best == {0, 1} and len(set(answer.places[:2])) == 2
 
 
 def test_the_answer_does_not_depend_on_where_the_query_starts() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from pc2grid.simulate import SimulationConfig, office_floorplan
 from signature.config import Config
 from signature.describe import describe
+from signature.driven import Driven, drive
 from signature.relocalize import Building
 from signature.sensor_matrix import Mapped, Trial, map_building, matrix, query_trials, reliability
 from signature.similarity import SignatureTable
@@ -61,7 +63,7 @@ def test_reliability_compares_confidence_with_truth() -> None:
     assert rows == [(pytest.approx((0.95 + 0.91 + 1.0) / 3), pytest.approx(2 / 3), 3)]
 
 
-def test_a_laser_finds_itself_in_a_map_made_by_another_session() -> None:
+def test_a_laser_finds_itself_in_a_map_made_by_another_session(tmp_path: Path) -> None:
     plan = office_floorplan(3, 22.0, 20.0)
     config = Config()
     session, T_plan_map = map_building(
@@ -72,8 +74,9 @@ def test_a_laser_finds_itself_in_a_map_made_by_another_session() -> None:
     )
     building = Building({session.session: session.grid}, table, config, config)
     mapped = Mapped(name="office", sensor="laser", T_plan_map=T_plan_map, building=building)
-    trials = query_trials(
-        "office", plan, "laser", SimulationConfig(length_m=8, seed=4, clutter=8), [mapped], config, (2.0, 6.0)
-    )
+    queries = SimulationConfig(length_m=8, seed=4, clutter=8)
+    driven = drive(plan, "laser", queries, config, until_m=6.0)
+    driven.save(tmp_path / "query.npz")
+    trials = query_trials("office", 4, Driven.load(tmp_path / "query.npz"), [mapped], (2.0, 6.0))
     assert [t.travel_m for t in trials] == [2.0, 6.0]
     assert trials[-1].status == "located" and trials[-1].right and trials[-1].error_m < 0.15

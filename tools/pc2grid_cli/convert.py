@@ -8,43 +8,35 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.settings import (
-    AsJson,
-    Assignments,
-    AssumeIdentity,
-    ConfigFile,
-    Duration,
-    Force,
-    OdometryTopic,
-    Recover,
-    Start,
-    Topic,
-    make_config,
-)
+from pc2grid_cli import settings as options
 
 if TYPE_CHECKING:
     from pc2grid.model import OccupancyGrid, SessionMap
     from signature.config import Config
-    from signature.database import Provenance
+    from signature.database import Label, Provenance
 
 
 def convert_command(
     inputs: Annotated[list[Path], typer.Argument(metavar="LOG|MAP.yaml...", help="recordings, or nav2 maps")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="BUILDING.submaps", help="what to write")],
-    topic: Topic = None,
-    odometry: OdometryTopic = None,
-    start: Start = 0.0,
-    duration: Duration = None,
+    topic: options.Topic = None,
+    odometry: options.OdometryTopic = None,
+    start: options.Start = 0.0,
+    duration: options.Duration = None,
     name: Annotated[
         str | None, typer.Option("--name", help="of the session; default: the file's name")
     ] = None,
+    building: Annotated[
+        str | None, typer.Option("--building", metavar="NAME", help="where it was recorded; answers say so")
+    ] = None,
+    floor: Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, within it")] = None,
     add: Annotated[bool, typer.Option("--add", help="add to an existing database")] = False,
-    config: ConfigFile = None,
-    set_: Assignments = None,
-    force: Force = False,
-    recover: Recover = False,
-    assume_identity: AssumeIdentity = False,
-    json: AsJson = False,
+    config: options.ConfigFile = None,
+    set_: options.Assignments = None,
+    force: options.Force = False,
+    recover: options.Recover = False,
+    assume_identity: options.AssumeIdentity = False,
+    json: options.AsJson = False,
 ) -> None:
     """Make a submap database from recordings or maps.
 
@@ -52,11 +44,15 @@ def convert_command(
     """
     from pc2grid.errors import ConfigError, OutputError
     from signature.build import add_sessions
+    from signature.database import Label
 
-    settings = make_config(config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity)
+    settings = options.make_config(
+        config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
+    )
     if name is not None and len(inputs) > 1:
         raise ConfigError("--name names one session, but there are several inputs")
     names = [name or path.stem for path in inputs]
+    label = Label(building=building, floor=floor)
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise ConfigError(
@@ -64,7 +60,7 @@ def convert_command(
         )
     if not add and not force and output.exists() and not (output.is_file() and output.stat().st_size == 0):
         raise OutputError(
-            f"{output}: exists already{_difference(output, inputs, names, settings, start, duration)}",
+            f"{output}: exists already{_difference(output, inputs, names, label, settings, start, duration)}",
             hint="--force replaces it, --add adds to it",
         )
     if not output.parent.is_dir():
@@ -76,7 +72,9 @@ def convert_command(
 
         open_database(output).close()
     sessions = [
-        build_session(path, session, settings, start_s=start, duration_s=duration, recover=recover)
+        build_session(
+            path, session, settings, start_s=start, duration_s=duration, recover=recover, label=label
+        )
         for path, session in zip(inputs, names, strict=True)
     ]
     with console.progress("describe") as update:
@@ -108,6 +106,7 @@ def build_session(
     start_s: float = 0.0,
     duration_s: float | None = None,
     recover: bool = False,
+    label: Label | None = None,
 ) -> tuple[SessionMap, Provenance]:
     """One input as a session map and what it came from."""
     from pc2grid.io.nav2_map import is_map_file
@@ -115,7 +114,7 @@ def build_session(
 
     if is_map_file(path):
         session_map, digest = _import_map(path, name, config)
-        return session_map, provenance(path, digest, config)
+        return session_map, provenance(path, digest, config, label=label)
 
     from pc2grid.io import open_log
     from pc2grid.pipeline import build_map
@@ -127,7 +126,7 @@ def build_session(
             session_map = build_map(
                 log, config, session=name, start_s=start_s, duration_s=duration_s, progress=update
             )
-        origin = provenance(path, log.digest(), config, start_s=start_s, duration_s=duration_s)
+        origin = provenance(path, log.digest(), config, start_s=start_s, duration_s=duration_s, label=label)
     return session_map, origin
 
 
@@ -142,6 +141,8 @@ def summary(session: SessionMap, origin: Provenance) -> dict[str, Any]:
     stamps = session.trajectory.stamps_ns
     return {
         "session": session.session,
+        "building": origin.label.building,
+        "floor": origin.label.floor,
         "source": origin.source,
         "digest": origin.digest,
         "sensor": session.sensor,
@@ -158,6 +159,7 @@ def _difference(
     output: Path,
     inputs: list[Path],
     names: list[str],
+    label: Label,
     config: Config,
     start_s: float,
     duration_s: float | None,
@@ -177,6 +179,8 @@ def _difference(
         return f" and holds {there} instead of {', '.join(map(repr, sorted(names)))}"
     for path, name in zip(inputs, names, strict=True):
         origin = present[name]
+        if origin.label != label:
+            return f", {name!r} with {origin.label} instead of {label} (--building, --floor)"
         part = (origin.start_s, origin.duration_s)
         if not is_map_file(path) and part != (start_s, duration_s):
             return f", {name!r} made from another part of the recording (--start, --duration)"

@@ -28,6 +28,8 @@ def info_command(database: Database, json: AsJson = False) -> None:
             {
                 "name": s.name,
                 "sensor": s.sensor,
+                "building": s.provenance.label.building,
+                "floor": s.provenance.label.floor,
                 "source": s.provenance.source,
                 "digest": s.digest,
                 "submaps": s.submaps,

@@ -9,24 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pc2grid_cli import console
+from pc2grid_cli import settings as options
 from pc2grid_cli.answer_files import write_initialpose
 from pc2grid_cli.finding import find_log, find_map, in_map
-from pc2grid_cli.settings import (
-    AsJson,
-    Assignments,
-    AssumeIdentity,
-    ConfigFile,
-    Duration,
-    Force,
-    OdometryTopic,
-    Recover,
-    Start,
-    Topic,
-    make_config,
-)
 
 if TYPE_CHECKING:
     from signature.relocalize import Answer
+    from signature.verify import Hypothesis
 
 
 def relocalize_command(
@@ -34,10 +23,10 @@ def relocalize_command(
     database: Annotated[
         str, typer.Option("--database", "-d", metavar="BUILDING.submaps", help="where to look")
     ],
-    topic: Topic = None,
-    odometry: OdometryTopic = None,
-    start: Start = 0.0,
-    duration: Duration = None,
+    topic: options.Topic = None,
+    odometry: options.OdometryTopic = None,
+    start: options.Start = 0.0,
+    duration: options.Duration = None,
     top_k: Annotated[int | None, typer.Option("--top-k", min=1, help="candidates to align with")] = None,
     trajectory: Annotated[
         Path | None, typer.Option("--trajectory", metavar="OUT.tum", help="the query's poses in the map")
@@ -54,12 +43,12 @@ def relocalize_command(
     report: Annotated[
         Path | None, typer.Option("--report", metavar="OUT.html", help="a page to look into the answer")
     ] = None,
-    config: ConfigFile = None,
-    set_: Assignments = None,
-    force: Force = False,
-    recover: Recover = False,
-    assume_identity: AssumeIdentity = False,
-    json: AsJson = False,
+    config: options.ConfigFile = None,
+    set_: options.Assignments = None,
+    force: options.Force = False,
+    recover: options.Recover = False,
+    assume_identity: options.AssumeIdentity = False,
+    json: options.AsJson = False,
 ) -> None:
     """Find where a recording was made. Exit code 4: there is no confident single answer.
 
@@ -78,7 +67,9 @@ def relocalize_command(
             raise ConfigError(
                 f"{option}: there is no robot in a map", hint="--json and --output have its pose"
             )
-    settings = make_config(config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity)
+    settings = options.make_config(
+        config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
+    )
     if top_k is not None:
         settings = settings.model_copy(
             update={"relocalize": settings.relocalize.model_copy(update={"top_k": top_k})}
@@ -139,18 +130,24 @@ def as_text(answer: Answer, *, is_map: bool = False) -> str:
         of_what = "for the map's own frame" if is_map else "at the last scan"
         travel = "" if is_map else f", after {answer.path_m:.1f} m of travel"
         return (
-            f"located in {answer.session}: x {pose.x:.2f} m, y {pose.y:.2f} m,"
+            f"located in {_named(answer, answer.hypotheses[0])}: x {pose.x:.2f} m, y {pose.y:.2f} m,"
             f" yaw {math.degrees(pose.yaw):.1f} deg {of_what},"
             f" confidence {answer.confidence:.2f}{travel}"
         )
     lines = [
         {
-            "ambiguous": f"ambiguous: {len(answer.hypotheses)} places fit{after}",
+            "ambiguous": f"ambiguous: {len(set(answer.places))} places fit{after}",
             "not_found": f"not found: no place fits well enough{after}",
         }[answer.status]
     ]
     for h in answer.hypotheses[:5]:
         pose = h.fit.T_map_query @ answer.T_odom_base
-        session = answer.sessions[h.session_index]
-        lines.append(f"  {session}: x {pose.x:.2f} m, y {pose.y:.2f} m, score {h.fit.score:.2f}")
+        lines.append(f"  {_named(answer, h)}: x {pose.x:.2f} m, y {pose.y:.2f} m, score {h.fit.score:.2f}")
     return "\n".join(lines)
+
+
+def _named(answer: Answer, hypothesis: Hypothesis) -> str:
+    """The session whose map a hypothesis is in, with its building and floor if they were ever told."""
+    session = answer.sessions[hypothesis.session_index]
+    label = answer.labels[hypothesis.session_index]
+    return f"{session} ({label})" if label.building or label.floor else session
