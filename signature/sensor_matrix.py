@@ -199,14 +199,15 @@ def start_of(plan: OccupancyGrid, mapping: SimulationConfig, seed: int) -> tuple
 def query_trials(
     name: str, seed: int, driven: Driven, maps: Sequence[Mapped], distances_m: Sequence[float] = DISTANCES_M
 ) -> list[Trial]:
-    """One query session against all `maps`, asked after each of `distances_m` of travel.
+    """One query session against all `maps`, asked after each of `distances_m` that it has driven.
 
     Maps of another building than `name` have no right answer; only the longest distance is asked there.
     """
     relocalizer = Relocalizer(*(m.building for m in maps))
     trials: list[Trial] = []
-    left = sorted(distances_m)
-    for driven_m, (registered, sweep, truth) in zip(driven.path_m(), driven.scans(), strict=True):
+    path_m = driven.path_m()
+    left = sorted(d for d in distances_m if d <= path_m[-1])
+    for driven_m, (registered, sweep, truth) in zip(path_m, driven.scans(), strict=True):
         relocalizer.add(registered, sweep)
         if not left or driven_m < left[0]:
             continue

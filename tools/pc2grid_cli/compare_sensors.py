@@ -34,6 +34,10 @@ def compare_sensors_command(
     clutter: Annotated[
         int, typer.Option("--clutter", help="Things in the way, different in each session.")
     ] = 30,
+    rate: Annotated[float, typer.Option("--rate", help="Scans a second, of every sensor.")] = 10.0,
+    travel: Annotated[
+        float, typer.Option("--travel", min=1.0, help="Metres that a query drives at most.")
+    ] = 15.0,
     seed: Annotated[int, typer.Option("--seed", help="Of the first query session.")] = 1,
     jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="Processes. [one a core]")] = None,
     as_json: Annotated[
@@ -60,7 +64,7 @@ def compare_sensors_command(
             (out / folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{out}: {error.strerror}", hint="choose another --out") from error
-    setting = {"map_length": map_length, "clutter": clutter}
+    setting = {"map_length": map_length, "clutter": clutter, "rate": rate, "travel": travel}
     here = [(str(p), sensor, str(out), setting) for p in plans for sensor in SENSORS]
     asking = [
         (str(p), sensor, seed + i, str(out), setting)
@@ -128,9 +132,24 @@ def _tag(setting: Setting) -> str:
 
 
 def _mapping(setting: Setting) -> SimulationConfig:
+    return _simulation(setting, setting["map_length"], MAP_SEED)
+
+
+def _simulation(
+    setting: Setting, length_m: float, seed: int, start_m: tuple[float, float] | None = None
+) -> SimulationConfig:
     from pc2grid.simulate import SimulationConfig
 
-    return SimulationConfig(length_m=setting["map_length"], seed=MAP_SEED, clutter=int(setting["clutter"]))
+    rate = {"rate_hz": setting["rate"]}
+    return SimulationConfig.model_validate(
+        {
+            "length_m": length_m,
+            "seed": seed,
+            "clutter": int(setting["clutter"]),
+            "start_m": start_m,
+            **dict.fromkeys(("lidar", "laser", "depth"), rate),
+        }
+    )
 
 
 def _map(plan: str, sensor: SensorKind, out: str, setting: Setting) -> None:
@@ -158,21 +177,16 @@ def _map(plan: str, sensor: SensorKind, out: str, setting: Setting) -> None:
 def _drive(plan: str, sensor: SensorKind, seed: int, out: str, setting: Setting) -> None:
     """Simulate and register one query session, unless it was done before."""
     from pc2grid.io.nav2_map import load_map
-    from pc2grid.simulate import SimulationConfig
     from signature.config import Config
     from signature.driven import drive
-    from signature.sensor_matrix import DISTANCES_M, start_of
+    from signature.sensor_matrix import start_of
 
     target = _file("drives", plan, sensor, seed, out, setting)
     if target.exists():
         return
-    grid, until_m = load_map(Path(plan)), max(DISTANCES_M)
-    simulation = SimulationConfig(
-        length_m=until_m + 3.0,
-        seed=seed,
-        clutter=int(setting["clutter"]),
-        start_m=start_of(grid, _mapping(setting), seed),
-    )
+    grid, until_m = load_map(Path(plan)), setting["travel"]
+    start_m = start_of(grid, _mapping(setting), seed)
+    simulation = _simulation(setting, until_m + 3.0, seed, start_m)
     drive(grid, sensor, simulation, Config(), until_m=until_m).save(target)
 
 
