@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pc2grid.errors import DatabaseError, DatabaseVersion, NotADatabase, OutputError
+from pc2grid.errors import DatabaseError, NotADatabase, OutputError
 from pc2grid.model import OccupancyGrid, SessionMap, Submap, Trajectory
 from signature.database import codec, postgres_schema, rows
 from signature.database.postgres_schema import served
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
 Key = tuple[str, int]
 """Building and number of a session."""
 _ATTEMPTS = 5
+_OF = "building = %s AND session_id = %s"
 
 
 def store(url: str, entries: Iterable[Entry], *, keep: bool, force: bool = False) -> None:
@@ -417,18 +417,27 @@ class PostgresDatabase:
 
         Returns what is wrong with each of them. Raises DatabaseCorrupt if none is left.
         """
-        damaged = self._damaged(("session", "grid", "signature"))
-        first = {key: found[0] for key, found in damaged.items()}
-        self._left_out = first.keys()
-        problems = tuple(first.values())
+        with served(self._where):
+            damaged = {
+                key: problem
+                for key in self._all_keys()
+                for problem in [next(self._damage(key, ("session", "grid", "signature")), None)]
+                if problem is not None
+            }
+        self._left_out = damaged.keys()
+        problems = tuple(damaged.values())
         if problems and not self._keys():
             raise rows.corrupt(self._where, problems[0].where, problems[0].what)
         return problems
 
     def check(self) -> tuple[Problem, ...]:
         """Everything that is wrong with the database: each row against its checksum, none may be missing."""
-        damaged = self._damaged(tuple(postgres_schema.TABLES))
-        return tuple(dict.fromkeys(problem for found in damaged.values() for problem in found))
+        problems: list[Problem] = []
+        with served(self._where):
+            for key in self._all_keys():
+                found = list(self._damage(key, tuple(postgres_schema.TABLES)))
+                problems += found or [*self._misled(key), *self._incomplete(key)]
+        return tuple(dict.fromkeys(problems))
 
     def close(self) -> None:
         """Let go of the connection."""
@@ -472,55 +481,55 @@ class PostgresDatabase:
             raise rows.corrupt(self._where, f"{what} of session {session!r}", "wrong checksum")
         return row
 
-    def _damaged(self, tables: Sequence[str]) -> dict[Key, list[Problem]]:
-        """What is wrong with the rows of each session in these tables."""
-        with served(self._where):
-            keys = self._connection.execute("SELECT building, id FROM pc2grid.session ORDER BY id").fetchall()
-            problems = {
-                (building, number): [
-                    *(p for table in tables for p in self._damage(table, (building, number))),
-                    *self._missing((building, number)),
-                ]
-                for building, number in keys
-            }
-        return {key: found for key, found in problems.items() if found}
+    def _all_keys(self) -> list[Key]:
+        found = self._connection.execute("SELECT building, id FROM pc2grid.session ORDER BY id").fetchall()
+        return [(building, number) for building, number in found]
 
-    def _damage(self, table: str, key: Key) -> Iterator[Problem]:
-        for row, sound in _select(self._connection, table, key):
-            number = row["submap_id"] if "submap_id" in row else key[1]
-            name = f"{table} {number}" + (f" of session {key[1]}" if "submap_id" in row else "")
-            try:
-                if not sound:
-                    raise ValueError("wrong checksum")
-                _decode(table, row, self._where)
-            except DatabaseVersion:
-                raise
-            except Exception as error:
-                # Whatever the decoding of damaged content stumbles over is the finding.
-                yield Problem(name, str(error))
+    def _damage(self, key: Key, tables: Sequence[str]) -> Iterator[Problem]:
+        """What is wrong with the rows of a session in these tables, and which single ones it lacks."""
+        for table in tables:
+            found = _select(self._connection, table, key)
+            for row, sound in found:
+                number = row["submap_id"] if "submap_id" in row else key[1]
+                name = f"{table} {number}" + (f" of session {key[1]}" if "submap_id" in row else "")
+                try:
+                    if not sound:
+                        raise ValueError("wrong checksum")
+                    _decode(table, row, self._where)
+                except Exception as error:
+                    # Whatever the decoding of damaged content stumbles over is the finding.
+                    yield Problem(name, str(error))
+        for table in ("grid", "trajectory"):
+            if not _select(self._connection, table, key):
+                yield Problem(f"session {key[1]}", f"has no {table}")
 
-    def _missing(self, key: Key) -> Iterator[Problem]:
-        """What a session should have and has not."""
-        counts = self._connection.execute(
-            "SELECT name, document, (SELECT count(*) FROM pc2grid.grid o WHERE o.building = s.building AND"
-            " o.session_id = s.id), (SELECT count(*) FROM pc2grid.trajectory o WHERE o.building = s.building"
-            " AND o.session_id = s.id), ARRAY(SELECT submap_id FROM pc2grid.submap o WHERE o.building ="
-            " s.building AND o.session_id = s.id ORDER BY 1), ARRAY(SELECT submap_id FROM pc2grid.signature o"
-            " WHERE o.building = s.building AND o.session_id = s.id ORDER BY 1)"
-            " FROM pc2grid.session s WHERE s.building = %s AND s.id = %s",
-            key,
-        ).fetchone()
-        if counts is None:
+    def _misled(self, key: Key) -> Iterator[Problem]:
+        """Embeddings that are not what the histograms make them: the index would look in the wrong place."""
+        found = [row for row, _ in _select(self._connection, "signature", key)]
+        if not found:
             return
-        name, document, grids, trajectories, submaps, signatures = counts
-        for table, count in (("grid", grids), ("trajectory", trajectories)):
-            if not count:
-                yield Problem(f"session {name!r}", f"has no {table}")
-        stored = json.loads(document).get("submaps")
-        if not len(submaps) == len(signatures) == stored or submaps != signatures:
+        (session, _), *_rest = _select(self._connection, "session", key)
+        config = rows.read_info(session, 1.0, 0, self._where).provenance.config
+        stored = self._connection.execute(
+            f"SELECT embedding FROM pc2grid.signature WHERE {_OF} ORDER BY submap_id", key
+        ).fetchall()
+        for row, wanted, (vector,) in zip(found, _embeddings(found, config), stored, strict=True):
+            if not np.array_equal(vector.to_numpy(), wanted):
+                yield Problem(f"signature {row['submap_id']} of session {key[1]}", "wrong embedding")
+
+    def _incomplete(self, key: Key) -> Iterator[Problem]:
+        """Submaps that are missing, against what was stored."""
+        (session, _), *_rest = _select(self._connection, "session", key)
+        stored = rows.read_info(session, 1.0, 0, self._where).submaps
+        ids = {
+            table: [row["submap_id"] for row, _ in _select(self._connection, table, key)]
+            for table in ("submap", "signature")
+        }
+        if ids["submap"] != ids["signature"] or len(ids["submap"]) != stored:
             yield Problem(
-                f"session {name!r}",
-                f"has {len(submaps)} submaps and {len(signatures)} signatures where {stored} were stored",
+                f"session {session['name']!r}",
+                f"has {len(ids['submap'])} submaps and {len(ids['signature'])} signatures where {stored} were"
+                " stored",
             )
 
     def _believe(self, row: rows.Row, sound: bool) -> None:
