@@ -12,6 +12,7 @@ from pc2grid.config import PartitionConfig, ProjectionConfig, RegistrationConfig
 from pc2grid.errors import NoScans
 from pc2grid.geometry import F64, SE2
 from pc2grid.model import (
+    F32,
     I64,
     Health,
     OccupancyGrid,
@@ -124,6 +125,7 @@ def map_scans(
     >>> grid.resolution_m, bool(grid.occupied.any())
     (0.05, True)
     """
+    from pc2grid.glimpses import Glimpses
     from pc2grid.loops import close_loops, spread
     from pc2grid.pieces import Keyframe
     from pc2grid.tracking import Tracker
@@ -133,18 +135,27 @@ def map_scans(
     poses: list[F64] = []
     health: list[Health] = []
     keyframes: list[Keyframe] = []
+    between = Glimpses(config.projection.max_range_m, config.projection.resolution_m)
+    glimpsed: list[F32] = []
     for scan in scans:
         tracked = tracker.track(scan)
         registered = tracked.registered
+        pose = SE2.flatten(registered.T_map_base)
         if tracked.keyframe:
-            pose = SE2.flatten(registered.T_map_base)
+            if keyframes:
+                glimpsed.append(between.take())
+            between.restart(tracked.sweep, pose)
             keyframes.append(
                 Keyframe(len(stamps), tracked.sweep, pose, tracked.information, restart=tracked.restart)
             )
+        elif keyframes and registered.health is not Health.LOST:
+            between.add(tracked.sweep, pose)
         stamps.append(scan.stamp_ns)
         poses.append(registered.T_map_base)
         health.append(registered.health)
         advance(scan.stamp_ns)
+    if keyframes:
+        glimpsed.append(between.take())
     builder = GridBuilder(config.projection)
     if not stamps:
         nothing = Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
@@ -158,9 +169,10 @@ def map_scans(
         T_map_base = _replant(T_map_base, flat, settled)
         index = np.array([k.index for k in keyframes])
         loops = index[np.array(closed.loops, np.int64).reshape(-1, 2)]
-    for keyframe in keyframes:
-        if health[keyframe.index] is not Health.LOST:
-            builder.add(keyframe.sweep, SE2.flatten(T_map_base[keyframe.index]))
+    for keyframe, glimpses in zip(keyframes, glimpsed, strict=True):
+        pose = SE2.flatten(T_map_base[keyframe.index])
+        builder.add(keyframe.sweep, pose)
+        builder.glimpse(pose.apply(glimpses))
     trajectory = Trajectory(
         stamps_ns=np.array(stamps, dtype=np.int64), T_map_base=T_map_base, health=tuple(health)
     )

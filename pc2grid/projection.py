@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from pc2grid.config import ProjectionConfig
 from pc2grid.errors import LimitExceeded
-from pc2grid.geometry import SE2
-from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from pc2grid.geometry import F64, SE2
+from pc2grid.model import FREE, I64, OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.sweep import Sweep
 
 _TILE = 256
@@ -25,6 +25,7 @@ _SUBPIXEL = 4  # fractional bits of cv2's polygon corners
 _HIT = 150
 _MISS = -75
 _CLAMP = 500
+_GLIMPSED = round(OCCUPIED / (1.0 + math.exp(-_HIT / 100.0)))
 BODY_M = 0.15
 """Around the origin of the base nothing but the robot has room."""
 
@@ -40,6 +41,7 @@ class GridBuilder:
         self._config = config
         self._log_odds: dict[tuple[int, int], NDArray[np.int16]] = {}
         self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
+        self._glimpsed: list[I64] = []
 
     def add(self, sweep: Sweep, T_map_base: SE2) -> None:
         """Draw one sweep taken at `T_map_base`. Raises LimitExceeded if the map grows past `max_cells`."""
@@ -66,6 +68,10 @@ class GridBuilder:
         cv2.circle(update, (here - low).tolist(), round(BODY_M / resolution), 2 * _MISS, -1)
         self._add_window(update, int(low[0]), int(low[1]))
 
+    def glimpse(self, hits_m: F64) -> None:
+        """Obstacles (N, 2) in the map frame that count only where no sweep says anything, now or later."""
+        self._glimpsed.append(np.floor(hits_m / self._config.resolution_m).astype(np.int64))
+
     def grid(self) -> OccupancyGrid:
         """The map so far: 0..100 where seen, unknown elsewhere, cropped to what was seen."""
         if not self._log_odds:
@@ -82,6 +88,11 @@ class GridBuilder:
             percent = np.rint(OCCUPIED / (1.0 + np.exp(-odds))).astype(np.int8)
             r, c = (row - min(rows)) * _TILE, (column - min(columns)) * _TILE
             cells[r : r + _TILE, c : c + _TILE] = np.where(self._seen[row, column], percent, UNKNOWN)
+        for columns_rows in self._glimpsed:
+            at = columns_rows[:, ::-1] - (min(rows) * _TILE, min(columns) * _TILE)
+            at = at[((at >= 0) & (at < cells.shape)).all(axis=1)]
+            at = at[cells[at[:, 0], at[:, 1]] == UNKNOWN]
+            cells[at[:, 0], at[:, 1]] = _GLIMPSED
         known_rows = np.flatnonzero((cells >= FREE).any(axis=1))
         known_columns = np.flatnonzero((cells >= FREE).any(axis=0))
         r0, r1 = int(known_rows[0]), int(known_rows[-1]) + 1

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from pc2grid.simulate.session import Reading
 
 LOOKS = 3
-"""A wall cell counts as visible if this many scans have a return within a cell of it."""
+"""A wall cell counts as visible if it borders on open space that came in sight, and this many scans have a
+return within a cell of it."""
 _BEARINGS = 1440
 _SIGHT_STEP_M, _SIGHT_STEP_RAD = 0.05, math.radians(2.0)
 
@@ -117,7 +118,7 @@ class TrueFloor:
     def judge(self, grid: OccupancyGrid, T_plan_map: SE2) -> GridQuality:
         """A map of the drive, placed in the plan, against what there was to be known."""
         plan = self._session.grid
-        visible = self._walls & (_around(self._looks) >= LOOKS)
+        visible = self._walls & _grown(self._seen & ~self._walls) & (_around(self._looks) >= LOOKS)
         rows, columns = np.nonzero(grid.cells != UNKNOWN)
         known = np.column_stack((rows, columns))
         cells = plan.to_cell(T_plan_map.apply(grid.to_point(known)))
