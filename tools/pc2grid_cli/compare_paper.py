@@ -49,7 +49,10 @@ def compare_paper_command(
         bool, typer.Option("--json", help="Print one JSON document instead of tables.")
     ] = False,
 ) -> None:
-    """Reproduce the paper's tables and figures 9 and 10 on its maps, each number beside the published one."""
+    """Reproduce the paper's tables and figures 9 and 10 on its maps, each number beside the published one.
+
+    Example: pc2grid compare paper --maps maps/ --queries 200
+    """
     from pc2grid.errors import ConfigError, MapFileError, OutputError
     from pc2grid_cli import paper_report
     from signature.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES

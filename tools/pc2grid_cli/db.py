@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pc2grid_cli import console
 from pc2grid_cli.settings import AsJson, Force
+
+if TYPE_CHECKING:
+    from signature.database import Problem
 
 Database = Annotated[Path, typer.Argument(metavar="BUILDING.submaps", help="the database")]
 Output = Annotated[Path, typer.Option("--output", "-o", metavar="OUT.submaps", help="what to write")]
@@ -77,6 +81,7 @@ def merge_command(
     databases: Annotated[list[Path], typer.Argument(metavar="A.submaps B.submaps...", help="what to merge")],
     output: Output,
     force: Force = False,
+    json: AsJson = False,
 ) -> None:
     """Put the sessions of several databases into a new one.
 
@@ -85,7 +90,10 @@ def merge_command(
     from signature.database.upkeep import merge
 
     count = merge(databases, output, force=force)
-    print(f"{output}: {count} sessions")
+    if json:
+        console.print_json(_written(output))
+    else:
+        print(f"{output}: {count} sessions")
 
 
 def copy_command(
@@ -93,6 +101,7 @@ def copy_command(
     output: Output,
     recover: Annotated[bool, typer.Option("--recover", help="leave damaged parts out; exit code 3")] = False,
     force: Force = False,
+    json: AsJson = False,
 ) -> None:
     """Write a compact copy of a database.
 
@@ -103,6 +112,23 @@ def copy_command(
     problems = copy(database, output, recover=recover, force=force)
     for problem in problems:
         console.warn(f"left out: {problem.where}: {problem.what}")
-    print(f"{output}: {output.stat().st_size / 1e6:.1f} MB")
+    if json:
+        console.print_json(_written(output, problems))
+    else:
+        print(f"{output}: {output.stat().st_size / 1e6:.1f} MB")
     if problems:
         raise typer.Exit(console.LOSSY)
+
+
+def _written(path: Path, left_out: Sequence[Problem] = ()) -> dict[str, Any]:
+    """What a command says of the database it made."""
+    from signature.database import open_database
+
+    with open_database(path) as opened:
+        count = len(opened.sessions())
+    return {
+        "schema_version": 1,
+        "database": str(path),
+        "sessions": count,
+        "left_out": [{"where": problem.where, "what": problem.what} for problem in left_out],
+    }

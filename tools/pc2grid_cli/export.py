@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.settings import Force
+from pc2grid_cli.settings import AsJson, Force
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory
@@ -54,6 +54,7 @@ def export_command(
     ] = None,
     session: Annotated[str | None, typer.Option("--session", help="which, if there are several")] = None,
     force: Force = False,
+    json: AsJson = False,
 ) -> None:
     """Write a session's map, trajectory or picture, or a page that shows all sessions.
 
@@ -113,6 +114,15 @@ def export_command(
             write_report(report, opened)
     for path in targets:
         console.note(f"wrote {path}")
+    if json:
+        console.print_json(
+            {
+                "schema_version": 1,
+                "database": database,
+                "session": name if of_session else None,
+                "written": [str(path) for path in targets],
+            }
+        )
 
 
 def _poses(database: SubmapDatabase, session: str) -> Trajectory:

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-import json as json_text
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from pc2grid_cli.console import print_json
+from pc2grid_cli.settings import AsJson, Recover, Topic
+
 
 def info_command(
-    log: Annotated[Path, typer.Argument(help="Recording to look at.", show_default=False)],
-    topic: Annotated[str | None, typer.Option("--topic", "-t", help="Topic of the scans.")] = None,
-    recover: Annotated[bool, typer.Option("--recover", help="Read what is whole of a damaged file.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="the recording to look at")],
+    topic: Topic = None,
+    recover: Recover = False,
+    json: AsJson = False,
 ) -> None:
-    """Say what is in a recording, and which topic convert would use and why."""
+    """Say what is in a recording, and which topic convert would use and why.
+
+    Example: pc2grid info monday.mcap
+    """
     document = describe(log, topic=topic, recover=recover)
     if json:
-        print(json_text.dumps(document, indent=2))
+        print_json(document)
     else:
         _show(document)
 

@@ -10,10 +10,11 @@ import typer
 
 import pc2grid
 from pc2grid_cli import console
+from pc2grid_cli.compare_log import compare_log_command
 from pc2grid_cli.compare_maps import compare_maps_command
 from pc2grid_cli.compare_paper import compare_paper_command
 from pc2grid_cli.compare_sensors import compare_sensors_command
-from pc2grid_cli.config import dump_command
+from pc2grid_cli.config import dump_command, schema_command
 from pc2grid_cli.convert import convert_command
 from pc2grid_cli.db import check_command, copy_command, merge_command
 from pc2grid_cli.db import info_command as db_info_command
@@ -62,6 +63,7 @@ app.command("export")(export_command)
 compare = typer.Typer(help="The paper's tables, sensors against sensors.", no_args_is_help=True)
 compare.command("paper")(compare_paper_command)
 compare.command("sensors")(compare_sensors_command)
+compare.command("log")(compare_log_command)
 compare.command("maps")(compare_maps_command)
 app.add_typer(compare, name="compare")
 
@@ -72,8 +74,9 @@ db.command("merge")(merge_command)
 db.command("copy")(copy_command)
 app.add_typer(db, name="db")
 
-config = typer.Typer(help="Settings.", no_args_is_help=True)
+config = typer.Typer(help="Settings, and schemas of JSON documents.", no_args_is_help=True)
 config.command("dump")(dump_command)
+config.command("schema")(schema_command)
 app.add_typer(config, name="config")
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import enum
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from pc2grid_cli import console
+from pc2grid_cli.settings import AsJson, Force
 
 
 class SensorName(str, enum.Enum):
@@ -36,12 +38,14 @@ def simulate_command(
     ] = None,
     building_seed: Annotated[int, typer.Option(min=0, help="which office, when there is no MAP.yaml")] = 0,
     no_odometry: Annotated[bool, typer.Option("--no-odometry", help="leave odometry out of the log")] = False,
-    force: Annotated[bool, typer.Option("--force", help="replace existing files")] = False,
+    force: Force = False,
+    json: AsJson = False,
 ) -> None:
-    """Drive a robot through a building and record it: OUT.mcap, and OUT.tum with the true poses."""
+    """Drive a robot through a building and record it: OUT.mcap, and OUT.tum with the true poses.
+
+    Example: pc2grid simulate map.yaml drive.mcap --sensor depth --length 20
+    """
     from pydantic import ValidationError
-    from rich.console import Console
-    from rich.progress import Progress
 
     from pc2grid.errors import ConfigError
     from pc2grid.io.nav2_map import load_map
@@ -66,18 +70,25 @@ def simulate_command(
     except ValidationError as error:
         first = error.errors()[0]
         raise ConfigError(f"{first['loc'][0]}: {first['msg']}, got {first['input']}") from error
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task(f"simulate {sensor.value}", total=1.0)
+    with console.progress(f"simulate {sensor.value}") as update:
         made = simulate_session(
-            files[-1],
-            sensor=sensor.value,
-            grid=grid,
-            config=config,
-            progress=lambda share: bar.update(task, completed=share),
-            force=force,
+            files[-1], sensor=sensor.value, grid=grid, config=config, progress=update, force=force
         )
+    if made.clutter < clutter:
+        console.warn(f"only {made.clutter} of {clutter} pieces of clutter found room")
+    if json:
+        console.print_json(
+            {
+                "schema_version": 1,
+                "recording": str(made.path),
+                "truth": str(made.truth_path),
+                "sensor": made.sensor,
+                "scans": made.scans,
+                "duration_s": made.duration_s,
+                "length_m": made.length_m,
+                "clutter": made.clutter,
+            }
+        )
+        return
     print(f"{made.path}: {made.scans} {made.sensor} scans, {made.length_m:.1f} m in {made.duration_s:.1f} s")
     print(f"{made.truth_path}: {made.scans} true poses of base_link in the map frame")
-    if made.clutter < clutter:
-        print(f"only {made.clutter} of {clutter} pieces of clutter found room", file=sys.stderr)
