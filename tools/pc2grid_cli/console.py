@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import signal
@@ -40,33 +41,53 @@ def print_json(document: Any) -> None:
 
 
 @contextlib.contextmanager
-def progress(what: str) -> Iterator[Callable[[float], None]]:
-    """Report a share 0..1 of the work: a bar on a terminal, otherwise a line every ten seconds."""
+def progress(what: str, recorded_s: float | None = None) -> Iterator[Callable[[float], None]]:
+    """Report a share 0..1 of the work: a bar on a terminal, otherwise a line every ten seconds.
+
+    recorded_s : length of the recording that is worked through, to say how much faster than it was made.
+    """
     if State.verbosity < 0:
         yield lambda share: None
         return
     if not sys.stderr.isatty():
-        yield _plain_progress(what)
+        yield _plain_progress(what, recorded_s)
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    begin = time.monotonic()
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
+        task = bar.add_task(what, total=1.0, rate="")
+        yield lambda share: bar.update(task, completed=share, rate=_rate(share, begin, recorded_s))
 
 
-def _plain_progress(what: str) -> Callable[[float], None]:
-    last = time.monotonic()
+def _plain_progress(what: str, recorded_s: float | None) -> Callable[[float], None]:
+    begin = last = time.monotonic()
 
     def update(share: float) -> None:
         nonlocal last
-        if time.monotonic() - last >= 10.0:
-            last = time.monotonic()
-            print(f"pc2grid: {what}: {share:.0%}", file=sys.stderr)
+        now = time.monotonic()
+        if now - last >= 10.0:
+            last = now
+            rate = _rate(share, begin, recorded_s)
+            left = f", {(now - begin) * (1.0 / share - 1.0):.0f} s left" if share > 0 else ""
+            print(f"pc2grid: {what}: {share:.0%}{f', {rate}' if rate else ''}{left}", file=sys.stderr)
 
     return update
+
+
+def _rate(share: float, begin: float, recorded_s: float | None) -> str:
+    """How many seconds of the recording a second of work takes in."""
+    if recorded_s is None or share <= 0:
+        return ""
+    return f"{share * recorded_s / max(time.monotonic() - begin, 1e-3):.1f}x real time"
 
 
 def report_error(error: BaseException) -> int:
@@ -96,6 +117,8 @@ def report_error(error: BaseException) -> int:
 def run(command: Callable[[], Any]) -> int:
     """Run a command and turn everything that can happen into an exit code."""
     signal.signal(signal.SIGTERM, _terminate)
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names of files need not be text
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         result = command()
         sys.stdout.flush()

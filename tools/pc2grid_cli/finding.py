@@ -96,7 +96,7 @@ def locate(
     seen: list[RegisteredScan] = []
     begin_ns = query.info.start_ns + int(start_s * 1e9)
     span_ns = max(query.info.end_ns - begin_ns if duration_s is None else int(duration_s * 1e9), 1)
-    with console.progress("locate") as update:
+    with console.progress("locate", span_ns * 1e-9) as update:
 
         def keep() -> Any:
             for registered, sweep in follow(query.scans(start_s, duration_s), config):

@@ -80,6 +80,12 @@ config.command("schema")(schema_command)
 app.add_typer(config, name="config")
 
 
+_GLOBAL = ("-v", "-vv", "--verbose", "-q", "--quiet", "--debug")
+
+
 def main() -> None:
     """Entry point of the console script."""
-    sys.exit(console.run(lambda: app(prog_name="pc2grid", standalone_mode=False)))
+    # Global options are understood behind the command as well, where people put them.
+    first = [word for word in sys.argv[1:] if word in _GLOBAL]
+    rest = [word for word in sys.argv[1:] if word not in _GLOBAL]
+    sys.exit(console.run(lambda: app([*first, *rest], prog_name="pc2grid", standalone_mode=False)))

@@ -1,0 +1,108 @@
+"""What a terminal sees, and what a pipe sees."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pc2grid_cli import console, main
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def on_a_terminal(code: str, *arguments: str, **environment: str) -> str:
+    """What a program writes to a terminal that is its stdout and stderr."""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stdin=theirs, stdout=theirs, stderr=theirs,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}", "TERM": "xterm-256color",
+             "COLUMNS": "100", **environment},
+    )  # fmt: skip
+    os.close(theirs)
+    seen = b""
+    while True:
+        try:
+            part = os.read(ours, 65536)
+        except OSError:  # Linux: the other end is closed
+            break
+        if not part:
+            break
+        seen += part
+    assert process.wait(timeout=60) == 0, seen
+    os.close(ours)
+    return seen.decode()
+
+
+PROGRAM = "from pc2grid_cli.main import main; main()"
+WORKING = """
+import time
+from pc2grid_cli.console import progress
+with progress("work", 100.0) as update:
+    for tenth in range(11):
+        time.sleep(0.06)
+        update(tenth / 10)
+"""
+COLOUR = re.compile(r"\x1b\[[0-9;]*(?:3[0-7]|38;|9[0-7])[0-9;]*m")
+
+
+def test_a_terminal_gets_colours_unless_no_color_is_set() -> None:
+    assert "\x1b[" in on_a_terminal(PROGRAM, "--help", NO_COLOR="")
+    assert "\x1b[" not in on_a_terminal(PROGRAM, "--help", NO_COLOR="1")
+
+
+def test_a_terminal_gets_a_bar_with_rate_and_time_left() -> None:
+    seen = on_a_terminal(WORKING, NO_COLOR="")
+    assert COLOUR.search(seen)
+    assert re.search(r"\d+%", seen) and "x real time" in seen and re.search(r"\d:\d\d", seen)
+    plain = on_a_terminal(WORKING, NO_COLOR="1")
+    assert not COLOUR.search(plain) and "x real time" in plain
+
+
+def test_a_pipe_gets_a_line_every_ten_seconds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(console.time, "monotonic", lambda: now)
+    with console.progress("map a.mcap", 300.0) as update:
+        for second in range(26):
+            now = 100.0 + second
+            update(second / 50)
+    assert capsys.readouterr().err.splitlines() == [
+        "pc2grid: map a.mcap: 20%, 6.0x real time, 40 s left",
+        "pc2grid: map a.mcap: 40%, 6.0x real time, 30 s left",
+    ]
+
+
+@pytest.mark.parametrize("words", [["-q", "config", "schema"], ["config", "schema", "-q"]])
+def test_global_options_may_stand_behind_the_command(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pc2grid", *words])
+    monkeypatch.setattr(console.State, "verbosity", 0)
+    with pytest.raises(SystemExit) as end:
+        main.main()
+    assert end.value.code == 0
+    assert console.State.verbosity == -1
+    with console.progress("quiet") as update:
+        update(0.5)
+    console.note("nothing")
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion(shell: str) -> None:
+    environment = {
+        "_PC2GRID_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_ARGS": "pc2grid reloc",
+        "_TYPER_COMPLETE_FISH_ACTION": "get-args", "COMP_WORDS": "pc2grid reloc", "COMP_CWORD": "1",
+    }  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}", **environment},
+    )  # fmt: skip
+    assert "relocalize" in done.stdout
