@@ -11,7 +11,7 @@ import numpy as np
 
 from pc2grid.alignment import NEUTRAL, Fit, LikelihoodField, assess, prepare, prepare_query, refine
 from pc2grid.geometry import F64, wrap_angle
-from pc2grid.model import UNKNOWN, OccupancyGrid
+from pc2grid.model import UNKNOWN, BoolGrid, OccupancyGrid
 from signature.answer import Status, Verdict
 from signature.confidence import CALIBRATION, RIVALS, Evidence
 from signature.config import Config
@@ -178,7 +178,7 @@ def unseen_by(query: QueryMap, grid: OccupancyGrid, fit: Fit) -> OccupancyGrid:
     known = cv2.dilate(known.astype(np.uint8), np.ones((2 * n + 1, 2 * n + 1), np.uint8)).astype(bool)
     cells = np.argwhere(grid.cells != UNKNOWN)
     at = query.grid.to_cell(fit.T_map_query.inverse().apply(grid.to_point(cells)))
-    inside = ((at >= 0) & (at < query.grid.cells.shape)).all(axis=1)
+    inside: BoolGrid = np.all((at >= 0) & (at < query.grid.cells.shape), axis=1)
     inside[inside] = known[at[inside, 0], at[inside, 1]]
     left = grid.cells.copy()
     left[cells[inside, 0], cells[inside, 1]] = UNKNOWN

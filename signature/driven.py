@@ -7,7 +7,7 @@ maps it is located in, and however often a method is tried on it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,7 +31,8 @@ class Driven:
     sweeps : what each says about the plane, with its stamp.
     T_odom_base : (N, 3) x, y, yaw as registered, in a frame of the session's own.
     lost : (N,) whether registration was lost.
-    T_world_base : (N, 3) x, y, yaw in truth: in the floor plan, or as a log's ground truth has it.
+    T_world_base : (N, 3) x, y, yaw in truth: in the floor plan, or as a log's ground truth has it; NaN where
+    that says nothing.
     """
 
     sensor: SensorKind
@@ -47,6 +48,11 @@ class Driven:
         """(N,) metres driven up to each scan, as registered."""
         steps = np.hypot(*np.diff(self.T_odom_base[:, :2], axis=0).T)
         return np.concatenate(([0.0], np.cumsum(steps)))[: len(self)]
+
+    def T_world_odom(self) -> SE2:
+        """Where the session's own frame truly lies, by the last scan whose truth is known."""
+        known = int(np.flatnonzero(~np.isnan(self.T_world_base[:, 0]))[-1])
+        return _pose(self.T_world_base[known]) @ _pose(self.T_odom_base[known]).inverse()
 
     def scans(self) -> Iterator[tuple[RegisteredScan, Sweep, SE2]]:
         """Each scan (without its points), its sweep and its true pose, as they came."""
@@ -69,19 +75,19 @@ class Driven:
         from pc2grid.io.atomic import replace_file
 
         empty = np.empty((0, 2), np.float32)
-        arrays = {
-            "sensor": np.array(self.sensor),
-            "stamps_ns": np.array([s.stamp_ns for s in self.sweeps], np.int64),
-            "T_odom_base": self.T_odom_base,
-            "lost": self.lost,
-            "T_world_base": self.T_world_base,
-            "hit_count": np.array([len(s.hits_m) for s in self.sweeps], np.int64),
-            "hits_m": np.concatenate([empty, *(s.hits_m for s in self.sweeps)]),
-            "origin_m": np.array([s.origin_m for s in self.sweeps]).reshape(-1, 2),
-            "free_m": np.array([s.free_m for s in self.sweeps], np.float32),
-        }
         with replace_file(path) as draft, draft.open("wb") as file:
-            np.savez_compressed(file, **arrays)
+            np.savez_compressed(
+                file,
+                sensor=np.array(self.sensor),
+                stamps_ns=np.array([s.stamp_ns for s in self.sweeps], np.int64),
+                T_odom_base=self.T_odom_base,
+                lost=self.lost,
+                T_world_base=self.T_world_base,
+                hit_count=np.array([len(s.hits_m) for s in self.sweeps], np.int64),
+                hits_m=np.concatenate([empty, *(s.hits_m for s in self.sweeps)]),
+                origin_m=np.array([s.origin_m for s in self.sweeps]).reshape(-1, 2),
+                free_m=np.array([s.free_m for s in self.sweeps], np.float32),
+            )
 
     @staticmethod
     def load(path: Path) -> Driven:
@@ -104,21 +110,23 @@ class Driven:
 
 
 def register(
-    scans: Iterable[tuple[Scan, SE2]],
+    scans: Iterable[tuple[Scan, SE2 | None]],
     config: PipelineConfig,
     *,
     sensor: SensorKind,
     until_m: float = math.inf,
 ) -> Driven:
-    """Register scans, each with its true pose, as a user would get it; stop after `until_m` of travel."""
-    truths: list[SE2] = []
+    """Register scans, each with its true pose if known, as a user would; stop after `until_m` of travel."""
+    truths: list[SE2 | None] = []
 
     def untold() -> Iterator[Scan]:
         for scan, truth in scans:
             truths.append(truth)
             yield scan
 
-    sweeps, poses, lost = [], [], []
+    sweeps: list[Sweep] = []
+    poses: list[SE2] = []
+    lost: list[bool] = []
     driven_m = 0.0
     for registered, sweep in follow(untold(), config):
         pose = SE2.flatten(registered.T_map_base)
@@ -157,5 +165,6 @@ def _pose(row: F64) -> SE2:
     return SE2(float(row[0]), float(row[1]), float(row[2]))
 
 
-def _array(poses: list[SE2]) -> F64:
-    return np.array([(p.x, p.y, p.yaw) for p in poses], np.float64).reshape(-1, 3)
+def _array(poses: Sequence[SE2 | None]) -> F64:
+    rows = [(p.x, p.y, p.yaw) if p else (math.nan,) * 3 for p in poses]
+    return np.array(rows, np.float64).reshape(-1, 3)
