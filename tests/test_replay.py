@@ -44,9 +44,9 @@ def test_the_tally_keeps_what_the_map_does_not_cover_apart() -> None:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A laser goes around a small office, 20 m."""
+    """A laser goes around a small office, 30 m."""
     folder = tmp_path_factory.mktemp("recorded")
-    slow: dict[str, Any] = {"laser": {"rate_hz": 4.0}, "length_m": 20.0, "seed": 3, "clutter": 4}
+    slow: dict[str, Any] = {"laser": {"rate_hz": 4.0}, "length_m": 30.0, "seed": 3, "clutter": 4}
     simulate_session(
         folder / "round.mcap",
         sensor="laser",
