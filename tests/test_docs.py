@@ -5,7 +5,9 @@ from __future__ import annotations
 import doctest
 import importlib
 import inspect
+import json
 import math
+import os
 import re
 import runpy
 import subprocess
@@ -13,13 +15,21 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+import yaml
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from typer.testing import CliRunner
 
 import pc2grid
 import signature
+from pc2grid_cli.main import app
 from tests import workplace
+from tests.test_io_files import oracle
 
 ROOT = Path(__file__).resolve().parent.parent
 FLAGS = doctest.NORMALIZE_WHITESPACE
@@ -154,3 +164,84 @@ def test_example_own_floor_plan(run: Run) -> None:
 def test_example_signature_of_a_submap(run: Run) -> None:
     run("signature_of_a_submap.py", "map.yaml", "--out", "submap.png")
     assert Path("submap.png").read_bytes().startswith(b"\x89PNG")
+
+
+# --- nav2 and Foxglove ------------------------------------------------------------------------------------
+
+
+def nav2_map(yaml_path: Path) -> tuple[np.ndarray, float, tuple[float, float]]:
+    """A map as nav2's map server reads it, by another implementation: cells, metres a cell, origin."""
+    keys = yaml.safe_load(yaml_path.read_text())
+    pixels = cv2.imread(str(yaml_path.parent / keys["image"]), cv2.IMREAD_GRAYSCALE)
+    states = np.array([oracle(grey, keys, keys["mode"]) for grey in range(256)])
+    cells = states[pixels[::-1]]
+    return cells, keys["resolution"], tuple(keys["origin"][:2])
+
+
+def test_example_nav2(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tools = folder / "bin"
+    tools.mkdir()
+    program = f"#!{sys.executable}\nfrom pc2grid_cli.main import main\nmain()\n"
+    for name, text in (
+        ("pc2grid", program),
+        ("ros2", '#!/bin/sh\nfor last; do :; done; echo "$last" > heard\n'),
+    ):
+        (tools / name).write_text(text)
+        (tools / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tools}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(ROOT), str(ROOT / "tools"))))
+    subprocess.run(["sh", ROOT / "examples" / "nav2.sh", "map.yaml", "tuesday.mcap"], check=True)
+
+    pose = json.loads((folder / "heard").read_text())["pose"]["pose"]
+    truth = list(pc2grid.read_tum("tuesday.tum").poses())[-1]
+    x, y = pose["position"]["x"], pose["position"]["y"]
+    yaw = 2 * math.atan2(pose["orientation"]["z"], pose["orientation"]["w"])
+    assert math.hypot(x - truth.x, y - truth.y) < 0.1
+    assert abs(math.remainder(yaw - truth.yaw, 2 * math.pi)) < math.radians(2)
+    # In the map as nav2 reads it, the last scan ends at walls.
+    cells, resolution_m, origin_m = nav2_map(folder / "map.yaml")
+    with pc2grid.open_log("tuesday.mcap") as log:
+        *_, scan = log.scans()
+    ends = pc2grid.SE2(x, y, yaw).apply(scan.points_m[:, :2])
+    column, row = ((ends - origin_m) / resolution_m).astype(int).T
+    near_wall = cv2.dilate((cells == 100).astype(np.uint8), np.ones((7, 7), np.uint8))
+    assert near_wall[row, column].mean() > 0.9
+
+
+def test_an_exported_map_is_read_by_nav2_as_it_was(folder: Path) -> None:
+    assert CliRunner().invoke(app, ["export", "building.submaps", "--map", "out"]).exit_code == 0
+    cells, resolution_m, origin_m = nav2_map(folder / "out.yaml")
+    with signature.open_database("building.submaps") as database:
+        grid = database.grid("monday")
+    assert np.array_equal(cells == 100, grid.occupied) and np.array_equal(cells == 0, grid.free)
+    assert (resolution_m, origin_m) == (grid.resolution_m, grid.origin_m)
+
+
+def test_foxglove_shows_what_the_layout_names(folder: Path) -> None:
+    export = ["export", "building.submaps", "--mcap", "map.mcap"]
+    locate = ["relocalize", "tuesday.mcap", "-d", "building.submaps", "--output", "answer.mcap"]
+    for arguments in (export, locate):
+        assert CliRunner().invoke(app, arguments).exit_code == 0
+    layout = json.loads((ROOT / "examples" / "foxglove.json").read_text())
+    panel = layout["configById"]["3D!pc2grid"]
+    path = layout["configById"]["RawMessages!pose"]["topicPath"]
+    assert {layout["layout"]["first"], layout["layout"]["second"]} == set(layout["configById"])
+
+    def read(name: str) -> list[tuple[str, int, Any]]:
+        with (folder / name).open("rb") as stream:
+            reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+            return [(c.topic, m.log_time, d) for _, c, m, d in reader.iter_decoded_messages()]
+
+    answer = read("answer.mcap")
+    topics = {topic for topic, _, _ in answer}
+    assert set(panel["topics"]) <= topics and path.partition(".")[0] in topics
+    assert {topic for topic, _, _ in read("map.mcap")} == {"/map", "/submaps", "/path", "/tf"}
+    # A transform must be there at or before all that is drawn in its frame.
+    edges = [(at, edge) for topic, at, told in answer if topic == "/tf" for edge in told.transforms]
+    joined = {(edge.header.frame_id, edge.child_frame_id) for _, edge in edges}
+    assert joined == {("map", "odom"), ("odom", "base_link")}
+    first = min(at for _, at, _ in answer)
+    assert {edge.child_frame_id for at, edge in edges if at == first} == {"odom", "base_link"}
+    with signature.open_database("building.submaps") as database:
+        spheres = next(told for topic, _, told in answer if topic == "/submaps").markers[0].points
+        assert len(spheres) == len(database.signatures())
