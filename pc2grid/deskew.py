@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from pc2grid.geometry import F64, rotation_vector
 from pc2grid.model import F32
@@ -25,10 +26,19 @@ def deskew(points_m: F32, offsets_s: F32, motion: F64, motion_s: float) -> F32:
         first, last = first - 1e-6, last + 1e-6
     # Poses on a fine raster of times; between two of them the robot moves less than a millimetre.
     times = np.linspace(first, last, _STEPS)
-    rotations = _rotations(rate[:3] * times[:, None]).astype(np.float32)
-    shifts = (rate[3:] * times[:, None]).astype(np.float32)
-    index = np.rint((offsets_s - first) * ((_STEPS - 1) / (last - first))).astype(np.intp)
-    moved: F32 = np.einsum("nij,nj->ni", rotations[index], points_m) + shifts[index]
+    rotations, shifts = _rotations(rate[:3] * times[:, None]), rate[3:] * times[:, None]
+    return _moved(points_m, offsets_s, first, (_STEPS - 1) / (last - first), rotations, shifts)
+
+
+@njit(cache=True)
+def _moved(points: F32, offsets: F32, first: float, per_s: float, rotations: F64, shifts: F64) -> F32:
+    moved = np.empty_like(points)
+    for k in range(len(points)):
+        step = round((offsets[k] - first) * per_s)
+        R, t = rotations[step], shifts[step]
+        x, y, z = points[k]
+        for axis in range(3):
+            moved[k, axis] = R[axis, 0] * x + R[axis, 1] * y + R[axis, 2] * z + t[axis]
     return moved
 
 

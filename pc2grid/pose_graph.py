@@ -15,6 +15,10 @@ from numpy.typing import NDArray
 
 from pc2grid.geometry import F64, SE2
 
+_NEAR_BY_M = 6.0
+_AGREE_M, _AGREE_RAD = 0.3, 0.05
+_LESS_LENIENT = 3.0  # an iteration
+
 
 @dataclass(frozen=True, slots=True)
 class Edge:
@@ -48,6 +52,10 @@ def optimise(
     """Poses (N, 3) that agree best with the edges; the first pose stays where it is.
 
     robust_scale : standard deviations at which a loop edge has lost half of its say.
+
+    A loop is doubted from the start, or a false one would bend the map before the others are heard - unless
+    two more, at other places near by, ask for the same correction. Then drift is likelier than three equal
+    mistakes, and doubt comes only as the iterations go on (graduated non-convexity, Yang et al. 2020).
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
@@ -65,9 +73,11 @@ def optimise(
     column = np.tile(rows, (1, 6)).ravel()
     size = 3 * len(poses)
     error, jacobian = _linearise(poses, i, j, z)
+    chi2 = np.einsum("ea,eab,eb->e", error, omega, error)
+    seconded = _seconded(poses, i, j, z, loop & (chi2 > robust_scale**2))
+    leniency = np.where(seconded, np.maximum(chi2 / robust_scale**2, 1.0), 1.0)
     for _ in range(iterations):
-        chi2 = np.einsum("ea,eab,eb->e", error, omega, error)
-        weight = np.where(loop, 1.0 / (1.0 + chi2 / robust_scale**2), 1.0)
+        weight = np.where(loop, 1.0 / (1.0 + chi2 / (leniency * robust_scale**2)), 1.0)
         weighted = omega * weight[:, None, None]
         JtO = jacobian.transpose(0, 2, 1) @ weighted
         H = coo_matrix(((JtO @ jacobian).ravel(), (row, column)), shape=(size, size)).tocsc()
@@ -78,9 +88,47 @@ def optimise(
         poses += delta.reshape(-1, 3)
         poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
         error, jacobian = _linearise(poses, i, j, z)
-        if np.abs(delta).max() < 1e-5:
+        chi2 = np.einsum("ea,eab,eb->e", error, omega, error)
+        if leniency.max() == 1.0 and np.abs(delta).max() < 1e-5:
             break
-    return Solution(poses, np.einsum("ea,eab,eb->e", error, omega, error))
+        leniency = np.maximum(leniency / _LESS_LENIENT, 1.0)
+    return Solution(poses, chi2)
+
+
+def _seconded(
+    poses: F64, i: NDArray[np.intp], j: NDArray[np.intp], z: F64, doubted: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Which of the doubted edges (of E) at least two others, near by but between other poses, agree with.
+
+    Two edges agree if they want to move what is at their second ends in the same way.
+    """
+    seconded = np.zeros(len(i), np.bool_)
+    index = np.flatnonzero(doubted)
+    a, b, measured = poses[i[index]], poses[j[index]], z[index]
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    wanted = np.column_stack(
+        (
+            a[:, 0] + c * measured[:, 0] - s * measured[:, 1],
+            a[:, 1] + s * measured[:, 0] + c * measured[:, 1],
+            a[:, 2] + measured[:, 2],
+        )
+    )
+    turn = wanted[:, 2] - b[:, 2]
+    for k in range(len(index)):
+        near = np.hypot(*(b[:, :2] - b[k, :2]).T) < _NEAR_BY_M
+        near &= np.hypot(*(a[:, :2] - a[k, :2]).T) < _NEAR_BY_M
+        near &= (i[index] != i[index[k]]) & (j[index] != j[index[k]])
+        other = np.flatnonzero(near)
+        if len(other) < 2:
+            continue
+        # Where this edge's correction would take the others' second ends.
+        cos, sin = np.cos(turn[k]), np.sin(turn[k])
+        d = b[other, :2] - b[k, :2]
+        x = wanted[k, 0] + cos * d[:, 0] - sin * d[:, 1] - wanted[other, 0]
+        y = wanted[k, 1] + sin * d[:, 0] + cos * d[:, 1] - wanted[other, 1]
+        yaw = np.abs(np.remainder(turn[k] - turn[other] + np.pi, 2 * np.pi) - np.pi)
+        seconded[index[k]] = ((np.hypot(x, y) < _AGREE_M) & (yaw < _AGREE_RAD)).sum() >= 2
+    return seconded
 
 
 def _identity(size: int):  # type: ignore[no-untyped-def]

@@ -137,15 +137,15 @@ class _DeferredMap:
         self._owner._pending = points
 
 
-def thin(points_m: NDArray[np.floating], count: int) -> NDArray[np.intp]:
-    """Indices of at most `count` of the points (N, 3), random but always the same, in order.
+def thin(points: NDArray[np.generic], count: int) -> NDArray[np.intp]:
+    """Indices of at most `count` of the points (N, ...), random but always the same, in order.
 
     Random, because a camera's regular pixel grid pulls ICP towards standing still as a lidar's rings do.
     """
-    if len(points_m) <= count:
-        return np.arange(len(points_m))
+    if len(points) <= count:
+        return np.arange(len(points))
     return np.sort(
-        np.random.default_rng(len(points_m)).choice(len(points_m), count, replace=False, shuffle=False)
+        np.random.default_rng(len(points)).choice(len(points), count, replace=False, shuffle=False)
     )
 
 

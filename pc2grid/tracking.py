@@ -27,7 +27,8 @@ from pc2grid.sweep import Sweep, flatten
 KEYFRAME_TRAVEL_M = 0.2
 KEYFRAME_TURN_RAD = math.radians(10.0)
 LOCAL_MAP_TRAVEL_M = 5.0
-_ROLLING_GAIN = 0.05  # how fast the floor follows what is seen of it
+_ROLLING_GAIN = 0.2  # how fast the floor follows what is seen of it
+_ROLLING_EVERY = 4
 _CARRIED_GAIN = 0.3
 _MIN_HITS = 10
 _MIN_OVERLAP = 0.3
@@ -78,6 +79,7 @@ class Tracker:
         self._last_keyframe: SE2 | None = None
         self._travel_m = 0.0
         self._rolling = True
+        self._scans = 0
         self._poor_scans = 0
         self._lost_scans = 0
         self._restarted = False
@@ -155,19 +157,24 @@ class Tracker:
 
     def _usable(self, scan: Scan, motion: F64, motion_s: float) -> F32:
         points, offsets = scan.points_m, scan.offsets_s
-        keep = thin(points, _MAX_POINTS)
-        points = points[keep]
-        sensor = scan.T_base_sensor[:3, 3].astype(np.float32)
-        far = np.einsum("ij,ij->i", points - sensor, points - sensor) >= self._config.min_range_m**2
-        points = points[far]
+        away = points - scan.T_base_sensor[:3, 3].astype(np.float32)
+        keep = np.flatnonzero(np.einsum("ij,ij->i", away, away) >= self._config.min_range_m**2)
+        keep = keep[thin(keep, _MAX_POINTS)]
+        if len(keep) < len(points):
+            points, offsets = points[keep], None if offsets is None else offsets[keep]
         if offsets is not None and self._config.deskew:
-            points = deskew(points, offsets[keep][far], motion, motion_s)
+            points = deskew(points, offsets, motion, motion_s)
         return points
 
     def _follow_ground(self, points: F32, scan: Scan, motion: F64) -> None:
         """Where the floor is now: fixed to a robot that rolls on it, else where the motion has taken it."""
         if self._ground is None:
             return
+        if self._rolling:
+            # A floor that is fixed to the robot need not be looked for in every scan.
+            self._scans += 1
+            if self._scans % _ROLLING_EVERY:
+                return
         expected = self._ground if self._rolling else self._ground.moved(invert_pose(motion))
         found = find_ground(points, scan.T_base_sensor[:3, 3], expected)
         gain = _ROLLING_GAIN if self._rolling else _CARRIED_GAIN
