@@ -92,6 +92,7 @@ def set_header(offset: int, value: int) -> Callable[[bytes], bytes]:
 # --- faults 43 and 44: what is not a whole database of this format ------------------------------------
 
 
+@pytest.mark.fault(43)
 @pytest.mark.parametrize(
     ("damage", "error", "words"),
     [
@@ -155,6 +156,7 @@ def test_files_of_other_programs(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [stranger]
 
 
+@pytest.mark.fault(44)
 def test_command_line_refuses_a_newer_format_in_one_line(path: Path) -> None:
     path.write_bytes(set_header(60, 7)(path.read_bytes()))
     done = pc2grid("db", "info", path.name, cwd=path.parent)
@@ -179,6 +181,7 @@ def flip(path: Path, table: str, column: str, position: float, bit: int, session
     connection.close()
 
 
+@pytest.mark.fault(43)
 def test_fuzz_flipped_bit_anywhere_in_any_blob_is_found(path: Path) -> None:
     clean = path.read_bytes()
     rng = np.random.default_rng(43)
@@ -258,9 +261,10 @@ def test_sound_database_leaves_nothing_out_and_a_wholly_damaged_one_is_refused(p
         database.leave_out_damaged()
 
 
+@pytest.mark.fault(43)
 def test_relocalize_goes_on_without_a_damaged_session_and_says_so(tmp_path: Path) -> None:
     """A map is looked for in a database of itself and of a damaged neighbour."""
-    from pc2grid_cli.convert import build_session
+    from signature.build import build_session
 
     yaml, _ = save_map(small_house(), tmp_path / "house")
     config, database = Config(), tmp_path / "x.submaps"
@@ -306,6 +310,7 @@ def _read(file: str, known: dict[str, set[str]], until: float, results: Any) -> 
     results.put(("read", done, 0))
 
 
+@pytest.mark.fault(45)
 def test_fuzz_eight_readers_and_two_writers(path: Path, tmp_path: Path) -> None:
     """No error but busy, no torn read; what nobody touched is still there."""
     known: dict[str, set[str]] = {}
@@ -347,6 +352,7 @@ def _hold_until(file: str, ready: Event, leave: Event) -> None:
         leave.wait(60)
 
 
+@pytest.mark.fault(45)
 def test_second_writer_waits_for_the_first(path: Path) -> None:
     context = multiprocessing.get_context("spawn")
     ready, leave = context.Event(), context.Event()

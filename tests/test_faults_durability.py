@@ -12,9 +12,10 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -22,8 +23,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pc2grid.errors import DatabaseError, OutputError
-from pc2grid.io.nav2_map import save_map
+from pc2grid.errors import DatabaseError, LogNotFound, MapFileError, NotADatabase, OutputError
+from pc2grid.io import open_log
+from pc2grid.io.nav2_map import load_map, save_map
 from pc2grid.model import OccupancyGrid
 from pc2grid.simulate import SimulationConfig, simulate_session
 from signature.database import open_database
@@ -103,6 +105,7 @@ def in_child(body: Callable[[], object]) -> tuple[int, str]:
 # --- fault 40: kill -9 --------------------------------------------------------------------------------
 
 
+@pytest.mark.fault(40)
 def test_fuzz_kill_at_random_moments_of_convert(inputs: Path, tmp_path: Path) -> None:
     """Every second one while the temporary file is there, the others anywhere from the start."""
     rng = np.random.default_rng(40)
@@ -133,6 +136,7 @@ def test_fuzz_kill_at_random_moments_of_convert(inputs: Path, tmp_path: Path) ->
     assert killed > 0
 
 
+@pytest.mark.fault(40)
 def test_fuzz_kill_at_every_line_of_the_writer(tmp_path: Path) -> None:
     """Exact where the clock is not: a forked writer kills itself before the N-th line it would run."""
     path = tmp_path / "x.submaps"
@@ -186,6 +190,7 @@ def test_fuzz_kill_at_every_line_of_the_writer(tmp_path: Path) -> None:
 # --- fault 41: signals --------------------------------------------------------------------------------
 
 
+@pytest.mark.fault(41)
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_signal_in_the_middle_of_writing(inputs: Path, tmp_path: Path, number: int, code: int) -> None:
     output = tmp_path / "x.submaps"
@@ -209,6 +214,7 @@ def test_signal_in_the_middle_of_writing(inputs: Path, tmp_path: Path, number: i
     assert output.read_bytes() == (inputs / "both.submaps").read_bytes()
 
 
+@pytest.mark.fault(41)
 @pytest.mark.parametrize("arguments", ["db info both.submaps --json", "db check both.submaps"])
 def test_reader_that_has_seen_enough_is_no_error(inputs: Path, arguments: str) -> None:
     """`| head`, at its earliest: nobody reads at all."""
@@ -226,6 +232,7 @@ def test_reader_that_has_seen_enough_is_no_error(inputs: Path, arguments: str) -
 # --- fault 39: what the system refuses ----------------------------------------------------------------
 
 
+@pytest.mark.fault(39)
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO, errno.EDQUOT, errno.EACCES])
 def test_fail_the_nth_call_of_a_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     path = tmp_path / "x.submaps"
@@ -273,6 +280,7 @@ def test_fail_the_nth_call_of_a_write(tmp_path: Path, monkeypatch: pytest.Monkey
     assert refused >= {"open", "fsync", "replace"}
 
 
+@pytest.mark.fault(39)
 def test_disk_full_at_every_page_of_a_write(tmp_path: Path) -> None:
     """A limit on the size of files stops SQLite's own writing, from the first page to the last."""
     path = tmp_path / "x.submaps"
@@ -299,6 +307,7 @@ def test_disk_full_at_every_page_of_a_write(tmp_path: Path) -> None:
     assert path.read_bytes() == new
 
 
+@pytest.mark.fault(39)
 def test_disk_full_is_one_line_and_exit_1(inputs: Path, tmp_path: Path) -> None:
     process = convert(inputs / "house.yaml", "-o", "x.submaps", cwd=tmp_path, limit_bytes=8192)
     _, said = process.communicate(timeout=60)
@@ -310,24 +319,114 @@ def test_disk_full_is_one_line_and_exit_1(inputs: Path, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_folder_that_refuses(tmp_path: Path) -> None:
-    if os.geteuid() == 0:
-        folder = Path("/proc")  # nobody creates files there
-        if not folder.is_dir():
-            pytest.skip("root may write everywhere, and there is no /proc")
-    else:
-        folder = tmp_path / "closed"
-        folder.mkdir(mode=0o555)
-    with pytest.raises(OutputError, match=r"new\.submaps: cannot write") as caught:
-        store(folder / "new.submaps", [make_entry()], keep=False)
-    assert caught.value.hint
-    file = tmp_path / "file"
+SMALL_DISK = """
+import subprocess, sys
+from pathlib import Path
+from pc2grid.errors import OutputError
+from signature.database.sqlite import store
+from tests.test_database import make_entry
+
+disk, path = Path(sys.argv[1]), Path(sys.argv[1]) / "x.submaps"
+mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", disk]
+if subprocess.run(mount, capture_output=True).returncode:
+    sys.exit(77)
+store(path, [make_entry("monday", 0)], keep=False)
+old, outcomes = path.read_bytes(), []
+for pages in range(len(old) // 4096, 4 * len(old) // 4096):
+    path.write_bytes(old)
+    subprocess.run(["mount", "-o", f"remount,size={4 * pages}k", disk], check=True)
+    try:
+        store(path, [make_entry("tuesday", 1)], keep=True)
+        outcomes.append("new")
+    except OutputError as error:
+        assert str(path) in error.message and "cannot write" in error.message, error
+        assert error.hint == "free some space, or write to another disk", error
+        assert path.read_bytes() == old
+        outcomes.append("old")
+    assert list(disk.iterdir()) == [path], list(disk.iterdir())
+assert outcomes == sorted(outcomes, reverse=True) and {*outcomes} == {"old", "new"}, outcomes
+"""
+
+
+@pytest.mark.fault(39)
+def test_disk_that_is_really_full(tmp_path: Path) -> None:
+    """A disk of memory, in a name space of its own, from room for nothing more to room enough."""
+    command = ["unshare", "--user", "--map-root-user", "--mount", sys.executable, "-c", SMALL_DISK, tmp_path]
+    if shutil.which("unshare") is None or shutil.which("mount") is None:
+        pytest.skip("no unshare or mount in this system")
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120)
+    if done.returncode == 77 or "unshare" in done.stderr:
+        pytest.skip("this system lets nobody mount a disk of memory")
+    assert done.returncode == 0, done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def as_nobody(body: Callable[[], object]) -> None:
+    """Run the body without root's privileges to read and write what it likes."""
+
+    def run() -> None:
+        if os.geteuid() == 0:
+            os.setgroups([])
+            os.setgid(65534)
+            os.setuid(65534)
+        body()
+
+    status, said = in_child(run)
+    assert status == 0, said
+
+
+@pytest.fixture
+def open_folder() -> Iterator[Path]:
+    """A folder that any user may enter; those of pytest are for the one who runs it."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        yield Path(folder)
+
+
+@pytest.mark.fault(1)
+def test_log_that_may_not_be_read(open_folder: Path) -> None:
+    path = open_folder / "log.mcap"
+    path.write_bytes(b"secret")
+    path.chmod(0)
+
+    def body() -> None:
+        with pytest.raises(LogNotFound, match=r"log\.mcap: Permission denied"):
+            open_log(path)
+        with pytest.raises(NotADatabase, match=r"log\.mcap: cannot be read: Permission denied"):
+            open_database(path)
+        with pytest.raises(MapFileError, match=r"log\.mcap: Permission denied"):
+            load_map(path)
+
+    as_nobody(body)
+    assert list(open_folder.iterdir()) == [path]
+
+
+@pytest.mark.fault(39)
+def test_folder_that_refuses(open_folder: Path) -> None:
+    path, file = open_folder / "x.submaps", open_folder / "file"
+    store(path, [make_entry("monday", 0)], keep=False)
     file.write_text("mine")
+    before = path.read_bytes()
+
+    def body() -> None:
+        with pytest.raises(OutputError, match=r"new\.submaps: cannot write: Permission denied") as caught:
+            store(open_folder / "new.submaps", [make_entry()], keep=False)
+        assert caught.value.hint
+        with pytest.raises(OutputError, match=r"x\.submaps: cannot write: Permission denied"):
+            store(path, [make_entry("tuesday", 1)], keep=True)
+        with open_database(path) as database:
+            assert_holds(database, make_entry("monday", 0))
+
+    open_folder.chmod(0o555)
+    as_nobody(body)
     with pytest.raises(OutputError, match="Not a directory"):
         store(file / "new.submaps", [make_entry()], keep=False)
+    open_folder.chmod(0o755)
     with pytest.raises(OutputError, match="folder"):
-        store(tmp_path, [make_entry()], keep=False)
-    assert file.read_text() == "mine"
+        store(open_folder, [make_entry()], keep=False)
+    assert path.read_bytes() == before
+    assert sorted(open_folder.iterdir()) == [file, path]
 
 
 def test_reader_keeps_what_it_opened(tmp_path: Path) -> None:
@@ -356,6 +455,7 @@ def test_symbolic_link_is_followed(tmp_path: Path) -> None:
 # --- fault 42: not the run that was interrupted -------------------------------------------------------
 
 
+@pytest.mark.fault(42)
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

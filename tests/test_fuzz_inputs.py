@@ -10,9 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import resource
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,52 +26,13 @@ from signature.database.sqlite import store
 from signature.database.upkeep import check, copy
 from tests import test_io_foxglove as foxglove
 from tests.builders import STEP, T0, drive, read, ros, write_mcap
+from tests.mutations import mutated, patiently
 from tests.test_database import make_entry
 
 FUZZ = int(os.environ.get("PC2GRID_FUZZ", "0"))
 RECORDINGS = ["lidar", "lidar ros1", "laser", "depth", "foxglove protobuf", "foxglove json"]
 PARTS = len(RECORDINGS) + 3
-ROUNDS = FUZZ // PARTS if FUZZ else 120
-# A round takes milliseconds; a decoder that is talked into a loop or a huge allocation takes far longer.
-PATIENCE_S = 10.0
-
-
-def mutated(whole: bytes, rng: np.random.Generator) -> bytes:
-    """The bytes truncated, flipped, spliced, shifted, or with two of their lengths swapped."""
-    content = bytearray(whole)
-    a, b = sorted(int(v) for v in rng.integers(0, len(content), 2))
-    kind = int(rng.integers(7))
-    if kind == 0:
-        del content[a:]
-    elif kind == 1:
-        content[a] ^= 1 << int(rng.integers(8))
-    elif kind == 2:
-        content[a : a + 16] = content[b : b + 16]
-    elif kind == 3:
-        del content[a : min(b, a + 40)]
-    elif kind == 4:
-        content[a:a] = content[a : min(b, a + 40)]
-    elif kind == 5:
-        extreme = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x7FC00000, 0x7F800000)
-        content[a : a + 4] = extreme[int(rng.integers(len(extreme)))].to_bytes(4, "little")
-    elif len(whole) >= 8:  # what looks like a length or an offset into the content
-        words = np.lib.stride_tricks.sliding_window_view(np.frombuffer(whole, np.uint8), 4)
-        values = words.astype(np.int64) @ np.array([1, 1 << 8, 1 << 16, 1 << 24])
-        places = np.flatnonzero((values > 0) & (values <= len(whole)))
-        if len(places) >= 2:
-            a, b = (int(v) for v in rng.choice(places, 2, replace=False))
-            content[a : a + 4], content[b : b + 4] = whole[b : b + 4], whole[a : a + 4]
-    return bytes(content)
-
-
-def patiently(rounds: int) -> Iterator[int]:
-    """Count, and watch the time of each round and the memory of all."""
-    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    for number in range(rounds):
-        begin = time.process_time()
-        yield number
-        assert time.process_time() - begin < PATIENCE_S, f"mutation {number}"
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb < 500 * 1024
+ROUNDS = FUZZ // PARTS if FUZZ else 90
 
 
 # --- recordings ---------------------------------------------------------------------------------------

@@ -11,7 +11,6 @@ import pytest
 from pc2grid.config import ReadConfig
 from pc2grid.errors import (
     LimitExceeded,
-    LogCorrupt,
     LogNotFound,
     NotALog,
     Pc2GridError,
@@ -245,29 +244,3 @@ def test_mixed_kinds_are_said(tmp_path: Path) -> None:
     scans, report = read(folder)
     assert len(scans) == 3
     assert any("only its .bin files are read" in w for w in report.warnings)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_mutations_end_in_our_errors_or_in_scans(tmp_path: Path, kind: str) -> None:
-    folder = tmp_path / "clouds"
-    folder.mkdir()
-    path = write_cloud(folder / "scan", POINTS[:40], kind)
-    whole = path.read_bytes()
-    rng = np.random.default_rng(4)
-    read_well = 0
-    for _ in range(150):
-        content = bytearray(whole)
-        at = int(rng.integers(min(len(content), 400 if rng.random() < 0.5 else len(content))))
-        if rng.random() < 0.2:
-            del content[at:]
-        else:
-            content[at] = int(rng.integers(256))
-        path.write_bytes(content)
-        try:
-            read(folder)
-            read_well += 1
-        except LogCorrupt as error:
-            raise AssertionError(f"a foreign exception: {error}") from error
-        except Pc2GridError:
-            continue
-    assert read_well > 5

@@ -58,6 +58,7 @@ class CloudFolder:
 
     def __init__(self, folder: Path, config: ReadConfig) -> None:
         self.tally = Tally()
+        self.tally.warn("files of clouds carry no checksum: damage to their data would not be seen")
         self._max_bytes = config.max_record_bytes
         found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
         kinds = sorted(

@@ -47,11 +47,12 @@ def read_image(path: Path) -> GreyImage:
     import cv2
 
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
-        image = None
-    if image is None or image.size == 0:
+        found = None
+    if found is None or found.size == 0:
         raise MapFileError(f"{path}: a damaged image", hint="copy or save the map again")
+    image = found.astype(np.uint8, copy=False)
     if image.ndim == 2:
         return GreyImage(image, 255)
     colours = image[..., : min(3, image.shape[2])]

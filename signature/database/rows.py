@@ -6,6 +6,7 @@ import contextlib
 import json
 import sqlite3
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from pc2grid.errors import DatabaseCorrupt, DatabaseError, DatabaseVersion
 from pc2grid.model import OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
 from signature.database import codec, schema
-from signature.database.protocol import Label, Provenance, SessionInfo
+from signature.database.protocol import Entry, Label, Provenance, SessionInfo
 
 if TYPE_CHECKING:
     from signature.config import Config
@@ -43,6 +44,16 @@ def select(
     query = f"SELECT {', '.join(columns)}, crc32 FROM {table} WHERE {where} ORDER BY {order}"
     for *row, crc in connection.execute(query, values):
         yield dict(zip(columns, row, strict=True)), codec.row_crc(row) == crc
+
+
+def storable(entry: Entry) -> Entry:
+    """The entry with names that are text: what is none in the name of a file is shown as `\\xff`."""
+    session_map, signatures, provenance = entry
+    name, source = (
+        text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+        for text in (session_map.session, provenance.source)
+    )
+    return replace(session_map, session=name), signatures, replace(provenance, source=source)
 
 
 def insert_session(

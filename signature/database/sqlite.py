@@ -41,7 +41,7 @@ def store(
     compared with the others'; DatabaseBusy; OutputError.
     """
     with rewrite(path, keep=keep, timeout_s=timeout_s) as connection:
-        for session_map, signatures, provenance in entries:
+        for session_map, signatures, provenance in map(rows.storable, entries):
             present = read_sessions(connection, path)
             name = session_map.session
             old = next((session_id for session_id, info in present if info.name == name), None)
@@ -147,24 +147,33 @@ class SqliteDatabase:
         """All signatures, or those of one session; `session_index` counts in the order of `sessions()`."""
         from signature.similarity import SignatureTable
 
-        parts: list[dict[str, Any]] = []
         index = {session_id: i for i, session_id in enumerate(self._ids().values())}
         only = ("1",) if session is None else ("session_id = ?", self._id(session))
+        table: dict[str, Any] = {}
+        filled = 0
         with rows.explained(self._path, "signatures"):
+            # Lengths of blobs are as large as the file at most, whatever a damaged row says of itself.
+            query = f"SELECT sum(length(submap_id)) / 4 FROM signature WHERE {only[0]}"
+            (capacity,) = self._connection.execute(query, only[1:]).fetchone()
             for row, sound in rows.select(self._connection, "signature", *only):
                 if row["session_id"] in self._left_out:
                     continue
                 where = f"signatures of session {row['session_id']}"
                 if not sound:
                     raise rows.corrupt(self._path, where, "wrong checksum")
-                if row["count"]:
-                    arrays = rows.read_signature_arrays(row)
-                    arrays["session_index"] = np.full(row["count"], index[row["session_id"]], np.int32)
-                    parts.append(arrays)
-            if not parts:
+                if not row["count"]:
+                    continue
+                arrays = rows.read_signature_arrays(row)
+                arrays["session_index"] = np.full(row["count"], index[row["session_id"]], np.int32)
+                # Row by row into place, so that no more than one session is in memory twice.
+                for name, values in arrays.items():
+                    if name not in table:
+                        table[name] = np.empty((capacity, *values.shape[1:]), values.dtype)
+                    table[name][filled : filled + len(values)] = values
+                filled += row["count"]
+            if not table:
                 return SignatureTable.of((), np.empty((0, 2)))
-            names = ("boundary", "freespace", "symmetry", "session_index", "submap_id", "center_m")
-            return SignatureTable(**{name: _joined([part[name] for part in parts]) for name in names})
+            return SignatureTable(**{name: values[:filled] for name, values in table.items()})
 
     def nearest(
         self,
@@ -294,11 +303,6 @@ class SqliteDatabase:
                 what = f"submap {values[-1]}" if table == "submap" else table
                 raise rows.corrupt(self._path, f"{what} of session {session!r}", "wrong checksum")
             return row
-
-
-def _joined(parts: list[Any]) -> Any:
-    """One array of several; a single one stays where it is."""
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _same(

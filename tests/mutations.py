@@ -1,0 +1,64 @@
+"""Damage by dice: what transfer, storage, dying recorders and hostile hands do to a file."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from tests.watching import Peak
+
+# A round takes milliseconds; a decoder that is talked into a loop or a huge allocation takes far longer.
+PATIENCE_S = 10.0
+MOST_BYTES = 500 << 20
+_EXTREMES = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x7FC00000, 0x7F800000, 0x7E000000)
+
+
+def mutated(whole: bytes, rng: np.random.Generator) -> bytes:
+    """The bytes truncated, flipped, spliced, shifted, or with other lengths in them."""
+    content = bytearray(whole)
+    a, b = sorted(int(v) for v in rng.integers(0, len(content), 2))
+    match int(rng.integers(10)):
+        case 0:
+            del content[a:]
+        case 1:
+            content[a] ^= 1 << int(rng.integers(8))
+        case 2:
+            content[a : a + 64] = content[b : b + 64]
+        case 3:
+            del content[a : min(b, a + 500)]
+        case 4:
+            content[a:a] = content[a : min(b, a + 40)]
+        case 5:
+            content[a : a + 4] = _EXTREMES[int(rng.integers(len(_EXTREMES)))].to_bytes(4, "little")
+        case 6:  # lengths and offsets are of eight bytes in one format, and of four in the others
+            content[a : a + 8] = int(rng.integers(1 << 62)).to_bytes(8, "little")
+        case 7:
+            content[a : a + 4] = int(rng.integers(1 << 32)).to_bytes(4, "little")
+        case 8:  # where summaries, indexes and footers are
+            content[-int(rng.integers(1, min(800, len(content) + 1)))] ^= 1 << int(rng.integers(8))
+        case _:
+            _swap_lengths(content, rng)
+    return bytes(content)
+
+
+def _swap_lengths(content: bytearray, rng: np.random.Generator) -> None:
+    """Exchange two words that look like lengths of, or offsets into, the content."""
+    if len(content) < 8:
+        return
+    words = np.lib.stride_tricks.sliding_window_view(np.frombuffer(bytes(content), np.uint8), 4)
+    values = words.astype(np.int64) @ np.array([1, 1 << 8, 1 << 16, 1 << 24])
+    places = np.flatnonzero((values > 0) & (values <= len(content)))
+    if len(places) >= 2:
+        a, b = (int(v) for v in rng.choice(places, 2, replace=False))
+        content[a : a + 4], content[b : b + 4] = content[b : b + 4], content[a : a + 4]
+
+
+def patiently(rounds: int) -> Iterator[int]:
+    """Count, and watch the time and the memory of each round."""
+    for number in range(rounds):
+        peak, begin = Peak(), time.process_time()
+        yield number
+        assert time.process_time() - begin < PATIENCE_S, f"mutation {number}"
+        assert peak.grown_bytes() < MOST_BYTES, f"mutation {number}"

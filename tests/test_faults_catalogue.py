@@ -1,0 +1,859 @@
+"""The catalogue of faults: what goes wrong with inputs, and what `pc2grid` answers.
+
+Each case is a command on files that a builder makes: its exit code (0 done, 1 failed, 2 usage, 3 done with
+loss), the class of the error, words of what is said, and that nothing is left behind or changed but a whole
+database where one was asked for. `same`: the map, the trajectory and the signatures are those of the clean
+recording, to the last bit. Other files hold what needs processes, clocks or file systems; there a test
+belongs to a case by the mark `fault(number)`. The last test counts that no number is missing:
+
+ 1 missing, folder, no permission      17 a type in two schema records    33 odd stamps
+ 2 zero bytes                          18 another type on the topic       34 gap in the log
+ 3 magic only                          19 another definition of the type  35 frame not in tf, or changing
+ 4 another kind of file                20 messages cut short              36 tf missing, circular, two parents
+ 5 truncated                           21 NaN and inf points              37 depth images
+ 6 recorder killed                     22 big-endian cloud                38 registration diverges
+ 7 flipped bit                         23 padded rows                     39 disk full, read-only
+ 8 no checksums                        24 data shorter than declared      40 kill -9
+ 9 summary damaged                     25 odd fields                      41 Ctrl-C, SIGTERM, closed pipe
+10 unknown compression                 26 other datatypes                 42 rerun with other settings
+11 decompression bomb                  27 scan without points             43 damaged or foreign database
+12 absurd length                       28 all points out of range         44 database of another version
+13 no such topic                       29 huge coordinates                45 readers and writers at once
+14 no scans in the log                 30 degenerate geometry             46 hostile maps, settings and names
+15 several topics with scans           31 no per-point times
+16 topic without messages              32 per-point times of any unit
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import struct
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from pc2grid import errors
+from pc2grid.errors import Pc2GridError
+from pc2grid_cli import console
+from signature.database import open_database
+from signature.database.sqlite import store
+from signature.database.upkeep import check
+from tests.builders import STEP, T0, Message, drive, raw_log, read, ros, write_bag, write_mcap, write_rosbag2
+from tests.test_database import make_entry
+from tests.watching import Peak
+
+CONVERT = "convert log.mcap -o x.submaps"
+CLOUD = "sensor_msgs/msg/PointCloud2"
+SCANS = 12
+
+
+# --- a small recording --------------------------------------------------------------------------------
+
+
+def sweep(x_m: float) -> np.ndarray:
+    """(1080, 3) float32: the walls of a room of 8 x 6 m, seen from (x_m, 0)."""
+    angle = np.linspace(-3.1, 3.1, 360)
+    c, s = np.cos(angle), np.sin(angle)
+    range_m = np.minimum(
+        np.maximum((5 - x_m) / c, (-3 - x_m) / c),
+        np.maximum(4 / s, -2 / s),
+    )
+    ring = np.column_stack((range_m * c, range_m * s))
+    return np.vstack([np.column_stack((ring, np.full(360, z))) for z in (-0.2, 0.1, 0.4)]).astype("f4")
+
+
+def cloud(
+    i: int,
+    points: np.ndarray | None = None,
+    *,
+    dtype: str = "<f4",
+    code: int = 7,
+    height: int = 1,
+    pad: int = 0,
+    frame: str = "lidar",
+    stamp: int | None = None,
+    fields: Iterable[tuple[str, int, int, int]] | None = None,
+    extra: tuple[str, int, np.ndarray] | None = None,
+) -> Message:
+    """Scan i; `extra` is a further field: name, datatype and a value per point."""
+    to, xyz = ros(), sweep(0.1 * i + 0.2) if points is None else points
+    columns = [("x", dtype), ("y", dtype), ("z", dtype)] + ([("t", extra[2].dtype)] if extra else [])
+    rows = np.zeros(len(xyz), np.dtype(columns))
+    for axis, name in enumerate("xyz"):
+        rows[name] = xyz[:, axis]
+    size = rows.dtype["x"].itemsize
+    known = [(name, size * axis, code, 1) for axis, name in enumerate("xyz")]
+    if extra:
+        rows["t"] = extra[2]
+        known.append((extra[0], 3 * size, extra[1], 1))
+    step, width = rows.dtype.itemsize, len(rows) // height
+    content = rows.tobytes()
+    data = b"".join(content[r * width * step : (r + 1) * width * step] + bytes(pad) for r in range(height))
+    at = T0 + i * STEP if stamp is None else stamp
+    message = to.make(
+        "sensor_msgs/PointCloud2", to.header(at, frame), height, width,
+        [to.make("sensor_msgs/PointField", *field) for field in fields or known],
+        dtype.startswith(">"), step, width * step + pad, np.frombuffer(data, np.uint8), True,
+    )  # fmt: skip
+    return to.message("/points", T0 + i * STEP, message)
+
+
+MOUNT = ros().tf(T0, "base_link", "lidar", 0.25, topic="/tf_static")
+ODOMETRY = [ros().odometry("/odom", T0 + i * STEP, 0.1 * i) for i in range(SCANS)]
+CLOUDS = [cloud(i) for i in range(SCANS)]
+
+
+def recording(clouds: Iterable[Message] = CLOUDS, *others: Message, mount: bool = True) -> list[Message]:
+    """All messages by the time of recording."""
+    messages = [*([MOUNT] if mount else []), *ODOMETRY, *clouds, *others]
+    return sorted(messages, key=lambda m: m.log_time_ns)
+
+
+def log(folder: Path, messages: Iterable[Message] | None = None, **options: Any) -> bytes:
+    """Write log.mcap, in several chunks."""
+    options = {"chunk_size": 20_000, **options}
+    return write_mcap(
+        folder / "log.mcap", recording() if messages is None else messages, **options
+    ).read_bytes()
+
+
+def changed(change: Callable[[int], Message | None], *others: Message) -> list[Message]:
+    """The recording with other clouds; None keeps the usual one."""
+    return recording([change(i) or CLOUDS[i] for i in range(SCANS)], *others)
+
+
+# --- the cases ----------------------------------------------------------------------------------------
+
+
+class Case(NamedTuple):
+    """What is to happen when the command that `make` returns is run in the folder that it filled."""
+
+    number: int
+    code: int
+    error: type[Pc2GridError] | None
+    words: tuple[str, ...]
+    same: bool
+    make: Callable[[Path], str]
+
+
+CASES: list[Case] = []
+
+
+def fault(
+    number: int, code: int, error: type[Pc2GridError] | None, *words: str, same: bool = False
+) -> Callable[[Callable[[Path], str]], Callable[[Path], str]]:
+    def add(make: Callable[[Path], str]) -> Callable[[Path], str]:
+        CASES.append(Case(number, code, error, words, same, make))
+        return make
+
+    return add
+
+
+@fault(1, 1, errors.LogNotFound, "log.mcap: no such file")
+def missing(folder: Path) -> str:
+    return CONVERT
+
+
+@fault(1, 1, errors.LogNotFound, "rooms: a folder without a recording")
+def folder_without_recording(folder: Path) -> str:
+    (folder / "rooms").mkdir()
+    return "convert rooms -o x.submaps"
+
+
+@fault(1, 0, None, same=True)
+def folder_with_a_recording(folder: Path) -> str:
+    log(write_rosbag2(folder / "rooms", recording(), "mcap"))
+    (folder / "rooms/log.mcap").rename(folder / "rooms/rooms.mcap")
+    return "convert rooms -o x.submaps --name log"
+
+
+@fault(2, 1, errors.LogTruncated, "log.mcap: empty file")
+def zero_bytes(folder: Path) -> str:
+    (folder / "log.mcap").touch()
+    return CONVERT
+
+
+@fault(3, 1, errors.LogTruncated, "ends after its first 8 bytes")
+def magic_only(folder: Path) -> str:
+    (folder / "log.mcap").write_bytes(log(folder)[:8])
+    return CONVERT
+
+
+@fault(4, 1, errors.NotALog, "log.mcap: not a recording; looks like text", "pc2grid reads MCAP, ROS 1 bags")
+def text(folder: Path) -> str:
+    (folder / "log.mcap").write_text("a recording, honestly\n")
+    return CONVERT
+
+
+@fault(4, 1, errors.NotALog, "looks like a zstd-compressed file", "unpack it first")
+def compressed(folder: Path) -> str:
+    import zstandard
+
+    (folder / "log.mcap").write_bytes(zstandard.compress(log(folder)))
+    return CONVERT
+
+
+@fault(4, 0, None, same=True)
+def bag_that_is_called_mcap(folder: Path) -> str:
+    """What a file is called does not matter."""
+    to = ros("ros1")
+    again = [to.tf(T0, "base_link", "lidar", 0.25, topic="/tf_static")]
+    for i in range(SCANS):
+        again.append(to.odometry("/odom", T0 + i * STEP, 0.1 * i))
+        again.append(to.cloud("/points", T0 + i * STEP, sweep(0.1 * i + 0.2)))
+    write_bag(folder / "a.bag", again).rename(folder / "log.mcap")
+    return CONVERT
+
+
+@fault(5, 1, errors.LogTruncated, "log.mcap", "readable", "--recover")
+def truncated(folder: Path) -> str:
+    whole = log(folder)
+    (folder / "log.mcap").write_bytes(whole[: int(0.6 * len(whole))])
+    return CONVERT
+
+
+@fault(5, 3, None, "log: data was lost", "bytes unreadable")
+def truncated_and_recovered(folder: Path) -> str:
+    return truncated(folder) + " --recover"
+
+
+@fault(6, 0, None, "not closed", same=True)
+def killed_recorder(folder: Path) -> str:
+    whole = log(folder)
+    (folder / "log.mcap").write_bytes(whole[: whole.rindex(b"\x0f" + struct.pack("<Q", 4))])
+    return CONVERT
+
+
+@fault(7, 1, errors.LogCorrupt, "log.mcap: chunk", "checksum", "--recover")
+def flipped_bit(folder: Path) -> str:
+    whole = bytearray(log(folder))
+    whole[3 * len(whole) // 5] ^= 4
+    (folder / "log.mcap").write_bytes(whole)
+    return CONVERT
+
+
+@fault(7, 3, None, "log: data was lost", "bytes unreadable")
+def flipped_bit_and_recovered(folder: Path) -> str:
+    return flipped_bit(folder) + " --recover"
+
+
+@fault(8, 0, None, "no checksum", same=True)
+def no_checksums(folder: Path) -> str:
+    log(folder, enable_crcs=False)
+    return CONVERT
+
+
+@fault(9, 0, None, "index is not usable", same=True)
+def summary_damaged(folder: Path) -> str:
+    whole = bytearray(log(folder))
+    whole[-100] ^= 0xFF
+    (folder / "log.mcap").write_bytes(whole)
+    return CONVERT
+
+
+@fault(10, 1, errors.UnsupportedSchema, "log.mcap", "compressed with 'brot'")
+def unknown_compression(folder: Path) -> str:
+    whole = log(folder).replace(b"\x04\0\0\0zstd", b"\x04\0\0\0brot")
+    (folder / "log.mcap").write_bytes(whole)
+    return CONVERT
+
+
+@fault(11, 1, errors.LimitExceeded, "limit", "read.max_chunk_bytes")
+def bomb(folder: Path) -> str:
+    """A chunk of zeros, of 16 kB, that says truly that it expands to 512 MiB."""
+    import zstandard
+
+    whole = log(folder, chunk_size=1 << 20)
+    at = whole.index(b"\x04\0\0\0zstd") - 37
+    assert whole[at] == 6
+    length = int.from_bytes(whole[at + 1 : at + 9], "little")
+    packer, zeros, packed = zstandard.ZstdCompressor().compressobj(512 << 20), bytes(1 << 20), bytearray()
+    for _ in range(512):
+        packed += packer.compress(zeros)
+    packed += packer.flush()
+    body = whole[at + 9 : at + 25] + struct.pack("<QI", 512 << 20, 0) + b"\x04\0\0\0zstd"
+    chunk = b"\x06" + struct.pack("<Q", len(body) + 8 + len(packed)) + body
+    (folder / "log.mcap").write_bytes(
+        whole[:at] + chunk + struct.pack("<Q", len(packed)) + packed + whole[at + 9 + length :]
+    )
+    return CONVERT
+
+
+@fault(12, 1, errors.LogCorrupt, "log.mcap", "another length")
+def absurd_length(folder: Path) -> str:
+    whole = log(folder)
+    at = whole.index(b"\x04\0\0\0zstd") - 37
+    (folder / "log.mcap").write_bytes(whole[: at + 1] + struct.pack("<Q", 1 << 60) + whole[at + 9 :])
+    return CONVERT
+
+
+@fault(13, 1, errors.TopicError, "no topic /pionts", "did you mean /points?", "/points (sensor_msgs/Point")
+def no_such_topic(folder: Path) -> str:
+    log(folder)
+    return CONVERT + " --topic /pionts"
+
+
+@fault(14, 1, errors.NoScans, "no topic with scans", "/odom (nav_msgs/Odometry)", "scans are PointCloud2")
+def no_scans(folder: Path) -> str:
+    log(folder, recording([]))
+    return CONVERT
+
+
+@fault(15, 1, errors.TopicError, "several topics hold scans", "/points", "/rear", "--topic /points")
+def two_lidars(folder: Path) -> str:
+    log(folder, recording(CLOUDS, *(c._replace(topic="/rear") for c in CLOUDS)))
+    return CONVERT
+
+
+@fault(15, 0, None, same=True)
+def one_of_two_lidars(folder: Path) -> str:
+    return two_lidars(folder) + " --topic /points"
+
+
+@fault(16, 1, errors.NoScans, "/points (sensor_msgs/PointCloud2)", "no message in the log")
+def topic_without_messages(folder: Path) -> str:
+    raw_log(folder / "log.mcap", [("/points", CLOUD, "ros2msg", ros().schema(CLOUDS[0].type), b"")])
+    return CONVERT
+
+
+@fault(17, 1, errors.TopicError, "/points", "/rear", "--topic")
+def same_type_in_two_schema_records(folder: Path) -> str:
+    definition = ros().schema(CLOUDS[0].type)
+    topics = [(t, CLOUD, "ros2msg", definition, CLOUDS[0].data) for t in ("/points", "/rear")]
+    raw_log(folder / "log.mcap", topics)
+    return CONVERT
+
+
+@fault(18, 1, errors.UnsupportedSchema, "/points: is of type std_msgs/String", "scans are PointCloud2")
+def another_type(folder: Path) -> str:
+    raw_log(folder / "log.mcap", [("/points", "std_msgs/msg/String", "ros2msg", b"string data", b"\0\1\0\0")])
+    return CONVERT + " --topic /points"
+
+
+@fault(19, 1, errors.UnsupportedSchema, "/points", "differently from ROS", "uint32 height")
+def another_definition(folder: Path) -> str:
+    definition = ros().schema(CLOUDS[0].type).replace(b"uint32 height\n", b"", 1)
+    raw_log(folder / "log.mcap", [("/points", CLOUD, "ros2msg", definition, CLOUDS[0].data)])
+    return CONVERT
+
+
+@fault(20, 3, None, "1 scans skipped (the message is shorter than its schema)")
+def one_message_cut_short(folder: Path) -> str:
+    log(folder, changed(lambda i: CLOUDS[i]._replace(data=CLOUDS[i].data[:-50]) if i == 5 else None))
+    return CONVERT
+
+
+@fault(20, 1, errors.LogCorrupt, "/points: 4 of 12 scans are unreadable", "shorter than its schema")
+def many_messages_cut_short(folder: Path) -> str:
+    log(folder, changed(lambda i: CLOUDS[i]._replace(data=CLOUDS[i].data[:-50]) if i > 7 else None))
+    return CONVERT
+
+
+@fault(21, 0, None, same=True)
+def points_that_are_not_finite(folder: Path) -> str:
+    """Dropped with their times, and the others stay where they are."""
+    rng, worse = np.random.default_rng(21), []
+    for i in range(SCANS):
+        points = sweep(0.1 * i + 0.2)
+        at = np.sort(rng.integers(0, len(points), 40))
+        bad = rng.choice(np.array([np.nan, np.inf, -np.inf], "f4"), (40, 3))
+        worse.append(cloud(i, np.insert(points, at, bad, axis=0)))
+    log(folder, recording(worse))
+    return CONVERT
+
+
+@fault(22, 0, None, same=True)
+def big_endian(folder: Path) -> str:
+    log(folder, changed(lambda i: cloud(i, dtype=">f4")))
+    return CONVERT
+
+
+@fault(23, 0, None, same=True)
+def padded_rows(folder: Path) -> str:
+    log(folder, changed(lambda i: cloud(i, height=3, pad=20)))
+    return CONVERT
+
+
+def short_data(i: int) -> Message:
+    """Twice as many points declared as are there; the message itself is whole."""
+    whole, many = CLOUDS[i].data, len(sweep(0))
+    declared = struct.pack("<II", 1, many)
+    assert whole.count(declared) == 1
+    return CLOUDS[i]._replace(data=whole.replace(declared, struct.pack("<II", 1, 2 * many)))
+
+
+@fault(24, 3, None, "1 scans skipped (12960 bytes of data where 25920 are declared)")
+def data_shorter_than_declared(folder: Path) -> str:
+    log(folder, changed(lambda i: short_data(i) if i == 4 else None))
+    return CONVERT
+
+
+def fields(*wrong: tuple[str, int, int, int]) -> Callable[[Path], str]:
+    def make(folder: Path) -> str:
+        log(folder, changed(lambda i: cloud(i, fields=wrong)))
+        return CONVERT
+
+    make.__name__ = "_".join(f"{name}_{offset}_{code}_{count}" for name, offset, code, count in wrong)
+    return make
+
+
+fault(25, 1, errors.PointCloudError, "field z: ends at byte 13 of a 12-byte point")(
+    fields(("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 9, 7, 1))
+)
+fault(25, 1, errors.PointCloudError, "field y: defined twice")(
+    fields(("x", 0, 7, 1), ("y", 4, 7, 1), ("y", 8, 7, 1))
+)
+fault(25, 1, errors.PointCloudError, "field z: missing")(fields(("x", 0, 7, 1), ("y", 4, 7, 1)))
+fault(25, 1, errors.PointCloudError, "field x: 3 values per point")(fields(("x", 0, 7, 3)))
+fault(26, 1, errors.PointCloudError, "field x: unknown datatype 77")(
+    fields(("x", 0, 77, 1), ("y", 4, 7, 1), ("z", 8, 7, 1))
+)
+
+
+@fault(26, 0, None, same=True)
+def float64(folder: Path) -> str:
+    log(folder, changed(lambda i: cloud(i, dtype="<f8", code=8)))
+    return CONVERT
+
+
+@fault(26, 0, None, "log: 12 lidar scans")
+def int64_as_pcl_writes_it(folder: Path) -> str:
+    """Metres as whole numbers are coarse, but they are read."""
+    log(folder, changed(lambda i: cloud(i, np.round(sweep(0.1 * i + 0.2)), dtype="<i8", code=9)))
+    return CONVERT
+
+
+@fault(27, 0, None, "hold no returns at all", "log: 12 lidar scans")
+def scan_without_points(folder: Path) -> str:
+    log(folder, changed(lambda i: cloud(i, np.empty((0, 3))) if i == 6 else None))
+    return CONVERT
+
+
+@fault(28, 3, None, "1 scans skipped (every point is farther than 1000 m from the sensor)")
+def one_scan_out_of_range(folder: Path) -> str:
+    log(folder, changed(lambda i: cloud(i, sweep(0) + 5000) if i == 6 else None))
+    return CONVERT
+
+
+@fault(28, 1, errors.PointCloudError, "every point is farther than 1000 m")
+@fault(29, 1, errors.PointCloudError, "every point is farther than 1000 m", "a global frame such as UTM")
+def all_scans_in_a_global_frame(folder: Path) -> str:
+    log(folder, changed(lambda i: cloud(i, sweep(0.1 * i) + np.float32([4e5, 5e6, 0]))))
+    return CONVERT
+
+
+@fault(29, 0, None, same=True)
+def one_outlier(folder: Path) -> str:
+    log(folder, changed(lambda i: cloud(i, np.vstack((sweep(0.1 * i + 0.2), [[1e30, -1e30, 1e7]])))))
+    return CONVERT
+
+
+@fault(30, 0, None, "log: 12 lidar scans", "0 submaps")
+def all_points_the_same(folder: Path) -> str:
+    log(folder, changed(lambda i: cloud(i, np.full((500, 3), 2.0))))
+    return CONVERT
+
+
+@fault(31, 0, None, "log: 12 lidar scans", same=True)
+def no_times(folder: Path) -> str:
+    log(folder)
+    return CONVERT
+
+
+def times(dtype: str, code: int, scale: float, offset: float = 0.0, *flags: str) -> Callable[[Path], str]:
+    """A sweep of 0.1 s that ends at the stamp."""
+
+    def make(folder: Path) -> str:
+        count = len(sweep(0))
+        seconds = np.tile(np.linspace(-0.09, 0.0, count // 3), 3)
+        offsets = (np.round(seconds * scale) + offset).astype(dtype)
+        log(folder, changed(lambda i: cloud(i, extra=("t", code, offsets))))
+        return " ".join((CONVERT, *flags))
+
+    make.__name__ = f"times_{dtype}_{scale:g}"
+    return make
+
+
+fault(32, 0, None, "log: 12 lidar scans")(times("<i4", 5, 1e9))
+fault(32, 0, None, "log: 12 lidar scans")(times("<i4", 5, 1e6))
+fault(32, 1, errors.PointCloudError, "field t", "fit no unit", "read.point_time")(times("<f8", 8, 1e15))
+fault(32, 0, None, same=True)(times("<f8", 8, 1e15, 0.0, "--set read.point_time=none"))
+
+
+@fault(33, 3, None, "1 scans skipped (stamp is a duplicate)", "1 scans skipped (stamp is zero or negative)")
+def odd_stamps(folder: Path) -> str:
+    more = [cloud(i) for i in range(SCANS, 30)]
+    odd = {5: T0 + 4 * STEP, 8: 0}
+    clouds = [cloud(i, stamp=odd[i]) if i in odd else c for i, c in enumerate([*CLOUDS, *more])]
+    log(folder, recording(clouds))
+    return CONVERT
+
+
+@fault(33, 0, None, "the time of recording is used instead", same=True)
+def all_stamps_zero(folder: Path) -> str:
+    log(folder, changed(lambda i: cloud(i, stamp=0)))
+    return CONVERT
+
+
+@fault(33, 3, None, "scans skipped (stamp jumps)")
+def a_stamp_a_day_ahead(folder: Path) -> str:
+    log(folder, changed(lambda i: cloud(i, stamp=T0 + i * STEP + 86_400 * 10**9) if i == 7 else None))
+    return CONVERT
+
+
+@fault(34, 0, None, "gaps of more than 5 s")
+def gap(folder: Path) -> str:
+    late = 30 * 10**9
+    again = [m._replace(log_time_ns=m.log_time_ns + late) for m in CLOUDS]
+    log(folder, recording([*CLOUDS, *(cloud(i + 300) for i in range(len(again)))]))
+    return CONVERT
+
+
+@fault(35, 1, errors.FrameError, "frame lidarr", "did the driver mean lidar?", "read.base_frame")
+def frame_not_in_tf(folder: Path) -> str:
+    log(folder, changed(lambda i: cloud(i, frame="lidarr")))
+    return CONVERT
+
+
+@fault(35, 1, errors.FrameError, "frame (empty)", "frames in the log: base_link, lidar")
+def frame_empty(folder: Path) -> str:
+    log(folder, changed(lambda i: cloud(i, frame="")))
+    return CONVERT
+
+
+@fault(35, 1, errors.FrameError, "frame rear", "frames in the log: base_link, lidar")
+def frame_that_changes(folder: Path) -> str:
+    log(folder, changed(lambda i: cloud(i, frame="rear") if i > 6 else None))
+    return CONVERT
+
+
+@fault(36, 0, None, "the log has no tf: frame lidar of the scans is taken for the robot's base")
+def no_tf(folder: Path) -> str:
+    log(folder, recording(mount=False))
+    return CONVERT
+
+
+@fault(36, 1, errors.FrameError, "tf goes in a circle")
+def circular_tf(folder: Path) -> str:
+    back = ros().tf(T0, "lidar", "base_link", 0.25, topic="/tf_static")
+    log(folder, recording(CLOUDS, back))
+    return CONVERT
+
+
+@fault(36, 0, None, "frame lidar has two parents", "the latest counts", same=True)
+def two_parents(folder: Path) -> str:
+    wrong = ros().tf(T0 - 1, "mast", "lidar", 0.7, topic="/tf_static")
+    log(folder, recording(CLOUDS, wrong))
+    return CONVERT
+
+
+@fault(36, 1, errors.FrameError, "tf does not connect frame lidar", "base_link", "read.assume_identity")
+def disconnected_tf(folder: Path) -> str:
+    other = ros().tf(T0, "mast", "lidar", 0.7, topic="/tf_static")
+    wheel = ros().tf(T0, "base_link", "wheel", 0.1, topic="/tf_static")
+    log(folder, recording(CLOUDS, other, wheel, mount=False))
+    return CONVERT
+
+
+def depth_log(
+    folder: Path, encoding: str = "16UC1", unit: float = 1000.0, camera: tuple[int, int] | None = (8, 6)
+) -> str:
+    """Three images of a wall, 1 m ahead; a size of the camera, or none."""
+    values = np.full((6, 8), unit, "<u2" if encoding == "16UC1" else "<f4")
+    messages = [ros().image("/depth/image", T0 + i * STEP, values, encoding) for i in range(3)]
+    if camera is not None:
+        messages.insert(0, ros().camera("/depth/camera_info", T0, *camera, 10.0))
+    log(folder, messages)
+    return CONVERT
+
+
+@fault(37, 1, errors.NoScans, "/depth/image: a depth image without a CameraInfo topic")
+def depth_without_camera(folder: Path) -> str:
+    return depth_log(folder, camera=None) + " --topic /depth/image"
+
+
+@fault(37, 1, errors.PointCloudError, "a depth image of 8 x 6 pixels with a CameraInfo of 9 x 6")
+def depth_of_another_size(folder: Path) -> str:
+    return depth_log(folder, camera=(9, 6))
+
+
+@fault(37, 1, errors.UnsupportedSchema, "/depth/image", "'64FC1' is not a depth image", "16UC1")
+def depth_of_an_unknown_encoding(folder: Path) -> str:
+    return depth_log(folder, "64FC1", 1.0)
+
+
+@fault(37, 0, None, "hold no returns at all", "log: 3 depth scans", "0 m2 free, 0 submaps")
+def depth_of_zeros(folder: Path) -> str:
+    return depth_log(folder, unit=0.0)
+
+
+@fault(38, 3, None, "registration was lost for 5 of 12 scans, first 0.7 s after", "they are not in the map")
+def carried_off(folder: Path) -> str:
+    """From one scan to the next into quite another place, and no odometry says so."""
+    rng = np.random.default_rng(38)
+    elsewhere = rng.uniform(5, 9, (800, 3)).astype("f4")
+    log(folder, changed(lambda i: cloud(i, elsewhere + np.float32(0.5 * i)) if i > 6 else None))
+    return CONVERT + " --odometry none"
+
+
+# --- faults 42 to 44: databases -----------------------------------------------------------------------
+
+
+def database(change: Callable[[bytes], bytes], command: str) -> Callable[[Path], str]:
+    def make(folder: Path) -> str:
+        store(folder / "x.submaps", [make_entry()], keep=False)
+        (folder / "x.submaps").write_bytes(change((folder / "x.submaps").read_bytes()))
+        log(folder)
+        return command
+
+    make.__name__ = command
+    return make
+
+
+def header(at: int, value: int) -> Callable[[bytes], bytes]:
+    return lambda data: data[:at] + value.to_bytes(4, "big") + data[at + 4 :]
+
+
+USES = ["db info x.submaps", "relocalize log.mcap --database x.submaps", "export x.submaps --map m"]
+for _command in (*USES, CONVERT + " --add"):
+    fault(43, 1, errors.DatabaseCorrupt, "x.submaps", "truncated")(database(lambda d: d[:-5000], _command))
+    fault(43, 1, errors.NotADatabase, "x.submaps: not a pc2grid database")(
+        database(lambda d: bytes(reversed(d)), _command)
+    )
+    fault(43, 1, errors.NotADatabase, "another program's SQLite file")(database(header(68, 0), _command))
+    fault(44, 1, errors.DatabaseVersion, "database format 2; this pc2grid reads up to 1", "a newer pc2grid")(
+        database(header(60, 2), _command)
+    )
+for _command in USES:
+    fault(43, 1, errors.NotADatabase, "x.submaps: empty file")(database(lambda d: b"", _command))
+fault(42, 1, errors.OutputError, "x.submaps: exists already and holds 'monday' instead of 'log'", "--force")(
+    database(bytes, CONVERT)
+)
+
+
+# --- fault 46: maps, settings, names ----------------------------------------------------------
+
+YAML = """image: m.pgm
+resolution: 0.05
+origin: [0, 0, 0]
+negate: 0
+occupied_thresh: 0.65
+free_thresh: 0.196
+"""
+
+
+def map_with(old: str, new: str, image: bytes = b"P5 40 40 255\n" + b"\xfe" * 1600) -> Callable[[Path], str]:
+    def make(folder: Path) -> str:
+        (folder / "m.yaml").write_text(YAML.replace(old, new))
+        (folder / "m.pgm").write_bytes(image)
+        return "convert m.yaml -o x.submaps"
+
+    make.__name__ = new.strip() or f"no {old.strip()}"
+    return make
+
+
+for _number, _new in enumerate(("0", ".nan", "-1", "[1]", "1e-300")):
+    fault(46, 1, errors.MapFileError, "m.yaml: resolution: expected")(map_with("0.05", _new))
+fault(46, 0, None, "m: 4 m2 free")(map_with("0.05", "5e-2"))
+fault(46, 1, errors.MapFileError, "m.yaml: free_thresh: missing")(map_with("free_thresh: 0.196\n", ""))
+fault(46, 1, errors.MapFileError, "none.pgm: cannot read the map's image")(map_with("m.pgm", "../none.pgm"))
+fault(46, 1, errors.MapFileError, "m.yaml: not readable as YAML")(
+    map_with("m.pgm", "!!python/object/apply:os.system ['touch pwned']")
+)
+fault(46, 1, errors.MapFileError, "m.yaml: not readable as YAML")(map_with("image: ", "a: &a [*a]\n\timage:"))
+fault(46, 1, errors.MapFileError, "m.pgm: 40 x 41 pixels declared, 1600 found")(
+    map_with("", "", b"P5 40 41 255\n" + b"\xfe" * 1600)
+)
+
+
+@fault(46, 1, errors.MapFileError, "m.yaml: larger than 65536 bytes")
+def yaml_without_end(folder: Path) -> str:
+    (folder / "m.yaml").write_text(YAML + "# " * 40_000)
+    return "convert m.yaml -o x.submaps"
+
+
+def image_of(pixels: np.ndarray) -> Callable[[Path], str]:
+    def make(folder: Path) -> str:
+        import cv2
+
+        (folder / "m.yaml").write_text(YAML.replace("m.pgm", "m.png"))
+        (folder / "m.png").write_bytes(bytes(cv2.imencode(".png", pixels)[1]))
+        return "convert m.yaml -o x.submaps"
+
+    make.__name__ = f"image_of_{pixels.dtype}_{pixels.ndim}"
+    return make
+
+
+fault(46, 1, errors.MapFileError, "m.png: a colour image")(
+    image_of(np.full((9, 9, 3), (9, 99, 200), np.uint8))
+)
+fault(46, 1, errors.MapFileError, "m.png: 16 bits")(image_of(np.zeros((9, 9), np.uint16)))
+
+
+@fault(46, 2, errors.ConfigError, "bad.toml", "not TOML")
+def settings_that_are_none(folder: Path) -> str:
+    log(folder)
+    (folder / "bad.toml").write_bytes(b"\x80\x04 a pickle, of all things")
+    return CONVERT + " --config bad.toml"
+
+
+@fault(46, 0, None, same=True)
+def odd_names(folder: Path) -> str:
+    log(folder)
+    name = "a b\n'\"?#%20é.mcap"
+    (folder / "log.mcap").rename(folder / name)
+    return f"convert {shlex.quote(name)} -o x.submaps --name log"
+
+
+@fault(46, 0, None, same=True)
+def name_that_is_no_text(folder: Path) -> str:
+    log(folder)
+    (folder / "log.mcap").rename(folder / os.fsdecode(b"\xff\xfe.mcap"))
+    return f"convert {os.fsdecode(bytes([255, 254]))}.mcap -o x.submaps --name log"
+
+
+@fault(46, 0, None, r"\udcff\udcfe: 12 lidar scans")
+def session_named_after_it(folder: Path) -> str:
+    return name_that_is_no_text(folder).replace(" --name log", "")
+
+
+# --- running them -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def run(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> Callable[[str, Path], tuple[int, BaseException | None, str]]:
+    """Run a command in a folder, within this process: exit code, error, and all that is said."""
+    from pc2grid_cli.main import main
+
+    plain = console.report_error
+
+    def run(command: str, folder: Path) -> tuple[int, BaseException | None, str]:
+        raised: list[BaseException] = []
+
+        def noted(error: BaseException) -> int:
+            raised.append(error)
+            return plain(error)
+
+        monkeypatch.setattr(console, "report_error", noted)
+        monkeypatch.setattr(sys, "argv", ["pc2grid", *shlex.split(command)])
+        monkeypatch.chdir(folder)
+        monkeypatch.setenv("PC2GRID_CONFIG", "")
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert isinstance(ended.value.code, int)
+        said = capfd.readouterr()
+        return ended.value.code, raised[0] if raised else None, said.out + said.err
+
+    return run
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def map_of(database: Path) -> list[bytes]:
+    """Everything of the one session in it, but for what is said about where it came from."""
+    with open_database(database) as opened:
+        (info,) = opened.sessions()
+        table, trajectory = opened.signatures(), opened.trajectory(info.name)
+        grids = [opened.grid(info.name), *(submap.grid for submap in opened.submaps(info.name))]
+        arrays = [table.boundary, table.freespace, table.symmetry, table.center_m, trajectory.T_map_base]
+        return [
+            info.name.encode(),
+            repr([(grid.origin_m, grid.resolution_m, grid.cells.shape) for grid in grids]).encode(),
+            *(grid.cells.tobytes() for grid in grids),
+            *(np.ascontiguousarray(array).tobytes() for array in (*arrays, trajectory.stamps_ns)),
+        ]
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    """The map of the undamaged recording."""
+    from signature.build import add_session, build_session
+    from signature.config import Config
+
+    folder = tmp_path_factory.mktemp("clean")
+    log(folder)
+    session, origin = build_session(folder / "log.mcap", "log", Config())
+    assert not session.report.lossy
+    add_session(folder / "x.submaps", session, Config(), origin)
+    return map_of(folder / "x.submaps")
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.number} {case.make.__name__}")
+def test_fault(case: Case, tmp_path: Path, clean: list[bytes], run: Callable[..., Any]) -> None:
+    command = case.make(tmp_path)
+    before = content(tmp_path)
+    peak = Peak()
+    code, error, said = run(command, tmp_path)
+    assert (code, type(error)) == (case.code, case.error or type(None)), said
+    for words in case.words:
+        assert words in said, said
+    assert "Traceback" not in said
+    left = content(tmp_path)
+    if case.error is None:
+        assert check(tmp_path / "x.submaps") == ()
+        assert (map_of(tmp_path / "x.submaps") == clean) or not case.same
+        assert left.keys() - before.keys() == {"x.submaps"}
+        del left["x.submaps"]
+    else:
+        lines = [line for line in said.splitlines() if not line.startswith("pc2grid: warning")]
+        assert len(lines) <= 2
+        assert lines[0].startswith("pc2grid: error: ")
+        assert all(line.startswith("hint: ") for line in lines[1:])
+    assert left == before
+    assert peak.grown_bytes() < 300 << 20
+
+
+@pytest.mark.fault(5)
+def test_a_cut_at_every_boundary_of_a_record(tmp_path: Path) -> None:
+    """Between records nothing is torn, and a recorder that was killed there is believed; else it is said."""
+    whole = write_mcap(tmp_path / "whole.mcap", drive(), chunk_size=400).read_bytes()
+    scans = [scan.points_m.tobytes() for scan in read(tmp_path / "whole.mcap")[0]]
+    boundaries, at = [], 8
+    while at < len(whole) - 8:
+        at += 9 + int.from_bytes(whole[at + 1 : at + 9], "little")
+        boundaries.append(at)
+    assert len(boundaries) > 40
+    path = tmp_path / "cut.mcap"
+    outcomes = {"whole": 0, "part": 0, "refused": 0}
+    for cut in sorted({b + d for b in boundaries for d in (-1, 0, 1)}):
+        path.write_bytes(whole[:cut])
+        try:
+            found, report = read(path)
+        except Pc2GridError as error:
+            assert "cut.mcap" in error.message
+            outcomes["refused"] += 1
+        else:
+            points = [scan.points_m.tobytes() for scan in found]
+            assert points == scans[: len(points)]
+            assert report.warnings or points == scans
+            outcomes["whole" if points == scans else "part"] += 1
+        try:
+            found, report = read(path, recover=True)
+        except Pc2GridError:
+            continue
+        points = [scan.points_m.tobytes() for scan in found]
+        assert points == scans[: len(points)]
+        assert report.warnings or points == scans
+    assert min(outcomes.values()) > 5, outcomes
+
+
+def test_every_case_of_the_catalogue_has_a_test() -> None:
+    marked = {
+        int(number)
+        for path in Path(__file__).parent.glob("test_*.py")
+        for number in re.findall(r"^(?:@pytest\.mark\.|@| *)fault\((\d+)", path.read_text(), re.MULTILINE)
+    }
+    assert sorted(set(range(1, 47)) - marked) == []
+    listed = {int(number) for number in re.findall(r"(?:^ ?|  )(\d+) [a-zA-Z]", __doc__ or "", re.MULTILINE)}
+    assert listed == set(range(1, 47))
