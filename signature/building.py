@@ -54,11 +54,11 @@ class Building:
         self.config = config.relocalize
         self.sessions = tuple(grids)
         self.labels = tuple((labels or {}).get(name, Label()) for name in grids)
-        self._maps = tuple(grids.values())
-        self.places = Places.of(table, dict(enumerate(self._maps)), made_with.partition.radius_m)
-        self.fields: tuple[LikelihoodField, ...] = tuple(prepare(grid) for grid in self._maps)
-        self._free = tuple(free_squares(grid) for grid in self._maps)
-        self._area_m2 = tuple(float(grid.free.sum()) * grid.resolution_m**2 for grid in self._maps)
+        self.grids = tuple(grids.values())
+        self.places = Places(table, dict(enumerate(self.grids)), made_with.partition.radius_m)
+        self.fields: tuple[LikelihoodField, ...] = tuple(prepare(grid) for grid in self.grids)
+        self._free = tuple(free_squares(grid) for grid in self.grids)
+        self._area_m2 = tuple(float(grid.free.sum()) * grid.resolution_m**2 for grid in self.grids)
 
     @staticmethod
     def of(database: SubmapDatabase, config: Config) -> Building:
@@ -148,7 +148,7 @@ class Building:
             return False
         at = query.T_odom_base
         there = b.fit.T_map_query @ at
-        beyond = unseen_by(query, self._maps[b.session_index].crop((there.x, there.y), _AROUND_M), b.fit)
+        beyond = unseen_by(query, self.grids[b.session_index].crop((there.x, there.y), _AROUND_M), b.fit)
         around = prepare_query(beyond, center_m=(there.x, there.y))
         field = self.fields[a.session_index]
         T_a_b = a.fit.T_map_query @ b.fit.T_map_query.inverse()

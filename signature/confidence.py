@@ -23,6 +23,8 @@ import numpy as np
 from pc2grid.geometry import F64
 from signature.verify import Hypothesis
 
+TUNED_ON = ("fr079", "intel")
+"""Plans whose trials had a say in the coefficients; how far confidence is true is judged on others."""
 RIVALS = 5
 """Hypotheses that take part; further ones add next to nothing."""
 MANY_WALLS = 1000.0

@@ -21,8 +21,8 @@ from signature.build import describe_all
 from signature.config import Config
 from signature.driven import Driven, register
 from signature.relocalize import Building, Relocalizer
-from signature.sensor_matrix import MAPPED, Mapped, Trial, judge
 from signature.similarity import SignatureTable
+from signature.trial import MAPPED, Mapped, Trial, judge
 
 if TYPE_CHECKING:
     from pc2grid.io import Log

@@ -10,11 +10,14 @@ import pytest
 
 from pc2grid.simulate import SimulationConfig, office_floorplan
 from signature.config import Config
+from signature.contribution import COMBINATIONS
 from signature.describe import describe
 from signature.driven import Driven, drive
 from signature.relocalize import Building
-from signature.sensor_matrix import Mapped, Trial, map_building, matrix, query_trials, reliability
+from signature.sensor_matrix import map_building, query_trials
 from signature.similarity import SignatureTable
+from signature.summary import matrix, reliability
+from signature.trial import Mapped, Trial
 
 
 def trial(**changes: Any) -> Trial:
@@ -32,6 +35,7 @@ def trial(**changes: Any) -> Trial:
         "error_m": 0.05,
         "error_rad": 0.01,
         "rank": 0,
+        "alone": dict.fromkeys(COMBINATIONS, 0),
         "scores": (0.8,),
         "walls": 500.0,
         "look_up_ms": 10.0,

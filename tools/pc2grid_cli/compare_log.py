@@ -13,7 +13,7 @@ from pc2grid_cli import settings as options
 
 if TYPE_CHECKING:
     from signature.replay import Part, Tally
-    from signature.sensor_matrix import Trial
+    from signature.trial import Trial
 
 
 def compare_log_command(

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +17,7 @@ import typer
 if TYPE_CHECKING:
     from pc2grid.model import SensorKind
     from pc2grid.simulate import SimulationConfig
-    from signature.sensor_matrix import Cell, Mapped, Trial
+    from signature.trial import Mapped, Trial
 
 Setting = dict[str, float]
 
@@ -50,8 +51,12 @@ def compare_sensors_command(
     """
     from pc2grid.errors import ConfigError, MapFileError, OutputError
     from pc2grid_cli.console import print_json, progress
-    from pc2grid_cli.matrix_report import draw, tables
-    from signature.sensor_matrix import MAPPED, SENSORS, matrix, reliability
+    from pc2grid_cli.matrix_report import contribution_table, draw, draw_signatures, tables
+    from signature.confidence import TUNED_ON
+    from signature.contribution import COMBINATIONS, Independence, independence
+    from signature.sensor_matrix import DISTANCES_M, SENSORS
+    from signature.summary import Truthfulness, ablation, matrix, reliability
+    from signature.trial import MAPPED
 
     names = [plan.stem for plan in plans]
     if len(set(names)) != len(names):
@@ -86,35 +91,58 @@ def compare_sensors_command(
                     future.result()
                     advance(done / len(waiting))
     trials = [t for task in asking for t in _read(_file("trials", *task))]
-    cells = matrix(trials)
-    elsewhere = [t for t in trials if not t.in_building]
+    tag = tuple(sorted(setting.items()))
+    cells, elsewhere = matrix(trials), [t for t in trials if not t.in_building]
+    known = [
+        measured
+        for plan in plans
+        for measured in independence([_mapped(str(plan), s, str(out), tag) for s in SENSORS])
+    ]
+    independent = {
+        name: Independence.together([k for k in known if k.combination == name]) for name in COMBINATIONS
+    }
+    described_m = max(d for d in DISTANCES_M if d <= min(travel, 8.0))
+    contributions = ablation(trials, described_m)
+    tuned = [t for t in trials if t.building in TUNED_ON]
+    others = [t for t in trials if t.building not in TUNED_ON]
     document = {
         "schema_version": 1,
         "plans": names,
         "queries": queries,
         "setting": {**setting, "seed": seed},
-        "cells": [_plain(cell) for cell in cells],
-        "reliability": reliability(trials),
+        "cells": [asdict(cell) for cell in cells],
+        "confidence": {
+            name: {**asdict(Truthfulness.of(some)), "reliability": reliability(some)}
+            for name, some in (("tuned on", tuned), ("other plans", others))
+        },
         "outside_the_map": sum(t.in_building and t.mapped < MAPPED for t in trials),
         "elsewhere": {
             "trials": len(elsewhere),
             "not_found": sum(t.status == "not_found" for t in elsewhere),
             "located": sum(t.status == "located" for t in elsewhere),
         },
+        "independence": {
+            name: {"auc": one.auc, "same": len(one.same), "other": len(one.other)}
+            for name, one in independent.items()
+        },
+        "ablation": {"travel_m": described_m, "recall": contributions},
     }
     (out / "matrix.json").write_text(json.dumps(document, indent=1))
-    draw(out / "matrix.png", cells, reliability(trials))
+    draw(out / "matrix.png", cells, reliability(others or trials))
+    draw_signatures(out / "signatures.png", independent, contributions)
     if as_json:
         print_json(document)
     else:
         tables(cells, elsewhere)
-        print(f"{out / 'matrix.json'}\n{out / 'matrix.png'}")
-
-
-def _plain(cell: Cell) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    return asdict(cell)
+        contribution_table(independent, contributions, described_m)
+        for name, some in (("plans it was tuned on", tuned), ("other plans", others)):
+            if some:
+                truthful = Truthfulness.of(some)
+                print(
+                    f"confidence, {name}: Brier {truthful.brier:.3f},"
+                    f" expected error {truthful.expected_error:.3f} ({truthful.trials} answers)"
+                )
+        print("\n".join(str(out / name) for name in ("matrix.json", "matrix.png", "signatures.png")))
 
 
 def _map_file(plan: str, sensor: str, out: str, setting: Setting) -> Path:
@@ -196,7 +224,7 @@ def _mapped(plan: str, sensor: SensorKind, out: str, tag: tuple[tuple[str, Any],
     from signature.config import Config
     from signature.database import open_database
     from signature.relocalize import Building
-    from signature.sensor_matrix import Mapped
+    from signature.trial import Mapped
 
     target = _map_file(plan, sensor, out, dict(tag))
     with open_database(target) as database:
@@ -225,7 +253,7 @@ def _locate(
 
 
 def _read(path: Path) -> list[Trial]:
-    from signature.sensor_matrix import Trial
+    from signature.trial import Trial
 
     rows = json.loads(path.read_text())
     return [Trial(**{**row, "scores": tuple(row["scores"])}) for row in rows]

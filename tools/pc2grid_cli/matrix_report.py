@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from signature.sensor_matrix import Cell, Trial
+    from signature.contribution import Independence
+    from signature.summary import Cell
+    from signature.trial import Trial
 
 _SENSORS = ("lidar", "laser", "depth")
 
@@ -96,8 +98,68 @@ def draw(path: Path, cells: Sequence[Cell], reliability: Sequence[tuple[float, f
     if reliability:
         said, true, count = zip(*reliability, strict=True)
         axes[3].scatter(said, true, s=[20 + 2 * min(n, 200) for n in count], color=BLUE, alpha=0.7)
-    axes[3].set(title="is confidence true?", xlabel="confidence", ylabel="share that was right")
+    axes[3].set(title="confidence on plans not tuned on", xlabel="confidence", ylabel="share that was right")
     axes[3].grid(alpha=0.3)
+    with replace_file(path) as draft:
+        figure.savefig(draft, format="png", dpi=130)
+    plt.close(figure)
+
+
+Recalls = Mapping[str, Mapping[str, Mapping[int, float]]]
+
+
+def contribution_table(independent: Mapping[str, Independence], recalls: Recalls, travel_m: float) -> None:
+    """Print what each signature contributes: AUC across sensors, and recall of places."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"what the signatures contribute; recall at 1/5/20 after {travel_m:g} m")
+    for heading in ("signatures", "AUC across sensors", *recalls):
+        table.add_column(heading, justify="left" if heading == "signatures" else "right")
+    for name in recalls["all"]:
+        auc = f"{independent[name].auc:.3f}" if name in independent else ""
+        shares = ("/".join(f"{v:.2f}" for v in row[name].values()) for row in recalls.values())
+        table.add_row(name, auc, *shares)
+    Console().print(table)
+
+
+def draw_signatures(path: Path, independent: Mapping[str, Independence], recalls: Recalls) -> None:
+    """One picture: distances of one place across sensors against other places; AUC; the ablation."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    import numpy as np
+
+    from pc2grid.io.atomic import replace_file
+    from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
+
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(15, 4.2), constrained_layout=True)
+    whole = list(independent.values())[-1]
+    if len(whole.same) and len(whole.other):
+        bins = np.linspace(0.0, float(np.quantile(np.concatenate((whole.same, whole.other)), 0.999)), 60)
+        for values, colour, label in (
+            (whole.same, BLUE, "one place, two sensors"),
+            (whole.other, VERMILLION, "two places, one sensor"),
+        ):
+            left.hist(values, bins, density=True, color=colour, alpha=0.6, label=label)
+        left.legend()
+    left.set(title="distance by all three signatures (Eq. 6)", xlabel="distance", ylabel="density")
+    names = list(independent)
+    middle.barh(names, [independent[name].auc for name in names], color=BLUE)
+    middle.set(title="AUC: one place across sensors before others", xlim=(0.5, 1.0))
+    middle.invert_yaxis()
+    rows = list(recalls["all"])
+    height = 0.27
+    for offset, (k, colour) in enumerate(zip((1, 5, 20), (VERMILLION, ORANGE, BLUE), strict=True)):
+        at = np.arange(len(rows)) + (offset - 1) * height
+        right.barh(at, [recalls["all"][name][k] for name in rows], height, color=colour, label=f"at {k}")
+    right.set(title="recall of the right place, all sensors", xlim=(0.0, 1.0))
+    right.set_yticks(np.arange(len(rows)), rows)
+    right.invert_yaxis()
+    right.legend(loc="lower right")
+    for ax in (middle, right):
+        ax.grid(axis="x", alpha=0.3)
     with replace_file(path) as draft:
         figure.savefig(draft, format="png", dpi=130)
     plt.close(figure)
