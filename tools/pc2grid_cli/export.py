@@ -46,6 +46,9 @@ def export_command(
     mcap: Annotated[
         Path | None, typer.Option("--mcap", metavar="OUT.mcap", help="map, path, submaps for Foxglove")
     ] = None,
+    rerun: Annotated[
+        Path | None, typer.Option("--rerun", metavar="OUT.rrd", help="the same for rerun; needs [viz]")
+    ] = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="OUT.png", help="a picture of the map")
     ] = None,
@@ -64,17 +67,21 @@ def export_command(
     from pc2grid.io.atomic import refuse_existing
     from signature.database import open_database
 
-    of_session = [path for path in (trajectory, cloud, graph, mcap, plot) if path is not None]
+    of_session = [path for path in (trajectory, cloud, graph, mcap, rerun, plot) if path is not None]
     if map_ is not None:
         of_session += [map_.with_name(map_.name + ".yaml"), map_.with_name(map_.name + ".pgm")]
     targets = of_session + ([report] if report is not None else [])
     if not targets:
         raise ConfigError(
             "nothing to export",
-            hint="name at least one of --map, --trajectory, --cloud, --graph, --mcap, --plot, --report",
+            hint="name one of --map, --trajectory, --cloud, --graph, --mcap, --rerun, --plot, --report",
         )
     for path in targets:
         refuse_existing(path, force)
+    if rerun is not None:
+        from pc2grid_cli.rerun_file import require_rerun
+
+        require_rerun()
     with open_database(database) as opened:
         names = [info.name for info in opened.sessions()]
         if of_session and session is None and len(names) != 1:
@@ -104,6 +111,10 @@ def export_command(
             from pc2grid_cli.foxglove import write_session
 
             write_session(mcap, opened, name, force)
+        if rerun is not None:
+            from pc2grid_cli import rerun_file
+
+            rerun_file.write_session(rerun, opened, name)
         if plot is not None:
             from pc2grid_cli.picture import draw_session
 

@@ -37,6 +37,9 @@ def relocalize_command(
     output: Annotated[
         Path | None, typer.Option("--output", metavar="OUT.mcap", help="map, pose and path for Foxglove")
     ] = None,
+    rerun: Annotated[
+        Path | None, typer.Option("--rerun", metavar="OUT.rrd", help="the same for rerun; needs [viz]")
+    ] = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="OUT.png", help="a picture of the answer")
     ] = None,
@@ -59,14 +62,18 @@ def relocalize_command(
     from pc2grid.io.nav2_map import is_map_file
     from signature.database import open_database
 
-    for path in (trajectory, initialpose, output, plot, report):
+    for path in (trajectory, initialpose, output, rerun, plot, report):
         if path is not None:
             refuse_existing(path, force)
-    for option, path in (("--trajectory", trajectory), ("--initialpose", initialpose)):
+    for option, path in (("--trajectory", trajectory), ("--initialpose", initialpose), ("--rerun", rerun)):
         if path is not None and is_map_file(log):
             raise ConfigError(
                 f"{option}: there is no robot in a map", hint="--json and --output have its pose"
             )
+    if rerun is not None:
+        from pc2grid_cli.rerun_file import require_rerun
+
+        require_rerun()
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
     )
@@ -96,6 +103,10 @@ def relocalize_command(
                     write_located_map(output, opened, answer, found.drawn, force)
                 else:
                     write_answer(output, opened, answer, located, force)
+            if rerun is not None:
+                from pc2grid_cli import rerun_file
+
+                rerun_file.write_answer(rerun, opened, answer, located)
         if plot is not None:
             from pc2grid_cli.picture import draw_answer
 
@@ -104,7 +115,7 @@ def relocalize_command(
             from pc2grid_cli.report import write_report
 
             write_report(report, opened, found=found, accept=settings.relocalize.accept)
-    for path in (trajectory, initialpose, output):
+    for path in (trajectory, initialpose, output, rerun):
         if path is not None and located is None:
             console.warn(f"{path}: not written, there is no answer to put into it")
     if json:
