@@ -8,7 +8,7 @@ READY = .venv/.ready
 ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 PYTEST_ARGS ?=
 
-.PHONY: help demo test check bench fuzz clean
+.PHONY: help demo test check bench fuzz picture clean
 .DEFAULT_GOAL = help
 
 help:
@@ -17,6 +17,7 @@ help:
 	@echo 'make check   lint, format, types, import order'
 	@echo 'make bench   measure against the goals and the peers'
 	@echo 'make fuzz    the long search for inputs that break it'
+	@echo 'make picture draw the modules and what they import: examples/architecture.svg'
 	@echo 'make clean   remove .venv and everything that was made'
 	@echo 'All of them work from a fresh clone. PYTHON=/path/to/python3 chooses the interpreter for .venv.'
 
@@ -41,6 +42,9 @@ bench: $(READY)
 
 fuzz: $(READY)
 	PC2GRID_FUZZ=20000 $(BIN)/python -m pytest -q -n auto -k fuzz --timeout 1200 $(PYTEST_ARGS)
+
+picture: $(READY)
+	PYTHONPATH=tools $(BIN)/python tools/architecture.py examples/architecture.svg
 
 clean:
 	rm -rf .venv demo_out dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

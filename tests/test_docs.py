@@ -166,6 +166,18 @@ def test_example_signature_of_a_submap(run: Run) -> None:
     assert Path("submap.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_the_picture_of_the_architecture_shows_every_module(folder: Path) -> None:
+    subprocess.run(
+        [sys.executable, ROOT / "tools" / "architecture.py", "out.svg"], check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "tools")))},
+    )  # fmt: skip
+    shown = set(re.findall(r'text-anchor="middle">(\w+)<', Path("out.svg").read_text()))
+    for package in ("pc2grid", "signature", "tools/pc2grid_cli"):
+        for file in (ROOT / package).iterdir():
+            if (file.suffix == ".py" or (file / "__init__.py").exists()) and file.stem != "__init__":
+                assert file.stem in shown
+
+
 # --- nav2 and Foxglove ------------------------------------------------------------------------------------
 
 
