@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F64
-from pc2grid.model import F32, OccupancyGrid
+from pc2grid.model import F32, I64, OccupancyGrid
 from pc2grid.visibility import HIDDEN, isovist
 from signature.config import RelocalizeConfig, SignatureConfig
+from signature.nearest import SignatureIndex
 from signature.query import PROFILE_BEARINGS, QueryMap
-from signature.similarity import SignatureTable, distances
+from signature.similarity import SignatureTable
 
 RANGE_SCALE_M = 0.4
 """Half of the likeness is gone at this difference of two ranges: about the offset between a view and the
@@ -31,31 +32,33 @@ PRIOR_SHARE = 0.15
 """Rays' worth of doubt, as a share of the circle: a likeness of few common rays counts for less."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Places:
     """The places of a database, ready for retrieval.
 
-    table : their signatures.
-    ranges_m : (N, B) float32, seen : (N, B) whether the ray's end is known.
+    table : their signatures. sight_m : how far their isovists reach.
+
+    A place is looked around at when it is first on a shortlist, so a large database is not gone through
+    before the first question, and what nobody asks for takes no memory.
     """
 
-    table: SignatureTable
-    ranges_m: F32
-    seen: NDArray[np.bool_]
+    def __init__(self, table: SignatureTable, grids: Mapping[int, OccupancyGrid], sight_m: float) -> None:
+        """grids : the map of each session, by session_index."""
+        self.table = table
+        self.sight_m = sight_m
+        self.index = SignatureIndex.of(table)
+        self._grids = grids
+        shape = (len(table), PROFILE_BEARINGS)
+        self._ranges_m, self._seen = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
+        self._known = np.zeros(len(table), np.bool_)
 
-    @staticmethod
-    def of(table: SignatureTable, grids: Mapping[int, OccupancyGrid], sight_m: float) -> Places:
-        """Look around, as far as `sight_m`, at every place of `table` in the grid of its session."""
-        n = len(table)
-        ranges = np.zeros((n, PROFILE_BEARINGS), np.float32)
-        seen = np.zeros((n, PROFILE_BEARINGS), np.bool_)
-        for i in range(n):
-            x, y = table.center_m[i]
-            view = isovist(
-                grids[int(table.session_index[i])], (float(x), float(y)), sight_m, bearings=PROFILE_BEARINGS
-            )
-            ranges[i], seen[i] = view.ranges_m, view.ends != HIDDEN
-        return Places(table=table, ranges_m=ranges, seen=seen)
+    def around(self, rows: I64) -> tuple[F32, NDArray[np.bool_]]:
+        """Isovists of places: how far each ray reaches (K, B), and whether its end is known (K, B)."""
+        for i in rows[~self._known[rows]]:
+            x, y = self.table.center_m[i]
+            grid = self._grids[int(self.table.session_index[i])]
+            view = isovist(grid, (float(x), float(y)), self.sight_m, bearings=PROFILE_BEARINGS)
+            self._ranges_m[i], self._seen[i], self._known[i] = view.ranges_m, view.ends != HIDDEN, True
+        return self._ranges_m[rows], self._seen[rows]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,14 +92,12 @@ def retrieve(
         return ()
     best: dict[int, Proposal] = {}
     for index, view in enumerate(query.views):
-        score = distances(view.signature, places.table, signature)
-        rows = np.argsort(score, kind="stable")[: config.shortlist]
-        overlap = rotate_and_compare(
-            view.profile.ranges_m, view.profile.ends != HIDDEN, places.ranges_m[rows], places.seen[rows]
-        )
+        found = places.index.nearest(view.signature, config.shortlist, signature)
+        rows, apart = found.rows, (found.scores - found.mean) / max(found.spread, 1e-12)
+        overlap = rotate_and_compare(view.profile.ranges_m, view.profile.ends != HIDDEN, *places.around(rows))
         turns = peaks(overlap)
         # The signatures keep their say: two places whose ranges agree are told apart by what lies between.
-        likeness = overlap.max(axis=1) * np.exp(-config.signature_weight * _standardised(score)[rows])
+        likeness = overlap.max(axis=1) * np.exp(-config.signature_weight * apart)
         # A view that looks like everywhere says little, so each speaks by how far a place stands out to it.
         likeness = (likeness - likeness.mean()) / (likeness.std() + _SPREAD_FLOOR)
         for position, row in enumerate(rows):
@@ -109,11 +110,6 @@ def retrieve(
     return tuple(ranked[: top_k or config.top_k])
 
 
-def _standardised(score: F64) -> F64:
-    spread = float(score.std())
-    return (score - score.mean()) / spread if spread > 0 else np.zeros_like(score)
-
-
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _overlap(
     ranges: F32,
@@ -124,21 +120,24 @@ def _overlap(
     doubt: float,
 ) -> F32:
     n, bearings = others.shape
-    rays = np.flatnonzero(seen)
-    out = np.zeros((n, bearings), np.float32)
-    inverse = np.float32(1.0 / scale)
+    out = np.empty((n, bearings), np.float32)
+    inverse, one = np.float32(1.0 / scale), np.float32(1.0)
+    own, counts = ranges * inverse, seen.astype(np.float32)
+    # The other's rays twice over, so that every rotation is one straight run of them.
+    other, known = np.empty(2 * bearings, np.float32), np.empty(2 * bearings, np.float32)
     for i in range(n):
+        for k in range(bearings):
+            other[k] = other[k + bearings] = others[i, k] * inverse
+            known[k] = known[k + bearings] = others_seen[i, k]
         for shift in range(bearings):
-            total, count = np.float32(0.0), 0
-            for k in rays:
-                j = k + shift
-                if j >= bearings:
-                    j -= bearings
-                if others_seen[i, j]:
-                    d = (ranges[k] - others[i, j]) * inverse
-                    total += np.float32(1.0) / (np.float32(1.0) + d * d)
-                    count += 1
-            out[i, shift] = total / (count + doubt)
+            turned, both = other[shift : shift + bearings], known[shift : shift + bearings]
+            total, count = np.float32(0.0), np.float32(doubt)
+            for k in range(bearings):
+                weight = counts[k] * both[k]
+                d = own[k] - turned[k]
+                total += weight / (one + d * d)
+                count += weight
+            out[i, shift] = total / count
     return out
 
 

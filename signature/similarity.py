@@ -15,7 +15,8 @@ from signature.describe import Signature
 
 I32 = NDArray[np.int32]
 
-_FARTHEST = 20.0  # cap of -ln BC: BC below 2e-9 means that no bin is shared
+FARTHEST = 20.0
+"""Cap of -ln BC: BC below 2e-9 means that no bin is shared."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,7 +122,7 @@ def histogram_distance(a: F32, b: F32, config: SignatureConfig) -> F64:
     bc = np.where(bc > 1.0 - 1e-7, 1.0, bc)
     if config.histogram_distance == "hellinger":
         return np.asarray(np.sqrt(1.0 - bc))
-    return np.asarray(-np.log(np.maximum(bc, np.exp(-_FARTHEST))))
+    return np.asarray(-np.log(np.maximum(bc, np.exp(-FARTHEST))))
 
 
 def structural_factor(a: F32, b: F32, config: SignatureConfig) -> F64:
