@@ -1,114 +1,74 @@
-"""Measure what the program promises, one line each: `make bench`.
+"""Measure what the program promises, goal beside measured: `make bench`.
 
-Machines differ and are noisy: figures are medians of interleaved runs, with the machine and versions above
-them. Peers and goals come with each measure where there is one.
+python tools/bench/run.py [--only NAME]... [--quick] [--out DIR]
+
+Machines differ and are noisy: figures are medians of interleaved runs, ratios where there is something to
+compare with. The table goes to stdout and, with machine and versions, to DIR/bench.md and DIR/bench.json.
 """
 
 from __future__ import annotations
 
-import platform
-import statistics
-import subprocess
+import argparse
+import json
+import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
+import finding
+import large
+import peers
+import places
+import reading
+from measure import ROOT, Row, machine, table
 
-from pc2grid.config import PartitionConfig
-from pc2grid.model import OccupancyGrid, SessionMap, Trajectory
-from pc2grid.partition import partition
-from pc2grid.simulate import office_floorplan
-from signature.build import provenance
-from signature.config import Config
-from signature.database import open_database
-from signature.database.sqlite import store
-from signature.describe import Signature, describe
+Measure = Callable[[Path, bool], Iterator[Row]]
+MEASURES: dict[str, Measure] = {
+    "help": reading.help_time,
+    "info": reading.info_time,
+    "decode": reading.decode_speed,
+    "convert": reading.convert_time,
+    "memory": reading.convert_memory,
+    "growth": reading.growth,
+    "describe": places.describe_time,
+    "align": places.align_time,
+    "retrieve": large.retrieve_time,
+    "open": large.open_time,
+    "relocalize": finding.relocalize_time,
+    "peers": peers.compare,
+}
 
 
 def main() -> None:
-    """Print the table."""
-    print(
-        f"{platform.machine()}, {platform.system()} {platform.release()}, Python {platform.python_version()},"
+    """Run the measures and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    print(f"numpy {np.__version__}")
-    rows = [("measure", "median", "goal"), *help_rows(), *describe_rows(), *database_rows()]
-    widths = [max(len(row[i]) for row in rows) for i in range(3)]
-    for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)))
-
-
-def help_rows() -> list[tuple[str, str, str]]:
-    """`pc2grid --help` beside an interpreter that does nothing."""
-    ours = [sys.executable, "-c", "from pc2grid_cli.main import main; main()", "--help"]
-    bare = [sys.executable, "-c", "pass"]
-    pairs = [(_seconds(lambda: _quiet(ours)), _seconds(lambda: _quiet(bare))) for _ in range(11)]
-    help_s, bare_s = (statistics.median(column) for column in zip(*pairs, strict=True))
-    return [
-        ("pc2grid --help", f"{help_s:.3f} s", "0.3 s"),
-        ("python that does nothing", f"{bare_s:.3f} s", ""),
-    ]
-
-
-def describe_rows() -> list[tuple[str, str, str]]:
-    """One submap to its signatures, on submaps of a procedural office."""
-    submaps = partition(office_floorplan(0), PartitionConfig())
-    for submap in submaps[:3]:
-        describe(submap)  # compiled code warms up
-    times = [_seconds(lambda submap=submap: describe(submap)) for submap in submaps]
-    return [
-        (f"describe a submap ({len(submaps)} of them)", f"{1e3 * statistics.median(times):.2f} ms", "2 ms")
-    ]
-
-
-def database_rows(submaps: int = 1_000_000, sessions: int = 100) -> list[tuple[str, str, str]]:
-    """Open a large database and have all its signatures ready."""
-    rng = np.random.default_rng(0)
-    each = submaps // sessions
-    grid = OccupancyGrid(cells=np.zeros((2, 2), np.int8), resolution_m=0.05, origin_m=(0.0, 0.0))
-    empty = Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
-    origin = provenance(Path("bench"), "0" * 64, Config())
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "bench.submaps"
-        from pc2grid.model import Submap
-
-        parts = tuple(Submap(submap_id=i, center_m=(0.0, 0.0), radius_m=8.0, grid=grid) for i in range(each))
-        noise = rng.random((each, 122)).astype(np.float32)
-        signatures = [
-            Signature(boundary=row[:80], freespace=row[80:120], symmetry=row[120:]) for row in noise
-        ]
-        entries = [
-            (
-                SessionMap(session=f"s{i}", sensor="map", grid=grid, submaps=parts, trajectory=empty),
-                signatures,
-                origin,
-            )
-            for i in range(sessions)
-        ]
-        written_s = _seconds(lambda: store(path, entries, keep=False))
-        times = []
-        for _ in range(3):
-            begin = time.perf_counter()
-            with open_database(path) as database:
-                assert len(database.signatures()) == each * sessions
-            times.append(time.perf_counter() - begin)
-        size = path.stat().st_size / 1e6
-    return [
-        (f"write {each * sessions} submaps ({size:.0f} MB)", f"{written_s:.1f} s", ""),
-        ("open them, all signatures ready", f"{statistics.median(times):.2f} s", "1 s"),
-    ]
-
-
-def _seconds(action: Callable[[], object]) -> float:
-    begin = time.perf_counter()
-    action()
-    return time.perf_counter() - begin
-
-
-def _quiet(command: list[str]) -> None:
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    parser.add_argument("--only", action="append", choices=MEASURES, help="one measure; repeatable")
+    parser.add_argument("--quick", action="store_true", help="smaller inputs, fewer rounds: a smoke test")
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "results", help="folder for bench.md and bench.json"
+    )
+    arguments = parser.parse_args()
+    rows: list[Row] = []
+    for name in arguments.only or MEASURES:
+        begin = time.perf_counter()
+        with tempfile.TemporaryDirectory(prefix="bench-") as folder:
+            try:
+                rows += MEASURES[name](Path(folder), arguments.quick)
+            except Exception as error:
+                rows.append(Row(what=name, measured=None, unit="", note=f"failed: {error}"))
+        print(f"{name}: {time.perf_counter() - begin:.0f} s", file=sys.stderr)
+    facts = {"command": " ".join(["python tools/bench/run.py", *sys.argv[1:]]), **machine()}
+    facts["data"] = "with PC2GRID_DATA" if os.environ.get("PC2GRID_DATA") else "simulated only"
+    text = table(rows) + "\n\n" + "\n".join(f"{key}: {value}" for key, value in facts.items()) + "\n"
+    print(text, end="")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "bench.md").write_text(text)
+    document = {"machine": facts, "quick": arguments.quick, "rows": [row.to_json() for row in rows]}
+    (arguments.out / "bench.json").write_text(json.dumps(document, indent=1) + "\n")
 
 
 if __name__ == "__main__":

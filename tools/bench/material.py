@@ -1,0 +1,217 @@
+"""Inputs, made from seeds and of any size: recordings, buildings, databases."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pc2grid.deskew import deskew
+from pc2grid.floor import assumed_ground
+from pc2grid.geometry import SE2
+from pc2grid.model import F32, OccupancyGrid, Scan, SessionMap, Submap, Trajectory
+from pc2grid.partition import partition
+from pc2grid.projection import GridBuilder
+from pc2grid.simulate import SimulationConfig, office_floorplan, prepare_session, simulate_session
+from pc2grid.simulate.config import LidarConfig
+from pc2grid.sweep import Sweep, flatten
+from signature.build import provenance
+from signature.config import Config
+from signature.database.sqlite import store
+from signature.describe import Signature, describe
+from signature.query import QueryMap, query_of
+from signature.relocalize import Building
+from signature.similarity import SignatureTable
+
+THIN = LidarConfig(beams=8, columns=240, rate_hz=5.0)
+"""A lidar of few points: for logs that are to be long, not wide."""
+
+
+def data_file(name: str) -> Path | None:
+    """A file of the real recordings in PC2GRID_DATA, if they are there."""
+    path = Path(os.environ.get("PC2GRID_DATA", "")) / name
+    return path if os.environ.get("PC2GRID_DATA") and path.exists() else None
+
+
+def lidar_log(path: Path, length_m: float, *, seed: int = 0, lidar: LidarConfig | None = None) -> int:
+    """Write a recording of a drive through the office; returns how many scans it has."""
+    config = SimulationConfig(length_m=length_m, seed=seed, lidar=lidar or LidarConfig())
+    return simulate_session(path, sensor="lidar", config=config).scans
+
+
+def huge_log(path: Path, size_bytes: int, message_bytes: int = 16_000_000) -> None:
+    """An MCAP of clouds full of zeros, with all its indexes, on a file system that keeps no zeros."""
+    from mcap.writer import CompressionType, Writer
+
+    from pc2grid.io.cdr import Cdr
+    from pc2grid.io.ros_definitions import schema_text
+
+    points = message_bytes // 16
+    cdr = Cdr().header(0, "lidar").put("I", 1, points, 3)
+    for index, name in enumerate("xyz"):
+        cdr.text(name).put("I", 4 * index).put("B", 7).put("I", 1)
+    cdr.put("?", False).put("I", 16, 16 * points).array(np.zeros(16 * points, np.uint8)).put("?", False)
+    message = bytes(cdr)
+    with path.open("wb") as file:
+        writer = Writer(_Sparse(file), compression=CompressionType.NONE, enable_crcs=False)
+        writer.start(profile="ros2", library="bench")
+        name = "sensor_msgs/msg/PointCloud2"
+        schema = writer.register_schema(name=name, encoding="ros2msg", data=schema_text(name).encode())
+        channel = writer.register_channel(topic="/points", message_encoding="cdr", schema_id=schema)
+        for k in range(size_bytes // len(message)):
+            stamp_ns = 100_000_000 * (k + 1)
+            writer.add_message(channel, log_time=stamp_ns, publish_time=stamp_ns, data=message)
+        writer.finish()
+
+
+class _Sparse:
+    """A file in which the zeros that end a write are a hole."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+
+    def write(self, data: bytes) -> int:
+        content = data.rstrip(b"\0")
+        self._file.write(content)
+        self._file.seek(len(data) - len(content), 1)
+        return len(data)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """One scan of a drive with its true pose: in the plane, and as points in the map frame."""
+
+    T_map_base: SE2
+    stamp_ns: int
+    sweep: Sweep
+    points_m: F32
+
+
+def drive(length_m: float, *, seed: int, every: int = 3) -> Iterator[Look]:
+    """A lidar's drive through the office with true poses; every third scan, 0.2 m apart."""
+    config = SimulationConfig(length_m=length_m, seed=seed)
+    last: tuple[Scan, SE2] | None = None
+    for count, (scan, truth) in enumerate(prepare_session(sensor="lidar", config=config).scans()):
+        if last is not None and count % every == 0:
+            motion = (last[1].inverse() @ truth).lift()
+            assert scan.offsets_s is not None
+            points = deskew(scan.points_m, scan.offsets_s, motion, (scan.stamp_ns - last[0].stamp_ns) * 1e-9)
+            sweep = flatten(
+                points,
+                stamp_ns=scan.stamp_ns,
+                sensor_m=scan.T_base_sensor[:3, 3],
+                ground=assumed_ground(scan.T_base_sensor),
+                config=Config().projection,
+            )
+            T = truth.lift()
+            yield Look(truth, scan.stamp_ns, sweep, (points @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
+        last = scan, truth
+
+
+def grid_of(looks: Iterable[Look]) -> OccupancyGrid:
+    """The map of a drive."""
+    builder = GridBuilder(Config().projection)
+    for look in looks:
+        builder.add(look.sweep, look.T_map_base)
+    return builder.grid()
+
+
+def query_map(looks: Sequence[Look], config: Config, grid: OccupancyGrid | None = None) -> QueryMap:
+    """What a robot has seen on a drive, in the map frame, described as a query is.
+
+    grid : what `grid_of` makes of it, if that is done already.
+    """
+    return query_of(
+        grid or grid_of(looks),
+        np.array([(look.T_map_base.x, look.T_map_base.y) for look in looks]),
+        partition=config.partition,
+        signature=config.signature,
+        config=config.relocalize,
+        T_odom_base=looks[-1].T_map_base,
+    )
+
+
+def building_of(grid: OccupancyGrid, config: Config) -> Building:
+    """A database of one session, in memory."""
+    submaps = partition(grid, config.partition)
+    table = SignatureTable.of(
+        [describe(submap, config.signature) for submap in submaps],
+        [submap.center_m for submap in submaps],
+        submap_id=[submap.submap_id for submap in submaps],
+    )
+    return Building({"office": grid}, table, config, config)
+
+
+def office(seed: int, side: int = 1) -> OccupancyGrid:
+    """side x side office floors side by side, no two alike."""
+    rows = [
+        np.hstack([office_floorplan(seed + side * r + c).cells for c in range(side)]) for r in range(side)
+    ]
+    return OccupancyGrid(cells=np.vstack(rows), resolution_m=0.05, origin_m=(0.0, 0.0))
+
+
+def many_signatures(count: int, config: Config) -> SignatureTable:
+    """Signatures like those of real places: those of office floors, mixed and disturbed at random.
+
+    Uniform noise would not do: all of it is equally far from everything.
+    """
+    real = [
+        describe(submap, config.signature)
+        for seed in range(4)
+        for submap in partition(office_floorplan(seed), config.partition)
+    ]
+    rng = np.random.default_rng(0)
+    first, second = rng.integers(0, len(real), (2, count))
+    share = rng.random((count, 1), np.float32)
+
+    def mixed(name: str, spread: float) -> F32:
+        rows = np.stack([getattr(signature, name) for signature in real])
+        out = np.empty((count, rows.shape[1]), np.float32)
+        for k in range(0, count, 100_000):
+            s = np.s_[k : k + 100_000]
+            out[s] = share[s] * rows[first[s]] + (1 - share[s]) * rows[second[s]]
+            out[s] *= np.exp(spread * rng.standard_normal(out[s].shape, np.float32))
+            if name != "symmetry":
+                out[s] /= np.maximum(out[s].sum(axis=1, keepdims=True), 1e-9)
+        return out
+
+    return SignatureTable(
+        boundary=mixed("boundary", 0.15),
+        freespace=mixed("freespace", 0.15),
+        symmetry=mixed("symmetry", 0.1),
+        session_index=np.zeros(count, np.int32),
+        submap_id=np.arange(count, dtype=np.int32),
+        center_m=np.zeros((count, 2)),
+    )
+
+
+def large_database(path: Path, table: SignatureTable, sessions: int, config: Config) -> None:
+    """Write a table as a database of so many sessions; the submaps' own grids are two cells wide."""
+    grid = OccupancyGrid(cells=np.zeros((2, 2), np.int8), resolution_m=0.05, origin_m=(0.0, 0.0))
+    empty = Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
+    origin = provenance(Path("bench"), "0" * 64, config)
+    each = len(table) // sessions
+    parts = tuple(
+        Submap(submap_id=i, center_m=(0.0, 0.0), radius_m=config.partition.radius_m, grid=grid)
+        for i in range(each)
+    )
+    entries = []
+    for s in range(sessions):
+        signatures = [signature_of(table, s * each + i) for i in range(each)]
+        session = SessionMap(session=f"s{s}", sensor="map", grid=grid, submaps=parts, trajectory=empty)
+        entries.append((session, signatures, origin))
+    store(path, entries, keep=False)
+
+
+def signature_of(table: SignatureTable, row: int) -> Signature:
+    """One row of a table."""
+    return Signature(
+        boundary=table.boundary[row], freespace=table.freespace[row], symmetry=table.symmetry[row]
+    )

@@ -1,0 +1,184 @@
+"""What every measurement is made of: rows of the table, interleaved timing, children and their memory."""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "open3d-cpu", "kiss-icp", "faiss-cpu")
+
+# VmHWM starts anew with each program; getrusage would count the parent's pages too.
+_PEAK = (
+    "import atexit, sys; atexit.register(lambda: print(next(line for line in open('/proc/self/status')"
+    " if line.startswith('VmHWM')), file=sys.stderr))\n"
+)
+_CLI = "from pc2grid_cli.main import main; main()"
+
+
+@dataclass(frozen=True, slots=True)
+class Time:
+    """Seconds by the clock on the wall, and seconds of processor (user and system, all threads)."""
+
+    wall: float
+    cpu: float
+
+    def times(self, factor: float) -> tuple[float, float]:
+        """Both in another unit."""
+        return factor * self.wall, factor * self.cpu
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """One line of the table.
+
+    goal : what to reach, at most (`at_least`: at least) that much; None where there is nothing to reach.
+    measured : a median, in `unit`. None: could not be measured, `note` says why.
+    cpu : the same by processor time: what it would be on a machine with nothing else to do.
+    """
+
+    what: str
+    measured: float | None
+    unit: str
+    goal: float | None = None
+    at_least: bool = False
+    cpu: float | None = None
+    note: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """ok, missed, or nothing to say."""
+        if self.goal is None:
+            return ""
+        if self.measured is None:
+            return "not measured"
+        if self._reached(self.measured):
+            return "ok"
+        return "ok by cpu" if self.cpu is not None and self._reached(self.cpu) else "missed"
+
+    def _reached(self, value: float) -> bool:
+        assert self.goal is not None
+        return value >= self.goal if self.at_least else value <= self.goal
+
+    def cells(self) -> tuple[str, ...]:
+        """As it is printed."""
+        goal = "" if self.goal is None else f"{'>=' if self.at_least else '<='} {self.goal:g} {self.unit}"
+        return self.what, goal, self._number(self.measured), self._number(self.cpu), self.verdict, self.note
+
+    def _number(self, value: float | None) -> str:
+        if value is None:
+            return ""
+        return f"{value:.0f} {self.unit}" if abs(value) >= 1000 else f"{value:.3g} {self.unit}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain types only."""
+        return {**asdict(self), "verdict": self.verdict}
+
+
+def timed(action: Callable[[], object]) -> Time:
+    """How long one call takes."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    action()
+    return Time(time.perf_counter() - wall, time.process_time() - cpu)
+
+
+def median(times: Iterable[Time]) -> Time:
+    """Of wall and processor time, each for itself."""
+    taken = list(times)
+    return Time(statistics.median(t.wall for t in taken), statistics.median(t.cpu for t in taken))
+
+
+def interleaved(actions: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, Time]:
+    """Median time of each action; they take turns, so that a busy moment hits all alike."""
+    taken: dict[str, list[Time]] = {name: [] for name in actions}
+    for _ in range(rounds):
+        for name, action in actions.items():
+            taken[name].append(timed(action))
+    return {name: median(times) for name, times in taken.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Child:
+    """A finished process: how long it took, its peak resident memory, what it printed."""
+
+    time: Time
+    peak_mb: float
+    stdout: str
+
+
+def program(*arguments: str | Path) -> Child:
+    """Run `pc2grid` as a process of its own, as a user does."""
+    return run_python(_PEAK + _CLI, *arguments)
+
+
+def run_python(code: str, *arguments: str | Path) -> Child:
+    """Run Python code as a process of its own; raises RuntimeError if it failed.
+
+    Exit codes 3 and 4 of the program are answers, not failures.
+    """
+    before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tools")))},
+    )
+    wall, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    if done.returncode not in (0, 3, 4):
+        raise RuntimeError(f"{arguments}: {done.stderr[-2000:]}")
+    peaks = [line for line in done.stderr.splitlines() if line.startswith("VmHWM")]
+    peak_mb = int(peaks[-1].split()[1]) / 1000 if peaks else float("nan")
+    return Child(Time(wall, cpu), peak_mb, done.stdout)
+
+
+def machine() -> dict[str, str]:
+    """What the figures were measured on."""
+    cpu = next(
+        (
+            line.split(":")[1].strip()
+            for line in Path("/proc/cpuinfo").read_text().splitlines()
+            if "model name" in line
+        ),
+        platform.machine(),
+    )
+    commit = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], cwd=ROOT, check=False, capture_output=True, text=True
+    ).stdout.strip()
+    return {
+        "cpu": f"{os.cpu_count()} x {cpu}",
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        "commit": commit,
+        "load": f"{os.getloadavg()[0]:.1f} processes at the end, 1.0 of them this one",
+        "threads": os.environ.get("OMP_NUM_THREADS", "default"),
+        **{name: _version(name) for name in LIBRARIES},
+    }
+
+
+def _version(library: str) -> str:
+    try:
+        return metadata.version(library)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Rows under each other, a Markdown table."""
+    lines = [("what", "goal", "measured", "by cpu time", "", "note"), *(row.cells() for row in rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(6)]
+    text = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |" for line in lines]
+    text.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
+    return "\n".join(text)
