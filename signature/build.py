@@ -1,14 +1,17 @@
-"""Session maps into the database: every submap described and stored."""
+"""Recordings and maps into the database: as session maps, every submap described, and stored."""
 
 from __future__ import annotations
 
+import hashlib
 import platform
 from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
+
 import pc2grid
-from pc2grid.model import SessionMap
+from pc2grid.model import OccupancyGrid, SessionMap, Trajectory
 from signature.config import Config
 from signature.database import Label, Provenance
 from signature.describe import Signature, describe
@@ -43,6 +46,72 @@ def provenance(
         versions=versions,
         label=label or Label(),
     )
+
+
+def build_session(
+    path: Path,
+    name: str,
+    config: Config,
+    *,
+    start_s: float = 0.0,
+    duration_s: float | None = None,
+    recover: bool = False,
+    label: Label | None = None,
+    progress: Callable[[float], None] | None = None,
+    note: Callable[[str], None] | None = None,
+) -> tuple[SessionMap, Provenance]:
+    """A recording or nav2 map as a session map, and what it came from.
+
+    progress : told the share that is done. note : told which topic was chosen, and why.
+
+    Raises LogError and its like, MapFileError, RegistrationDiverged.
+    """
+    from pc2grid.io.nav2_map import is_map_file, load_map
+
+    if is_map_file(path):
+        grid = load_map(path)
+        return _map_session(grid, name, config), provenance(
+            path, _map_digest(path, grid), config, label=label
+        )
+
+    from pc2grid.io import open_log
+    from pc2grid.pipeline import build_map
+
+    with open_log(path, config.read, recover=recover) as log:
+        choice = log.choose()
+        if note is not None:
+            note(f"{path}: {choice.topic} ({choice.sensor}): {choice.reason}")
+        session_map = build_map(
+            log, config, session=name, start_s=start_s, duration_s=duration_s, progress=progress
+        )
+        origin = provenance(path, log.digest(), config, start_s=start_s, duration_s=duration_s, label=label)
+    return session_map, origin
+
+
+def digest_of(path: Path, config: Config) -> str:
+    """The sha256 that a session made from this recording or map says it came from."""
+    from pc2grid.io.nav2_map import is_map_file, load_map
+
+    if is_map_file(path):
+        return _map_digest(path, load_map(path))
+    from pc2grid.io import open_log
+
+    with open_log(path, config.read) as log:
+        return log.digest()
+
+
+def _map_digest(path: Path, grid: OccupancyGrid) -> str:
+    """Of the text and of the cells: the image may be of another format and say the same."""
+    return hashlib.sha256(path.read_bytes() + grid.cells.tobytes()).hexdigest()
+
+
+def _map_session(grid: OccupancyGrid, name: str, config: Config) -> SessionMap:
+    """A map as a session in its own frame."""
+    from pc2grid.partition import partition
+
+    nowhere = Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
+    submaps = partition(grid, config.partition)
+    return SessionMap(session=name, sensor="map", grid=grid, submaps=submaps, trajectory=nowhere)
 
 
 def describe_all(
@@ -94,7 +163,7 @@ def add_sessions(
 
     keep : add to what the file holds; otherwise they become its whole content.
     """
-    from signature.database.sqlite import store
+    from signature.database.transfer import store
 
     entries = [(m, describe_all(m, config, progress), origin) for m, origin in sessions]
-    store(Path(database), entries, keep=keep, force=force)
+    store(database, entries, keep=keep, force=force)

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pc2grid.errors import DatabaseError
 from pc2grid_cli import console
 from pc2grid_cli import settings as options
 
 if TYPE_CHECKING:
-    from pc2grid.model import OccupancyGrid, SessionMap
-    from signature.config import Config
-    from signature.database import Label, Provenance
+    from pc2grid.model import SessionMap
+    from signature.cluster import Job
+    from signature.database import Provenance
+    from signature.database.protocol import Entry
 
 
 def convert_command(
     inputs: Annotated[list[Path], typer.Argument(metavar="LOG|MAP.yaml...", help="recordings, or nav2 maps")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="BUILDING.submaps", help="what to write")],
+    output: options.WrittenDatabase,
     topic: options.Topic = None,
     odometry: options.OdometryTopic = None,
     start: options.Start = 0.0,
@@ -31,6 +37,13 @@ def convert_command(
     ] = None,
     floor: Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, within it")] = None,
     add: Annotated[bool, typer.Option("--add", help="add to an existing database")] = False,
+    dask: Annotated[
+        str | None,
+        typer.Option("--dask", metavar="[ADDRESS]", help="of a scheduler; none: processes on this machine"),
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", min=1, help="how many processes; default: as many as cores")
+    ] = None,
     config: options.ConfigFile = None,
     set_: options.Assignments = None,
     force: options.Force = False,
@@ -38,96 +51,197 @@ def convert_command(
     assume_identity: options.AssumeIdentity = False,
     json: options.AsJson = False,
 ) -> None:
-    """Make a submap database from recordings or maps.
+    """Make a submap database from recordings or maps; several become a session each.
+
+    Of several, each is stored when it is done: after an interruption the same command goes on from there.
 
     Example: pc2grid convert monday.mcap -o building.submaps
     """
-    from pc2grid.errors import ConfigError, OutputError
-    from signature.build import add_sessions
-    from signature.database import Label
+    from pc2grid.errors import ConfigError
+    from signature.cluster import LOCAL, Job
+    from signature.database import Label, transfer
 
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
     )
     if name is not None and len(inputs) > 1:
         raise ConfigError("--name names one session, but there are several inputs")
-    names = [name or path.stem for path in inputs]
-    label = Label(building=building, floor=floor)
+    wanted = [
+        Job(
+            path=path,
+            name=name or path.stem,
+            config=settings,
+            start_s=start,
+            duration_s=duration,
+            recover=recover,
+            label=Label(building=building, floor=floor),
+        )
+        for path in inputs
+    ]
+    names = [job.name for job in wanted]
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise ConfigError(
             f"two inputs would both be the session {twice[0]!r}", hint="convert one later with --add --name"
         )
-    if not add and not force and output.exists() and not (output.is_file() and output.stat().st_size == 0):
-        raise OutputError(
-            f"{output}: exists already{_difference(output, inputs, names, label, settings, start, duration)}",
-            hint="--force replaces it, --add adds to it",
-        )
-    if not output.parent.is_dir():
-        raise OutputError(
-            f"{output}: cannot write: no folder {output.parent}", hint="create the folder first"
-        )
-    if add and output.exists():
-        from signature.database import open_database
-
-        open_database(output).close()
-    sessions = [
-        build_session(
-            path, session, settings, start_s=start, duration_s=duration, recover=recover, label=label
-        )
-        for path, session in zip(inputs, names, strict=True)
-    ]
-    with console.progress("describe") as update:
-        add_sessions(output, sessions, settings, keep=add, force=force, progress=update)
-    documents = [summary(session, origin) for session, origin in sessions]
-    lossy = any(session.report.lossy for session, _ in sessions)
+    stored = _stored(output, wanted, add=add, force=force)
+    if dask is None and jobs is not None:
+        dask = LOCAL
+    done = _convert_all(
+        [replace(job, stored=stored.get(job.name)) for job in wanted],
+        output,
+        keep=add or bool(stored),
+        force=force,
+        dask=dask,
+        processes=jobs or os.cpu_count() or 1,
+        quiet=json,
+    )
+    where = transfer.source_name(output)
     if json:
         console.print_json(
-            {"schema_version": 1, "database": str(output), "lossy": lossy, "sessions": documents}
+            {
+                "schema_version": 1,
+                "database": where,
+                "lossy": done.lossy,
+                "sessions": done.sessions,
+                "unchanged": done.unchanged,
+                "failed": done.failed,
+            }
         )
     else:
-        for document in documents:
-            print(_as_text(document))
-        print(f"{output}: {output.stat().st_size / 1e6:.1f} MB")
-    for session, _ in sessions:
-        for warning in session.report.warnings:
-            console.warn(f"{session.session}: {warning}")
-        if session.report.lossy:
-            console.warn(f"{session.session}: data was lost: {_losses(session)}")
-    if lossy:
+        path = Path(output)
+        if path.is_file():
+            print(f"{where}: {path.stat().st_size / 1e6:.1f} MB")
+    for warning in done.warnings:
+        console.warn(warning)
+    if done.failed:
+        console.warn(f"{len(done.failed)} of {len(inputs)} failed: {', '.join(done.failed)}")
+    if len(done.failed) == len(inputs):
+        raise typer.Exit(console.FAILED)
+    if done.lossy:
         raise typer.Exit(console.LOSSY)
 
 
-def build_session(
-    path: Path,
-    name: str,
-    config: Config,
-    *,
-    start_s: float = 0.0,
-    duration_s: float | None = None,
-    recover: bool = False,
-    label: Label | None = None,
-) -> tuple[SessionMap, Provenance]:
-    """One input as a session map and what it came from."""
-    from pc2grid.io.nav2_map import is_map_file
-    from signature.build import provenance
+@dataclass(kw_only=True)
+class _Done:
+    """What became of all inputs."""
 
-    if is_map_file(path):
-        session_map, digest = _import_map(path, name, config)
-        return session_map, provenance(path, digest, config, label=label)
+    sessions: list[dict[str, Any]] = field(default_factory=list)
+    unchanged: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    lossy: bool = False
 
-    from pc2grid.io import open_log
-    from pc2grid.pipeline import build_map
 
-    with open_log(path, config.read, recover=recover) as log:
-        choice = log.choose()
-        console.note(f"{path}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
-        with console.progress(f"map {path.name}", duration_s or log.info.duration_s) as update:
-            session_map = build_map(
-                log, config, session=name, start_s=start_s, duration_s=duration_s, progress=update
-            )
-        origin = provenance(path, log.digest(), config, start_s=start_s, duration_s=duration_s, label=label)
-    return session_map, origin
+def _convert_all(
+    jobs: list[Job], output: str, *, keep: bool, force: bool, dask: str | None, processes: int, quiet: bool
+) -> _Done:
+    """Convert, here or on a cluster, and store what comes back, in order, a transaction each."""
+    from signature import cluster
+    from signature.database import transfer
+
+    done = _Done()
+    with contextlib.ExitStack() as stack:
+        if len(jobs) > 1:
+            stack.enter_context(_say_how_far(done, len(jobs)))
+        if dask is None:
+            outcomes = cluster.here(jobs, console.progress, lambda line: console.note(line, level=1))
+        else:
+            outcomes = cluster.on_cluster(jobs, dask, min(processes, len(jobs)), console.warn)
+            update = stack.enter_context(console.progress(f"convert {len(jobs)} recordings"))
+        # Whatever ends this early ends the cluster too, before anything is said about it.
+        stack.enter_context(contextlib.closing(outcomes))
+        for number, outcome in enumerate(outcomes, start=1):
+            error = outcome.error
+            if outcome.entry is not None:
+                try:
+                    transfer.store(output, [outcome.entry], keep=keep, force=force)
+                    keep = True
+                    _tell(done, outcome.entry, quiet)
+                except DatabaseError as refusal:
+                    if type(refusal) is not DatabaseError:  # the database itself is in trouble
+                        raise
+                    error = refusal
+            if error is not None:
+                if len(jobs) == 1:
+                    raise error
+                console.report_error(error)
+                done.failed.append(str(outcome.job.path))
+                done.lossy = True
+            elif outcome.entry is None:
+                console.note(f"{outcome.job.name}: stored already")
+                done.unchanged.append(outcome.job.name)
+            if dask is not None:
+                update(number / len(jobs))
+    return done
+
+
+@contextlib.contextmanager
+def _say_how_far(done: _Done, count: int) -> Iterator[None]:
+    """What is stored stays when the rest is given up."""
+    try:
+        yield
+    except BaseException:
+        ready = len(done.sessions) + len(done.unchanged)
+        console.note(f"{ready} of {count} are stored; the same command goes on from there")
+        raise
+
+
+def _tell(done: _Done, entry: Entry, quiet: bool) -> None:
+    """Remember and print what became of one input."""
+    session, _, origin = entry
+    document = summary(session, origin)
+    done.sessions.append(document)
+    if not quiet:
+        print(_as_text(document), flush=True)
+    done.warnings += [f"{session.session}: {warning}" for warning in session.report.warnings]
+    if session.report.lossy:
+        done.warnings.append(f"{session.session}: data was lost: {_losses(session)}")
+        done.lossy = True
+
+
+def _stored(output: str, jobs: list[Job], *, add: bool, force: bool) -> dict[str, Provenance]:
+    """Sessions that are there already and shall stay as they are; without any, a new database is made.
+
+    Raises OutputError if there is a database that the inputs must not be written to.
+    """
+    from pc2grid.errors import OutputError
+    from signature.database import open_database, transfer
+    from signature.database.postgres_schema import is_url
+
+    where = transfer.source_name(output)
+    if not is_url(output) and not Path(output).parent.is_dir():
+        raise OutputError(
+            f"{output}: cannot write: no folder {Path(output).parent}", hint="create the folder first"
+        )
+    if not transfer.exists(output) or (force and not add):
+        return {}
+    try:
+        with open_database(output) as opened:
+            present = {info.name: info.provenance for info in opened.sessions()}
+    except DatabaseError:
+        if add:
+            raise
+        raise OutputError(f"{where}: exists already", hint="--force replaces it") from None
+    if force:
+        return {}
+    difference = _difference(present, jobs)
+    if add and difference:
+        raise DatabaseError(
+            f"{where}: holds the session{difference}",
+            hint="--force replaces it; --name gives this one another name",
+        )
+    others = present.keys() - {job.name for job in jobs}
+    if not add and (difference or others or len(jobs) == 1):
+        if others:
+            difference = f" and holds {', '.join(map(repr, sorted(present)))}"
+            difference += f" instead of {', '.join(repr(job.name) for job in jobs)}"
+        same = " and is made from the same input with the same settings"
+        raise OutputError(
+            f"{where}: exists already{difference or same}",
+            hint="--force replaces it, --add adds to it",
+        )
+    return present
 
 
 def summary(session: SessionMap, origin: Provenance) -> dict[str, Any]:
@@ -155,80 +269,43 @@ def summary(session: SessionMap, origin: Provenance) -> dict[str, Any]:
     }
 
 
-def _difference(
-    output: Path,
-    inputs: list[Path],
-    names: list[str],
-    label: Label,
-    config: Config,
-    start_s: float,
-    duration_s: float | None,
-) -> str:
-    """What tells an existing database from the one that was asked for, as the end of a sentence."""
-    from pc2grid.errors import DatabaseError, Pc2GridError
-    from pc2grid.io.nav2_map import is_map_file
-    from signature.database import open_database
+def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
+    """What tells a session that is there from the one that was asked for, as the end of a sentence.
 
-    try:
-        with open_database(output) as opened:
-            present = {info.name: info.provenance for info in opened.sessions()}
-    except DatabaseError:
-        return ""
-    if present.keys() != set(names):
-        there = ", ".join(map(repr, sorted(present))) or "no session"
-        return f" and holds {there} instead of {', '.join(map(repr, sorted(names)))}"
-    for path, name in zip(inputs, names, strict=True):
-        origin = present[name]
-        if origin.label != label:
-            return f", {name!r} with {origin.label} instead of {label} (--building, --floor)"
-        part = (origin.start_s, origin.duration_s)
-        if not is_map_file(path) and part != (start_s, duration_s):
-            return f", {name!r} made from another part of the recording (--start, --duration)"
-        for section, settings in config:
+    Of several inputs the content is not looked at: whoever converts them does that.
+    """
+    from pc2grid.errors import Pc2GridError
+    from signature.build import digest_of
+
+    for job in jobs:
+        if job.name not in present:
+            continue
+        was = present[job.name]
+        asked = job.made_from(was.digest)
+        if was.label != asked.label:
+            return f", {job.name!r} with {was.label} instead of {asked.label} (--building, --floor)"
+        if (was.start_s, was.duration_s) != (asked.start_s, asked.duration_s):
+            return f", {job.name!r} made from another part of the recording (--start, --duration)"
+        for section, settings in job.config:
             for key, value in settings:
-                was = getattr(getattr(origin.config, section), key)
-                if was != value:
-                    return f", {name!r} made with {section}.{key} = {was!r}, not {value!r}"
-        try:
-            digest = _digest(path, config)
-        except Pc2GridError:
-            return ""  # an input that cannot be read: the next attempt with --force says so
-        if digest != origin.digest:
-            return f", {name!r} made from a file {origin.source!r} with other content"
-    return " and is made from the same input with the same settings"
-
-
-def _digest(path: Path, config: Config) -> str:
-    from pc2grid.io.nav2_map import is_map_file, load_map
-
-    if is_map_file(path):
-        return _map_digest(path, load_map(path))
-    from pc2grid.io import open_log
-
-    with open_log(path, config.read) as log:
-        return log.digest()
-
-
-def _map_digest(path: Path, grid: OccupancyGrid) -> str:
-    """Of the text and of the cells: the image may be of another format and say the same."""
-    import hashlib
-
-    return hashlib.sha256(path.read_bytes() + grid.cells.tobytes()).hexdigest()
-
-
-def _import_map(path: Path, name: str, config: Config) -> tuple[SessionMap, str]:
-    """A nav2 map as a session in the map's own frame."""
-    import numpy as np
-
-    from pc2grid.io.nav2_map import load_map
-    from pc2grid.model import SessionMap, Trajectory
-    from pc2grid.partition import partition
-
-    grid = load_map(path)
-    digest = _map_digest(path, grid)
-    empty = Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
-    submaps = partition(grid, config.partition)
-    return SessionMap(session=name, sensor="map", grid=grid, submaps=submaps, trajectory=empty), digest
+                old = getattr(getattr(was.config, section), key)
+                if old != value:
+                    return f", {job.name!r} made with {section}.{key} = {old!r}, not {value!r}"
+        for library in sorted({*was.versions, *asked.versions}):
+            old, new = was.versions.get(library), asked.versions.get(library)
+            if old != new:
+                return f", {job.name!r} made with {library} {old}, not {new}"
+        other = f", {job.name!r} made from a file {was.source!r} with other content"
+        if was.source != asked.source:
+            return other
+        if len(jobs) == 1:
+            try:
+                digest = digest_of(job.path, job.config)
+            except Pc2GridError:
+                return ""  # an input that cannot be read: the next attempt with --force says so
+            if digest != was.digest:
+                return other
+    return ""
 
 
 def _as_text(d: dict[str, Any]) -> str:

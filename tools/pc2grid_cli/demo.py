@@ -33,12 +33,11 @@ def demo_command(
     from pc2grid.io.trajectory import read_tum
     from pc2grid.simulate import SimulationConfig, simulate_session
     from pc2grid.simulate.config import LidarConfig
-    from pc2grid_cli.convert import build_session
     from pc2grid_cli.finding import Found, locate
     from pc2grid_cli.picture import draw_answer
     from pc2grid_cli.relocalize import as_text
     from pc2grid_cli.report import write_report
-    from signature.build import add_sessions
+    from signature.build import add_sessions, build_session
     from signature.config import Config
     from signature.database import open_database
 
@@ -67,7 +66,8 @@ def demo_command(
 
     console.note("2/4 convert the lidar's recording into a database")
     config = Config()
-    session, origin = build_session(lidar, "lidar", config)
+    with console.progress(f"map {lidar.name}") as update:
+        session, origin = build_session(lidar, "lidar", config, progress=update)
     add_sessions(database, [(session, origin)], config, keep=False)
 
     console.note("3/4 relocalize the depth camera's recording in it")

@@ -30,6 +30,9 @@ AssumeIdentity = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="one JSON document on stdout")]
 Force = Annotated[bool, typer.Option("--force", help="replace existing files")]
+DATABASE = "BUILDING.submaps|postgresql://..."
+Database = Annotated[str, typer.Argument(metavar=DATABASE, help="the database")]
+WrittenDatabase = Annotated[str, typer.Option("--output", "-o", metavar=DATABASE, help="what to write")]
 
 
 def make_config(
