@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import functools
 import importlib
 import inspect
 import json
@@ -10,6 +11,7 @@ import math
 import os
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -23,6 +25,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from typer.main import get_command
 from typer.testing import CliRunner
 
 import pc2grid
@@ -88,6 +91,81 @@ def test_importing_a_package_loads_no_library(package: str) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+# --- README and what stands beside it ---------------------------------------------------------------------
+
+NOT_RUN = {
+    "make": "test_house.py looks at the Makefile; `make demo` takes minutes",
+    "pc2grid compare paper": "needs the paper's maps, and hours",
+    "pc2grid compare sensors": "needs the paper's maps, and an hour",
+    "ros2": "needs ROS; test_example_nav2 has one that listens",
+}
+SHORTER = {"--length 20": "--length 1"}
+"""What a command says, and what is run in its place so that it takes a second."""
+
+
+def shown_commands() -> list[Any]:
+    """The commands of each block of shell in the documents, in the order in which they stand."""
+    found = []
+    for name in ("README.md", "CONTRIBUTING.md", "examples/nav2.md"):
+        blocks = re.findall(r"^```sh\n(.*?)^```", (ROOT / name).read_text(), re.MULTILINE | re.DOTALL)
+        for number, block in enumerate(blocks, start=1):
+            lines = [line.partition(" #")[0].strip() for line in block.splitlines()]
+            found.append(pytest.param([line for line in lines if line], id=f"{name}-{number}"))
+    return found
+
+
+@pytest.mark.parametrize("commands", shown_commands())
+def test_shown_commands_work(commands: list[str], folder: Path) -> None:
+    """Each block in a user's folder of its own. What cannot be run must at least parse."""
+    shutil.copy("building.submaps", "a.submaps")
+    shutil.copy("plan.submaps", "b.submaps")
+    data = bytearray(Path("building.submaps").read_bytes())
+    data[len(data) // 2] ^= 1
+    Path("damaged.submaps").write_bytes(data)
+    reasons = []
+    for command in commands:
+        reason = next((why for start, why in NOT_RUN.items() if command.startswith(start)), None)
+        if reason is not None:
+            reasons.append(reason)
+            if command.startswith("pc2grid"):
+                parse(command.split()[1:])
+            continue
+        words = functools.reduce(lambda text, pair: text.replace(*pair), SHORTER.items(), command).split()
+        assert words[0] == "pc2grid", command
+        if "-o" in words and "--add" not in words:  # what the folder has already, but a user has not
+            Path(words[words.index("-o") + 1]).unlink(missing_ok=True)
+        done = CliRunner().invoke(app, words[1:], catch_exceptions=False)
+        assert done.exit_code == (3 if "--recover" in words else 0), f"{command}: {done.stderr}"
+    if len(reasons) == len(commands):
+        pytest.skip("; ".join(sorted(set(reasons))))
+
+
+def parse(arguments: list[str]) -> None:
+    """Look at the command and its options only; the files need not be there."""
+    group = get_command(app)
+    context = group.make_context("pc2grid", [], resilient_parsing=True)
+    while hasattr(group, "get_command"):
+        name = arguments.pop(0)
+        group = group.get_command(context, name)
+        assert group is not None, f"no command {name}"
+    group.make_context("pc2grid", arguments, parent=context)
+
+
+def test_the_notebook_of_the_readme(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
+    exec(compile(code, "README.md", "exec"), {})
+    assert capsys.readouterr().out.startswith("located SE2(")
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "examples/nav2.md"])
+def test_links_lead_somewhere(name: str) -> None:
+    text = (ROOT / name).read_text()
+    for target in re.findall(r"\]\(([^)#:]+)\)", text):
+        assert ((ROOT / name).parent / target).exists(), target
+    for target in re.findall(r"`((?:examples|tests|tools|signature|pc2grid)/[\w./]+)`", text):
+        assert (ROOT / target).exists(), target
 
 
 # --- examples/ --------------------------------------------------------------------------------------------

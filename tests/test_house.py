@@ -15,23 +15,6 @@ from pc2grid.settings import dump_settings, load_settings
 from signature.config import Config
 
 ROOT = Path(__file__).resolve().parent.parent
-COMMANDS = re.findall(r"^pc2grid ([^#\n]*)", (ROOT / "README.md").read_text(), re.MULTILINE)
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_readme_commands_are_real(command: str) -> None:
-    """Every command and option of the README parses; the files in it need not exist."""
-    from typer.main import get_command
-
-    from pc2grid_cli.main import app
-
-    group, arguments = get_command(app), command.split()
-    context = group.make_context("pc2grid", [], resilient_parsing=True)
-    while hasattr(group, "get_command"):
-        name = arguments.pop(0)
-        group = group.get_command(context, name)
-        assert group is not None, f"no command {name}"
-    group.make_context("pc2grid", arguments, parent=context)
 
 
 @pytest.mark.parametrize("target", re.findall(r"^make (\w+)", (ROOT / "README.md").read_text(), re.MULTILINE))
