@@ -61,7 +61,7 @@ def copy(source: Place, target: Place, *, recover: bool = False, force: bool = F
     if problems and not recover:
         more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
         raise DatabaseCorrupt(
-            f"{source_name(source)}: damaged: {problems[0].where}: {problems[0].what}{more}",
+            f"{shown(source)}: damaged: {problems[0].where}: {problems[0].what}{more}",
             hint="--recover copies what is whole",
         )
     store(target, Sessions([source], recover=bool(problems)), keep=False)
@@ -123,7 +123,7 @@ def _entry(database: SubmapDatabase, info: SessionInfo, recover: bool) -> Entry:
     return session_map, signatures, info.provenance
 
 
-def source_name(place: Place) -> str:
+def shown(place: Place) -> str:
     """A path or URL for messages: never with a password."""
     if not is_url(place):
         return str(place)
@@ -134,4 +134,4 @@ def source_name(place: Place) -> str:
 
 def _refuse_existing(target: Place, force: bool) -> None:
     if not force and exists(target):
-        raise OutputError(f"{source_name(target)}: exists already", hint="--force replaces it")
+        raise OutputError(f"{shown(target)}: exists already", hint="--force replaces it")

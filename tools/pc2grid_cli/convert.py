@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from pc2grid.errors import DatabaseError
 from pc2grid_cli import console
@@ -20,6 +21,19 @@ if TYPE_CHECKING:
     from signature.cluster import Job
     from signature.database import Provenance
     from signature.database.protocol import Entry
+
+
+class ConvertCommand(TyperCommand):
+    """`--dask` may stand without its address, for which typer has no notation."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put in what stands for no address, unless one follows."""
+        following = [*args[1:], ""]
+        named = [
+            "--dask=local" if arg == "--dask" and "://" not in after else arg
+            for arg, after in zip(args, following, strict=True)
+        ]
+        return super().parse_args(ctx, named)
 
 
 def convert_command(
@@ -96,7 +110,7 @@ def convert_command(
         processes=jobs or os.cpu_count() or 1,
         quiet=json,
     )
-    where = transfer.source_name(output)
+    where = transfer.shown(output)
     if json:
         console.print_json(
             {
@@ -209,7 +223,7 @@ def _stored(output: str, jobs: list[Job], *, add: bool, force: bool) -> dict[str
     from signature.database import open_database, transfer
     from signature.database.postgres_schema import is_url
 
-    where = transfer.source_name(output)
+    where = transfer.shown(output)
     if not is_url(output) and not Path(output).parent.is_dir():
         raise OutputError(
             f"{output}: cannot write: no folder {Path(output).parent}", hint="create the folder first"

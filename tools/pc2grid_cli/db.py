@@ -9,13 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.settings import AsJson, Force
+from pc2grid_cli.settings import DATABASE, AsJson, Database, Force, WrittenDatabase
 
 if TYPE_CHECKING:
     from signature.database import Problem
-
-Database = Annotated[Path, typer.Argument(metavar="BUILDING.submaps", help="the database")]
-Output = Annotated[Path, typer.Option("--output", "-o", metavar="OUT.submaps", help="what to write")]
 
 
 def info_command(database: Database, json: AsJson = False) -> None:
@@ -26,7 +23,7 @@ def info_command(database: Database, json: AsJson = False) -> None:
     from signature.database import open_database
 
     with open_database(database) as opened:
-        sessions = opened.sessions()
+        sessions, where = opened.sessions(), opened.location
     if json:
         documents = [
             {
@@ -49,9 +46,9 @@ def info_command(database: Database, json: AsJson = False) -> None:
             }
             for s in sessions
         ]
-        console.print_json({"schema_version": 1, "database": str(database), "sessions": documents})
+        console.print_json({"schema_version": 1, "database": where, "sessions": documents})
         return
-    print(f"{database}: {len(sessions)} sessions, {sum(s.submaps for s in sessions)} submaps")
+    print(f"{where}: {len(sessions)} sessions, {sum(s.submaps for s in sessions)} submaps")
     for s in sessions:
         travel = f", {s.scans} scans, {s.path_m:.1f} m in {s.duration_s:.0f} s" if s.scans else ""
         print(f"  {s.name} ({s.sensor}): {s.submaps} submaps, {s.area_m2:.0f} m2 free{travel}")
@@ -62,14 +59,14 @@ def check_command(database: Database, json: AsJson = False) -> None:
 
     Example: pc2grid db check building.submaps
     """
-    from signature.database.upkeep import check
+    from signature.database.transfer import check, shown
 
     problems = check(database)
     if json:
         found = [{"where": p.where, "what": p.what} for p in problems]
-        console.print_json({"schema_version": 1, "database": str(database), "problems": found})
+        console.print_json({"schema_version": 1, "database": shown(database), "problems": found})
     elif not problems:
-        print(f"{database}: sound")
+        print(f"{shown(database)}: sound")
     else:
         for problem in problems:
             print(f"{problem.where}: {problem.what}")
@@ -78,8 +75,8 @@ def check_command(database: Database, json: AsJson = False) -> None:
 
 
 def merge_command(
-    databases: Annotated[list[Path], typer.Argument(metavar="A.submaps B.submaps...", help="what to merge")],
-    output: Output,
+    databases: Annotated[list[str], typer.Argument(metavar=f"{DATABASE} ...", help="what to merge")],
+    output: WrittenDatabase,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -87,18 +84,18 @@ def merge_command(
 
     Example: pc2grid db merge monday.submaps tuesday.submaps -o week.submaps
     """
-    from signature.database.upkeep import merge
+    from signature.database.transfer import merge, shown
 
     count = merge(databases, output, force=force)
     if json:
         console.print_json(_written(output))
     else:
-        print(f"{output}: {count} sessions")
+        print(f"{shown(output)}: {count} sessions")
 
 
 def copy_command(
     database: Database,
-    output: Output,
+    output: WrittenDatabase,
     recover: Annotated[bool, typer.Option("--recover", help="leave damaged parts out; exit code 3")] = False,
     force: Force = False,
     json: AsJson = False,
@@ -107,7 +104,7 @@ def copy_command(
 
     Example: pc2grid db copy --recover damaged.submaps -o good.submaps
     """
-    from signature.database.upkeep import copy
+    from signature.database.transfer import copy, shown
 
     problems = copy(database, output, recover=recover, force=force)
     for problem in problems:
@@ -115,20 +112,31 @@ def copy_command(
     if json:
         console.print_json(_written(output, problems))
     else:
-        print(f"{output}: {output.stat().st_size / 1e6:.1f} MB")
+        print(f"{shown(output)}: {_size(output)}")
     if problems:
         raise typer.Exit(console.LOSSY)
 
 
-def _written(path: Path, left_out: Sequence[Problem] = ()) -> dict[str, Any]:
+def _size(output: str) -> str:
+    """How big the copy is: a file in bytes, anything else in sessions."""
+    from signature.database import open_database
+
+    path = Path(output)
+    if path.is_file():
+        return f"{path.stat().st_size / 1e6:.1f} MB"
+    with open_database(output) as opened:
+        return f"{len(opened.sessions())} sessions"
+
+
+def _written(output: str, left_out: Sequence[Problem] = ()) -> dict[str, Any]:
     """What a command says of the database it made."""
     from signature.database import open_database
 
-    with open_database(path) as opened:
-        count = len(opened.sessions())
+    with open_database(output) as opened:
+        count, where = len(opened.sessions()), opened.location
     return {
         "schema_version": 1,
-        "database": str(path),
+        "database": where,
         "sessions": count,
         "left_out": [{"where": problem.where, "what": problem.what} for problem in left_out],
     }

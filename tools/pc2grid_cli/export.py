@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.settings import AsJson, Force
+from pc2grid_cli.settings import AsJson, Database, Force
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory
@@ -24,7 +24,7 @@ class TrajectoryKind(str, enum.Enum):
 
 
 def export_command(
-    database: Annotated[str, typer.Argument(metavar="BUILDING.submaps", help="the database")],
+    database: Database,
     map_: Annotated[
         Path | None, typer.Option("--map", metavar="STEM", help="STEM.yaml and STEM.pgm for nav2")
     ] = None,
@@ -83,11 +83,12 @@ def export_command(
 
         require_rerun()
     with open_database(database) as opened:
+        where = opened.location
         names = [info.name for info in opened.sessions()]
         if of_session and session is None and len(names) != 1:
             there = ", ".join(names) or "none"
             raise DatabaseError(
-                f"{database}: holds {len(names)} sessions: {there}", hint="choose one with --session"
+                f"{where}: holds {len(names)} sessions: {there}", hint="choose one with --session"
             )
         name = session or (names[0] if names else "")
         # What the session cannot give is refused before anything is written.
@@ -129,7 +130,7 @@ def export_command(
         console.print_json(
             {
                 "schema_version": 1,
-                "database": database,
+                "database": where,
                 "session": name if of_session else None,
                 "written": [str(path) for path in targets],
             }

@@ -15,7 +15,7 @@ from pc2grid_cli.compare_maps import compare_maps_command
 from pc2grid_cli.compare_paper import compare_paper_command
 from pc2grid_cli.compare_sensors import compare_sensors_command
 from pc2grid_cli.config import dump_command, schema_command
-from pc2grid_cli.convert import convert_command
+from pc2grid_cli.convert import ConvertCommand, convert_command
 from pc2grid_cli.db import check_command, copy_command, merge_command
 from pc2grid_cli.db import info_command as db_info_command
 from pc2grid_cli.demo import demo_command
@@ -56,7 +56,7 @@ def options(
 app.command("demo")(demo_command)
 app.command("simulate")(simulate_command)
 app.command("info")(info_command)
-app.command("convert")(convert_command)
+app.command("convert", cls=ConvertCommand)(convert_command)
 app.command("relocalize")(relocalize_command)
 app.command("export")(export_command)
 

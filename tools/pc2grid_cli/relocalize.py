@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def relocalize_command(
     log: Annotated[Path, typer.Argument(metavar="LOG|MAP.yaml", help="the recording or nav2 map to locate")],
     database: Annotated[
-        str, typer.Option("--database", "-d", metavar="BUILDING.submaps", help="where to look")
+        str, typer.Option("--database", "-d", metavar=options.DATABASE, help="where to look")
     ],
     topic: options.Topic = None,
     odometry: options.OdometryTopic = None,
@@ -82,6 +82,7 @@ def relocalize_command(
             update={"relocalize": settings.relocalize.model_copy(update={"top_k": top_k})}
         )
     with open_database(database) as opened:
+        where = opened.location
         left_out = [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
         if is_map_file(log):
             found = find_map(log, opened, settings)
@@ -119,14 +120,14 @@ def relocalize_command(
         if path is not None and located is None:
             console.warn(f"{path}: not written, there is no answer to put into it")
     if json:
-        about_database = {"path": database, "left_out": left_out}
+        about_database = {"path": where, "left_out": left_out}
         console.print_json(answer.to_json(query=found.about, database=about_database))
     else:
         print(as_text(answer, is_map=found.drawn is not None))
     for warning in found.about["warnings"]:
         console.warn(warning)
     for damage in left_out:
-        console.warn(f"{database}: damaged and left out: {damage}")
+        console.warn(f"{where}: damaged and left out: {damage}")
     if answer.status != "located":
         raise typer.Exit(console.UNSURE)
     if found.about["lossy"] or left_out:
