@@ -1,7 +1,8 @@
 """Where settings come from: defaults, then a TOML file, then `section.key=value`; and back to TOML.
 
-Works on any tree of `Section`s, so that the packages above can add theirs. TOML has no null: a setting
-whose default is null is a commented line in a dump, and `section.key=null` on the command line.
+Works on any tree of `Section`s, so that the packages above can add theirs. TOML has no null: in a dump, a
+setting at null is a commented line if that is its default, else the text "null"; on the command line it is
+`section.key=null`.
 """
 
 from __future__ import annotations
@@ -58,19 +59,20 @@ def dump_settings(settings: Section) -> str:
     """The whole tree as TOML with a comment for every key; reading it back gives the same settings."""
     lines = ["# Settings of pc2grid. Lines that start with '# key =' are at null: chosen by the program."]
     for name, field in type(settings).model_fields.items():
-        section = getattr(settings, name)
+        section, usual = getattr(settings, name), field.default
         lines += ["", f"# {(type(section).__doc__ or '').strip().splitlines()[0]}", f"[{name}]"]
         for key, info in type(section).model_fields.items():
             value = getattr(section, key)
             lines.append(f"# {info.description}" if info.description else f"# ({key})")
-            lines.append(f"# {key} =" if value is None else f"{key} = {_toml(value)}")
-        del field
+            kept = value is None and getattr(usual, key) is None
+            lines.append(f"# {key} =" if kept else f"{key} = {_toml(value)}")
     return "\n".join(lines) + "\n"
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+        return {name: _with_nulls(section) for name, section in tree.items()}
     except FileNotFoundError:
         raise ConfigError(
             f"{path}: no such file", hint="`pc2grid config dump` prints one to start from"
@@ -79,6 +81,12 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not TOML: {error}") from None
+
+
+def _with_nulls(section: Any) -> Any:
+    if not isinstance(section, dict):
+        return section
+    return {key: None if value == "null" else value for key, value in section.items()}
 
 
 def _assign(model: type[Section], tree: dict[str, Any], assignment: str) -> None:
@@ -128,6 +136,8 @@ def _closest(model: type[Section], key: str) -> str | None:
 
 
 def _toml(value: Any) -> str:
+    if value is None:
+        return '"null"'
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, (list, tuple)):

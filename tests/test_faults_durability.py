@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import errno
+import multiprocessing
 import os
 import resource
 import shutil
@@ -54,33 +55,58 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = SimulationConfig(length_m=1.5, seed=5, clutter=0)
     simulate_session(folder / "drive.mcap", sensor="laser", grid=small_house(), config=config)
     for source, made in (("drive.mcap", "drive.submaps"), ("house.yaml", "house.submaps")):
-        done = convert(folder / source, "-o", made, cwd=folder).wait()
+        done = Convert(folder / source, "-o", made, cwd=folder).wait()
         assert done == 0
     shutil.copyfile(folder / "drive.submaps", folder / "both.submaps")
-    assert convert(folder / "house.yaml", "-o", "both.submaps", "--add", cwd=folder).wait() == 0
+    assert Convert(folder / "house.yaml", "-o", "both.submaps", "--add", cwd=folder).wait() == 0
     return folder
 
 
-def convert(
-    *arguments: object, cwd: Path, before: str = "", limit_bytes: int | None = None
-) -> subprocess.Popen[str]:
-    """Start `pc2grid convert`; `before` is code to run first, `limit_bytes` the largest file it may write."""
+# A server that has the libraries loaded forks each of them, so that kills meet the work and not the start.
+SERVER = multiprocessing.get_context("forkserver")
+SERVER.set_forkserver_preload([
+    "pc2grid_cli.main", "pc2grid.pipeline", "pc2grid.tracking", "pc2grid.partition", "pc2grid.io.mcap_log",
+    "signature.build", "signature.describe", "signature.database.sqlite", "signature.database.upkeep",
+    "pydantic", "kiss_icp.kiss_icp", "sklearn.cluster", "rich.progress",
+])  # fmt: skip
 
-    def prepare() -> None:
-        # A shell that runs the tests in the background lets its children ignore Ctrl-C.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        if limit_bytes is not None:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, limit_bytes))
 
-    code = f"{before}\nfrom pc2grid_cli.main import main; main()"
-    environment = {
-        **os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}", "PC2GRID_CONFIG": "",
-        "PC2GRID_DEBUG": "", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
-    }  # fmt: skip
-    return subprocess.Popen(
-        [sys.executable, "-c", code, "convert", *map(str, arguments)], cwd=cwd, text=True, env=environment,
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, preexec_fn=prepare,
-    )  # fmt: skip
+def _main(arguments: list[str], cwd: str, said: str, before: str, limit_bytes: int | None) -> None:
+    from pc2grid_cli.main import main
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # the server ignores Ctrl-C
+    os.chdir(cwd)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    os.dup2(os.open(said, os.O_WRONLY), 2)
+    if limit_bytes is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, limit_bytes))
+    exec(before, {})
+    sys.argv = ["pc2grid", "convert", *arguments]
+    main()
+
+
+class Convert:
+    """`pc2grid convert` on its way.
+
+    before : code to run first. limit_bytes : the largest file that it may write.
+    """
+
+    def __init__(
+        self, *arguments: object, cwd: Path, before: str = "", limit_bytes: int | None = None
+    ) -> None:
+        self._said = tempfile.NamedTemporaryFile()  # noqa: SIM115 - closed with this object
+        rest = (str(cwd), self._said.name, before, limit_bytes)
+        self.process = SERVER.Process(target=_main, args=([str(a) for a in arguments], *rest))
+        self.process.start()
+
+    def wait(self) -> int:
+        """Its exit code; negative for the signal that ended it."""
+        self.process.join(120)
+        assert self.process.exitcode is not None
+        return self.process.exitcode
+
+    def said(self) -> str:
+        return Path(self._said.name).read_text()
 
 
 def in_child(body: Callable[[], object]) -> tuple[int, str]:
@@ -115,20 +141,20 @@ def test_fuzz_kill_at_random_moments_of_convert(inputs: Path, tmp_path: Path) ->
     usual_s = 1.0
     killed = 0
     for turn in range(min(FUZZ, 200) or 5):
-        process = convert(source, "-o", output, cwd=tmp_path)
+        convert = Convert(source, "-o", output, cwd=tmp_path)
         if turn % 2:
-            while process.poll() is None and not any(tmp_path.iterdir()):
+            while convert.process.is_alive() and not any(tmp_path.iterdir()):
                 time.sleep(0.002)
             time.sleep(float(rng.uniform(0, 0.01)))
         else:
             time.sleep(float(rng.uniform(0.0, usual_s)))
-        process.kill()
-        killed += process.wait() == -signal.SIGKILL
+        convert.process.kill()
+        killed += convert.wait() == -signal.SIGKILL
         if output.exists():
             assert output.read_bytes() == wanted
         begin = time.monotonic()
-        rerun = convert(source, "-o", output, "--force", cwd=tmp_path)
-        assert rerun.wait() == 0, rerun.stderr
+        rerun = Convert(source, "-o", output, "--force", cwd=tmp_path)
+        assert rerun.wait() == 0, rerun.said()
         usual_s = time.monotonic() - begin
         assert output.read_bytes() == wanted
         assert list(tmp_path.iterdir()) == [output]
@@ -204,13 +230,13 @@ def test_signal_in_the_middle_of_writing(inputs: Path, tmp_path: Path, number: i
         "    return plain(*arguments)\n"
         "rows.insert = insert\n"
     )
-    process = convert(inputs / "house.yaml", "-o", output, "--add", cwd=tmp_path, before=at_the_second_row)
-    _, said = process.communicate(timeout=60)
-    assert process.returncode == code, said
+    process = Convert(inputs / "house.yaml", "-o", output, "--add", cwd=tmp_path, before=at_the_second_row)
+    found, said = process.wait(), process.said()
+    assert found == code, said
     assert "Traceback" not in said
     assert output.read_bytes() == (inputs / "drive.submaps").read_bytes()
     assert list(tmp_path.iterdir()) == [output]
-    assert convert(inputs / "house.yaml", "-o", output, "--add", cwd=tmp_path).wait() == 0
+    assert Convert(inputs / "house.yaml", "-o", output, "--add", cwd=tmp_path).wait() == 0
     assert output.read_bytes() == (inputs / "both.submaps").read_bytes()
 
 
@@ -309,9 +335,9 @@ def test_disk_full_at_every_page_of_a_write(tmp_path: Path) -> None:
 
 @pytest.mark.fault(39)
 def test_disk_full_is_one_line_and_exit_1(inputs: Path, tmp_path: Path) -> None:
-    process = convert(inputs / "house.yaml", "-o", "x.submaps", cwd=tmp_path, limit_bytes=8192)
-    _, said = process.communicate(timeout=60)
-    assert process.returncode == 1, said
+    process = Convert(inputs / "house.yaml", "-o", "x.submaps", cwd=tmp_path, limit_bytes=8192)
+    code, said = process.wait(), process.said()
+    assert code == 1, said
     lines = said.splitlines()
     assert lines[0].startswith("pc2grid: error: x.submaps: cannot write")
     assert lines[1].startswith("hint: ")
@@ -470,9 +496,9 @@ def test_another_run_onto_the_same_file_is_refused_with_the_difference(
     inputs: Path, arguments: str, words: str
 ) -> None:
     before, folder = (inputs / "drive.submaps").read_bytes(), sorted(inputs.iterdir())
-    process = convert(*arguments.split(), "-o", "drive.submaps", cwd=inputs)
-    _, said = process.communicate(timeout=60)
-    assert process.returncode == 1, said
+    process = Convert(*arguments.split(), "-o", "drive.submaps", cwd=inputs)
+    code, said = process.wait(), process.said()
+    assert code == 1, said
     assert said.startswith("pc2grid: error: drive.submaps: exists already")
     assert words in said
     assert "--force" in said.splitlines()[1]
