@@ -56,8 +56,8 @@ def measured(count: int, seconds: float) -> Iterator[Row]:
             index(connection, signatures)
             built = time.perf_counter()
             sizes = connection.execute(
-                "SELECT pg_total_relation_size('pc2grid.signature') - pg_relation_size(o), pg_relation_size(o)"
-                " FROM (SELECT 'pc2grid.signature_embedding'::regclass AS o)"
+                "SELECT pg_total_relation_size('pc2grid.signature') - pg_relation_size(o),"
+                " pg_relation_size(o) FROM (SELECT 'pc2grid.signature_embedding'::regclass AS o)"
             ).fetchone()
         what = f"{count} submaps in PostgreSQL"
         yield Row(what=f"{what}: load", measured=1e6 * (loaded - begin) / count, unit="us each")
