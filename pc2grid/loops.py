@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from pc2grid.facing import facing
 from pc2grid.geometry import F64, SE2
-from pc2grid.pieces import Keyframe, PieceStore, cut, evenly
+from pc2grid.matching import evenly
+from pc2grid.pieces import Keyframe, PieceStore, cut
 from pc2grid.pose_graph import Edge, optimise
 
 _ROUNDS = 3

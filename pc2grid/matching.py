@@ -309,3 +309,8 @@ def _scores(
                     if 0 <= at_column < width:
                         scores[a, r, c] += field[at_row, at_column]
     return scores / np.float32(max(points.shape[0], 1))
+
+
+def evenly(length: int, count: int) -> NDArray[np.intp]:
+    """At most `count` of the indices below `length`, evenly spread."""
+    return np.arange(length) if length <= count else np.linspace(0, length - 1, count).astype(np.intp)

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pc2grid.facing import facing
 from pc2grid.geometry import F64, SE2
@@ -156,8 +155,3 @@ class PieceStore:
         self.poses = poses
         if redraw:
             self._made.clear()
-
-
-def evenly(length: int, count: int) -> NDArray[np.intp]:
-    """At most `count` of the indices below `length`, evenly spread."""
-    return np.arange(length) if length <= count else np.linspace(0, length - 1, count).astype(np.intp)

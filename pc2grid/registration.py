@@ -26,7 +26,8 @@ class KissRegistration:
     carried : the sensor is in somebody's hands: six degrees of freedom, and nothing but ICP to find them.
 
     The voxel and the range come from the first frame with returns and the time to the next, unless
-    `config` fixes them: the range of a room wants 0.1 m voxels, that of a hall, or two scans a second, more.
+    `config` fixes them: in the hand the range of a room wants 0.1 m voxels, that of a hall, or two scans a
+    second, more; on wheels, where a refinement follows, voxels are coarse and iterations few.
     """
 
     def __init__(self, config: RegistrationConfig, *, carried: bool = False) -> None:
@@ -84,12 +85,14 @@ class KissRegistration:
         # ICP finds partners no farther than a voxel away, so it must span the motion between two frames.
         finest = max(float(np.percentile(ranges, 75)) / 40.0, min(_BRISK_MPS * period_s, 0.5))
         config.mapping.voxel_size = self._config.voxel_m or float(
-            np.clip(finest, 0.05 if self._carried else 0.1, 1.0)
+            np.clip(finest, 0.05 if self._carried else 0.3, 1.0)
         )
         config.registration.max_num_threads = 1
         if not self._carried:
-            # What is left after that, the refinement in the plane does better.
-            config.registration.max_num_iterations = 30
+            # ICP need only come near: what is left, the refinement in the plane does better and in a tenth
+            # of the time.
+            config.mapping.max_points_per_voxel = 10
+            config.registration.max_num_iterations = 10
             config.registration.convergence_criterion = 1e-3
             config.adaptive_threshold.initial_threshold = 1.0
         kiss = KissICP(config)

@@ -18,8 +18,8 @@ from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.deskew import deskew
 from pc2grid.facing import facing
 from pc2grid.floor import Ground, assumed_ground, find_ground
-from pc2grid.geometry import F64, SE2, invert_pose, rotation_vector
-from pc2grid.matching import Match, PointGrid
+from pc2grid.geometry import F64, SE2, interpolate_pose, invert_pose, rotation_vector
+from pc2grid.matching import Match, PointGrid, evenly
 from pc2grid.model import F32, Health, RegisteredScan, Scan
 from pc2grid.registration import KissRegistration, thin
 from pc2grid.sweep import Sweep, flatten
@@ -30,13 +30,14 @@ LOCAL_MAP_TRAVEL_M = 5.0
 _ROLLING_GAIN = 0.2  # how fast the floor follows what is seen of it
 _ROLLING_EVERY = 4
 _CARRIED_GAIN = 0.3
-_MIN_HITS = 10
+_MIN_HITS, _MATCHED_HITS = 10, 1000
 _MIN_OVERLAP = 0.3
 _MIN_OVERLAP_CARRIED = 0.1  # the plane shows less of a scene when the sensor tilts
 _MAX_RESIDUAL_M = 0.1
 _MAX_SIGMA_M = 0.15  # a direction known worse than this rests on odometry or on the motion model
 _BRIDGED_SCANS = 30
 _GIVE_UP_SCANS = 10
+_STEADY_S = 0.3
 _DISAGREE_M = 0.03
 _DISAGREE_RAD = 0.02
 _MAX_POINTS = 40_000  # of a camera's 300 000 pixels
@@ -74,7 +75,7 @@ class Tracker:
         self._last: Scan | None = None
         self._last_pose = np.eye(4)
         self._measured: tuple[F64, F64] | None = None  # T_odom_base, T_map_base when odometry was last known
-        self._velocity = np.eye(4)
+        self._recent: list[tuple[int, F64]] = []  # stamp, T_map_base of the last scans
         self._maps: list[tuple[PointGrid, float]] = []
         self._last_keyframe: SE2 | None = None
         self._travel_m = 0.0
@@ -122,8 +123,7 @@ class Tracker:
         keyframe = health is not Health.LOST and len(sweep.hits_m) > 0 and self._extend_maps(sweep, planar)
         if keyframe:
             self._kiss.integrate(pose)
-        if self._last is not None:
-            self._velocity = invert_pose(self._last_pose) @ pose
+        self._recent = [*self._recent[-2:], (scan.stamp_ns, pose)]
         self._last, self._last_pose = scan, pose
         if scan.T_odom_base is not None:
             self._measured = scan.T_odom_base, pose
@@ -148,12 +148,27 @@ class Tracker:
             return np.eye(4), 0.0, None
         seconds = (scan.stamp_ns - self._last.stamp_ns) * 1e-9
         if scan.T_odom_base is None or self._measured is None:
-            return self._velocity, seconds, None
+            return self._steady_motion(seconds), seconds, None
         T_odom_then, T_map_then = self._measured
         odometry: F64 = invert_pose(T_odom_then) @ scan.T_odom_base
         if self._last.T_odom_base is not None:
             return odometry, seconds, odometry
         return invert_pose(self._last_pose) @ T_map_then @ odometry, seconds, odometry
+
+    def _steady_motion(self, seconds: float) -> F64:
+        """The motion before, if it goes on for so long.
+
+        Over two scans where they follow closely: the motion undoes the skew of the next scan, and an error
+        of one pose, taken for motion, would come back in the next pose with the other sign, and grow.
+        """
+        now_ns, T_map_now = self._recent[-1]
+        for stamp_ns, T_map_then in self._recent[:-1]:
+            span = (now_ns - stamp_ns) * 1e-9
+            if span < _STEADY_S or stamp_ns == self._recent[-2][0]:
+                return interpolate_pose(
+                    np.eye(4), invert_pose(T_map_then) @ T_map_now, min(seconds / span, 1.0)
+                )
+        return np.eye(4)
 
     def _usable(self, scan: Scan, motion: F64, motion_s: float) -> F32:
         points, offsets = scan.points_m, scan.offsets_s
@@ -228,12 +243,13 @@ class Tracker:
             sigma_m, sigma_rad = 0.03, 0.01
         information = np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
         grid = self._maps[0][0]
-        face = facing(sweep.hits_m, sweep.origin_m)
-        match = grid.match(sweep.hits_m, face, guess, prior, information)
+        chosen = evenly(len(sweep.hits_m), _MATCHED_HITS)
+        hits, face = sweep.hits_m[chosen], facing(sweep.hits_m, sweep.origin_m)[chosen]
+        match = grid.match(hits, face, guess, prior, information)
         apart = SE2.flatten(predicted).inverse() @ guess
         if math.hypot(apart.x, apart.y) > _DISAGREE_M or abs(apart.yaw) > _DISAGREE_RAD:
             # KISS-ICP and the prediction differ: let each lead the refinement, and the walls decide.
-            other = grid.match(sweep.hits_m, face, SE2.flatten(predicted), prior, information)
+            other = grid.match(hits, face, SE2.flatten(predicted), prior, information)
             match = max(match, other, key=lambda m: m.overlap - 5.0 * m.residual_m)
         return (match.pose if match.overlap >= _MIN_OVERLAP else prior), match
 

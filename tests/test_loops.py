@@ -48,13 +48,13 @@ def array(poses):
 
 def test_one_loop_takes_the_drift_out_and_a_false_one_is_outvoted():
     truth = square()
-    poses, edges = drifting(truth, veer=0.005)
+    poses, edges = drifting(truth, veer=0.01)
     before = np.linalg.norm(array(poses)[-1, :2] - array(truth)[-1, :2])
     loops = [Edge(k, 39 - k, truth[k].inverse() @ truth[39 - k], INFORMATION, loop=True) for k in range(3)]
     false = Edge(5, 25, SE2(0.5, 0.0, 0.0), INFORMATION, loop=True)
     solved = optimise(array(poses), [*edges, *loops, false])
     after = np.linalg.norm(solved.poses[-1, :2] - array(truth)[-1, :2])
-    assert before > 1.0 and after < 0.1
+    assert before > 2.0 and after < 0.1
     assert solved.chi2[-1] > 100 * solved.chi2[-2]
     assert np.array_equal(solved.poses[0], array(truth)[0])
 
@@ -106,7 +106,7 @@ def test_two_laps_around_a_block_with_drift_agree_after_closing():
     block = [((2, 2), (8, 2)), ((8, 2), (8, 5)), ((8, 5), (5, 8)), ((5, 8), (2, 8)), ((2, 8), (2, 2))]
     truth = square(100) * 2
     walls = outer + block
-    poses, _ = drifting(truth, veer=0.0015)
+    poses, _ = drifting(truth, veer=0.003)
     keyframes = [
         Keyframe(k, ring_sweep(true, walls), pose, INFORMATION)
         for k, (true, pose) in enumerate(zip(truth, poses, strict=True))
@@ -114,7 +114,7 @@ def test_two_laps_around_a_block_with_drift_agree_after_closing():
     before = np.linalg.norm(array(poses)[:, :2] - array(truth)[:, :2], axis=1)
     closed = close_loops(keyframes)
     after = np.linalg.norm(closed.poses[:, :2] - array(truth)[:, :2], axis=1)
-    assert before.max() > 0.5 and len(closed.loops) > 3
+    assert before.max() > 3.0 and len(closed.loops) > 3
     lap = closed.poses[100:, :2] - closed.poses[:100, :2]
     assert np.linalg.norm(lap, axis=1).max() < 0.08
-    assert after.max() < 0.5 * before.max()
+    assert after.max() < 0.1

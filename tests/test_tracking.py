@@ -56,13 +56,13 @@ def test_odometry_that_says_forward_while_the_robot_reverses_is_overruled(laser)
             odometry = lying[-1][0].T_odom_base @ step
         lying.append((dataclasses.replace(scan, T_odom_base=odometry), pose))
     poses = [r.T_map_base for r in register(scan for scan, _ in lying)]
-    assert errors(laser, poses).max() < 0.25
+    assert errors(laser, poses).max() < 0.15
 
 
 def test_laser_without_odometry_is_followed_or_says_that_it_is_lost(laser):
     registered = list(register(blind(scan) for scan, _ in laser))
     lost = [r.health is Health.LOST for r in registered]
-    assert any(lost) or errors(laser, [r.T_map_base for r in registered]).max() < 0.3
+    assert any(lost) or errors(laser, [r.T_map_base for r in registered]).max() < 0.05
 
 
 def test_odometry_bridges_a_scan_without_any_at_the_edge_of_a_gap(laser):
