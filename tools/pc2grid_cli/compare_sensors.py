@@ -236,7 +236,7 @@ def _mapped(plan: str, sensor: SensorKind, out: str, tag: tuple[tuple[str, Any],
 def _locate(
     plan: str, sensor: SensorKind, seed: int, out: str, setting: Setting, plans: Sequence[str]
 ) -> None:
-    """Locate one query session in the maps of all plans, unless it was done before."""
+    """Locate one query session in the maps of its own plan and of one other, unless it was done before."""
     from pc2grid.io.atomic import replace_file
     from signature.driven import Driven
     from signature.sensor_matrix import SENSORS, query_trials
@@ -245,7 +245,9 @@ def _locate(
     if target.exists():
         return
     tag = tuple(sorted(setting.items()))
-    maps = [_mapped(p, s, out, tag) for p in plans for s in SENSORS]
+    others = [p for p in plans if p != plan]
+    asked = [plan, *others[seed % len(others) :][:1]] if others else [plan]
+    maps = [_mapped(p, s, out, tag) for p in asked for s in SENSORS]
     driven = Driven.load(_file("drives", plan, sensor, seed, out, setting))
     trials = query_trials(Path(plan).stem, seed, driven, maps)
     with replace_file(target) as draft:
