@@ -255,7 +255,7 @@ def test_convert_export_and_look_after_a_fleets_database(folder: Path, tmp_path:
     assert run("db", "copy", secret, "-o", tmp_path / "copy.submaps") == 0
     assert run("db", "merge", secret, database, "-o", tmp_path / "merged.submaps") == 0
     assert run("export", secret, "--session", "hall", "--map", tmp_path / "out") == 0
-    assert run("relocalize", folder / "attic.yaml", "--database", secret, "--json") in (0, 4)
+    assert run("relocalize", folder / "attic.yaml", "-d", secret, "--building", "b", "--json") in (0, 4)
     with pytest.raises(Exception, match="exists already"):
         run("db", "copy", database, "-o", secret)
     out, err = capsys.readouterr()

@@ -201,6 +201,18 @@ def test_nearest_are_the_best_of_eq_6_and_filters_hold(empty: str | Path) -> Non
             expected = [item for item in best if item[0] in sessions][:7]
             assert [(n.session, n.submap_id, n.score) for n in found] == expected, wanted
         assert database.nearest(query, 5, building="south") == ()
+        with pytest.raises(DatabaseError, match="no session of south") as caught:
+            database.keep_only(building="south")
+        assert "north, 1" in str(caught.value)
+        database.keep_only(building="north")
+        assert [info.name for info in database.sessions()] == ["a", "b"]
+        assert {n.session for n in database.nearest(query, 60)} == {"a", "b"}
+        assert database.nearest(query, 5, building="") == ()
+        assert len(database.signatures()) == 60
+        assert database.leave_out_damaged() == ()
+        with pytest.raises(DatabaseError, match="no session 'c'"):
+            database.grid("c")
+    with open_database(empty) as database:
         assert found[0].center_m == database.submap("c", found[0].submap_id).center_m
 
 

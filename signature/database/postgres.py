@@ -11,7 +11,7 @@ from pc2grid.errors import DatabaseError, NotADatabase, OutputError
 from pc2grid.model import OccupancyGrid, SessionMap, Submap, Trajectory
 from signature.database import codec, postgres_schema, rows
 from signature.database.postgres_schema import served
-from signature.database.protocol import Entry, Neighbour, Problem, Provenance, SessionInfo
+from signature.database.protocol import Entry, Label, Neighbour, Problem, Provenance, SessionInfo, none_there
 from signature.database.search import embedding, rank
 
 if TYPE_CHECKING:
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 Key = tuple[str, int]
 """Building and number of a session."""
 _ATTEMPTS = 5
+_KNOWN = (
+    "s.id <> ALL(%(left_out)s) AND (%(building)s::text IS NULL OR s.building = %(building)s)"
+    " AND (%(floor)s::text IS NULL OR s.floor = %(floor)s)"
+)
 _OF = "building = %s AND session_id = %s"
 
 
@@ -96,13 +100,13 @@ def _other_session(connection: Connection[Any], where: str, name: str) -> Sessio
     with connection.transaction() as attempt:
         # Shared, so that writers do not wait for each other once there is something to compare with.
         connection.execute("SELECT 1 FROM pc2grid.about FOR SHARE")
-        found = [info for _, info in _read_sessions(connection, where, query, name)]
+        found = [info for _, info in _read_sessions(connection, where, query, [name])]
         if not found:
             raise psycopg.Rollback(attempt)  # and let go of the lock: two that share it cannot both have it
     if found:
         return found[0]
     connection.execute("SELECT 1 FROM pc2grid.about FOR UPDATE")
-    return next((info for _, info in _read_sessions(connection, where, query, name)), None)
+    return next((info for _, info in _read_sessions(connection, where, query, [name])), None)
 
 
 def _insert_session(
@@ -199,7 +203,7 @@ def _select(
 
 
 def _read_sessions(
-    connection: Connection[Any], where: str, condition: str = "true ORDER BY s.id", *values: Any
+    connection: Connection[Any], where: str, condition: str, values: Any
 ) -> list[tuple[Key, SessionInfo]]:
     columns = tuple(postgres_schema.TYPES["session"])
     # The sizes come from rows whose own checksum is looked at when they are used.
@@ -236,6 +240,8 @@ class PostgresDatabase:
         self._where = postgres_schema.location(url)
         self._writable = writable
         self._left_out: Collection[Key] = ()
+        self._building: str | None = None
+        self._floor: str | None = None
         self._config: Config | None = None
         self._connection = postgres_schema.connect(url, self._where)
         try:
@@ -273,8 +279,7 @@ class PostgresDatabase:
     def sessions(self) -> tuple[SessionInfo, ...]:
         """All sessions in the order they were added."""
         with served(self._where):
-            left_out = [number for _, number in self._left_out]
-            found = _read_sessions(self._connection, self._where, "s.id <> ALL(%s) ORDER BY s.id", left_out)
+            found = _read_sessions(self._connection, self._where, f"{_KNOWN} ORDER BY s.id", self._known())
         return tuple(info for _, info in found)
 
     def config(self) -> Config:
@@ -283,9 +288,8 @@ class PostgresDatabase:
 
         if self._config is None:
             with served(self._where):
-                left_out = [number for _, number in self._left_out]
-                condition = "s.id <> ALL(%s) ORDER BY s.id LIMIT 1"
-                found = _read_sessions(self._connection, self._where, condition, left_out)
+                condition = f"{_KNOWN} ORDER BY s.id LIMIT 1"
+                found = _read_sessions(self._connection, self._where, condition, self._known())
             self._config = found[0][1].provenance.config if found else Config()
         return self._config
 
@@ -320,20 +324,18 @@ class PostgresDatabase:
         values: dict[str, Any] = {
             "vector": HalfVector(vector),
             "count": max(count, postgres_schema.SHORTLIST),
+            "left_out": [number for _, number in self._left_out],
         }
-        wanted = ["true"]
+        wanted = ["session_id <> ALL(%(left_out)s)"] if self._left_out else ["true"]
+        for column, asked, kept in (("building", building, self._building), ("floor", floor, self._floor)):
+            if asked is not None and kept not in (None, asked):
+                return ()
+            values[column] = asked if asked is not None else kept
+            if values[column] is not None:
+                wanted.append(f"{column} = %({column})s")
         if session is not None:
-            values["own_building"], values["number"] = self._key(session)
-            wanted.append("building = %(own_building)s AND session_id = %(number)s")
-        if building is not None:
-            wanted.append("building = %(building)s")
-            values["building"] = building
-        if floor is not None:
-            wanted.append("floor = %(floor)s")
-            values["floor"] = floor
-        if self._left_out:
-            wanted.append("session_id <> ALL(%(left_out)s)")
-            values["left_out"] = [number for _, number in self._left_out]
+            values["own"], values["number"] = self._key(session)
+            wanted.append("building = %(own)s AND session_id = %(number)s")
         columns = tuple(postgres_schema.TYPES["signature"])
         inside = (
             f"SELECT {', '.join(columns)}, crc32 FROM pc2grid.signature WHERE {' AND '.join(wanted)}"
@@ -415,6 +417,18 @@ class PostgresDatabase:
         finally:
             self._look()
 
+    def keep_only(self, *, building: str | None = None, floor: str | None = None) -> None:
+        """From now on, know only some sessions; see `SubmapDatabase.keep_only`."""
+        before = self._building, self._floor
+        self._building, self._floor, self._config = building, floor, None
+        if not self._keys():
+            self._building, self._floor = before
+            query = "SELECT DISTINCT building, floor FROM pc2grid.session ORDER BY 1, 2 LIMIT 20"
+            with served(self._where):
+                found = self._connection.execute(query).fetchall()
+            labels = [Label(building=b or None, floor=f or None) for b, f in found]
+            raise none_there(self._where, building, floor, labels)
+
     def leave_out_damaged(self) -> tuple[Problem, ...]:
         """From now on, do without the sessions that cannot be searched because they are damaged.
 
@@ -423,11 +437,11 @@ class PostgresDatabase:
         with served(self._where):
             damaged = {
                 key: problem
-                for key in self._all_keys()
+                for key in self._keys().values()
                 for problem in [next(self._damage(key, ("session", "grid", "signature")), None)]
                 if problem is not None
             }
-        self._left_out, self._config = damaged.keys(), None
+        self._left_out, self._config = {*self._left_out, *damaged}, None
         problems = tuple(damaged.values())
         if problems and not self._keys():
             raise rows.corrupt(self._where, problems[0].where, problems[0].what)
@@ -437,7 +451,7 @@ class PostgresDatabase:
         """Everything that is wrong with the database: each row against its checksum, none may be missing."""
         problems: list[Problem] = []
         with served(self._where):
-            for key in self._all_keys():
+            for key in self._keys().values():
                 found = list(self._damage(key, tuple(postgres_schema.TABLES)))
                 problems += found or [*self._misled(key), *self._incomplete(key)]
         return tuple(dict.fromkeys(problems))
@@ -452,21 +466,25 @@ class PostgresDatabase:
     def __exit__(self, *_: Any) -> None:
         self.close()
 
+    def _known(self) -> dict[str, Any]:
+        """Values for _KNOWN."""
+        left_out = [number for _, number in self._left_out]
+        return {"left_out": left_out, "building": self._building, "floor": self._floor}
+
     def _keys(self) -> dict[str, Key]:
+        """Name -> key of the sessions that are known, in their order."""
+        query = f"SELECT s.name, s.building, s.id FROM pc2grid.session s WHERE {_KNOWN} ORDER BY s.id"
         with served(self._where):
-            found = self._connection.execute("SELECT name, building, id FROM pc2grid.session ORDER BY id")
-            return {
-                name: (building, number)
-                for name, building, number in found
-                if (building, number) not in self._left_out
-            }
+            found = self._connection.execute(query, self._known()).fetchall()
+        return {name: (building, number) for name, building, number in found}
 
     def _key(self, session: str) -> Key:
         with served(self._where):
             found = self._connection.execute(
-                "SELECT building, id FROM pc2grid.session WHERE name = %s", [session]
+                f"SELECT s.building, s.id FROM pc2grid.session s WHERE s.name = %(name)s AND {_KNOWN}",
+                {**self._known(), "name": session},
             ).fetchone()
-        if found is None or tuple(found) in self._left_out:
+        if found is None:
             there = ", ".join(map(repr, list(self._keys())[:20])) or "none"
             raise DatabaseError(f"{self._where}: no session {session!r}", hint=f"there are: {there}")
         return str(found[0]), int(found[1])
@@ -483,10 +501,6 @@ class PostgresDatabase:
         if not sound:
             raise rows.corrupt(self._where, f"{what} of session {session!r}", "wrong checksum")
         return row
-
-    def _all_keys(self) -> list[Key]:
-        found = self._connection.execute("SELECT building, id FROM pc2grid.session ORDER BY id").fetchall()
-        return [(building, number) for building, number in found]
 
     def _damage(self, key: Key, tables: Sequence[str]) -> Iterator[Problem]:
         """What is wrong with the rows of a session in these tables, and which single ones it lacks."""

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
+from pc2grid.errors import DatabaseError
 from pc2grid.model import OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
 
 if TYPE_CHECKING:
@@ -23,6 +24,10 @@ class Label:
 
     def __str__(self) -> str:
         return ", ".join(word for word in (self.building, self.floor) if word) or "no label"
+
+    def fits(self, building: str | None, floor: str | None) -> bool:
+        """Whether it is this building and floor; None: any, "": not said."""
+        return building in (None, self.building or "") and floor in (None, self.floor or "")
 
     def contradicts(self, other: Label) -> bool:
         """Whether the two name different buildings, or different floors; what was not said rules nothing
@@ -87,6 +92,13 @@ class SessionInfo:
     def lossy(self) -> bool:
         """Whether data was lost on the way."""
         return self.report.lossy
+
+
+def none_there(where: str, building: str | None, floor: str | None, labels: Sequence[Label]) -> DatabaseError:
+    """The error for a building or floor that no session of a database has."""
+    wanted = Label(building=building, floor=floor)
+    there = "; ".join(sorted({str(label) for label in labels})[:20]) or "no session"
+    return DatabaseError(f"{where}: no session of {wanted}", hint=f"there are: {there}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,6 +191,13 @@ class SubmapDatabase(Protocol):
 
     def check(self) -> tuple[Problem, ...]:
         """Everything that is wrong with it; empty if sound."""
+        ...
+
+    def keep_only(self, *, building: str | None = None, floor: str | None = None) -> None:
+        """From now on, know only the sessions of this building and floor; None: any.
+
+        Raises DatabaseError if there are none.
+        """
         ...
 
     def leave_out_damaged(self) -> tuple[Problem, ...]:

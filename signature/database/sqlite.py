@@ -15,7 +15,14 @@ from pc2grid.errors import DatabaseError
 from pc2grid.io.atomic import refuse_existing
 from pc2grid.model import OccupancyGrid, SessionMap, Submap, Trajectory
 from signature.database import rows, schema
-from signature.database.protocol import Entry, Neighbour, Problem, Provenance, SessionInfo
+from signature.database.protocol import (
+    Entry,
+    Neighbour,
+    Problem,
+    Provenance,
+    SessionInfo,
+    none_there,
+)
 from signature.database.rewrite import BUSY_TIMEOUT_S, rewrite
 
 if TYPE_CHECKING:
@@ -188,12 +195,7 @@ class SqliteDatabase:
         from signature.database.search import rank
 
         table, sessions = self.signatures(session), self.sessions()
-        labels = [info.provenance.label for info in sessions]
-        wanted = [
-            (building is None or (label.building or "") == building)
-            and (floor is None or (label.floor or "") == floor)
-            for label in labels
-        ]
+        wanted = [info.provenance.label.fits(building, floor) for info in sessions]
         among = np.asarray(wanted, np.bool_)[table.session_index]
         names = [info.name for info in sessions]
         return rank(query, table, names, count, self.config().signature, among)
@@ -248,6 +250,19 @@ class SqliteDatabase:
         self.close()
         self._open()
 
+    def keep_only(self, *, building: str | None = None, floor: str | None = None) -> None:
+        """From now on, know only some sessions; see `SubmapDatabase.keep_only`."""
+        from signature.database.upkeep import damaged_sessions
+
+        # What a damaged one was is not known: whoever asks for damage shall hear of it.
+        unknown = {*self._left_out, *damaged_sessions(self._connection, self._path)}
+        known = read_sessions(self._connection, self._path, unknown)
+        labels = {number: info.provenance.label for number, info in known}
+        others = {number for number, label in labels.items() if not label.fits(building, floor)}
+        if len(others) == len(known):
+            raise none_there(self.location, building, floor, list(labels.values()))
+        self._left_out = {*self._left_out, *others}
+
     def leave_out_damaged(self) -> tuple[Problem, ...]:
         """From now on, do without the sessions that cannot be searched because they are damaged.
 
@@ -256,9 +271,10 @@ class SqliteDatabase:
         """
         from signature.database.upkeep import damaged_sessions
 
-        damaged = damaged_sessions(self._connection, self._path)
+        found = damaged_sessions(self._connection, self._path)
+        damaged = {number: problem for number, problem in found.items() if number not in self._left_out}
         problems = tuple(damaged.values())
-        self._left_out = damaged.keys()
+        self._left_out = {*self._left_out, *damaged}
         if problems and not self._ids():
             raise rows.corrupt(self._path, problems[0].where, problems[0].what)
         return problems

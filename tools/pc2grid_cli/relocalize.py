@@ -23,6 +23,10 @@ def relocalize_command(
     database: Annotated[
         str, typer.Option("--database", "-d", metavar=options.DATABASE, help="where to look")
     ],
+    building: Annotated[
+        str | None, typer.Option("--building", metavar="NAME", help="look only in sessions labelled so")
+    ] = None,
+    floor: Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, of a floor")] = None,
     topic: options.Topic = None,
     odometry: options.OdometryTopic = None,
     start: options.Start = 0.0,
@@ -83,6 +87,8 @@ def relocalize_command(
         )
     with open_database(database) as opened:
         where = opened.location
+        if building is not None or floor is not None:
+            opened.keep_only(building=building, floor=floor)
         left_out = [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
         if is_map_file(log):
             found = find_map(log, opened, settings)
