@@ -8,17 +8,14 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import pc2grid
 import signature
 
 
 def main(recording: str, database: str) -> None:
     """Map a recording, describe its submaps, store both."""
     config = signature.Config()
-    with pc2grid.open_log(recording) as log:
-        print(f"{log.choose().topic}: {log.choose().reason}")
-        session = pc2grid.build_map(log, config, session=Path(recording).stem)
-        origin = signature.provenance(recording, log.digest(), config)
+    # A nav2 map.yaml may stand in the place of the recording.
+    session, origin = signature.build_session(recording, Path(recording).stem, config, note=print)
     signature.add_session(database, session, config, origin)
 
     driven_m = session.trajectory.path_m()[-1]

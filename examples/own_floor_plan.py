@@ -23,9 +23,7 @@ def main(map_yaml: str, visitors: str = "5", map_length_m: str = "60", query_len
         folder = Path(name)
         mapper = pc2grid.SimulationConfig(length_m=float(map_length_m), seed=1, clutter=5)
         made = pc2grid.simulate_session(folder / "map.mcap", sensor="laser", grid=plan, config=mapper)
-        with pc2grid.open_log(made.path) as log:
-            session = pc2grid.build_map(log, config, session="map")
-            origin = signature.provenance(made.path, log.digest(), config)
+        session, origin = signature.build_session(made.path, "map", config)
         signature.add_session(folder / "map.submaps", session, config, origin)
         # The map's frame is where its robot started.
         T_plan_map = next(pc2grid.read_tum(made.truth_path).poses())

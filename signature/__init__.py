@@ -17,16 +17,18 @@ from typing import TYPE_CHECKING
 from pc2grid.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from signature.answer import Answer as Answer
     from signature.build import add_session as add_session
+    from signature.build import build_session as build_session
     from signature.build import provenance as provenance
+    from signature.building import Building as Building
     from signature.config import Config as Config
+    from signature.database import Label as Label
     from signature.database import SubmapDatabase as SubmapDatabase
     from signature.database import create_database as create_database
     from signature.database import open_database as open_database
     from signature.describe import Signature as Signature
     from signature.describe import describe as signature_of  # noqa: F401
-    from signature.relocalize import Answer as Answer
-    from signature.relocalize import Building as Building
     from signature.relocalize import Relocalizer as Relocalizer
     from signature.relocalize import locate_map as locate_map
     from signature.relocalize import relocalize as locate  # noqa: F401
@@ -35,14 +37,16 @@ if TYPE_CHECKING:
 
 # A function whose module has its name goes by another one here: the module would hide it.
 _HOMES = {
-    "Answer": "relocalize.Answer",
-    "Building": "relocalize.Building",
+    "Answer": "answer.Answer",
+    "Building": "building.Building",
     "Config": "config.Config",
+    "Label": "database.Label",
     "Relocalizer": "relocalize.Relocalizer",
     "Signature": "describe.Signature",
     "SignatureTable": "similarity.SignatureTable",
     "SubmapDatabase": "database.SubmapDatabase",
     "add_session": "build.add_session",
+    "build_session": "build.build_session",
     "create_database": "database.create_database",
     "distances": "similarity.distances",
     "locate": "relocalize.relocalize",

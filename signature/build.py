@@ -49,7 +49,7 @@ def provenance(
 
 
 def build_session(
-    path: Path,
+    path: str | Path,
     name: str,
     config: Config,
     *,
@@ -65,9 +65,15 @@ def build_session(
     progress : told the share that is done. note : told which topic was chosen, and why.
 
     Raises LogError and its like, MapFileError, RegistrationDiverged.
+
+    >>> import signature
+    >>> session, origin = build_session("map.yaml", "plan", signature.Config())
+    >>> session.sensor, len(session.trajectory), origin.source
+    ('map', 0, 'map.yaml')
     """
     from pc2grid.io.nav2_map import is_map_file, load_map
 
+    path = Path(path)
     if is_map_file(path):
         grid = load_map(path)
         return _map_session(grid, name, config), provenance(

@@ -190,7 +190,7 @@ Run = Callable[..., list[str]]
 
 def test_example_convert_a_log(run: Run) -> None:
     said = run("convert_a_log.py", "tuesday.mcap", "new.submaps")
-    assert said[0].startswith("/scan: ") and "4.0 m driven" in said[1]
+    assert said[0].startswith("tuesday.mcap: /scan (laser): ") and "4.0 m driven" in said[1]
     with signature.open_database("new.submaps") as database:
         assert [session.name for session in database.sessions()] == ["tuesday"]
 
