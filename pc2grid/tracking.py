@@ -38,6 +38,9 @@ _MAX_SIGMA_M = 0.15  # a direction known worse than this rests on odometry or on
 _BRIDGED_SCANS = 30
 _GIVE_UP_SCANS = 10
 _STEADY_S = 0.3
+_GAP_S = 1.0
+_FASTEST_MPS, _FASTEST_RPS = 4.0, 4.0
+_SURE_OVERLAP = 0.6  # of a scan with the local map, where odometry alone does not tell
 _DISAGREE_M = 0.03
 _DISAGREE_RAD = 0.02
 _MAX_POINTS = 40_000  # of a camera's 300 000 pixels
@@ -88,6 +91,9 @@ class Tracker:
     def track(self, scan: Scan) -> Tracked:
         """Follow the next scan; stamps must increase."""
         motion, motion_s, odometry = self._predict(scan)
+        believed = True
+        if odometry is not None and self._maps and _is_odd(odometry, motion_s):
+            motion, odometry, believed = self._examine(scan, motion, motion_s, odometry)
         points = self._usable(scan, motion, motion_s)
         predicted: F64 = self._last_pose @ motion
         if self._last is None:
@@ -114,6 +120,8 @@ class Tracker:
                 planar = refined
                 pose = planar.lift() @ T_level_base
             health = self._judge(match, odometry is not None)
+        if not believed:
+            health, self._lost_scans = Health.LOST, _GIVE_UP_SCANS + 1
         was_restarted = self._restarted
         restart = self._lost_scans > _GIVE_UP_SCANS
         if restart:
@@ -154,6 +162,26 @@ class Tracker:
         if self._last.T_odom_base is not None:
             return odometry, seconds, odometry
         return invert_pose(self._last_pose) @ T_map_then @ odometry, seconds, odometry
+
+    def _examine(
+        self, scan: Scan, motion: F64, seconds: float, odometry: F64
+    ) -> tuple[F64, F64 | None, bool]:
+        """Motion, odometry and whether to believe in either, for odometry that a restarted driver may have
+        begun anew: it counts only if the scan fits where it leads, and better than where the robot was."""
+        points = self._usable(scan, np.eye(4), 0.0)
+        upright = SE2.flatten(self._last_pose)
+        sweep = self._flatten(points, scan, upright.inverse().lift() @ self._last_pose)
+        hits, face = sweep.hits_m, facing(sweep.hits_m, sweep.origin_m)
+        fits = []
+        for moved, measured in ((motion, odometry), (self._steady_motion(seconds), None)):
+            guess = SE2.flatten(self._last_pose @ moved)
+            match = self._maps[0][0].match(hits, face, guess, guess, np.zeros((3, 3)))
+            if match.overlap > _SURE_OVERLAP and match.residual_m < _MAX_RESIDUAL_M:
+                fits.append((match.overlap - 5.0 * match.residual_m, moved, measured))
+        if not fits:
+            return motion, odometry, False
+        _, moved, measured = max(fits, key=lambda fit: fit[0])
+        return moved, measured, True
 
     def _steady_motion(self, seconds: float) -> F64:
         """The motion before, if it goes on for so long.
@@ -302,6 +330,12 @@ def _ground_at_start(points: F32, T_base_sensor: F64) -> Ground:
     assumed = assumed_ground(T_base_sensor)
     mounted = find_ground(points, sensor, assumed) if assumed.offset_m == 0.0 else None
     return mounted or find_ground(points, sensor) or assumed
+
+
+def _is_odd(odometry: F64, seconds: float) -> bool:
+    """Whether odometry passes over a gap, or claims what no robot indoors can do."""
+    distance, turn = float(np.linalg.norm(odometry[:3, 3])), float(np.linalg.norm(rotation_vector(odometry)))
+    return seconds > _GAP_S or distance > 0.2 + _FASTEST_MPS * seconds or turn > 0.3 + _FASTEST_RPS * seconds
 
 
 def _rolls(scan: Scan) -> bool:

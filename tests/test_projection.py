@@ -73,5 +73,28 @@ def test_a_map_past_the_limit_is_refused():
         builder.grid()
 
 
+def test_memory_goes_with_what_was_visited_not_with_the_rectangle_around_it():
+    builder = GridBuilder(ProjectionConfig(max_cells=15_000_000))
+    for k in range(200):  # 800 m as the crow flies: a square of 128 million cells
+        builder.add(disc(2.0), SE2(2.83 * k, 2.83 * k, 0.0))
+    with pytest.raises(LimitExceeded, match="max_cells"):
+        builder.grid()
+    corridor = GridBuilder(ProjectionConfig(max_cells=15_000_000))
+    for k in range(200):
+        corridor.add(disc(2.0), SE2(4.0 * k, 0.0, 0.0))
+    grid = corridor.grid()
+    assert grid.cells.shape[1] * grid.resolution_m > 790 and 0 <= state(grid, 796.5, 0.5) < 50
+
+
+def test_glimpses_fill_what_is_unknown_and_change_nothing_else():
+    builder = GridBuilder(ProjectionConfig())
+    builder.add(disc(2.0), SE2())
+    before = builder.grid()
+    builder.glimpse(np.array([[0.52, 0.52], [2.52, 0.02], [900.0, 0.0]]))
+    after = builder.grid()
+    assert state(after, 0.52, 0.52) == state(before, 0.52, 0.52) < 50
+    assert state(after, 2.52, 0.02) >= 65
+
+
 def test_nothing_seen_gives_an_empty_grid():
     assert GridBuilder(ProjectionConfig()).grid().cells.size == 0

@@ -74,6 +74,39 @@ def test_odometry_bridges_a_scan_without_any_at_the_edge_of_a_gap(laser):
     assert errors(gap, [r.T_map_base for r in registered]).max() < 0.06
 
 
+def restarted(pairs, stamp_shift_ns=0):
+    """The same scans from a robot whose odometry began anew with the first of them."""
+    first = invert_pose(pairs[0][0].T_odom_base)
+    return [
+        (
+            dataclasses.replace(
+                scan, T_odom_base=first @ scan.T_odom_base, stamp_ns=scan.stamp_ns + stamp_shift_ns
+            ),
+            pose,
+        )
+        for scan, pose in pairs
+    ]
+
+
+@pytest.mark.parametrize("gap_s", [0.0, 20.0])
+def test_odometry_that_begins_anew_where_the_robot_stands_is_seen_through(laser, gap_s):
+    reset = [*laser[:40], *restarted(laser[40:], int(gap_s * 1e9))]
+    assert np.linalg.norm(laser[40][0].T_odom_base[:2, 3]) > 1.0
+    registered = list(register(scan for scan, _ in reset))
+    assert not any(r.health is Health.LOST for r in registered)
+    assert errors(reset, [r.T_map_base for r in registered]).max() < 0.06
+
+
+def test_odometry_that_begins_anew_while_nobody_looks_is_not_believed(laser):
+    gap_ns = laser[39][0].stamp_ns - laser[0][0].stamp_ns + 5_000_000_000
+    elsewhere = restarted(session("laser", length_m=2.0, seed=11), gap_ns)
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    tracked = [tracker.track(scan) for scan, _ in [*laser[:40], *elsewhere]]
+    health = [t.registered.health for t in tracked]
+    assert health[40] is Health.LOST and Health.LOST not in health[:40] + health[41:]
+    assert [k for k, t in enumerate(tracked) if t.restart] == [41]
+
+
 def test_carried_off_without_odometry_is_noticed_and_restarts(laser):
     tracker = Tracker(RegistrationConfig(), ProjectionConfig())
     elsewhere = session("laser", length_m=3.0, seed=11)
