@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import pc2grid
 from pc2grid_cli import console, main
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -93,6 +94,16 @@ def test_global_options_may_stand_behind_the_command(
         update(0.5)
     console.note("nothing")
     assert capsys.readouterr().err == ""
+
+
+def test_the_version_needs_no_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pc2grid", "--version"])
+    with pytest.raises(SystemExit) as end:
+        main.main()
+    assert end.value.code == 0
+    assert capsys.readouterr() == (f"pc2grid {pc2grid.__version__}\n", "")
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

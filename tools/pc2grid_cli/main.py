@@ -36,6 +36,12 @@ app = typer.Typer(
 )
 
 
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        print(f"pc2grid {pc2grid.__version__}")
+        raise typer.Exit
+
+
 @app.callback()
 def options(
     verbose: Annotated[
@@ -43,12 +49,12 @@ def options(
     ] = 0,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only warnings and errors")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="tracebacks for errors")] = False,
-    version: Annotated[bool, typer.Option("--version", help="print the version and stop")] = False,
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_say_version, is_eager=True, help="print the version and stop"),
+    ] = False,
 ) -> None:
     """Recordings to a submap database, and where in it a later recording was made."""
-    if version:
-        print(f"pc2grid {pc2grid.__version__}")
-        raise typer.Exit
     console.State.verbosity = -1 if quiet else verbose
     console.State.debug = console.State.debug or debug
 
