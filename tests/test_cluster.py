@@ -266,3 +266,27 @@ def test_convert_export_and_look_after_a_fleets_database(folder: Path, tmp_path:
     with open_database(url) as there, open_database(tmp_path / "copy.submaps") as copy:
         assert [info.provenance for info in copy.sessions()] == [info.provenance for info in there.sessions()]
         assert transfer.check(tmp_path / "merged.submaps") == ()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "address", "processes"),
+    [
+        (["--dask", "FIRST", "SECOND"], "local", os.cpu_count()),
+        (["FIRST", "SECOND", "--dask"], "local", os.cpu_count()),
+        (["FIRST", "SECOND", "--jobs", "1"], "local", 1),
+        (["--dask", "tcp://scheduler:8786", "FIRST", "SECOND"], "tcp://scheduler:8786", os.cpu_count()),
+    ],
+)
+def test_an_address_may_follow_dask_or_not(
+    folder: Path, tmp_path: Path, monkeypatch, arguments, address, processes
+) -> None:
+    asked: list[object] = []
+
+    def nobody(jobs, address, processes, tell):
+        asked.extend([[job.name for job in jobs], address, processes])
+        yield from ()
+
+    monkeypatch.setattr(cluster, "on_cluster", nobody)
+    paths = dict(zip(("FIRST", "SECOND"), inputs(folder, "kitchen", "hall"), strict=True))
+    run("convert", *(paths.get(argument, argument) for argument in arguments), "-o", tmp_path / "x.submaps")
+    assert asked == [["kitchen", "hall"], address, min(2, processes)]

@@ -148,6 +148,7 @@ def test_what_goes_in_comes_out(filled: str | Path) -> None:
         assert database.check() == ()
         assert database.leave_out_damaged() == ()
         assert list(database.signatures("tuesday").session_index) == [1] * 5
+        assert [info.name for info in database.sessions(["tuesday", "friday"])] == ["tuesday"]
         with pytest.raises(DatabaseError, match="no session 'sunday'"):
             database.grid("sunday")
         with pytest.raises(DatabaseError, match="has no submap 99"):

@@ -276,10 +276,14 @@ class PostgresDatabase:
         """The URL without its password."""
         return self._where
 
-    def sessions(self) -> tuple[SessionInfo, ...]:
-        """All sessions in the order they were added."""
+    def sessions(self, names: Collection[str] | None = None) -> tuple[SessionInfo, ...]:
+        """All sessions, or those of `names`, in the order they were added."""
+        values = self._known()
+        condition = _KNOWN
+        if names is not None:
+            condition, values["names"] = f"{_KNOWN} AND s.name = ANY(%(names)s)", list(names)
         with served(self._where):
-            found = _read_sessions(self._connection, self._where, f"{_KNOWN} ORDER BY s.id", self._known())
+            found = _read_sessions(self._connection, self._where, f"{condition} ORDER BY s.id", values)
         return tuple(info for _, info in found)
 
     def config(self) -> Config:

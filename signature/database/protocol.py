@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -137,8 +137,8 @@ class SubmapDatabase(Protocol):
         """Path or URL, for messages."""
         ...
 
-    def sessions(self) -> tuple[SessionInfo, ...]:
-        """All sessions in the order they were added."""
+    def sessions(self, names: Collection[str] | None = None) -> tuple[SessionInfo, ...]:
+        """All sessions, or those of `names`, in the order they were added."""
         ...
 
     def config(self) -> Config:

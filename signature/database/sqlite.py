@@ -139,9 +139,10 @@ class SqliteDatabase:
         """Path of the file."""
         return str(self._path)
 
-    def sessions(self) -> tuple[SessionInfo, ...]:
-        """All sessions in the order they were added."""
-        return tuple(info for _, info in read_sessions(self._connection, self._path, self._left_out))
+    def sessions(self, names: Collection[str] | None = None) -> tuple[SessionInfo, ...]:
+        """All sessions, or those of `names`, in the order they were added."""
+        found = read_sessions(self._connection, self._path, self._left_out)
+        return tuple(info for _, info in found if names is None or info.name in names)
 
     def config(self) -> Config:
         """The configuration of the first session; the default if there is none."""

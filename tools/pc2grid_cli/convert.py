@@ -232,7 +232,9 @@ def _stored(output: str, jobs: list[Job], *, add: bool, force: bool) -> dict[str
         return {}
     try:
         with open_database(output) as opened:
-            present = {info.name: info.provenance for info in opened.sessions()}
+            # Of what a whole fleet has stored, only namesakes matter for adding.
+            known = opened.sessions([job.name for job in jobs] if add else None)
+        present = {info.name: info.provenance for info in known}
     except DatabaseError:
         if add:
             raise
