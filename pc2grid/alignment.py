@@ -131,7 +131,7 @@ def _bound(
 
 
 @numba.njit(cache=True, nogil=True)
-def _levels_for(d: F32, half_t: float, half_a: float, reaches: F64) -> NDArray[np.int64]:
+def levels_for(d: F32, half_t: float, half_a: float, reaches: F64) -> NDArray[np.int64]:
     """The smallest sliding maximum that covers what a box does to a point at distance d (cells)."""
     out = np.empty(len(d), dtype=np.int64)
     for p in range(len(d)):
@@ -166,7 +166,7 @@ def _search(
     d = np.sqrt(x * x + y * y)
     point_levels = np.empty((depth + 1, n), dtype=np.int64)
     for k in range(depth + 1):
-        point_levels[k] = _levels_for(d, half_t0 * 0.5**k, half_a0 * 0.5**k, reaches)
+        point_levels[k] = levels_for(d, half_t0 * 0.5**k, half_a0 * 0.5**k, reaches)
     scale = 1.0 / (255.0 * n)
     heap = [(0.0, 0, 0.0, 0.0, 0.0)]
     heap.pop()

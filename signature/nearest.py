@@ -93,8 +93,8 @@ class SignatureIndex:
             rows = np.concatenate((rows, left))
             score = np.concatenate((score, self._scores(query, left, config)))
         order = np.lexsort((rows, score))[:k]
-        sample = self._scores(query, np.arange(0, n, step), config)
-        return Nearest(rows[order], score[order], float(sample.mean()), float(sample.std()))
+        sampled = self._scores(query, np.arange(0, n, step), config)
+        return Nearest(rows[order], score[order], float(sampled.mean()), float(sampled.std()))
 
     def _scores(self, query: Signature, rows: I64, config: SignatureConfig) -> F64:
         """What `distances` says of some rows, read where they lie."""
@@ -155,7 +155,7 @@ def _sketch(histograms: F32, merged: int, out: NDArray[np.uint16]) -> float:
                 out[g, i] = np.uint16(min(np.ceil(np.sqrt(mass) / _UNIT), np.float32(65535)))
                 total += mass
             largest = max(largest, total)
-    return largest
+    return float(largest)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)

@@ -11,6 +11,7 @@ import numpy as np
 from pc2grid.alignment import Fit, LikelihoodField, assess, refine, search, thin_evenly
 from pc2grid.geometry import F64, SE2, wrap_angle
 from pc2grid.model import F32
+from pc2grid.windows import search_windows
 from signature.config import RelocalizeConfig
 from signature.query import QueryMap
 from signature.retrieve import Places, Proposal
@@ -70,7 +71,7 @@ def verify(
         points = coarse_points(query, center)
         rows = np.array([p.row for p in members])
         starts = np.concatenate([_boxes(places.table.center_m[p.row], p.yaw_rad) for p in members])
-        poses = search(
+        poses = search_windows(
             fields[session],
             points,
             starts,
