@@ -127,11 +127,12 @@ class Stream:
         return take
 
     def _child_to_base(self, child: str) -> F64:
-        """`T_child_base` of the odometry's child frame; identity if they are one, or unconnected."""
+        """`T_child_base` of the odometry's child frame; identity if they are one, or tf does not say."""
         base, frames = self._plan.choice.base_frame, self._frames
-        if child == base or self._plan.sensor_is_base or child not in frames or base not in frames:
+        if not child or child == base or self._plan.sensor_is_base:
             return np.eye(4)
-        if frames.connected(child, base) and not frames.moving(child, base):
+        known = child in frames and base in frames
+        if known and frames.connected(child, base) and not frames.moving(child, base):
             found = frames.lookup(child, base, 0)
             return np.eye(4) if found is None else found
         self._tally.warn(f"the odometry is of frame {child}, which is taken for {base}")

@@ -24,14 +24,14 @@ def stamp_ns_from_text(text: str) -> int:
 
     Raises ValueError if it is not a finite decimal number that fits.
     """
-    mantissa, _, exponent = text.strip().lower().partition("e")
-    if exponent:  # numpy.savetxt writes 1.283e+09; rare enough for the slow way
+    mantissa, e, _ = text.strip().lower().partition("e")
+    if e:  # numpy.savetxt writes 1.283e+09; rare enough for the slow way
         from decimal import Decimal
 
         stamp = int((Decimal(text) * 1_000_000_000).to_integral_value())
     else:
         sign = -1 if mantissa.startswith("-") else 1
-        whole, _, fraction = mantissa.lstrip("+-").partition(".")
+        whole, _, fraction = mantissa[mantissa[:1] in ("+", "-") :].partition(".")
         if not (whole + fraction).isdecimal():
             raise ValueError(f"not a time: {text!r}")
         stamp = sign * (int(whole or "0") * 1_000_000_000 + round(int((fraction + "0" * 10)[:10]) / 10))
