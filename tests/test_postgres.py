@@ -155,6 +155,26 @@ def test_without_the_extra_it_says_what_to_install() -> None:
     assert "pip install 'pc2grid[postgres]'" in done.stderr
 
 
+def test_rights_that_a_robot_needs(filled: str) -> None:
+    """Those that examples/fleet.md names, and no others."""
+    with postgresql.connect(filled) as connection:
+        for role, tables in (("writer", "SELECT, INSERT, DELETE"), ("viewer", "SELECT")):
+            connection.execute(f"CREATE ROLE {role} LOGIN")
+            connection.execute(f"GRANT USAGE ON SCHEMA pc2grid TO {role}")
+            connection.execute(f"GRANT {tables} ON ALL TABLES IN SCHEMA pc2grid TO {role}")
+        connection.execute("GRANT UPDATE ON pc2grid.about, pc2grid.session TO writer")
+        connection.execute("GRANT USAGE ON SEQUENCE pc2grid.session_id TO writer")
+    writer, viewer = (with_user(filled, role, "") for role in ("writer", "viewer"))
+    store(writer, [make_entry("friday", 5)], keep=True)
+    store(writer, [make_entry("friday", 6)], keep=True, force=True)
+    with open_database(viewer, writable=True) as database:
+        assert_holds(database, make_entry("friday", 6))
+        assert len(database.nearest(make_entry("q", 99)[1][0], 5)) == 5
+        with pytest.raises(DatabaseError, match="permission denied"):
+            database.add(*make_entry("sunday", 7))
+        assert len(database.sessions()) == 3
+
+
 # --- many at once -------------------------------------------------------------------------------------
 
 
