@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -25,6 +26,7 @@ from signature.database import open_database, transfer
 from tests import postgresql
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
+ROOT = Path(__file__).resolve().parent.parent
 NAMES = ("kitchen", "hall", "cellar", "attic")
 
 
@@ -290,3 +292,18 @@ def test_an_address_may_follow_dask_or_not(
     paths = dict(zip(("FIRST", "SECOND"), inputs(folder, "kitchen", "hall"), strict=True))
     run("convert", *(paths.get(argument, argument) for argument in arguments), "-o", tmp_path / "x.submaps")
     assert asked == [["kitchen", "hall"], address, min(2, processes)]
+
+
+@pytest.mark.parametrize(
+    "command", re.findall(r"^pc2grid ([^#\n]*)", (ROOT / "examples" / "fleet.md").read_text(), re.MULTILINE)
+)
+def test_commands_of_the_fleets_page_are_real(command: str) -> None:
+    from typer.main import get_command
+
+    group, arguments = get_command(app), command.split()
+    context = group.make_context("pc2grid", [], resilient_parsing=True)
+    while hasattr(group, "get_command"):
+        name = arguments.pop(0)
+        group = group.get_command(context, name)
+        assert group is not None, f"no command {name}"
+    group.make_context("pc2grid", arguments, parent=context)
