@@ -106,6 +106,19 @@ def test_the_version_needs_no_command(
     assert capsys.readouterr() == (f"pc2grid {pc2grid.__version__}\n", "")
 
 
+@pytest.mark.parametrize("words", [[], ["config"], ["db"]])
+def test_a_group_alone_shows_its_help(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pc2grid", *words])
+    with pytest.raises(SystemExit) as end:
+        main.main()
+    assert end.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == "" and "pc2grid: error" not in err
+    assert f"Usage: {' '.join(['pc2grid', *words])} [OPTIONS] COMMAND" in err and "Commands:" in err
+
+
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_completion(shell: str) -> None:
     environment = {

@@ -150,9 +150,8 @@ def _pipe_closed() -> int:
 
 def _report_usage(error: Any) -> int:
     context = getattr(error, "ctx", None)
-    if not error.format_message():
-        if context is not None:
-            print(context.get_help(), file=sys.stderr)
+    if type(error).__name__ == "NoArgsIsHelpError":  # its message is the help of the command
+        print(error.format_message() or context.get_help(), file=sys.stderr)
         return USAGE
     print(f"pc2grid: error: {_one_line(error.format_message())}", file=sys.stderr)
     if context is not None:
