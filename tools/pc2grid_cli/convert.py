@@ -28,7 +28,7 @@ class ConvertCommand(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put in what stands for no address, unless one follows."""
-        following = [*args[1:], ""]
+        following = [*args, ""][1:]
         named = [
             "--dask=local" if arg == "--dask" and "://" not in after else arg
             for arg, after in zip(args, following, strict=True)
