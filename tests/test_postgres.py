@@ -144,6 +144,13 @@ def test_schema_of_another_version(filled: str, number: int, words: str) -> None
         assert words in str(caught.value)
 
 
+def test_old_pgvector_is_named(filled: str) -> None:
+    with postgresql.connect(filled) as connection:
+        connection.execute("UPDATE pg_extension SET extversion = '0.7.4' WHERE extname = 'vector'")
+    with pytest.raises(DatabaseError, match=r"pgvector 0\.7\.4; needed is 0\.8 or newer"):
+        open_database(filled)
+
+
 def test_without_the_extra_it_says_what_to_install() -> None:
     code = (
         "import sys; sys.modules['psycopg'] = None\n"

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from psycopg import Connection, Error
 
 FORMAT = 1
+PGVECTOR = (0, 8)
+"""The first version that goes on looking when a filter leaves too few (hnsw.iterative_scan)."""
 SHORTLIST = 400
 """Candidates that the index hands to Eq. 6."""
 CONVERT = "make one with `pc2grid convert LOG -o URL`"
@@ -152,13 +154,20 @@ def inspect(connection: Connection[Any], where: str) -> None:
                 f"{where}: database format {found[0][0]}; this pc2grid reads {FORMAT}",
                 hint="use a newer pc2grid" if found[0][0] > FORMAT else "convert the recordings again",
             )
-        namespace = connection.execute(
-            "SELECT n.nspname FROM pg_extension e JOIN pg_namespace n ON n.oid = e.extnamespace"
+        extension = connection.execute(
+            "SELECT n.nspname, e.extversion FROM pg_extension e JOIN pg_namespace n ON n.oid = e.extnamespace"
             " WHERE e.extname = 'vector'"
         ).fetchone()
-        if namespace is None:
+        if extension is None:
             raise _no_pgvector(where)
-        connection.execute("SELECT set_config('search_path', %s, false)", [f"pc2grid, {namespace[0]}"])
+        namespace, version = extension
+        if tuple(int(part) for part in re.findall(r"\d+", version)[:2]) < PGVECTOR:
+            needed = ".".join(map(str, PGVECTOR))
+            raise DatabaseError(
+                f"{where}: the server has pgvector {version}; needed is {needed} or newer",
+                hint="install it on the server, then `ALTER EXTENSION vector UPDATE` in the database",
+            )
+        connection.execute("SELECT set_config('search_path', %s, false)", [f"pc2grid, {namespace}"])
         register_vector(connection)
         # Library first, then its settings: they exist only once it is loaded.
         connection.execute("SELECT '[1]'::halfvec <#> '[1]'")
