@@ -17,7 +17,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.facing import facing
 from pc2grid.geometry import F64, SE2
 from pc2grid.matching import evenly
 from pc2grid.pieces import Keyframe, PieceStore, cut
@@ -31,6 +30,7 @@ _MAX_WINDOW_M = 3.0
 _MAX_WINDOW_RAD = math.radians(20.0)
 _MIN_SEEN = 0.35
 _MIN_AGREEMENT = 0.8
+_SAME_M, _SAME_RAD = 0.01, 0.002
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +98,16 @@ def close_loops(keyframes: Sequence[Keyframe], proposers: Sequence[LoopProposer]
         return Closed(tracked, (), proposals)
     chain = _tracking_edges(keyframes, runs)
     poses = store.poses
+    matched: dict[tuple[int, int], tuple[SE2, list[Edge]]] = {}
     for _ in range(_ROUNDS):
-        loops = [
-            edge for older, newer in _overlapping(store) for edge in _match_keyframes(store, older, newer)
-        ]
+        loops: list[Edge] = []
+        for older, newer in _overlapping(store):
+            relative = store.pose(store.anchor(older)).inverse() @ store.pose(store.anchor(newer))
+            at, edges = matched.get((older, newer), (None, []))
+            if at is None or not _same(at.inverse() @ relative):
+                edges = list(_match_keyframes(store, older, newer))
+                matched[older, newer] = relative, edges
+            loops += edges
         poses = optimise(poses, chain + loops).poses
         store.move(poses, redraw=True)
     loops_at = tuple((store.anchor(older), store.anchor(newer)) for older, newer in pairs)
@@ -198,6 +204,11 @@ def _overlapping(store: PieceStore) -> list[tuple[int, int]]:
     return pairs
 
 
+def _same(apart: SE2) -> bool:
+    """Whether matching two pieces again would tell nothing new."""
+    return math.hypot(apart.x, apart.y) < _SAME_M and abs(apart.yaw) < _SAME_RAD
+
+
 def _match_keyframes(store: PieceStore, older: int, newer: int) -> Iterable[Edge]:
     """Each keyframe of either piece against the other piece as a whole."""
     for target, source in ((older, newer), (newer, older)):
@@ -205,12 +216,12 @@ def _match_keyframes(store: PieceStore, older: int, newer: int) -> Iterable[Edge
         T_anchor_map = store.pose(anchor).inverse()
         for k in store.runs[source]:
             guess = T_anchor_map @ store.pose(k)
-            sweep = store.keyframes[k].sweep
-            chosen = evenly(len(sweep.hits_m), _KEYFRAME_POINTS)
-            points = sweep.hits_m[chosen].astype(np.float64)
+            hits = store.keyframes[k].sweep.hits_m
+            chosen = evenly(len(hits), _KEYFRAME_POINTS)
+            points = hits[chosen].astype(np.float64)
             if len(points) < 30 or piece.agreement(points, guess)[0] < _MIN_SEEN:
                 continue
-            match = piece.match(points, facing(sweep.hits_m, sweep.origin_m)[chosen], guess)
+            match = piece.match(points, store.facing(k)[chosen], guess)
             seen, agree = piece.agreement(points, match.pose)
             apart = guess.inverse() @ match.pose
             if (

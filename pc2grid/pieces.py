@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pc2grid.facing import facing
 from pc2grid.geometry import F64, SE2
@@ -19,6 +20,7 @@ PIECE_TRAVEL_M = 4.0
 RANGE_M = 12.0  # what is seen from farther away is too thin to match
 CELL_M = 0.1
 _FREE, _HIT = 1, 2
+_RADII = (3, 2, 2, 1, 1, 1, 1, 1)
 _CACHE = 64
 
 
@@ -54,18 +56,25 @@ def cut(keyframes: Sequence[Keyframe]) -> list[range]:
 class Piece:
     """The local map of a run of keyframes, in the frame of its anchor, the keyframe in the middle.
 
+    Made from the keyframes, which way the surfaces at their hits face (radians), and their poses.
+
     points_m : (N, 2) obstacle points, thinned to one a cell. facing_rad : (N,) which way each one faces.
     """
 
-    def __init__(self, keyframes: Sequence[Keyframe], T_anchor_base: Sequence[SE2]) -> None:
+    def __init__(
+        self,
+        keyframes: Sequence[Keyframe],
+        facings: Sequence[NDArray[np.floating]],
+        T_anchor_base: Sequence[SE2],
+    ) -> None:
         import cv2
 
         hits, faces, outlines = [], [], []
-        for keyframe, pose in zip(keyframes, T_anchor_base, strict=True):
+        for keyframe, face_rad, pose in zip(keyframes, facings, T_anchor_base, strict=True):
             sweep = keyframe.sweep
             near = np.linalg.norm(sweep.hits_m - sweep.origin_m, axis=1) < RANGE_M
             hits.append(pose.apply(sweep.hits_m[near]))
-            faces.append(facing(sweep.hits_m, sweep.origin_m)[near] + pose.yaw)
+            faces.append(face_rad[near] + pose.yaw)
             outlines.append(pose.apply(sweep.free_polygon(RANGE_M)))
         points, face = np.concatenate(hits), np.concatenate(faces)
         everything = np.concatenate((points, *outlines))
@@ -91,7 +100,12 @@ class Piece:
         self.facing_rad: F64 = face[keep]
 
     def match(
-        self, points_m: F64, facing_rad: F64, guess: SE2, *, radii: tuple[int, ...] = (3, 2, 2, 1, 1, 1, 1, 1)
+        self,
+        points_m: F64,
+        facing_rad: NDArray[np.floating],
+        guess: SE2,
+        *,
+        radii: tuple[int, ...] = (3, 2, 2, 1, 1, 1, 1, 1),
     ) -> Match:
         """Refine where points (N, 2), facing (N,), lie in this piece, from the points alone."""
         return self._grid.match(points_m, facing_rad, guess, guess, np.zeros((3, 3)), radii=radii)
@@ -127,6 +141,7 @@ class PieceStore:
         self.runs = runs
         self.poses = poses
         self._made: OrderedDict[int, Piece] = OrderedDict()
+        self._facing: dict[int, NDArray[np.float16]] = {}
 
     def anchor(self, piece: int) -> int:
         """The keyframe whose frame the piece lives in."""
@@ -138,12 +153,21 @@ class PieceStore:
         x, y, yaw = self.poses[keyframe]
         return SE2(float(x), float(y), float(yaw))
 
+    def facing(self, keyframe: int) -> NDArray[np.float16]:
+        """Which way the surfaces at the keyframe's hits face, radians in its frame; worked out once."""
+        if keyframe not in self._facing:
+            sweep = self.keyframes[keyframe].sweep
+            self._facing[keyframe] = facing(sweep.hits_m, sweep.origin_m).astype(np.float16)
+        return self._facing[keyframe]
+
     def __getitem__(self, piece: int) -> Piece:
         if piece not in self._made:
             T_anchor_map = self.pose(self.anchor(piece)).inverse()
             run = self.runs[piece]
             self._made[piece] = Piece(
-                [self.keyframes[k] for k in run], [T_anchor_map @ self.pose(k) for k in run]
+                [self.keyframes[k] for k in run],
+                [self.facing(k) for k in run],
+                [T_anchor_map @ self.pose(k) for k in run],
             )
             if len(self._made) > _CACHE:
                 self._made.popitem(last=False)

@@ -88,9 +88,10 @@ class TrueFloor:
         c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
         x, y = points[near, 0], points[near, 1]
         cells = session.grid.to_cell(np.column_stack((c * x - s * y, s * x + c * y)) + poses[:, :2])
-        cells = cells[((cells >= 0) & (cells < self._looks.shape)).all(axis=1)]
-        flat = np.unique(cells[:, 0] * self._looks.shape[1] + cells[:, 1])
-        self._looks.ravel()[flat] += 1
+        cells = cells[_within(cells, self._open)]
+        width = self._open.cells.shape[1]
+        once = np.unique(cells[:, 0] * width + cells[:, 1])  # however many returns a scan has there
+        self._looks[once // width, once % width] += 1
         pose = session.drive.pose(reading.time_s)
         step = (self._last or pose).inverse() @ pose
         if self._last and math.hypot(step.x, step.y) < _SIGHT_STEP_M and abs(step.yaw) < _SIGHT_STEP_RAD:
@@ -122,7 +123,7 @@ class TrueFloor:
         rows, columns = np.nonzero(grid.cells != UNKNOWN)
         known = np.column_stack((rows, columns))
         cells = plan.to_cell(T_plan_map.apply(grid.to_point(known)))
-        inside: BoolGrid = ((cells >= 0) & (cells < plan.cells.shape)).all(axis=1)
+        inside = _within(cells, plan)
         occupied, free = grid.occupied[rows, columns], grid.free[rows, columns]
         near_solid = _look_up(_grown(self._solid), cells, inside)
         seen = _look_up(_grown(self._seen), cells, inside)
@@ -171,6 +172,14 @@ def _around(counts: NDArray[np.int32]) -> F32:
     import cv2
 
     return cv2.boxFilter(counts.astype(np.float32), -1, (3, 3), normalize=False).astype(np.float32)
+
+
+def _within(cells: I64, grid: OccupancyGrid) -> BoolGrid:
+    """Which cells (N, 2) exist."""
+    height, width = grid.cells.shape
+    row, column = cells[:, 0], cells[:, 1]
+    inside: BoolGrid = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    return inside
 
 
 def _look_up(mask: BoolGrid, cells: I64, inside: BoolGrid) -> BoolGrid:

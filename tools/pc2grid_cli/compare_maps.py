@@ -113,11 +113,13 @@ def _run_all(tasks: list[dict[str, Any]], out: str, jobs: int) -> Iterator[None]
     """Yields once for each task that is done; in processes of their own if there is more than one job."""
     if jobs == 1 or len(tasks) < 2:
         for task in tasks:
-            yield _run(task, out)
+            _run(task, out)
+            yield
         return
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
         for future in as_completed([pool.submit(_run, task, out) for task in tasks]):
-            yield future.result()
+            future.result()
+            yield
 
 
 def _run(task: dict[str, Any], out: str) -> None:
