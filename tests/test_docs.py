@@ -99,6 +99,8 @@ NOT_RUN = {
     "make": "test_house.py looks at the Makefile; `make demo` takes minutes",
     "pc2grid compare paper": "needs the paper's maps, and hours",
     "pc2grid compare sensors": "needs the paper's maps, and an hour",
+    "pc2grid compare log": "needs a long recording with its truth",
+    "pc2grid compare maps": "drives hundreds of metres",
     "ros2": "needs ROS; test_example_nav2 has one that listens",
 }
 SHORTER = {"--length 20": "--length 1"}
