@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
+from pc2grid.errors import one_line
+
 OK, FAILED, USAGE, LOSSY, UNSURE, INTERRUPTED = 0, 1, 2, 3, 4, 130
 PIPE_CLOSED = 128 + signal.SIGPIPE
 
@@ -32,7 +34,7 @@ def note(message: str, *, level: int = 0) -> None:
 
 def warn(message: str) -> None:
     """Something that the user should know although it worked; shown even with -q."""
-    print(f"pc2grid: warning: {_one_line(message)}", file=sys.stderr)
+    print(f"pc2grid: warning: {one_line(message)}", file=sys.stderr)
 
 
 def print_json(document: Any) -> None:
@@ -108,9 +110,9 @@ def report_error(error: BaseException) -> int:
     else:
         message = f"internal error: {type(error).__name__}: {error}"
         hint, code = "this is a bug; run again with --debug and report what it prints", FAILED
-    print(f"pc2grid: error: {_one_line(message)}", file=sys.stderr)
+    print(f"pc2grid: error: {one_line(message)}", file=sys.stderr)
     if hint:
-        print(f"hint: {_one_line(hint)}", file=sys.stderr)
+        print(f"hint: {one_line(hint)}", file=sys.stderr)
     return code
 
 
@@ -150,10 +152,10 @@ def _pipe_closed() -> int:
 
 def _report_usage(error: Any) -> int:
     context = getattr(error, "ctx", None)
-    if type(error).__name__ == "NoArgsIsHelpError":  # its message is the help of the command
-        print(error.format_message() or context.get_help(), file=sys.stderr)
+    if type(error).__name__ == "NoArgsIsHelpError":
+        print(error.ctx.get_help(), file=sys.stderr)
         return USAGE
-    print(f"pc2grid: error: {_one_line(error.format_message())}", file=sys.stderr)
+    print(f"pc2grid: error: {one_line(error.format_message())}", file=sys.stderr)
     if context is not None:
         print(f"hint: {context.command_path} --help", file=sys.stderr)
     return USAGE
@@ -161,8 +163,3 @@ def _report_usage(error: Any) -> int:
 
 def _terminate(signum: int, frame: FrameType | None) -> None:
     raise SystemExit(128 + signum)
-
-
-def _one_line(text: str) -> str:
-    """No line breaks or control characters of a file's making reach the terminal."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(text))
