@@ -7,6 +7,11 @@ wrong and where; `hint` says what to type next.
 from __future__ import annotations
 
 
+def one_line(text: str) -> str:
+    """The text without line breaks and control characters, which names in a file may be made of."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
 class Pc2GridError(Exception):
     """Base of all errors of pc2grid.
 
@@ -19,9 +24,9 @@ class Pc2GridError(Exception):
     exit_code = 1
 
     def __init__(self, message: str, *, hint: str | None = None) -> None:
-        super().__init__(message)
-        self.message = message
-        self.hint = hint
+        self.message = one_line(message)
+        self.hint = None if hint is None else one_line(hint)
+        super().__init__(self.message)
 
     def __str__(self) -> str:
         return self.message if self.hint is None else f"{self.message} ({self.hint})"

@@ -17,6 +17,7 @@ import pytest
 from pc2grid.config import ReadConfig
 from pc2grid.errors import (
     ConfigError,
+    FrameError,
     LimitExceeded,
     LogCorrupt,
     LogNotFound,
@@ -73,6 +74,17 @@ def test_what_a_file_looks_like(tmp_path: Path, head: bytes, words: str) -> None
     path.write_bytes(head)
     with pytest.raises(NotALog, match=rf"a\.mcap: not a recording; looks like {words}"):
         open_log(path)
+
+
+def test_names_in_a_file_break_no_line(tmp_path: Path) -> None:
+    to = ros()
+    mount = to.tf(T0, "mast\x1b[31m", "li\ndar", 0.2, topic="/tf_static")
+    path = write_mcap(tmp_path / "a\nb.mcap", [mount, to.cloud("/points", T0, [[1, 2, 3]])])
+    with pytest.raises(FrameError) as caught:
+        read(path)
+    assert str(caught.value).isprintable()
+    assert r"there is: li\ndar, mast\x1b[31m" in caught.value.message
+    assert caught.value.message.count("a\\nb.mcap") == 1
 
 
 # --- structure of an MCAP -----------------------------------------------------------------------------

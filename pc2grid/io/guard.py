@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
-from pc2grid.errors import LogCorrupt, LogError, Pc2GridError
+from pc2grid.errors import LogCorrupt, LogError, Pc2GridError, one_line
 
 T = TypeVar("T")
 
 
 def adapted(path: Path, error: Exception) -> Pc2GridError:
     """The error to show for one that a decoder raised; ours only learn which recording they are about."""
-    if isinstance(error, LogError) and path.name not in error.message:
+    if isinstance(error, LogError) and one_line(path.name) not in error.message:
         return type(error)(f"{path}: {error.message}", hint=error.hint)
     if isinstance(error, Pc2GridError):
         return error
