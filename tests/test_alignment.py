@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pc2grid.alignment import NEUTRAL, assess, prepare, prepare_query, refine, search, thin_evenly
+from pc2grid.alignment import NEUTRAL, assess, likelihood, prepare, prepare_query, refine, search, thin_evenly
 from pc2grid.geometry import SE2
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from tests.drives import office, plan
@@ -26,6 +27,21 @@ def cut(center: tuple[float, float], half_m: float = 3.0) -> OccupancyGrid:
         resolution_m=crop.resolution_m,
         origin_m=(crop.origin_m[0] - center[0], crop.origin_m[1] - center[1]),
     )
+
+
+@pytest.mark.parametrize(("resolution_m", "sigma_m"), [(0.05, 0.1), (0.1, 0.1), (0.03, 0.07)])
+def test_the_field_is_what_opencv_s_exact_distance_gives(resolution_m: float, sigma_m: float) -> None:
+    cells = np.random.default_rng(0).choice([-1, 0, 50, 100], (90, 140), p=[0.2, 0.75, 0.03, 0.02])
+    cells[:, 100:] = np.where(cells[:, 100:] == 100, 0, cells[:, 100:])
+    grid = OccupancyGrid(cells=cells.astype(np.int8), resolution_m=resolution_m, origin_m=(0.0, 0.0))
+    free_of_walls = (~grid.occupied).astype(np.uint8)
+    distance = cv2.distanceTransform(free_of_walls, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    expected = np.exp(-0.5 * (distance * (resolution_m / sigma_m)) ** 2) * 255.0
+    expected[cells < 0] = np.maximum(expected[cells < 0], NEUTRAL * 255.0)
+    expected[(cells == 50)] = np.maximum(expected[cells == 50], NEUTRAL * 255.0)  # neither free nor occupied
+    field, known = likelihood(grid, sigma_m)
+    assert np.array_equal(field, expected.astype(np.uint8))
+    assert np.array_equal(known, (cells == 0) | (cells == 100))
 
 
 def all_poses() -> np.ndarray:
