@@ -85,7 +85,7 @@ def test_wrong_password_user_and_database(filled: str) -> None:
     server = postgresql.server()
     with postgresql.connect(filled) as connection:
         connection.execute("CREATE ROLE robot LOGIN PASSWORD 'right'")
-        rules = Path(server.pgdata) / "pg_hba.conf"
+        rules = server.data / "pg_hba.conf"
         rules.write_text("local all robot scram-sha-256\n" + rules.read_text())
         connection.execute("SELECT pg_reload_conf()")
     with pytest.raises(DatabaseUnreachable, match="user or password is not accepted") as caught:
@@ -97,7 +97,7 @@ def test_wrong_password_user_and_database(filled: str) -> None:
     with pytest.raises(DatabaseUnreachable, match="ghost"):
         open_database(with_user(filled, "ghost", ""))
     with pytest.raises(NotADatabase, match="does not exist") as caught:
-        open_database(server.get_uri(database="none"))
+        open_database(server.url("none"))
     assert "createdb none" in str(caught.value)
 
 
@@ -335,12 +335,12 @@ def test_killed_server_loses_nothing_that_was_stored(filled: str) -> None:
     writer.start()
     stored = [queue.get(timeout=60) for _ in range(4)]
     with open_database(filled) as reader:
-        postgresql.kill(Path(server.pgdata))
+        server.kill()
         with pytest.raises(DatabaseUnreachable, match="server went away"):
             reader.sessions()
     with pytest.raises(DatabaseUnreachable):
         open_database(filled)
-    server.ensure_postgres_running()
+    server.start()
     writer.join(60)
     while not isinstance(stored[-1], str):
         stored.append(queue.get(timeout=10))

