@@ -277,20 +277,23 @@ def nav2_map(yaml_path: Path) -> tuple[np.ndarray, float, tuple[float, float]]:
 
 
 def test_example_nav2(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Programs that say how they were called; both commands of pc2grid end with the file to write.
     tools = folder / "bin"
     tools.mkdir()
-    program = f"#!{sys.executable}\nfrom pc2grid_cli.main import main\nmain()\n"
-    for name, text in (
-        ("pc2grid", program),
-        ("ros2", '#!/bin/sh\nfor last; do :; done; echo "$last" > heard\n'),
-    ):
-        (tools / name).write_text(text)
+    called = '#!/bin/sh\necho "$@" >> called\nfor last; do :; done\n'
+    for name, does in (("pc2grid", 'echo "{}" > "$last"\n'), ("ros2", 'echo "$last" > heard\n')):
+        (tools / name).write_text(called + does)
         (tools / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tools}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(ROOT), str(ROOT / "tools"))))
     subprocess.run(["sh", ROOT / "examples" / "nav2.sh", "map.yaml", "tuesday.mcap"], check=True)
+    convert, locate, publish = Path("called").read_text().splitlines()
+    assert publish.startswith("topic pub --once /initialpose geometry_msgs/msg/PoseWithCovarianceStamped {}")
+    assert Path("heard").read_text() == "{}\n"
+    for command in (convert, locate):
+        Path(command.split()[-1]).unlink()
+        assert CliRunner().invoke(app, command.split(), catch_exceptions=False).exit_code == 0
 
-    pose = json.loads((folder / "heard").read_text())["pose"]["pose"]
+    pose = json.loads(Path("tuesday.initialpose.json").read_text())["pose"]["pose"]
     truth = list(pc2grid.read_tum("tuesday.tum").poses())[-1]
     x, y = pose["position"]["x"], pose["position"]["y"]
     yaw = 2 * math.atan2(pose["orientation"]["z"], pose["orientation"]["w"])
