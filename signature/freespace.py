@@ -95,38 +95,36 @@ def freespace_histogram(lengths_m: F32, radius_m: float, config: SignatureConfig
 
 
 @numba.njit(cache=True)
-def _in_sight(occupied: NDArray[np.bool_], r0: int, c0: int, r1: int, c1: int) -> bool:
-    """Whether the straight line between two cell centres meets no occupied cell.
+def _in_sight(occupied: NDArray[np.bool_], width: int, r0: int, c0: int, r1: int, c1: int) -> bool:
+    """Whether the straight line between two cell centres meets no occupied cell; `occupied` row by row.
 
     Visits every cell the line passes through, so it cannot slip through a wall one pixel wide; a line
     through the very corner of four cells is blocked only if both cells beside the corner are occupied.
     """
     dr, dc = abs(r1 - r0), abs(c1 - c0)
-    step_r, step_c = (1 if r1 > r0 else -1), (1 if c1 > c0 else -1)
-    r, c = r0, c0
+    down, across = (width if r1 > r0 else -width), (1 if c1 > c0 else -1)
+    at, end = np.uint64(r0 * width + c0), np.uint64(r1 * width + c1)
     lead = dr - dc  # > 0: the next border crossed is a row's
     while True:
-        if occupied[r, c]:
+        if occupied[at]:
             return False
-        if r == r1 and c == c1:
+        if at == end:
             return True
-        if lead > 0:
-            r += step_r
-            lead -= 2 * dc
-        elif lead < 0:
-            c += step_c
-            lead += 2 * dr
+        if lead != 0:
+            # By arithmetic: which border comes next is as good as random, and a wrong guess costs more.
+            row = np.int64(lead > 0)
+            at += np.uint64(across + row * (down - across))
+            lead += 2 * (dr - row * (dr + dc))
         else:
-            if occupied[r + step_r, c] and occupied[r, c + step_c]:
+            if occupied[at + np.uint64(down)] and occupied[at + np.uint64(across)]:
                 return False
-            r += step_r
-            c += step_c
+            at += np.uint64(down + across)
             lead += 2 * (dr - dc)
 
 
 @numba.njit(cache=True)
 def _adjacency(nodes: NDArray[np.int64], occupied: NDArray[np.bool_], reach: float) -> NDArray[np.float32]:
-    n = len(nodes)
+    n, flat, width = len(nodes), occupied.reshape(-1), occupied.shape[1]
     weights = np.full((n, n), np.float32(np.inf), np.float32)
     for i in range(n):
         weights[i, i] = 0.0
@@ -134,7 +132,7 @@ def _adjacency(nodes: NDArray[np.int64], occupied: NDArray[np.bool_], reach: flo
         for j in range(i + 1, n):
             r1, c1 = nodes[j]
             d = math.sqrt((r1 - r0) ** 2 + (c1 - c0) ** 2)
-            if d <= reach and _in_sight(occupied, r0, c0, r1, c1):
+            if d <= reach and _in_sight(flat, width, r0, c0, r1, c1):
                 weights[i, j] = d
                 weights[j, i] = d
     return weights
