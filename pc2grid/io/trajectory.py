@@ -48,7 +48,7 @@ def stamp_text(stamp_ns: int) -> str:
 
 
 def read_tum(path: str | Path) -> Trajectory:
-    """Read a TUM file; stamps must increase.
+    """Read a TUM file as poses of the base in the map frame, metres; stamps must increase.
 
     Raises TrajectoryFileError with the line that is wrong.
 
@@ -79,7 +79,9 @@ def read_tum(path: str | Path) -> Trajectory:
 
 
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:
-    """Write a TUM file: 9 decimals on the time, full precision on the rest, no trailing space.
+    """Write a TUM file: seconds with 9 decimals, metres, quaternions x y z w, no trailing space.
+
+    Raises OutputError if it cannot be written; an existing file is replaced.
 
     >>> write_tum("copy.tum", read_tum("tuesday.tum"))
     >>> len(read_tum("copy.tum")) == len(read_tum("tuesday.tum"))
@@ -92,7 +94,7 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
 
 
 def read_kitti(path: str | Path) -> F64:
-    """Read a KITTI pose file; returns (N, 4, 4).
+    """Read a KITTI pose file; returns (N, 4, 4), metres.
 
     Raises TrajectoryFileError with the line that is wrong.
     """
@@ -115,7 +117,9 @@ def read_kitti(path: str | Path) -> F64:
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
-    """Write a KITTI pose file: 12 numbers per line, row-major.
+    """Write a KITTI pose file: 12 numbers per line, the upper (3, 4) of each pose, row by row, metres.
+
+    Raises OutputError if it cannot be written; an existing file is replaced.
 
     >>> write_kitti("poses.txt", read_tum("tuesday.tum"))
     >>> len(read_kitti("poses.txt")) == len(read_tum("tuesday.tum"))
