@@ -92,6 +92,14 @@ class Server:
         """Of one of its databases."""
         return f"postgresql://postgres:@/{database}?host={self.folder}"
 
+    def cpu_s(self) -> float:
+        """CPU time that its processes of this moment have used so far."""
+        import psutil
+
+        process = psutil.Process(self._process.pid)
+        times = [one.cpu_times() for one in (process, *process.children())]
+        return float(sum(t.user + t.system for t in times))
+
     def kill(self) -> None:
         """As after a power cut: nothing is brought to an end."""
         self._process.send_signal(signal.SIGQUIT)
