@@ -26,8 +26,10 @@ import pytest
 
 from pc2grid.errors import DatabaseError, LogNotFound, MapFileError, NotADatabase, OutputError
 from pc2grid.io import open_log
+from pc2grid.io.mcap_out import LogWriter
 from pc2grid.io.nav2_map import load_map, save_map
-from pc2grid.model import OccupancyGrid
+from pc2grid.io.trajectory import write_kitti, write_tum
+from pc2grid.model import OccupancyGrid, Trajectory
 from pc2grid.simulate import SimulationConfig, simulate_session
 from signature.database import open_database
 from signature.database.sqlite import store
@@ -331,6 +333,46 @@ def test_disk_full_at_every_page_of_a_write(tmp_path: Path) -> None:
         assert list(tmp_path.iterdir()) == [path]
     store(path, [added], keep=True)
     assert path.read_bytes() == new
+
+
+def write_cloud_log(path: Path) -> None:
+    with LogWriter(path, force=True) as out:
+        out.point_cloud("/points", 10**18, "lidar", np.random.default_rng(1).random((500, 3), np.float32))
+
+
+EXPORTS: dict[str, Callable[[Path], object]] = {
+    "a.tum": lambda path: write_tum(path, TRAJECTORY),
+    "a.kitti": lambda path: write_kitti(path, TRAJECTORY),
+    "a.mcap": write_cloud_log,
+    "a.pgm": lambda path: save_map(small_house(), path.with_suffix("")),
+    "a.png": lambda path: save_map(small_house(), path.with_suffix(""), image_format="png"),
+}
+TRAJECTORY = Trajectory(stamps_ns=np.arange(200), T_map_base=np.stack([np.eye(4)] * 200))
+
+
+@pytest.mark.fault(39)
+@pytest.mark.parametrize("name", EXPORTS)
+@pytest.mark.parametrize("there", ["nothing", "an old one"])
+def test_disk_full_while_exporting(tmp_path: Path, name: str, there: str) -> None:
+    path = tmp_path / name
+    EXPORTS[name](path)
+    size = path.stat().st_size
+    for file in tmp_path.iterdir():
+        file.unlink()
+    if there == "an old one":
+        path.write_bytes(b"old")
+    before = {file: file.read_bytes() for file in tmp_path.iterdir()}
+
+    def export(limit: int) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+        with pytest.raises(OutputError, match=f"{name}: cannot write: File too large") as caught:
+            EXPORTS[name](path)
+        assert caught.value.hint
+
+    for limit in (0, 1, size // 2, size - 1):
+        status, said = in_child(lambda limit=limit: export(limit))
+        assert status == 0, said
+        assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
 @pytest.mark.fault(39)
