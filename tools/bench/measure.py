@@ -162,7 +162,6 @@ def machine() -> dict[str, str]:
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "commit": commit,
-        "load": f"{os.getloadavg()[0]:.1f} processes at the end, 1.0 of them this one",
         "threads": os.environ.get("OMP_NUM_THREADS", "default"),
         **{name: _version(name) for name in LIBRARIES},
     }

@@ -25,6 +25,15 @@ import reading
 from measure import ROOT, Row, machine, table
 
 Measure = Callable[[Path, bool], Iterator[Row]]
+
+
+def fleet_search(folder: Path, quick: bool) -> Iterator[Row]:
+    """As `fleet.fleet_search`; PostgreSQL's libraries are an extra."""
+    import fleet
+
+    yield from fleet.fleet_search(folder, quick)
+
+
 MEASURES: dict[str, Measure] = {
     "help": reading.help_time,
     "info": reading.info_time,
@@ -38,6 +47,7 @@ MEASURES: dict[str, Measure] = {
     "open": large.open_time,
     "relocalize": finding.relocalize_time,
     "peers": peers.compare,
+    "fleet": fleet_search,
 }
 
 
@@ -52,6 +62,8 @@ def main() -> None:
         "--out", type=Path, default=ROOT / "results", help="folder for bench.md and bench.json"
     )
     arguments = parser.parse_args()
+    facts = {"command": " ".join(["python tools/bench/run.py", *sys.argv[1:]]), **machine()}
+    facts["data"] = "with PC2GRID_DATA" if os.environ.get("PC2GRID_DATA") else "simulated only"
     rows: list[Row] = []
     for name in arguments.only or MEASURES:
         begin = time.perf_counter()
@@ -61,14 +73,18 @@ def main() -> None:
             except Exception as error:
                 rows.append(Row(what=name, measured=None, unit="", note=f"failed: {error}"))
         print(f"{name}: {time.perf_counter() - begin:.0f} s", file=sys.stderr)
-    facts = {"command": " ".join(["python tools/bench/run.py", *sys.argv[1:]]), **machine()}
-    facts["data"] = "with PC2GRID_DATA" if os.environ.get("PC2GRID_DATA") else "simulated only"
+        facts["load"] = f"{os.getloadavg()[0]:.1f} processes, one of them this"
+        write(arguments.out, rows, facts, quick=arguments.quick)
+    print((arguments.out / "bench.md").read_text(), end="")
+
+
+def write(folder: Path, rows: list[Row], facts: dict[str, str], *, quick: bool) -> None:
+    """What is known so far, as bench.md and bench.json; after every measure, for the whole takes long."""
+    folder.mkdir(parents=True, exist_ok=True)
     text = table(rows) + "\n\n" + "\n".join(f"{key}: {value}" for key, value in facts.items()) + "\n"
-    print(text, end="")
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / "bench.md").write_text(text)
-    document = {"machine": facts, "quick": arguments.quick, "rows": [row.to_json() for row in rows]}
-    (arguments.out / "bench.json").write_text(json.dumps(document, indent=1) + "\n")
+    (folder / "bench.md").write_text(text)
+    document = {"machine": facts, "quick": quick, "rows": [row.to_json() for row in rows]}
+    (folder / "bench.json").write_text(json.dumps(document, indent=1) + "\n")
 
 
 if __name__ == "__main__":
