@@ -16,8 +16,9 @@ from signature.answer import Status, Verdict
 from signature.confidence import CALIBRATION, RIVALS, Evidence
 from signature.config import Config
 from signature.database.protocol import Label
+from signature.places import Places
 from signature.query import QueryMap
-from signature.retrieve import Places, retrieve
+from signature.retrieve import retrieve
 from signature.verify import SAME_M, SAME_RAD, Hypothesis, carry_on, distinct, search_everywhere, verify
 
 if TYPE_CHECKING:

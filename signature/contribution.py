@@ -18,8 +18,8 @@ from pc2grid.geometry import F64, SE2
 from pc2grid.partition import view_at
 from signature.config import SignatureConfig
 from signature.describe import Signature, describe
+from signature.places import Places
 from signature.query import QueryMap
-from signature.retrieve import Places
 from signature.similarity import SignatureTable, histogram_distance, structural_factor
 
 if TYPE_CHECKING:

@@ -22,6 +22,7 @@ from pc2grid.sweep import Sweep
 
 if TYPE_CHECKING:
     from pc2grid.simulate import SimulationConfig
+_FITTED_M = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,9 +51,19 @@ class Driven:
         return np.concatenate(([0.0], np.cumsum(steps)))[: len(self)]
 
     def T_world_odom(self) -> SE2:
-        """Where the session's own frame truly lies, by the last scan whose truth is known."""
-        known = int(np.flatnonzero(~np.isnan(self.T_world_base[:, 0]))[-1])
-        return _pose(self.T_world_base[known]) @ _pose(self.T_odom_base[known]).inverse()
+        """Where the session's own frame truly lies at its end.
+
+        Fitted over the scans of the last `_FITTED_M` whose truth is known: a single heading, taken while the
+        robot turns, may be some degrees off.
+        """
+        path_m = self.path_m()
+        known = np.flatnonzero(~np.isnan(self.T_world_base[:, 0]))
+        known = known[path_m[known] >= path_m[known[-1]] - _FITTED_M]
+        ahead = np.array([(0.0, 0.0), (_FITTED_M, 0.0)])
+        return SE2.fit(
+            np.concatenate([_pose(self.T_odom_base[k]).apply(ahead) for k in known]),
+            np.concatenate([_pose(self.T_world_base[k]).apply(ahead) for k in known]),
+        )
 
     def scans(self) -> Iterator[tuple[RegisteredScan, Sweep, SE2]]:
         """Each scan (without its points), its sweep and its true pose, as they came."""

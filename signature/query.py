@@ -26,8 +26,9 @@ from signature.config import RelocalizeConfig, SignatureConfig
 from signature.describe import Signature, describe
 
 _CLEARANCE_M = 0.3
-PROFILE_BEARINGS = 90
-"""Rays of the isovists that are compared by their ranges: one every four degrees."""
+PROFILE_BEARINGS = 48
+"""Rays of the isovists that are compared by their ranges: one every 7.5 degrees, and a round number for
+the processor."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

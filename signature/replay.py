@@ -1,7 +1,7 @@
 """A real recording against itself: one part becomes the map, later parts are located in it.
 
 The truth is a trajectory that somebody else computed over the whole recording. It need not cover every
-scan; a query is judged at its last scan that it does cover.
+scan; a query is judged by the last of its scans that it does cover.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
 """Which places of the database look like the query's views?
 
-Two steps, cheap first. The three signatures (Eq. 6) rank all places; they know no direction and no
-order, so one matrix product serves a million of them. For the places on that shortlist the isovists'
-ranges are laid over each other at every rotation, rays that either side has not observed left out; the
-best overlap re-ranks them, and says how the query would have to be turned.
+Three steps, cheap first. The three signatures (Eq. 6) make a shortlist; they know no direction and no
+order, so one matrix product serves a million places. At the places on it the isovists' ranges are laid
+over each other at every rotation, from many standpoints, rays that either side has not observed left out.
+The best of these say where the whole query would lie, and there the other views have their say: the
+right place is where all of them find what they see.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numba
@@ -17,63 +17,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F64
-from pc2grid.model import F32, I64, OccupancyGrid
-from pc2grid.visibility import HIDDEN, isovist
+from pc2grid.model import F32, I64
+from pc2grid.visibility import HIDDEN
 from signature.config import RelocalizeConfig, SignatureConfig
-from signature.nearest import SignatureIndex
-from signature.query import PROFILE_BEARINGS, QueryMap
-from signature.similarity import SignatureTable
+from signature.places import Places, Standpoints
+from signature.query import QueryMap
 
-RANGE_SCALE_M = 0.4
-"""Half of the likeness is gone at this difference of two ranges: about the offset between a view and the
-nearest place of the database."""
-_SPREAD_FLOOR = 1e-3
+RANGE_SCALE_M = 0.25
+"""Half of the likeness is gone at this difference of two ranges, all of it at twice that: about the offset
+between a view and the nearest standpoint."""
 PRIOR_SHARE = 0.15
 """Rays' worth of doubt, as a share of the circle: a likeness of few common rays counts for less."""
-
-
-class Places:
-    """The places of a database, ready for retrieval.
-
-    table : their signatures. sight_m : how far their isovists reach.
-
-    A place is looked around at when it is first on a shortlist, so a large database is not gone through
-    before the first question, and what nobody asks for takes no memory.
-    """
-
-    def __init__(self, table: SignatureTable, grids: Mapping[int, OccupancyGrid], sight_m: float) -> None:
-        """grids : the map of each session, by session_index."""
-        self.table = table
-        self.sight_m = sight_m
-        self.index = SignatureIndex.of(table)
-        self._grids = grids
-        shape = (len(table), PROFILE_BEARINGS)
-        self._ranges_m, self._seen = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
-        self._known = np.zeros(len(table), np.bool_)
-
-    def around(self, rows: I64) -> tuple[F32, NDArray[np.bool_]]:
-        """Isovists of places: how far each ray reaches (K, B), and whether its end is known (K, B)."""
-        for i in rows[~self._known[rows]]:
-            x, y = self.table.center_m[i]
-            grid = self._grids[int(self.table.session_index[i])]
-            view = isovist(grid, (float(x), float(y)), self.sight_m, bearings=PROFILE_BEARINGS)
-            self._ranges_m[i], self._seen[i], self._known[i] = view.ranges_m, view.ends != HIDDEN, True
-        return self._ranges_m[rows], self._seen[rows]
+_SPREAD_FLOOR = 1e-3
+_LEADS = 150
+"""Placements that each view puts up for the vote."""
+_APART_M, _APART_RAD = 0.75, math.radians(15.0)
+"""Placements nearer than this are one."""
+_AGAINST = -1.0
+"""A view can speak against a placement by no more than this many standard deviations: what stood in its
+way may be somewhere else today."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proposal:
-    """A view of the query may be at a place of the database.
+    """The query may lie so that one of its views is at a place of the database.
 
-    view : index into the query's views. row : row of the table.
-    likeness : standard deviations above what the view finds on its whole shortlist.
-    yaw_rad : rotations from the query's frame into the map's under which they look alike, best first.
+    view : index into the query's views. row : row of the table. at_m : (x, y) where the view would be.
+    yaw_rad : rotation from the query's frame into the map's.
+    likeness : what all views have to say to it, in standard deviations above what they find anywhere.
     """
 
     view: int
     row: int
+    at_m: tuple[float, float]
+    yaw_rad: float
     likeness: float
-    yaw_rad: tuple[float, ...]
 
 
 def retrieve(
@@ -84,30 +62,154 @@ def retrieve(
     config: RelocalizeConfig,
     top_k: int | None = None,
 ) -> tuple[Proposal, ...]:
-    """The `top_k` (default `config.top_k`) most promising places, each with the view that likes it best.
+    """The `top_k` (default `config.top_k`) most promising placements of the query, no two alike.
 
-    Ties are broken by row, so equal inputs give equal answers.
+    Ties are broken by order, so equal inputs give equal answers.
     """
     if not query.views or not len(places.table):
         return ()
-    best: dict[int, Proposal] = {}
-    for index, view in enumerate(query.views):
-        found = places.index.nearest(view.signature, config.shortlist, signature)
-        rows, apart = found.rows, (found.scores - found.mean) / max(found.spread, 1e-12)
-        overlap = rotate_and_compare(view.profile.ranges_m, view.profile.ends != HIDDEN, *places.around(rows))
-        turns = peaks(overlap)
-        # The signatures keep their say: two places whose ranges agree are told apart by what lies between.
-        likeness = overlap.max(axis=1) * np.exp(-config.signature_weight * apart)
-        # A view that looks like everywhere says little, so each speaks by how far a place stands out to it.
-        likeness = (likeness - likeness.mean()) / (likeness.std() + _SPREAD_FLOOR)
-        for position, row in enumerate(rows):
-            value = float(likeness[position])
-            if int(row) not in best or value > best[int(row)].likeness:
-                best[int(row)] = Proposal(
-                    view=index, row=int(row), likeness=value, yaw_rad=tuple(turns[position].tolist())
-                )
-    ranked = sorted(best.values(), key=lambda p: (-p.likeness, p.row))
-    return tuple(ranked[: top_k or config.top_k])
+    shortlists = [places.index.nearest(v.signature, config.shortlist, signature) for v in query.views]
+    rows = np.unique(np.concatenate([s.rows for s in shortlists]))
+    stand = places.around(rows)
+    weight = np.empty((len(query.views), len(rows)), np.float32)
+    for view, shortlist in enumerate(shortlists):
+        apart = np.exp(
+            -config.signature_weight * (shortlist.scores - shortlist.mean) / max(shortlist.spread, 1e-12)
+        )
+        weight[view] = apart.min()  # what is not on its shortlist is no better than the last of it
+        weight[view, np.searchsorted(rows, shortlist.rows)] = apart
+    weight = weight[:, stand.place]
+    ranges = np.stack([v.profile.ranges_m for v in query.views])
+    seen = np.stack([v.profile.ends != HIDDEN for v in query.views])
+    leads, level, spread = [], [], []
+    for view in range(len(query.views)):
+        likeness = rotate_and_compare(ranges[view], seen[view], stand.ranges_m, stand.seen)
+        likeness *= weight[view, :, None]
+        best = likeness.max(axis=1)
+        level.append(float(best.mean()))
+        spread.append(float(best.std()) + _SPREAD_FLOOR)
+        leads.append(_leads(likeness, best))
+    placed = _Placements.of(query, stand, leads, ranges.shape[1])
+    voices = _voices(
+        placed.shift,
+        placed.beside,
+        ranges,
+        seen,
+        stand.ranges_m,
+        stand.seen,
+        weight,
+        RANGE_SCALE_M,
+        PRIOR_SHARE * ranges.shape[1],
+    )
+    # A view that looks like everywhere says little, so each speaks by how far a place stands out to it.
+    heard = np.where(voices >= 0.0, (voices - np.array(level)) / np.array(spread), 0.0)
+    votes = np.maximum(heard, _AGAINST).sum(axis=1)
+    chosen = _distinct(votes, placed.base_m, placed.yaw_rad, stand.session[placed.at], top_k or config.top_k)
+    return tuple(
+        Proposal(
+            view=int(placed.view[i]),
+            row=int(rows[stand.place[placed.at[i]]]),
+            at_m=(float(stand.at_m[placed.at[i], 0]), float(stand.at_m[placed.at[i], 1])),
+            yaw_rad=float(placed.yaw_rad[i]),
+            likeness=float(votes[i]),
+        )
+        for i in chosen
+    )
+
+
+def _leads(likeness: F32, best: F32) -> tuple[I64, I64]:
+    """The standpoints and rotations of the highest local maxima over the rotations of `likeness` (K, B)."""
+    top = np.argsort(-best, kind="stable")[:_LEADS]
+    rows = likeness[top]
+    local = (rows >= np.roll(rows, 1, axis=1)) & (rows > np.roll(rows, -1, axis=1))
+    at, shift = np.nonzero(local)
+    order = np.argsort(-rows[at, shift], kind="stable")[:_LEADS]
+    return top[at[order]], shift[order]
+
+
+@dataclass(frozen=True, slots=True)
+class _Placements:
+    """Ways to lay the query on a map, C of them, each by one of its views.
+
+    view, at, shift, yaw_rad (C,) : which view is put on which standpoint, turned by how many rays.
+    base_m : (C, 2) where that puts the base. beside : (C, V) the standpoint next to each view, K: none.
+    """
+
+    view: I64
+    at: I64
+    shift: I64
+    yaw_rad: F64
+    base_m: F64
+    beside: I64
+
+    @staticmethod
+    def of(query: QueryMap, stand: Standpoints, leads: list[tuple[I64, I64]], bearings: int) -> _Placements:
+        view = np.repeat(np.arange(len(leads)), [len(at) for at, _ in leads])
+        at = np.concatenate([at for at, _ in leads])
+        shift = np.concatenate([shift for _, shift in leads])
+        yaw = shift * (2.0 * math.pi / bearings)
+        base = (query.T_odom_base.x, query.T_odom_base.y)
+        points = np.array([*(v.center_m for v in query.views), base])
+        steps = points[None] - points[view][:, None]
+        c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+        turned = np.stack((c * steps[..., 0] - s * steps[..., 1], s * steps[..., 0] + c * steps[..., 1]), -1)
+        there = stand.at_m[at][:, None] + turned
+        views = there[:, :-1]
+        beside = stand.nearest(views, np.broadcast_to(stand.session[at][:, None], views.shape[:2]))
+        beside[np.arange(len(at)), view] = at
+        return _Placements(view, at, shift, yaw, there[:, -1], beside)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _voices(
+    shift: I64,
+    beside: I64,
+    ranges: F32,
+    seen: NDArray[np.bool_],
+    others: F32,
+    others_seen: NDArray[np.bool_],
+    weight: F32,
+    scale: float,
+    doubt: float,
+) -> F64:
+    """How well each view (V, B) likes what it would see in each placement (C, V); -1 where nobody knows.
+
+    A ray more or less of rotation is allowed, for the rotation is known to a ray only.
+    """
+    views, bearings = ranges.shape
+    inverse = 0.5 / scale
+    out = np.full((len(shift), views), -1.0)
+    for c in range(len(shift)):
+        for u in range(views):
+            j = beside[c, u]
+            if j >= len(others):
+                continue
+            for turn in range(-1, 2):
+                first = (shift[c] + turn) % bearings
+                total, count = 0.0, doubt
+                for k in range(bearings):
+                    m = first + k
+                    if m >= bearings:
+                        m -= bearings
+                    if seen[u, k] and others_seen[j, m]:
+                        total += max(0.0, 1.0 - abs(ranges[u, k] - others[j, m]) * inverse)
+                        count += 1.0
+                out[c, u] = max(out[c, u], total / count * weight[u, j])
+    return out
+
+
+def _distinct(votes: F64, base_m: F64, yaw_rad: F64, session: I64, most: int) -> list[int]:
+    """The placements with the most votes, best first, leaving out what lies beside a better one."""
+    left, chosen = votes.copy(), []
+    while len(chosen) < most:
+        i = int(np.argmax(left))
+        if left[i] == -np.inf:
+            break
+        chosen.append(i)
+        turn = np.abs((yaw_rad - yaw_rad[i] + math.pi) % (2 * math.pi) - math.pi)
+        near = (np.abs(base_m - base_m[i]).max(axis=1) < _APART_M) & (turn < _APART_RAD)
+        left[near & (session == session[i])] = -np.inf
+    return chosen
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
@@ -121,22 +223,21 @@ def _overlap(
 ) -> F32:
     n, bearings = others.shape
     out = np.empty((n, bearings), np.float32)
-    inverse, one = np.float32(1.0 / scale), np.float32(1.0)
-    own, counts = ranges * inverse, seen.astype(np.float32)
+    inverse, zero, one = np.float32(0.5 / scale), np.float32(0.0), np.float32(1.0)
+    # What one side has not seen is put farther from all else than the kernel reaches.
+    own, counts = np.where(seen, ranges * inverse, np.float32(1e6)), seen.astype(np.float32)
     # The other's rays twice over, so that every rotation is one straight run of them.
     other, known = np.empty(2 * bearings, np.float32), np.empty(2 * bearings, np.float32)
     for i in range(n):
         for k in range(bearings):
-            other[k] = other[k + bearings] = others[i, k] * inverse
+            there = others[i, k] * inverse if others_seen[i, k] else np.float32(-1e6)
+            other[k] = other[k + bearings] = there
             known[k] = known[k + bearings] = others_seen[i, k]
         for shift in range(bearings):
-            turned, both = other[shift : shift + bearings], known[shift : shift + bearings]
-            total, count = np.float32(0.0), np.float32(doubt)
+            total, count = zero, np.float32(doubt)
             for k in range(bearings):
-                weight = counts[k] * both[k]
-                d = own[k] - turned[k]
-                total += weight / (one + d * d)
-                count += weight
+                total += max(zero, one - abs(own[k] - other[shift + k]))
+                count += counts[k] * known[shift + k]
             out[i, shift] = total / count
     return out
 
@@ -146,7 +247,7 @@ def rotate_and_compare(
 ) -> F32:
     """Likeness (N, B), 0..1, of one isovist (B,) with others (N, B), for each rotation by 2 pi s / B.
 
-    Only rays whose ends both sides know are compared, by a Cauchy kernel of their difference.
+    Only rays whose ends both sides know are compared, by a triangular kernel of their difference.
     """
     result: F32 = _overlap(
         np.ascontiguousarray(ranges_m),
@@ -157,16 +258,3 @@ def rotate_and_compare(
         PRIOR_SHARE * len(ranges_m),
     )
     return result
-
-
-def peaks(overlap: F32, most: int = 4) -> F64:
-    """The rotations (N, most), radians, at which each row of `overlap` (N, B) has its highest local maxima.
-
-    A row with fewer maxima repeats its highest one.
-    """
-    local = (overlap >= np.roll(overlap, 1, axis=1)) & (overlap >= np.roll(overlap, -1, axis=1))
-    height = np.where(local, overlap, -1.0)
-    shifts = np.argsort(-height, axis=1, kind="stable")[:, :most]
-    missing = np.take_along_axis(height, shifts, axis=1) < 0
-    shifts = np.where(missing, shifts[:, :1], shifts)
-    return np.asarray(shifts * (2.0 * math.pi / overlap.shape[1]))

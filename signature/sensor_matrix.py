@@ -19,7 +19,7 @@ from pc2grid.partition import partition
 from pc2grid.pipeline import map_scans
 from signature.config import Config
 from signature.driven import Driven
-from signature.relocalize import Relocalizer
+from signature.relocalize import Relocalizer, Search
 from signature.trial import Mapped, Trial, judge
 
 if TYPE_CHECKING:
@@ -78,7 +78,8 @@ def query_trials(
 
     Maps of another building than `name` have no right answer; only the longest distance is asked there.
     """
-    relocalizer = Relocalizer(*(m.building for m in maps))
+    own = [m for m in maps if m.name == name]
+    relocalizer = Relocalizer(*(m.building for m in own))
     trials: list[Trial] = []
     path_m = driven.path_m()
     left = sorted(d for d in distances_m if d <= path_m[-1])
@@ -90,22 +91,24 @@ def query_trials(
         begin = time.perf_counter()
         query = relocalizer.query()
         describe_ms = 1000.0 * (time.perf_counter() - begin)
-        for mapped, search in zip(maps, relocalizer.searches, strict=True):
-            if mapped.name == name or not left:
-                begin = time.perf_counter()
-                answer = search.answer(query)
-                elapsed_ms = describe_ms + 1000.0 * (time.perf_counter() - begin)
-                trials.append(
-                    judge(
-                        mapped,
-                        query,
-                        answer,
-                        truth,
-                        building=name,
-                        query_sensor=driven.sensor,
-                        seed=seed,
-                        travel_m=travel_m,
-                        look_up_ms=elapsed_ms,
-                    )
+        searches = list(zip(own, relocalizer.searches, strict=True))
+        if not left:
+            searches += [(m, Search(m.building)) for m in maps if m.name != name]
+        for mapped, search in searches:
+            begin = time.perf_counter()
+            answer = search.answer(query)
+            elapsed_ms = describe_ms + 1000.0 * (time.perf_counter() - begin)
+            trials.append(
+                judge(
+                    mapped,
+                    query,
+                    answer,
+                    truth,
+                    building=name,
+                    query_sensor=driven.sensor,
+                    seed=seed,
+                    travel_m=travel_m,
+                    look_up_ms=elapsed_ms,
                 )
+            )
     return trials

@@ -13,11 +13,12 @@ from pc2grid.geometry import F64, SE2, wrap_angle
 from pc2grid.model import F32
 from pc2grid.windows import search_windows
 from signature.config import RelocalizeConfig
+from signature.places import Places
 from signature.query import QueryMap
-from signature.retrieve import Places, Proposal
+from signature.retrieve import Proposal
 
-_HALF_T_M = 0.5
-_HALF_A_RAD = math.radians(5.0)
+_HALF_T_M = 0.4
+_HALF_A_RAD = math.radians(8.0)
 _EVERY_RAD = math.radians(7.5)
 _FEW_POINTS = 128
 """Enough to rank poses coarsely; all points are used in the refinement."""
@@ -70,7 +71,7 @@ def verify(
         center = query.views[view].center_m
         points = coarse_points(query, center)
         rows = np.array([p.row for p in members])
-        starts = np.concatenate([_boxes(places.table.center_m[p.row], p.yaw_rad) for p in members])
+        starts = np.array([(*p.at_m, p.yaw_rad) for p in members])
         poses = search_windows(
             fields[session],
             points,
@@ -158,11 +159,6 @@ def coarse_points(query: QueryMap, center_m: tuple[float, float]) -> F32:
     if len(local) > _FEW_POINTS:
         local = local[np.linspace(0, len(local) - 1, _FEW_POINTS).astype(int)]
     return local
-
-
-def _boxes(center_m: F64, yaw_rad: Sequence[float]) -> F64:
-    """Boxes of poses (K, 3) around one place: half a metre each way, at each of the proposed headings."""
-    return np.array([(center_m[0], center_m[1], yaw) for yaw in dict.fromkeys(yaw_rad)])
 
 
 def _fitted(

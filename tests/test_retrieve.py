@@ -33,7 +33,7 @@ def test_the_right_place_is_among_the_first_twenty(field_deg: float) -> None:
     made_with = OFFICE.made_with
     query = seen.query(made_with.partition, made_with.signature)
     found = retrieve(query, OFFICE.places, signature=made_with.signature, config=OFFICE.config, top_k=20)
-    assert len({p.row for p in found}) == len(found) == 20
+    assert len(found) == 20
     assert [p.likeness for p in found] == sorted((p.likeness for p in found), reverse=True)
     right = [
         p
@@ -45,8 +45,30 @@ def test_the_right_place_is_among_the_first_twenty(field_deg: float) -> None:
         <= 1.0
     ]
     assert right
-    turns = [abs(math.remainder(yaw - T_map_query.yaw, 2 * math.pi)) for p in right for yaw in p.yaw_rad]
+    turns = [abs(math.remainder(p.yaw_rad - T_map_query.yaw, 2 * math.pi)) for p in right]
     assert min(turns) < math.radians(10)
+    bases = [SE2(*p.at_m, p.yaw_rad) @ SE2(*query.views[p.view].center_m).inverse() for p in found]
+    poses = [b @ query.T_odom_base for b in bases]
+    for i, a in enumerate(poses):
+        for b in poses[:i]:
+            turn = abs(math.remainder(a.yaw - b.yaw, 2 * math.pi))
+            assert max(abs(a.x - b.x), abs(a.y - b.y)) > 0.7 or turn > math.radians(14)
+
+
+def test_every_view_has_a_standpoint_beside_it_that_belongs_to_the_nearest_place() -> None:
+    places, grid = OFFICE.places, office()
+    rows = np.arange(len(places.table))
+    stand = places.around(rows)
+    cells = grid.to_cell(stand.at_m)
+    assert grid.free[cells[:, 0], cells[:, 1]].all()
+    apart = np.hypot(*(stand.at_m[:, None] - places.table.center_m[None]).transpose(2, 0, 1))
+    assert (apart[np.arange(len(apart)), stand.place] <= apart.min(axis=1) + 1e-9).all()
+    rng = np.random.default_rng(0)
+    on_the_way = rng.uniform((0.5, 6.6), (19.5, 7.4), (50, 2))
+    found = stand.nearest(on_the_way, np.zeros(50, np.int64))
+    assert (found < len(stand.at_m)).all()
+    assert np.hypot(*(stand.at_m[found] - on_the_way).T).max() <= 0.4
+    assert (stand.nearest(on_the_way, np.ones(50, np.int64)) == len(stand.at_m)).all()
 
 
 def test_views_lie_apart_and_on_what_was_seen() -> None:
@@ -83,16 +105,16 @@ def test_standing_still_adds_nothing() -> None:
 
 def test_isovists_are_compared_at_every_rotation_like_a_slow_oracle() -> None:
     rng = np.random.default_rng(0)
-    ranges, others = rng.uniform(1, 5, 90).astype(np.float32), rng.uniform(1, 5, (7, 90)).astype(np.float32)
-    seen, others_seen = rng.random(90) < 0.8, rng.random((7, 90)) < 0.8
+    ranges, others = rng.uniform(1, 5, 48).astype(np.float32), rng.uniform(1, 5, (7, 48)).astype(np.float32)
+    seen, others_seen = rng.random(48) < 0.8, rng.random((7, 48)) < 0.8
     others[3], others_seen[3] = np.roll(ranges, 20), np.roll(seen, 20)
     fast = rotate_and_compare(ranges, seen, others, others_seen)
     for i in range(7):
-        for shift in (0, 1, 20, 89):
+        for shift in (0, 1, 20, 47):
             other, known = np.roll(others[i], -shift), np.roll(others_seen[i], -shift)
             both = seen & known
-            kernel = 1 / (1 + ((ranges - other)[both] / 0.4) ** 2)
-            assert fast[i, shift] == pytest.approx(kernel.sum() / (both.sum() + 0.15 * 90), abs=1e-4)
+            kernel = np.maximum(0.0, 1.0 - np.abs(ranges - other)[both] / 0.5)
+            assert fast[i, shift] == pytest.approx(kernel.sum() / (both.sum() + 0.15 * 48), abs=1e-4)
     assert np.unravel_index(np.argmax(fast), fast.shape) == (3, 20)
 
 

@@ -1,0 +1,135 @@
+"""The places of a database, looked around at from many points when they are asked for.
+
+A signature hardly minds whether it is taken half a metre off; what the eye sees in a cluttered room does.
+So a place has one signature and many standpoints, close enough together for every view of a query to have
+one beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.geometry import F64
+from pc2grid.model import F32, I64, BoolGrid, OccupancyGrid
+from pc2grid.visibility import HIDDEN, isovist
+from signature.nearest import SignatureIndex
+from signature.query import PROFILE_BEARINGS
+from signature.similarity import SignatureTable
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+LATTICE_M = 0.4
+"""Between standpoints: a view is at most 0.28 m from one of them, less than a range is compared by."""
+_AROUND_M = 1.2
+"""A standpoint farther than this from every place belongs to none."""
+_CLEARANCE_M = 0.2
+_SESSION_M = 1e6
+"""Lifts the sessions apart, so that one search tree holds them all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Standpoints:
+    """Points to stand at, K of them, at some places of the database.
+
+    place : (K,) which of the places asked for each belongs to. at_m : (K, 2) in the map of `session` (K,).
+    ranges_m : (K, B) float32, how far each ray reaches. seen : (K, B) whether its end is known.
+    """
+
+    place: I64
+    at_m: F64
+    session: I64
+    ranges_m: F32
+    seen: NDArray[np.bool_]
+    tree: cKDTree
+
+    def nearest(self, at_m: F64, session: I64) -> I64:
+        """Index of the standpoint next to each of the points (..., 2) in the maps of `session` (...), or K
+        where there is none beside it."""
+        lifted = np.concatenate((at_m, _SESSION_M * session[..., None]), axis=-1)
+        _, found = self.tree.query(lifted, distance_upper_bound=LATTICE_M)
+        return np.asarray(found, np.int64)
+
+
+class Places:
+    """All places, ready for retrieval.
+
+    table : their signatures. sight_m : how far their isovists reach.
+
+    A place is looked around at when it is first on a shortlist, so a large database is not gone through
+    before the first question, and what nobody asks for takes no memory.
+    """
+
+    def __init__(self, table: SignatureTable, grids: Mapping[int, OccupancyGrid], sight_m: float) -> None:
+        """grids : the map of each session, by session_index."""
+        from scipy.spatial import cKDTree
+
+        self.table = table
+        self.sight_m = sight_m
+        self.index = SignatureIndex.of(table)
+        self._grids = grids
+        self._roomy = {session: _roomy(grid) for session, grid in grids.items()}
+        self._tree = cKDTree(np.column_stack((table.center_m, _SESSION_M * table.session_index)))
+        self._known: dict[int, tuple[F64, F32, NDArray[np.bool_]]] = {}
+        self._last: tuple[I64, Standpoints] | None = None
+
+    def around(self, rows: I64) -> Standpoints:
+        """The standpoints at places (R,), and what is seen from there."""
+        if self._last is not None and np.array_equal(self._last[0], rows):
+            return self._last[1]
+        from scipy.spatial import cKDTree
+
+        for row in rows.tolist():
+            if row not in self._known:
+                self._known[row] = self._look_around(row)
+        found = [self._known[row] for row in rows.tolist()]
+        counts = np.array([len(at) for at, _, _ in found], np.int64)
+        at_m, ranges_m, seen = (np.concatenate(part) for part in zip(*found, strict=True))
+        session = np.repeat(self.table.session_index[rows].astype(np.int64), counts)
+        standpoints = Standpoints(
+            np.repeat(np.arange(len(rows)), counts),
+            at_m,
+            session,
+            ranges_m,
+            seen,
+            cKDTree(np.column_stack((at_m, _SESSION_M * session))),
+        )
+        self._last = rows.copy(), standpoints
+        return standpoints
+
+    def _look_around(self, row: int) -> tuple[F64, F32, NDArray[np.bool_]]:
+        """The place itself, and the points of a lattice over its map that no other place is nearer to."""
+        center, session = self.table.center_m[row], int(self.table.session_index[row])
+        grid = self._grids[session]
+        steps = np.arange(np.floor(-_AROUND_M / LATTICE_M), np.ceil(_AROUND_M / LATTICE_M) + 1)
+        lattice = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        points = (np.round(center / LATTICE_M) + lattice) * LATTICE_M
+        lifted = np.column_stack((points, np.full(len(points), _SESSION_M * session)))
+        distance, owner = self._tree.query(lifted)
+        cells = grid.to_cell(points)
+        inside = ((cells >= 0) & (cells < grid.cells.shape)).all(axis=1)
+        inside &= (owner == row) & (distance <= _AROUND_M)
+        inside[inside] = self._roomy[session][cells[inside, 0], cells[inside, 1]]
+        at_m = np.concatenate((center[None], points[inside]))
+        views = [
+            isovist(grid, (float(x), float(y)), self.sight_m, bearings=PROFILE_BEARINGS) for x, y in at_m
+        ]
+        return (
+            at_m,
+            np.array([view.ranges_m for view in views]),
+            np.array([view.ends != HIDDEN for view in views]),
+        )
+
+
+def _roomy(grid: OccupancyGrid) -> BoolGrid:
+    """Free cells (H, W) with room for a robot's middle around them."""
+    import cv2
+
+    n = round(_CLEARANCE_M / grid.resolution_m)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * n + 1, 2 * n + 1))
+    return np.asarray(cv2.erode(grid.free.astype(np.uint8), kernel), bool)
