@@ -93,12 +93,13 @@ class Server:
         return f"postgresql://postgres:@/{database}?host={self.folder}"
 
     def cpu_s(self) -> float:
-        """CPU time that its processes of this moment have used so far."""
+        """CPU time that all its processes have used so far."""
         import psutil
 
-        process = psutil.Process(self._process.pid)
-        times = [one.cpu_times() for one in (process, *process.children())]
-        return float(sum(t.user + t.system for t in times))
+        first = psutil.Process(self._process.pid)
+        living = [process.cpu_times() for process in (first, *first.children())]
+        ended = first.cpu_times()
+        return float(sum(t.user + t.system for t in living) + ended.children_user + ended.children_system)
 
     def kill(self) -> None:
         """As after a power cut: nothing is brought to an end."""

@@ -47,20 +47,31 @@ def measured(count: int, seconds: float) -> Iterator[Row]:
     queries = [disturbed(signatures, int(row), rng) for row in chosen]
     with server() as made:
         url = made.url()
-        begin = time.perf_counter()
+        begin, cpu = time.perf_counter(), made.cpu_s() + time.process_time()
         fill(url, signatures)
-        loaded = time.perf_counter()
+        loaded, fill_s = time.perf_counter(), made.cpu_s() + time.process_time() - cpu
         with postgres_schema.connect(url, url) as connection:
             postgres_schema.inspect(connection, url)
+            cpu = made.cpu_s()
             index(connection, signatures)
-            built = time.perf_counter()
+            built, index_s = time.perf_counter(), made.cpu_s() - cpu
             sizes = connection.execute(
                 "SELECT pg_total_relation_size('pc2grid.signature') - pg_relation_size(o),"
                 " pg_relation_size(o) FROM (SELECT 'pc2grid.signature_embedding'::regclass AS o)"
             ).fetchone()
         what = f"{count} submaps in PostgreSQL"
-        yield Row(what=f"{what}: load", measured=1e6 * (loaded - begin) / count, unit="us each")
-        yield Row(what=f"{what}: build the index", measured=1e6 * (built - loaded) / count, unit="us each")
+        yield Row(
+            what=f"{what}: load",
+            measured=1e6 * (loaded - begin) / count,
+            cpu=1e6 * fill_s / count,
+            unit="us each",
+        )
+        yield Row(
+            what=f"{what}: build the index",
+            measured=1e6 * (built - loaded) / count,
+            cpu=1e6 * index_s / count,
+            unit="us each",
+        )
         yield Row(what=f"{what}: signatures on disk", measured=sizes[0] / count, unit="bytes each")
         yield Row(what=f"{what}: index", measured=sizes[1] / count, unit="bytes each")
         yield from searched(what, made, signatures, queries, chosen)
@@ -115,12 +126,10 @@ def searched(
 def at_once(what: str, made: Any, queries: Sequence[Signature], seconds: float) -> Iterator[Row]:
     """Many clients, each a process with a connection of its own, asking one query after the other."""
     context = multiprocessing.get_context("fork")
-    ready, go, done = context.Barrier(CLIENTS + 1), context.Event(), context.Event()
+    ready, go = context.Barrier(CLIENTS + 1), context.Event()
     answers = context.Queue()
     clients = [
-        context.Process(
-            target=_client, args=(made.url(), queries[k::CLIENTS], seconds, (ready, go, done), answers)
-        )
+        context.Process(target=_client, args=(made.url(), queries[k::CLIENTS], seconds, ready, go, answers))
         for k in range(CLIENTS)
     ]
     for client in clients:
@@ -129,6 +138,8 @@ def at_once(what: str, made: Any, queries: Sequence[Signature], seconds: float) 
     server_s = made.cpu_s()
     go.set()
     counts, cpu_s, latencies = zip(*(answers.get() for _ in clients), strict=True)
+    for client in clients:
+        client.join()
     server_s = made.cpu_s() - server_s
     total = sum(counts)
     p95 = 1e3 * float(np.percentile(np.concatenate(latencies), 95))
@@ -139,13 +150,11 @@ def at_once(what: str, made: Any, queries: Sequence[Signature], seconds: float) 
         note=f"95 %: {p95:.3g} ms; CPU a query: {1e3 * server_s / total:.3g} ms on the server,"
         f" {1e3 * sum(cpu_s) / total:.3g} ms in the client",
     )
-    done.set()
-    for client in clients:
-        client.join()
 
 
-def _client(url: str, queries: Sequence[Signature], seconds: float, signals: Any, answers: Any) -> None:
-    ready, go, done = signals
+def _client(
+    url: str, queries: Sequence[Signature], seconds: float, ready: Any, go: Any, answers: Any
+) -> None:
     with open_database(url) as database:
         database.nearest(queries[0], K)
         ready.wait()
@@ -155,7 +164,6 @@ def _client(url: str, queries: Sequence[Signature], seconds: float, signals: Any
             database.nearest(queries[len(times) % len(queries)], K)
             times.append(time.perf_counter() - now)
         answers.put((len(times), time.process_time() - cpu, np.array(times)))
-        done.wait()  # the server counts its processes' time while they are there
 
 
 def number_of(session: str, submap_id: int) -> int:
