@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from pc2grid.config import ProjectionConfig
 from pc2grid.floor import Ground
 from pc2grid.geometry import F64
-from pc2grid.model import F32
+from pc2grid.model import F32, SensorKind
 
 BEARINGS = 1440  # a wall seen along itself needs them fine: a quarter of a degree is a cell at 12 m
+_CAMERA_NOISE_PER_M2 = 0.0015  # of a depth, as in stereo and structured light; standard deviation
 _GAP_BINS = 5  # beams up to 1.5 degrees apart count as looking in between
 
 
@@ -55,6 +56,7 @@ def flatten(
     sensor_m: F64,
     ground: Ground | None,
     config: ProjectionConfig,
+    sensor: SensorKind = "lidar",
 ) -> Sweep:
     """Reduce points to the plane.
 
@@ -63,20 +65,23 @@ def flatten(
 
     A bearing is free up to its nearest obstacle; without an obstacle, as far as the farthest return on
     the floor or, for a ray that climbs to a ceiling or an overhang, to where it leaves the height band.
+    Obstacle points above each other, as far apart as the noise of a `sensor` makes them, are one hit in
+    their middle: thirty pixels on a wall say where it is five times as well as each of them.
     """
-    sensor = np.asarray(sensor_m, dtype=np.float64)
+    origin = np.asarray(sensor_m, dtype=np.float64)
     if ground is None:
         plane, sensor_height = np.zeros(4), 0.0
         band = (-np.inf, np.inf)
         cell_m = 0.5 * config.resolution_m  # a laser's beams are few: keep nearly all of them
     else:
         plane = np.array([*ground.normal, ground.offset_m])
-        sensor_height = float(ground.heights(sensor[None, :])[0])
+        sensor_height = float(ground.heights(origin[None, :])[0])
         band = (config.band_min_m, config.band_max_m)
         cell_m = config.resolution_m
     points = np.asarray(points_m, dtype=np.float32)
-    free, hits = _scatter(points, sensor, sensor_height, plane, *band, config.max_range_m, cell_m)
-    return Sweep(stamp_ns=stamp_ns, hits_m=hits, origin_m=sensor[:2].copy(), free_m=free)
+    noise = _CAMERA_NOISE_PER_M2 if sensor == "depth" else 0.0
+    free, hits = _scatter(points, origin, sensor_height, plane, *band, config.max_range_m, cell_m, noise)
+    return Sweep(stamp_ns=stamp_ns, hits_m=hits, origin_m=origin[:2].copy(), free_m=free)
 
 
 @njit(cache=True)
@@ -89,54 +94,88 @@ def _scatter(
     band_max: float,
     limit: float,
     cell_m: float,
+    noise: float,
 ) -> tuple[F32, F32]:
-    """How far each bearing is free, and the mean of the obstacle points in each cell, first seen first."""
+    """How far each bearing is free, and the obstacle points, about one a cell."""
     nearest = np.full(BEARINGS, np.inf)
     reach = np.zeros(BEARINGS)
     count = points.shape[0]
-    mask = 1
-    while mask < 2 * count + 2:
-        mask *= 2
-    slots = np.full(mask, -1, dtype=np.int32)  # a hash table of cells
-    mask -= 1
-    keys = np.empty(count, dtype=np.int64)
-    sums = np.zeros((count, 3))
-    used = 0
+    bearings = np.empty(count, dtype=np.int32)
+    ranges = np.empty(count)
+    starts = np.zeros(BEARINGS + 1, dtype=np.int64)
     for k in range(count):
         px, py = float(points[k, 0]), float(points[k, 1])
         x, y = px - sensor[0], py - sensor[1]
-        distance = math.hypot(x, y)
+        ranges[k] = distance = math.hypot(x, y)
         bearing = round(math.atan2(y, x) * (BEARINGS / (2.0 * math.pi))) % BEARINGS
         height = plane[0] * px + plane[1] * py + plane[2] * points[k, 2] + plane[3]
+        bearings[k] = -1
         if height < band_min:
             reach[bearing] = max(reach[bearing], distance)
-            continue
-        if height > band_max:
+        elif height > band_max:
             if sensor_height < band_max:
                 part = (band_max - sensor_height) / (height - sensor_height)
                 reach[bearing] = max(reach[bearing], distance * part)
-            continue
-        nearest[bearing] = min(nearest[bearing], distance)
-        if distance > limit:
-            continue
-        key = math.floor(px / cell_m) * (1 << 32) + math.floor(py / cell_m)
+        else:
+            nearest[bearing] = min(nearest[bearing], distance)
+            if distance <= limit:
+                bearings[k] = bearing
+                starts[bearing + 1] += 1
+    starts = np.cumsum(starts)
+    column = np.empty(starts[-1], dtype=np.int64)
+    filled = starts.copy()
+    for k in range(count):
+        if bearings[k] >= 0:
+            column[filled[bearings[k]]] = k
+            filled[bearings[k]] += 1
+    surfaces = np.empty((len(column), 3))
+    found = 0
+    for bearing in range(BEARINGS):
+        members = column[starts[bearing] : starts[bearing + 1]]
+        members = members[np.argsort(ranges[members])]
+        first = 0.0
+        for place in range(len(members)):
+            k = members[place]
+            depth = cell_m + 4.0 * noise * ranges[k] * ranges[k]
+            if place == 0 or ranges[k] - first > depth:
+                first = ranges[k]
+                surfaces[found] = 0.0
+                found += 1
+            surfaces[found - 1, 0] += points[k, 0]
+            surfaces[found - 1, 1] += points[k, 1]
+            surfaces[found - 1, 2] += 1.0
+    free = np.where(np.isfinite(nearest), nearest, reach)
+    _fill_gaps(free)
+    return np.minimum(free, limit).astype(np.float32), _one_per_cell(surfaces[:found], cell_m)
+
+
+@njit(cache=True)
+def _one_per_cell(sums: F64, cell_m: float) -> F32:
+    """The means (M, 2) of all that falls into each cell, first seen first; sums (N, 3) of x, y and number."""
+    mask = 1
+    while mask < 2 * len(sums) + 2:
+        mask *= 2
+    slots = np.full(mask, -1, dtype=np.int32)  # a hash table of cells
+    mask -= 1
+    keys = np.empty(len(sums), dtype=np.int64)
+    total = np.zeros((len(sums), 3))
+    used = 0
+    for x, y, n in sums:
+        key = math.floor(x / n / cell_m) * (1 << 32) + math.floor(y / n / cell_m)
         slot = (key * -7046029254386353131 >> 20) & mask
         while slots[slot] >= 0 and keys[slots[slot]] != key:
             slot = (slot + 1) & mask
         if slots[slot] < 0:
             slots[slot], keys[used] = used, key
             used += 1
-        cell = sums[slots[slot]]
-        cell[0] += px
-        cell[1] += py
-        cell[2] += 1.0
-    free = np.where(np.isfinite(nearest), nearest, reach)
-    _fill_gaps(free)
+        total[slots[slot], 0] += x
+        total[slots[slot], 1] += y
+        total[slots[slot], 2] += n
     hits = np.empty((used, 2), dtype=np.float32)
     for k in range(used):
-        hits[k, 0] = sums[k, 0] / sums[k, 2]
-        hits[k, 1] = sums[k, 1] / sums[k, 2]
-    return np.minimum(free, limit).astype(np.float32), hits
+        hits[k, 0] = total[k, 0] / total[k, 2]
+        hits[k, 1] = total[k, 1] / total[k, 2]
+    return hits
 
 
 @njit(cache=True)

@@ -255,7 +255,14 @@ class Tracker:
             level = points @ R[:3, :3].T.astype(np.float32)
             sensor = R[:3, :3] @ sensor
             ground = self._ground.moved(R)
-        return flatten(level, stamp_ns=scan.stamp_ns, sensor_m=sensor, ground=ground, config=self._projection)
+        return flatten(
+            level,
+            stamp_ns=scan.stamp_ns,
+            sensor_m=sensor,
+            ground=ground,
+            config=self._projection,
+            sensor=scan.sensor,
+        )
 
     def _refine(
         self, sweep: Sweep, guess: SE2, predicted: F64, odometry: F64 | None
