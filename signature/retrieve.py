@@ -200,7 +200,8 @@ def _voices(
 
 def _distinct(votes: F64, base_m: F64, yaw_rad: F64, session: I64, most: int) -> list[int]:
     """The placements with the most votes, best first, leaving out what lies beside a better one."""
-    left, chosen = votes.copy(), []
+    chosen: list[int] = []
+    left = votes.copy()
     while len(chosen) < most:
         i = int(np.argmax(left))
         if left[i] == -np.inf:
