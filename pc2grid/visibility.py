@@ -55,6 +55,7 @@ def _cast(
 ) -> tuple[F32, NDArray[np.int8]]:
     """Walk each ray half a cell at a time; all lengths in cells."""
     height, width = cells.shape
+    flat = np.ascontiguousarray(cells).reshape(-1)
     ranges = np.empty(bearings, dtype=np.float32)
     ends = np.empty(bearings, dtype=np.int8)
     step = 0.5
@@ -69,11 +70,10 @@ def _cast(
             r += dr
             c += dc
             length += step
-            i, j = int(np.floor(r)), int(np.floor(c))
-            if i < 0 or j < 0 or i >= height or j >= width:
+            if not (0.0 <= r < height and 0.0 <= c < width):
                 end = -1
                 break
-            value = cells[i, j]
+            value = flat[np.uint64(r) * np.uint64(width) + np.uint64(c)]
             if value >= 65:
                 end = 1
                 known = length
