@@ -6,6 +6,8 @@ import base64
 import itertools
 import json
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import cv2
@@ -153,3 +155,26 @@ def test_a_map_of_nothing_still_has_a_page(tmp_path: Path) -> None:
     with open_database(tmp_path / "x.submaps") as opened:
         (only,) = contents(opened)["sessions"]
     assert only["submaps"] == [] and only["path"] == [] and only["graph"] == {"nodes": [], "edges": []}
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
+@pytest.mark.parametrize("size", ["1280,900", "390,844"])
+def test_a_browser_has_nothing_to_complain_about(
+    database: SubmapDatabase, found: Found, tmp_path: Path, size: str
+) -> None:
+    write_report(tmp_path / "page.html", database, found=found)
+    assert CHROMIUM is not None
+    done = subprocess.run(
+        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
+         "--enable-logging=stderr", "--virtual-time-budget=3000", f"--window-size={size}", "--dump-dom",
+         f"file://{tmp_path / 'page.html'}"],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    assert [line for line in done.stderr.splitlines() if "CONSOLE" in line] == []
+    shown = re.sub(r"<script>.*?</script>", "", done.stdout, flags=re.S)
+    for words in ("part.yaml in two.submaps", "submap centres", "query: walls as located", "Submap "):
+        assert words in shown
+    assert "NaN" not in shown and "Infinity" not in shown
