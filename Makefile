@@ -7,6 +7,7 @@ READY = .venv/.ready
 # Two workers on two cores: the numeric libraries must not each start as many threads as there are cores.
 ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 PYTEST_ARGS ?=
+BENCH_ARGS ?=
 
 .PHONY: help demo test check bench fuzz picture clean
 .DEFAULT_GOAL = help
@@ -15,7 +16,7 @@ help:
 	@echo 'make demo    simulate two robots, map with one, find the other; leaves a picture in demo_out/'
 	@echo 'make test    run the tests (PYTEST_ARGS="-k name" for some of them)'
 	@echo 'make check   lint, format, types, import order'
-	@echo 'make bench   measure against the goals and the peers'
+	@echo 'make bench   measure against the goals and the peers (BENCH_ARGS="--only convert --quick" for some of it)'
 	@echo 'make fuzz    the long search for inputs that break it'
 	@echo 'make picture draw the modules and what they import: examples/architecture.svg'
 	@echo 'make clean   remove .venv and everything that was made'
@@ -38,7 +39,8 @@ check: $(READY)
 	$(BIN)/lint-imports
 
 bench: $(READY)
-	$(BIN)/python tools/bench/run.py
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[bench,postgres]'
+	$(ONE_THREAD) $(BIN)/python tools/bench/run.py $(BENCH_ARGS)
 
 fuzz: $(READY)
 	PC2GRID_FUZZ=20000 $(BIN)/python -m pytest -q -n auto -k fuzz --timeout 1200 $(PYTEST_ARGS)
