@@ -163,12 +163,14 @@ class Converted(TypedDict):
 
 
 class Convert(TypedDict):
-    """`pc2grid convert --json`."""
+    """`pc2grid convert --json`. unchanged: sessions that were stored already; failed: inputs left out."""
 
     schema_version: Version
     database: str
     lossy: bool
     sessions: list[Converted]
+    unchanged: list[str]
+    failed: list[str]
 
 
 class Session(TypedDict):
