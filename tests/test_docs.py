@@ -25,6 +25,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from rosbags.typesys import Stores, get_typestore
 from typer.main import get_command
 from typer.testing import CliRunner
 
@@ -332,6 +333,14 @@ def test_foxglove_shows_what_the_layout_names(folder: Path) -> None:
         with (folder / name).open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
             return [(c.topic, m.log_time, d) for _, c, m, d in reader.iter_decoded_messages()]
+
+    # Another implementation, with definitions of its own, reads every message to its last byte.
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name in ("map.mcap", "answer.mcap"):
+        with (folder / name).open("rb") as stream:
+            for kind, _, message in make_reader(stream).iter_messages():
+                again = store.serialize_cdr(store.deserialize_cdr(message.data, kind.name), kind.name)
+                assert bytes(again) == message.data, kind.name
 
     answer = read("answer.mcap")
     topics = {topic for topic, _, _ in answer}
