@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +20,8 @@ from signature.nearest import SignatureIndex
 from signature.query import PROFILE_BEARINGS
 from signature.similarity import SignatureTable
 
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
-
 LATTICE_M = 0.4
-"""Between standpoints: a view is at most 0.28 m from one of them, less than a range is compared by."""
+"""Between standpoints: a view is at most 0.28 m from one of them, about what ranges are compared by."""
 _AROUND_M = 1.2
 """A standpoint farther than this from every place belongs to none."""
 _CLEARANCE_M = 0.2
@@ -39,6 +35,8 @@ class Standpoints:
 
     place : (K,) which of the places asked for each belongs to. at_m : (K, 2) in the map of `session` (K,).
     ranges_m : (K, B) float32, how far each ray reaches. seen : (K, B) whether its end is known.
+    rasters : by session, the index of the standpoint in each square of the lattice, K where there is none,
+    and the (column, row) of its first square.
     """
 
     place: I64
@@ -46,14 +44,34 @@ class Standpoints:
     session: I64
     ranges_m: F32
     seen: NDArray[np.bool_]
-    tree: cKDTree
+    rasters: Mapping[int, tuple[I64, I64]]
 
-    def nearest(self, at_m: F64, session: I64) -> I64:
-        """Index of the standpoint next to each of the points (..., 2) in the maps of `session` (...), or K
-        where there is none beside it."""
-        lifted = np.concatenate((at_m, _SESSION_M * session[..., None]), axis=-1)
-        _, found = self.tree.query(lifted, distance_upper_bound=LATTICE_M)
-        return np.asarray(found, np.int64)
+    @staticmethod
+    def of(place: I64, at_m: F64, session: I64, ranges_m: F32, seen: NDArray[np.bool_]) -> Standpoints:
+        """Standpoints with their rasters; in a square with several the one next to its middle counts."""
+        squares = np.rint(at_m / LATTICE_M)
+        off = np.abs(squares * LATTICE_M - at_m).max(axis=1)
+        rasters = {}
+        for number in np.unique(session).tolist():
+            members = np.flatnonzero(session == number)
+            members = members[np.argsort(-off[members], kind="stable")]
+            inside = squares[members].astype(np.int64)
+            low = inside.min(axis=0)
+            raster = np.full(inside.max(axis=0) - low + 1, len(at_m), np.int64)
+            raster[tuple((inside - low).T)] = members
+            rasters[number] = raster, low
+        return Standpoints(place, at_m, session, ranges_m, seen, rasters)
+
+    def beside(self, at_m: F64, session: I64) -> I64:
+        """Index of the standpoint in the square of each of the points (..., 2) in the maps of `session`
+        (...), or K where there is none."""
+        found = np.full(session.shape, len(self.at_m), np.int64)
+        squares = np.rint(at_m / LATTICE_M).astype(np.int64)
+        for number, (raster, low) in self.rasters.items():
+            index = squares - low
+            inside = (session == number) & ((index >= 0) & (index < raster.shape)).all(axis=-1)
+            found[inside] = raster[tuple(index[inside].T)]
+        return found
 
 
 class Places:
@@ -82,8 +100,6 @@ class Places:
         """The standpoints at places (R,), and what is seen from there."""
         if self._last is not None and np.array_equal(self._last[0], rows):
             return self._last[1]
-        from scipy.spatial import cKDTree
-
         for row in rows.tolist():
             if row not in self._known:
                 self._known[row] = self._look_around(row)
@@ -91,14 +107,8 @@ class Places:
         counts = np.array([len(at) for at, _, _ in found], np.int64)
         at_m, ranges_m, seen = (np.concatenate(part) for part in zip(*found, strict=True))
         session = np.repeat(self.table.session_index[rows].astype(np.int64), counts)
-        standpoints = Standpoints(
-            np.repeat(np.arange(len(rows)), counts),
-            at_m,
-            session,
-            ranges_m,
-            seen,
-            cKDTree(np.column_stack((at_m, _SESSION_M * session))),
-        )
+        place = np.repeat(np.arange(len(rows)), counts)
+        standpoints = Standpoints.of(place, at_m, session, ranges_m, seen)
         self._last = rows.copy(), standpoints
         return standpoints
 

@@ -29,7 +29,7 @@ between a view and the nearest standpoint."""
 PRIOR_SHARE = 0.15
 """Rays' worth of doubt, as a share of the circle: a likeness of few common rays counts for less."""
 _SPREAD_FLOOR = 1e-3
-_LEADS = 150
+_LEADS = 100
 """Placements that each view puts up for the vote."""
 _APART_M, _APART_RAD = 0.75, math.radians(15.0)
 """Placements nearer than this are one."""
@@ -104,7 +104,8 @@ def retrieve(
     # A view that looks like everywhere says little, so each speaks by how far a place stands out to it.
     heard = np.where(voices >= 0.0, (voices - np.array(level)) / np.array(spread), 0.0)
     votes = np.maximum(heard, _AGAINST).sum(axis=1)
-    chosen = _distinct(votes, placed.base_m, placed.yaw_rad, stand.session[placed.at], top_k or config.top_k)
+    order = np.argsort(-votes, kind="stable")
+    chosen = _distinct(order, placed.base_m, placed.yaw_rad, stand.session[placed.at], top_k or config.top_k)
     return tuple(
         Proposal(
             view=int(placed.view[i]),
@@ -155,7 +156,7 @@ class _Placements:
         turned = np.stack((c * steps[..., 0] - s * steps[..., 1], s * steps[..., 0] + c * steps[..., 1]), -1)
         there = stand.at_m[at][:, None] + turned
         views = there[:, :-1]
-        beside = stand.nearest(views, np.broadcast_to(stand.session[at][:, None], views.shape[:2]))
+        beside = stand.beside(views, np.broadcast_to(stand.session[at][:, None], views.shape[:2]))
         beside[np.arange(len(at)), view] = at
         return _Placements(view, at, shift, yaw, there[:, -1], beside)
 
@@ -198,19 +199,25 @@ def _voices(
     return out
 
 
-def _distinct(votes: F64, base_m: F64, yaw_rad: F64, session: I64, most: int) -> list[int]:
-    """The placements with the most votes, best first, leaving out what lies beside a better one."""
-    chosen: list[int] = []
-    left = votes.copy()
-    while len(chosen) < most:
-        i = int(np.argmax(left))
-        if left[i] == -np.inf:
-            break
-        chosen.append(i)
-        turn = np.abs((yaw_rad - yaw_rad[i] + math.pi) % (2 * math.pi) - math.pi)
-        near = (np.abs(base_m - base_m[i]).max(axis=1) < _APART_M) & (turn < _APART_RAD)
-        left[near & (session == session[i])] = -np.inf
-    return chosen
+@numba.njit(cache=True, nogil=True)
+def _distinct(order: I64, base_m: F64, yaw_rad: F64, session: I64, most: int) -> I64:
+    """The first `most` of placements in `order`, leaving out what lies beside one before it."""
+    chosen = np.empty(most, np.int64)
+    count = 0
+    for i in order:
+        alone = True
+        for k in chosen[:count]:
+            turn = abs((yaw_rad[i] - yaw_rad[k] + math.pi) % (2 * math.pi) - math.pi)
+            apart = max(abs(base_m[i, 0] - base_m[k, 0]), abs(base_m[i, 1] - base_m[k, 1]))
+            if session[i] == session[k] and apart < _APART_M and turn < _APART_RAD:
+                alone = False
+                break
+        if alone:
+            chosen[count] = i
+            count += 1
+            if count == most:
+                break
+    return chosen[:count]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
