@@ -6,6 +6,7 @@ import csv
 import json
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 import typer
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 from pc2grid.errors import ConfigError, MapFileError
 from pc2grid.io.nav2_map import save_map
 from pc2grid_cli.compare_paper import compare_paper_command
+from pc2grid_cli.documents import schema
 from pc2grid_cli.paper_report import published, verdicts
 from signature.published import MAPS, TABLE_3, TABLE_4
 from signature.reproduce import load_result, paper_tasks, run_task
@@ -51,6 +53,7 @@ def test_a_run_writes_its_cells_and_the_next_one_only_reads_them(maps: Path, tmp
     first = runner.invoke(app, [*arguments, "--json"])
     assert first.exit_code == 0, first.output
     document = json.loads(first.stdout)
+    jsonschema.validate(document, schema("compare-paper"))
     assert len(document["cells"]) == 8  # 2 methods x 3 levels, and 2 radii
     assert {cell["paper_auc"] for cell in document["cells"] if cell["radius_m"] == 6.0} == {0.935}
     assert json.loads((tmp_path / "results.json").read_text()) == document

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from pc2grid.io.nav2_map import save_map
 from pc2grid.settings import dump_settings
+from pc2grid_cli.console import print_json
 from pc2grid_cli.documents import DOCUMENTS, schema
 from pc2grid_cli.main import app
 from signature.config import Config
@@ -61,6 +62,11 @@ COMMANDS = [
     ("relocalize", "relocalize drive.mcap -d b.submaps --set relocalize.accept=0.9999999", 4),
     ("export", "export b.submaps --map out --report out.html", 0),
     ("export", "export b.submaps --report out.html", 0),
+    (
+        "compare-log",
+        "compare log drive.mcap --truth drive.tum --of-base --map 0..2 --queries 1 --length 1",
+        0,
+    ),
     ("db-info", "db info b.submaps", 0),
     ("db-check", "db check b.submaps", 0),
     ("db-check", "db check damaged.submaps", 1),
@@ -81,7 +87,10 @@ def test_documents_are_as_their_schema_says(
 
 
 def test_every_document_has_been_looked_at() -> None:
-    assert {name for name, _, _ in COMMANDS} == set(DOCUMENTS)
+    elsewhere = {"compare-paper": "test_compare_paper.py", "compare-maps": "test_map_quality.py"}
+    for name, file in elsewhere.items():
+        assert f'schema("{name}")' in (Path(__file__).parent / file).read_text()
+    assert {name for name, _, _ in COMMANDS} | set(elsewhere) == set(DOCUMENTS)
 
 
 @pytest.mark.parametrize("name", ["settings", *DOCUMENTS])
@@ -123,7 +132,12 @@ def test_every_command_shows_an_example_that_parses(name: str, command: Any) -> 
 
 
 def test_json_is_offered_where_there_is_a_schema_and_only_there() -> None:
-    """The tables of `compare` are the exception: each has columns of its own."""
+    """`compare sensors` is the exception: what it tells still changes with what is asked."""
     for name, command in commands(get_command(app)):
         has_json = any("--json" in option.opts for option in command.params)
-        assert has_json == (name.replace(" ", "-") in DOCUMENTS or name.startswith("compare")), name
+        assert has_json == (name.replace(" ", "-") in {*DOCUMENTS, "compare-sensors"}), name
+
+
+def test_what_is_not_known_is_null(capsys: pytest.CaptureFixture[str]) -> None:
+    print_json({"error_m": float("nan"), "ranges": (1.0, float("inf")), "count": 2})
+    assert json.loads(capsys.readouterr().out) == {"error_m": None, "ranges": [1.0, None], "count": 2}

@@ -2,6 +2,7 @@
 
 import json
 
+import jsonschema
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from pc2grid.io.nav2_map import save_map
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, Health, OccupancyGrid, Trajectory
 from pc2grid.simulate import SimulationConfig, office_floorplan, prepare_session
 from pc2grid_cli.compare_maps import compare_maps_command
+from pc2grid_cli.documents import schema
 from signature.config import Config
 from signature.map_quality import map_simulated
 from signature.trajectory_error import trajectory_error
@@ -119,4 +121,5 @@ def test_command_maps_a_plan_once_and_prints_a_table(tmp_path, capsys):
     kept.write_text(json.dumps({**row, "loops": 77}))
     compare_maps_command(plans, **asked, as_json=True)
     document = json.loads(capsys.readouterr().out)
+    jsonschema.validate(document, schema("compare-maps"))
     assert [r["loops"] for r in document["rows"]] == [77]  # what is there is not done again

@@ -55,6 +55,7 @@ def compare_paper_command(
     """
     from pc2grid.errors import ConfigError, MapFileError, OutputError
     from pc2grid_cli import paper_report
+    from pc2grid_cli.console import print_json
     from signature.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES
     from signature.reproduce import known_maps, paper_tasks
 
@@ -91,7 +92,7 @@ def compare_paper_command(
     document = _write(results, out, queries, seed)
     pictures = paper_report.draw_figures(results, out)
     if as_json:
-        print(json.dumps(document))
+        print_json(document)
     else:
         paper_report.print_tables(results, chosen)
         print(f"written: {out / 'results.json'}, {out / 'results.csv'}, {', '.join(map(str, pictures))}")

@@ -248,7 +248,64 @@ class Simulate(TypedDict):
     clutter: int
 
 
+class Trial(TypedDict):
+    """A query whose true place is known. mapped: share of what it saw that the map covers, 0..1. error_m and
+    error_rad are of the best hypothesis, null if there is none. rank: of the right place among those
+    retrieved, -1 if it is not; alone: the same by each combination of signatures."""
+
+    building: str
+    map_sensor: str
+    query_sensor: str
+    seed: int
+    travel_m: float
+    in_building: bool
+    mapped: float
+    status: Status
+    confidence: float
+    right: bool
+    error_m: float | None
+    error_rad: float | None
+    rank: int
+    alone: dict[str, int]
+    scores: list[float]
+    walls: float
+    look_up_ms: float
+
+
+class CompareLog(TypedDict):
+    """`pc2grid compare log --json`. map_s: from and to, seconds of the recording. tally: what became of how
+    many."""
+
+    schema_version: Version
+    log: str
+    map_s: list[float]
+    length_s: float
+    without_truth: int
+    tally: dict[str, int]
+    trials: list[Trial]
+
+
+class CompareMaps(TypedDict):
+    """`pc2grid compare maps --json`: a row a session, with the errors of its trajectory and of its cells."""
+
+    schema_version: Version
+    rows: list[dict[str, Any]]
+
+
+class ComparePaper(TypedDict):
+    """`pc2grid compare paper --json`: a cell a map, method and noise level, measured beside published."""
+
+    schema_version: Version
+    version: str
+    queries: int
+    seed: int
+    cells: list[dict[str, Any]]
+
+
 DOCUMENTS: dict[str, type] = {
+    "compare-log": CompareLog,
+    "compare-maps": CompareMaps,
+    "compare-paper": ComparePaper,
     "convert": Convert,
     "db-check": DbCheck,
     "db-copy": DbWrite,
