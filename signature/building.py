@@ -29,6 +29,8 @@ _AROUND_M = 10.0
 """Two maps show the same place if they agree this far around it: farther than the query needs to have
 seen, so that two rooms alike are told apart by what lies around them."""
 _WALL_M = 0.4
+_RIVAL_SCORE = 0.2
+"""A hypothesis that much worse than the best is no rival to it, wherever it is."""
 
 
 class Building:
@@ -118,9 +120,11 @@ class Building:
     def _places(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> tuple[int, ...]:
         """Which place each hypothesis is at, numbered from 0 as they come; a place lies in a session once.
 
-        Sessions of one floor all show the right place: they must not make each other ambiguous. Only the
-        first few places are compared, the rest count as their own: they do not take part in the decision.
+        Sessions of one floor all show the right place: they must not make each other ambiguous. What is far
+        behind the best, or behind the first few places, is not compared and counts as its own: it does not
+        take part in the decision.
         """
+        least = hypotheses[0].fit.score - _RIVAL_SCORE if hypotheses else 0.0
         members: list[list[Hypothesis]] = []
         numbers = []
         for h in hypotheses:
@@ -128,7 +132,8 @@ class Building:
                 (
                     k
                     for k, place in enumerate(members[:RIVALS])
-                    if all(h.session_index != other.session_index for other in place)
+                    if h.fit.score >= least
+                    and all(h.session_index != other.session_index for other in place)
                     and any(self._one_place(query, h, other) for other in place)
                 ),
                 len(members),
