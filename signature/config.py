@@ -99,7 +99,7 @@ class RelocalizeConfig(Section):
     signature_weight: float = Field(
         0.2, ge=0, description="say of the signatures against the isovists' ranges; 0: none"
     )
-    top_k: int = Field(50, gt=0, description="places that retrieval hands to alignment")
+    top_k: int = Field(50, gt=0, description="placements that retrieval hands to alignment")
     coarse_floor: float = Field(0.4, ge=0, le=1, description="coarse scores below this are not looked at")
     coarse_keep: float = Field(0.8, gt=0, le=1, description="nor those below this share of the best")
     hypotheses: int = Field(20, gt=0, description="hypotheses kept at most")
