@@ -91,14 +91,19 @@ def map_skeleton(grid: OccupancyGrid, config: PartitionConfig) -> BoolGrid:
 def _clusters(cells: I64, resolution_m: float, config: PartitionConfig) -> list[tuple[I64, I64]]:
     """DBSCAN over cells (N, 2): for each cluster the member next to its mean, and all members.
 
-    Every cell is a core point (min_samples 1): a junction seen in one pixel is a junction. The mean itself
-    may lie in a wall; the member next to it lies on the skeleton.
+    Every cell is a core point: a junction seen in one pixel is a junction. Then DBSCAN's clusters are the
+    connected components of the cells within its radius of each other (tests compare with scikit-learn's).
+    The mean itself may lie in a wall; the member next to it lies on the skeleton.
     """
     if len(cells) == 0:
         return []
-    from sklearn.cluster import DBSCAN
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
 
-    labels = DBSCAN(eps=config.cluster_m / resolution_m, min_samples=1).fit_predict(cells)
+    pairs = cKDTree(cells).query_pairs(config.cluster_m / resolution_m, output_type="ndarray")
+    near = coo_array((np.ones(len(pairs), np.bool_), pairs.T), shape=(len(cells), len(cells)))
+    labels = connected_components(near, directed=False)[1]
     clusters = []
     for label in range(labels.max() + 1):
         members = cells[labels == label]

@@ -8,10 +8,11 @@ from pathlib import Path
 import networkx as nx
 import numpy as np
 import pytest
+from sklearn.cluster import DBSCAN
 
 from pc2grid.config import PartitionConfig
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN
-from pc2grid.partition import junction_graph, partition, submap_at
+from pc2grid.partition import _clusters, junction_graph, partition, submap_at
 from tests.rooms import canvas, cross, grid_of, rectangle
 
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).parents[1] / "../shared/data"))
@@ -122,3 +123,18 @@ def test_number_of_submaps_is_near_table_1_with_one_set_of_parameters() -> None:
     for name, published in SUBMAPS.items():
         found = len(partition(read_map(DATA / "maps" / f"{name}.yaml", "paper")))
         assert abs(found / published - 1) <= 0.25, name
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("resolution_m", [0.05, 0.03])
+def test_clusters_are_those_of_dbscan(seed: int, resolution_m: float) -> None:
+    rng = np.random.default_rng(seed)
+    cells = np.unique(rng.integers(0, 200 * (seed + 1), (300, 2)), axis=0)
+    config = PartitionConfig(cluster_m=0.5)
+    labels = DBSCAN(eps=config.cluster_m / resolution_m, min_samples=1).fit_predict(cells)
+    found = _clusters(cells, resolution_m, config)
+    assert len(found) == labels.max() + 1 > 3
+    for label, (middle, members) in enumerate(found):
+        assert np.array_equal(members, cells[labels == label])
+        away = np.linalg.norm(members - members.mean(axis=0), axis=1)
+        assert np.linalg.norm(middle - members.mean(axis=0)) == pytest.approx(away.min())
