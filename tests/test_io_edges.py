@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 import os
@@ -261,6 +262,26 @@ def test_beams_and_their_times() -> None:
     assert unlimited.offsets_s is None
     assert len(laserscan.decode(beams(range_max=math.inf)).xyz_m) == 5
     assert len(laserscan.decode(beams(1, angle_increment=0.0)).xyz_m) == 1
+
+
+def test_a_range_of_zero_is_no_return() -> None:
+    ranges = np.array([0.0, 1.0, -1.0, np.inf, np.nan], np.float32)
+    found = laserscan.decode(dataclasses.replace(beams(range_min=0.0), ranges=ranges))
+    np.testing.assert_allclose(np.linalg.norm(found.xyz_m, axis=1), [1.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("count", "slack"), [(5, 2), (1000, 20)])
+def test_angles_may_be_off_by_two_beams_or_two_percent(count: int, slack: int) -> None:
+    """Drivers round the last angle, or leave a beam out."""
+
+    def declared(beams_more: float) -> LaserScan:
+        return beams(count, angle_increment=0.001, angle_max=-0.2 + 0.001 * (count - 1 + beams_more))
+
+    for fine in (-slack + 0.01, slack - 0.01):
+        assert len(laserscan.decode(declared(fine), max_points=10_000).xyz_m) > 0
+    for wrong in (-slack - 0.5, slack + 0.5):
+        with pytest.raises(PointCloudError, match="ranges where the angles make"):
+            laserscan.decode(declared(wrong), max_points=10_000)
 
 
 # --- cameras with lenses ------------------------------------------------------------------------------
