@@ -21,6 +21,7 @@ from pc2grid.floor import Ground, assumed_ground, find_ground
 from pc2grid.geometry import F64, SE2, interpolate_pose, invert_pose, rotation_vector
 from pc2grid.matching import Match, PointGrid, evenly
 from pc2grid.model import F32, Health, RegisteredScan, Scan
+from pc2grid.odometry_trust import OdometryTrust
 from pc2grid.registration import KissRegistration, thin
 from pc2grid.sweep import Sweep, flatten
 
@@ -78,6 +79,7 @@ class Tracker:
         self._last: Scan | None = None
         self._last_pose = np.eye(4)
         self._measured: tuple[F64, F64] | None = None  # T_odom_base, T_map_base when odometry was last known
+        self._odometry = OdometryTrust()
         self._recent: list[tuple[int, F64]] = []  # stamp, T_map_base of the last scans
         self._maps: list[tuple[PointGrid, float]] = []
         self._last_keyframe: SE2 | None = None
@@ -135,6 +137,7 @@ class Tracker:
         self._last, self._last_pose = scan, pose
         if scan.T_odom_base is not None:
             self._measured = scan.T_odom_base, pose
+            self._odometry.observe(scan.T_odom_base, pose, health is Health.FINE)
         deskewed = dataclasses.replace(scan, points_m=points, offsets_s=None)
         registered = RegisteredScan(scan=deskewed, T_map_base=pose, health=health)
         self._restarted = (self._restarted or restart) and not keyframe
@@ -271,12 +274,9 @@ class Tracker:
             return SE2.flatten(predicted), None
         prior = guess if odometry is None else SE2.flatten(predicted)
         if odometry is not None:
-            distance = float(np.linalg.norm(odometry[:3, 3]))
-            turn = float(np.linalg.norm(rotation_vector(odometry)))
-            sigma_m, sigma_rad = 0.01 + 0.1 * distance + 0.05 * turn, 0.01 + 0.1 * turn + 0.1 * distance
+            information = self._odometry.information(odometry)
         else:
-            sigma_m, sigma_rad = 0.03, 0.01
-        information = np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
+            information = np.diag([0.03**-2, 0.03**-2, 0.01**-2])
         grid = self._maps[0][0]
         chosen = evenly(len(sweep.hits_m), _MATCHED_HITS)
         hits, face = sweep.hits_m[chosen], facing(sweep.hits_m, sweep.origin_m)[chosen]
