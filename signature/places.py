@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +21,14 @@ from signature.nearest import SignatureIndex
 from signature.query import PROFILE_BEARINGS
 from signature.similarity import SignatureTable
 
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
 LATTICE_M = 0.4
 """Between standpoints: a view is at most 0.28 m from one of them, about what ranges are compared by."""
 _AROUND_M = 1.2
 """A standpoint farther than this from every place belongs to none."""
 _CLEARANCE_M = 0.2
-_SESSION_M = 1e6
-"""Lifts the sessions apart, so that one search tree holds them all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,14 +87,11 @@ class Places:
 
     def __init__(self, table: SignatureTable, grids: Mapping[int, OccupancyGrid], sight_m: float) -> None:
         """grids : the map of each session, by session_index."""
-        from scipy.spatial import cKDTree
-
         self.table = table
         self.sight_m = sight_m
         self.index = SignatureIndex.of(table)
         self._grids = grids
-        self._roomy = {session: _roomy(grid) for session, grid in grids.items()}
-        self._tree = cKDTree(np.column_stack((table.center_m, _SESSION_M * table.session_index)))
+        self._grounds: dict[int, _Ground] = {}
         self._known: dict[int, tuple[F64, F32, NDArray[np.bool_]]] = {}
         self._last: tuple[I64, Standpoints] | None = None
 
@@ -116,15 +115,17 @@ class Places:
         """The place itself, and the points of a lattice over its map that no other place is nearer to."""
         center, session = self.table.center_m[row], int(self.table.session_index[row])
         grid = self._grids[session]
+        if session not in self._grounds:
+            self._grounds[session] = _Ground.of(grid, self.table, session)
+        ground = self._grounds[session]
         steps = np.arange(np.floor(-_AROUND_M / LATTICE_M), np.ceil(_AROUND_M / LATTICE_M) + 1)
         lattice = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         points = (np.round(center / LATTICE_M) + lattice) * LATTICE_M
-        lifted = np.column_stack((points, np.full(len(points), _SESSION_M * session)))
-        distance, owner = self._tree.query(lifted)
+        distance, owner = ground.places.query(points)
         cells = grid.to_cell(points)
         inside = ((cells >= 0) & (cells < grid.cells.shape)).all(axis=1)
-        inside &= (owner == row) & (distance <= _AROUND_M)
-        inside[inside] = self._roomy[session][cells[inside, 0], cells[inside, 1]]
+        inside &= (ground.rows[owner] == row) & (distance <= _AROUND_M)
+        inside[inside] = ground.roomy[cells[inside, 0], cells[inside, 1]]
         at_m = np.concatenate((center[None], points[inside]))
         views = [
             isovist(grid, (float(x), float(y)), self.sight_m, bearings=PROFILE_BEARINGS) for x, y in at_m
@@ -136,8 +137,26 @@ class Places:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class _Ground:
+    """A session's map as what can be stood on, and whose it is.
+
+    roomy : (H, W) free cells with room around them. rows : its places (N,), and their search tree.
+    """
+
+    roomy: BoolGrid
+    rows: I64
+    places: cKDTree
+
+    @staticmethod
+    def of(grid: OccupancyGrid, table: SignatureTable, session: int) -> _Ground:
+        from scipy.spatial import cKDTree
+
+        rows = np.flatnonzero(table.session_index == session)
+        return _Ground(_roomy(grid), rows, cKDTree(table.center_m[rows]))
+
+
 def _roomy(grid: OccupancyGrid) -> BoolGrid:
-    """Free cells (H, W) with room for a robot's middle around them."""
     import cv2
 
     n = round(_CLEARANCE_M / grid.resolution_m)
