@@ -48,7 +48,7 @@ def info_command(database: Database, json: AsJson = False) -> None:
         ]
         console.print_json({"schema_version": 1, "database": where, "sessions": documents})
         return
-    print(f"{where}: {len(sessions)} sessions, {sum(s.submaps for s in sessions)} submaps")
+    print(f"{where}: {_count(len(sessions))}, {sum(s.submaps for s in sessions)} submaps")
     for s in sessions:
         travel = f", {s.scans} scans, {s.path_m:.1f} m in {s.duration_s:.0f} s" if s.scans else ""
         print(f"  {s.name} ({s.sensor}): {s.submaps} submaps, {s.area_m2:.0f} m2 free{travel}")
@@ -90,7 +90,7 @@ def merge_command(
     if json:
         console.print_json(_written(output))
     else:
-        print(f"{shown(output)}: {count} sessions")
+        print(f"{shown(output)}: {_count(count)}")
 
 
 def copy_command(
@@ -125,7 +125,7 @@ def _size(output: str) -> str:
     if path.is_file():
         return f"{path.stat().st_size / 1e6:.1f} MB"
     with open_database(output) as opened:
-        return f"{len(opened.sessions())} sessions"
+        return _count(len(opened.sessions()))
 
 
 def _written(output: str, left_out: Sequence[Problem] = ()) -> dict[str, Any]:
@@ -140,3 +140,7 @@ def _written(output: str, left_out: Sequence[Problem] = ()) -> dict[str, Any]:
         "sessions": count,
         "left_out": [{"where": problem.where, "what": problem.what} for problem in left_out],
     }
+
+
+def _count(sessions: int) -> str:
+    return f"{sessions} session{'' if sessions == 1 else 's'}"
