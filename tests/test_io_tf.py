@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import FrameError, LogCorrupt, PointCloudError
 from pc2grid.io import open_log
+from pc2grid.io.frames import PoseTrack
 from tests.builders import STEP, T0, Message, read, ros, write_mcap
 
 POINT = [[1.0, 2.0, 3.0]]
@@ -153,3 +156,41 @@ def test_a_scan_of_which_all_tf_is_unknown_is_no_scan(tmp_path: Path) -> None:
     late = ros().tf(T0 + 50 * STEP, "base_link", "lidar", 0.1)
     with pytest.raises(PointCloudError, match="3 of 3 scans are unreadable: tf is unknown"):
         read(write_mcap(tmp_path / "a.mcap", [*clouds(3), late]))
+
+
+def where(samples: dict[int, float], lasting: bool, at: int) -> float | None:
+    """A track, said slowly: on a sample, between two near ones, held, or near one."""
+    if at in samples:
+        return samples[at]
+    before = max((s for s in samples if s < at), default=None)
+    after = min((s for s in samples if s > at), default=None)
+    if before is not None and after is not None and after - before <= 2 * 10**9:
+        return samples[before] + (samples[after] - samples[before]) * (at - before) / (after - before)
+    if lasting and before is not None:
+        return samples[before]
+    if lasting and len(samples) == 1:
+        return samples[after or 0]
+    near = [s for s in (before, after) if s is not None and abs(s - at) <= 10**8]
+    return samples[near[0]] if near else None
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    samples=st.dictionaries(st.integers(0, 80), st.integers(-9, 9).map(float), max_size=6),
+    lasting=st.booleans(),
+    at=st.integers(-10, 90),
+    unit=st.sampled_from([10**7, 5 * 10**7, 10**9]),
+)
+def test_a_track_agrees_with_the_oracle(samples: dict[int, float], lasting: bool, at: int, unit: int) -> None:
+    """In whatever order the samples come; the first of a stamp counts."""
+    track = PoseTrack(lasting=True) if lasting else PoseTrack()
+    for stamp, x in samples.items():
+        assert track.add(stamp * unit, (x, 0, 0, 0, 0, 0, 1))
+        assert track.add(stamp * unit, (x + 1, 0, 0, 0, 0, 0, 1))
+    expected = where({stamp * unit: x for stamp, x in samples.items()}, lasting, at * unit)
+    found = track.at(at * unit)
+    if expected is None:
+        assert found is None
+    else:
+        assert found is not None
+        assert found[0, 3] == pytest.approx(expected)
