@@ -93,7 +93,7 @@ class KissRegistration:
             # of the time.
             config.mapping.max_points_per_voxel = 10
             config.registration.max_num_iterations = 10
-            config.registration.convergence_criterion = 1e-3
+            config.registration.convergence_criterion = 1e-2
             config.adaptive_threshold.initial_threshold = 1.0
         kiss = KissICP(config)
         kiss.local_map.update(kiss.voxelize(points)[1], pose)

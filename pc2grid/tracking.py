@@ -45,6 +45,7 @@ _SURE_OVERLAP = 0.6  # of a scan with the local map, where odometry alone does n
 _DISAGREE_M = 0.03
 _DISAGREE_RAD = 0.02
 _MAX_POINTS = 40_000  # of a camera's 300 000 pixels
+_ICP_POINTS = 6_000  # floor and ceiling included
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,8 +228,10 @@ class Tracker:
         self._ground = expected if found is None else expected.toward(found, gain)
 
     def _without_floor(self, points: F32) -> F32:
+        """What KISS-ICP gets."""
         if self._ground is None or not len(points) or not self._rolling:
             return points  # in the hand, the floor is what holds tilt and height
+        points = points[thin(points, _ICP_POINTS)]
         heights = self._ground.heights(points)
         slack = 0.1 + 0.01 * np.hypot(points[:, 0], points[:, 1])
         keep = heights > slack
