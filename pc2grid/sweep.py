@@ -131,13 +131,18 @@ def _scatter(
     surfaces = np.empty((len(column), 3))
     found = 0
     for bearing in range(BEARINGS):
-        members = column[starts[bearing] : starts[bearing + 1]]
-        members = members[np.argsort(ranges[members])]
         first = 0.0
-        for place in range(len(members)):
-            k = members[place]
+        for place in range(starts[bearing], starts[bearing + 1]):
+            k = column[place]
+            before = place  # sorting by insertion: a bearing holds a few dozen
+            while before > starts[bearing] and ranges[column[before - 1]] > ranges[k]:
+                column[before] = column[before - 1]
+                before -= 1
+            column[before] = k
+        for place in range(starts[bearing], starts[bearing + 1]):
+            k = column[place]
             depth = cell_m + 4.0 * noise * ranges[k] * ranges[k]
-            if place == 0 or ranges[k] - first > depth:
+            if place == starts[bearing] or ranges[k] - first > depth:
                 first = ranges[k]
                 surfaces[found] = 0.0
                 found += 1
