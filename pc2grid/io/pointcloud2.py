@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pc2grid.errors import LimitExceeded, PointCloudError
 from pc2grid.geometry import F64
 from pc2grid.io.messages import PointCloud2
-from pc2grid.model import F32, I64
+from pc2grid.model import F32
 
 # sensor_msgs/PointField; 9 to 11 are PCL's, absent from the definition (ros2/common_interfaces#300).
 _DATATYPES = {
@@ -64,16 +64,17 @@ def decode(cloud: PointCloud2, *, unit: str = "auto", max_points: int = 20_000_0
     note: str | None = None
     if name is not None:
         values = rows[name].reshape(-1)[index]
+        timed: NDArray[np.bool_] | None = None
+        if values.dtype.kind == "f" and not (finite := np.isfinite(values)).all():
+            values, timed = values[finite], finite
         seconds, note = _offsets(values, cloud.header.stamp_ns, unit, name)
         if seconds is not None:
-            timed = np.isfinite(seconds)
-            if not timed.all():
-                xyz, seconds = xyz[timed], seconds[timed]
-            offsets = seconds.astype(np.float32)
+            offsets = seconds.astype(np.float32, copy=False)
+            xyz = xyz if timed is None else xyz[timed]
     return Points(xyz, offsets, rows.size - len(xyz), note)
 
 
-def _returns(rows: NDArray[Any]) -> tuple[F32 | F64, I64]:
+def _returns(rows: NDArray[Any]) -> tuple[F32 | F64, NDArray[np.integer]]:
     """Usable returns (N, 3), and which rows they are (N,); float32 if the message's numbers fit in it."""
     kinds = [rows.dtype[name] for name in ("x", "y", "z")]
     if all(kind == np.float32 for kind in kinds):
@@ -140,16 +141,18 @@ def _time_field(cloud: PointCloud2) -> str | None:
     return next((names[n] for n in _TIME_FIELDS if n in names), None)
 
 
-def _offsets(values: NDArray[Any], stamp_ns: int, unit: str, name: str) -> tuple[F64 | None, str | None]:
-    """Seconds relative to the stamp, and how they were understood; None if all times are the same.
+def _offsets(
+    values: NDArray[Any], stamp_ns: int, unit: str, name: str
+) -> tuple[NDArray[Any] | None, str | None]:
+    """Seconds relative to the stamp, from finite times, and how they were understood; None if all times are
+    the same.
 
     Raises PointCloudError if the unit cannot be told.
     """
     whole = values.dtype.kind in "iu"
-    usable = values if whole else values[np.isfinite(values)]
-    if not len(usable):
+    if not len(values):
         return None, None
-    first, last = usable.min(), usable.max()
+    first, last = values.min(), values.max()
     span = int(last) - int(first) if whole else float(last) - float(first)
     if span == 0:
         return None, f"the per-point times in field {name} are all the same: no deskewing"
@@ -164,8 +167,7 @@ def _offsets(values: NDArray[Any], stamp_ns: int, unit: str, name: str) -> tuple
     scale = _SECONDS[unit]
     stamp = stamp_ns * 1e-9
     if abs(float(first) * scale) <= 10.0 and abs(float(last) * scale) <= 10.0:
-        with np.errstate(invalid="ignore"):
-            return values.astype(np.float64) * scale, None
+        return values if scale == 1.0 else values.astype(np.float64) * scale, None
     note = None
     if abs(float(first) * scale - stamp) <= 10.0:
         if whole and scale == 1e-9:
