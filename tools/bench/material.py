@@ -164,7 +164,7 @@ def many_signatures(count: int, config: Config) -> SignatureTable:
     """
     real = [
         describe(submap, config.signature)
-        for seed in range(4)
+        for seed in range(2)
         for submap in partition(office_floorplan(seed), config.partition)
     ]
     rng = np.random.default_rng(0)
