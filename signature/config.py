@@ -91,8 +91,8 @@ class RelocalizeConfig(Section):
 
     window_m: float = Field(15.0, gt=0, description="how far back along its path a query remembers")
     step_m: float = Field(1.0, gt=0, description="a new look at the database every so many metres of travel")
-    views: int = Field(6, gt=0, description="places of its path at which a query is described")
-    view_spacing_m: float = Field(1.5, gt=0, description="least distance of two views")
+    views: int = Field(8, gt=0, description="places of its path at which a query is described")
+    view_spacing_m: float = Field(1.2, gt=0, description="least distance of two views")
     shortlist: int = Field(
         400, gt=0, description="places that the signatures hand to the comparison of isovists"
     )
