@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from mcap.writer import IndexType
 
+from pc2grid.errors import LogCorrupt
 from pc2grid.io import open_log
 from tests.builders import check_drive, drive, read, write_mcap
 
@@ -127,6 +128,28 @@ def test_a_footer_that_points_elsewhere(tmp_path: Path, start: int) -> None:
     scans, report = read(path)
     check_drive(scans)
     assert any("index is not usable" in warning for warning in report.warnings)
+
+
+@pytest.mark.parametrize("kind", [0x86, 0x07, 0x09, 0x0C, 0xFF])
+@pytest.mark.parametrize("number", [0, 2])
+def test_a_chunk_that_looks_like_another_record_is_missed(tmp_path: Path, kind: int, number: int) -> None:
+    """One flipped bit in its first byte, and a reader that follows the records passes over it."""
+    path = write_mcap(tmp_path / "a.mcap", drive(), chunk_size=2000)
+    clean = read(path)[0]
+    whole = bytearray(path.read_bytes())
+    at = [i for i in range(8, len(whole)) if whole[i] == 6 and whole[i + 37 : i + 45] == b"\4\0\0\0zstd"][
+        number
+    ]
+    whole[at] = kind
+    path.write_bytes(whole)
+    with pytest.raises(LogCorrupt, match=r"a\.mcap: chunk"):
+        read(path)
+    if number == 0:
+        return  # tf is in it, and no scan is of use without
+    scans, report = read(path, recover=True)
+    assert 0 < len(scans) < len(clean)
+    assert report.bytes_lost > 300
+    assert any("not there" in w or "skipped" in w for w in report.warnings)
 
 
 def test_counts_that_do_not_add_up_are_not_shown(tmp_path: Path) -> None:

@@ -68,13 +68,20 @@ class McapSource:
                     self.tally.warnings += found.warnings
                     return found
                 self.tally.warn(f"the log has no index ({found}); it was read in full instead")
-        known = Definitions()
+        known, listed = Definitions(), list[ChunkIndex]()
         if self._recover:
             # A chunk may rest on definitions in an earlier one that is lost; the summary repeats them.
             with contextlib.suppress(Damage):
                 found = read_summary(self._stream, size, self._limits)
-                known = found.definitions if isinstance(found, Survey) else known
+                if isinstance(found, Survey):
+                    known, listed = found.definitions, found.chunks
         made = survey(self._stream, size, self._limits, resync=self._recover, known=known)
+        there = {chunk.offset for chunk in made.chunks}
+        hidden = [chunk for chunk in listed if chunk.offset not in there]
+        if hidden and not made.bytes_lost:
+            # With another first byte a chunk looks like a record that is none of our business.
+            made.bytes_lost = sum(chunk.size for chunk in hidden)
+            made.warnings.append(f"{len(hidden)} chunks that the index lists are not there")
         self.tally.warnings += made.warnings
         self.tally.bytes_lost += made.bytes_lost
         if made.damage is not None and not self._recover:
