@@ -72,8 +72,9 @@ class TrueFloor:
         self._looks = np.zeros(plan.cells.shape, np.int32)
         self._seen: BoolGrid = np.zeros(plan.cells.shape, np.bool_)
         self._last: SE2 | None = None
-        self._reach_m = min(session.sensor.config.max_range_m, projection.max_range_m)
-        self._field = _field(session.sensor.directions @ session.sensor.T_base_sensor[:3, :3].T)
+        directions = session.sensor.directions @ session.sensor.T_base_sensor[:3, :3].T
+        reach_m = session.sensor.config.max_range_m * _lengths(directions)
+        self._reach_m = np.minimum(reach_m, projection.max_range_m)
 
     def look(self, reading: Reading) -> None:
         """Where the returns of one scan truly are, and what was in sight."""
@@ -81,7 +82,7 @@ class TrueFloor:
         kept = np.isfinite(reading.values_m)
         T = sensor.T_base_sensor
         points = (reading.values_m[kept, None] * sensor.directions[kept]) @ T[:3, :3].T + T[:3, 3]
-        near = np.linalg.norm(points[:, :2] - T[:2, 3], axis=1) <= self._reach_m
+        near = np.linalg.norm(points[:, :2] - T[:2, 3], axis=1) <= self._projection.max_range_m
         if sensor.kind != "laser":
             near &= (points[:, 2] >= self._band[0]) & (points[:, 2] <= self._band[1])
         poses = session.drive.at(reading.time_s + sensor.offsets_s[kept][near])
@@ -103,11 +104,10 @@ class TrueFloor:
         import cv2
 
         x, y = (float(v) for v in pose.apply(self._session.sensor.T_base_sensor[None, :2, 3])[0])
-        view = isovist(self._open, (x, y), self._reach_m, bearings=_BEARINGS)
-        shift = round(pose.yaw * _BEARINGS / (2 * math.pi))
-        inside = np.roll(self._field, shift)
+        view = isovist(self._open, (x, y), float(self._reach_m.max()), bearings=_BEARINGS)
+        turned_m = np.roll(self._reach_m, round(pose.yaw * _BEARINGS / (2 * math.pi)))
         angles = 2 * np.pi * np.arange(_BEARINGS) / _BEARINGS
-        reach = np.where(inside, view.ranges_m, 0.0)[:, None]
+        reach = np.minimum(turned_m, view.ranges_m)[:, None]
         corners = (x, y) + reach * np.column_stack((np.cos(angles), np.sin(angles)))
         pixels = (corners - self._open.origin_m) / self._open.resolution_m - 0.5
         mask = np.zeros(self._seen.shape, np.uint8)
@@ -150,13 +150,16 @@ def _standing(session: Session, band_m: tuple[float, float]) -> BoolGrid:
     return mask
 
 
-def _field(directions: F64) -> BoolGrid:
-    """Bearings (of _BEARINGS) in the base frame that a sensor with rays along (R, 3) looks to."""
+def _lengths(directions: F64) -> F64:
+    """For each of _BEARINGS in the base frame how far a sensor looks there, as a share of its range.
+
+    directions : (R, 3) of its rays; a camera's, of depth 1, are longer at the edges of the image.
+    """
     turns = np.rint(np.arctan2(directions[:, 1], directions[:, 0]) * _BEARINGS / (2 * np.pi)).astype(int)
-    field = np.zeros(_BEARINGS, np.bool_)
+    lengths = np.zeros(_BEARINGS)
     for step in range(-2, 3):  # rays are up to a degree apart
-        field[(turns + step) % _BEARINGS] = True
-    return field
+        np.maximum.at(lengths, (turns + step) % _BEARINGS, np.linalg.norm(directions[:, :2], axis=1))
+    return lengths
 
 
 def _grown(mask: BoolGrid) -> BoolGrid:
