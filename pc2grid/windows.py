@@ -53,13 +53,14 @@ def search_windows(
     if not len(walls_m) or not len(starts):
         return np.empty((0, 4))
     res, origin = target.resolution_m, np.asarray(target.origin_m)
-    points = np.ascontiguousarray(walls_m.T / res, np.float32)
+    x, y = np.ascontiguousarray(walls_m.T / res, np.float32)
     turns = max(1, math.ceil(2 * half_a_rad / step_rad))
     step_rad = 2 * half_a_rad / turns
     found = _best_of_quarters(
         target.levels,
-        levels_for(np.hypot(*points), 0.5, 0.5 * step_rad, np.asarray(target.reaches_m) / res),
-        *points,
+        levels_for(np.hypot(x, y), 0.5, 0.5 * step_rad, np.asarray(target.reaches_m) / res),
+        x,
+        y,
         np.column_stack(((starts[:, :2] - origin) / res, starts[:, 2])),
         max(1, math.ceil(half_t_m / res)),
         step_rad * (np.arange(turns) - 0.5 * (turns - 1)),

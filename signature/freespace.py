@@ -112,7 +112,7 @@ def _in_sight(occupied: NDArray[np.bool_], width: int, r0: int, c0: int, r1: int
             return True
         if lead != 0:
             # By arithmetic: which border comes next is as good as random, and a wrong guess costs more.
-            row = np.int64(lead > 0)
+            row = int(lead > 0)
             at += np.uint64(across + row * (down - across))
             lead += 2 * (dr - row * (dr + dc))
         else:
