@@ -29,6 +29,9 @@ _AROUND_M = 10.0
 """Two maps show the same place if they agree this far around it: farther than the query needs to have
 seen, so that two rooms alike are told apart by what lies around them."""
 _WALL_M = 0.4
+_SAME, _SAME_TOLD = 0.5, 0.1
+"""Least probability, by what surrounds it, that two places that fit the query alike are one: likelier than
+not; and if their labels say so, not clearly otherwise."""
 _RIVAL_SCORE = 0.2
 """A hypothesis that much worse than the best is no rival to it, wherever it is."""
 
@@ -169,7 +172,7 @@ class Building:
         # Ground that only one of the maps knows says nothing here, and neither may contradict the other.
         agreement = min((fit.forward - NEUTRAL * (1.0 - fit.overlap)) / fit.overlap, fit.backward)
         evidence = Evidence(scores=(agreement,), walls=fit.overlap * len(around.walls_m))
-        return bool(CALIBRATION.probabilities(evidence)[0] >= (0.5 if told else self.config.accept))
+        return bool(CALIBRATION.probabilities(evidence)[0] >= (_SAME_TOLD if told else _SAME))
 
 
 def unseen_by(query: QueryMap, grid: OccupancyGrid, fit: Fit) -> OccupancyGrid:

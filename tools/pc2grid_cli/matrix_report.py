@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from signature.contribution import Independence
     from signature.summary import Cell
     from signature.trial import Trial
@@ -14,12 +16,19 @@ if TYPE_CHECKING:
 _SENSORS = ("lidar", "laser", "depth")
 
 
-def tables(cells: Sequence[Cell], elsewhere: Sequence[Trial]) -> None:
-    """Print located-and-right by metres driven, and what else there is to know of each cell."""
+def _wide() -> Console:
+    """Of the terminal's width; in a file wide enough for every column."""
     from rich.console import Console
-    from rich.table import Table
 
     console = Console()
+    return console if console.is_terminal else Console(width=140)
+
+
+def tables(cells: Sequence[Cell], elsewhere: Sequence[Trial]) -> None:
+    """Print located-and-right by metres driven, and what else there is to know of each cell."""
+    from rich.table import Table
+
+    console = _wide()
     distances = sorted({cell.travel_m for cell in cells})
     shares = Table(title="located and right, by metres driven")
     for heading in ("map", "query", *(f"{d:g} m" for d in distances), "n"):
@@ -110,7 +119,6 @@ Recalls = Mapping[str, Mapping[str, Mapping[int, float]]]
 
 def contribution_table(independent: Mapping[str, Independence], recalls: Recalls, travel_m: float) -> None:
     """Print what each signature contributes: AUC across sensors, and recall of places."""
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(title=f"what the signatures contribute; recall at 1/5/20 after {travel_m:g} m")
@@ -120,7 +128,7 @@ def contribution_table(independent: Mapping[str, Independence], recalls: Recalls
         auc = f"{independent[name].auc:.3f}" if name in independent else ""
         shares = ("/".join(f"{v:.2f}" for v in row[name].values()) for row in recalls.values())
         table.add_row(name, auc, *shares)
-    Console().print(table)
+    _wide().print(table)
 
 
 def draw_signatures(path: Path, independent: Mapping[str, Independence], recalls: Recalls) -> None:
@@ -157,7 +165,7 @@ def draw_signatures(path: Path, independent: Mapping[str, Independence], recalls
     right.set(title="recall of the right place, all sensors", xlim=(0.0, 1.0))
     right.set_yticks(np.arange(len(rows)), rows)
     right.invert_yaxis()
-    right.legend(loc="lower right")
+    right.legend(loc="upper right")
     for ax in (middle, right):
         ax.grid(axis="x", alpha=0.3)
     with replace_file(path) as draft:
