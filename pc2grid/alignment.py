@@ -86,8 +86,8 @@ def _field(occupied: NDArray[np.bool_], known: NDArray[np.bool_], values: U8, re
         steps = reach
         for j in range(width - 1, -1, -1):
             steps = 0 if row[j] else min(steps + 1, reach)
-            both = int(min(steps, np.int64(out[j])))
-            out[j] = both * both
+            nearer = min(steps, int(out[j]))
+            out[j] = nearer * nearer
     field = np.empty((height, width), np.uint8)
     nearest = np.empty(width, np.uint16)
     for i in range(height):

@@ -63,7 +63,7 @@ def search_windows(
         y,
         np.column_stack(((starts[:, :2] - origin) / res, starts[:, 2])),
         max(1, math.ceil(half_t_m / res)),
-        step_rad * (np.arange(turns) - 0.5 * (turns - 1)),
+        np.asarray(step_rad * (np.arange(turns) - 0.5 * (turns - 1)), np.float64),
         int(255 * NEUTRAL),
     )
     found = found[np.argsort(-found[:, 3], kind="stable")]
