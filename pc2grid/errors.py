@@ -79,11 +79,7 @@ class FrameError(LogError):
     """A coordinate frame is unknown, or not connected to the base frame."""
 
 
-# --- maps and registration ----------------------------------------------------------------------------
-
-
-class RegistrationDiverged(Pc2GridError):
-    """Registration lost track and could not go on."""
+# --- maps and trajectories ----------------------------------------------------------------------------
 
 
 class MapFileError(Pc2GridError):

@@ -64,7 +64,7 @@ def build_session(
 
     progress : told the share that is done. note : told which topic was chosen, and why.
 
-    Raises LogError and its like, MapFileError, RegistrationDiverged.
+    Raises LogError and its like, MapFileError.
 
     >>> import signature
     >>> session, origin = build_session("map.yaml", "plan", signature.Config())

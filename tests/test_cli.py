@@ -195,6 +195,15 @@ def test_convert_export_add_and_look_after(house: Path, tmp_path: Path) -> None:
     assert "checksum" in checked.stdout or "malformed" in checked.stdout
 
 
+def test_map_without_free_space_is_stored_and_said_to_be_useless(tmp_path: Path) -> None:
+    cells = np.full((40, 40), 100, np.int8)
+    save_map(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0)), tmp_path / "rock")
+    made = pc2grid("convert", "rock.yaml", "-o", "rock.submaps", cwd=tmp_path)
+    assert made.returncode == 0, made.stderr
+    assert "0 submaps" in made.stdout
+    assert "warning: rock: no free space" in made.stderr
+
+
 def test_truncated_recording_needs_recover_and_gives_exit_3(house: Path, tmp_path: Path) -> None:
     data = (house / "drive.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: int(len(data) * 0.7)])

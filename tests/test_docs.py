@@ -32,7 +32,7 @@ from typer.testing import CliRunner
 import pc2grid
 import signature
 from pc2grid_cli.main import app
-from tests import workplace
+from tests import desk
 from tests.test_io_files import oracle
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -42,14 +42,14 @@ FLAGS = doctest.NORMALIZE_WHITESPACE
 @pytest.fixture(scope="module")
 def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("furnished")
-    workplace.furnish(folder)
+    desk.furnish(folder)
     return folder
 
 
 @pytest.fixture
 def folder(furnished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The user's folder, and the working directory."""
-    monkeypatch.chdir(workplace.copy(furnished, tmp_path))
+    monkeypatch.chdir(desk.copy(furnished, tmp_path))
     return tmp_path
 
 

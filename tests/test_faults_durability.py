@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import multiprocessing
 import os
@@ -373,6 +374,22 @@ def test_disk_full_while_exporting(tmp_path: Path, name: str, there: str) -> Non
         status, said = in_child(lambda limit=limit: export(limit))
         assert status == 0, said
         assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+@pytest.mark.fault(39)
+def test_map_and_image_change_together(tmp_path: Path, monkeypatch) -> None:
+    save_map(small_house(), tmp_path / "a")
+    before = {file: file.read_bytes() for file in tmp_path.iterdir()}
+
+    def full(path: Path, *_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    house = small_house()
+    other = dataclasses.replace(house, cells=np.full_like(house.cells, 100))
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OutputError, match=r"a\.yaml: cannot write: No space left"):
+        save_map(other, tmp_path / "a")
+    assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
 @pytest.mark.fault(39)

@@ -78,7 +78,10 @@ def test_a_flipped_bit_anywhere_in_a_png_is_seen(tmp_path: Path) -> None:
         (lying_png(60_000, 60_000), "cannot hold 60000 x 60000 pixels"),
         (lying_png(2**31, 2**31), "cannot hold"),
         (lying_png(0, 5), "0 x 5 pixels"),
-        (lying_png(20_000, 20_000, bits=1, data=zlib.compress(bytes(2501 * 20_000))), "the limit is 100000000"),
+        (
+            lying_png(20_000, 20_000, bits=1, data=zlib.compress(bytes(2501 * 20_000))),
+            "the limit is 100000000",
+        ),
         (lying_png(4, 4, bits=16), "16 bits"),
         (lying_png(4, 4, bits=3), "its header makes no sense"),
         (lying_png(4, 4, colour=5), "its header makes no sense"),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import LimitExceeded, NoScans, PointCloudError, UnsupportedSchema
+from pc2grid.errors import NoScans, PointCloudError, UnsupportedSchema
 from tests.builders import T0, Message, raw_log, read, ros, write_mcap
 
 INFO = "/camera/depth/camera_info"

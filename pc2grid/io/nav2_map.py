@@ -138,8 +138,6 @@ def save_map(
 
     image_path = stem.with_name(f"{stem.name}.{suffix}")
     yaml_path = stem.with_name(f"{stem.name}.yaml")
-    with replace_file(image_path) as temporary:
-        temporary.write_bytes(encode_image(pixels, suffix, grid.resolution_m))
     plain = re.fullmatch(r"[A-Za-z_][\w.\-]*", image_path.name)
     text = (
         f"image: {image_path.name if plain else json.dumps(image_path.name)}\n"
@@ -150,8 +148,10 @@ def save_map(
         f"occupied_thresh: {occupied_thresh}\n"
         f"free_thresh: {free_thresh}\n"
     )
-    with replace_file(yaml_path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    # Both are written before either takes its place: a full disk leaves the old pair, not a mixed one.
+    with replace_file(yaml_path) as new_yaml, replace_file(image_path) as new_image:
+        new_image.write_bytes(encode_image(pixels, suffix, grid.resolution_m))
+        new_yaml.write_text(text, encoding="utf-8")
     return yaml_path, image_path
 
 

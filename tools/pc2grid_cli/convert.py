@@ -209,6 +209,8 @@ def _tell(done: _Done, entry: Entry, quiet: bool) -> None:
     if not quiet:
         print(_as_text(document), flush=True)
     done.warnings += [f"{session.session}: {warning}" for warning in session.report.warnings]
+    if not session.submaps:
+        done.warnings.append(f"{session.session}: no free space to cut submaps from: nothing is found in it")
     if session.report.lossy:
         done.warnings.append(f"{session.session}: data was lost: {_losses(session)}")
         done.lossy = True

@@ -26,6 +26,6 @@ def furnish(folder: Path) -> None:
         add_sessions(folder / f"{database}.submaps", [session], Config(), keep=False)
 
 
-def copy(workplace: Path, folder: Path) -> Path:
+def copy(desk: Path, folder: Path) -> Path:
     """A copy of a furnished folder to work in."""
-    return Path(shutil.copytree(workplace, folder, dirs_exist_ok=True))
+    return Path(shutil.copytree(desk, folder, dirs_exist_ok=True))
