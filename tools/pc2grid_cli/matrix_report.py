@@ -165,7 +165,7 @@ def draw_signatures(path: Path, independent: Mapping[str, Independence], recalls
     right.set(title="recall of the right place, all sensors", xlim=(0.0, 1.0))
     right.set_yticks(np.arange(len(rows)), rows)
     right.invert_yaxis()
-    right.legend(loc="upper right")
+    right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=3)
     for ax in (middle, right):
         ax.grid(axis="x", alpha=0.3)
     with replace_file(path) as draft:
