@@ -7,7 +7,6 @@ still. The predicted motion (odometry where the log has it) is set before each f
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from pc2grid.config import RegistrationConfig
 from pc2grid.geometry import F64
-from pc2grid.model import RegisteredScan, Scan
+from pc2grid.model import Scan
 
 _BRISK_MPS = 1.0  # how fast a robot or a person may move
 
@@ -150,12 +149,3 @@ def thin(points: NDArray[np.generic], count: int) -> NDArray[np.intp]:
     return np.sort(
         np.random.default_rng(len(points)).choice(len(points), count, replace=False, shuffle=False)
     )
-
-
-def register(scans: Iterable[Scan], config: RegistrationConfig | None = None) -> Iterator[RegisteredScan]:
-    """Registered scans, one for each scan, as they come: the streaming front half without its sweeps."""
-    from pc2grid.tracking import Tracker
-
-    tracker = Tracker(config or RegistrationConfig())
-    for scan in scans:
-        yield tracker.track(scan).registered

@@ -1,7 +1,6 @@
 """Following a robot: pose, health, and what it costs to be wrong."""
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.deskew import deskew
 from pc2grid.geometry import SE2, invert_pose, transform_points
 from pc2grid.model import Health, Scan
-from pc2grid.registration import KissRegistration, register, thin
+from pc2grid.registration import KissRegistration, thin
 from pc2grid.simulate import SimulationConfig, iter_session
 from pc2grid.tracking import Tracker
 
@@ -22,6 +21,11 @@ def session(sensor, *, length_m=6.0, seed=4):
 @pytest.fixture(scope="module")
 def laser():
     return session("laser", length_m=8.0)
+
+
+def follow(scans):
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    return [tracker.track(scan).registered for scan in scans]
 
 
 def errors(pairs, poses):
@@ -38,7 +42,7 @@ def blind(scan):
 @pytest.mark.parametrize(("sensor", "limit_m"), [("laser", 0.06), ("lidar", 0.06), ("depth", 0.10)])
 def test_each_sensor_is_followed(sensor, limit_m):
     pairs = session(sensor)
-    registered = list(register(scan for scan, _ in pairs))
+    registered = follow(scan for scan, _ in pairs)
     assert len(registered) == len(pairs)
     assert errors(pairs, [r.T_map_base for r in registered]).max() < limit_m
     assert sum(r.health is Health.LOST for r in registered) == 0
@@ -55,12 +59,12 @@ def test_odometry_that_says_forward_while_the_robot_reverses_is_overruled(laser)
             step[:2, 3] *= -1.0
             odometry = lying[-1][0].T_odom_base @ step
         lying.append((dataclasses.replace(scan, T_odom_base=odometry), pose))
-    poses = [r.T_map_base for r in register(scan for scan, _ in lying)]
+    poses = [r.T_map_base for r in follow(scan for scan, _ in lying)]
     assert errors(laser, poses).max() < 0.15
 
 
 def test_laser_without_odometry_is_followed_or_says_that_it_is_lost(laser):
-    registered = list(register(blind(scan) for scan, _ in laser))
+    registered = follow(blind(scan) for scan, _ in laser)
     lost = [r.health is Health.LOST for r in registered]
     assert any(lost) or errors(laser, [r.T_map_base for r in registered]).max() < 0.05
 
@@ -69,7 +73,7 @@ def test_odometry_bridges_a_scan_without_any_at_the_edge_of_a_gap(laser):
     gap = [*laser[:31], (blind(laser[31][0]), laser[31][1]), *laser[61:]]
     unseen = laser[31][1].inverse() @ laser[61][1]
     assert np.hypot(unseen.x, unseen.y) > 1.0 and abs(unseen.yaw) > 0.3
-    registered = list(register(scan for scan, _ in gap))
+    registered = follow(scan for scan, _ in gap)
     assert not any(r.health is Health.LOST for r in registered)
     assert errors(gap, [r.T_map_base for r in registered]).max() < 0.06
 
@@ -92,7 +96,7 @@ def restarted(pairs, stamp_shift_ns=0):
 def test_odometry_that_begins_anew_where_the_robot_stands_is_seen_through(laser, gap_s):
     reset = [*laser[:40], *restarted(laser[40:], int(gap_s * 1e9))]
     assert np.linalg.norm(laser[40][0].T_odom_base[:2, 3]) > 1.0
-    registered = list(register(scan for scan, _ in reset))
+    registered = follow(scan for scan, _ in reset)
     assert not any(r.health is Health.LOST for r in registered)
     assert errors(reset, [r.T_map_base for r in registered]).max() < 0.06
 
@@ -165,7 +169,7 @@ def test_standing_still_adds_no_keyframes(laser):
 
 def test_same_scans_same_bytes(laser):
     def run():
-        return np.array([r.T_map_base for r in register(s for s, _ in itertools.islice(laser, 40))]).tobytes()
+        return np.array([r.T_map_base for r in follow(scan for scan, _ in laser[:40])]).tobytes()
 
     assert run() == run()
 
