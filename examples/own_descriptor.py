@@ -16,8 +16,8 @@ import numpy as np
 
 import pc2grid
 from signature.baselines import make_methods
-from signature.evaluate import Experiment, evaluate, precision_recall
-from signature.noise import NOISE_LEVELS
+from signature.evaluation.evaluate import Experiment, evaluate, precision_recall
+from signature.evaluation.noise import NOISE_LEVELS
 
 
 class WallDistances:

@@ -22,6 +22,7 @@ from pc2grid.partition import junction_graph, map_skeleton, partition
 from signature.boundary import boundary_edges, boundary_histogram, boundary_points
 from signature.config import SignatureConfig
 from signature.describe import describe
+from signature.evaluation.noise import NOISE_LEVELS, add_noise
 from signature.freespace import (
     adjacency,
     freespace_graph,
@@ -29,7 +30,6 @@ from signature.freespace import (
     freespace_nodes,
     shortest_paths,
 )
-from signature.noise import NOISE_LEVELS, add_noise
 from signature.symmetry import blurred, line_segments, symmetry_axes
 
 FREE, WALL, UNSEEN = (1.0, 1.0, 1.0), (0.1, 0.1, 0.1), (0.86, 0.86, 0.86)

@@ -14,7 +14,7 @@ from signature.baselines.sdf import DistanceFeatures, _consensus, _directions
 from signature.baselines.shape_context import ShapeContext
 from signature.baselines.surf import describe_points, interest_points
 from signature.baselines.words import Words, sift, submap_image, surf
-from signature.evaluate import rotated_submap
+from signature.evaluation.evaluate import rotated_submap
 from tests.rooms import cross, degenerate, disc, l_shape, polygon, random_rooms, rectangle, submap_of
 
 ALL = METHOD_NAMES + EXTRA_METHOD_NAMES

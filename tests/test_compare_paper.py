@@ -17,8 +17,8 @@ from pc2grid.io.nav2_map import save_map
 from pc2grid_cli.compare_paper import compare_paper_command
 from pc2grid_cli.documents import schema
 from pc2grid_cli.paper_report import published, verdicts
-from signature.published import MAPS, TABLE_3, TABLE_4
-from signature.reproduce import load_result, paper_tasks, run_task
+from signature.evaluation.published import MAPS, TABLE_3, TABLE_4
+from signature.evaluation.reproduce import load_result, paper_tasks, run_task
 from tests.rooms import cross, grid_of, l_shape, rectangle
 
 app = typer.Typer()

@@ -9,12 +9,12 @@ import pytest
 
 from pc2grid.geometry import SE2
 from signature.config import SignatureConfig
-from signature.contribution import COMBINATIONS, Independence, independence, part_distances, ranks
 from signature.describe import Signature
+from signature.evaluation.contribution import COMBINATIONS, Independence, independence, part_distances, ranks
+from signature.evaluation.mapped import Mapped
+from signature.evaluation.summary import Truthfulness, ablation
 from signature.query import query_of
 from signature.similarity import distances
-from signature.summary import Truthfulness, ablation
-from signature.trial import Mapped
 from tests.drives import building, office, plan
 from tests.test_sensor_matrix import trial
 

@@ -11,9 +11,9 @@ from sklearn.metrics import precision_recall_curve
 from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
 from pc2grid.partition import submap_at
 from signature.baselines import make_methods
-from signature.evaluate import Experiment, draw_queries, evaluate, precision_recall, rotated_submap
-from signature.noise import NOISE_LEVELS, Noise, add_noise
-from signature.reproduce import halved
+from signature.evaluation.evaluate import Experiment, draw_queries, evaluate, precision_recall, rotated_submap
+from signature.evaluation.noise import NOISE_LEVELS, Noise, add_noise
+from signature.evaluation.reproduce import halved
 from tests.rooms import canvas, cross, disc, grid_of, l_shape, random_rooms, rectangle, submap_of
 
 SILENT = NOISE_LEVELS[0]

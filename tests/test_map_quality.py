@@ -14,9 +14,9 @@ from pc2grid.simulate import SimulationConfig, office_floorplan, prepare_session
 from pc2grid_cli.compare_maps import compare_maps_command
 from pc2grid_cli.documents import schema
 from signature.config import Config
-from signature.map_quality import map_simulated
-from signature.trajectory_error import trajectory_error
-from signature.true_floor import TrueFloor
+from signature.evaluation.map_quality import map_simulated
+from signature.evaluation.trajectory_error import trajectory_error
+from signature.evaluation.true_floor import TrueFloor
 
 
 def trajectory(poses, health=()):

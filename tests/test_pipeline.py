@@ -13,7 +13,7 @@ from pc2grid.model import Health
 from pc2grid.pipeline import build_map, follow, map_scans
 from pc2grid.simulate import SimulationConfig, prepare_session
 from signature.config import Config
-from signature.relations import read_relations, relation_error
+from signature.evaluation.relations import read_relations, relation_error
 
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).parents[2] / "shared" / "data"))
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="PC2GRID_DATA is not there")

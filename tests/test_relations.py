@@ -6,7 +6,7 @@ import pytest
 from pc2grid.errors import TrajectoryFileError
 from pc2grid.geometry import SE2
 from pc2grid.model import Trajectory
-from signature.relations import read_relations, relation_error
+from signature.evaluation.relations import read_relations, relation_error
 
 
 def trajectory(poses):

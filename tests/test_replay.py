@@ -16,7 +16,7 @@ from pc2grid.model import Trajectory
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli import compare_log
 from signature.config import Config
-from signature.replay import Part, Replay, Tally, spread
+from signature.evaluation.replay import Part, Replay, Tally, spread
 from tests.drives import office
 from tests.test_sensor_matrix import trial
 

@@ -10,14 +10,15 @@ import pytest
 
 from pc2grid.simulate import SimulationConfig, office_floorplan
 from signature.config import Config
-from signature.contribution import COMBINATIONS
 from signature.describe import describe
-from signature.driven import Driven, drive
+from signature.evaluation.contribution import COMBINATIONS
+from signature.evaluation.driven import Driven, drive
+from signature.evaluation.mapped import Mapped
+from signature.evaluation.sensor_matrix import map_building, query_trials
+from signature.evaluation.summary import matrix, reliability
+from signature.evaluation.trial import Trial
 from signature.relocalize import Building
-from signature.sensor_matrix import map_building, query_trials
 from signature.similarity import SignatureTable
-from signature.summary import matrix, reliability
-from signature.trial import Mapped, Trial
 
 
 def trial(**changes: Any) -> Trial:

@@ -12,8 +12,8 @@ from pc2grid_cli import console
 from pc2grid_cli import settings as options
 
 if TYPE_CHECKING:
-    from signature.replay import Part, Tally
-    from signature.trial import Trial
+    from signature.evaluation.replay import Part, Tally
+    from signature.evaluation.trial import Trial
 
 
 def compare_log_command(
@@ -41,7 +41,7 @@ def compare_log_command(
     """
     from pc2grid.io import open_log
     from pc2grid.io.trajectory import read_tum
-    from signature.replay import Replay, Tally, spread
+    from signature.evaluation.replay import Replay, Tally, spread
 
     settings = options.make_config(config, set_, topic=topic, odometry=odometry)
     part = _part(map_)
@@ -75,7 +75,7 @@ def compare_log_command(
 
 def _part(text: str) -> Part:
     from pc2grid.errors import ConfigError
-    from signature.replay import Part
+    from signature.evaluation.replay import Part
 
     first, _, last = text.partition("..")
     try:

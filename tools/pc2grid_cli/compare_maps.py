@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from signature.map_quality import Mapped
+    from signature.evaluation.map_quality import Mapped
 
 Row = dict[str, Any]
 
@@ -83,7 +83,7 @@ def _simulated_tasks(
 ) -> list[dict[str, Any]]:
     """One task a plan, sensor and seed. Raises ConfigError for what cannot be read."""
     from pc2grid.errors import ConfigError
-    from signature.sensor_matrix import SENSORS
+    from signature.evaluation.sensor_matrix import SENSORS
 
     kinds = [name.strip() for name in sensors.split(",")]
     unknown = [name for name in kinds if name not in SENSORS]
@@ -138,8 +138,8 @@ def _of_plan(task: dict[str, Any]) -> Row:
     from pc2grid.simulate import SimulationConfig, prepare_session
     from pc2grid.simulate.config import OdometryConfig
     from signature.config import Config
-    from signature.map_quality import map_simulated
-    from signature.trajectory_error import trajectory_error
+    from signature.evaluation.map_quality import map_simulated
+    from signature.evaluation.trajectory_error import trajectory_error
 
     simulation = SimulationConfig(
         length_m=task["length_m"], seed=task["seed"], odometry=OdometryConfig(enabled=task["odometry"])
@@ -160,9 +160,9 @@ def _of_log(task: dict[str, Any]) -> Row:
     from pc2grid.io import open_log
     from pc2grid.io.trajectory import read_tum
     from signature.config import Config
-    from signature.map_quality import map_beside_bare
-    from signature.relations import read_relations, relation_error
-    from signature.trajectory_error import trajectory_error
+    from signature.evaluation.map_quality import map_beside_bare
+    from signature.evaluation.relations import read_relations, relation_error
+    from signature.evaluation.trajectory_error import trajectory_error
 
     config = Config()
     truth = Path(task["truth"])

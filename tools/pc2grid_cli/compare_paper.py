@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from signature.reproduce import Result, Task
+    from signature.evaluation.reproduce import Result, Task
 
 _COSTS = {"proposed": 1.0, "shape_context": 1.0, "sdf": 14.0, "sift_bow": 8.0, "surf_bow": 14.0}
 
@@ -57,7 +57,7 @@ def compare_paper_command(
     from pc2grid_cli import paper_report
     from pc2grid_cli.console import print_json
     from signature.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES
-    from signature.reproduce import known_maps, paper_tasks
+    from signature.evaluation.reproduce import known_maps, paper_tasks
 
     chosen = tuple(methods or METHOD_NAMES)
     known = METHOD_NAMES + EXTRA_METHOD_NAMES
@@ -103,7 +103,7 @@ def run_tasks(tasks: Sequence[Task], cells: Path, jobs: int) -> None:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from signature.reproduce import load_result
+    from signature.evaluation.reproduce import load_result
 
     open_tasks = [t for t in tasks if any(load_result(t, m, cells) is None for m in t.methods)]
     if not open_tasks:
@@ -162,7 +162,7 @@ def _start_worker(shares: Any) -> None:
 
 
 def _run(index: int, task: Task, cells: Path) -> int:
-    from signature.reproduce import run_task
+    from signature.evaluation.reproduce import run_task
 
     reported = 0.0
 
@@ -177,7 +177,7 @@ def _run(index: int, task: Task, cells: Path) -> int:
 
 
 def _results(tasks: Iterable[Task], cells: Path) -> list[Result]:
-    from signature.reproduce import load_result
+    from signature.evaluation.reproduce import load_result
 
     found = (load_result(task, method, cells) for task in tasks for method in task.methods)
     return [result for result in found if result is not None]

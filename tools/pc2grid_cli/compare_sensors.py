@@ -17,7 +17,8 @@ import typer
 if TYPE_CHECKING:
     from pc2grid.model import SensorKind
     from pc2grid.simulate import SimulationConfig
-    from signature.trial import Mapped, Trial
+    from signature.evaluation.mapped import Mapped
+    from signature.evaluation.trial import Trial
 
 Setting = dict[str, float]
 
@@ -53,10 +54,10 @@ def compare_sensors_command(
     from pc2grid_cli.console import print_json, progress
     from pc2grid_cli.matrix_report import contribution_table, draw, draw_signatures, tables
     from signature.confidence import TUNED_ON
-    from signature.contribution import COMBINATIONS, Independence, independence
-    from signature.sensor_matrix import DISTANCES_M, SENSORS
-    from signature.summary import Truthfulness, ablation, matrix, reliability
-    from signature.trial import MAPPED
+    from signature.evaluation.contribution import COMBINATIONS, Independence, independence
+    from signature.evaluation.sensor_matrix import DISTANCES_M, SENSORS
+    from signature.evaluation.summary import Truthfulness, ablation, matrix, reliability
+    from signature.evaluation.trial import MAPPED
 
     names = [plan.stem for plan in plans]
     if len(set(names)) != len(names):
@@ -186,7 +187,7 @@ def _map(plan: str, sensor: SensorKind, out: str, setting: Setting) -> None:
     from pc2grid.io.nav2_map import load_map
     from signature.build import add_session, provenance
     from signature.config import Config
-    from signature.sensor_matrix import map_building
+    from signature.evaluation.sensor_matrix import map_building
 
     target = _map_file(plan, sensor, out, setting)
     frame = target.with_suffix(".json")
@@ -206,8 +207,8 @@ def _drive(plan: str, sensor: SensorKind, seed: int, out: str, setting: Setting)
     """Simulate and register one query session, unless it was done before."""
     from pc2grid.io.nav2_map import load_map
     from signature.config import Config
-    from signature.driven import drive
-    from signature.sensor_matrix import start_of
+    from signature.evaluation.driven import drive
+    from signature.evaluation.sensor_matrix import start_of
 
     target = _file("drives", plan, sensor, seed, out, setting)
     if target.exists():
@@ -223,8 +224,8 @@ def _mapped(plan: str, sensor: SensorKind, out: str, tag: tuple[tuple[str, Any],
     from pc2grid.geometry import SE2
     from signature.config import Config
     from signature.database import open_database
+    from signature.evaluation.mapped import Mapped
     from signature.relocalize import Building
-    from signature.trial import Mapped
 
     target = _map_file(plan, sensor, out, dict(tag))
     with open_database(target) as database:
@@ -238,8 +239,8 @@ def _locate(
 ) -> None:
     """Locate one query session in the maps of its own plan and of one other, unless it was done before."""
     from pc2grid.io.atomic import replace_file
-    from signature.driven import Driven
-    from signature.sensor_matrix import SENSORS, query_trials
+    from signature.evaluation.driven import Driven
+    from signature.evaluation.sensor_matrix import SENSORS, query_trials
 
     target = _file("trials", plan, sensor, seed, out, setting)
     if target.exists():
@@ -255,7 +256,7 @@ def _locate(
 
 
 def _read(path: Path) -> list[Trial]:
-    from signature.trial import Trial
+    from signature.evaluation.trial import Trial
 
     rows = json.loads(path.read_text())
     return [Trial(**{**row, "scores": tuple(row["scores"])}) for row in rows]

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from signature.contribution import Independence
-    from signature.summary import Cell
-    from signature.trial import Trial
+    from signature.evaluation.contribution import Independence
+    from signature.evaluation.summary import Cell
+    from signature.evaluation.trial import Trial
 
 _SENSORS = ("lidar", "laser", "depth")
 

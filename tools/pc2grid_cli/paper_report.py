@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from pc2grid.io.atomic import replace_file
-from signature.published import MAPS, SUBMAPS, TABLE_3, TABLE_4, Measures
-from signature.reproduce import RADII_M, Result
+from signature.evaluation.published import MAPS, SUBMAPS, TABLE_3, TABLE_4, Measures
+from signature.evaluation.reproduce import RADII_M, Result
 
 _LEVELS = ("without noise", "noise level 1", "noise level 2")
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from signature.contribution import COMBINATIONS
-from signature.trial import MAPPED, Trial
+from signature.evaluation.contribution import COMBINATIONS
+from signature.evaluation.trial import MAPPED, Trial
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,9 +20,9 @@ from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid.partition import partition
 from signature.baselines import METHOD_NAMES, Method, make_methods
 from signature.config import SignatureConfig
-from signature.evaluate import Experiment, Outcome, evaluate
-from signature.noise import NOISE_LEVELS
-from signature.published import MAPS, SIZE_PX
+from signature.evaluation.evaluate import Experiment, Outcome, evaluate
+from signature.evaluation.noise import NOISE_LEVELS
+from signature.evaluation.published import MAPS, SIZE_PX
 
 Reading = Literal["paper", "true"]
 

@@ -14,7 +14,7 @@ from pc2grid.model import Health, OccupancyGrid, Scan, Trajectory
 from pc2grid.pipeline import map_scans
 from pc2grid.registration import BareKissIcp
 from signature.config import Config
-from signature.true_floor import GridQuality, TrueFloor
+from signature.evaluation.true_floor import GridQuality, TrueFloor
 
 if TYPE_CHECKING:
     from pc2grid.simulate import Session

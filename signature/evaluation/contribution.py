@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,12 +17,10 @@ from pc2grid.geometry import F64, SE2
 from pc2grid.partition import view_at
 from signature.config import SignatureConfig
 from signature.describe import Signature, describe
+from signature.evaluation.mapped import Mapped
 from signature.places import Places
 from signature.query import QueryMap
 from signature.similarity import SignatureTable, histogram_distance, structural_factor
-
-if TYPE_CHECKING:
-    from signature.trial import Mapped
 
 PARTS = ("boundary", "freespace", "symmetry")
 COMBINATIONS = tuple("+".join(c) for n in (1, 2, 3) for c in itertools.combinations(PARTS, n))

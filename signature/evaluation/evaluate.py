@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pc2grid.geometry import F64
 from pc2grid.model import UNKNOWN, OccupancyGrid, Submap
 from signature.baselines import Method
-from signature.noise import Noise, add_noise
+from signature.evaluation.noise import Noise, add_noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,9 +18,10 @@ from pc2grid.model import OccupancyGrid, Scan, SensorKind, SessionMap
 from pc2grid.partition import partition
 from pc2grid.pipeline import map_scans
 from signature.config import Config
-from signature.driven import Driven
+from signature.evaluation.driven import Driven
+from signature.evaluation.mapped import Mapped
+from signature.evaluation.trial import Trial, judge
 from signature.relocalize import Relocalizer, Search
-from signature.trial import Mapped, Trial, judge
 
 if TYPE_CHECKING:
     from pc2grid.simulate import SimulationConfig

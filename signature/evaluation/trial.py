@@ -11,9 +11,10 @@ import numpy as np
 from pc2grid.alignment import assess
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.model import SensorKind
-from signature.contribution import ranks
+from signature.evaluation.contribution import ranks
+from signature.evaluation.mapped import Mapped
 from signature.query import QueryMap
-from signature.relocalize import Answer, Building
+from signature.relocalize import Answer
 from signature.retrieve import retrieve
 
 RIGHT_M, RIGHT_RAD = 0.25, math.radians(3.0)
@@ -25,16 +26,6 @@ RETRIEVED_M = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Mapped:
-    """A building as one sensor mapped it. T_plan_map : where the map's frame lies in the true plan."""
-
-    name: str
-    sensor: SensorKind
-    T_plan_map: SE2
-    building: Building
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
     """One answer, with the truth beside it.
 
@@ -43,7 +34,7 @@ class Trial:
     status, confidence, error_m, error_rad : of the answer's best hypothesis (errors NaN if there is none).
     right : the best hypothesis is within 0.25 m (real logs: 0.3 m) and 3 degrees.
     rank : of the first right place among those retrieved, -1 if there is none.
-    alone : the same rank by each of `signature.contribution.COMBINATIONS`, without isovists.
+    alone : the same rank by each of `signature.evaluation.contribution.COMBINATIONS`, without isovists.
     scores, walls : `signature.confidence.Evidence` of the decision.
     """
 

@@ -19,10 +19,11 @@ from pc2grid.model import Scan, Trajectory
 from pc2grid.pipeline import build_map
 from signature.build import describe_all
 from signature.config import Config
-from signature.driven import Driven, register
+from signature.evaluation.driven import Driven, register
+from signature.evaluation.mapped import Mapped
+from signature.evaluation.trial import MAPPED, Trial, judge
 from signature.relocalize import Building, Relocalizer
 from signature.similarity import SignatureTable
-from signature.trial import MAPPED, Mapped, Trial, judge
 
 if TYPE_CHECKING:
     from pc2grid.io import Log
