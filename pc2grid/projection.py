@@ -88,11 +88,7 @@ class GridBuilder:
             percent = np.rint(OCCUPIED / (1.0 + np.exp(-odds))).astype(np.int8)
             r, c = (row - min(rows)) * _TILE, (column - min(columns)) * _TILE
             cells[r : r + _TILE, c : c + _TILE] = np.where(self._seen[row, column], percent, UNKNOWN)
-        for columns_rows in self._glimpsed:
-            at = columns_rows[:, ::-1] - (min(rows) * _TILE, min(columns) * _TILE)
-            at = at[((at >= 0) & (at < cells.shape)).all(axis=1)]
-            at = at[cells[at[:, 0], at[:, 1]] == UNKNOWN]
-            cells[at[:, 0], at[:, 1]] = _GLIMPSED
+        self._draw_glimpsed(cells, (min(rows) * _TILE, min(columns) * _TILE))
         known_rows = np.flatnonzero((cells >= FREE).any(axis=1))
         known_columns = np.flatnonzero((cells >= FREE).any(axis=0))
         r0, r1 = int(known_rows[0]), int(known_rows[-1]) + 1
@@ -103,6 +99,25 @@ class GridBuilder:
             resolution_m=resolution,
             origin_m=((min(columns) * _TILE + c0) * resolution, (min(rows) * _TILE + r0) * resolution),
         )
+
+    def _draw_glimpsed(self, cells: NDArray[np.int8], first: tuple[int, int]) -> None:
+        """Put what was only glimpsed into unknown cells; `first` is the cell that is (0, 0) there.
+
+        In front of a wall that sweeps have drawn, a return that no other scan repeats is its noise; where
+        a wall goes on, fewer than three neighbours are drawn.
+        """
+        import cv2
+
+        if not self._glimpsed:
+            return
+        at = np.concatenate(self._glimpsed)[:, ::-1] - first
+        at, times = np.unique(at[((at >= 0) & (at < cells.shape)).all(axis=1)], axis=0, return_counts=True)
+        neighbours = cv2.boxFilter(
+            (cells >= 65).astype(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT
+        )
+        row, column = at[:, 0], at[:, 1]
+        kept = (cells[row, column] == UNKNOWN) & ((times > 1) | (neighbours[row, column] < 3))
+        cells[row[kept], column[kept]] = _GLIMPSED
 
     def _add_window(self, update: NDArray[np.int16], x0: int, y0: int) -> None:
         height, width = update.shape

@@ -1,5 +1,7 @@
 """Sweeps drawn into a growing grid."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -94,6 +96,34 @@ def test_glimpses_fill_what_is_unknown_and_change_nothing_else():
     after = builder.grid()
     assert state(after, 0.52, 0.52) == state(before, 0.52, 0.52) < 50
     assert state(after, 2.52, 0.02) >= 65
+
+
+def test_lone_return_beside_a_drawn_wall_is_noise_until_it_is_repeated():
+    behind, away = (2.02, -0.12), (2.52, 0.02)
+    for repeated in (False, True):
+        builder = GridBuilder(ProjectionConfig())
+        builder.add(disc(2.0), SE2())
+        for _ in range(1 + repeated):
+            builder.glimpse(np.array([behind, away]))
+        grid = builder.grid()
+        assert state(grid, *away) >= 65
+        assert (state(grid, *behind) >= 65) == repeated
+
+
+def test_wall_is_continued_by_glimpses():
+    sweep = disc(2.0)
+    gap = np.abs(sweep.hits_m[:, 1] - 1.0) < 0.15
+    builder = GridBuilder(ProjectionConfig())
+    builder.add(dataclasses.replace(sweep, hits_m=sweep.hits_m[~gap]), SE2())
+    missing = sweep.hits_m[gap & (sweep.hits_m[:, 0] > 0)]
+    assert (occupied_at(builder.grid(), missing)).mean() < 0.1
+    builder.glimpse(missing.astype(np.float64)[::4])
+    assert occupied_at(builder.grid(), missing).mean() > 0.8
+
+
+def occupied_at(grid, points):
+    cells = grid.to_cell(points)
+    return grid.cells[cells[:, 0], cells[:, 1]] >= 65
 
 
 def test_nothing_seen_gives_an_empty_grid():
