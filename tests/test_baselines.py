@@ -46,7 +46,7 @@ def test_every_method_finds_a_submap_itself(name: str, matchers: dict[str, Match
         assert scores[i] == pytest.approx(scores.max())
 
 
-@pytest.mark.parametrize("name", ["shape_context", "point_contexts", "sdf", "proposed"])
+@pytest.mark.parametrize("name", ["shape_context", "shape_rings", "point_contexts", "sdf", "proposed"])
 def test_methods_on_geometry_find_a_turned_submap(name: str, matchers: dict[str, Matcher]) -> None:
     # Bags of words are not asked: the stairs of turned walls are the only features of rooms as bare as these.
     found = []
@@ -133,6 +133,8 @@ def test_shape_context_of_one_wall_by_hand() -> None:
     ring = int(np.searchsorted(rings, 4.0))
     assert np.argwhere(context > 0).tolist() == [[ring, 0], [ring, 6]]
     assert context.sum() == pytest.approx(1.0)
+    rings = ShapeContext(turns=False).context(submap_of(cells))
+    assert rings.shape == (12, 1) and rings[ring, 0] == pytest.approx(1.0)
 
 
 def test_chi_square_cost_by_hand() -> None:

@@ -44,8 +44,8 @@ METHOD_NAMES = (
 )
 """In the order of Table III."""
 
-EXTRA_METHOD_NAMES = ("point_contexts", "verified")
-"""What the paper does not have: Belongie's form of the shape context, and its own method with alignment."""
+EXTRA_METHOD_NAMES = ("point_contexts", "shape_rings", "verified")
+"""Beyond the paper: two other readings of the shape context, and its own method with alignment."""
 
 
 def make_methods(names: Iterable[str]) -> dict[str, Method]:
@@ -64,10 +64,10 @@ def _make(name: str, vocabularies: dict[str, Vocabulary]) -> Method:
         from signature.baselines.proposed import Proposed
 
         return Proposed()
-    if name == "shape_context":
+    if name in ("shape_context", "shape_rings"):
         from signature.baselines.shape_context import ShapeContext
 
-        return ShapeContext()
+        return ShapeContext(turns=name == "shape_context")
     if name == "point_contexts":
         from signature.baselines.point_contexts import PointContexts
 

@@ -1,7 +1,8 @@
 """Shape Context of a whole submap: 24 angular, 12 radial bins (paper IV-A, "describes global shapes").
 
 One log-polar histogram of the boundary around the submap's centre (the descriptor of Belongie et al. 2002),
-compared by the chi-square statistic in every of the 24 turns.
+compared by the chi-square statistic in every of the 24 turns. The paper does not say what it does about
+rotation; `turns=False`, which adds up each ring, comes nearest to its figures.
 """
 
 from __future__ import annotations
@@ -18,20 +19,24 @@ from pc2grid.skeleton import cells_of, thin
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShapeContext:
-    """Bins as in the paper; rings grow by a constant factor from a radius of `inner_m` to the submap's."""
+    """Bins as in the paper; rings grow by a constant factor from a radius of `inner_m` to the submap's.
+
+    turns : compare in every turn. False: only how much each ring holds, which no turn changes.
+    """
 
     angular_bins: int = 24
     radial_bins: int = 12
     inner_m: float = 0.5
+    turns: bool = True
 
     def fit(self, submaps: Sequence[Submap]) -> _Shapes:
         """Describe every submap."""
-        bins = (self.radial_bins, self.angular_bins)
+        bins = (self.radial_bins, self.angular_bins if self.turns else 1)
         shapes = [self.context(submap) for submap in submaps]
         return _Shapes(self, np.stack(shapes) if shapes else np.empty((0, *bins), np.float32))
 
     def context(self, submap: Submap) -> F32:
-        """Shares (radial, angular) of the boundary pixels; sum 1, or all 0 without any."""
+        """Shares of the boundary pixels, (radial, angular; 1 without turns); sum 1, or all 0 without any."""
         edges = thin(submap.grid.occupied)
         y, x = ((cells_of(edges) - (np.array(edges.shape) - 1) / 2) * submap.grid.resolution_m).T
         rings = np.geomspace(self.inner_m, submap.radius_m, self.radial_bins)
@@ -42,7 +47,9 @@ class ShapeContext:
             ring * self.angular_bins + sector, minlength=self.radial_bins * self.angular_bins
         )
         shares = counts.reshape(self.radial_bins, self.angular_bins) / max(len(x), 1)
-        return shares.astype(np.float32)
+        if not self.turns:
+            shares = shares.sum(axis=1, keepdims=True)
+        return np.asarray(shares, np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +60,7 @@ class _Shapes:
     def similarities(self, query: Submap) -> F64:
         shape = self.method.context(query)
         best = np.ones(len(self.table))
-        for turn in range(self.method.angular_bins):
+        for turn in range(shape.shape[1]):
             turned = np.roll(shape, turn, axis=1)
             total = self.table + turned
             terms = np.divide((self.table - turned) ** 2, total, out=np.zeros_like(total), where=total > 0)

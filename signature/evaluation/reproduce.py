@@ -35,6 +35,7 @@ TOGETHER = (
     ("sift_bow", "sift_tfidf"),
     ("surf_bow", "surf_tfidf"),
     ("shape_context",),
+    ("shape_rings",),
     ("point_contexts",),
 )
 """Methods that share their features and so are run together."""

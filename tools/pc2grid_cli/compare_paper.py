@@ -31,7 +31,9 @@ def compare_paper_command(
     ] = 2000,
     methods: Annotated[
         list[str] | None,
-        typer.Option("--methods", help="Only these, repeatable; point_contexts is an extra."),
+        typer.Option(
+            "--methods", help="Only these, repeatable. Extras: point_contexts, shape_rings, verified."
+        ),
     ] = None,
     offset: Annotated[
         list[float] | None,
