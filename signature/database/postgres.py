@@ -516,7 +516,7 @@ class PostgresDatabase:
                 try:
                     if not sound:
                         raise ValueError("wrong checksum")
-                    _decode(table, row, self._where)
+                    rows.decode(table, row, self._where, lambda r: _table([r], {key: 0}))
                 except Exception as error:
                     # Whatever the decoding of damaged content stumbles over is the finding.
                     yield Problem(name, str(error))
@@ -569,19 +569,6 @@ def is_filled(url: str) -> bool:
             return False
         with served(where):
             return connection.execute("SELECT 1 FROM pc2grid.session LIMIT 1").fetchone() is not None
-
-
-def _decode(table: str, row: rows.Row, where: str) -> None:
-    if table == "session":
-        rows.read_info(row, 1.0, 0, where)
-    elif table == "grid":
-        rows.read_grid(row)
-    elif table == "trajectory":
-        rows.read_trajectory(row)
-    elif table == "submap":
-        rows.read_submap(row)
-    else:
-        _table([row], {(row["building"], row["session_id"]): 0})
 
 
 def _table(described: Sequence[rows.Row], index: Mapping[Key, int]) -> SignatureTable:

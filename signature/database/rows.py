@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -284,3 +284,20 @@ def submap_row(submap: Submap) -> Row:
         "radius_m": float(submap.radius_m),
         **grid_row(submap.grid),
     }
+
+
+def decode(table: str, row: Row, where: Path | str, read_signatures: Callable[[Row], object]) -> None:
+    """Decode a row of any table, to see whether it can be; raises whatever its damage leads to.
+
+    read_signatures : decodes a row of the table `signature`, the one that engines store differently.
+    """
+    if table == "session":
+        read_info(row, 1.0, 0, where)
+    elif table == "grid":
+        read_grid(row)
+    elif table == "trajectory":
+        read_trajectory(row)
+    elif table == "submap":
+        read_submap(row)
+    else:
+        read_signatures(row)

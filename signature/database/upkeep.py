@@ -148,7 +148,7 @@ def _read_table(
             try:
                 if not sound:
                     raise ValueError("wrong checksum")
-                _decode(table, row, path)
+                rows.decode(table, row, path, rows.read_signature_arrays)
             except Exception as error:
                 # Whatever the decoding of damaged content stumbles over is the finding.
                 yield row, Problem(name, str(error))
@@ -156,19 +156,6 @@ def _read_table(
                 yield row, None
     except schema.COMPLAINTS as error:
         yield None, Problem(table, str(error))
-
-
-def _decode(table: str, row: rows.Row, path: Path) -> None:
-    if table == "session":
-        rows.read_info(row, 1.0, 0, path)
-    elif table == "grid":
-        rows.read_grid(row)
-    elif table == "trajectory":
-        rows.read_trajectory(row)
-    elif table == "submap":
-        rows.read_submap(row)
-    else:
-        rows.read_signature_arrays(row)
 
 
 def _counts(connection: sqlite3.Connection, path: Path) -> Iterator[Problem]:
