@@ -3,8 +3,8 @@
 The front of pc2grid: everything that knows what a sensor is. `signature` (the back) only sees grids
 and submaps. Importing this package costs nothing: its names load their modules when first used.
 
-Types: `Scan`, `RegisteredScan`, `Trajectory`, `OccupancyGrid`, `Submap`, `SessionMap`; `SE2` for planar
-poses. Everywhere metres, radians, int64 nanoseconds; `T_target_source` maps coordinates of source into
+Types: `Scan`, `RegisteredScan`, `Trajectory`, `Loop`, `OccupancyGrid`, `Submap`, `SessionMap`; `SE2` for
+planar poses. Everywhere metres, radians, int64 nanoseconds; `T_target_source` maps coordinates of source into
 target. What is raised on purpose is a `Pc2GridError`, whose `hint` says what to do.
 
 >>> import pc2grid, signature
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from pc2grid.io.trajectory import write_kitti as write_kitti
     from pc2grid.io.trajectory import write_tum as write_tum
     from pc2grid.model import Health as Health
+    from pc2grid.model import Loop as Loop
     from pc2grid.model import OccupancyGrid as OccupancyGrid
     from pc2grid.model import RegisteredScan as RegisteredScan
     from pc2grid.model import Scan as Scan
@@ -48,6 +49,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "Health": "model.Health",
     "Log": "io.log.Log",
+    "Loop": "model.Loop",
     "OccupancyGrid": "model.OccupancyGrid",
     "Pc2GridError": "errors.Pc2GridError",
     "RegisteredScan": "model.RegisteredScan",

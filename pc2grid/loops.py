@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pc2grid.geometry import F64, SE2
 from pc2grid.matching import evenly
+from pc2grid.model import Loop
 from pc2grid.pieces import Keyframe, PieceStore, cut
 from pc2grid.pose_graph import Edge, optimise
 
@@ -80,11 +81,12 @@ class Nearness:
 
 @dataclass(frozen=True, slots=True)
 class Closed:
-    """poses (K, 3): x, y, yaw of each keyframe in the map frame. loops: keyframes, older and newer, in the
-    middle of pieces found to overlap. proposals: how many were verified to get them."""
+    """poses (K, 3): x, y, yaw of each keyframe in the map frame. loops: between keyframes in the middle of
+    pieces found to overlap, `older` and `newer` counting keyframes. proposals: how many were verified to get
+    them."""
 
     poses: F64
-    loops: tuple[tuple[int, int], ...]
+    loops: tuple[Loop, ...]
     proposals: int
 
 
@@ -93,8 +95,8 @@ def close_loops(keyframes: Sequence[Keyframe], proposers: Sequence[LoopProposer]
     tracked = np.array([(k.T_map_base.x, k.T_map_base.y, k.T_map_base.yaw) for k in keyframes])
     runs = cut(keyframes)
     store = PieceStore(keyframes, runs, tracked)
-    pairs, proposals = _find_pairs(store, proposers)
-    if not pairs:
+    found, proposals = _find_loops(store, proposers)
+    if not found:
         return Closed(tracked, (), proposals)
     chain = _tracking_edges(keyframes, runs)
     poses = store.poses
@@ -110,19 +112,18 @@ def close_loops(keyframes: Sequence[Keyframe], proposers: Sequence[LoopProposer]
             loops += edges
         poses = optimise(poses, chain + loops).poses
         store.move(poses, redraw=True)
-    loops_at = tuple((store.anchor(older), store.anchor(newer)) for older, newer in pairs)
-    return Closed(poses, loops_at, proposals)
+    return Closed(poses, found, proposals)
 
 
 # --- finding overlaps, piece by piece ---------------------------------------------------------------------
 
 
-def _find_pairs(store: PieceStore, proposers: Sequence[LoopProposer]) -> tuple[list[tuple[int, int]], int]:
-    """Verified overlaps; on return `store` holds poses that honour them."""
+def _find_loops(store: PieceStore, proposers: Sequence[LoopProposer]) -> tuple[tuple[Loop, ...], int]:
+    """Verified overlaps, between anchors; on return `store` holds poses that honour them."""
     anchors = [store.anchor(piece) for piece in range(len(store.runs))]
     tracked = store.poses
     edges: list[Edge] = []
-    pairs: list[tuple[int, int]] = []
+    believed: Sequence[bool] = ()
     nodes = tracked[anchors].copy()
     drift_m, proposals = 0.0, 0
     for newest in range(1, len(store.runs)):
@@ -143,11 +144,23 @@ def _find_pairs(store: PieceStore, proposers: Sequence[LoopProposer]) -> tuple[l
                     found.append(edge)
         if found:
             edges += found
-            pairs += [(edge.first, edge.second) for edge in found]
-            nodes[: newest + 1] = optimise(nodes[: newest + 1], edges).poses
+            solution = optimise(nodes[: newest + 1], edges)
+            nodes[: newest + 1], believed = solution.poses, solution.believed.tolist()
             drift_m = 0.0
     store.move(_carry(tracked, store, anchors, nodes, len(store.runs) - 1), redraw=False)
-    return pairs, proposals
+    loops = (
+        Loop(
+            older=anchors[edge.first],
+            newer=anchors[edge.second],
+            T_older_newer=edge.T_first_second,
+            information=edge.information,
+            accepted=accepted,
+        )
+        # What came after the last loop is no loop.
+        for edge, accepted in zip(edges, believed, strict=False)
+        if edge.loop
+    )
+    return tuple(loops), proposals
 
 
 def _carry(tracked: F64, store: PieceStore, anchors: list[int], nodes: F64, newest: int) -> F64:

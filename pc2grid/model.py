@@ -256,6 +256,33 @@ class ReadReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Loop:
+    """A place that a session came back to, as measured there: what closed a loop, or would have.
+
+    older, newer : which poses of the trajectory saw it.
+    T_older_newer : the newer base in the older one's frame, in the plane, as the two views fit each other.
+        The trajectory honours it as far as the other loops and the way between agree.
+    information : (3, 3) inverse covariance of its x, y, yaw in the older base's axes.
+    accepted : whether the others bear it out; otherwise it has lost most of its say.
+
+    >>> import numpy as np
+    >>> from pc2grid import SE2
+    >>> home = Loop(older=0, newer=900, T_older_newer=SE2(0.2, 0.0, 3.1), information=np.eye(3))
+    >>> home.accepted
+    True
+    """
+
+    older: int
+    newer: int
+    T_older_newer: SE2
+    information: F64
+    accepted: bool = True
+
+    def __post_init__(self) -> None:
+        _freeze(self, "information", np.float64, (3, 3))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SessionMap:
     """What one recording became: the end of the point-cloud half of pc2grid.
 
@@ -264,7 +291,7 @@ class SessionMap:
     grid : the whole occupancy grid in the session's map frame.
     submaps : its partition.
     trajectory : poses of the base; empty for an imported map.
-    loops : (L, 2) int64, pairs of indices of the trajectory that saw the same place and were made to agree.
+    loops : where the recording came back to a place it had seen.
 
     >>> import numpy as np
     >>> import pc2grid
@@ -282,8 +309,13 @@ class SessionMap:
     grid: OccupancyGrid
     submaps: tuple[Submap, ...]
     trajectory: Trajectory
-    loops: I64 = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    loops: tuple[Loop, ...] = ()
     report: ReadReport = field(default_factory=ReadReport)
 
     def __post_init__(self) -> None:
-        _freeze(self, "loops", np.int64, (None, 2))
+        for loop in self.loops:
+            if not 0 <= min(loop.older, loop.newer) <= max(loop.older, loop.newer) < len(self.trajectory):
+                raise ValueError(
+                    f"SessionMap.loops: expected poses of 0..{len(self.trajectory) - 1},"
+                    f" got {loop.older} and {loop.newer}"
+                )

@@ -13,8 +13,8 @@ from pc2grid.errors import NoScans
 from pc2grid.geometry import F64, SE2
 from pc2grid.model import (
     F32,
-    I64,
     Health,
+    Loop,
     OccupancyGrid,
     ReadReport,
     RegisteredScan,
@@ -113,9 +113,9 @@ def build_map(
 
 def map_scans(
     scans: Iterable[Scan], config: PipelineConfig, advance: Callable[[int], None] = lambda stamp_ns: None
-) -> tuple[OccupancyGrid, Trajectory, I64]:
-    """Grid and trajectory of scans, and the loops closed on the way: (L, 2) indices of poses that saw the
-    same place. `advance` is called with each scan's stamp.
+) -> tuple[OccupancyGrid, Trajectory, tuple[Loop, ...]]:
+    """Grid and trajectory of scans, and the loops found on the way. `advance` is called with each scan's
+    stamp.
 
     Only keyframes are kept, as sweeps of a few kilobytes; a robot that stands still adds nothing.
 
@@ -159,16 +159,18 @@ def map_scans(
     builder = GridBuilder(config.projection)
     if not stamps:
         nothing = Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
-        return builder.grid(), nothing, np.empty((0, 2), np.int64)
+        return builder.grid(), nothing, ()
     T_map_base = np.array(poses)
-    loops = np.empty((0, 2), np.int64)
+    loops: tuple[Loop, ...] = ()
     if len(keyframes) > 2:
         flat = np.array([(p.x, p.y, p.yaw) for p in map(SE2.flatten, poses)])
         closed = close_loops(keyframes)
         settled = spread(flat, [k.index for k in keyframes], closed.poses)
         T_map_base = _replant(T_map_base, flat, settled)
-        index = np.array([k.index for k in keyframes])
-        loops = index[np.array(closed.loops, np.int64).reshape(-1, 2)]
+        loops = tuple(
+            dataclasses.replace(loop, older=keyframes[loop.older].index, newer=keyframes[loop.newer].index)
+            for loop in closed.loops
+        )
     for keyframe, glimpses in zip(keyframes, glimpsed, strict=True):
         pose = SE2.flatten(T_map_base[keyframe.index])
         builder.add(keyframe.sweep, pose)

@@ -36,10 +36,14 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """poses (N, 3): x, y, yaw. chi2 (E,): weighted squared error of each edge, before robust weights."""
+    """poses (N, 3): x, y, yaw. chi2 (E,): weighted squared error of each edge, before robust weights.
+
+    believed (E,): all edges but the loops that lost more than half of their say.
+    """
 
     poses: F64
     chi2: F64
+    believed: NDArray[np.bool_]
 
 
 def optimise(
@@ -62,7 +66,7 @@ def optimise(
 
     poses = np.array(poses, dtype=np.float64)
     if not edges or len(poses) < 2:
-        return Solution(poses, np.zeros(len(edges)))
+        return Solution(poses, np.zeros(len(edges)), np.ones(len(edges), np.bool_))
     i = np.array([e.first for e in edges])
     j = np.array([e.second for e in edges])
     z = np.array([(e.T_first_second.x, e.T_first_second.y, e.T_first_second.yaw) for e in edges])
@@ -92,7 +96,7 @@ def optimise(
         if leniency.max() == 1.0 and np.abs(delta).max() < 1e-5:
             break
         leniency = np.maximum(leniency / _LESS_LENIENT, 1.0)
-    return Solution(poses, chi2)
+    return Solution(poses, chi2, ~loop | (chi2 <= robust_scale**2))
 
 
 def _seconded(

@@ -25,7 +25,7 @@ from pc2grid.errors import (
     OutputError,
 )
 from pc2grid.geometry import SE2
-from pc2grid.model import Health, OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
+from pc2grid.model import Health, Loop, OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
 from signature.config import Config
 from signature.database import Label, Provenance, create_database, open_database, transfer
 from signature.database.rewrite import hold
@@ -70,6 +70,16 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
         grid=grid,
         submaps=parts,
         trajectory=trajectory,
+        loops=tuple(
+            Loop(
+                older=k,
+                newer=6 - k,
+                T_older_newer=SE2(*(rng.random(3) / 3).tolist()),
+                information=rng.random((3, 3)) * 1e4,
+                accepted=k != 1,
+            )
+            for k in range(3)
+        ),
         report=ReadReport(scans_read=7, warnings=("no per-point time",)),
     )
     digest = hashlib.sha256(f"{name}{seed}".encode()).hexdigest()
@@ -77,6 +87,12 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
         source=f"{name}.mcap", digest=digest, config=config or Config(), versions={"pc2grid": "0.1.0"}
     )
     return session_map, signatures, origin
+
+
+def without_loops(entry):
+    """The entry as format 1 could hold it."""
+    session_map, *rest = entry
+    return replace(session_map, loops=()), *rest
 
 
 def assert_holds(database, entry) -> None:
@@ -97,6 +113,10 @@ def assert_holds(database, entry) -> None:
     assert np.array_equal(trajectory.stamps_ns, session_map.trajectory.stamps_ns)
     assert np.array_equal(trajectory.T_map_base, session_map.trajectory.T_map_base)
     assert trajectory.health == session_map.trajectory.health
+    for wanted, got in zip(session_map.loops, database.loops(name), strict=True):
+        assert np.array_equal(got.information, wanted.information)
+        assert (got.older, got.newer, got.accepted) == (wanted.older, wanted.newer, wanted.accepted)
+        assert got.T_older_newer == wanted.T_older_newer
     for wanted, got in zip(session_map.submaps, database.submaps(name), strict=True):
         assert (got.submap_id, got.center_m, got.radius_m) == (
             wanted.submap_id,
@@ -382,7 +402,7 @@ def test_newer_format_is_refused_by_number(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[60:64] = (99).to_bytes(4, "big")
     path.write_bytes(data)
-    with pytest.raises(DatabaseVersion, match="format 99; this pc2grid reads up to 1"):
+    with pytest.raises(DatabaseVersion, match="format 99; this pc2grid reads up to 2"):
         open_database(path)
 
 
@@ -408,6 +428,7 @@ def test_strangers_trigger_is_refused(path: Path) -> None:
     [
         ("grid", "cells"),
         ("trajectory", "poses"),
+        ("loop", "measured"),
         ("submap", "cells"),
         ("signature", "boundary"),
         ("signature", "center_m"),
@@ -433,6 +454,7 @@ def test_flipped_bit_in_any_blob_is_found_where_integrity_check_is_blind(path: P
         for info in database.sessions():
             database.grid(info.name)
             database.trajectory(info.name)
+            database.loops(info.name)
             list(database.submaps(info.name))
         database.signatures()
     assert "db check" in str(caught.value)
@@ -470,6 +492,7 @@ def _everything(database) -> str:
         digest.update(repr(info).encode())
         digest.update(database.grid(info.name).cells.tobytes())
         digest.update(database.trajectory(info.name).T_map_base.tobytes())
+        digest.update(repr(database.loops(info.name)).encode())
         for submap in database.submaps(info.name):
             digest.update(repr((submap.submap_id, submap.center_m, submap.radius_m)).encode())
             digest.update(submap.grid.cells.tobytes())

@@ -42,6 +42,7 @@ FUZZ = int(os.environ.get("PC2GRID_FUZZ", "0"))
 BLOBS = {
     "grid": ["cells"],
     "trajectory": ["stamps_ns", "poses", "health"],
+    "loop": ["pairs", "measured", "information", "accepted"],
     "submap": ["cells"],
     "signature": ["submap_id", "center_m", "boundary", "freespace", "symmetry"],
 }
@@ -76,6 +77,7 @@ def read_all(file: Path) -> dict[str, str]:
             trajectory = database.trajectory(info.name)
             digest.update(trajectory.stamps_ns.tobytes() + trajectory.T_map_base.tobytes())
             digest.update(repr(trajectory.health).encode())
+            digest.update(repr(database.loops(info.name)).encode())
             for submap in database.submaps(info.name):
                 digest.update(repr((submap.submap_id, submap.center_m, submap.radius_m)).encode())
                 digest.update(submap.grid.cells.tobytes())
@@ -107,7 +109,8 @@ def set_header(offset: int, value: int) -> Callable[[bytes], bytes]:
         (lambda data: data[:100] + bytes(len(data) - 100), DatabaseCorrupt, "x.submaps"),
         (lambda data: bytes(range(256)) * 64, NotADatabase, "not a pc2grid database"),
         (set_header(68, 0), NotADatabase, "another program's SQLite file (application id 0x0)"),
-        (set_header(60, 2), DatabaseVersion, "database format 2; this pc2grid reads up to 1"),
+        (set_header(60, 3), DatabaseVersion, "database format 3; this pc2grid reads up to 2"),
+        (set_header(60, 1), DatabaseCorrupt, "its tables are not those of format 1 ('loop')"),
         (set_header(60, 2**31 - 1), DatabaseVersion, "database format 2147483647"),
         (set_header(60, 0), DatabaseCorrupt, "database format 0 never existed"),
     ],
@@ -162,7 +165,7 @@ def test_command_line_refuses_a_newer_format_in_one_line(path: Path) -> None:
     done = pc2grid("db", "info", path.name, cwd=path.parent)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.splitlines() == [
-        "pc2grid: error: x.submaps: database format 7; this pc2grid reads up to 1",
+        "pc2grid: error: x.submaps: database format 7; this pc2grid reads up to 2",
         "hint: use a newer pc2grid",
     ]
 

@@ -155,6 +155,7 @@ def sessions_of(database: SubmapDatabase) -> dict[str, str]:
         digest = hashlib.sha256(repr(info).encode())
         digest.update(database.grid(info.name).cells.tobytes())
         digest.update(database.trajectory(info.name).T_map_base.tobytes())
+        digest.update(repr(database.loops(info.name)).encode())
         for submap in database.submaps(info.name):
             digest.update(repr((submap.submap_id, submap.center_m, submap.radius_m)).encode())
             digest.update(submap.grid.cells.tobytes())

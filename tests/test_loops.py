@@ -56,6 +56,7 @@ def test_one_loop_takes_the_drift_out_and_a_false_one_is_outvoted():
     after = np.linalg.norm(solved.poses[-1, :2] - array(truth)[-1, :2])
     assert before > 2.0 and after < 0.1
     assert solved.chi2[-1] > 100 * solved.chi2[-2]
+    assert solved.believed[:39].all() and solved.believed[-2:].tolist() == [True, False]
     assert np.array_equal(solved.poses[0], array(truth)[0])
 
 
@@ -118,3 +119,11 @@ def test_two_laps_around_a_block_with_drift_agree_after_closing():
     lap = closed.poses[100:, :2] - closed.poses[:100, :2]
     assert np.linalg.norm(lap, axis=1).max() < 0.08
     assert after.max() < 0.1
+    for loop in closed.loops:
+        assert loop.older < loop.newer
+        apart = (truth[loop.older].inverse() @ truth[loop.newer]).inverse() @ loop.T_older_newer
+        assert math.hypot(apart.x, apart.y) < 0.1 and abs(apart.yaw) < 0.03
+        # The information is right about the size of that error: 16 is beyond 0.1 % of what it promises.
+        error = np.array([apart.x, apart.y, apart.yaw])
+        assert error @ loop.information @ error < 16.0 and np.linalg.eigvalsh(loop.information)[0] > 10.0
+    assert sum(loop.accepted for loop in closed.loops) > 0.9 * len(closed.loops)

@@ -68,7 +68,7 @@ def test_follow_streams_one_sweep_a_scan(session):
 
 def test_no_scans_no_trajectory():
     grid, trajectory, loops = map_scans(iter(()), Config())
-    assert grid.cells.size == 0 and len(trajectory) == 0 and loops.shape == (0, 2)
+    assert grid.cells.size == 0 and len(trajectory) == 0 and loops == ()
 
 
 @needs_data

@@ -30,7 +30,7 @@ from signature.database import create_database, open_database, postgres_schema, 
 from signature.database.search import embedding
 from signature.database.transfer import store
 from tests import postgresql
-from tests.test_database import assert_holds, everything, make_entry
+from tests.test_database import assert_holds, everything, make_entry, without_loops
 
 
 @pytest.fixture
@@ -134,14 +134,42 @@ def test_server_without_pgvector(url: str, monkeypatch) -> None:
         assert connection.execute("SELECT to_regnamespace('pc2grid')").fetchone() == (None,)
 
 
-@pytest.mark.parametrize(("number", "words"), [(99, "use a newer"), (0, "convert the recordings again")])
-def test_schema_of_another_version(filled: str, number: int, words: str) -> None:
+@pytest.mark.parametrize(
+    ("number", "error", "words"),
+    [
+        (99, DatabaseVersion, r"format 99; this pc2grid reads up to 2 \(use a newer"),
+        (0, DatabaseCorrupt, "never existed"),
+    ],
+)
+def test_schema_of_another_version(filled: str, number: int, error: type[DatabaseError], words: str) -> None:
     with postgresql.connect(filled) as connection:
         connection.execute("UPDATE pc2grid.about SET format = %s", [number])
     for attempt in (open_database, lambda u: store(u, [make_entry("friday", 5)], keep=True)):
-        with pytest.raises(DatabaseVersion, match=f"format {number}; this pc2grid reads 1") as caught:
+        with pytest.raises(error, match=words):
             attempt(filled)
-        assert words in str(caught.value)
+
+
+@pytest.mark.fault(44)
+def test_a_database_of_format_1_is_read_as_it_is_and_grows_up_when_written(url: str) -> None:
+    plain = [without_loops(make_entry(name, seed)) for seed, name in enumerate(("monday", "tuesday"))]
+    store(url, plain, keep=False)
+    with postgresql.connect(url) as connection:  # what format 1 was
+        connection.execute("DROP TABLE pc2grid.loop; UPDATE pc2grid.about SET format = 1")
+    with open_database(url) as early:
+        for entry in plain:
+            assert_holds(early, entry)
+        assert early.check() == ()
+        store(url, [make_entry("friday", 5)], keep=True)
+        assert early.loops("monday") == () and early.check() == ()
+    with open_database(url) as late, postgresql.connect(url) as connection:
+        assert connection.execute("SELECT format FROM pc2grid.about").fetchone() == (2,)
+        for entry in (*plain, make_entry("friday", 5)):
+            assert_holds(late, entry)
+        assert late.check() == ()
+        connection.execute("DELETE FROM pc2grid.loop WHERE session_id = 1")
+    with open_database(url) as short:
+        (problem,) = short.check()
+        assert (problem.where, problem.what) == ("session 1", "has no loop")
 
 
 def test_old_pgvector_is_named(filled: str) -> None:
@@ -254,6 +282,7 @@ def test_writer_that_waits_too_long_is_told(filled: str, monkeypatch) -> None:
         ("session", "floor", "'cellar'"),
         ("grid", "cells", "set_byte(cells, 9, 1)"),
         ("trajectory", "poses", "set_byte(poses, 9, 1)"),
+        ("loop", "measured", "set_byte(measured, 9, 1)"),
         ("submap", "center_x_m", "center_x_m + 1"),
         ("signature", "boundary", "set_byte(boundary, 9, 1)"),
         ("signature", "embedding", "embedding + embedding"),
@@ -272,6 +301,7 @@ def test_changed_rows_are_found(filled: str, table: str, column: str, value: str
         for info in database.sessions():
             database.grid(info.name)
             database.trajectory(info.name)
+            database.loops(info.name)
             list(database.submaps(info.name))
         database.signatures()
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pc2grid.errors import DatabaseError, NotADatabase, OutputError
-from pc2grid.model import OccupancyGrid, SessionMap, Submap, Trajectory
+from pc2grid.model import Loop, OccupancyGrid, SessionMap, Submap, Trajectory
 from signature.database import codec, postgres_schema, rows
 from signature.database.postgres_schema import served
 from signature.database.protocol import Entry, Label, Neighbour, Problem, Provenance, SessionInfo, none_there
@@ -42,7 +42,9 @@ def store(url: str, entries: Iterable[Entry], *, keep: bool, force: bool = False
     again = (psycopg.errors.UniqueViolation, psycopg.errors.DeadlockDetected)
     with postgres_schema.connect(url, where) as connection:
         postgres_schema.initialise(connection, where)
-        postgres_schema.inspect(connection, where)
+        if postgres_schema.inspect(connection, where) < postgres_schema.FORMAT:
+            with served(where), connection.transaction():
+                _bring_along(connection)
         for attempt in range(1, _ATTEMPTS + 1):
             try:
                 with served(where), connection.transaction():
@@ -90,6 +92,14 @@ def _store(
         _insert_session(connection, int(number), session_map, signatures, provenance)
 
 
+def _bring_along(connection: Connection[Any]) -> None:
+    """Sessions of format 1 knew no loops: they have none."""
+    if "loop" in postgres_schema.bring_along(connection):
+        known = connection.execute("SELECT building, id FROM pc2grid.session ORDER BY id").fetchall()
+        nothing = rows.loop_row(())
+        _copy_in(connection, "loop", [{"building": b, "session_id": n, **nothing} for b, n in known])
+
+
 def _other_session(connection: Connection[Any], where: str, name: str) -> SessionInfo | None:
     """Any session but `name`, kept from being removed until this transaction ends.
 
@@ -132,6 +142,7 @@ def _insert_session(
     _copy_in(connection, "session", [session])
     _copy_in(connection, "grid", [{**of_session, **rows.grid_row(session_map.grid)}])
     _copy_in(connection, "trajectory", [{**of_session, **rows.trajectory_row(session_map.trajectory)}])
+    _copy_in(connection, "loop", [{**of_session, **rows.loop_row(session_map.loops)}])
     _copy_in(connection, "submap", [{**of_session, **rows.submap_row(submap)} for submap in submaps])
     described = [
         {
@@ -269,7 +280,8 @@ class PostgresDatabase:
         self._config = None
         with served(self._where):
             self._connection.rollback()
-            self._connection.execute("SELECT 1 FROM pc2grid.about")
+            found = self._connection.execute("SELECT format FROM pc2grid.about").fetchone()
+        self._format = int(found[0]) if found else postgres_schema.FORMAT
 
     @property
     def location(self) -> str:
@@ -378,6 +390,14 @@ class PostgresDatabase:
         with rows.explained(self._where, f"trajectory of session {session!r}"):
             return rows.read_trajectory(row)
 
+    def loops(self, session: str) -> tuple[Loop, ...]:
+        """Where the session came back to a place; see `SubmapDatabase.loops`."""
+        if "loop" not in postgres_schema.tables(self._format):
+            return ()
+        row = self._row("loop", session)
+        with rows.explained(self._where, f"loops of session {session!r}"):
+            return rows.read_loops(row)
+
     def submap(self, session: str, submap_id: int) -> Submap:
         """One submap. Raises DatabaseError if the session has none of that number."""
         row = self._row("submap", session, int(submap_id))
@@ -456,7 +476,7 @@ class PostgresDatabase:
         problems: list[Problem] = []
         with served(self._where):
             for key in self._keys().values():
-                found = list(self._damage(key, tuple(postgres_schema.TABLES)))
+                found = list(self._damage(key, postgres_schema.tables(self._format)))
                 problems += found or [*self._misled(key), *self._incomplete(key)]
         return tuple(dict.fromkeys(problems))
 
@@ -520,7 +540,8 @@ class PostgresDatabase:
                 except Exception as error:
                     # Whatever the decoding of damaged content stumbles over is the finding.
                     yield Problem(name, str(error))
-        for table in ("grid", "trajectory"):
+        # Without the first two a session is not even listed.
+        for table in ("grid", "trajectory", *({"loop"} & {*tables})):
             if not _select(self._connection, table, key):
                 yield Problem(f"session {key[1]}", f"has no {table}")
 

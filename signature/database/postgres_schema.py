@@ -28,7 +28,7 @@ from signature.database.schema import APPLICATION_ID
 if TYPE_CHECKING:
     from psycopg import Connection, Error
 
-FORMAT = 1
+FORMAT = 2
 PGVECTOR = (0, 8)
 """The first version that goes on looking when a filter leaves too few (hnsw.iterative_scan)."""
 SHORTLIST = 400
@@ -51,6 +51,9 @@ TABLES = {
     f" PRIMARY KEY (building, session_id), {_REFERENCES}",
     "trajectory": f"{_OF_SESSION}, count integer NOT NULL, stamps_ns bytea NOT NULL, poses bytea NOT NULL,"
     f" health bytea NOT NULL, crc32 bigint NOT NULL, PRIMARY KEY (building, session_id), {_REFERENCES}",
+    "loop": f"{_OF_SESSION}, count integer NOT NULL, pairs bytea NOT NULL, measured bytea NOT NULL,"
+    f" information bytea NOT NULL, accepted bytea NOT NULL, crc32 bigint NOT NULL,"
+    f" PRIMARY KEY (building, session_id), {_REFERENCES}",
     "submap": f"{_OF_SESSION}, submap_id integer NOT NULL, center_x_m float8 NOT NULL, center_y_m float8 NOT"
     f" NULL, radius_m float8 NOT NULL, {_GRID}, crc32 bigint NOT NULL,"
     f" PRIMARY KEY (building, session_id, submap_id), {_REFERENCES}",
@@ -62,6 +65,8 @@ TABLES = {
     " crc32 bigint NOT NULL, embedding halfvec NOT NULL,"
     f" PRIMARY KEY (building, session_id, submap_id), {_REFERENCES}",
 }
+_SINCE = {"loop": 2}
+"""The format that brought a table; the others were always there."""
 _NO_COLUMNS = ("crc32", "embedding", "PRIMARY", "FOREIGN")
 TYPES = {
     name: {
@@ -136,8 +141,15 @@ def connect(url: str, where: str) -> Connection[Any]:
     return connection
 
 
-def inspect(connection: Connection[Any], where: str) -> None:
+def tables(version: int = FORMAT) -> tuple[str, ...]:
+    """Names of the tables of a format."""
+    return tuple(name for name in TABLES if _SINCE.get(name, 1) <= version)
+
+
+def inspect(connection: Connection[Any], where: str) -> int:
     """Look whether this is a database of ours, and make its vector type known to the connection.
+
+    Returns its format, this version's or an older one.
 
     Raises NotADatabase, DatabaseVersion, DatabaseError without pgvector, DatabaseCorrupt.
     """
@@ -149,22 +161,25 @@ def inspect(connection: Connection[Any], where: str) -> None:
         found = connection.execute("SELECT format FROM pc2grid.about").fetchall()
         if len(found) != 1:
             raise DatabaseCorrupt(f"{where}: damaged: pc2grid.about has {len(found)} rows instead of one")
-        if found[0][0] != FORMAT:
+        version = int(found[0][0])
+        if version > FORMAT:
             raise DatabaseVersion(
-                f"{where}: database format {found[0][0]}; this pc2grid reads {FORMAT}",
-                hint="use a newer pc2grid" if found[0][0] > FORMAT else "convert the recordings again",
+                f"{where}: database format {version}; this pc2grid reads up to {FORMAT}",
+                hint="use a newer pc2grid",
             )
+        if version < 1:
+            raise DatabaseCorrupt(f"{where}: damaged: database format {version} never existed")
         extension = connection.execute(
             "SELECT n.nspname, e.extversion FROM pg_extension e JOIN pg_namespace n ON n.oid = e.extnamespace"
             " WHERE e.extname = 'vector'"
         ).fetchone()
         if extension is None:
             raise _no_pgvector(where)
-        namespace, version = extension
-        if tuple(int(part) for part in re.findall(r"\d+", version)[:2]) < PGVECTOR:
+        namespace, installed = extension
+        if tuple(int(part) for part in re.findall(r"\d+", installed)[:2]) < PGVECTOR:
             needed = ".".join(map(str, PGVECTOR))
             raise DatabaseError(
-                f"{where}: the server has pgvector {version}; needed is {needed} or newer",
+                f"{where}: the server has pgvector {installed}; needed is {needed} or newer",
                 hint="install it on the server, then `ALTER EXTENSION vector UPDATE` in the database",
             )
         connection.execute("SELECT set_config('search_path', %s, false)", [f"pc2grid, {namespace}"])
@@ -173,6 +188,7 @@ def inspect(connection: Connection[Any], where: str) -> None:
         connection.execute("SELECT '[1]'::halfvec <#> '[1]'")
         connection.execute(f"SET hnsw.ef_search = {SHORTLIST}")
         connection.execute("SET hnsw.iterative_scan = strict_order")
+    return version
 
 
 def initialise(connection: Connection[Any], where: str) -> None:
@@ -202,6 +218,19 @@ def initialise(connection: Connection[Any], where: str) -> None:
         connection.execute("CREATE SEQUENCE pc2grid.session_id")
         for table, columns in TABLES.items():
             connection.execute(f"CREATE TABLE pc2grid.{table} ({columns})")
+
+
+def bring_along(connection: Connection[Any]) -> list[str]:
+    """Within a transaction: make the tables that a database of an older format lacks; returns their names.
+
+    Readers that are at it keep the database as they opened it.
+    """
+    (version,) = connection.execute("SELECT format FROM pc2grid.about FOR UPDATE").fetchone() or (FORMAT,)
+    missing = [table for table in tables() if table not in tables(version)]
+    for table in missing:
+        connection.execute(f"CREATE TABLE pc2grid.{table} ({TABLES[table]})")
+    connection.execute("UPDATE pc2grid.about SET format = %s", [FORMAT])
+    return missing
 
 
 def index_embeddings(connection: Connection[Any], dimensions: int) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pc2grid.errors import DatabaseError
-from pc2grid.model import OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
+from pc2grid.model import Loop, OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
 
 if TYPE_CHECKING:
     from signature.config import Config
@@ -167,6 +167,10 @@ class SubmapDatabase(Protocol):
 
     def trajectory(self, session: str) -> Trajectory:
         """Poses of the base in the session's map frame; empty for an imported map."""
+        ...
+
+    def loops(self, session: str) -> tuple[Loop, ...]:
+        """Where the session came back to a place; `older` and `newer` count poses of its trajectory."""
         ...
 
     def submap(self, session: str, submap_id: int) -> Submap:

@@ -21,6 +21,7 @@ from pathlib import Path
 from pc2grid.errors import DatabaseBusy, DatabaseCorrupt, OutputError
 from pc2grid.io.atomic import replace_file
 from signature.database import schema
+from signature.database.older import bring_along
 
 BUSY_TIMEOUT_S = 30.0
 
@@ -29,7 +30,8 @@ BUSY_TIMEOUT_S = 30.0
 def rewrite(path: Path, *, keep: bool, timeout_s: float = BUSY_TIMEOUT_S) -> Iterator[sqlite3.Connection]:
     """Give the body a connection to change; when it ends well, `path` holds the result.
 
-    keep : start from what `path` holds; otherwise, or if there is nothing yet, from an empty database.
+    keep : start from what `path` holds; otherwise, or if there is nothing yet, from an empty database. What
+        is of an older format becomes one of this; the file as it was stays beside it as `NAME.format1`.
 
     Raises DatabaseBusy if another writer does not finish within `timeout_s`, OutputError if the file
     cannot be written, NotADatabase, DatabaseCorrupt and their like if `path` cannot be kept.
@@ -48,11 +50,17 @@ def rewrite(path: Path, *, keep: bool, timeout_s: float = BUSY_TIMEOUT_S) -> Ite
             connection.execute("PRAGMA trusted_schema = OFF")
             if kept:
                 schema.inspect_tables(connection, path)
+                version = schema.version_of(connection)
+                bring_along(connection)
             else:
                 schema.initialise(connection)
+                version = schema.FORMAT
             connection.execute("BEGIN")
             yield connection
             connection.execute("COMMIT")
+            if version < schema.FORMAT:
+                with replace_file(target.with_name(f"{target.name}.format{version}")) as before:
+                    shutil.copyfile(target, before)
         except schema.COMPLAINTS as error:
             raise _explained(error, path, kept) from error
         finally:

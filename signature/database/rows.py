@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError, DatabaseVersion
-from pc2grid.model import OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
+from pc2grid.geometry import SE2
+from pc2grid.model import Loop, OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
 from signature.database import codec, schema
 from signature.database.protocol import Entry, Label, Provenance, SessionInfo
 
@@ -76,6 +77,7 @@ def insert_session(
     insert(connection, "session", session)
     insert(connection, "grid", {"session_id": session_id, **grid_row(session_map.grid)})
     insert(connection, "trajectory", {"session_id": session_id, **trajectory_row(session_map.trajectory)})
+    insert(connection, "loop", {"session_id": session_id, **loop_row(session_map.loops)})
     for submap in submaps:
         insert(connection, "submap", {"session_id": session_id, **submap_row(submap)})
     insert(connection, "signature", {"session_id": session_id, **signature_row(submaps, signatures)})
@@ -220,6 +222,25 @@ def read_trajectory(row: Row) -> Trajectory:
     )
 
 
+def read_loops(row: Row) -> tuple[Loop, ...]:
+    """A loop row: all loops of a session. ValueError if its arrays do not fit."""
+    n = row["count"]
+    pairs = codec.unpack_array(row["pairs"], "<i4", (n, 2))
+    measured = codec.unpack_array(row["measured"], "<f8", (n, 3))
+    information = codec.unpack_array(row["information"], "<f8", (n, 3, 3))
+    accepted = codec.unpack_array(row["accepted"], "u1", (n,))
+    return tuple(
+        Loop(
+            older=int(pairs[k, 0]),
+            newer=int(pairs[k, 1]),
+            T_older_newer=SE2(*measured[k].tolist()),
+            information=information[k],
+            accepted=bool(accepted[k]),
+        )
+        for k in range(n)
+    )
+
+
 def refuse_other_settings(known: SessionInfo, config: Config, resolution_m: float, path: Path | str) -> None:
     """Signatures made differently must never be compared: all sessions share what shapes them.
 
@@ -275,6 +296,18 @@ def trajectory_row(trajectory: Trajectory) -> Row:
     }
 
 
+def loop_row(loops: Sequence[Loop]) -> Row:
+    """The other way round of `read_loops`."""
+    relative = [loop.T_older_newer for loop in loops]
+    return {
+        "count": len(loops),
+        "pairs": codec.pack_array(np.array([(loop.older, loop.newer) for loop in loops]), "<i4"),
+        "measured": codec.pack_array(np.array([(T.x, T.y, T.yaw) for T in relative]), "<f8"),
+        "information": codec.pack_array(np.array([loop.information for loop in loops]), "<f8"),
+        "accepted": codec.pack_array(np.array([loop.accepted for loop in loops]), "u1"),
+    }
+
+
 def submap_row(submap: Submap) -> Row:
     """The other way round of `read_submap`."""
     return {
@@ -297,6 +330,8 @@ def decode(table: str, row: Row, where: Path | str, read_signatures: Callable[[R
         read_grid(row)
     elif table == "trajectory":
         read_trajectory(row)
+    elif table == "loop":
+        read_loops(row)
     elif table == "submap":
         read_submap(row)
     else:

@@ -8,7 +8,7 @@ from pathlib import Path
 from pc2grid.errors import DatabaseCorrupt, DatabaseVersion, NotADatabase
 
 APPLICATION_ID = 0x70633267  # "pc2g"
-FORMAT = 1
+FORMAT = 2
 CONVERT = "make one with `pc2grid convert LOG -o BUILDING.submaps`"
 SALVAGE = "`pc2grid db check` lists all damage, `pc2grid db copy --recover` keeps what is whole"
 
@@ -25,6 +25,9 @@ TABLES = {
     " cells BLOB NOT NULL, crc32 INTEGER NOT NULL",
     "trajectory": "session_id INTEGER PRIMARY KEY REFERENCES session(id), count INTEGER NOT NULL,"
     " stamps_ns BLOB NOT NULL, poses BLOB NOT NULL, health BLOB NOT NULL, crc32 INTEGER NOT NULL",
+    "loop": "session_id INTEGER PRIMARY KEY REFERENCES session(id), count INTEGER NOT NULL,"
+    " pairs BLOB NOT NULL, measured BLOB NOT NULL, information BLOB NOT NULL, accepted BLOB NOT NULL,"
+    " crc32 INTEGER NOT NULL",
     "submap": "id INTEGER PRIMARY KEY, session_id INTEGER NOT NULL REFERENCES session(id),"
     " submap_id INTEGER NOT NULL, center_x_m REAL NOT NULL, center_y_m REAL NOT NULL, radius_m REAL NOT NULL,"
     " height INTEGER NOT NULL, width INTEGER NOT NULL, resolution_m REAL NOT NULL,"
@@ -36,7 +39,10 @@ TABLES = {
     " center_m BLOB NOT NULL, boundary BLOB NOT NULL, freespace BLOB NOT NULL, symmetry BLOB NOT NULL,"
     " crc32 INTEGER NOT NULL",
 }
-_STATEMENTS = {name: f"CREATE TABLE {name} ({columns})" for name, columns in TABLES.items()}
+ONE_EACH = ("grid", "trajectory", "loop", "signature")
+"""The tables in which every session has exactly one row."""
+_SINCE = {"loop": 2}
+"""The format that brought a table; the others were always there."""
 
 # What the checksum covers: everything but the row's own number, which says nothing.
 COLUMNS = {
@@ -50,12 +56,27 @@ COLUMNS = {
 }
 
 
+def statements(version: int = FORMAT) -> dict[str, str]:
+    """What makes the tables of a format: table -> SQL."""
+    return {
+        name: f"CREATE TABLE {name} ({columns})"
+        for name, columns in TABLES.items()
+        if _SINCE.get(name, 1) <= version
+    }
+
+
+def version_of(connection: sqlite3.Connection) -> int:
+    """The format of the file that a connection is to."""
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    return int(version)
+
+
 def initialise(connection: sqlite3.Connection) -> None:
     """Turn an empty file into a database of this format."""
     connection.execute("PRAGMA page_size = 4096")
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     connection.execute(f"PRAGMA user_version = {FORMAT}")
-    for statement in _STATEMENTS.values():
+    for statement in statements().values():
         connection.execute(statement)
 
 
@@ -107,7 +128,7 @@ def inspect_header(path: Path) -> None:
 
 
 def inspect_tables(connection: sqlite3.Connection, path: Path) -> None:
-    """The tables must be ours to the letter: no triggers or views of strangers, no damaged definitions.
+    """The tables must be those of its format to the letter: no strangers' triggers or views, no damage.
 
     Raises DatabaseCorrupt.
     """
@@ -115,8 +136,11 @@ def inspect_tables(connection: sqlite3.Connection, path: Path) -> None:
         str(name): str(sql)
         for name, sql in connection.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL")
     }
-    if found != _STATEMENTS:
-        odd = sorted(name for name in found.keys() | _STATEMENTS if found.get(name) != _STATEMENTS.get(name))
+    version = version_of(connection)
+    wanted = statements(version)
+    if found != wanted:
+        odd = sorted(name for name in found.keys() | wanted if found.get(name) != wanted.get(name))
         raise DatabaseCorrupt(
-            f"{path}: its tables are not those of format {FORMAT} ({', '.join(map(repr, odd))})", hint=SALVAGE
+            f"{path}: its tables are not those of format {version} ({', '.join(map(repr, odd))})",
+            hint=SALVAGE,
         )

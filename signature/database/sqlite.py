@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
 
 import numpy as np
 
 from pc2grid.errors import DatabaseError
 from pc2grid.io.atomic import refuse_existing
-from pc2grid.model import OccupancyGrid, SessionMap, Submap, Trajectory
-from signature.database import rows, schema
+from pc2grid.model import Loop, OccupancyGrid, SessionMap, Submap, Trajectory
+from signature.database import rows, schema, upkeep
 from signature.database.protocol import (
     Entry,
     Neighbour,
@@ -24,6 +22,7 @@ from signature.database.protocol import (
     none_there,
 )
 from signature.database.rewrite import BUSY_TIMEOUT_S, rewrite
+from signature.database.sqlite_file import connect, damaged_sessions, read_sessions
 
 if TYPE_CHECKING:
     from signature.config import Config
@@ -77,25 +76,6 @@ def remove(connection: sqlite3.Connection, session_id: int) -> None:
         connection.execute(f"DELETE FROM {table} WHERE {column} = ?", (session_id,))
 
 
-def read_sessions(
-    connection: sqlite3.Connection, path: Path, without: Collection[int] = ()
-) -> list[tuple[int, SessionInfo]]:
-    """All sessions but those of the numbers `without`, with their numbers. Raises DatabaseCorrupt."""
-    sessions = []
-    with rows.explained(path, "session"):
-        # The sizes come from rows whose own checksum is looked at when they are used.
-        resolution_m = dict(connection.execute("SELECT session_id, resolution_m FROM grid"))
-        scans = dict(connection.execute("SELECT session_id, count FROM trajectory"))
-        for row, sound in rows.select(connection, "session"):
-            if row["id"] in without:
-                continue
-            if not sound:
-                raise rows.corrupt(path, f"session {row['id']}", "wrong checksum")
-            info = rows.read_info(row, resolution_m[row["id"]], scans[row["id"]], path)
-            sessions.append((row["id"], info))
-    return sessions
-
-
 class SqliteDatabase:
     """A `*.submaps` file. See `SubmapDatabase` for what the methods promise.
 
@@ -106,7 +86,7 @@ class SqliteDatabase:
         self._path = path
         self._writable = writable
         self._left_out: Collection[int] = ()
-        self._open()
+        self._connection = connect(self._path)
 
     @classmethod
     def create(cls, path: Path, *, force: bool = False) -> SqliteDatabase:
@@ -115,24 +95,6 @@ class SqliteDatabase:
             refuse_existing(path, force)
         store(path, (), keep=False)
         return cls(path, writable=True)
-
-    def _open(self) -> None:
-        schema.inspect_header(self._path)
-        real = os.path.realpath(self._path)
-        # Finished files are never written again, so no locks are needed and none are taken; unless
-        # another program left its journal beside the file.
-        journals = [Path(real + suffix) for suffix in ("-wal", "-journal")]
-        immutable = "" if any(journal.exists() for journal in journals) else "&immutable=1"
-        uri = f"file:{quote(real)}?mode=ro{immutable}"
-        with rows.explained(self._path, "header"):
-            self._connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
-            try:
-                self._connection.execute("PRAGMA trusted_schema = OFF")
-                self._connection.execute("PRAGMA mmap_size = 1073741824")
-                schema.inspect_tables(self._connection, self._path)
-            except BaseException:
-                self._connection.close()
-                raise
 
     @property
     def location(self) -> str:
@@ -213,6 +175,12 @@ class SqliteDatabase:
         with rows.explained(self._path, f"trajectory of session {session!r}"):
             return rows.read_trajectory(row)
 
+    def loops(self, session: str) -> tuple[Loop, ...]:
+        """Where the session came back to a place; see `SubmapDatabase.loops`."""
+        row = self._row("loop", session, "session_id = ?", self._id(session))
+        with rows.explained(self._path, f"loops of session {session!r}"):
+            return rows.read_loops(row)
+
     def submap(self, session: str, submap_id: int) -> Submap:
         """One submap. Raises DatabaseError if the session has none of that number."""
         where = "session_id = ? AND submap_id = ?"
@@ -249,12 +217,10 @@ class SqliteDatabase:
             raise DatabaseError(f"{self._path}: opened for reading only")
         store(self._path, [(session_map, signatures, provenance)], keep=True, force=force)
         self.close()
-        self._open()
+        self._connection = connect(self._path)
 
     def keep_only(self, *, building: str | None = None, floor: str | None = None) -> None:
         """From now on, know only some sessions; see `SubmapDatabase.keep_only`."""
-        from signature.database.upkeep import damaged_sessions
-
         # What a damaged one was is not known: whoever asks for damage shall hear of it.
         unknown = {*self._left_out, *damaged_sessions(self._connection, self._path)}
         known = read_sessions(self._connection, self._path, unknown)
@@ -270,8 +236,6 @@ class SqliteDatabase:
         Returns what is wrong with each of them. Raises DatabaseCorrupt if none is left, or if the file
         itself cannot be read.
         """
-        from signature.database.upkeep import damaged_sessions
-
         found = damaged_sessions(self._connection, self._path)
         damaged = {number: problem for number, problem in found.items() if number not in self._left_out}
         problems = tuple(damaged.values())
@@ -282,9 +246,7 @@ class SqliteDatabase:
 
     def check(self) -> tuple[Problem, ...]:
         """Everything that is wrong with the file."""
-        from signature.database.upkeep import check
-
-        return check(self._path)
+        return upkeep.check(self._path)
 
     def close(self) -> None:
         """Let go of the file."""

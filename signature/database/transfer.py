@@ -118,6 +118,7 @@ def _entry(database: SubmapDatabase, info: SessionInfo, recover: bool) -> Entry:
         grid=database.grid(info.name),
         submaps=tuple(submaps),
         trajectory=database.trajectory(info.name),
+        loops=database.loops(info.name),
         report=info.report,
     )
     return session_map, signatures, info.provenance

@@ -6,7 +6,6 @@ import contextlib
 import sqlite3
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from urllib.parse import quote
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from pc2grid.errors import DatabaseCorrupt, DatabaseError, Pc2GridError
 from signature.database import codec, rows, schema
 from signature.database.protocol import Problem
 from signature.database.rewrite import rewrite
-from signature.database.sqlite import read_sessions
+from signature.database.sqlite_file import connect, read_sessions, read_table, whatever_it_holds
 
 
 def check(path: Path) -> tuple[Problem, ...]:
@@ -27,41 +26,13 @@ def check(path: Path) -> tuple[Problem, ...]:
         schema.inspect_header(path)
     except DatabaseCorrupt as error:
         problems.append(Problem("file", error.message))
-    with _read_only(path) as connection:
+    with whatever_it_holds(path) as connection:
         problems += _structure(connection, path)
         for table in schema.TABLES:
-            problems += [problem for _, problem in _read_table(connection, path, table) if problem]
+            problems += [problem for _, problem in read_table(connection, path, table) if problem]
         if not problems:
             problems += _counts(connection, path)
     return tuple(dict.fromkeys(problems))
-
-
-def damaged_sessions(connection: sqlite3.Connection, path: Path) -> dict[int, Problem]:
-    """Numbers of the sessions whose own row, grid or signatures are damaged or missing, and what it is.
-
-    These are what a search reads; damaged submaps and trajectories are not looked for. Raises
-    DatabaseCorrupt if a table cannot be read to its end.
-    """
-    damaged: dict[int, Problem] = {}
-    present: dict[str, set[int]] = {}
-    for table, key in (("session", "id"), ("grid", "session_id"), ("signature", "session_id")):
-        present[table] = set()
-        for row, problem in _read_table(connection, path, table):
-            if row is None:
-                assert problem is not None
-                raise rows.corrupt(path, problem.where, problem.what)
-            present[table].add(row[key])
-            if problem is not None:
-                damaged.setdefault(row[key], problem)
-    with rows.explained(path, "trajectory"):
-        present["trajectory"] = {
-            number for (number,) in connection.execute("SELECT session_id FROM trajectory")
-        }
-    for number in sorted(set().union(*present.values())):
-        lost = [table for table, numbers in present.items() if number not in numbers]
-        if lost:
-            damaged.setdefault(number, Problem(f"session {number}", f"has no {' and no '.join(lost)}"))
-    return damaged
 
 
 def copy(source: Path, target: Path, *, recover: bool = False, force: bool = False) -> tuple[Problem, ...]:
@@ -76,7 +47,7 @@ def copy(source: Path, target: Path, *, recover: bool = False, force: bool = Fal
     if problems and not recover:
         more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
         raise rows.corrupt(source, problems[0].where, problems[0].what + more)
-    with rewrite(target, keep=False) as out, _read_only(source) as connection:
+    with rewrite(target, keep=False) as out, whatever_it_holds(source) as connection:
         _copy_sessions(connection, source, out)
     return problems
 
@@ -88,16 +59,15 @@ def merge(sources: Sequence[Path], target: Path, *, force: bool = False) -> int:
     share a name, or were made with settings whose submaps cannot be compared.
     """
     from pc2grid.io.atomic import refuse_existing
-    from signature.database.sqlite import SqliteDatabase
 
     refuse_existing(target, force)
     seen: dict[str, tuple[str, Path]] = {}
     with rewrite(target, keep=False) as out:
         for source in sources:
-            with SqliteDatabase(source) as database, _read_only(source) as connection:
+            with contextlib.closing(connect(source)) as connection:
                 skip = set()
                 first = read_sessions(out, target)
-                for info in database.sessions():
+                for _, info in read_sessions(connection, source):
                     if first:
                         rows.refuse_other_settings(
                             first[0][1], info.provenance.config, info.resolution_m, source
@@ -115,20 +85,13 @@ def merge(sources: Sequence[Path], target: Path, *, force: bool = False) -> int:
     return len(seen)
 
 
-@contextlib.contextmanager
-def _read_only(path: Path) -> Iterator[sqlite3.Connection]:
-    uri = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
-    with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
-        yield connection
-
-
 def _structure(connection: sqlite3.Connection, path: Path) -> list[Problem]:
     problems = []
     try:
         schema.inspect_tables(connection, path)
         for (message,) in connection.execute("PRAGMA integrity_check"):
             problems += [Problem("file", line) for line in str(message).splitlines() if line != "ok"]
-        for table, rowid, *_ in connection.execute("PRAGMA foreign_key_check"):
+        for table, rowid, *_ in connection.execute("PRAGMA main.foreign_key_check"):
             problems.append(Problem(f"{table} row {rowid}", "belongs to no session"))
     except Pc2GridError as error:
         problems.append(Problem("file", error.message))
@@ -137,31 +100,10 @@ def _structure(connection: sqlite3.Connection, path: Path) -> list[Problem]:
     return problems
 
 
-def _read_table(
-    connection: sqlite3.Connection, path: Path, table: str, where: str = "1", *values: int
-) -> Iterator[tuple[rows.Row | None, Problem | None]]:
-    """Each row, and what is wrong with it: it must match its checksum and decode."""
-    try:
-        for row, sound in rows.select(connection, table, where, *values):
-            number = row["submap_id"] if table == "submap" else row.get("id", row.get("session_id"))
-            name = f"{table} {number}" + (f" of session {row['session_id']}" if table == "submap" else "")
-            try:
-                if not sound:
-                    raise ValueError("wrong checksum")
-                rows.decode(table, row, path, rows.read_signature_arrays)
-            except Exception as error:
-                # Whatever the decoding of damaged content stumbles over is the finding.
-                yield row, Problem(name, str(error))
-            else:
-                yield row, None
-    except schema.COMPLAINTS as error:
-        yield None, Problem(table, str(error))
-
-
 def _counts(connection: sqlite3.Connection, path: Path) -> Iterator[Problem]:
     """Every session must be complete: no row lost as a whole."""
     for session_id, info in read_sessions(connection, path):
-        for table in ("grid", "trajectory", "signature"):
+        for table in schema.ONE_EACH:
             query = f"SELECT count(*) FROM {table} WHERE session_id = ?"
             if connection.execute(query, (session_id,)).fetchone() != (1,):
                 yield Problem(f"session {info.name!r}", f"has no {table}")
@@ -189,19 +131,19 @@ def _copy_sessions(
     strict : raise DatabaseCorrupt instead of leaving anything behind.
     """
     (last,) = out.execute("SELECT coalesce(max(id), 0) FROM session").fetchone()
-    for session, problem in list(_read_table(connection, source, "session")):
+    for session, problem in list(read_table(connection, source, "session")):
         if strict and problem:
             raise rows.corrupt(source, problem.where, problem.what)
         if session is None or problem or session["name"] in skip:
             continue
         parts = {
-            table: list(_read_table(connection, source, table, "session_id = ?", session["id"]))
-            for table in ("grid", "trajectory", "submap", "signature")
+            table: list(read_table(connection, source, table, "session_id = ?", session["id"]))
+            for table in (*schema.ONE_EACH, "submap")
         }
         bad = [p for part in parts.values() for _, p in part if p]
         if strict and bad:
             raise rows.corrupt(source, bad[0].where, bad[0].what)
-        if any(len(parts[t]) != 1 or parts[t][0][1] for t in ("grid", "trajectory", "signature")):
+        if any(len(parts[t]) != 1 or parts[t][0][1] for t in schema.ONE_EACH):
             continue
         submaps = [row for row, fault in parts["submap"] if row is not None and fault is None]
         signature = parts["signature"][0][0]
@@ -211,7 +153,7 @@ def _copy_sessions(
         rows.insert(
             out, "session", {**session, "id": last, "document": _with_count(session["document"], len(kept))}
         )
-        for table in ("grid", "trajectory"):
+        for table in ("grid", "trajectory", "loop"):
             rows.insert(out, table, {**(parts[table][0][0] or {}), "session_id": last})
         for row in submaps:
             rows.insert(out, "submap", {**row, "session_id": last})

@@ -1,0 +1,117 @@
+"""A `*.submaps` file opened for reading: its rows, and what is wrong with them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+from signature.database import rows, schema
+from signature.database.older import bring_along
+from signature.database.protocol import Problem, SessionInfo
+
+
+def connect(path: Path) -> sqlite3.Connection:
+    """A connection that cannot change the file.
+
+    Raises NotADatabase, DatabaseVersion, DatabaseCorrupt.
+    """
+    schema.inspect_header(path)
+    real = os.path.realpath(path)
+    # Finished files are never written again, so no locks are needed and none are taken; unless
+    # another program left its journal beside the file.
+    journals = [Path(real + suffix) for suffix in ("-wal", "-journal")]
+    immutable = "" if any(journal.exists() for journal in journals) else "&immutable=1"
+    uri = f"file:{quote(real)}?mode=ro{immutable}"
+    with rows.explained(path, "header"):
+        connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+        try:
+            connection.execute("PRAGMA trusted_schema = OFF")
+            connection.execute("PRAGMA mmap_size = 1073741824")
+            schema.inspect_tables(connection, path)
+            bring_along(connection, beside=True)
+        except BaseException:
+            connection.close()
+            raise
+    return connection
+
+
+@contextlib.contextmanager
+def whatever_it_holds(path: Path) -> Iterator[sqlite3.Connection]:
+    """A connection to a file that may be damaged in any way; nothing is believed yet."""
+    uri = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
+    with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
+        with contextlib.suppress(*schema.COMPLAINTS):  # each use of the connection meets the damage again
+            bring_along(connection, beside=True)
+        yield connection
+
+
+def read_sessions(
+    connection: sqlite3.Connection, path: Path, without: Collection[int] = ()
+) -> list[tuple[int, SessionInfo]]:
+    """All sessions but those of the numbers `without`, with their numbers. Raises DatabaseCorrupt."""
+    sessions = []
+    with rows.explained(path, "session"):
+        # The sizes come from rows whose own checksum is looked at when they are used.
+        resolution_m = dict(connection.execute("SELECT session_id, resolution_m FROM grid"))
+        scans = dict(connection.execute("SELECT session_id, count FROM trajectory"))
+        for row, sound in rows.select(connection, "session"):
+            if row["id"] in without:
+                continue
+            if not sound:
+                raise rows.corrupt(path, f"session {row['id']}", "wrong checksum")
+            info = rows.read_info(row, resolution_m[row["id"]], scans[row["id"]], path)
+            sessions.append((row["id"], info))
+    return sessions
+
+
+def read_table(
+    connection: sqlite3.Connection, path: Path, table: str, where: str = "1", *values: int
+) -> Iterator[tuple[rows.Row | None, Problem | None]]:
+    """Each row, and what is wrong with it: it must match its checksum and decode."""
+    try:
+        for row, sound in rows.select(connection, table, where, *values):
+            number = row["submap_id"] if table == "submap" else row.get("id", row.get("session_id"))
+            name = f"{table} {number}" + (f" of session {row['session_id']}" if table == "submap" else "")
+            try:
+                if not sound:
+                    raise ValueError("wrong checksum")
+                rows.decode(table, row, path, rows.read_signature_arrays)
+            except Exception as error:
+                # Whatever the decoding of damaged content stumbles over is the finding.
+                yield row, Problem(name, str(error))
+            else:
+                yield row, None
+    except schema.COMPLAINTS as error:
+        yield None, Problem(table, str(error))
+
+
+def damaged_sessions(connection: sqlite3.Connection, path: Path) -> dict[int, Problem]:
+    """Numbers of the sessions whose own row, grid or signatures are damaged or missing, and what it is.
+
+    These are what a search reads; damaged submaps, trajectories and loops are not looked for. Raises
+    DatabaseCorrupt if a table cannot be read to its end.
+    """
+    damaged: dict[int, Problem] = {}
+    present: dict[str, set[int]] = {}
+    for table, key in (("session", "id"), ("grid", "session_id"), ("signature", "session_id")):
+        present[table] = set()
+        for row, problem in read_table(connection, path, table):
+            if row is None:
+                assert problem is not None
+                raise rows.corrupt(path, problem.where, problem.what)
+            present[table].add(row[key])
+            if problem is not None:
+                damaged.setdefault(row[key], problem)
+    with rows.explained(path, "trajectory"):
+        present["trajectory"] = {
+            number for (number,) in connection.execute("SELECT session_id FROM trajectory")
+        }
+    for number in sorted(set().union(*present.values())):
+        lost = [table for table, numbers in present.items() if number not in numbers]
+        if lost:
+            damaged.setdefault(number, Problem(f"session {number}", f"has no {' and no '.join(lost)}"))
+    return damaged
