@@ -627,8 +627,8 @@ for _command in (*USES, CONVERT + " --add"):
         database(lambda d: bytes(reversed(d)), _command)
     )
     fault(43, 1, errors.NotADatabase, "another program's SQLite file")(database(header(68, 0), _command))
-    fault(44, 1, errors.DatabaseVersion, "database format 2; this pc2grid reads up to 1", "a newer pc2grid")(
-        database(header(60, 2), _command)
+    fault(44, 1, errors.DatabaseVersion, "database format 3; this pc2grid reads up to 2", "a newer pc2grid")(
+        database(header(60, 3), _command)
     )
 for _command in USES:
     fault(43, 1, errors.NotADatabase, "x.submaps: empty file")(database(lambda d: b"", _command))
