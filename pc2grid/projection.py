@@ -83,11 +83,14 @@ class GridBuilder:
         width = (max(columns) - min(columns) + 1) * _TILE
         self._check_size(height * width)
         cells = np.full((height, width), UNKNOWN, dtype=np.int8)
+        summed = np.zeros((height, width), dtype=np.int16)
         for (row, column), log_odds in self._log_odds.items():
             odds = log_odds.astype(np.float32) / 100.0
             percent = np.rint(OCCUPIED / (1.0 + np.exp(-odds))).astype(np.int8)
             r, c = (row - min(rows)) * _TILE, (column - min(columns)) * _TILE
             cells[r : r + _TILE, c : c + _TILE] = np.where(self._seen[row, column], percent, UNKNOWN)
+            summed[r : r + _TILE, c : c + _TILE] = log_odds
+        _erase_lone_hits(cells, summed)
         self._draw_glimpsed(cells, (min(rows) * _TILE, min(columns) * _TILE))
         known_rows = np.flatnonzero((cells >= FREE).any(axis=1))
         known_columns = np.flatnonzero((cells >= FREE).any(axis=0))
@@ -103,20 +106,15 @@ class GridBuilder:
     def _draw_glimpsed(self, cells: NDArray[np.int8], first: tuple[int, int]) -> None:
         """Put what was only glimpsed into unknown cells; `first` is the cell that is (0, 0) there.
 
-        In front of a wall that sweeps have drawn, a return that no other scan repeats is its noise; where
-        a wall goes on, fewer than three neighbours are drawn.
+        In front of a drawn wall it is the wall's noise; where a wall goes on or has a gap, fewer than five
+        cells around are drawn.
         """
-        import cv2
-
         if not self._glimpsed:
             return
-        at = np.concatenate(self._glimpsed)[:, ::-1] - first
-        at, times = np.unique(at[((at >= 0) & (at < cells.shape)).all(axis=1)], axis=0, return_counts=True)
-        neighbours = cv2.boxFilter(
-            (cells >= 65).astype(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT
-        )
-        row, column = at[:, 0], at[:, 1]
-        kept = (cells[row, column] == UNKNOWN) & ((times > 1) | (neighbours[row, column] < 3))
+        at = np.unique(np.concatenate(self._glimpsed)[:, ::-1] - first, axis=0)
+        row, column = at[((at >= 0) & (at < cells.shape)).all(axis=1)].T
+        walls = _count_around(cells >= 65, 5)
+        kept = (cells[row, column] == UNKNOWN) & (walls[row, column] < 5)
         cells[row[kept], column[kept]] = _GLIMPSED
 
     def _add_window(self, update: NDArray[np.int16], x0: int, y0: int) -> None:
@@ -145,6 +143,25 @@ class GridBuilder:
                 f"the map needs {cells} cells, more than projection.max_cells = {self._config.max_cells}",
                 hint="raise projection.max_cells, or choose a coarser projection.resolution_m",
             )
+
+
+def _erase_lone_hits(cells: NDArray[np.int8], log_odds: NDArray[np.int16]) -> None:
+    """Make unknown again what was hit once, and never looked through, beside a wall that was hit more often:
+    a return that strayed a cell from it, and that no later ray can clear because the wall stops them all."""
+    often = _count_around(log_odds > _HIT, 3)
+    cells[(log_odds == _HIT) & (often >= 3)] = UNKNOWN
+
+
+def _count_around(mask: NDArray[np.bool_], width: int) -> NDArray[np.uint8]:
+    """How many cells of the mask are in the square of `width` cells around each cell (H, W)."""
+    import cv2
+
+    return np.asarray(
+        cv2.boxFilter(
+            mask.astype(np.uint8), -1, (width, width), normalize=False, borderType=cv2.BORDER_CONSTANT
+        ),
+        np.uint8,
+    )
 
 
 def _rims(corners: NDArray[np.int32], free_m: NDArray[np.float32]) -> list[NDArray[np.int32]]:

@@ -98,16 +98,33 @@ def test_glimpses_fill_what_is_unknown_and_change_nothing_else():
     assert state(after, 2.52, 0.02) >= 65
 
 
-def test_lone_return_beside_a_drawn_wall_is_noise_until_it_is_repeated():
+def test_glimpse_beside_a_drawn_wall_is_its_noise():
     behind, away = (2.02, -0.12), (2.52, 0.02)
-    for repeated in (False, True):
+    builder = GridBuilder(ProjectionConfig())
+    builder.add(disc(2.0), SE2())
+    builder.glimpse(np.array([behind, away]))
+    grid = builder.grid()
+    assert state(grid, *away) >= 65
+    assert state(grid, *behind) == -1
+
+
+def test_lone_hit_beside_a_wall_is_noise_until_it_is_repeated():
+    strayed, away = (1.92, 0.02), (0.0, 2.5)
+    once = disc(2.0)
+    rays = np.hypot(*(once.hits_m - strayed).T) < 0.12  # their free space ends a cell before the wall
+    bearings = np.arange(len(once.free_m)) * 2 * np.pi / len(once.free_m)
+    free_m = np.where(np.cos(bearings) > 0.99, 1.9, once.free_m).astype(np.float32)
+    hits_m = np.concatenate((once.hits_m[~rays], np.array([strayed, away], np.float32)))
+    stray = dataclasses.replace(once, hits_m=hits_m, free_m=free_m)
+    wall_alone = dataclasses.replace(once, free_m=free_m)
+    for times in (1, 2):
         builder = GridBuilder(ProjectionConfig())
-        builder.add(disc(2.0), SE2())
-        for _ in range(1 + repeated):
-            builder.glimpse(np.array([behind, away]))
+        for k in range(3):
+            builder.add(stray if k < times else wall_alone, SE2())
         grid = builder.grid()
-        assert state(grid, *away) >= 65
-        assert (state(grid, *behind) >= 65) == repeated
+        assert state(grid, *away) >= 65  # met as seldom, but nothing stands beside it
+        assert state(grid, *strayed) >= 65 if times == 2 else state(grid, *strayed) == -1
+        assert occupied_at(grid, once.hits_m).all()
 
 
 def test_wall_is_continued_by_glimpses():
