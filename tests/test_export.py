@@ -23,14 +23,14 @@ from pc2grid_cli.main import app
 from signature.build import add_sessions, provenance
 from signature.config import Config
 from tests.drives import office
-from tests.test_report import session, way
+from tests.test_report import LOOPS, session, way
 
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("export") / "office.submaps"
     config = Config()
-    entry = (session("office", office(), way()), provenance(Path("office.mcap"), "a" * 64, config))
+    entry = (session("office", office(), way(), LOOPS), provenance(Path("office.mcap"), "a" * 64, config))
     add_sessions(path, [entry], config, keep=False)
     return path
 
@@ -91,6 +91,57 @@ def test_ways_as_graphs(database: Path, tmp_path: Path) -> None:
         assert all(graph.edges[e]["length_m"] == wanted.edges[e]["length_m"] for e in wanted.edges)
 
 
+def read_g2o(path: Path) -> tuple[dict[int, np.ndarray], list[tuple[int, int, np.ndarray, np.ndarray]]]:
+    """Vertices and edges (from, to, transform, information) by the words of g2o's own documentation."""
+
+    def matrix(x: float, y: float, yaw: float) -> np.ndarray:
+        return np.array([[np.cos(yaw), -np.sin(yaw), x], [np.sin(yaw), np.cos(yaw), y], [0, 0, 1]])
+
+    vertices, edges = {}, []
+    for line in path.read_text().splitlines():
+        tag, *words = line.split()
+        if tag == "VERTEX_SE2":
+            vertices[int(words[0])] = matrix(*map(float, words[1:]))
+        else:
+            assert tag == "EDGE_SE2" and len(words) == 11
+            a, b, c, d, e, f = map(float, words[5:])
+            information = np.array([[a, b, c], [b, d, e], [c, e, f]])
+            edges.append((int(words[0]), int(words[1]), matrix(*map(float, words[2:5])), information))
+    return vertices, edges
+
+
+def test_the_pose_graph_for_g2o(database: Path, tmp_path: Path) -> None:
+    export(database, "--g2o", tmp_path / "poses.g2o", "--trajectory", tmp_path / "poses.tum")
+    vertices, edges = read_g2o(tmp_path / "poses.g2o")
+    truth = way().T_map_base[:, [[0], [1], [3]], [0, 1, 3]]
+    assert np.allclose([vertices[k] for k in range(len(vertices))], truth, atol=1e-8)
+    assert len(vertices) == len(read_tum(tmp_path / "poses.tum")) == 40
+    steps, loops = edges[:39], edges[39:]
+    assert [(a, b) for a, b, *_ in steps] == [(k, k + 1) for k in range(39)]
+    for a, b, transform, information in steps:
+        assert np.allclose(vertices[a] @ transform, vertices[b], atol=1e-7)
+        assert np.linalg.eigvalsh(information)[0] > 0
+    trust = np.array([information[0, 0] for *_, information in steps])
+    lost = np.array([b >= 15 and a < 20 for a, b, *_ in steps])  # of `way`
+    assert np.allclose(trust[~lost], trust[0]) and np.allclose(trust[lost], 1e-3 * trust[0])
+    accepted = [loop for loop in LOOPS if loop.accepted]
+    for loop, (a, b, transform, information) in zip(accepted, loops, strict=True):
+        assert (a, b) == (loop.older, loop.newer)
+        assert np.allclose(transform, loop.T_older_newer.matrix(), atol=1e-8)
+        assert np.allclose(information, loop.information, rtol=1e-8)
+        assert np.abs(vertices[a] @ transform - vertices[b]).max() < 0.03
+
+
+def test_gtsam_reads_the_pose_graph(database: Path, tmp_path: Path) -> None:
+    gtsam = pytest.importorskip("gtsam", reason="GTSAM is not installed")
+    export(database, "--g2o", tmp_path / "poses.g2o")
+    graph, initial = gtsam.readG2o(str(tmp_path / "poses.g2o"), False)
+    assert (graph.size(), initial.size()) == (39 + 2, 40)
+    # Steps agree with the poses; what is left is what the two loops would still like to move.
+    error = np.array([0.01, -0.02, 0.003])
+    assert graph.error(initial) == pytest.approx(error @ LOOPS[0].information @ error, rel=0.01)
+
+
 def test_a_suffix_nobody_knows_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"\.ply or \.pcd"):
         write_cloud(tmp_path / "x.las", np.zeros((1, 3)))
@@ -103,9 +154,10 @@ def test_a_trajectory_that_is_not_there_stops_everything(tmp_path: Path) -> None
     nowhere = Trajectory(stamps_ns=np.empty(0), T_map_base=np.empty((0, 4, 4)))
     entry = (session("plan", office(), nowhere), provenance(Path("plan.yaml"), "b" * 64, Config()))
     add_sessions(tmp_path / "p.submaps", [entry], Config(), keep=False)
-    options = ["--map", str(tmp_path / "m"), "--trajectory", str(tmp_path / "t.tum")]
-    done = CliRunner().invoke(app, ["export", str(tmp_path / "p.submaps"), *options])
-    assert isinstance(done.exception, Pc2GridError) and "no trajectory" in str(done.exception)
+    for option, name in (("--trajectory", "t.tum"), ("--g2o", "p.g2o")):
+        options = ["--map", str(tmp_path / "m"), option, str(tmp_path / name)]
+        done = CliRunner().invoke(app, ["export", str(tmp_path / "p.submaps"), *options])
+        assert isinstance(done.exception, Pc2GridError) and "no trajectory" in str(done.exception)
     assert [path.name for path in tmp_path.iterdir()] == ["p.submaps"]
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
-from pc2grid.model import Health, OccupancyGrid, SessionMap, Trajectory
+from pc2grid.model import Health, Loop, OccupancyGrid, SessionMap, Trajectory
 from pc2grid.partition import partition
 from pc2grid_cli.answer_files import initialpose
 from pc2grid_cli.finding import Found, find_map
@@ -36,9 +36,25 @@ def way(n: int = 40) -> Trajectory:
     return Trajectory(stamps_ns=np.arange(n) * 10**8, T_map_base=poses, health=tuple(health))
 
 
-def session(name: str, grid: OccupancyGrid, trajectory: Trajectory) -> SessionMap:
+LOOPS = tuple(
+    Loop(
+        older=older,
+        newer=newer,
+        T_older_newer=SE2(0.2 * (newer - older) + 0.01, -0.02, 0.003),
+        information=np.array([[900.0, 30.0, 5.0], [30.0, 400.0, -7.0], [5.0, -7.0, 4e4]]),
+        accepted=accepted,
+    )
+    for older, newer, accepted in ((2, 30, True), (5, 39, True), (1, 12, False))
+)
+
+
+def session(
+    name: str, grid: OccupancyGrid, trajectory: Trajectory, loops: tuple[Loop, ...] = ()
+) -> SessionMap:
     submaps = partition(grid, Config().partition)
-    return SessionMap(session=name, sensor="laser", grid=grid, submaps=submaps, trajectory=trajectory)
+    return SessionMap(
+        session=name, sensor="laser", grid=grid, submaps=submaps, trajectory=trajectory, loops=loops
+    )
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +62,7 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> SubmapDatabase:
     folder = tmp_path_factory.mktemp("report")
     config = Config()
     sessions = [
-        (session("office", office(), way()), provenance(Path("office.mcap"), "a" * 64, config)),
+        (session("office", office(), way(), LOOPS), provenance(Path("office.mcap"), "a" * 64, config)),
         (session(NASTY, plan(8, 5, []), way(25)), provenance(Path("room.mcap"), "b" * 64, config)),
     ]
     add_sessions(folder / "two.submaps", sessions, config, keep=False)

@@ -23,7 +23,10 @@ def write_graph(path: str | Path, graph: nx.Graph) -> None:
 
     suffix = Path(path).suffix.lower()
     if suffix not in (".graphml", ".json"):
-        raise OutputError(f"{path}: not a kind of graph file", hint="end its name in .graphml or .json")
+        raise OutputError(
+            f"{path}: not a kind of graph file",
+            hint="end its name in .graphml or .json; poses and loops: --g2o",
+        )
     flat = nx.Graph(**graph.graph)
     for node, about in graph.nodes(data=True):
         x_m, y_m = about["center_m"]

@@ -43,6 +43,9 @@ def export_command(
         Path | None,
         typer.Option("--graph", metavar="OUT.graphml|.json", help="junctions, ends, and the ways between"),
     ] = None,
+    g2o: Annotated[
+        Path | None, typer.Option("--g2o", metavar="OUT.g2o", help="the pose graph: steps and loops")
+    ] = None,
     mcap: Annotated[
         Path | None, typer.Option("--mcap", metavar="OUT.mcap", help="map, path, submaps for Foxglove")
     ] = None,
@@ -67,14 +70,15 @@ def export_command(
     from pc2grid.io.atomic import refuse_existing
     from signature.database import open_database
 
-    of_session = [path for path in (trajectory, cloud, graph, mcap, rerun, plot) if path is not None]
+    of_session = [path for path in (trajectory, cloud, graph, g2o, mcap, rerun, plot) if path is not None]
     if map_ is not None:
         of_session += [map_.with_name(map_.name + ".yaml"), map_.with_name(map_.name + ".pgm")]
     targets = of_session + ([report] if report is not None else [])
     if not targets:
         raise ConfigError(
             "nothing to export",
-            hint="name one of --map, --trajectory, --cloud, --graph, --mcap, --rerun, --plot, --report",
+            hint="name one of --map, --trajectory, --cloud, --graph, --g2o, --mcap, --rerun, --plot,"
+            " --report",
         )
     for path in targets:
         refuse_existing(path, force)
@@ -92,7 +96,7 @@ def export_command(
             )
         name = session or (names[0] if names else "")
         # What the session cannot give is refused before anything is written.
-        poses = _poses(opened, name) if trajectory is not None else None
+        poses = _poses(opened, name) if trajectory or g2o else None
         if map_ is not None:
             from pc2grid.io.nav2_map import save_map
 
@@ -108,6 +112,10 @@ def export_command(
             from pc2grid.partition import junction_graph
 
             write_graph(graph, junction_graph(opened.grid(name), opened.config().partition))
+        if g2o is not None and poses is not None:
+            from pc2grid.io.g2o_out import write_g2o
+
+            write_g2o(g2o, poses, opened.loops(name))
         if mcap is not None:
             from pc2grid_cli.foxglove import write_session
 
