@@ -139,6 +139,14 @@ def test_standing_still_costs_no_points() -> None:
     assert piece["health"] == "fine" and len(piece["xy"]) == 4
 
 
+def test_loops_join_the_places_that_they_are_between(database: SubmapDatabase) -> None:
+    first, second = contents(database)["sessions"]
+    places = way().planar()[:, :2]
+    wanted = [[*places[loop.older], *places[loop.newer], loop.accepted] for loop in LOOPS]
+    assert np.allclose(first["loops"], wanted, atol=0.006)
+    assert second["loops"] == []
+
+
 def test_the_answer_on_the_page_is_the_answer(database: SubmapDatabase, found: Found) -> None:
     shown = contents(database, found=found, accept=0.8)["answer"]
     assert shown["status"] == "located" == found.answer.status
@@ -193,4 +201,7 @@ def test_a_browser_has_nothing_to_complain_about(
     shown = re.sub(r"<script>.*?</script>", "", done.stdout, flags=re.S)
     for words in ("part.yaml in two.submaps", "submap centres", "query: walls as located", "Submap "):
         assert words in shown
+    # Of the three loops that the first session came back by.
+    assert re.search(r"<label><input type=\"checkbox\">.*?2 loops closed</label>", shown)
+    assert "1 loop doubted</label>" in shown
     assert "NaN" not in shown and "Infinity" not in shown

@@ -19,7 +19,7 @@ from pc2grid.io.atomic import replace_file
 
 if TYPE_CHECKING:
     from pc2grid.geometry import F64
-    from pc2grid.model import OccupancyGrid, Trajectory
+    from pc2grid.model import Loop, OccupancyGrid, Trajectory
     from pc2grid_cli.finding import Found
     from signature.config import Config
     from signature.database import SubmapDatabase
@@ -72,6 +72,7 @@ def contents(
                 "submaps": _submaps(table, index),
                 "graph": _graph(database.grid(info.name), config),
                 "path": runs(database.trajectory(info.name)),
+                "loops": _loops(database.trajectory(info.name), database.loops(info.name)),
             }
             for index, info in enumerate(database.sessions())
         ],
@@ -135,6 +136,12 @@ def runs(poses: Trajectory) -> list[dict[str, Any]]:
                 last = xy[i]
         pieces.append({"health": kind, "xy": _short(np.ravel(points), 2)})
     return pieces
+
+
+def _loops(poses: Trajectory, loops: tuple[Loop, ...]) -> list[list[float]]:
+    """Which two places of the path were found to be near each other: x, y, x, y, whether it was accepted."""
+    xy = poses.planar()[:, :2]
+    return [[*_short(xy[loop.older], 2), *_short(xy[loop.newer], 2), int(loop.accepted)] for loop in loops]
 
 
 def _answer(found: Found, accept: float, truth_m: F64 | None) -> dict[str, Any]:
