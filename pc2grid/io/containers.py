@@ -6,8 +6,9 @@ import os
 from pathlib import Path
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import LogNotFound, LogTruncated, NotALog
+from pc2grid.errors import LogCorrupt, LogNotFound, LogTruncated, NotALog
 from pc2grid.io import cloud_folder, rosbag2_folder
+from pc2grid.io.guard import guarded
 from pc2grid.io.mcap_records import MAGIC
 from pc2grid.io.source import Source
 
@@ -55,10 +56,22 @@ def _open_file(path: Path, head: bytes, config: ReadConfig, recover: bool) -> So
 
         return SalvagedBag(path, config) if recover else BagSource(path, config)
     if head.startswith(_SQLITE):
-        from pc2grid.io.db3_log import Db3Source
-
-        return Db3Source(path, config)
+        return _open_db3(path, config, recover)
     raise NotALog(f"{path}: not a recording; looks like {_looks_like(head)}", hint=_advice(head))
+
+
+def _open_db3(path: Path, config: ReadConfig, recover: bool) -> Source:
+    from pc2grid.io.db3_log import Db3Source, is_unfinished
+    from pc2grid.io.db3_salvage import SalvagedDb3
+
+    if is_unfinished(path):
+        return SalvagedDb3(path, config, recover=recover)
+    try:
+        return guarded(path, lambda: Db3Source(path, config, check=recover))
+    except (LogCorrupt, LogTruncated):
+        if not recover:
+            raise
+        return SalvagedDb3(path, config, recover=True)
 
 
 def _open_folder(path: Path, config: ReadConfig, recover: bool) -> Source:
