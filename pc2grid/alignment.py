@@ -8,7 +8,8 @@ what any pose in the box can score: boxes that cannot beat what has been found a
 bound is per point, so rotation is searched by the same tree).
 
 The winners are refined below the cell size by Gauss-Newton on the interpolated field and scored both
-ways: the query's walls against the map's free space, and the map's walls against the query's.
+ways: the query's walls against the map's free space, and the map's walls against the query's. What stands
+alone and is small may have been moved since; a wall speaks by the size of what it belongs to.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F64, SE2, wrap_angle
-from pc2grid.model import F32, OccupancyGrid
+from pc2grid.model import F32, I64, OccupancyGrid
+from pc2grid.skeleton import cells_of
 
 U8 = NDArray[np.uint8]
 
@@ -31,6 +33,8 @@ SIGMA_M = 0.10
 NEUTRAL = 0.35
 """What a point on unknown cells scores: about what a random point of a building scores, so that ground
 one side has not seen speaks neither for nor against a pose."""
+FIXED_M = 2.0
+"""What is at least that long is taken to stay where it is."""
 _ENOUGH_POINTS = 300
 REACHES_M = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.3, 1.6)
 """Radii of the sliding maxima; the first is the field itself."""
@@ -43,12 +47,14 @@ class LikelihoodField:
     levels : (L, H, W) uint8, sliding maxima of the field over `reaches_m`; 255 = on a wall.
     known : (H, W) cells that are occupied or free.
     walls_m : (K, 2) float32 occupied cell centres, map frame, one per 0.1 m square.
+    weights : (K,) float32, 0..1, how surely each of them stays where it is, see `steadiness`.
     """
 
     levels: U8
     reaches_m: tuple[float, ...]
     known: NDArray[np.bool_]
     walls_m: F32
+    weights: F32
     resolution_m: float
     origin_m: tuple[float, float]
 
@@ -74,28 +80,30 @@ def likelihood(
 def _field(occupied: NDArray[np.bool_], known: NDArray[np.bool_], values: U8, reach: int, neutral: int) -> U8:
     """`values[d^2]` for the distance d in cells to the nearest occupied cell; at most `reach` count."""
     height, width = occupied.shape
-    far = np.uint16(reach * reach)
-    squared = np.empty((height + 2 * reach, width), np.uint16)  # distance within the row
-    squared[:reach], squared[height + reach :] = far, far
+    far, limit, one = np.uint16(reach * reach), np.uint16(reach), np.uint16(1)
+    # Distance within the column, then its square. Whole rows at a time, which the processor does in parallel.
+    squared = np.full((height, width + 2 * reach), far, np.uint16)
+    steps = np.full(width, limit, np.uint16)
     for i in range(height):
-        row, out = occupied[i], squared[i + reach]
-        steps = reach
+        row, out = occupied[i], squared[i, reach : reach + width]
         for j in range(width):
-            steps = 0 if row[j] else min(steps + 1, reach)
-            out[j] = steps
-        steps = reach
-        for j in range(width - 1, -1, -1):
-            steps = 0 if row[j] else min(steps + 1, reach)
-            nearer = min(steps, int(out[j]))
-            out[j] = nearer * nearer
+            steps[j] = np.uint16(0) if row[j] else min(np.uint16(steps[j] + one), limit)
+            out[j] = steps[j]
+    steps[:] = limit
+    for i in range(height - 1, -1, -1):
+        row, out = occupied[i], squared[i, reach : reach + width]
+        for j in range(width):
+            steps[j] = np.uint16(0) if row[j] else min(np.uint16(steps[j] + one), limit)
+            nearer = min(steps[j], out[j])
+            out[j] = np.uint16(nearer * nearer)
     field = np.empty((height, width), np.uint8)
     nearest = np.empty(width, np.uint16)
     for i in range(height):
         nearest[:] = far
-        for k in range(1 - reach, reach):
-            row_k, more = squared[i + reach + k], np.uint16(k * k)
+        for k in range(1, 2 * reach):
+            beside, more = squared[i, k : k + width], np.uint16((k - reach) ** 2)
             for j in range(width):
-                nearest[j] = min(nearest[j], np.uint16(row_k[j] + more))
+                nearest[j] = min(nearest[j], np.uint16(beside[j] + more))
         row_known, out_field = known[i], field[i]
         for j in range(width):
             value = values[nearest[j]]
@@ -124,13 +132,14 @@ def prepare(grid: OccupancyGrid) -> LikelihoodField:
         n = math.ceil(reach_m / grid.resolution_m)
         kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * n + 1, 2 * n + 1))
         levels.append(np.asarray(cv2.dilate(field, kernel, borderType=cv2.BORDER_REPLICATE), np.uint8))
-    walls = padded.to_point(np.argwhere(padded.occupied))
-    walls = walls[thin_evenly(walls, 0.1)]
+    cells = cells_of(padded.occupied)
+    cells = cells[thin_evenly(padded.to_point(cells), 0.1)]
     return LikelihoodField(
         levels=np.stack(levels),
         reaches_m=REACHES_M,
         known=known,
-        walls_m=walls.astype(np.float32),
+        walls_m=padded.to_point(cells).astype(np.float32),
+        weights=steadiness(padded.occupied, cells, padded.resolution_m),
         resolution_m=padded.resolution_m,
         origin_m=padded.origin_m,
     )
@@ -164,7 +173,9 @@ def _bound(
 
 @numba.njit(cache=True, nogil=True)
 def levels_for(d: F32, half_t: float, half_a: float, reaches: F64) -> NDArray[np.int64]:
-    """The smallest sliding maximum that covers what a box does to a point at distance d (cells)."""
+    """The smallest sliding maximum that covers what a box does to a point at distance d (cells).
+
+    Half a cell is neglected: it is less than `SIGMA_M`, and covering it would blur the smallest boxes."""
     out = np.empty(len(d), dtype=np.int64)
     for p in range(len(d)):
         reach = half_t + d[p] * half_a
@@ -243,13 +254,12 @@ def _search(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """How a query lies on a map at one pose.
+    """How a query lies on a map at one pose. Means and shares are of walls weighted by `steadiness`.
 
     T_map_query : pose of the query's frame in the map.
     forward : 0..1, mean likelihood of the query's walls, neutral where the map is unknown.
     backward : 0..1, mean likelihood of the map's walls where the query has looked.
     overlap : 0..1, share of the query's walls that fall on known ground of the map.
-    conflict : 0..1, share of known ground on which the two sides contradict each other clearly.
     score : 0..1, what hypotheses are ranked by.
     covariance : (3, 3) of x, y, yaw from the score surface: wide along a corridor, narrow across it.
     """
@@ -258,7 +268,6 @@ class Fit:
     forward: float
     backward: float
     overlap: float
-    conflict: float
     score: float
     covariance: F64
 
@@ -268,23 +277,63 @@ class Query:
     """A query's grid prepared for alignment.
 
     walls_m : (M, 2) float32 occupied cell centres, query frame, thinned evenly to `spacing_m`.
+    weights : (M,) float32, 0..1, how surely each of them stays where it is, see `steadiness`.
     field, known : likelihood (H, W) uint8 and known cells of the query's grid, for the way back.
     """
 
     walls_m: F32
+    weights: F32
     field: U8
     known: NDArray[np.bool_]
     resolution_m: float
     origin_m: tuple[float, float]
     center_m: tuple[float, float]
 
+    @property
+    def walls(self) -> float:
+        """How many wall points there are, by weight."""
+        return float(self.weights.sum(dtype=np.float64))
+
+
+def steadiness(occupied: NDArray[np.bool_], cells: I64, resolution_m: float) -> F32:
+    """How surely what fills `cells` (K, 2) stays where it is: (K,) 0..1.
+
+    The longer side of what a cell belongs to, as a share of `FIXED_M`, at most 1; gaps of one cell do not
+    part things. Chairs, boxes and people are somewhere else the next time; walls are not.
+    """
+    import cv2
+
+    joined = cv2.dilate(occupied.astype(np.uint8), np.ones((3, 3), np.uint8))
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(joined, connectivity=8)
+    extent_m = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * resolution_m
+    return np.minimum(extent_m / FIXED_M, 1.0).astype(np.float32)[labels[cells[:, 0], cells[:, 1]]]
+
 
 def thin_evenly(points_m: NDArray[np.floating], spacing_m: float) -> NDArray[np.intp]:
     """Indices (K,) of one point per square of `spacing_m`; deterministic, keeps the order of the points."""
-    keys = np.floor(np.asarray(points_m) / spacing_m).astype(np.int64)
-    keys -= keys.min(axis=0, initial=0)
-    flat = keys[:, 0] * (keys[:, 1].max(initial=0) + 1) + keys[:, 1]
-    return np.sort(np.unique(flat, return_index=True)[1])
+    return _first_of_each(np.floor(np.asarray(points_m) / spacing_m).astype(np.int64))
+
+
+@numba.njit(cache=True, nogil=True)
+def _first_of_each(squares: I64) -> NDArray[np.intp]:
+    """Indices (K,) of the squares (N, 2) that were not there before; a hash table remembers which were."""
+    mask = 1
+    while mask < 2 * len(squares):
+        mask *= 2
+    slots = np.full(mask, -1, np.int32)
+    mask -= 1
+    first = np.empty(len(squares), np.intp)
+    count = 0
+    for k in range(len(squares)):
+        i, j = squares[k]
+        slot = ((i * 73856093) ^ (j * 19349663)) & mask
+        while slots[slot] >= 0 and (squares[slots[slot], 0] != i or squares[slots[slot], 1] != j):
+            slot = (slot + 1) & mask
+        if slots[slot] < 0:
+            slots[slot] = k
+            first[count] = k
+            count += 1
+    return first[:count].copy()
 
 
 def prepare_query(
@@ -292,13 +341,15 @@ def prepare_query(
 ) -> Query:
     """Prepare a query grid; poses rotate about `center_m` (query frame), by default the mean of the walls."""
     field, known = likelihood(grid)
-    walls = grid.to_point(np.argwhere(grid.occupied))
-    walls = walls[thin_evenly(walls, spacing_m)]
+    cells = cells_of(grid.occupied)
+    cells = cells[thin_evenly(grid.to_point(cells), spacing_m)]
+    walls = grid.to_point(cells)
     if center_m is None:
         mean = walls.mean(axis=0) if len(walls) else np.zeros(2)
         center_m = (float(mean[0]), float(mean[1]))
     return Query(
         walls_m=walls.astype(np.float32),
+        weights=steadiness(grid.occupied, cells, grid.resolution_m),
         field=field,
         known=known,
         resolution_m=grid.resolution_m,
@@ -334,7 +385,7 @@ def search(
     budget : boxes opened at most.
 
     Returns (H, 4): x, y, yaw of the centres of the smallest boxes, and the most (mean likelihood over the
-    points, 0..1) that any pose in the box can score.
+    points, 0..1) that any pose in the box can score, but for half a cell, see `levels_for`.
     """
     if not len(walls_m) or not len(starts):
         return np.empty((0, 4))
@@ -368,6 +419,8 @@ def _gauss_newton(
 ) -> tuple[float, float, float, F64, float]:
     """Climb the interpolated field; lengths in cells. Returns pose, Hessian (3, 3), mean squared misfit."""
     height, width = field.shape
+    flat, down, one = field.reshape(-1), np.uint64(width), np.uint64(1)
+    right, top = width - 1 - 1e-6, height - 1 - 1e-6
     H = np.zeros((3, 3))
     g = np.zeros(3)
     misfit, unit = 1.0, 1.0 / 255.0
@@ -375,24 +428,25 @@ def _gauss_newton(
         c, s = math.cos(yaw), math.sin(yaw)
         g0, g1, g2 = 0.0, 0.0, 0.0
         h00, h01, h02, h11, h12, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        total, count = 0.0, 0
+        total, count = 0.0, 0.0
         for p in range(len(x)):
             rx, ry = c * x[p] - s * y[p], s * x[p] + c * y[p]
             u, v = rx + tx - 0.5, ry + ty - 0.5
-            j, i = math.floor(u), math.floor(v)
-            if i < 0 or j < 0 or i >= height - 1 or j >= width - 1:
-                continue
-            a, b = u - j, v - i
-            f00, f01 = field[i, j] * unit, field[i, j + 1] * unit
-            f10, f11 = field[i + 1, j] * unit, field[i + 1, j + 1] * unit
+            inside_u, inside_v = min(max(u, 0.0), right), min(max(v, 0.0), top)
+            j, i = int(inside_u), int(inside_v)
+            a, b = inside_u - j, inside_v - i
+            at = np.uint64(i * width + j)
+            f00, f01 = flat[at] * unit, flat[at + one] * unit
+            f10, f11 = flat[at + down] * unit, flat[at + down + one] * unit
             f = (1 - b) * ((1 - a) * f00 + a * f01) + b * ((1 - a) * f10 + a * f11)
-            if f < 0.05:  # clutter or moved furniture: too far from any wall to pull
-                continue
-            du = (1 - b) * (f01 - f00) + b * (f11 - f10)
-            dv = (1 - a) * (f10 - f00) + a * (f11 - f01)
-            r, dyaw = 1.0 - f, dv * rx - du * ry
+            # Nothing outside counts, nor clutter or moved furniture, too far from any wall to pull. By weight:
+            # which points those are is as good as random, and a branch taken wrongly costs more.
+            w = 1.0 if (inside_u == u) & (inside_v == v) & (f >= 0.05) else 0.0
+            du = w * ((1 - b) * (f01 - f00) + b * (f11 - f10))
+            dv = w * ((1 - a) * (f10 - f00) + a * (f11 - f01))
+            r, dyaw = w * (1.0 - f), dv * rx - du * ry
             total += r * r
-            count += 1
+            count += w
             g0 += du * r
             g1 += dv * r
             g2 += dyaw * r
@@ -452,50 +506,53 @@ def refine(target: LikelihoodField, query: Query, T_map_query: SE2, *, steps: in
 
 @numba.njit(cache=True, nogil=True)
 def _agreement(
-    walls: F32, pose: F64, field: U8, known: NDArray[np.bool_], resolution: float, origin: F64
-) -> tuple[int, float, int]:
-    """Of walls (K, 2) moved by `pose` (x, y, yaw): how many land on known ground, the sum of their
-    likelihood 0..1 there, and how many of them contradict it."""
+    walls: F32, weights: F32, pose: F64, field: U8, known: NDArray[np.bool_], resolution: float, origin: F64
+) -> tuple[float, float]:
+    """Of walls (K, 2) moved by `pose` (x, y, yaw): the weight of those that land on known ground, and the
+    weighted sum of their likelihood 0..1 there."""
     height, width = field.shape
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    count, total, conflicts = 0, 0.0, 0
+    weight, total = 0.0, 0.0
     for p in range(len(walls)):
         x, y = walls[p, 0], walls[p, 1]
         j = math.floor((c * x - s * y + pose[0] - origin[0]) / resolution)
         i = math.floor((s * x + c * y + pose[1] - origin[1]) / resolution)
         if 0 <= i < height and 0 <= j < width and known[i, j]:
-            count += 1
-            total += field[i, j] / 255.0
-            if field[i, j] < 5:
-                conflicts += 1
-    return count, total, conflicts
+            weight += weights[p]
+            total += weights[p] * field[i, j] / 255.0
+    return weight, total
 
 
 def assess(target: LikelihoodField, query: Query, T_map_query: SE2, covariance: F64) -> Fit:
     """Score a pose both ways: query walls on the map, and map walls on what the query has looked at."""
     there = np.array([T_map_query.x, T_map_query.y, T_map_query.yaw])
     back = T_map_query.inverse()
-    seen, total, clash = _agreement(
-        query.walls_m, there, target.levels[0], target.known, target.resolution_m, np.array(target.origin_m)
+    seen, total = _agreement(
+        query.walls_m,
+        query.weights,
+        there,
+        target.levels[0],
+        target.known,
+        target.resolution_m,
+        np.array(target.origin_m),
     )
-    looked, echoed, contradicted = _agreement(
+    looked, echoed = _agreement(
         target.walls_m,
+        target.weights,
         np.array([back.x, back.y, back.yaw]),
         query.field,
         query.known,
         query.resolution_m,
         np.array(query.origin_m),
     )
-    unseen = len(query.walls_m) - seen
-    forward = (total + NEUTRAL * unseen) / max(len(query.walls_m), 1)
+    walls = query.walls
+    forward = (total + NEUTRAL * (walls - seen)) / walls if walls else 0.0
     backward = echoed / looked if looked else 0.0
-    overlap = seen / max(len(query.walls_m), 1)
     return Fit(
         T_map_query=T_map_query,
         forward=forward,
         backward=backward,
-        overlap=overlap,
-        conflict=(clash + contradicted) / (seen + looked) if seen + looked else 1.0,
+        overlap=seen / walls if walls else 0.0,
         score=math.sqrt(forward * backward),
         covariance=covariance,
     )

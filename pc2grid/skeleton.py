@@ -206,21 +206,10 @@ def pixel_graph(skeleton: BoolGrid, resolution_m: float) -> nx.Graph:
     return graph
 
 
-@numba.njit(cache=True)
 def cells_of(mask: BoolGrid) -> I64:
-    """Set cells (N, 2) of a mask as (row, column), row by row: `np.argwhere`, several times as fast."""
-    count = 0
-    for r in range(mask.shape[0]):
-        count += mask[r].sum()
-    cells = np.empty((count, 2), np.int64)
-    k = 0
-    for r in range(mask.shape[0]):
-        for c in range(mask.shape[1]):
-            if mask[r, c]:
-                cells[k, 0] = r
-                cells[k, 1] = c
-                k += 1
-    return cells
+    """Set cells (N, 2) of a mask as (row, column), row by row: `np.argwhere`, many times as fast."""
+    rows, columns = np.divmod(np.flatnonzero(mask), mask.shape[1])
+    return np.stack((rows, columns), axis=1)
 
 
 @numba.njit(cache=True)

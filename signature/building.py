@@ -95,7 +95,7 @@ class Building:
         """What the hypotheses, best first, amount to."""
         places = self._places(query, hypotheses)
         rivals = [hypotheses[places.index(k)] for k in range(max(places, default=-1) + 1)]
-        evidence = Evidence.of(rivals, len(query.aligned.walls_m))
+        evidence = Evidence.of(rivals, query.aligned.walls)
         *probabilities, none = (float(p) for p in CALIBRATION.probabilities(evidence))
         best = probabilities[0] if probabilities else 0.0
         status: Status = "located" if best >= self.config.accept else "ambiguous"
@@ -171,7 +171,7 @@ class Building:
             return told
         # Ground that only one of the maps knows says nothing here, and neither may contradict the other.
         agreement = min((fit.forward - NEUTRAL * (1.0 - fit.overlap)) / fit.overlap, fit.backward)
-        evidence = Evidence(scores=(agreement,), walls=fit.overlap * len(around.walls_m))
+        evidence = Evidence(scores=(agreement,), walls=fit.overlap * around.walls)
         return bool(CALIBRATION.probabilities(evidence)[0] >= (_SAME_TOLD if told else _SAME))
 
 

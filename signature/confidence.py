@@ -2,15 +2,15 @@
 
 Every hypothesis competes with its rivals and with the possibility that the query was made elsewhere:
 
-    p_i = exp(k (s_i - s_0)) / (1 + sum_j exp(k (s_j - s_0)))
+    p_i = exp(k (l(s_i) - l(s_0))) / (1 + sum_j exp(k (l(s_j) - l(s_0)))),    l(s) = ln s - ln(1.1 - s)
 
-with s the two-way score of `pc2grid.alignment.Fit`. s_0 is the score at which a lone hypothesis is as
-likely right as wrong, and k says how much a lead is worth; more walls seen make a lead worth more.
+with s the two-way score of `pc2grid.alignment.Fit`. l is the log-odds of a wall point to agree: a lead of a
+tenth says more near 0.9 than near 0.5, for where nearly everything agrees, a little that does not is telling.
+s_0 is the score at which a lone hypothesis is as likely right as wrong, and k says how much a lead is worth;
+more walls seen make a lead worth more.
 
-The coefficients are those that `fit` finds most likely for the 324 trials of `compare sensors` in two
-plans, fr079 and intel, from 1 to 10 m of travel (it finds 0.608, 106, 0.99): a lead is worth in proportion
-to the walls seen, as evidence from each wall for itself would be. On a third plan, csail, the squared error
-of the confidence is no worse than on those two (0.023, 162 trials).
+The coefficients are those that `fit` finds most likely for the trials of `compare sensors` in two plans,
+fr079 and intel, from 1 to 10 m of travel; how true confidence is, is judged on the other plans.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ TUNED_ON = ("fr079", "intel")
 RIVALS = 5
 """Hypotheses that take part; further ones add next to nothing."""
 MANY_WALLS = 1000.0
+_SLACK = 0.1
+"""Two maps of one place, drawn from one side and from the other, disagree by about as much."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,18 +37,19 @@ class Evidence:
     """What the decision rests on.
 
     scores : of the best hypotheses, best first, at most `RIVALS`.
-    walls : wall points (0.1 m apart) of the query that lie on ground known to the best one.
+    walls : wall points (0.1 m apart) of the query that lie on ground known to the best one, weighted by
+        `pc2grid.alignment.steadiness`.
     """
 
     scores: tuple[float, ...]
     walls: float
 
     @staticmethod
-    def of(hypotheses: Sequence[Hypothesis], wall_points: int) -> Evidence:
-        """Evidence of hypotheses, best first, for a query of so many wall points."""
+    def of(hypotheses: Sequence[Hypothesis], walls: float) -> Evidence:
+        """Evidence of hypotheses, best first, for a query of so many wall points, by weight."""
         return Evidence(
             scores=tuple(h.fit.score for h in hypotheses[:RIVALS]),
-            walls=hypotheses[0].fit.overlap * wall_points if hypotheses else 0.0,
+            walls=hypotheses[0].fit.overlap * walls if hypotheses else 0.0,
         )
 
 
@@ -55,15 +58,16 @@ class Calibration:
     """Coefficients of the model: neutral score s_0, worth k of a lead seen with `MANY_WALLS`, and the
     power with which k grows with the walls seen."""
 
-    neutral: float = 0.61
-    worth: float = 106.0
-    power: float = 1.0
+    neutral: float = 0.65
+    worth: float = 23.0
+    power: float = 0.55
 
     def probabilities(self, evidence: Evidence) -> F64:
         """(H + 1,) probabilities: of each hypothesis in order, and last of none of them."""
         k = self.worth * min(1.0, max(evidence.walls, 1.0) / MANY_WALLS) ** self.power
-        logits = np.array([k * (score - self.neutral) for score in evidence.scores] + [0.0])
-        weights = np.exp(logits - logits.max())
+        scores = np.array([*evidence.scores, self.neutral])
+        logits = np.log(np.clip(scores, 0.01, 1.0)) - np.log(1.0 + _SLACK - np.clip(scores, 0.01, 1.0))
+        weights = np.exp(k * (logits - logits.max()))
         return np.asarray(weights / weights.sum())
 
 
@@ -75,11 +79,15 @@ def fit(evidence: Sequence[Evidence], right: Sequence[bool]) -> Calibration:
     from scipy.optimize import minimize
 
     def loss(x: F64) -> float:
-        model = Calibration(neutral=float(x[0]), worth=float(np.exp(x[1])), power=float(x[2]))
+        model = Calibration(
+            neutral=float(np.clip(x[0], 0.05, 0.95)), worth=float(np.exp(x[1])), power=float(x[2])
+        )
         p = np.array([model.probabilities(e)[0] if e.scores else 0.0 for e in evidence])
         p = np.clip(p, 1e-4, 1 - 1e-4)
         truth = np.asarray(right, dtype=bool)
         return float(-np.log(np.where(truth, p, 1 - p)).mean() + 1e-3 * float(x[2]) ** 2)
 
-    best = minimize(loss, np.array([0.6, np.log(50.0), 0.3]), method="Nelder-Mead").x
-    return Calibration(neutral=float(best[0]), worth=float(np.exp(best[1])), power=float(best[2]))
+    best = minimize(loss, np.array([0.6, np.log(25.0), 0.7]), method="Nelder-Mead").x
+    return Calibration(
+        neutral=float(np.clip(best[0], 0.05, 0.95)), worth=float(np.exp(best[1])), power=float(best[2])
+    )
