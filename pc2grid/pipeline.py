@@ -73,10 +73,12 @@ def build_map(
     start_s: float = 0.0,
     duration_s: float | None = None,
     progress: Callable[[float], None] | None = None,
+    watch: Callable[[RegisteredScan], None] | None = None,
 ) -> SessionMap:
     """Turn a recording, or `duration_s` of it from `start_s` on, into a map.
 
     progress : called with the share that is done, 0..1.
+    watch : called with each scan where tracking puts it, before loops are closed.
     Raises NoScans if there is nothing to make a map from.
 
     >>> import pc2grid, signature
@@ -90,11 +92,13 @@ def build_map(
     begin_ns = log.info.start_ns + int(start_s * 1e9)
     span_ns = max(log.info.end_ns - begin_ns if duration_s is None else int(duration_s * 1e9), 1)
 
-    def advance(stamp_ns: int) -> None:
+    def see(registered: RegisteredScan) -> None:
         if progress is not None:
-            progress(min(0.8 * (stamp_ns - begin_ns) / span_ns, 0.8))
+            progress(min(0.8 * (registered.scan.stamp_ns - begin_ns) / span_ns, 0.8))
+        if watch is not None:
+            watch(registered)
 
-    grid, trajectory, loops = map_scans(log.scans(start_s, duration_s), config, advance)
+    grid, trajectory, loops = map_scans(log.scans(start_s, duration_s), config, see)
     if not len(trajectory):
         raise NoScans(f"{log.info.path}: no scans in the part asked for", hint="check --start and --duration")
     submaps = partition(grid, config.partition)
@@ -112,10 +116,12 @@ def build_map(
 
 
 def map_scans(
-    scans: Iterable[Scan], config: PipelineConfig, advance: Callable[[int], None] = lambda stamp_ns: None
+    scans: Iterable[Scan],
+    config: PipelineConfig,
+    watch: Callable[[RegisteredScan], None] = lambda registered: None,
 ) -> tuple[OccupancyGrid, Trajectory, tuple[Loop, ...]]:
-    """Grid and trajectory of scans, and the loops found on the way. `advance` is called with each scan's
-    stamp.
+    """Grid and trajectory of scans, and the loops found on the way. `watch` is called with each scan where
+    tracking puts it, before loops are closed.
 
     Only keyframes are kept, as sweeps of a few kilobytes; a robot that stands still adds nothing.
 
@@ -153,7 +159,7 @@ def map_scans(
         stamps.append(scan.stamp_ns)
         poses.append(registered.T_map_base)
         health.append(registered.health)
-        advance(scan.stamp_ns)
+        watch(registered)
     if keyframes:
         glimpsed.append(between.take())
     builder = GridBuilder(config.projection)

@@ -34,11 +34,15 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moment:
-    """The answer as it stood after `path_m` of travel; the pose is of the best hypothesis, if any."""
+    """The answer as it stood after `path_m` of travel.
+
+    pose : of the best hypothesis, if any, in the map of `session`.
+    """
 
     stamp_ns: int
     path_m: float
     status: Status
+    session: str | None
     pose: SE2 | None
     confidence: float
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import pc2grid
-from pc2grid.model import OccupancyGrid, SessionMap, Trajectory
+from pc2grid.model import OccupancyGrid, RegisteredScan, SessionMap, Trajectory
 from signature.config import Config
 from signature.database import Label, Provenance
 from signature.describe import Signature, describe
@@ -59,10 +59,12 @@ def build_session(
     label: Label | None = None,
     progress: Callable[[float], None] | None = None,
     note: Callable[[str], None] | None = None,
+    watch: Callable[[RegisteredScan], None] | None = None,
 ) -> tuple[SessionMap, Provenance]:
     """A recording or nav2 map as a session map, and what it came from.
 
     progress : told the share that is done. note : told which topic was chosen, and why.
+    watch : shown each scan of a recording where tracking puts it.
 
     Raises LogError and its like, MapFileError.
 
@@ -88,7 +90,13 @@ def build_session(
         if note is not None:
             note(f"{path}: {choice.topic} ({choice.sensor}): {choice.reason}")
         session_map = build_map(
-            log, config, session=name, start_s=start_s, duration_s=duration_s, progress=progress
+            log,
+            config,
+            session=name,
+            start_s=start_s,
+            duration_s=duration_s,
+            progress=progress,
+            watch=watch,
         )
         origin = provenance(path, log.digest(), config, start_s=start_s, duration_s=duration_s, label=label)
     return session_map, origin

@@ -7,6 +7,7 @@ stored by one process, in the order asked for. So the database is the same whoev
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import signal
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -16,6 +17,7 @@ from typing import Any
 
 import pc2grid
 from pc2grid.errors import ClusterError, DatabaseError
+from pc2grid.model import RegisteredScan
 from signature.build import build_session, describe_all, digest_of, provenance
 from signature.config import Config
 from signature.database.protocol import Entry, Label, Provenance
@@ -56,6 +58,10 @@ class Job:
         )
 
 
+Watch = Callable[[Job, RegisteredScan], None]
+"""Is shown each scan of a job's recording where tracking puts it."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
     """What became of a job.
@@ -70,7 +76,10 @@ class Outcome:
 
 
 def convert(
-    job: Job, progress: Progress | None = None, note: Callable[[str], None] | None = None
+    job: Job,
+    progress: Progress | None = None,
+    note: Callable[[str], None] | None = None,
+    watch: Watch | None = None,
 ) -> Entry | None:
     """Do a job: everything there is to store of it, or None if it is stored already.
 
@@ -100,6 +109,7 @@ def convert(
             label=job.label,
             progress=update,
             note=note,
+            watch=None if watch is None else functools.partial(watch, job),
         )
     with progress("describe") as update:
         return session_map, describe_all(session_map, job.config, update), origin
@@ -111,12 +121,12 @@ def _in_silence(what: str) -> Iterator[Callable[[float], None]]:
 
 
 def here(
-    jobs: Sequence[Job], progress: Progress, note: Callable[[str], None]
+    jobs: Sequence[Job], progress: Progress, note: Callable[[str], None], watch: Watch | None = None
 ) -> Generator[Outcome, None, None]:
     """Do jobs one after the other in this process."""
     for job in jobs:
         try:
-            entry = convert(job, progress, note)
+            entry = convert(job, progress, note, watch)
         except Exception as error:
             yield Outcome(job=job, error=error)
         else:

@@ -39,6 +39,11 @@ class Search:
         self._history: list[Moment] = []
         self.forget()
 
+    @property
+    def latest(self) -> Moment | None:
+        """The answer as it stood when the database was last asked."""
+        return self._history[-1] if self._history else None
+
     def forget(self) -> None:
         """Begin anew: what the query saw so far says nothing about where it is now."""
         self._hypotheses: tuple[Hypothesis, ...] = ()
@@ -47,7 +52,7 @@ class Search:
     def look(self, query: QueryMap) -> None:
         """Ask the database with what the query has seen by now."""
         verdict = self._look_up(query, self.building.judge)
-        self._history.append(_moment(query, verdict))
+        self._history.append(_moment(self.building, query, verdict))
 
     def answer(self, query: QueryMap) -> Answer:
         """Where the query is by all that it has seen."""
@@ -211,12 +216,13 @@ def _at_origin(hypothesis: Hypothesis, at: SE2) -> Hypothesis:
     return replace(hypothesis, fit=replace(fit, covariance=J @ fit.covariance @ J.T))
 
 
-def _moment(query: QueryMap, verdict: Verdict) -> Moment:
+def _moment(building: Building, query: QueryMap, verdict: Verdict) -> Moment:
     best = verdict.hypotheses[0] if verdict.hypotheses else None
     return Moment(
         stamp_ns=query.stamp_ns,
         path_m=query.path_m,
         status=verdict.status,
+        session=building.sessions[best.session_index] if best else None,
         pose=best.fit.T_map_query @ query.T_odom_base if best else None,
         confidence=verdict.confidence,
     )
@@ -242,7 +248,7 @@ def _answer(
         confidence=verdict.confidence,
         hypotheses=verdict.hypotheses,
         places=verdict.places,
-        history=(*history, _moment(query, verdict)),
+        history=(*history, _moment(building, query, verdict)),
         T_odom_base=query.T_odom_base,
         path_m=query.path_m,
         sessions=building.sessions,

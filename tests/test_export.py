@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import networkx as nx
@@ -159,26 +158,3 @@ def test_a_trajectory_that_is_not_there_stops_everything(tmp_path: Path) -> None
         done = CliRunner().invoke(app, ["export", str(tmp_path / "p.submaps"), *options])
         assert isinstance(done.exception, Pc2GridError) and "no trajectory" in str(done.exception)
     assert [path.name for path in tmp_path.iterdir()] == ["p.submaps"]
-
-
-def test_rerun_is_an_extra_that_is_named(
-    database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    done = CliRunner().invoke(app, ["export", str(database), "--rerun", str(tmp_path / "x.rrd")])
-    assert isinstance(done.exception, Pc2GridError) and "pc2grid[viz]" in str(done.exception)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_rerun_takes_all_that_is_logged(
-    database: Path, tmp_path: Path, recwarn: pytest.WarningsRecorder
-) -> None:
-    pytest.importorskip("rerun", reason="the extra viz is not installed")
-    path = tmp_path / "office.rrd"
-    export(database, "--rerun", path)
-    assert [w for w in recwarn if "Rerun" in w.category.__name__] == []
-    rerun = [sys.executable, "-m", "rerun", "rrd"]
-    subprocess.run([*rerun, "verify", path], check=True, capture_output=True)
-    told = subprocess.run([*rerun, "stats", path], check=True, capture_output=True, text=True).stdout
-    for entity in ("map/walls", "map/submaps", "map/ways", "map/path", "map/base"):
-        assert f"/{entity}: " in told

@@ -36,7 +36,9 @@ def session():
 @pytest.fixture(scope="module")
 def mapped(session):
     pairs = list(session.scans())
-    grid, trajectory, _ = map_scans((scan for scan, _ in pairs), Config())
+    watched = []
+    grid, trajectory, _ = map_scans((scan for scan, _ in pairs), Config(), watched.append)
+    assert [registered.scan.stamp_ns for registered in watched] == trajectory.stamps_ns.tolist()
     return session, pairs, grid, trajectory
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 
 from pc2grid.errors import DatabaseError
 from pc2grid_cli import console
@@ -21,19 +20,6 @@ if TYPE_CHECKING:
     from signature.cluster import Job
     from signature.database import Provenance
     from signature.database.protocol import Entry
-
-
-class ConvertCommand(TyperCommand):
-    """`--dask` may stand without its address, for which typer has no notation."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put in what stands for no address, unless one follows."""
-        following = [*args, ""][1:]
-        named = [
-            "--dask=local" if arg == "--dask" and "://" not in after else arg
-            for arg, after in zip(args, following, strict=True)
-        ]
-        return super().parse_args(ctx, named)
 
 
 def convert_command(
@@ -58,6 +44,7 @@ def convert_command(
     jobs: Annotated[
         int | None, typer.Option("--jobs", min=1, help="how many processes; default: as many as cores")
     ] = None,
+    rerun: options.Rerun = None,
     config: options.ConfigFile = None,
     set_: options.Assignments = None,
     force: options.Force = False,
@@ -78,6 +65,17 @@ def convert_command(
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
     )
+    if rerun is not None:
+        from pc2grid_cli.rerun_target import require_target, url_of
+
+        if dask is not None or jobs is not None:
+            raise ConfigError("--rerun shows what is done in this process: not with --dask or --jobs")
+        if len(inputs) > 1 and url_of(rerun) is None:
+            raise ConfigError(
+                "--rerun writes one recording to a file, but there are several inputs",
+                hint="watch them in the viewer: --rerun, or --rerun HOST:PORT",
+            )
+        require_target(rerun, force)
     if name is not None and len(inputs) > 1:
         raise ConfigError("--name names one session, but there are several inputs")
     wanted = [
@@ -108,6 +106,7 @@ def convert_command(
         force=force,
         dask=dask,
         processes=jobs or os.cpu_count() or 1,
+        rerun=rerun,
         quiet=json,
     )
     where = transfer.shown(output)
@@ -148,7 +147,15 @@ class _Done:
 
 
 def _convert_all(
-    jobs: list[Job], output: str, *, keep: bool, force: bool, dask: str | None, processes: int, quiet: bool
+    jobs: list[Job],
+    output: str,
+    *,
+    keep: bool,
+    force: bool,
+    dask: str | None,
+    processes: int,
+    rerun: str | None,
+    quiet: bool,
 ) -> _Done:
     """Convert, here or on a cluster, and store what comes back, in order, a transaction each."""
     from signature import cluster
@@ -158,8 +165,14 @@ def _convert_all(
     with contextlib.ExitStack() as stack:
         if len(jobs) > 1:
             stack.enter_context(_say_how_far(done, len(jobs)))
+        shown = None
+        if rerun is not None:
+            from pc2grid_cli.rerun_stream import Conversions
+
+            shown = stack.enter_context(Conversions(rerun))
         if dask is None:
-            outcomes = cluster.here(jobs, console.progress, lambda line: console.note(line, level=1))
+            watch = None if shown is None else shown.watch
+            outcomes = cluster.here(jobs, console.progress, lambda line: console.note(line, level=1), watch)
         else:
             outcomes = cluster.on_cluster(jobs, dask, min(processes, len(jobs)), console.warn)
             update = stack.enter_context(console.progress(f"convert {len(jobs)} recordings"))
@@ -172,6 +185,8 @@ def _convert_all(
                     transfer.store(output, [outcome.entry], keep=keep, force=force)
                     keep = True
                     _tell(done, outcome.entry, quiet)
+                    if shown is not None:
+                        shown.show(outcome.entry[0], outcome.job.config)
                 except DatabaseError as refusal:
                     if type(refusal) is not DatabaseError:  # the database itself is in trouble
                         raise

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.settings import AsJson, Database, Force
+from pc2grid_cli.settings import AsJson, Database, Force, Rerun
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory
@@ -49,9 +49,7 @@ def export_command(
     mcap: Annotated[
         Path | None, typer.Option("--mcap", metavar="OUT.mcap", help="map, path, submaps for Foxglove")
     ] = None,
-    rerun: Annotated[
-        Path | None, typer.Option("--rerun", metavar="OUT.rrd", help="the same for rerun; needs [viz]")
-    ] = None,
+    rerun: Rerun = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="OUT.png", help="a picture of the map")
     ] = None,
@@ -70,11 +68,11 @@ def export_command(
     from pc2grid.io.atomic import refuse_existing
     from signature.database import open_database
 
-    of_session = [path for path in (trajectory, cloud, graph, g2o, mcap, rerun, plot) if path is not None]
+    of_session = [path for path in (trajectory, cloud, graph, g2o, mcap, plot) if path is not None]
     if map_ is not None:
         of_session += [map_.with_name(map_.name + ".yaml"), map_.with_name(map_.name + ".pgm")]
     targets = of_session + ([report] if report is not None else [])
-    if not targets:
+    if not targets and rerun is None:
         raise ConfigError(
             "nothing to export",
             hint="name one of --map, --trajectory, --cloud, --graph, --g2o, --mcap, --rerun, --plot,"
@@ -83,13 +81,13 @@ def export_command(
     for path in targets:
         refuse_existing(path, force)
     if rerun is not None:
-        from pc2grid_cli.rerun_file import require_rerun
+        from pc2grid_cli.rerun_target import require_target, url_of
 
-        require_rerun()
+        require_target(rerun, force)
     with open_database(database) as opened:
         where = opened.location
         names = [info.name for info in opened.sessions()]
-        if of_session and session is None and len(names) != 1:
+        if (of_session or rerun) and session is None and len(names) != 1:
             there = ", ".join(names) or "none"
             raise DatabaseError(
                 f"{where}: holds {len(names)} sessions: {there}", hint="choose one with --session"
@@ -121,9 +119,11 @@ def export_command(
 
             write_session(mcap, opened, name, force)
         if rerun is not None:
-            from pc2grid_cli import rerun_file
+            from pc2grid_cli.rerun_stream import write_session as stream_session
 
-            rerun_file.write_session(rerun, opened, name)
+            stream_session(rerun, opened, name)
+            if url_of(rerun) is None:
+                targets.append(Path(rerun))
         if plot is not None:
             from pc2grid_cli.picture import draw_session
 
@@ -139,7 +139,7 @@ def export_command(
             {
                 "schema_version": 1,
                 "database": where,
-                "session": name if of_session else None,
+                "session": name if of_session or rerun else None,
                 "written": [str(path) for path in targets],
             }
         )

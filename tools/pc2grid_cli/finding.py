@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,9 +12,12 @@ from pc2grid_cli import console
 if TYPE_CHECKING:
     from pc2grid.io import Log
     from pc2grid.model import OccupancyGrid, RegisteredScan, Trajectory
+    from signature.answer import Moment
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.relocalize import Answer
+
+    Watch = Callable[[RegisteredScan, Moment | None], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,12 +42,13 @@ def find_log(
     start_s: float,
     duration_s: float | None,
     recover: bool,
+    watch: Watch | None = None,
 ) -> Found:
     """Locate a recording, or the part of it from `start_s` on that is `duration_s` long."""
     from pc2grid.io import open_log
 
     with open_log(path, config.read, recover=recover) as query:
-        answer, poses = locate(query, database, config, start_s=start_s, duration_s=duration_s)
+        answer, poses = locate(query, database, config, start_s=start_s, duration_s=duration_s, watch=watch)
         report = query.report()
         about = {
             "source": path.name,
@@ -77,8 +82,11 @@ def locate(
     *,
     start_s: float = 0.0,
     duration_s: float | None = None,
+    watch: Watch | None = None,
 ) -> tuple[Answer, Trajectory]:
     """The answer for a recording, and its poses in its own odometry frame.
+
+    watch : is shown each scan, and what became of it if the database was asked.
 
     The query is registered and drawn with the settings that made the database; only how to read the
     recording and how to search are the caller's.
@@ -87,7 +95,7 @@ def locate(
 
     from pc2grid.model import Trajectory
     from pc2grid.pipeline import follow
-    from signature.relocalize import relocalize
+    from signature.relocalize import Building, Relocalizer
 
     made_with = database.config()
     config = made_with.model_copy(
@@ -96,15 +104,17 @@ def locate(
     seen: list[RegisteredScan] = []
     begin_ns = query.info.start_ns + int(start_s * 1e9)
     span_ns = max(query.info.end_ns - begin_ns if duration_s is None else int(duration_s * 1e9), 1)
+    relocalizer = Relocalizer(Building.of(database, config))
+    (search,) = relocalizer.searches
     with console.progress("locate", span_ns * 1e-9) as update:
-
-        def keep() -> Any:
-            for registered, sweep in follow(query.scans(start_s, duration_s), config):
-                seen.append(_without_points(registered))
-                update(min((registered.scan.stamp_ns - begin_ns) / span_ns, 1.0))
-                yield registered, sweep
-
-        answer = relocalize(keep(), database, config)
+        for registered, sweep in follow(query.scans(start_s, duration_s), config):
+            seen.append(_without_points(registered))
+            update(min((registered.scan.stamp_ns - begin_ns) / span_ns, 1.0))
+            before = search.latest
+            relocalizer.add(registered, sweep)
+            if watch is not None:
+                watch(registered, None if search.latest is before else search.latest)
+        answer = relocalizer.answer()
     poses = Trajectory(
         stamps_ns=np.array([s.scan.stamp_ns for s in seen], np.int64),
         T_map_base=np.array([s.T_map_base for s in seen]).reshape(-1, 4, 4),

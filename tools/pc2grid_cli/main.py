@@ -15,13 +15,14 @@ from pc2grid_cli.compare_maps import compare_maps_command
 from pc2grid_cli.compare_paper import compare_paper_command
 from pc2grid_cli.compare_sensors import compare_sensors_command
 from pc2grid_cli.config import dump_command, schema_command
-from pc2grid_cli.convert import ConvertCommand, convert_command
+from pc2grid_cli.convert import convert_command
 from pc2grid_cli.db import check_command, copy_command, merge_command
 from pc2grid_cli.db import info_command as db_info_command
 from pc2grid_cli.demo import demo_command
 from pc2grid_cli.export import export_command
 from pc2grid_cli.info import info_command
 from pc2grid_cli.relocalize import relocalize_command
+from pc2grid_cli.settings import LooseCommand
 from pc2grid_cli.simulate import simulate_command
 
 # Colours and boxes cost a tenth of a second at every --help; they are for terminals that want them.
@@ -62,9 +63,9 @@ def options(
 app.command("demo")(demo_command)
 app.command("simulate")(simulate_command)
 app.command("info")(info_command)
-app.command("convert", cls=ConvertCommand)(convert_command)
-app.command("relocalize")(relocalize_command)
-app.command("export")(export_command)
+app.command("convert", cls=LooseCommand)(convert_command)
+app.command("relocalize", cls=LooseCommand)(relocalize_command)
+app.command("export", cls=LooseCommand)(export_command)
 
 compare = typer.Typer(help="The paper's tables, sensors against sensors.", no_args_is_help=True)
 compare.command("paper")(compare_paper_command)

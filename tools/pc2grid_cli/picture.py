@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from signature.relocalize import Answer
 
 BLUE, ORANGE, GREEN, VERMILLION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
+YELLOW = "#F0E442"
 _SHADES = {"unknown": 0.87, "free": 1.0, "wall": 0.15}
 
 

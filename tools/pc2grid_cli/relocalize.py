@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -41,9 +42,7 @@ def relocalize_command(
     output: Annotated[
         Path | None, typer.Option("--output", metavar="OUT.mcap", help="map, pose and path for Foxglove")
     ] = None,
-    rerun: Annotated[
-        Path | None, typer.Option("--rerun", metavar="OUT.rrd", help="the same for rerun; needs [viz]")
-    ] = None,
+    rerun: options.Rerun = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="OUT.png", help="a picture of the answer")
     ] = None,
@@ -66,18 +65,18 @@ def relocalize_command(
     from pc2grid.io.nav2_map import is_map_file
     from signature.database import open_database
 
-    for path in (trajectory, initialpose, output, rerun, plot, report):
+    for path in (trajectory, initialpose, output, plot, report):
         if path is not None:
             refuse_existing(path, force)
-    for option, path in (("--trajectory", trajectory), ("--initialpose", initialpose), ("--rerun", rerun)):
-        if path is not None and is_map_file(log):
+    for option, asked in (("--trajectory", trajectory), ("--initialpose", initialpose), ("--rerun", rerun)):
+        if asked is not None and is_map_file(log):
             raise ConfigError(
                 f"{option}: there is no robot in a map", hint="--json and --output have its pose"
             )
     if rerun is not None:
-        from pc2grid_cli.rerun_file import require_rerun
+        from pc2grid_cli.rerun_target import require_target
 
-        require_rerun()
+        require_target(rerun, force)
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
     )
@@ -85,15 +84,28 @@ def relocalize_command(
         settings = settings.model_copy(
             update={"relocalize": settings.relocalize.model_copy(update={"top_k": top_k})}
         )
-    with open_database(database) as opened:
+    with open_database(database) as opened, contextlib.ExitStack() as stack:
         where = opened.location
         if building is not None or floor is not None:
             opened.keep_only(building=building, floor=floor)
         left_out = [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
+        shown = None
+        if rerun is not None:
+            from pc2grid_cli.rerun_stream import Search, stream_to
+
+            shown = Search(stack.enter_context(stream_to(rerun, log.stem)), opened)
         if is_map_file(log):
             found = find_map(log, opened, settings)
         else:
-            found = find_log(log, opened, settings, start_s=start, duration_s=duration, recover=recover)
+            found = find_log(
+                log,
+                opened,
+                settings,
+                start_s=start,
+                duration_s=duration,
+                recover=recover,
+                watch=None if shown is None else shown.watch,
+            )
         answer = found.answer
         located = in_map(found.poses, answer)
         if located is not None:
@@ -110,10 +122,8 @@ def relocalize_command(
                     write_located_map(output, opened, answer, found.drawn, force)
                 else:
                     write_answer(output, opened, answer, located, force)
-            if rerun is not None:
-                from pc2grid_cli import rerun_file
-
-                rerun_file.write_answer(rerun, opened, answer, located)
+            if shown is not None:
+                shown.show(answer, located)
         if plot is not None:
             from pc2grid_cli.picture import draw_answer
 
@@ -122,7 +132,7 @@ def relocalize_command(
             from pc2grid_cli.report import write_report
 
             write_report(report, opened, found=found, accept=settings.relocalize.accept)
-    for path in (trajectory, initialpose, output, rerun):
+    for path in (trajectory, initialpose, output):
         if path is not None and located is None:
             console.warn(f"{path}: not written, there is no answer to put into it")
     if json:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 if TYPE_CHECKING:
     from signature.config import Config
@@ -33,6 +35,34 @@ Force = Annotated[bool, typer.Option("--force", help="replace existing files")]
 DATABASE = "BUILDING.submaps|postgresql://..."
 Database = Annotated[str, typer.Argument(metavar=DATABASE, help="the database")]
 WrittenDatabase = Annotated[str, typer.Option("--output", "-o", metavar=DATABASE, help="what to write")]
+
+Rerun = Annotated[
+    str | None,
+    typer.Option(
+        "--rerun",
+        metavar="[HOST:PORT|OUT.rrd]",
+        help="watch in the rerun viewer, here or there, or in a file; needs [viz]",
+    ),
+]
+
+
+class LooseCommand(TyperCommand):
+    """`--dask` and `--rerun` may stand without a value, for which typer has no notation."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put in what stands for no value, unless one follows."""
+        from pc2grid_cli.rerun_target import VIEWER, names_target
+
+        following = [*args, ""][1:]
+        alone: dict[str, tuple[str, Callable[[str], bool]]] = {
+            "--dask": ("local", lambda word: "://" in word),
+            "--rerun": (VIEWER, names_target),
+        }
+        named = [
+            f"{arg}={alone[arg][0]}" if arg in alone and not alone[arg][1](after) else arg
+            for arg, after in zip(args, following, strict=True)
+        ]
+        return super().parse_args(ctx, named)
 
 
 def make_config(

@@ -1,0 +1,264 @@
+"""Maps, and recordings as they are worked on, in the rerun viewer or as `.rrd` files; needs the extra `viz`.
+
+Entities: map/walls, map/submaps, map/ways, map/path, map/loops, map/base. While a recording is converted,
+map/live is what tracking sees of it, before loops are closed; while one is located, query/live is the same
+where the best hypothesis puts it, and query/confidence how sure that is. In the end query/path,
+query/hypotheses and query/base. What moves does so over the timeline `time`, the recording's own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pc2grid.io.atomic import replace_file
+from pc2grid_cli import console
+from pc2grid_cli.picture import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, YELLOW
+from pc2grid_cli.rerun_target import VIEWER, require_rerun, url_of
+
+if TYPE_CHECKING:
+    from pc2grid.config import PartitionConfig
+    from pc2grid.geometry import F64, SE2
+    from pc2grid.model import Loop, OccupancyGrid, RegisteredScan, SessionMap, Trajectory
+    from signature.answer import Answer, Moment
+    from signature.cluster import Job
+    from signature.config import Config
+    from signature.database import SubmapDatabase
+
+_MOST_POINTS = 4000  # of a scan; a viewer far away shall keep up
+_KEPT_EVERY_M = 1.0
+_PATIENCE_S = 10.0
+
+
+@contextlib.contextmanager
+def stream_to(target: str, name: str) -> Iterator[Any]:
+    """A recording that a viewer shows as it grows, or that becomes a file when the block ends well."""
+    url = url_of(target)
+    # A file is named after its content, so that the same data does not open as something new every time.
+    stream = require_rerun().RecordingStream("pc2grid", recording_id=name if url is None else None)
+    with contextlib.ExitStack() as stack:
+        if url is None:
+            stream.save(stack.enter_context(replace_file(target)))
+        elif target == VIEWER:
+            stream.spawn()
+        else:
+            stream.connect_grpc(url)
+        stream.send_recording_name(name)
+        try:
+            yield stream
+        finally:
+            try:
+                stream.flush(timeout_sec=_PATIENCE_S)
+            except Exception as error:  # its class differs between versions of rerun
+                console.warn(f"rerun: not all of {name} has arrived: {error}")
+            stream.disconnect()
+
+
+def write_session(target: str, database: SubmapDatabase, session: str) -> None:
+    """A session's map, submaps, path and loops."""
+    with stream_to(target, session) as recording:
+        _log_stored(recording, database, session)
+        _log_moving(recording, "map/base", database.trajectory(session), BLUE)
+
+
+class Conversions:
+    """Shows recordings as they are converted, and the maps that they become: a rerun recording each."""
+
+    def __init__(self, target: str) -> None:
+        self._target = target
+        self._stack = contextlib.ExitStack()
+        self._name: str | None = None
+
+    def watch(self, job: Job, registered: RegisteredScan) -> None:
+        """The next scan of a job's recording."""
+        self._begin(job.name)
+        self._live.add(registered)
+
+    def show(self, session: SessionMap, config: Config) -> None:
+        """The map that it became."""
+        self._begin(session.session)
+        self._live.end()
+        centers = np.array([submap.center_m for submap in session.submaps]).reshape(-1, 2)
+        _log_map(self._recording, session.grid, centers, config.partition, session.trajectory, session.loops)
+        _log_moving(self._recording, "map/base", session.trajectory, BLUE)
+
+    def _begin(self, name: str) -> None:
+        if name != self._name:
+            self._stack.close()
+            self._recording = self._stack.enter_context(stream_to(self._target, name))
+            self._live = _Live(self._recording, "map/live")
+            self._name = name
+
+    def __enter__(self) -> Conversions:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._stack.__exit__(*error)
+
+
+class Search:
+    """Shows a recording while it is looked for in a database, and the answer."""
+
+    def __init__(self, recording: Any, database: SubmapDatabase) -> None:
+        self._recording, self._database = recording, database
+        self._live = _Live(recording, "query/live")
+        self._shown: str | None = None
+        self._placed = False
+        sessions = database.sessions()
+        if len(sessions) == 1:
+            self._show(sessions[0].name)
+
+    def watch(self, registered: RegisteredScan, moment: Moment | None) -> None:
+        """The next scan, and what became of it if the database was asked."""
+        from pc2grid.geometry import SE2
+
+        rr = require_rerun()
+        if moment is not None:
+            _set_time(self._recording, moment.stamp_ns)
+            self._recording.log("query/confidence", rr.Scalars(moment.confidence))
+            if moment.session is not None and moment.pose is not None:
+                self._show(moment.session)
+                self._live.move(moment.pose @ SE2.flatten(registered.T_map_base).inverse())
+                self._placed = True
+        if self._placed:
+            self._live.add(registered)
+
+    def show(self, answer: Answer, located: Trajectory) -> None:
+        """Where it was: `located` are its poses in the map."""
+        assert answer.session is not None
+        rr = require_rerun()
+        self._show(answer.session)
+        self._live.end()
+        way = rr.LineStrips3D([located.T_map_base[:, :3, 3]], colors=_rgb(VERMILLION))
+        self._recording.log("query/path", way, static=True)
+        poses = [hypothesis.fit.T_map_query @ answer.T_odom_base for hypothesis in answer.hypotheses]
+        here = [answer.sessions[h.session_index] == answer.session for h in answer.hypotheses]
+        places = [(pose.x, pose.y, 0.0) for pose, shown in zip(poses, here, strict=True) if shown]
+        spots = rr.Points3D(places, colors=_rgb(PURPLE), radii=0.2)
+        self._recording.log("query/hypotheses", spots, static=True)
+        _log_moving(self._recording, "query/base", located, VERMILLION)
+
+    def _show(self, session: str) -> None:
+        """The map of one session at a time: each has a frame of its own."""
+        if session != self._shown:
+            _log_stored(self._recording, self._database, session)
+            self._shown = session
+
+
+class _Live:
+    """Scans where tracking puts them: the last one, and of the way so far a scan a metre."""
+
+    def __init__(self, recording: Any, entity: str) -> None:
+        self._recording, self._entity = recording, entity
+        self._way: list[F64] = []
+        self._driven_m, self._kept = 0.0, 0
+
+    def move(self, T_map_odom: SE2) -> None:
+        """From now on, everything is there."""
+        from pc2grid.geometry import quat_xyzw_from_pose
+
+        T = T_map_odom.lift()
+        transform = require_rerun().Transform3D(translation=T[:3, 3], quaternion=quat_xyzw_from_pose(T))
+        self._recording.log(self._entity, transform)
+
+    def add(self, registered: RegisteredScan) -> None:
+        """The next scan."""
+        from pc2grid.geometry import transform_points
+        from pc2grid.model import Health
+
+        rr = require_rerun()
+        scan, T = registered.scan, registered.T_map_base
+        _set_time(self._recording, scan.stamp_ns)
+        step = -(-len(scan.points_m) // _MOST_POINTS) or 1
+        points = transform_points(T, scan.points_m[::step])
+        colour = {Health.FINE: VERMILLION, Health.DEGENERATE: ORANGE, Health.LOST: PURPLE}[registered.health]
+        self._recording.log(f"{self._entity}/scan", rr.Points3D(points, colors=_rgb(colour), radii=0.03))
+        ahead = rr.Arrows3D(origins=[T[:3, 3]], vectors=[0.5 * T[:3, 0]], colors=_rgb(colour), radii=0.06)
+        self._recording.log(f"{self._entity}/base", ahead)
+        if self._way:
+            self._driven_m += float(np.linalg.norm(T[:2, 3] - self._way[-1][:2]))
+        self._way.append(T[:3, 3])
+        if registered.health is not Health.LOST and (self._driven_m >= _KEPT_EVERY_M or not self._kept):
+            place = f"{self._entity}/seen/{self._kept}"
+            self._recording.log(f"{place}/way", rr.LineStrips3D([self._way], colors=_rgb(BLUE)))
+            self._recording.log(f"{place}/points", rr.Points3D(points, colors=_rgb("#999999"), radii=0.02))
+            self._way, self._driven_m, self._kept = self._way[-1:], 0.0, self._kept + 1
+
+    def end(self) -> None:
+        """Take it all away: what it became is there."""
+        self._recording.log(self._entity, require_rerun().Clear(recursive=True))
+
+
+def _set_time(recording: Any, stamp_ns: int) -> None:
+    recording.set_time("time", timestamp=np.datetime64(stamp_ns, "ns"))
+
+
+def _log_stored(recording: Any, database: SubmapDatabase, session: str) -> None:
+    """The map of a session as the database has it."""
+    table = database.signatures(session)
+    _log_map(
+        recording,
+        database.grid(session),
+        table.center_m,
+        database.config().partition,
+        database.trajectory(session),
+        database.loops(session),
+    )
+
+
+def _log_map(
+    recording: Any,
+    grid: OccupancyGrid,
+    centers_m: F64,
+    partition: PartitionConfig,
+    trajectory: Trajectory,
+    loops: Sequence[Loop],
+) -> None:
+    from pc2grid.partition import junction_graph
+
+    rr = require_rerun()
+    walls = _lift(grid.to_point(np.argwhere(grid.occupied)))
+    graph = junction_graph(grid, partition)
+    ways = [_lift(np.array([graph.nodes[n]["center_m"] for n in edge])) for edge in graph.edges]
+    path = trajectory.T_map_base[:, :3, 3]
+    closed = [path[[loop.older, loop.newer]] for loop in loops if loop.accepted]
+    for entity, shown in (
+        ("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
+        ("map/walls", rr.Points3D(walls, colors=_rgb("#555555"), radii=grid.resolution_m / 2)),
+        ("map/submaps", rr.Points3D(_lift(centers_m), colors=_rgb(GREEN), radii=0.12)),
+        ("map/ways", rr.LineStrips3D(ways, colors=_rgb("#999999"))),
+        ("map/path", rr.LineStrips3D([path], colors=_rgb(BLUE))),
+        ("map/loops", rr.LineStrips3D(closed, colors=_rgb(YELLOW))),
+    ):
+        recording.log(entity, shown, static=True)
+
+
+def _log_moving(recording: Any, entity: str, poses: Trajectory, color: str) -> None:
+    """The base over time, as an arrow of half a metre."""
+    from pc2grid.geometry import quat_xyzw_from_pose
+
+    rr = require_rerun()
+    if not len(poses):
+        return
+    recording.log(entity, rr.Arrows3D(vectors=[[0.5, 0.0, 0.0]], colors=_rgb(color), radii=0.06), static=True)
+    recording.send_columns(
+        entity,
+        indexes=[rr.TimeColumn("time", timestamp=poses.stamps_ns.astype("datetime64[ns]"))],
+        columns=rr.Transform3D.columns(
+            translation=poses.T_map_base[:, :3, 3],
+            quaternion=[quat_xyzw_from_pose(T) for T in poses.T_map_base],
+        ),
+    )
+
+
+def _lift(points_m: F64) -> F64:
+    """Points (N, 2) as (N, 3) at z = 0."""
+    return np.column_stack((points_m, np.zeros(len(points_m))))
+
+
+def _rgb(color: str) -> list[tuple[int, ...]]:
+    """A colour "#RRGGBB" as rerun takes it, for all parts of an entity."""
+    return [tuple(bytes.fromhex(color[1:]))]
