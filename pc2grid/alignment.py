@@ -439,7 +439,7 @@ def _gauss_newton(
             f00, f01 = flat[at] * unit, flat[at + one] * unit
             f10, f11 = flat[at + down] * unit, flat[at + down + one] * unit
             f = (1 - b) * ((1 - a) * f00 + a * f01) + b * ((1 - a) * f10 + a * f11)
-            # Nothing outside counts, nor clutter or moved furniture, too far from any wall to pull. By weight:
+            # What is outside counts nothing, nor clutter, too far from any wall to pull. By weight, because
             # which points those are is as good as random, and a branch taken wrongly costs more.
             w = 1.0 if (inside_u == u) & (inside_v == v) & (f >= 0.05) else 0.0
             du = w * ((1 - b) * (f01 - f00) + b * (f11 - f10))

@@ -13,6 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pc2grid.geometry import F64
 from pc2grid.model import F32, OCCUPIED, UNKNOWN, OccupancyGrid, Submap, _freeze
 
 BEARINGS = 360
@@ -51,44 +52,66 @@ class Isovist:
 
 @numba.njit(cache=True, nogil=True)
 def _cast(
-    cells: NDArray[np.int8], row: float, column: float, limit: float, bearings: int, patience: int
+    cells: NDArray[np.int8], rows: F64, columns: F64, limit: float, bearings: int, patience: int
 ) -> tuple[F32, NDArray[np.int8]]:
-    """Walk each ray half a cell at a time; all lengths in cells."""
+    """Walk the rays of each place (N,) half a cell at a time; all lengths in cells. Returns (N, B) each."""
     height, width = cells.shape
     flat = np.ascontiguousarray(cells).reshape(-1)
-    ranges = np.empty(bearings, dtype=np.float32)
-    ends = np.empty(bearings, dtype=np.int8)
+    ranges = np.empty((len(rows), bearings), dtype=np.float32)
+    ends = np.empty((len(rows), bearings), dtype=np.int8)
     step = 0.5
     for b in range(bearings):
         angle = 2.0 * np.pi * b / bearings
         dc, dr = np.cos(angle) * step, np.sin(angle) * step
-        r, c, length = row, column, 0.0
-        end = 0
-        known = 0.0
-        unknown_run = 0
-        while length < limit:
-            r += dr
-            c += dc
-            length += step
-            if not (0.0 <= r < height and 0.0 <= c < width):
-                end = -1
-                break
-            value = flat[np.uint64(r) * np.uint64(width) + np.uint64(c)]
-            if value >= 65:
-                end = 1
-                known = length
-                break
-            if value < 0:
-                unknown_run += 1
-                if unknown_run > patience:
+        for n in range(len(rows)):
+            r, c, length = rows[n], columns[n], 0.0
+            end = 0
+            known = 0.0
+            unknown_run = 0
+            while length < limit:
+                r += dr
+                c += dc
+                length += step
+                if not (0.0 <= r < height and 0.0 <= c < width):
                     end = -1
                     break
-            else:
-                unknown_run = 0
-                known = length
-        ranges[b] = known
-        ends[b] = end
+                value = flat[np.uint64(r) * np.uint64(width) + np.uint64(c)]
+                if value >= 65:
+                    end = 1
+                    known = length
+                    break
+                if value < 0:
+                    unknown_run += 1
+                    if unknown_run > patience:
+                        end = -1
+                        break
+                else:
+                    unknown_run = 0
+                    known = length
+            ranges[n, b] = known
+            ends[n, b] = end
     return ranges, ends
+
+
+def look_around(
+    grid: OccupancyGrid,
+    centers_m: F64,
+    sight_m: float,
+    *,
+    bearings: int = BEARINGS,
+    patience_m: float = 0.1,
+) -> tuple[F32, NDArray[np.int8]]:
+    """Ranges (N, B) in metres and ends (N, B) of the isovists of many points (N, 2); see `isovist`."""
+    columns, rows = ((centers_m - np.asarray(grid.origin_m)) / grid.resolution_m).T
+    ranges, ends = _cast(
+        grid.cells,
+        np.ascontiguousarray(rows, np.float64),
+        np.ascontiguousarray(columns, np.float64),
+        sight_m / grid.resolution_m,
+        bearings,
+        int(2 * patience_m / grid.resolution_m),
+    )
+    return ranges * np.float32(grid.resolution_m), ends
 
 
 def isovist(
@@ -104,17 +127,10 @@ def isovist(
     A ray ends at the first occupied cell, at `sight_m`, or when it has run through more than `patience_m`
     of unknown cells (single unobserved cells between beams do not hide what lies behind them).
     """
-    column = (center_m[0] - grid.origin_m[0]) / grid.resolution_m
-    row = (center_m[1] - grid.origin_m[1]) / grid.resolution_m
-    ranges, ends = _cast(
-        grid.cells,
-        row,
-        column,
-        sight_m / grid.resolution_m,
-        bearings,
-        int(2 * patience_m / grid.resolution_m),
+    ranges_m, ends = look_around(
+        grid, np.array([center_m]), sight_m, bearings=bearings, patience_m=patience_m
     )
-    return Isovist(center_m=center_m, sight_m=sight_m, ranges_m=ranges * grid.resolution_m, ends=ends)
+    return Isovist(center_m=center_m, sight_m=sight_m, ranges_m=ranges_m[0], ends=ends[0])
 
 
 def polygon_mask(view: Isovist, grid: OccupancyGrid, *, margin_m: float = 0.0) -> NDArray[np.bool_]:

@@ -56,15 +56,23 @@ def search_windows(
     x, y = np.ascontiguousarray(walls_m.T / res, np.float32)
     turns = max(1, math.ceil(2 * half_a_rad / step_rad))
     step_rad = 2 * half_a_rad / turns
+    half = max(1, math.ceil(half_t_m / res))
+    level = levels_for(np.hypot(x, y), 0.5, 0.5 * step_rad, np.asarray(target.reaches_m) / res)
+    # The first maximum that covers what `level` does, from the middle of a quarter to all its cells.
+    reach = np.array([math.ceil(reach_m / res) for reach_m in target.reaches_m])
+    cover = np.searchsorted(reach, reach[level] + (half + 1) // 2)
     found = _best_of_quarters(
         target.levels,
-        levels_for(np.hypot(x, y), 0.5, 0.5 * step_rad, np.asarray(target.reaches_m) / res),
+        level,
+        cover,
         x,
         y,
         np.column_stack(((starts[:, :2] - origin) / res, starts[:, 2])),
-        max(1, math.ceil(half_t_m / res)),
+        half,
         np.asarray(step_rad * (np.arange(turns) - 0.5 * (turns - 1)), np.float64),
         int(255 * NEUTRAL),
+        floor,
+        keep,
     )
     found = found[np.argsort(-found[:, 3], kind="stable")]
     found = found[found[:, 3] >= max(floor, keep * float(found[0, 3]))]
@@ -136,48 +144,83 @@ def _add_hanging_window(level: U8, row: int, column: int, sums: NDArray[np.uint1
 
 
 @numba.njit(cache=True, nogil=True)
+def _most_around(levels: U8, cover: I64, rows: I64, columns: I64, down: int, right: int, outside: int) -> int:
+    """What no sum of the points comes to that `cover` covers, from their cells moved `down` and `right`."""
+    count, height, width = levels.shape
+    total = 0
+    for p in range(len(rows)):
+        i, j = rows[p] + down, columns[p] + right
+        if cover[p] < count and 0 <= i < height and 0 <= j < width:
+            total += max(int(levels[cover[p], i, j]), outside)
+        else:
+            total += 255
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
 def _best_of_quarters(
     levels: U8,
     point_level: I64,
+    cover: I64,
     x: F32,
     y: F32,
     starts: F64,
     half: int,
     turns: F64,
     outside: int,
+    floor: float,
+    keep: float,
 ) -> F64:
-    """For each start the best pose in each quarter of its window (4 B, 4): x, y (cells), yaw, score."""
+    """For each start the best pose in each quarter of its window (4 B, 4): x, y (cells), yaw, score.
+
+    Left out is what would not be reported: the upper or lower half of a window at a heading at which neither
+    of its quarters can come to `floor`, to `keep` times the best so far, and to more than at other headings.
+    """
     _, height, width = levels.shape
     n, size = len(x), 2 * half + 1
     best = np.empty((4 * len(starts), 4))
+    full, least = 255.0 * n, floor
     # Whole vectors: what lies beyond the window belongs to other cells and is not looked at.
-    sums = np.empty((size, -(-size // _LANES) * _LANES), np.uint16)
+    sums = np.empty((half + 1, -(-size // _LANES) * _LANES), np.uint16)
     flat, corners = levels.reshape(-1), np.empty(n, np.int64)
+    rows, columns = np.empty(n, np.int64), np.empty(n, np.int64)
+    middles = (-half // 2, (half + 1) // 2)
     for b in range(len(starts)):
         for q in range(4):
             best[4 * b + q] = starts[b, 0], starts[b, 1], starts[b, 2], -1.0
         for turn in turns:
             yaw = starts[b, 2] + turn
             c, s = math.cos(yaw), math.sin(yaw)
-            sums[:] = 0
-            whole = 0
             for p in range(n):
-                i = math.floor(s * x[p] + c * y[p] + starts[b, 1]) - half
-                j = math.floor(c * x[p] - s * y[p] + starts[b, 0]) - half
-                if i >= 0 and j >= 0 and i + size < height and j + size <= width:
-                    corners[whole] = (point_level[p] * height + i) * width + j
-                    whole += 1
-                else:
-                    _add_hanging_window(levels[point_level[p]], i, j, sums, outside)
-            _add_windows(flat, corners[:whole], width, sums)
-            for r in range(size):
+                rows[p] = math.floor(s * x[p] + c * y[p] + starts[b, 1])
+                columns[p] = math.floor(c * x[p] - s * y[p] + starts[b, 0])
+            for upper in range(2):
+                hope = False
                 for right in range(2):
-                    part = sums[r, half:size] if right else sums[r, :half]
-                    top = np.uint16(0)
-                    for k in range(len(part)):
-                        top = max(top, part[k])
-                    q = 4 * b + (2 if r >= half else 0) + right
-                    if top / (255.0 * n) > best[q, 3]:
-                        at = np.argmax(part) + (half if right else 0)
-                        best[q] = starts[b, 0] + at - half, starts[b, 1] + r - half, yaw, top / (255.0 * n)
+                    most = _most_around(levels, cover, rows, columns, middles[upper], middles[right], outside)
+                    hope |= most / full >= least and most / full > best[4 * b + 2 * upper + right, 3]
+                if not hope:
+                    continue
+                first, tall = (0, half + 1) if upper else (-half, half)
+                sums[:] = 0
+                whole = 0
+                for p in range(n):
+                    i, j = rows[p] + first, columns[p] - half
+                    if i >= 0 and j >= 0 and i + tall < height and j + size <= width:
+                        corners[whole] = (point_level[p] * height + i) * width + j
+                        whole += 1
+                    else:
+                        _add_hanging_window(levels[point_level[p]], i, j, sums[:tall], outside)
+                _add_windows(flat, corners[:whole], width, sums[:tall])
+                for r in range(tall):
+                    for right in range(2):
+                        part = sums[r, half:size] if right else sums[r, :half]
+                        top = np.uint16(0)
+                        for k in range(len(part)):
+                            top = max(top, part[k])
+                        q = 4 * b + 2 * upper + right
+                        if top / full > best[q, 3]:
+                            at = np.argmax(part) + (half if right else 0)
+                            best[q] = starts[b, 0] + at - half, starts[b, 1] + first + r, yaw, top / full
+                            least = max(least, keep * best[q, 3])
     return best

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pc2grid.geometry import F64
 from pc2grid.model import F32, I64, BoolGrid, OccupancyGrid
-from pc2grid.visibility import HIDDEN, isovist
+from pc2grid.visibility import HIDDEN, look_around
 from signature.nearest import SignatureIndex
 from signature.query import PROFILE_BEARINGS
 from signature.similarity import SignatureTable
@@ -127,14 +127,8 @@ class Places:
         inside &= (ground.rows[owner] == row) & (distance <= _AROUND_M)
         inside[inside] = ground.roomy[cells[inside, 0], cells[inside, 1]]
         at_m = np.concatenate((center[None], points[inside]))
-        views = [
-            isovist(grid, (float(x), float(y)), self.sight_m, bearings=PROFILE_BEARINGS) for x, y in at_m
-        ]
-        return (
-            at_m,
-            np.array([view.ranges_m for view in views]),
-            np.array([view.ends != HIDDEN for view in views]),
-        )
+        ranges_m, ends = look_around(grid, at_m, self.sight_m, bearings=PROFILE_BEARINGS)
+        return at_m, ranges_m, ends != HIDDEN
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,9 +19,9 @@ from pc2grid.geometry import F64, SE2
 from pc2grid.model import OccupancyGrid
 from pc2grid.partition import view_at
 from pc2grid.projection import GridBuilder
-from pc2grid.skeleton import sample_evenly, skeleton_of
+from pc2grid.skeleton import cells_of, sample_evenly, skeleton_of
 from pc2grid.sweep import Sweep
-from pc2grid.visibility import Isovist, isovist
+from pc2grid.visibility import HIDDEN, Isovist, isovist, look_around
 from signature.config import RelocalizeConfig, SignatureConfig
 from signature.describe import Signature, describe
 
@@ -160,17 +160,17 @@ def best_observed(
     is observed is the share of the rays from it that end on something known.
     """
     middle = skeleton_of(grid.free, grid.resolution_m, _CLEARANCE_M)
-    spaced = sample_evenly(np.argwhere(middle), 0.5 / grid.resolution_m)
+    spaced = sample_evenly(cells_of(middle), 0.5 / grid.resolution_m)
     chosen: list[tuple[float, float]] = []
     for points, most in (
         (path_xy_m[:: max(1, len(path_xy_m) // 40)], (config.views + 1) // 2),
         (grid.to_point(spaced), config.views),
     ):
-        places = [(float(x), float(y)) for x, y in points]
-        observed = [isovist(grid, p, sight_m, bearings=PROFILE_BEARINGS).observed for p in places]
-        for i in np.argsort(-np.asarray(observed), kind="stable"):
+        _, ends = look_around(grid, points, sight_m, bearings=PROFILE_BEARINGS)
+        hidden = np.count_nonzero(ends == HIDDEN, axis=1)
+        for x, y in points[np.argsort(hidden, kind="stable")].tolist():
             if len(chosen) == most:
                 break
-            if all(math.dist(places[i], c) >= config.view_spacing_m for c in chosen):
-                chosen.append(places[i])
+            if all(math.dist((x, y), c) >= config.view_spacing_m for c in chosen):
+                chosen.append((x, y))
     return tuple(chosen)

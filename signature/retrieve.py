@@ -33,6 +33,8 @@ _LEADS = 100
 """Placements that each view puts up for the vote."""
 _APART_M, _APART_RAD = 0.75, math.radians(15.0)
 """Placements nearer than this are one."""
+_UNSEEN = 65535
+"""A range that is not known, in units: farther from any that is than two that are alike."""
 _AGAINST = -1.0
 """A view can speak against a placement by no more than this many standard deviations: what stood in its
 way may be somewhere else today."""
@@ -81,26 +83,16 @@ def retrieve(
     weight = weight[:, stand.place]
     ranges = np.stack([v.profile.ranges_m for v in query.views])
     seen = np.stack([v.profile.ends != HIDDEN for v in query.views])
+    likeness = rotate_and_compare(ranges, seen, stand.ranges_m, stand.seen)
     leads, level, spread = [], [], []
-    for view in range(len(query.views)):
-        likeness = rotate_and_compare(ranges[view], seen[view], stand.ranges_m, stand.seen)
-        likeness *= weight[view, :, None]
-        best = likeness.max(axis=1)
+    for view, found in enumerate(likeness):
+        found *= weight[view]
+        best = found.max(axis=0)
         level.append(float(best.mean()))
         spread.append(float(best.std()) + _SPREAD_FLOOR)
-        leads.append(_leads(likeness, best))
+        leads.append(_leads(found, best))
     placed = _Placements.of(query, stand, leads, ranges.shape[1])
-    voices = _voices(
-        placed.shift,
-        placed.beside,
-        ranges,
-        seen,
-        stand.ranges_m,
-        stand.seen,
-        weight,
-        RANGE_SCALE_M,
-        PRIOR_SHARE * ranges.shape[1],
-    )
+    voices = _voices(likeness, placed.shift, placed.beside)
     # A view that looks like everywhere says little, so each speaks by how far a place stands out to it.
     heard = np.where(voices >= 0.0, (voices - np.array(level)) / np.array(spread), 0.0)
     votes = np.maximum(heard, _AGAINST).sum(axis=1)
@@ -119,13 +111,26 @@ def retrieve(
 
 
 def _leads(likeness: F32, best: F32) -> tuple[I64, I64]:
-    """The standpoints and rotations of the highest local maxima over the rotations of `likeness` (K, B)."""
-    top = np.argsort(-best, kind="stable")[:_LEADS]
-    rows = likeness[top]
-    local = (rows >= np.roll(rows, 1, axis=1)) & (rows > np.roll(rows, -1, axis=1))
-    at, shift = np.nonzero(local)
-    order = np.argsort(-rows[at, shift], kind="stable")[:_LEADS]
-    return top[at[order]], shift[order]
+    """The standpoints and rotations of the highest local maxima over the rotations of `likeness` (B, K)."""
+    at, shift = _peaks(likeness, np.argsort(-best, kind="stable")[:_LEADS])
+    order = np.argsort(-likeness[shift, at], kind="stable")[:_LEADS]
+    return at[order], shift[order]
+
+
+@numba.njit(cache=True, nogil=True)
+def _peaks(likeness: F32, columns: I64) -> tuple[I64, I64]:
+    """Where in each of the `columns` of `likeness` (B, K) it is higher than at the next rotation and no lower
+    than at the one before."""
+    bearings = len(likeness)
+    at, shift = np.empty((2, len(columns) * bearings), np.int64)
+    count = 0
+    for column in columns:
+        for k in range(bearings):
+            here = likeness[k, column]
+            if here >= likeness[k - 1, column] and here > likeness[k + 1 - bearings, column]:
+                at[count], shift[count] = column, k
+                count += 1
+    return at[:count], shift[:count]
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,41 +166,21 @@ class _Placements:
         return _Placements(view, at, shift, yaw, there[:, -1], beside)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
-def _voices(
-    shift: I64,
-    beside: I64,
-    ranges: F32,
-    seen: NDArray[np.bool_],
-    others: F32,
-    others_seen: NDArray[np.bool_],
-    weight: F32,
-    scale: float,
-    doubt: float,
-) -> F64:
-    """How well each view (V, B) likes what it would see in each placement (C, V); -1 where nobody knows.
+@numba.njit(cache=True, nogil=True)
+def _voices(likeness: F32, shift: I64, beside: I64) -> F64:
+    """How well each view likes what it would see in each placement (C, V); -1 where nobody knows.
 
-    A ray more or less of rotation is allowed, for the rotation is known to a ray only.
+    likeness : (V, B, K) of each view with each standpoint at each rotation. A ray more or less of rotation is
+    allowed, for the rotation is known to a ray only.
     """
-    views, bearings = ranges.shape
-    inverse = 0.5 / scale
+    views, bearings, standpoints = likeness.shape
     out = np.full((len(shift), views), -1.0)
     for c in range(len(shift)):
         for u in range(views):
-            j = beside[c, u]
-            if j >= len(others):
-                continue
-            for turn in range(-1, 2):
-                first = (shift[c] + turn) % bearings
-                total, count = 0.0, doubt
-                for k in range(bearings):
-                    m = first + k
-                    if m >= bearings:
-                        m -= bearings
-                    if seen[u, k] and others_seen[j, m]:
-                        total += max(0.0, 1.0 - abs(ranges[u, k] - others[j, m]) * inverse)
-                        count += 1.0
-                out[c, u] = max(out[c, u], total / count * weight[u, j])
+            if beside[c, u] < standpoints:
+                for turn in range(-1, 2):
+                    found = likeness[u, (shift[c] + turn) % bearings, beside[c, u]]
+                    out[c, u] = max(out[c, u], found)
     return out
 
 
@@ -220,49 +205,51 @@ def _distinct(order: I64, base_m: F64, yaw_rad: F64, session: I64, most: int) ->
     return chosen[:count]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
-def _overlap(
-    ranges: F32,
-    seen: NDArray[np.bool_],
-    others: F32,
-    others_seen: NDArray[np.bool_],
-    scale: float,
-    doubt: float,
-) -> F32:
-    n, bearings = others.shape
-    out = np.empty((n, bearings), np.float32)
-    inverse, zero, one = np.float32(0.5 / scale), np.float32(0.0), np.float32(1.0)
-    # What one side has not seen is put farther from all else than the kernel reaches.
-    own, counts = np.where(seen, ranges * inverse, np.float32(1e6)), seen.astype(np.float32)
-    # The other's rays twice over, so that every rotation is one straight run of them.
-    other, known = np.empty(2 * bearings, np.float32), np.empty(2 * bearings, np.float32)
-    for i in range(n):
-        for k in range(bearings):
-            there = others[i, k] * inverse if others_seen[i, k] else np.float32(-1e6)
-            other[k] = other[k + bearings] = there
-            known[k] = known[k + bearings] = others_seen[i, k]
-        for shift in range(bearings):
-            total, count = zero, np.float32(doubt)
-            for k in range(bearings):
-                total += max(zero, one - abs(own[k] - other[shift + k]))
-                count += counts[k] * known[shift + k]
-            out[i, shift] = total / count
-    return out
-
-
 def rotate_and_compare(
     ranges_m: F32, seen: NDArray[np.bool_], others_m: F32, others_seen: NDArray[np.bool_]
 ) -> F32:
-    """Likeness (N, B), 0..1, of one isovist (B,) with others (N, B), for each rotation by 2 pi s / B.
+    """Likeness (V, B, N), 0..1, of isovists (V, B) with others (N, B), for each rotation by 2 pi s / B.
 
     Only rays whose ends both sides know are compared, by a triangular kernel of their difference.
     """
-    result: F32 = _overlap(
-        np.ascontiguousarray(ranges_m),
-        np.ascontiguousarray(seen),
-        np.ascontiguousarray(others_m),
-        np.ascontiguousarray(others_seen),
-        RANGE_SCALE_M,
-        PRIOR_SHARE * len(ranges_m),
-    )
-    return result
+    views, bearings = ranges_m.shape
+    # In whole units of 16 bits: the most that all rays come to must fit in, and the longest range too.
+    longest_m = max(float(ranges_m.max(initial=0.0)), float(others_m.max(initial=0.0)))
+    width_m = 2 * RANGE_SCALE_M
+    per_m = np.float32(min(65535 // bearings / width_m, (_UNSEEN - 1) / (longest_m + width_m)))
+    units = [(m * per_m + np.float32(0.5)).astype(np.uint16) for m in (ranges_m, others_m)]
+    others = np.ascontiguousarray(np.where(others_seen, units[1], np.uint16(_UNSEEN)).T)
+    known = np.ascontiguousarray(others_seen.T)
+    likeness = np.empty((views, bearings, len(others_m)), np.float32)
+    for own, own_seen, out in zip(units[0], seen, likeness, strict=True):
+        rays = np.flatnonzero(own_seen)
+        _overlap(rays, own[rays], others, known, int(width_m * per_m), PRIOR_SHARE * bearings, out)
+    return likeness
+
+
+@numba.njit(cache=True, nogil=True)
+def _overlap(
+    rays: I64,
+    own: NDArray[np.uint16],
+    others: NDArray[np.uint16],
+    known: NDArray[np.bool_],
+    width: int,
+    doubt: float,
+    out: F32,
+) -> None:
+    """Compare the ranges `own` of some `rays` with all others', (B, N); those `width` apart are not alike."""
+    bearings, n = others.shape
+    full, scale, more = np.uint16(width), np.float32(1.0 / width), np.float32(doubt)
+    total, count = np.empty(n, np.uint16), np.empty(n, np.uint16)
+    for shift in range(bearings):
+        total[:], count[:] = 0, 0
+        for ray in range(len(rays)):
+            here, k = own[ray], (rays[ray] + shift) % bearings
+            there, there_known = others[k], known[k]
+            for i in range(n):
+                apart = np.uint16(max(here, there[i]) - min(here, there[i]))
+                total[i] += np.uint16(full - min(apart, full))
+                count[i] += np.uint16(there_known[i])
+        found = out[shift]
+        for i in range(n):
+            found[i] = np.float32(total[i]) * scale / (np.float32(count[i]) + more)

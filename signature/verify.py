@@ -42,13 +42,6 @@ class Hypothesis:
     fit: Fit
     supported_m: float = 0.0
 
-    def same_place(self, other: Hypothesis, at: SE2) -> bool:
-        """Whether both put the base (at pose `at` in the query's frame) at the same pose."""
-        if self.session_index != other.session_index:
-            return False
-        a, b = self.fit.T_map_query @ at, other.fit.T_map_query @ at
-        return math.hypot(a.x - b.x, a.y - b.y) < SAME_M and abs(wrap_angle(a.yaw - b.yaw)) < SAME_RAD
-
 
 def verify(
     query: QueryMap,
@@ -138,10 +131,22 @@ def carry_on(query: QueryMap, hypothesis: Hypothesis, field: LikelihoodField, dr
 def distinct(hypotheses: Sequence[Hypothesis], at: SE2) -> tuple[Hypothesis, ...]:
     """Best first; of those at the same place only the best, with the longest support among them."""
     kept: list[Hypothesis] = []
+    bases: list[SE2] = []
     for candidate in sorted(hypotheses, key=lambda h: -h.fit.score):
-        twin = next((i for i, k in enumerate(kept) if k.same_place(candidate, at)), None)
+        base = candidate.fit.T_map_query @ at
+        twin = next(
+            (
+                i
+                for i, other in enumerate(bases)
+                if candidate.session_index == kept[i].session_index
+                and math.hypot(base.x - other.x, base.y - other.y) < SAME_M
+                and abs(wrap_angle(base.yaw - other.yaw)) < SAME_RAD
+            ),
+            None,
+        )
         if twin is None:
             kept.append(candidate)
+            bases.append(base)
         elif candidate.supported_m > kept[twin].supported_m:
             old = kept[twin]
             row = old.row if old.row >= 0 else candidate.row

@@ -10,7 +10,7 @@ import pytest
 from pc2grid.geometry import SE2
 from signature.confidence import Calibration, Evidence, fit
 from signature.query import Window
-from signature.retrieve import retrieve, rotate_and_compare
+from signature.retrieve import _voices, retrieve, rotate_and_compare
 from tests.drives import building, drive, office
 
 OFFICE = building({"office": office()})
@@ -103,19 +103,37 @@ def test_standing_still_adds_nothing() -> None:
     assert len(seen) == 1 and seen.path_m == 0.0
 
 
-def test_isovists_are_compared_at_every_rotation_like_a_slow_oracle() -> None:
+@pytest.mark.parametrize(("bearings", "longest_m"), [(48, 5.0), (90, 5.0), (48, 80.0)])
+def test_isovists_are_compared_at_every_rotation_like_a_slow_oracle(bearings: int, longest_m: float) -> None:
     rng = np.random.default_rng(0)
-    ranges, others = rng.uniform(1, 5, 48).astype(np.float32), rng.uniform(1, 5, (7, 48)).astype(np.float32)
-    seen, others_seen = rng.random(48) < 0.8, rng.random((7, 48)) < 0.8
-    others[3], others_seen[3] = np.roll(ranges, 20), np.roll(seen, 20)
+    ranges, others = (rng.uniform(0, longest_m, (n, bearings)).astype(np.float32) for n in (2, 700))
+    seen, others_seen = rng.random((2, bearings)) < 0.8, rng.random((700, bearings)) < 0.8
+    others[3], others_seen[3] = np.roll(ranges[1], 20), np.roll(seen[1], 20)
+    seen[0, 5:] = False
+    others_seen[600] = False
     fast = rotate_and_compare(ranges, seen, others, others_seen)
-    for i in range(7):
-        for shift in (0, 1, 20, 47):
-            other, known = np.roll(others[i], -shift), np.roll(others_seen[i], -shift)
-            both = seen & known
-            kernel = np.maximum(0.0, 1.0 - np.abs(ranges - other)[both] / 0.5)
-            assert fast[i, shift] == pytest.approx(kernel.sum() / (both.sum() + 0.15 * 48), abs=1e-4)
-    assert np.unravel_index(np.argmax(fast), fast.shape) == (3, 20)
+    assert fast.shape == (2, bearings, 700)
+    for shift in range(bearings):
+        other, known = np.roll(others, -shift, axis=1), np.roll(others_seen, -shift, axis=1)
+        both = seen[:, None] & known
+        kernel = np.maximum(0.0, 1.0 - np.abs(ranges[:, None] - other) / 0.5) * both
+        plain = kernel.sum(axis=2) / (both.sum(axis=2) + 0.15 * bearings)
+        assert np.abs(fast[:, shift] - plain).max() < 0.002 * max(1.0, longest_m / 20)
+    assert np.unravel_index(np.argmax(fast[1]), fast[1].shape) == (20, 3)
+
+
+def test_a_view_speaks_of_what_it_would_see_or_not_at_all() -> None:
+    rng = np.random.default_rng(0)
+    likeness = rng.random((3, 48, 10)).astype(np.float32)
+    shift, beside = rng.integers(0, 48, 40), rng.integers(0, 11, (40, 3))
+    voices = _voices(likeness, shift, beside)
+    for c, u in np.ndindex(voices.shape):
+        near = (
+            [likeness[u, (shift[c] + turn) % 48, beside[c, u]] for turn in (-1, 0, 1)]
+            if beside[c, u] < 10
+            else [-1]
+        )
+        assert voices[c, u] == max(near)
 
 
 def test_probabilities_sum_to_one_and_a_tie_is_halved() -> None:

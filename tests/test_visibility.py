@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pc2grid.model import UNKNOWN, OccupancyGrid
-from pc2grid.visibility import HIDDEN, OPEN, WALL, isovist, polygon_mask, visible_submap
+from pc2grid.visibility import HIDDEN, OPEN, WALL, isovist, look_around, polygon_mask, visible_submap
 from tests.drives import plan
 
 
@@ -72,3 +72,15 @@ def test_what_is_inside_the_polygon_is_seen(seed: int) -> None:
         cells = room.to_cell(center + steps * (point - center))
         seen += not room.occupied[cells[:, 0], cells[:, 1]].any()
     assert seen >= 0.9 * len(sample)
+
+
+def test_looking_around_at_many_points_is_one_isovist_after_the_other() -> None:
+    rng = np.random.default_rng(0)
+    cells = rng.choice([UNKNOWN, 0, 100], (80, 120), p=[0.02, 0.96, 0.02]).astype(np.int8)
+    grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-1.0, 2.0))
+    points = rng.uniform((-1.5, 1.5), (5.5, 6.5), (40, 2))  # some of them beside the grid
+    ranges_m, ends = look_around(grid, points, 3.0, bearings=50)
+    for point, own_ranges_m, own_ends in zip(points.tolist(), ranges_m, ends, strict=True):
+        view = isovist(grid, (point[0], point[1]), 3.0, bearings=50)
+        assert np.array_equal(view.ranges_m, own_ranges_m) and np.array_equal(view.ends, own_ends)
+    assert len(look_around(grid, np.empty((0, 2)), 3.0)[0]) == 0

@@ -91,3 +91,18 @@ def test_nothing_to_search_and_too_much() -> None:
     on_wall = FIELD.walls_m[:1].astype(np.float64)
     found = search_windows(FIELD, black, np.array([[*on_wall[0], 0.0]]), half_t_m=0.05, half_a_rad=0.01)
     assert found[0, 3] == pytest.approx(1.0)  # 256 times 255 still fits
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10_000), half_m=st.floats(0.05, 1.5))
+def test_leaving_out_what_would_not_be_reported_changes_nothing(seed: int, half_m: float) -> None:
+    rng = np.random.default_rng(seed)
+    truth = np.array([*rng.uniform((1, 1), (19, 13)), rng.uniform(-3, 3)])
+    walls = FIELD.walls_m[np.hypot(*(FIELD.walls_m - truth[:2]).T) < 5.0][:200]
+    c, s = math.cos(truth[2]), math.sin(truth[2])
+    points = ((walls - truth[:2]) @ np.array([[c, -s], [s, c]])).astype(np.float32)
+    starts = np.concatenate((truth[None] + 0.02, truth + rng.uniform(-1, 1, (4, 3)) * (3, 3, 3)))
+    shape = {"half_t_m": half_m, "half_a_rad": 2 * STEP, "step_rad": STEP, "most": 100}
+    whole = search_windows(FIELD, points, starts, floor=0.0, keep=0.0, **shape)
+    found = search_windows(FIELD, points, starts, floor=0.3, keep=0.8, **shape)
+    assert np.array_equal(found, whole[whole[:, 3] >= max(0.3, 0.8 * whole[0, 3])])

@@ -121,9 +121,12 @@ def _fast(
     place: Isovist,
 ) -> Fit | None:
     overlap = rotate_and_compare(
-        profile.ranges_m, profile.ends != HIDDEN, place.ranges_m[None], (place.ends != HIDDEN)[None]
+        profile.ranges_m[None],
+        (profile.ends != HIDDEN)[None],
+        place.ranges_m[None],
+        (place.ends != HIDDEN)[None],
     )
-    start = np.array([(*at, np.argmax(overlap) * 2 * np.pi / overlap.shape[1])])
+    start = np.array([(*at, np.argmax(overlap) * 2 * np.pi / overlap.size)])
     found = search_windows(field, points, start, half_t_m=1.5, half_a_rad=np.radians(5.0), most=1)
     return _fit(field, query, found)
 
