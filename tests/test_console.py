@@ -42,9 +42,11 @@ def on_a_terminal(code: str, *arguments: str, **environment: str) -> str:
 
 PROGRAM = "from pc2grid_cli.main import main; main()"
 WORKING = """
-import time
-from pc2grid_cli.console import progress
-with progress("work", 100.0) as update:
+import time, types
+from pc2grid_cli import console
+begin, real = time.monotonic(), time.monotonic
+console.time = types.SimpleNamespace(monotonic=lambda: 20 * (real() - begin))  # a clock in a hurry
+with console.progress("work", 100.0) as update:
     for tenth in range(11):
         time.sleep(0.06)
         update(tenth / 10)
@@ -60,7 +62,7 @@ def test_a_terminal_gets_colours_unless_no_color_is_set() -> None:
 def test_a_terminal_gets_a_bar_with_rate_and_time_left() -> None:
     seen = on_a_terminal(WORKING, NO_COLOR="")
     assert COLOUR.search(seen)
-    assert re.search(r"\d+%", seen) and "x real time" in seen and re.search(r"\d:\d\d", seen)
+    assert re.search(r"\d+%", seen) and "x real time" in seen and re.search(r"\d s left", seen)
     plain = on_a_terminal(WORKING, NO_COLOR="1")
     assert not COLOUR.search(plain) and "x real time" in plain
 
@@ -78,6 +80,36 @@ def test_a_pipe_gets_a_line_every_ten_seconds(
         "pc2grid: map a.mcap: 20%, 6.0x real time, 40 s left",
         "pc2grid: map a.mcap: 40%, 6.0x real time, 30 s left",
     ]
+
+
+def said(
+    shares: dict[float, float], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> list[str]:
+    """What a pipe gets to read if at these seconds so much is done."""
+    clock = [0.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
+    with console.progress("map", 300.0) as update:
+        for second, share in shares.items():
+            clock[0] = second
+            update(share)
+    return capsys.readouterr().err.splitlines()
+
+
+def test_nothing_is_said_of_the_time_left_before_it_can_be_known(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither at a few per mille, nor from the start, which includes what has to be made ready first."""
+    assert said({0: 0.0, 10: 0.0007, 20: 0.02, 30: 0.04}, monkeypatch, capsys) == [
+        "pc2grid: map: 0%",
+        "pc2grid: map: 2%",
+        "pc2grid: map: 4%, 0.4x real time, 12 min 0 s left",
+    ]
+    assert said({40: 0.2, 41: 0.21, 50: 0.4}, monkeypatch, capsys) == [
+        "pc2grid: map: 20%",
+        "pc2grid: map: 40%, 6.0x real time, 30 s left",
+    ]
+    # A jump within a second is no pace.
+    assert said({9: 0.0, 10: 0.5}, monkeypatch, capsys) == ["pc2grid: map: 50%"]
 
 
 @pytest.mark.parametrize("words", [["-q", "config", "schema"], ["config", "schema", "-q"]])

@@ -18,6 +18,7 @@ from pc2grid.errors import one_line
 
 OK, FAILED, USAGE, LOSSY, UNSURE, INTERRUPTED = 0, 1, 2, 3, 4, 130
 PIPE_CLOSED = 128 + signal.SIGPIPE
+_LEAST_S, _LEAST_DONE = 2.0, 0.03  # of work, before anything is said about the rest of it
 
 
 class State:
@@ -66,41 +67,58 @@ def progress(what: str, recorded_s: float | None = None) -> Iterator[Callable[[f
         yield _plain_progress(what, recorded_s)
         return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         TaskProgressColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
+        TextColumn("{task.fields[pace]}"),
     )
-    begin = time.monotonic()
+    pace = _Pace(recorded_s)
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=1.0, rate="")
-        yield lambda share: bar.update(task, completed=share, rate=_rate(share, begin, recorded_s))
+        task = bar.add_task(what, total=1.0, pace="")
+        yield lambda share: bar.update(task, completed=share, pace=pace.told(share))
 
 
 def _plain_progress(what: str, recorded_s: float | None) -> Callable[[float], None]:
-    begin = last = time.monotonic()
+    last = time.monotonic()
+    pace = _Pace(recorded_s)
 
     def update(share: float) -> None:
         nonlocal last
-        now = time.monotonic()
-        if now - last >= 10.0:
-            last = now
-            rate = _rate(share, begin, recorded_s)
-            left = f", {(now - begin) * (1.0 / share - 1.0):.0f} s left" if share > 0 else ""
-            print(f"pc2grid: {what}: {share:.0%}{f', {rate}' if rate else ''}{left}", file=sys.stderr)
+        told = pace.told(share)
+        if time.monotonic() - last >= 10.0:
+            last = time.monotonic()
+            print(f"pc2grid: {what}: {share:.0%}{', ' if told else ''}{told}", file=sys.stderr)
 
     return update
 
 
-def _rate(share: float, begin: float, recorded_s: float | None) -> str:
-    """How many seconds of the recording a second of work takes in."""
-    if recorded_s is None or share <= 0:
-        return ""
-    return f"{share * recorded_s / max(time.monotonic() - begin, 1e-3):.1f}x real time"
+class _Pace:
+    """How fast work goes, and how long it will take at that, once that can be said."""
+
+    def __init__(self, recorded_s: float | None) -> None:
+        self._recorded_s = recorded_s
+        self._first: tuple[float, float] | None = None
+
+    def told(self, share: float) -> str:
+        """In words; nothing while too little is done to judge by.
+
+        Measured from the first share reported: what was prepared before is not part of the pace.
+        """
+        now = time.monotonic()
+        begin, done_before = self._first = self._first or (now, share)
+        spent_s, done = now - begin, share - done_before
+        if spent_s < _LEAST_S or done < _LEAST_DONE:
+            return ""
+        rate = f"{done * self._recorded_s / spent_s:.1f}x real time, " if self._recorded_s else ""
+        return f"{rate}{_duration(spent_s * (1.0 - share) / done)} left"
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
 def report_error(error: BaseException) -> int:
