@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
 
+import jsonschema
+import numpy as np
 import pytest
 
 from pc2grid.simulate import SimulationConfig, office_floorplan
+from pc2grid_cli.compare_sensors import _document
+from pc2grid_cli.console import json_text
+from pc2grid_cli.documents import schema
 from signature.config import Config
 from signature.describe import describe
-from signature.evaluation.contribution import COMBINATIONS
+from signature.evaluation.contribution import COMBINATIONS, Independence
 from signature.evaluation.driven import Driven, drive
 from signature.evaluation.mapped import Mapped
 from signature.evaluation.sensor_matrix import map_building, query_trials
@@ -19,6 +25,7 @@ from signature.evaluation.summary import matrix, reliability
 from signature.evaluation.trial import Trial
 from signature.relocalize import Building
 from signature.similarity import SignatureTable
+from tests.test_documents import closed
 
 
 def trial(**changes: Any) -> Trial:
@@ -61,6 +68,26 @@ def test_a_cell_counts_what_it_says() -> None:
     assert cell.ambiguous == cell.not_found == pytest.approx(1 / 5)
     assert cell.recall == {1: pytest.approx(1 / 5), 5: pytest.approx(2 / 5), 20: pytest.approx(3 / 5)}
     assert cell.median_error_m == pytest.approx(0.10)
+
+
+def test_the_document_says_null_where_nothing_is_known() -> None:
+    """Nothing located rightly, no plan that was tuned on, nothing compared: none of it is a number."""
+    trials = [
+        trial(status="not_found", right=False, error_m=math.nan, rank=-1),
+        trial(building="b", in_building=False, mapped=0.0, status="not_found", right=False),
+    ]
+    nothing = Independence(combination="boundary", same=np.empty(0), other=np.empty(0))
+    about = {"plans": ["a", "b"], "queries": 1, "setting": {"rate": 10.0, "seed": 1}}
+    text = json_text({**_document(trials, {"boundary": nothing}, 8.0), **about})
+    document = json.loads(text, parse_constant=pytest.fail)
+    jsonschema.validate(document, closed(schema("compare-sensors")))
+    (cell,) = document["cells"]
+    assert (cell["trials"], cell["median_error_m"], cell["recall"]["20"]) == (1, None, 0.0)
+    assert document["confidence"]["tuned on"]["brier"] is None
+    assert document["confidence"]["other plans"]["reliability"] == [[0.95, 0.0, 2]]
+    assert document["elsewhere"] == {"trials": 1, "not_found": 1, "located": 0}
+    assert document["independence"]["boundary"] == {"auc": None, "same": 0, "other": 0}
+    assert document["ablation"]["recall"]["all"]["with isovists"]["1"] is None  # nobody drove 8 m
 
 
 def test_reliability_compares_confidence_with_truth() -> None:

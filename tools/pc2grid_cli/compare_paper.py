@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import multiprocessing
 import os
 from collections.abc import Iterable, Sequence
@@ -189,6 +188,7 @@ def _write(results: Sequence[Result], out: Path, queries: int, seed: int) -> dic
     """results.json and results.csv; returns the JSON document."""
     from pc2grid import __version__
     from pc2grid.io.atomic import replace_file
+    from pc2grid_cli.console import json_text
     from pc2grid_cli.paper_report import published
 
     rows = []
@@ -200,7 +200,7 @@ def _write(results: Sequence[Result], out: Path, queries: int, seed: int) -> dic
         )
     document = {"schema_version": 1, "version": __version__, "queries": queries, "seed": seed, "cells": rows}
     with replace_file(out / "results.json") as temporary:
-        temporary.write_text(json.dumps(document, indent=1))
+        temporary.write_text(json_text(document) + "\n", encoding="utf-8")
     with replace_file(out / "results.csv") as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]) if rows else ["map_name"])
         writer.writeheader()

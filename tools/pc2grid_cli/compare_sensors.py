@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from functools import cache
@@ -17,6 +17,7 @@ import typer
 if TYPE_CHECKING:
     from pc2grid.model import SensorKind
     from pc2grid.simulate import SimulationConfig
+    from signature.evaluation.contribution import Independence
     from signature.evaluation.mapped import Mapped
     from signature.evaluation.trial import Trial
 
@@ -51,13 +52,12 @@ def compare_sensors_command(
     Example: pc2grid compare sensors maps/fr079.yaml maps/intel.yaml --queries 40 --out matrix
     """
     from pc2grid.errors import ConfigError, MapFileError, OutputError
-    from pc2grid_cli.console import print_json, progress
+    from pc2grid.io.atomic import replace_file
+    from pc2grid_cli.console import json_text, print_json, progress
     from pc2grid_cli.matrix_report import contribution_table, draw, draw_signatures, tables
-    from signature.confidence import TUNED_ON
     from signature.evaluation.contribution import COMBINATIONS, Independence, independence
     from signature.evaluation.sensor_matrix import DISTANCES_M, SENSORS
     from signature.evaluation.summary import Truthfulness, ablation, matrix, reliability
-    from signature.evaluation.trial import MAPPED
 
     names = [plan.stem for plan in plans]
     if len(set(names)) != len(names):
@@ -93,7 +93,6 @@ def compare_sensors_command(
                     advance(done / len(waiting))
     trials = [t for task in asking for t in _read(_file("trials", *task))]
     tag = tuple(sorted(setting.items()))
-    cells, elsewhere = matrix(trials), [t for t in trials if not t.in_building]
     known = [
         measured
         for plan in plans
@@ -103,32 +102,16 @@ def compare_sensors_command(
         name: Independence.together([k for k in known if k.combination == name]) for name in COMBINATIONS
     }
     described_m = max(d for d in DISTANCES_M if d <= min(travel, 8.0))
-    contributions = ablation(trials, described_m)
-    tuned = [t for t in trials if t.building in TUNED_ON]
-    others = [t for t in trials if t.building not in TUNED_ON]
+    cells, elsewhere, contributions = matrix(trials), _elsewhere(trials), ablation(trials, described_m)
+    tuned, others = _by_tuning(trials)
     document = {
-        "schema_version": 1,
+        **_document(trials, independent, described_m),
         "plans": names,
         "queries": queries,
         "setting": {**setting, "seed": seed},
-        "cells": [asdict(cell) for cell in cells],
-        "confidence": {
-            name: {**asdict(Truthfulness.of(some)), "reliability": reliability(some)}
-            for name, some in (("tuned on", tuned), ("other plans", others))
-        },
-        "outside_the_map": sum(t.in_building and t.mapped < MAPPED for t in trials),
-        "elsewhere": {
-            "trials": len(elsewhere),
-            "not_found": sum(t.status == "not_found" for t in elsewhere),
-            "located": sum(t.status == "located" for t in elsewhere),
-        },
-        "independence": {
-            name: {"auc": one.auc, "same": len(one.same), "other": len(one.other)}
-            for name, one in independent.items()
-        },
-        "ablation": {"travel_m": described_m, "recall": contributions},
     }
-    (out / "matrix.json").write_text(json.dumps(document, indent=1))
+    with replace_file(out / "matrix.json") as draft:
+        draft.write_text(json_text(document) + "\n", encoding="utf-8")
     draw(out / "matrix.png", cells, reliability(others or trials))
     draw_signatures(out / "signatures.png", independent, contributions)
     if as_json:
@@ -144,6 +127,48 @@ def compare_sensors_command(
                     f" expected error {truthful.expected_error:.3f} ({truthful.trials} answers)"
                 )
         print("\n".join(str(out / name) for name in ("matrix.json", "matrix.png", "signatures.png")))
+
+
+def _document(
+    trials: Sequence[Trial], independent: Mapping[str, Independence], described_m: float
+) -> dict[str, Any]:
+    """What all trials say together. described_m : metres driven after which the signatures are compared."""
+    from signature.evaluation.summary import Truthfulness, ablation, matrix, reliability
+    from signature.evaluation.trial import MAPPED
+
+    elsewhere = _elsewhere(trials)
+    return {
+        "schema_version": 1,
+        "cells": [asdict(cell) for cell in matrix(trials)],
+        "confidence": {
+            name: {**asdict(Truthfulness.of(some)), "reliability": reliability(some)}
+            for name, some in zip(("tuned on", "other plans"), _by_tuning(trials), strict=True)
+        },
+        "outside_the_map": sum(t.in_building and t.mapped < MAPPED for t in trials),
+        "elsewhere": {
+            "trials": len(elsewhere),
+            "not_found": sum(t.status == "not_found" for t in elsewhere),
+            "located": sum(t.status == "located" for t in elsewhere),
+        },
+        "independence": {
+            name: {"auc": one.auc, "same": len(one.same), "other": len(one.other)}
+            for name, one in independent.items()
+        },
+        "ablation": {"travel_m": described_m, "recall": ablation(trials, described_m)},
+    }
+
+
+def _elsewhere(trials: Sequence[Trial]) -> list[Trial]:
+    """Those of queries from another building than the map."""
+    return [t for t in trials if not t.in_building]
+
+
+def _by_tuning(trials: Sequence[Trial]) -> tuple[list[Trial], list[Trial]]:
+    """Those in plans that the confidence was tuned on, and the others."""
+    from signature.confidence import TUNED_ON
+
+    tuned = [t for t in trials if t.building in TUNED_ON]
+    return tuned, [t for t in trials if t.building not in TUNED_ON]
 
 
 def _map_file(plan: str, sensor: str, out: str, setting: Setting) -> Path:

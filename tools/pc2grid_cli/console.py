@@ -40,8 +40,13 @@ def warn(message: str) -> None:
 
 
 def print_json(document: Any) -> None:
-    """The one document on stdout. JSON knows no NaN and no infinity: what is not known is null."""
-    print(json.dumps(_finite(document), indent=1, ensure_ascii=False, allow_nan=False))
+    """The one document on stdout."""
+    print(json_text(document))
+
+
+def json_text(document: Any) -> str:
+    """A document as JSON. That knows no NaN and no infinity: what is not known is null."""
+    return json.dumps(_finite(document), indent=1, ensure_ascii=False, allow_nan=False)
 
 
 def _finite(value: Any) -> Any:

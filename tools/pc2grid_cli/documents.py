@@ -302,10 +302,79 @@ class ComparePaper(TypedDict):
     cells: list[dict[str, Any]]
 
 
+class MatrixCell(TypedDict):
+    """Queries of one sensor in maps by another after some metres. Shares 0..1 of its trials; wrong: of those
+    answered located; recall by how many are retrieved; errors in metres, null if none was located rightly."""
+
+    map_sensor: str
+    query_sensor: str
+    travel_m: float
+    trials: int
+    located_right: float
+    wrong: float
+    ambiguous: float
+    not_found: float
+    recall: dict[str, float]
+    median_error_m: float | None
+    p95_error_m: float | None
+    look_up_ms: float
+
+
+class Truthfulness(TypedDict):
+    """Whether confidence is true; null without trials. reliability: for each band of confidence its mean, the
+    share that was right, and how many."""
+
+    trials: int
+    brier: float | None
+    expected_error: float | None
+    reliability: list[tuple[float, float, int]]
+
+
+class Elsewhere(TypedDict):
+    """What was answered to queries from another building."""
+
+    trials: int
+    not_found: int
+    located: int
+
+
+class Apart(TypedDict):
+    """How well distances tell one place seen by two sensors from two places; auc is null if nothing was
+    compared."""
+
+    auc: float | None
+    same: int
+    other: int
+
+
+class Ablation(TypedDict):
+    """Recall after travel_m metres by query sensor, by what is used, and by how many are retrieved."""
+
+    travel_m: float
+    recall: dict[str, dict[str, dict[str, float | None]]]
+
+
+class CompareSensors(TypedDict):
+    """`pc2grid compare sensors --json`, and its matrix.json. outside_the_map: trials where the map has not
+    been."""
+
+    schema_version: Version
+    plans: list[str]
+    queries: int
+    setting: dict[str, float]
+    cells: list[MatrixCell]
+    confidence: dict[str, Truthfulness]
+    outside_the_map: int
+    elsewhere: Elsewhere
+    independence: dict[str, Apart]
+    ablation: Ablation
+
+
 DOCUMENTS: dict[str, type] = {
     "compare-log": CompareLog,
     "compare-maps": CompareMaps,
     "compare-paper": ComparePaper,
+    "compare-sensors": CompareSensors,
     "convert": Convert,
     "db-check": DbCheck,
     "db-copy": DbWrite,
