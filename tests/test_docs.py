@@ -106,6 +106,7 @@ NOT_RUN = {
     "ros2": "needs ROS; test_example_nav2 has one that listens",
     "pip": "the network is not asked in tests",
     "createdb": "needs a PostgreSQL server; test_postgres.py brings one",
+    "pc2grid relocalize tuesday.mcap --rerun": "needs a display and the extra viz; see test_rerun.py",
     "pc2grid convert logs": "several processes; test_cluster.py does it",
 }
 SHORTER = {"--length 20": "--length 1"}
