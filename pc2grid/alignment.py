@@ -36,6 +36,7 @@ one side has not seen speaks neither for nor against a pose."""
 FIXED_M = 2.0
 """What is at least that long is taken to stay where it is."""
 _ENOUGH_POINTS = 300
+_BLOCK = 64  # cells at a time
 REACHES_M = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.3, 1.6)
 """Radii of the sliding maxima; the first is the field itself."""
 
@@ -97,17 +98,27 @@ def _field(occupied: NDArray[np.bool_], known: NDArray[np.bool_], values: U8, re
             nearer = min(steps[j], out[j])
             out[j] = np.uint16(nearer * nearer)
     field = np.empty((height, width), np.uint8)
-    nearest = np.empty(width, np.uint16)
+    nearest = np.empty(_BLOCK, np.uint16)
     for i in range(height):
-        nearest[:] = far
-        for k in range(1, 2 * reach):
-            beside, more = squared[i, k : k + width], np.uint16((k - reach) ** 2)
-            for j in range(width):
-                nearest[j] = min(nearest[j], np.uint16(beside[j] + more))
-        row_known, out_field = known[i], field[i]
-        for j in range(width):
-            value = values[nearest[j]]
-            out_field[j] = value if row_known[j] else max(value, np.uint8(neutral))
+        for first in range(0, width, _BLOCK):
+            size = min(_BLOCK, width - first)
+            row_known, out = known[i, first : first + size], field[i, first : first + size]
+            around = squared[i, first : first + size + 2 * reach]
+            lowest = far
+            for j in range(len(around)):
+                lowest = min(lowest, around[j])
+            if lowest == far:  # as most of a map is: no wall near
+                for j in range(size):
+                    out[j] = np.uint8(0) if row_known[j] else np.uint8(neutral)
+                continue
+            nearest[:] = far
+            for k in range(1, 2 * reach):
+                beside, more = around[k : k + size], np.uint16((k - reach) ** 2)
+                for j in range(size):
+                    nearest[j] = min(nearest[j], np.uint16(beside[j] + more))
+            for j in range(size):
+                value = values[nearest[j]]
+                out[j] = value if row_known[j] else max(value, np.uint8(neutral))
     return field
 
 
@@ -301,12 +312,53 @@ def steadiness(occupied: NDArray[np.bool_], cells: I64, resolution_m: float) -> 
     The longer side of what a cell belongs to, as a share of `FIXED_M`, at most 1; gaps of one cell do not
     part things. Chairs, boxes and people are somewhere else the next time; walls are not.
     """
-    import cv2
+    extent = _extents(cells_of(occupied), occupied.shape)
+    share = extent[cells[:, 0], cells[:, 1]] * resolution_m / FIXED_M
+    return np.asarray(np.minimum(share, 1.0), np.float32)
 
-    joined = cv2.dilate(occupied.astype(np.uint8), np.ones((3, 3), np.uint8))
-    _, labels, boxes, _ = cv2.connectedComponentsWithStats(joined, connectivity=8)
-    extent_m = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * resolution_m
-    return np.minimum(extent_m / FIXED_M, 1.0).astype(np.float32)[labels[cells[:, 0], cells[:, 1]]]
+
+@numba.njit(cache=True, nogil=True)
+def _extents(cells: I64, shape: tuple[int, int]) -> NDArray[np.int32]:
+    """(H, W) the longer side, in cells, of what each of `cells` (N, 2), row by row, belongs to, with a rim of
+    one cell; elsewhere 0. Those whose rims touch, three rows and columns apart at most, belong together."""
+    height, width = shape
+    number = np.zeros((height + 3, width + 6), np.int32)  # from 1 on; with a margin, not to ask for the edge
+    leader = np.arange(len(cells) + 1)
+    for k in range(len(cells)):
+        i, j = cells[k, 0] + 3, cells[k, 1] + 3
+        number[i, j] = k + 1
+        for row in range(i - 3, i + 1):
+            for column in range(j - 3, j + 4 if row < i else j):
+                other = number[row, column]
+                if other:
+                    _join(leader, k + 1, other)
+    boxes = np.empty((len(leader), 4), np.int64)
+    boxes[:, :2], boxes[:, 2:] = max(height, width), -1
+    for k in range(len(cells)):
+        box = boxes[_leader(leader, k + 1)]
+        for axis in range(2):
+            box[axis] = min(box[axis], max(cells[k, axis] - 1, 0))
+            box[2 + axis] = max(box[2 + axis], min(cells[k, axis] + 1, shape[axis] - 1))
+    extent = number[3:, 3:-3]
+    for k in range(len(cells)):
+        box = boxes[_leader(leader, k + 1)]
+        extent[cells[k, 0], cells[k, 1]] = max(box[2] - box[0], box[3] - box[1]) + 1
+    return extent
+
+
+@numba.njit(cache=True, nogil=True)
+def _leader(leader: I64, k: int) -> int:
+    """Who speaks for k; those on the way there come nearer to him."""
+    while leader[k] != k:
+        leader[k] = leader[leader[k]]
+        k = leader[k]
+    return k
+
+
+@numba.njit(cache=True, nogil=True)
+def _join(leader: I64, a: int, b: int) -> None:
+    a, b = _leader(leader, a), _leader(leader, b)
+    leader[max(a, b)] = min(a, b)
 
 
 def thin_evenly(points_m: NDArray[np.floating], spacing_m: float) -> NDArray[np.intp]:

@@ -152,8 +152,9 @@ def clearance_of(free: BoolGrid, resolution_m: float) -> NDArray[np.float32]:
     """
     padded = np.zeros((free.shape[0] + 2, free.shape[1] + 2), np.uint8)
     padded[1:-1, 1:-1] = free
-    cells = cv2.distanceTransform(padded, cv2.DIST_L2, 5)
-    return np.asarray(cells[1:-1, 1:-1] * resolution_m, np.float32)
+    distance_m = np.asarray(cv2.distanceTransform(padded, cv2.DIST_L2, 5), np.float32)
+    distance_m *= np.float32(resolution_m)
+    return distance_m[1:-1, 1:-1]
 
 
 def skeleton_of(

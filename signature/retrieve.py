@@ -125,11 +125,13 @@ def _peaks(likeness: F32, columns: I64) -> tuple[I64, I64]:
     at, shift = np.empty((2, len(columns) * bearings), np.int64)
     count = 0
     for column in columns:
+        before, here = likeness[bearings - 1, column], likeness[0, column]
         for k in range(bearings):
-            here = likeness[k, column]
-            if here >= likeness[k - 1, column] and here > likeness[k + 1 - bearings, column]:
+            after = likeness[(k + 1) % bearings, column]
+            if here >= before and here > after:
                 at[count], shift[count] = column, k
                 count += 1
+            before, here = here, after
     return at[:count], shift[:count]
 
 

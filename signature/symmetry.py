@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -13,6 +14,8 @@ from pc2grid.geometry import F64
 from pc2grid.model import F32, I64, BoolGrid
 from pc2grid.skeleton import cells_of
 from signature.config import SignatureConfig
+
+_DEGREES = np.arange(180)
 
 
 class Axes(NamedTuple):
@@ -50,17 +53,21 @@ def symmetry_axes(segments: F64, config: SignatureConfig) -> Axes | None:
     if not lengths.any():
         return None
     angles = np.arctan2(steps[:, 1], steps[:, 0]) % math.pi
-    degrees = np.arange(180)
     votes = np.bincount(np.degrees(angles).round().astype(np.int64) % 180, lengths, 180)
-    kernel = np.exp(-0.5 * (_apart_deg(degrees, 0) / config.axis_smoothing_deg) ** 2)
-    smooth = np.fft.irfft(np.fft.rfft(votes) * np.fft.rfft(kernel), 180)
+    smooth = np.fft.irfft(np.fft.rfft(votes) * _blur(config.axis_smoothing_deg), 180)
     alpha = int(np.argmax(smooth))
-    rest = np.where(_apart_deg(degrees, alpha) >= config.axis_separation_deg, smooth, 0.0)
+    rest = np.where(_apart_deg(_DEGREES, alpha) >= config.axis_separation_deg, smooth, 0.0)
     beta = int(np.argmax(rest)) if rest.max() > 1e-6 * smooth[alpha] else (alpha + 90) % 180
     return Axes(
         _refined(alpha, angles, lengths, 2 * config.axis_smoothing_deg),
         _refined(beta, angles, lengths, 2 * config.axis_smoothing_deg),
     )
+
+
+@functools.cache
+def _blur(sigma_deg: float) -> NDArray[np.complex128]:
+    """Fourier transform of the kernel that votes are blurred with."""
+    return np.fft.rfft(np.exp(-0.5 * (_apart_deg(_DEGREES, 0) / sigma_deg) ** 2))
 
 
 def _apart_deg(a_deg: I64, b_deg: int) -> I64:

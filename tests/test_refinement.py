@@ -1,15 +1,16 @@
-"""Refinement below the cell size, and thinning, against their plain counterparts."""
+"""Refinement below the cell size, thinning and steadiness against their plain counterparts."""
 
 from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pc2grid.alignment import _gauss_newton, prepare, thin_evenly
+from pc2grid.alignment import FIXED_M, _gauss_newton, prepare, steadiness, thin_evenly
 from tests.drives import office
 
 FIELD = prepare(office())
@@ -62,3 +63,13 @@ def test_thinning_keeps_the_first_point_of_each_square(seed: int, count: int, fa
     squares = np.floor(points / 0.4).astype(np.int64)
     first = np.unique(squares, axis=0, return_index=True)[1]
     assert np.array_equal(thin_evenly(points, 0.4), np.sort(first))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 1.0])
+def test_what_things_belong_to_is_what_opencv_s_components_say(share: float) -> None:
+    occupied = np.random.default_rng(0).random((60, 90)) < share
+    cells = np.argwhere(occupied)[::2]
+    joined = cv2.dilate(occupied.astype(np.uint8), np.ones((3, 3), np.uint8))
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(joined, connectivity=8)
+    longer = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)[labels[cells[:, 0], cells[:, 1]]]
+    assert np.allclose(steadiness(occupied, cells, 0.05), np.minimum(longer * 0.05 / FIXED_M, 1.0))
