@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 import zlib
 from collections.abc import Callable
@@ -12,15 +13,38 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import FrameError, MapFileError, PointCloudError
-from pc2grid.io import png
+from pc2grid.errors import (
+    FrameError,
+    LimitExceeded,
+    LogCorrupt,
+    LogNotFound,
+    MapFileError,
+    NoScans,
+    PointCloudError,
+    TrajectoryFileError,
+    UnsupportedSchema,
+)
+from pc2grid.io import cloud_files, png
+from pc2grid.io.messages import Header
 from pc2grid.io.nav2_map import load_map, save_map
+from pc2grid.io.trajectory import read_tum, stamp_ns_from_text
 from pc2grid.model import OccupancyGrid
 from tests import test_io_foxglove as foxglove
-from tests.builders import STEP, T0, Message, read, ros, write_mcap
+from tests.builders import (
+    STEP,
+    T0,
+    Message,
+    drive,
+    raw_log,
+    read,
+    ros,
+    write_bag,
+    write_mcap,
+    write_rosbag2,
+)
 from tests.watching import peak_memory
 
 INFO, DEPTH = "/camera/depth/camera_info", "/camera/depth/image_raw"
@@ -44,12 +68,12 @@ def lying_png(width: int, height: int, bits: int = 8, colour: int = 0, data: byt
     )
 
 
-def map_with(folder: Path, image: bytes, suffix: str = "png", **keys: object) -> Path:
+def map_with(folder: Path, content: bytes, suffix: str = "png", **keys: object) -> Path:
     known: dict[str, object] = {
         "image": f"m.{suffix}", "resolution": 0.05, "origin": "[0, 0, 0]", "negate": 0,
         "occupied_thresh": 0.65, "free_thresh": 0.196,
     }  # fmt: skip
-    (folder / f"m.{suffix}").write_bytes(image)
+    (folder / f"m.{suffix}").write_bytes(content)
     path = folder / "m.yaml"
     path.write_text("".join(f"{k}: {v}\n" for k, v in (known | keys).items()))
     return path
@@ -322,3 +346,224 @@ def test_times_of_recording_past_all_calendars(tmp_path: Path, late: int) -> Non
     scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
     assert len(scans) == 19
     assert report.scans_skipped == {"stamp is past the year 2262": 1}
+
+
+# --- a few bytes that ask for gigabytes or hours ------------------------------------------------------
+
+
+def yaml_bomb() -> str:
+    """A list named l9 of 9^10 items in a kilobyte."""
+    lines = ["l0: &l0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 9)}]" for i in range(1, 10)]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.fault(46)
+@pytest.mark.parametrize(
+    "key",
+    ["image", "mode", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"],
+)
+@pytest.mark.parametrize("value", ["*l9", "0x" + "f" * 9000, "[*l9, 0, 0]", "{a: *l9}"])
+def test_values_of_billions_of_items_are_not_written_out(tmp_path: Path, key: str, value: str) -> None:
+    path = map_with(tmp_path, b"P5 2 2 255\n" + bytes(4), "pgm", **{key: value})
+    path.write_text(yaml_bomb() + path.read_text())
+    with peak_memory() as peak, pytest.raises(MapFileError, match=f"{key}: ") as caught:
+        load_map(path)
+    assert len(caught.value.message) < 400
+    assert peak.grown_bytes() < 16 * MIB
+
+
+@pytest.mark.parametrize("target", ["/dev/zero", "pipe"])
+def test_images_and_clouds_without_end(tmp_path: Path, target: str) -> None:
+    if target == "pipe":
+        target = str(tmp_path / "pipe")
+        os.mkfifo(target)
+    with pytest.raises(MapFileError, match="not a regular file"):
+        load_map(map_with(tmp_path, b"", "pgm", image=target))
+    clouds = tmp_path / "clouds"
+    clouds.mkdir()
+    (clouds / "2.bin").symlink_to(target)
+    (clouds / "poses.tum").symlink_to(target)
+    with pytest.raises(LogNotFound, match="a folder without a recording"):
+        read(clouds)
+    (clouds / "1.bin").write_bytes(np.ones((5, 4), "<f4").tobytes())
+    assert len(read(clouds)[0]) == 1
+
+
+def test_files_that_are_too_large_are_not_read(tmp_path: Path) -> None:
+    path = map_with(tmp_path, b"P5 2 2 255\n", "pgm")
+    with (tmp_path / "m.pgm").open("r+b") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(MapFileError, match=r"m\.pgm: larger than \d+ bytes: not the image of a map"):
+        load_map(path)
+    with (tmp_path / "a.tum").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(TrajectoryFileError, match=r"a\.tum: larger than \d+ bytes"):
+        read_tum(tmp_path / "a.tum")
+
+
+@pytest.mark.parametrize("word", ["1e999000", "-1e300000", "1e999999999999", "inf", "nan"])
+def test_times_of_a_million_digits(word: str) -> None:
+    with pytest.raises((ValueError, ArithmeticError)):
+        stamp_ns_from_text(word)
+
+
+HEADER = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 30000\nHEIGHT 1\nDATA "
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (HEADER + b"ascii\n" + b"1 2 3\n" * 29_999 + b"1 2 " + b"0" * MIB + b"3\n", "more than 100 digits"),
+        (HEADER + b"ascii\n" + b"1 2 3\n" * 29_999 + b"1 2", "89999 numbers where 90000 are declared"),
+        (HEADER + b"binary_compressed\n" + struct.pack("<II", 9, 360_000) + bytes(9), "expand to 360000"),
+        (
+            HEADER.replace(b"30000", b"30000000") + b"binary_compressed\n"
+            + struct.pack("<II", 4_100_000, 360_000_000) + bytes(4_100_000),
+            "would expand to 360000000",
+        ),
+    ],
+)  # fmt: skip
+def test_clouds_that_swell(content: bytes, words: str) -> None:
+    """One long word among many short ones is as wide a column of text for all of them."""
+    with peak_memory() as peak, pytest.raises(PointCloudError, match=words):
+        cloud_files.parser("pcd")(content, Header(1, "lidar"))
+    assert peak.grown_bytes() < 64 * MIB
+
+
+def test_numbers_of_a_text_are_read_in_blocks() -> None:
+    points = np.random.default_rng(5).normal(size=(70_000, 3))
+    text = "\n".join(" ".join(map(repr, p)) for p in points.tolist()).encode()
+    assert len(text) > 3 * MIB
+    found = cloud_files.parser("pcd")(
+        HEADER.replace(b"30000", b"70000") + b"ascii\n" + text, Header(1, "lidar")
+    )
+    assert np.frombuffer(found.data, "<f8").tolist() == points.ravel().tolist()
+
+
+def nested(levels: int, width: int, leaf: str = "int32 a\n") -> str:
+    """A definition of width ** levels fields."""
+    parts = ["".join(f"p/L0 f{i}\n" for i in range(width))]
+    parts += [
+        f"MSG: p/L{n}\n" + "".join(f"p/L{n + 1} f{i}\n" for i in range(width)) for n in range(levels - 1)
+    ]
+    return ("=" * 80 + "\n").join([*parts, f"MSG: p/L{levels - 1}\n{leaf}"])
+
+
+@pytest.mark.parametrize(
+    ("encoding", "text"),
+    [
+        ("ros2msg", nested(14, 12)),
+        ("ros2msg", nested(14, 12, leaf="")),
+        ("ros2msg", nested(2, 5000)),
+        ("ros2msg", "sensor_msgs/PointCloud2 again\n"),
+        ("ros2msg", "int32 a\n" * 200_000),
+        ("ros2idl", "typedef " + " " * 30_000 + "x"),
+        ("ros2idl", "typedef " + "a " * 30_000 + "[3]"),
+        ("ros2idl", '"' + '\\"' * 100_000),
+        ("ros2idl", "/* " * 100_000),
+        ("ros2idl", "@a(" * 100_000),
+        ("ros2idl", "struct a {" * 50_000),
+    ],
+)
+def test_definitions_that_swell_or_take_for_ever(tmp_path: Path, encoding: str, text: str) -> None:
+    cloud = ros().cloud("/points", T0, [[1, 2, 3]])
+    path = raw_log(
+        tmp_path / "a.mcap", [("/points", "sensor_msgs/msg/PointCloud2", encoding, text.encode(), cloud.data)]
+    )
+    with peak_memory() as peak, pytest.raises(UnsupportedSchema, match="/points"):
+        read(path, ReadConfig(assume_identity=True))
+    assert peak.grown_bytes() < 64 * MIB
+
+
+def test_a_chunk_above_the_limit_is_not_read_by_the_index_either(tmp_path: Path) -> None:
+    cloud = ros().cloud("/points", T0, np.ones((900, 3)))
+    path = write_mcap(tmp_path / "a.mcap", [cloud], compression=CompressionType.NONE)
+    with pytest.raises(LimitExceeded, match=r"a record at byte \d+ has \d+ bytes; the limit is 3000"):
+        read(path, ReadConfig(assume_identity=True, max_record_bytes=3000))
+
+
+def test_small_messages_do_not_keep_large_chunks_in_memory(tmp_path: Path) -> None:
+    """30 chunks of 24 MB that overlap in time, each with one scan among images that nobody asked for."""
+    image = Message("/other", "sensor_msgs/Image", T0, bytes(24 * MIB))
+    messages = []
+    for i in range(30):
+        messages += [image, ros().cloud("/points", T0 + i * STEP, [[1, 2, 3]])]
+    path = write_mcap(tmp_path / "a.mcap", messages, chunk_size=23 * MIB)
+    assert path.stat().st_size < MIB
+    with peak_memory() as peak:
+        assert len(read(path, ReadConfig(assume_identity=True))[0]) == 30
+    assert peak.grown_bytes() < 200 * MIB
+
+
+@pytest.mark.parametrize("encoding", ["json", "protobuf"])
+def test_a_laser_of_millions_of_beams(tmp_path: Path, encoding: str) -> None:
+    fields = foxglove.stamped(
+        T0, frame_id="laser", pose=foxglove.IDENTITY, start_angle=0.0, end_angle=6.0,
+        ranges=[0.0] * 2_100_000, intensities=[],
+    )  # fmt: skip
+    path = foxglove.write(tmp_path / "a.mcap", [("/scan", "LaserScan", T0, fields)], encoding)
+    words = "a scan of 2100000 beams; the limit is 1000000|values; the limits are"
+    with pytest.raises(LimitExceeded, match=words):
+        read(path, ReadConfig(assume_identity=True))
+
+
+@pytest.mark.parametrize("number", [-1, -8, 9, 77])
+def test_numbers_that_name_no_type_of_a_field(tmp_path: Path, number: int) -> None:
+    def change(fields: dict[str, Any]) -> None:
+        fields["fields"][0]["type"] = number
+
+    scans, report = read(json_clouds(tmp_path / "a.mcap", change))
+    assert len(scans) == 19
+    assert report.lossy
+
+
+def test_a_calibration_that_is_no_pose(tmp_path: Path) -> None:
+    folder = tmp_path / "velodyne"
+    folder.mkdir()
+    for i in range(3):
+        (folder / f"{i:06}.bin").write_bytes(np.ones((5, 4), "<f4").tobytes())
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    for matrix in ("1 0 0 0 0 1 0 0 0 0 nan 0", "2 0 0 0 0 1 0 0 0 0 1 0", "2 0 0 0 0 0.5 0 0 0 0 1 0"):
+        (tmp_path / "calib.txt").write_text(f"P0: 1\nTr: {matrix}\n")
+        with pytest.raises(TrajectoryFileError, match=r"calib\.txt: Tr is not a rigid pose"):
+            read(folder)
+    (tmp_path / "calib.txt").unlink()
+    (tmp_path / "poses.txt").write_text("2 0 0 0 0 0.5 0 0 0 0 1 0\n" * 3)  # its determinant is 1
+    with pytest.raises(TrajectoryFileError, match=r"poses\.txt, line 1: not a rigid pose"):
+        read(folder)
+
+
+@pytest.mark.parametrize("name", ["9999999999.5", "9999999999999999999"])
+def test_names_past_all_calendars_are_no_times(tmp_path: Path, name: str) -> None:
+    (tmp_path / f"{name}.bin").write_bytes(np.ones((5, 4), "<f4").tobytes())
+    scans, report = read(tmp_path)
+    assert len(scans) == 1
+    assert any("10 clouds a second are assumed" in w for w in report.warnings)
+
+
+def test_a_bag_whose_records_are_too_large(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a.bag", drive("ros1"), chunk_bytes=2000)
+    with pytest.raises(LimitExceeded, match=r"a record's part of \d+ bytes.*the limit is 1000 .*max_record"):
+        read(path, ReadConfig(max_record_bytes=1000))
+    with pytest.raises(NoScans):  # nothing of it is read, nor does it stop at the first
+        read(path, ReadConfig(max_record_bytes=1000), recover=True)
+    whole = path.read_bytes()
+    with path.open("wb") as file:
+        file.write(whole[:13] + struct.pack("<I", 1 << 31))
+        file.truncate(1 << 32)  # nothing but a hole
+    with peak_memory() as peak, pytest.raises(LimitExceeded, match="2147483648 bytes"):
+        read(path)
+    assert peak.grown_bytes() < 16 * MIB
+
+
+def test_metadata_of_very_many_items(tmp_path: Path) -> None:
+    folder = write_rosbag2(tmp_path / "log", drive())
+    known = (folder / "metadata.yaml").read_text()
+    for more in ("more: [" + "1," * 250_000 + "]", "\n".join(["#"] * 250_000)):
+        (folder / "metadata.yaml").write_text(known + more)
+        with pytest.raises(LogCorrupt, match=r"metadata\.yaml: more than 200000 items .*reindex"):
+            read(folder)
+    with peak_memory() as peak:
+        assert len(read(folder, recover=True)[0]) == 12
+    assert peak.grown_bytes() < 64 * MIB

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import LogCorrupt, LogTruncated
+from pc2grid.errors import LimitExceeded, LogCorrupt, LogTruncated
 from pc2grid.io.ros_definitions import short_name
 from pc2grid.io.source import LogInfo, RawMessage, Tally, TopicInfo
 from pc2grid.io.unpack import unpacker
 
 MAGIC = b"#ROSBAG V2.0\n"
+MAX_HEADER = 1 << 20
 _RECOVER = "--recover reads what is whole"
 
 
@@ -49,7 +50,7 @@ class BagSource:
         self.files: tuple[Path, ...] = (path,)
         self.tally = Tally()
         self._path = path
-        _check_records(path)
+        _check_records(path, config.max_record_bytes)
         self._reader = Reader(path)
         try:
             self._reader.open()
@@ -128,17 +129,26 @@ def topics_of(connections: dict[int, Connection]) -> dict[int, TopicInfo]:
     return {key: first[c.topic, c.type] for key, c in connections.items()}
 
 
-def _check_records(path: Path) -> None:
-    """Walk over all records by their lengths: header and data, a u32 length in front of each."""
+def _check_records(path: Path, most_bytes: int) -> None:
+    """Walk over all records by their lengths: header and data, a u32 length in front of each.
+
+    Raises LogTruncated, or LimitExceeded for a record that nobody should try to read.
+    """
     size = path.stat().st_size
     at = len(MAGIC)
     with path.open("rb") as stream:
         while at < size:
-            for _ in range(2):
+            for limit in (MAX_HEADER, most_bytes):
                 stream.seek(at)
-                length = stream.read(4)
-                at += 4 + int.from_bytes(length, "little")
-                if len(length) < 4 or at > size:
+                raw = stream.read(4)
+                length = int.from_bytes(raw, "little")
+                at += 4 + length
+                if len(raw) < 4 or at > size:
                     raise LogTruncated(
                         f"{path}: the bag ends within a record ({size} bytes, {at} needed)", hint=_RECOVER
+                    )
+                if length > limit:
+                    raise LimitExceeded(
+                        f"{path}: a record's part of {length} bytes, before byte {at}; the limit is {limit}",
+                        hint="--set read.max_record_bytes=N raises it",
                     )

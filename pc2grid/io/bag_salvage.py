@@ -13,7 +13,7 @@ from typing import BinaryIO, NamedTuple
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LimitExceeded, LogCorrupt
-from pc2grid.io.bag_log import MAGIC, UNCHECKED, Connection, topics_of
+from pc2grid.io.bag_log import MAGIC, MAX_HEADER, UNCHECKED, Connection, topics_of
 from pc2grid.io.source import LogInfo, RawMessage, Tally
 from pc2grid.io.unpack import unpacker
 
@@ -21,8 +21,8 @@ _KINDS = (b"\x02", b"\x03", b"\x04", b"\x05", b"\x06", b"\x07")
 _MESSAGE, _CHUNK, _CONNECTION = b"\x02", b"\x05", b"\x07"
 # Only a chunk has this field; writers differ in where in its header it stands.
 _CHUNK_MARK = b"compression="
-_MAX_HEADER = 80
-_WINDOW = 4 << 20
+_MAX_CHUNK_HEADER = 80
+_WINDOW = 64 << 10  # not larger: it is read anew for each place of damage
 
 
 class _Chunk(NamedTuple):
@@ -95,9 +95,9 @@ class SalvagedBag:
 
     def _take_record(self, at: int, size: int) -> int:
         """Take up the record at a place in the file; returns where the next one is."""
-        head_size = self._length(at, size)
+        head_size = self._length(at, size, MAX_HEADER)
         data_at = at + 4 + head_size + 4
-        data_size = self._length(data_at - 4, size)
+        data_size = self._length(data_at - 4, size, self._config.max_record_bytes)
         self._stream.seek(at + 4)
         fields = _fields(memoryview(self._stream.read(head_size)))
         kind = fields.get(b"op")
@@ -116,12 +116,14 @@ class SalvagedBag:
                 self._connections[key] = self._connections[key].one_more()
         return data_at + data_size
 
-    def _length(self, at: int, size: int) -> int:
+    def _length(self, at: int, size: int, most: int) -> int:
         self._stream.seek(at)
         raw = self._stream.read(4)
         length = int.from_bytes(raw, "little")
         if len(raw) < 4 or at + 4 + length > size:
             raise _Broken("the bag ends within a record")
+        if length > most:
+            raise _Broken(f"a part of a record has {length} bytes; the limit is {most}")
         return length
 
     def _messages_in(self, stored: bytes, compression: str) -> list[tuple[int, int, memoryview]]:
@@ -162,9 +164,9 @@ class SalvagedBag:
         at = start
         while at < size:
             self._stream.seek(at)
-            window = memoryview(self._stream.read(_WINDOW + 2 * _MAX_HEADER))
+            window = memoryview(self._stream.read(_WINDOW + 2 * _MAX_CHUNK_HEADER))
             for mark in re.finditer(re.escape(_CHUNK_MARK), window):
-                for begin in range(max(mark.start() - _MAX_HEADER, 0), mark.start() - 7):
+                for begin in range(max(mark.start() - _MAX_CHUNK_HEADER, 0), mark.start() - 7):
                     if _is_chunk(window, begin):
                         return at + begin
             at += _WINDOW
@@ -175,7 +177,7 @@ def _is_chunk(view: memoryview, at: int) -> bool:
     """Whether a chunk record's header could begin here."""
     length = int.from_bytes(view[at : at + 4], "little")
     try:
-        return length <= _MAX_HEADER and _fields(_blob(view, at)[0]).get(b"op") == _CHUNK
+        return length <= _MAX_CHUNK_HEADER and _fields(_blob(view, at)[0]).get(b"op") == _CHUNK
     except _Broken:
         return False
 

@@ -12,12 +12,16 @@ from collections.abc import Callable
 import numpy as np
 
 from pc2grid.errors import PointCloudError, UnsupportedSchema
+from pc2grid.geometry import F64
 from pc2grid.io.messages import Header, PointCloud2
 
 Fields = tuple[tuple[str, int, int, int], ...]  # name, offset, datatype, count
 
 _MAX_HEADER = 1 << 16
-_MAX_UNPACKED = 1 << 30
+_MAX_UNPACKED = 256 << 20
+_BEST_LZF = 88  # three bytes stand for 264 at most
+_BLOCK = 1 << 20
+_LONGEST_NUMBER = 100
 _SIZES = (0, 1, 1, 2, 2, 4, 4, 4, 8, 8, 8)  # of the datatypes of sensor_msgs/PointField
 _PCD_TYPES = {"I1": 1, "U1": 2, "I2": 3, "U2": 4, "I4": 5, "U4": 6, "F4": 7, "F8": 8, "I8": 9, "U8": 10}
 _PLY_TYPES = {
@@ -79,8 +83,8 @@ def _unpacked(body: memoryview, size: int) -> bytes:
     stored, expanded = (int.from_bytes(body[i : i + 4], "little") for i in (0, 4))
     if expanded != size or len(body) < 8 + stored:
         raise PointCloudError(f"{expanded} bytes of compressed data where {size} are declared")
-    if expanded > _MAX_UNPACKED:
-        raise PointCloudError(f"a PCD that would expand to {expanded} bytes")
+    if expanded > min(_MAX_UNPACKED, _BEST_LZF * stored):
+        raise PointCloudError(f"a PCD of {stored} bytes that would expand to {expanded}")
     return lzf.decompress(body[8 : 8 + stored], expanded)
 
 
@@ -145,15 +149,29 @@ def _from_text(body: bytes, header: Header, columns: list[tuple[str, int]], poin
     width = sum(count for _, count in columns)
     if width * points > len(body):
         raise PointCloudError(f"{len(body)} bytes of text where {width * points} numbers are declared")
-    words = body.split(maxsplit=width * points)[: width * points]
-    if len(words) < width * points:
-        raise PointCloudError(f"{len(words)} numbers where {width * points} are declared")
-    try:
-        values = np.array(words, dtype="S").astype(np.float64) if words else np.zeros(0)
-    except ValueError as error:
-        raise PointCloudError(f"not a number: {error}") from error
+    values = _numbers(body, width * points)
+    if len(values) < width * points:
+        raise PointCloudError(f"{len(values)} numbers where {width * points} are declared")
     fields, step = _packed([(name, 8, count) for name, count in columns])
     return _cloud(header, fields, step, points, values.astype("<f8").tobytes())
+
+
+def _numbers(body: bytes, most: int) -> F64:
+    """The first numbers of a text, at most so many; in blocks, as each word of it is an object of its own."""
+    parts, at = [np.zeros(0)], 0
+    while most > 0 and at < len(body):
+        end = re.compile(rb"\s").search(body, at + _BLOCK)
+        stop = end.start() if end else len(body)
+        words = body[at:stop].split()[:most]
+        if max(map(len, words), default=0) > _LONGEST_NUMBER:
+            raise PointCloudError(f"a number of more than {_LONGEST_NUMBER} digits")
+        try:
+            parts.append(np.array(words, dtype="S").astype(np.float64) if words else np.zeros(0))
+        except ValueError as error:
+            raise PointCloudError(f"not a number: {error}") from error
+        most -= len(words)
+        at = stop
+    return np.concatenate(parts)
 
 
 def _cloud(

@@ -21,7 +21,7 @@ from pc2grid.geometry import F64, invert_pose, quat_xyzw_from_pose
 from pc2grid.io import cloud_files
 from pc2grid.io.messages import Header, Odometry
 from pc2grid.io.source import LogInfo, RawMessage, Tally, TopicInfo
-from pc2grid.io.trajectory import read_kitti, read_tum, stamp_ns_from_text
+from pc2grid.io.trajectory import is_rigid, lines_of, read_kitti, read_tum, stamp_ns_from_text
 from pc2grid.model import Trajectory
 
 SUFFIXES = (".pcd", ".ply", ".bin")
@@ -60,7 +60,7 @@ class CloudFolder:
         self.tally = Tally()
         self.tally.warn("files of clouds carry no checksum: damage to their data would not be seen")
         self._max_bytes = config.max_record_bytes
-        found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+        found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file()]
         kinds = sorted(
             {p.suffix.lower() for p in found}, key=lambda s: -sum(p.suffix.lower() == s for p in found)
         )
@@ -175,7 +175,7 @@ class Sidecars:
 
     def _pose_files(self) -> tuple[Path | None, Path | None]:
         """A TUM file and a KITTI file; at most one of them."""
-        tums = sorted(self._folder.glob("*.tum"))
+        tums = sorted(path for path in self._folder.glob("*.tum") if path.is_file())
         beside = self._folder.with_name(self._folder.name + ".tum")
         tums = tums or ([beside] if beside.is_file() else [])
         if len(tums) > 1:
@@ -195,7 +195,7 @@ class Sidecars:
         if path is None:
             return None
         try:
-            stamps = [stamp_ns_from_text(w) for w in path.read_text(encoding="ascii").split()]
+            stamps = [stamp_ns_from_text(word) for line in lines_of(path) for word in line.split()]
         except (ValueError, ArithmeticError) as error:
             raise TrajectoryFileError(f"{path}: not seconds, one per line: {error}") from error
         if len(stamps) != count:
@@ -210,13 +210,15 @@ class Sidecars:
         if path is None:
             return T_cam0_cam
         T_cam_lidar = np.eye(4)
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        for line in lines_of(path):
             name, _, values = line.partition(":")
             if name.strip() in ("Tr", "Tr_velo_to_cam"):
                 try:
                     T_cam_lidar[:3] = np.array([float(v) for v in values.split()]).reshape(3, 4)
                 except ValueError as error:
                     raise TrajectoryFileError(f"{path}: {name} is not a 3x4 matrix") from error
+                if not is_rigid(T_cam_lidar):
+                    raise TrajectoryFileError(f"{path}: {name} is not a rigid pose")
         result: F64 = invert_pose(T_cam_lidar) @ T_cam0_cam @ T_cam_lidar
         return result
 
@@ -230,18 +232,19 @@ def _from_names(clouds: list[Path]) -> list[int] | None:
     """Stamps from names such as 1305031102.175304.pcd (s) or 1305031102175304000.pcd (ns, us); else None."""
     stamps = []
     for path in clouds:
-        if re.fullmatch(r"\d{9,10}\.\d+", path.stem):
-            stamps.append(stamp_ns_from_text(path.stem))
-        elif re.fullmatch(r"\d{18,19}|\d{15,16}", path.stem):
-            stamps.append(int(path.stem) * (1 if len(path.stem) >= 18 else 1000))
-        else:
+        if not (kind := re.fullmatch(r"(\d{9,10}\.\d+)|(\d{18,19})|\d{15,16}", path.stem)):
+            return None
+        seconds, nanoseconds = kind.groups()
+        text = seconds or (f"{path.stem}e-9" if nanoseconds else f"{path.stem}e-6")
+        try:
+            stamps.append(stamp_ns_from_text(text))
+        except ValueError:  # past the year 2262
             return None
     return stamps if all(b > a for a, b in itertools.pairwise(stamps)) else None
 
 
 def _numbers_per_line(path: Path) -> int:
-    with path.open(encoding="utf-8", errors="replace") as file:
-        for line in file:
-            if line.strip() and not line.startswith("#"):
-                return len(line.split())
+    for line in lines_of(path):
+        if line.strip() and not line.startswith("#"):
+            return len(line.split())
     return 0

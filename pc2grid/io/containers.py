@@ -75,7 +75,7 @@ def _open_db3(path: Path, config: ReadConfig, recover: bool) -> Source:
 
 
 def _open_folder(path: Path, config: ReadConfig, recover: bool) -> Source:
-    names = sorted(entry.name for entry in path.iterdir())
+    names = sorted(entry.name for entry in path.iterdir() if entry.is_file())
     if rosbag2_folder.METADATA in names or any(name.endswith(rosbag2_folder.SUFFIXES) for name in names):
         return rosbag2_folder.open_folder(
             path,

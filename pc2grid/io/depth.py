@@ -136,7 +136,7 @@ def _check_size(height: int, width: int, max_points: int) -> None:
         )
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=2)
 def _rays(
     height: int,
     width: int,
@@ -155,13 +155,16 @@ def _rays(
         fx, cx, fy, cy = k[0], k[2], k[4], k[5]
     if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
         raise PointCloudError(f"a CameraInfo without focal length (fx {fx}, fy {fy})")
-    u, v = np.meshgrid(np.arange(0, width, stride, dtype=float), np.arange(0, height, stride, dtype=float))
-    x, y = ((u - cx) / fx).reshape(-1), ((v - cy) / fy).reshape(-1)
+    u, v = np.arange(0, width, stride, dtype=float), np.arange(0, height, stride, dtype=float)
+    x, y = (u - cx) / fx, ((v - cy) / fy)[:, None]
     if any(d):
-        x, y = _undistorted(u, v, np.reshape(k, (3, 3)), np.asarray(d), distortion_model)
+        columns, rows = np.meshgrid(u, v)
+        x, y = _undistorted(columns, rows, np.reshape(k, (3, 3)), np.asarray(d), distortion_model)
     if not max(np.abs(x).max(initial=0.0), np.abs(y).max(initial=0.0)) < _STEEPEST:
         raise PointCloudError("a CameraInfo whose camera looks sideways or backwards")
-    return np.column_stack((x, y, np.ones_like(x))).astype(np.float32)
+    rays = np.ones((len(v), len(u), 3), np.float32)
+    rays[..., 0], rays[..., 1] = x, y
+    return rays.reshape(-1, 3)
 
 
 def _undistorted(u: F64, v: F64, k: F64, d: F64, model: str) -> tuple[F64, F64]:
@@ -174,4 +177,5 @@ def _undistorted(u: F64, v: F64, k: F64, d: F64, model: str) -> tuple[F64, F64]:
         rays = cv2.undistortPoints(pixels, k, d)
     else:
         raise UnsupportedSchema(f"the distortion model {model!r:.40} is not read")
-    return rays[:, 0, 0].astype(np.float64), rays[:, 0, 1].astype(np.float64)
+    x, y = (rays[:, 0, axis].astype(np.float64).reshape(u.shape) for axis in (0, 1))
+    return x, y

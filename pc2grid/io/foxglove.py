@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from pc2grid.errors import PointCloudError, UnsupportedSchema
+from pc2grid.errors import LimitExceeded, PointCloudError, UnsupportedSchema
+from pc2grid.io.laserscan import MOST_BEAMS
 from pc2grid.io.messages import (
     CameraInfo,
     CompressedImage,
@@ -40,6 +41,8 @@ _NUMERIC = {
     "FLOAT32": 7,
     "FLOAT64": 8,
 }
+_MOST_JSON_BYTES = 64 << 20
+_MOST_JSON_VALUES = 2_000_000
 _NUMERIC_NAMES = ("UNKNOWN", *_NUMERIC)
 
 
@@ -68,6 +71,12 @@ def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
 
 
 def _parse_json(data: bytes) -> Any:
+    # What stands between two commas may become an object of a hundred bytes.
+    if len(data) > _MOST_JSON_BYTES or data.count(b",") > _MOST_JSON_VALUES:
+        raise LimitExceeded(
+            f"a JSON message of {len(data)} bytes and {data.count(b',')} values; "
+            f"the limits are {_MOST_JSON_BYTES} and {_MOST_JSON_VALUES}"
+        )
     return json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
 
 
@@ -155,11 +164,15 @@ def _point_cloud(m: Any) -> PointCloud2:
 
 
 def _datatype(value: Any) -> int:
-    name = value if isinstance(value, str) else _NUMERIC_NAMES[value]
-    return _NUMERIC.get(name, 0)
+    if isinstance(value, str):
+        return _NUMERIC.get(value, 0)
+    # Protobuf takes any number for a name, also a negative one.
+    return _NUMERIC[_NUMERIC_NAMES[value]] if 0 < value < len(_NUMERIC_NAMES) else 0
 
 
 def _laser_scan(m: Any) -> LaserScan:
+    if len(m.ranges) > MOST_BEAMS:
+        raise LimitExceeded(f"a scan of {len(m.ranges)} beams; the limit is {MOST_BEAMS}")
     ranges = np.array(_floats(m.ranges))
     start, end = float(m.start_angle), float(m.end_angle)
     step = (end - start) / (len(ranges) - 1) if len(ranges) > 1 else 0.0

@@ -12,6 +12,9 @@ from pc2grid.io.messages import LaserScan
 from pc2grid.io.pointcloud2 import Points
 from pc2grid.model import F32
 
+# No laser turns through so many angles, and their directions are kept.
+MOST_BEAMS = 1_000_000
+
 
 def decode(scan: LaserScan, *, max_points: int = 20_000_000) -> Points:
     """Returns of a scan: beams with NaN, inf, or a range outside [range_min, range_max) are dropped.
@@ -22,8 +25,9 @@ def decode(scan: LaserScan, *, max_points: int = 20_000_000) -> Points:
     Raises PointCloudError if the angles contradict the number of ranges.
     """
     count = len(scan.ranges)
-    if count > max_points:
-        raise LimitExceeded(f"a scan of {count} beams; the limit is {max_points}")
+    most = min(max_points, MOST_BEAMS)
+    if count > most:
+        raise LimitExceeded(f"a scan of {count} beams; the limit is {most}")
     numbers = (scan.angle_min, scan.angle_max, scan.angle_increment)
     if not all(map(math.isfinite, numbers)):
         raise PointCloudError(f"angles that are not finite: {numbers}")
@@ -47,7 +51,7 @@ def decode(scan: LaserScan, *, max_points: int = 20_000_000) -> Points:
     return Points(points, offsets, count - len(kept))
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=4)
 def _directions(count: int, angle_min: float, angle_increment: float) -> F32:
     """(count, 2) unit vectors of the beams."""
     angles = angle_min + np.arange(count) * angle_increment

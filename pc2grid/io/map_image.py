@@ -14,6 +14,8 @@ from pc2grid.io import png
 
 MAX_CELLS = 100_000_000
 _MAX_TEXT_CELLS = 10_000_000  # a number as text becomes an object of its own
+_MAX_BYTES = 4 * MAX_CELLS + (1 << 20)
+_MAX_HEADER = 1 << 16
 
 
 class GreyImage(NamedTuple):
@@ -33,6 +35,10 @@ def read_image(path: Path) -> GreyImage:
     Raises MapFileError for what is not a whole image of 8 bits and grey, or is larger than MAX_CELLS.
     """
     try:
+        if path.exists() and not path.is_file():  # a device or a pipe would never end
+            raise MapFileError(f"{path}: the map's image is not a regular file")
+        if path.stat().st_size > _MAX_BYTES:
+            raise MapFileError(f"{path}: larger than {_MAX_BYTES} bytes: not the image of a map")
         data = path.read_bytes()
     except (OSError, ValueError) as error:
         raise MapFileError(f"{path}: cannot read the map's image: {error}") from error
@@ -91,7 +97,7 @@ def _check_bmp(path: Path, data: bytes) -> None:
 def _decode_pgm(path: Path, data: bytes) -> GreyImage:
     """Binary (P5) or text (P2) PGM."""
     number = rb"(?:\s|#[^\n]*\n)+(\d{1,9})"
-    header = re.match(rb"P[25]" + number * 3 + rb"\s", data)
+    header = re.match(rb"P[25]" + number * 3 + rb"\s", data[:_MAX_HEADER])
     if header is None:
         raise MapFileError(f"{path}: the PGM header is damaged")
     width, height, top = (int(v) for v in header.groups())

@@ -24,7 +24,7 @@ from pc2grid.io.ros_definitions import short_name
 from pc2grid.io.source import LogInfo, RawMessage, Tally, TopicInfo
 
 _ENCODINGS = {"cdr": "cdr", "ros1": "ros1", "protobuf": "protobuf", "json": "json"}
-_PENDING_BYTES = 512 << 20
+_PENDING_BYTES = 128 << 20
 
 
 class McapSource:
@@ -182,6 +182,8 @@ class McapSource:
             length = int.from_bytes(head[1:], "little")
             if length + rec.RECORD_HEAD != chunk.size:
                 raise Damage(chunk.offset, "the index gives another length")
+            if length > self._limits.record_bytes:
+                raise rec.too_large(chunk.offset, length, self._limits)
             data = self._stream.read(length)
             if len(data) < length:
                 raise Damage(chunk.offset, "the file ends within it", truncated=True)
@@ -191,7 +193,11 @@ class McapSource:
             if fields.crc == 0 and fields.uncompressed_size:
                 self.tally.warn("chunks of the log carry no checksum: damage would not be seen")
             content = rec.decompress(data, fields, chunk.offset, self._limits)
-            return rec.chunk_messages(content, chunk.offset, self._survey.definitions, wanted)
+            found = rec.chunk_messages(content, chunk.offset, self._survey.definitions, wanted)
+            if 2 * sum(len(m.data) for m in found) < len(content):
+                # A view keeps the whole chunk: small messages of many large chunks would fill the memory.
+                return [m._replace(data=memoryview(bytes(m.data))) for m in found]
+            return found
         except Damage as damage:
             number = self._survey.chunks.index(chunk) + 1
             where = f"chunk {number} ({self._when(chunk.start_ns)} to {self._when(chunk.end_ns)})"

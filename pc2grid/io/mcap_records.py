@@ -182,15 +182,20 @@ def read_records(
         data = b""
         if opcode in wanted:
             if length > limits.record_bytes:
-                raise LimitExceeded(
-                    f"a record at byte {offset} has {length} bytes; the limit is {limits.record_bytes}",
-                    hint="--set read.max_record_bytes=N raises it",
-                )
+                raise too_large(offset, length, limits)
             data = stream.read(length)
             if len(data) < length:
                 raise Damage(offset, "the file ends within a record", truncated=True)
         yield Record(offset, opcode, data, RECORD_HEAD + length)
         offset += RECORD_HEAD + length
+
+
+def too_large(offset: int, length: int, limits: Limits) -> LimitExceeded:
+    """The error for a record that is not read for its size."""
+    return LimitExceeded(
+        f"a record at byte {offset} has {length} bytes; the limit is {limits.record_bytes}",
+        hint="--set read.max_record_bytes=N raises it",
+    )
 
 
 def chunk_head(data: bytes | memoryview, offset: int) -> ChunkHead:

@@ -12,7 +12,7 @@ from pc2grid.io.mcap_records import ChunkIndex, Damage, Definitions, Fields
 
 _READ = frozenset({rec.SCHEMA, rec.CHANNEL, rec.MESSAGE, rec.CHUNK, rec.DATA_END, rec.FOOTER})
 _KNOWN = frozenset(range(rec.HEADER, rec.DATA_END + 1))
-_WINDOW = 4 << 20
+_WINDOW = 64 << 10  # not larger: it is read anew for each place of damage
 
 
 @dataclass(slots=True)

@@ -50,7 +50,7 @@ def load_map(yaml_path: str | Path) -> OccupancyGrid:
     yaml_path = Path(yaml_path)
     keys = _read_yaml(yaml_path)
     image_path = _image_path(yaml_path, keys)
-    mode = str(keys.get("mode", "trinary"))
+    mode = keys.get("mode", "trinary")
     resolution_m = _number(yaml_path, keys, "resolution")
     if not _RESOLUTION_M[0] <= resolution_m <= _RESOLUTION_M[1]:
         raise MapFileError(
@@ -67,7 +67,7 @@ def load_map(yaml_path: str | Path) -> OccupancyGrid:
             f"found {free_thresh} and {occupied_thresh}"
         )
     if mode not in ("trinary", "scale", "raw"):
-        raise MapFileError(f"{yaml_path}: mode: {mode!r} is not one of trinary, scale, raw")
+        raise MapFileError(f"{yaml_path}: mode: {_shown(mode)} is not one of trinary, scale, raw")
     image = read_image(image_path)
     table = _cell_of(image, mode, negate, occupied_thresh, free_thresh)
     cells = np.empty(image.values.shape, np.int8)
@@ -177,6 +177,15 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return keys
 
 
+def _shown(value: object) -> str:
+    """A value for a message: a few lines of YAML can stand for billions of items, or digits without end."""
+    if isinstance(value, int) and abs(value) >= 10**18:
+        return "a huge number"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join('[...]' if isinstance(v, list) else _shown(v) for v in value[:4])}]"
+    return f"{value!r:.60}" if isinstance(value, (str, int, float)) else f"a {type(value).__name__}"
+
+
 def _value(path: Path, keys: dict[str, Any], key: str) -> Any:
     if keys.get(key) is None:
         raise MapFileError(f"{path}: {key}: missing", hint="see nav2's map.yaml format")
@@ -198,14 +207,14 @@ def _number(path: Path, keys: dict[str, Any], key: str) -> float:
     try:
         return _as_float(value)
     except (ValueError, OverflowError):
-        raise MapFileError(f"{path}: {key}: expected a finite number, found {value!r:.60}") from None
+        raise MapFileError(f"{path}: {key}: expected a finite number, found {_shown(value)}") from None
 
 
 def _flag(path: Path, keys: dict[str, Any], key: str) -> bool:
     value = _value(path, keys, key)
-    named = {"0": False, "1": True, "false": False, "true": True}.get(str(value).lower())
+    named = {"0": False, "1": True, "False": False, "True": True}.get(_shown(value).strip("'").capitalize())
     if named is None:
-        raise MapFileError(f"{path}: {key}: expected 0 or 1, found {value!r:.60}")
+        raise MapFileError(f"{path}: {key}: expected 0 or 1, found {_shown(value)}")
     return named
 
 
@@ -214,7 +223,7 @@ def _origin(path: Path, keys: dict[str, Any]) -> tuple[float, float]:
     try:
         x, y, yaw = (_as_float(v) for v in value)
     except (TypeError, ValueError, OverflowError):
-        raise MapFileError(f"{path}: origin: expected [x, y, yaw], found {value!r:.60}") from None
+        raise MapFileError(f"{path}: origin: expected [x, y, yaw], found {_shown(value)}") from None
     if max(abs(x), abs(y)) > _FARTHEST_M:
         raise MapFileError(f"{path}: origin: {x:g}, {y:g} m is nowhere on earth")
     if abs(yaw) > 1e-9:
@@ -228,7 +237,7 @@ def _origin(path: Path, keys: dict[str, Any]) -> tuple[float, float]:
 def _image_path(path: Path, keys: dict[str, Any]) -> Path:
     name = _value(path, keys, "image")
     if not isinstance(name, str) or not name or "\0" in name:
-        raise MapFileError(f"{path}: image: expected a file name, found {name!r:.60}")
+        raise MapFileError(f"{path}: image: expected a file name, found {_shown(name)}")
     if ".." in Path(name).parts:
         _log.warning("%s: image: %s leaves the folder of the map", path, name)
     return path.parent / name  # an absolute name stays absolute, as in nav2

@@ -124,6 +124,10 @@ _PRIMITIVES = {
     "string": "string",
 }
 
+# Types that we know flatten to some tens of fields, and published definitions have thousands of characters.
+_MOST_FIELDS = 1000
+_MOST_CHARACTERS = 1 << 20
+
 Layout = tuple[tuple[str, str], ...]
 _Fields = tuple[tuple[str, str, str], ...]  # (type, array suffix, name)
 
@@ -173,6 +177,8 @@ def layout_of(type_name: str, encoding: str, text: str) -> Layout:
 
     encoding : `ros2msg`, `ros1msg` or `ros2idl`. Raises ValueError if the text cannot be understood.
     """
+    if len(text) > _MOST_CHARACTERS:
+        raise ValueError(f"{type_name}: a definition of {len(text)} characters")
     name = short_name(type_name)
     structs = dict(_parse_idl(text)) if encoding == "ros2idl" else _parse_concatenated(name, text)
     structs.setdefault("builtin_interfaces/Time", (("int32", "", "sec"), ("uint32", "", "nanosec")))
@@ -181,18 +187,24 @@ def layout_of(type_name: str, encoding: str, text: str) -> Layout:
     return _flatten(name, structs)
 
 
-def _flatten(name: str, structs: dict[str, _Fields], prefix: str = "", depth: int = 0) -> Layout:
-    if depth > 16:
-        raise ValueError(f"{name}: definitions nest without end")
-    if name not in structs:
-        raise ValueError(f"{name}: definition missing")
+def _flatten(top: str, structs: dict[str, _Fields]) -> Layout:
     flat: list[tuple[str, str]] = []
-    for kind, array, field in structs[name]:
-        path = f"{prefix}{field}{array}"
+    todo, seen = [(top, "")], 0
+    while todo:
+        seen += 1
+        if seen + len(todo) > _MOST_FIELDS:  # a few lines can nest into billions
+            raise ValueError(
+                f"{top}: its definitions nest without end, or into more than {_MOST_FIELDS} fields"
+            )
+        kind, path = todo.pop()
         if kind in _PRIMITIVES:
             flat.append((path, _PRIMITIVES[kind]))
-        else:
-            flat += _flatten(_resolve(kind, name, structs), structs, path + ".", depth + 1)
+            continue
+        if kind not in structs:
+            raise ValueError(f"{kind}: definition missing")
+        for inner, array, field in reversed(structs[kind]):
+            full = inner if inner in _PRIMITIVES else _resolve(inner, kind, structs)
+            todo.append((full, f"{path}.{field}{array}" if path else f"{field}{array}"))
     return tuple(flat)
 
 
@@ -241,13 +253,17 @@ def _parse_msg(text: str) -> _Fields:
 
 def _parse_idl(text: str) -> dict[str, _Fields]:
     """Structs of an IDL text as rosbag2 writes it (OMG IDL 4.2, the part that ROS 2 uses)."""
-    text = re.sub(r"//[^\n]*|/\*.*?\*/", "", text, flags=re.DOTALL)
-    text = re.sub(r'"(?:[^"\\]|\\.)*"', '""', text)
+    # Comments and strings in one pass, to the end if they do not end: so each character is looked at once.
+    text = re.sub(r"//[^\n]*|/\*.*?(?:\*/|\Z)|\"(?:[^\"\\]|\\.)*(?:\"|\Z)", "", text, flags=re.DOTALL)
     text = re.sub(r"@\w+\s*(\((?:[^()]|\([^()]*\))*\))?", "", text)
     text = re.sub(r"^[=#][^\n]*$|^IDL:[^\n]*$", "", text, flags=re.MULTILINE)
     typedefs: dict[str, tuple[str, str]] = {}
-    for kind, alias, size in re.findall(r"typedef\s+([\w:<>,\s]+?)\s+(\w+)\s*\[(\d+)\]\s*;", text):
-        typedefs[alias] = (kind, f"[{size}]")
+    for statement in re.split("[;{}]", text):
+        words = statement.split()
+        if words[:1] == ["typedef"] and words[-1].endswith("]"):
+            declared, _, size = " ".join(words[1:]).removesuffix("]").rpartition("[")
+            kind, _, alias = declared.rstrip().rpartition(" ")
+            typedefs[alias] = (kind, f"[{size}]")
     structs: dict[str, _Fields] = {}
     package = ""
     for match in re.finditer(r"module\s+(\w+)|struct\s+(\w+)\s*\{([^{}]*)\}", text):

@@ -14,7 +14,8 @@ from pc2grid.io.split_log import SplitSource
 METADATA = "metadata.yaml"
 SUFFIXES = (".mcap", ".db3")
 _REINDEX = "`ros2 bag reindex` writes it anew"
-_MAX_YAML_BYTES = 64 << 20
+# As YAML each item is an object of half a kilobyte; a recording in 10 000 files has some 70 000.
+_MAX_YAML_BYTES, _MAX_YAML_ITEMS = 8 << 20, 200_000
 
 
 def open_folder(
@@ -75,8 +76,11 @@ def listed_files(metadata: Path) -> list[str]:
 
     if metadata.stat().st_size > _MAX_YAML_BYTES:
         raise LogCorrupt(f"{metadata}: larger than {_MAX_YAML_BYTES} bytes", hint=_REINDEX)
+    content = metadata.read_bytes()
+    if content.count(b"\n") + content.count(b",") > _MAX_YAML_ITEMS:
+        raise LogCorrupt(f"{metadata}: more than {_MAX_YAML_ITEMS} items", hint=_REINDEX)
     try:
-        document = yaml.safe_load(metadata.read_text(encoding="utf-8"))
+        document = yaml.safe_load(content.decode("utf-8"))
         paths = document["rosbag2_bagfile_information"]["relative_file_paths"]
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise LogCorrupt(f"{metadata}: not YAML ({type(error).__name__})", hint=_REINDEX) from error

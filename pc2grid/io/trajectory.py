@@ -16,6 +16,7 @@ from pc2grid.geometry import F64, pose_from_xyz_quat, quat_xyzw_from_pose
 from pc2grid.io.atomic import replace_file
 from pc2grid.model import Trajectory
 
+_MAX_BYTES = 128 << 20
 TrajectoryFormat = Literal["tum", "kitti"]
 
 
@@ -28,7 +29,10 @@ def stamp_ns_from_text(text: str) -> int:
     if e:  # numpy.savetxt writes 1.283e+09; rare enough for the slow way
         from decimal import Decimal
 
-        stamp = int((Decimal(text) * 1_000_000_000).to_integral_value())
+        seconds = Decimal(text)
+        if seconds.adjusted() > 10:  # 1e999000 as an integer would take minutes
+            raise ValueError(f"not a time: {text!r:.60}")
+        stamp = int((seconds * 1_000_000_000).to_integral_value())
     else:
         sign = -1 if mantissa.startswith("-") else 1
         whole, _, fraction = mantissa[mantissa[:1] in ("+", "-") :].partition(".")
@@ -58,7 +62,7 @@ def read_tum(path: str | Path) -> Trajectory:
     """
     stamps: list[int] = []
     poses: list[F64] = []
-    for number, line in enumerate(_lines(path), start=1):
+    for number, line in enumerate(lines_of(path), start=1):
         words = line.replace(",", " ").split()
         if not words or words[0].startswith("#"):
             continue
@@ -99,7 +103,7 @@ def read_kitti(path: str | Path) -> F64:
     Raises TrajectoryFileError with the line that is wrong.
     """
     poses: list[F64] = []
-    for number, line in enumerate(_lines(path), start=1):
+    for number, line in enumerate(lines_of(path), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -108,12 +112,18 @@ def read_kitti(path: str | Path) -> F64:
                 raise ValueError(f"expected 12 numbers (a 3x4 pose), found {len(words)}")
             pose = np.eye(4)
             pose[:3] = np.array([float(word) for word in words]).reshape(3, 4)
-            if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3]) - 1) > 1e-2:
+            if not is_rigid(pose):
                 raise ValueError("not a rigid pose")
         except ValueError as error:
             raise TrajectoryFileError(f"{path}, line {number}: {error}") from error
         poses.append(pose)
     return np.array(poses).reshape(-1, 4, 4)
+
+
+def is_rigid(T: F64) -> bool:
+    """Whether a (4, 4) pose turns and shifts, as far as numbers rounded in a text can say."""
+    R = T[:3, :3]
+    return bool(np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-2 and np.linalg.det(R) > 0)
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
@@ -142,8 +152,14 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, kind: TrajectoryF
     (write_kitti if kind == "kitti" else write_tum)(path, trajectory)
 
 
-def _lines(path: str | Path) -> list[str]:
+def lines_of(path: str | Path) -> list[str]:
+    """The lines of a text file of poses or times.
+
+    Raises TrajectoryFileError if it cannot be read, is larger than 128 MiB, or not text.
+    """
     try:
+        if Path(path).stat().st_size > _MAX_BYTES:
+            raise TrajectoryFileError(f"{path}: larger than {_MAX_BYTES} bytes: no trajectory")
         return Path(path).read_text(encoding="utf-8").splitlines()
     except OSError as error:
         raise TrajectoryFileError(f"{path}: {error.strerror}") from error
