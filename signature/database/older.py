@@ -30,7 +30,7 @@ def bring_along(connection: sqlite3.Connection, *, beside: bool = False) -> None
             connection.execute(statement.replace("TABLE", "TEMP TABLE", 1) if beside else statement)
     # Whoever reads damaged sessions hears of it then; that a copy of them is written must not happen.
     with contextlib.suppress(*schema.COMPLAINTS if beside else ()):
-        for (session_id,) in connection.execute("SELECT id FROM session").fetchall():
+        for (session_id,) in connection.execute("SELECT id FROM session"):
             rows.insert(connection, "loop", {"session_id": session_id, **rows.loop_row(())})
     if not beside:
         connection.execute(f"PRAGMA user_version = {schema.FORMAT}")

@@ -50,12 +50,11 @@ def rewrite(path: Path, *, keep: bool, timeout_s: float = BUSY_TIMEOUT_S) -> Ite
             connection.execute("PRAGMA trusted_schema = OFF")
             if kept:
                 schema.inspect_tables(connection, path)
-                version = schema.version_of(connection)
-                bring_along(connection)
             else:
                 schema.initialise(connection)
-                version = schema.FORMAT
+            version = schema.version_of(connection)
             connection.execute("BEGIN")
+            bring_along(connection)
             yield connection
             connection.execute("COMMIT")
             if version < schema.FORMAT:
