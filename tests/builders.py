@@ -114,14 +114,16 @@ class Ros:
             topic, stamp_ns, self.make("sensor_msgs/CompressedImage", header, format_name, content)
         )
 
-    def camera(self, topic: str, stamp_ns: int, width: int, height: int, focal: float) -> Message:
-        """A camera without distortion whose axis meets pixel (0, 0)."""
+    def camera(
+        self, topic: str, stamp_ns: int, width: int, height: int, focal: float, *, distortion: int = 5
+    ) -> Message:
+        """A camera whose axis meets pixel (0, 0); its distortion is so many zeros."""
         k = np.array([focal, 0, 0, 0, focal, 0, 0, 0, 1.0])
         p = np.array([focal, 0, 0, 0, 0, focal, 0, 0, 0, 0, 1.0, 0])
         roi = self.make("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
         header = self.header(stamp_ns, "camera_optical")
         content = self.make(
-            "sensor_msgs/CameraInfo", header, height, width, "plumb_bob", np.zeros(5), k,
+            "sensor_msgs/CameraInfo", header, height, width, "plumb_bob", np.zeros(distortion), k,
             np.eye(3).reshape(-1), p, 0, 0, roi,
         )  # fmt: skip
         return self.message(topic, stamp_ns, content)

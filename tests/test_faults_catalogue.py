@@ -814,6 +814,28 @@ def test_fault(case: Case, tmp_path: Path, clean: list[bytes], run: Callable[...
     assert peak.grown_bytes() < 300 << 20
 
 
+@pytest.mark.fault(46)
+def test_names_that_a_terminal_would_obey(tmp_path: Path, run: Callable[..., Any]) -> None:
+    to = ros()
+    clear = "\x1b[2J\n\x07"
+    mount = to.tf(T0, "base_link", f"li{clear}dar", 0.25, topic="/tf_static")
+    clouds = [cloud(i, frame=f"li{clear}dar") for i in range(SCANS)]
+    log(tmp_path, recording([c._replace(topic=f"/points{clear}") for c in clouds], mount, mount=False))
+    for command, shown in (
+        ("info log.mcap", r"/points\x1b[2J\n\x07"),
+        (
+            f"convert log.mcap -o x.submaps --name {shlex.quote(f'a{clear}b')}",
+            r"a\x1b[2J\n\x07b: 12 lidar scans",
+        ),
+        ("db info x.submaps", r"a\x1b[2J\n\x07b (lidar)"),
+    ):
+        code, _, said = run(command, tmp_path)
+        assert code == 0
+        assert shown in said
+        assert "\x1b" not in said
+        assert "\x07" not in said
+
+
 @pytest.mark.fault(5)
 def test_a_cut_at_every_boundary_of_a_record(tmp_path: Path) -> None:
     """Between records nothing is torn, and a recorder that was killed there is believed; else it is said."""

@@ -30,6 +30,8 @@ from pc2grid.errors import (
 from pc2grid.io import cloud_files, png
 from pc2grid.io.messages import Header
 from pc2grid.io.nav2_map import load_map, save_map
+from pc2grid.io.ros_messages import decoder_for
+from pc2grid.io.source import TopicInfo
 from pc2grid.io.trajectory import read_tum, stamp_ns_from_text
 from pc2grid.model import OccupancyGrid
 from tests import test_io_foxglove as foxglove
@@ -241,6 +243,13 @@ def test_cameras_with_absurd_distortion(tmp_path: Path, value: float, place: int
         assert "a CameraInfo" in error.message
     else:
         assert np.isfinite(scan.points_m).all()
+
+
+def test_a_camera_with_very_many_numbers_of_distortion() -> None:
+    decode = decoder_for(TopicInfo(topic=INFO, type="sensor_msgs/CameraInfo", encoding="cdr"))
+    assert len(decode(ros().camera(INFO, T0, 6, 4, 100.0, distortion=14).data).d) == 14
+    with pytest.raises(PointCloudError, match="a CameraInfo with 101 numbers of distortion"):
+        decode(ros().camera(INFO, T0, 6, 4, 100.0, distortion=101).data)
 
 
 # --- poses --------------------------------------------------------------------------------------------

@@ -137,6 +137,8 @@ def _camera_info(r: Reader) -> CameraInfo:
     header = r.header()
     height, width = r.take("II")
     model, d, k = r.text(), r.array("f8"), r.array("f8", 9)
+    if len(d) > 100:
+        raise PointCloudError(f"a CameraInfo with {len(d)} numbers of distortion")
     r.array("f8", 9)
     p = r.array("f8", 12)
     return CameraInfo(header, height, width, model, tuple(d.tolist()), tuple(k.tolist()), tuple(p.tolist()))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pc2grid.errors import DatabaseError
+from pc2grid.errors import DatabaseError, one_line
 from pc2grid_cli import console
 from pc2grid_cli import settings as options
 
@@ -222,7 +222,7 @@ def _tell(done: _Done, entry: Entry, quiet: bool) -> None:
     document = summary(session, origin)
     done.sessions.append(document)
     if not quiet:
-        print(_as_text(document), flush=True)
+        print(one_line(_as_text(document)), flush=True)
     done.warnings += [f"{session.session}: {warning}" for warning in session.report.warnings]
     if not session.submaps:
         done.warnings.append(f"{session.session}: no free space to cut submaps from: nothing is found in it")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pc2grid.errors import one_line
 from pc2grid_cli import console
 from pc2grid_cli.settings import DATABASE, AsJson, Database, Force, WrittenDatabase
 
@@ -51,7 +52,8 @@ def info_command(database: Database, json: AsJson = False) -> None:
     print(f"{where}: {_count(len(sessions))}, {sum(s.submaps for s in sessions)} submaps")
     for s in sessions:
         travel = f", {s.scans} scans, {s.path_m:.1f} m in {s.duration_s:.0f} s" if s.scans else ""
-        print(f"  {s.name} ({s.sensor}): {s.submaps} submaps, {s.area_m2:.0f} m2 free{travel}")
+        line = f"  {s.name} ({s.sensor}): {s.submaps} submaps, {s.area_m2:.0f} m2 free{travel}"
+        print(one_line(line))
 
 
 def check_command(database: Database, json: AsJson = False) -> None:
@@ -69,7 +71,7 @@ def check_command(database: Database, json: AsJson = False) -> None:
         print(f"{shown(database)}: sound")
     else:
         for problem in problems:
-            print(f"{problem.where}: {problem.what}")
+            print(one_line(f"{problem.where}: {problem.what}"))
     if problems:
         raise typer.Exit(console.FAILED)
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from pc2grid.errors import one_line
 from pc2grid_cli.console import print_json
 from pc2grid_cli.settings import AsJson, Recover, Topic
 
@@ -78,9 +79,13 @@ def describe(path: Path, *, topic: str | None = None, recover: bool = False) -> 
 
 
 def _show(document: dict[str, Any]) -> None:
+    from rich import markup
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
+
+    def escape(text: str) -> str:
+        # Names come from the log, and may hold what a terminal would obey.
+        return markup.escape(one_line(text))
 
     console = Console()
     choice = document["choice"] or {}

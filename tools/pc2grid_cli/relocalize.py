@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pc2grid.errors import one_line
 from pc2grid_cli import console
 from pc2grid_cli import settings as options
 from pc2grid_cli.answer_files import write_initialpose
@@ -178,4 +179,4 @@ def _named(answer: Answer, hypothesis: Hypothesis) -> str:
     """The session whose map a hypothesis is in, with its building and floor if they were ever told."""
     session = answer.sessions[hypothesis.session_index]
     label = answer.labels[hypothesis.session_index]
-    return f"{session} ({label})" if label.building or label.floor else session
+    return one_line(f"{session} ({label})" if label.building or label.floor else session)
