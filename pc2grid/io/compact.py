@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from pc2grid.model import F32
+from pc2grid.model import F32, I64
 
 
 @numba.njit(cache=True, nogil=True)
-def returns_of(x: F32, y: F32, z: F32) -> tuple[F32, NDArray[np.int32]]:
+def returns_of(x: F32, y: F32, z: F32) -> tuple[F32, I64]:
     """Finite returns (N, 3) that are not at the exact origin, and their numbers (N,), row by row.
 
     x, y, z : (H, W) float32 of this machine's byte order, any strides, aligned or not.
     """
     height, width = x.shape
     xyz = np.empty((height * width, 3), np.float32)
-    index = np.empty(height * width, np.int32)
+    index = np.empty(height * width, np.int64)  # as numpy wants them, which spares a copy
     count = 0
     for i in range(height):
         for j in range(width):
