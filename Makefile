@@ -43,7 +43,7 @@ bench: $(READY)
 	$(ONE_THREAD) $(BIN)/python tools/bench/run.py $(BENCH_ARGS)
 
 fuzz: $(READY)
-	PC2GRID_FUZZ=20000 $(BIN)/python -m pytest -q -n auto -k fuzz --timeout 1200 $(PYTEST_ARGS)
+	$(ONE_THREAD) PC2GRID_FUZZ=20000 $(BIN)/python -m pytest -q -n auto --dist worksteal -k fuzz --timeout 1200 $(PYTEST_ARGS)
 
 picture: $(READY)
 	PYTHONPATH=tools $(BIN)/python tools/architecture.py examples/architecture.svg

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -13,6 +14,12 @@ from tests.watching import Peak
 PATIENCE_S = 10.0
 MOST_BYTES = 500 << 20
 _EXTREMES = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x7FC00000, 0x7F800000, 0x7E000000)
+
+
+def put(path: Path, content: bytes) -> None:
+    """Write a file anew: what is emptied and filled again, file systems flush to the disk each time."""
+    path.unlink(missing_ok=True)
+    path.write_bytes(content)
 
 
 def mutated(whole: bytes, rng: np.random.Generator) -> bytes:

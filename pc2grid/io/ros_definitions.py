@@ -172,6 +172,7 @@ def expected_layout(type_name: str, ros1: bool) -> Layout | None:
     return _flatten(name, structs)
 
 
+@functools.lru_cache(maxsize=32)  # a log's topics share types, and each is looked at several times
 def layout_of(type_name: str, encoding: str, text: str) -> Layout:
     """Flat (path, primitive type) list of a type in a schema text of a log.
 
