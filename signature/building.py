@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,8 @@ from signature.answer import Status, Verdict
 from signature.confidence import CALIBRATION, RIVALS, Evidence
 from signature.config import Config
 from signature.database.protocol import Label
-from signature.places import Places
+from signature.maps import Lazily, Stored, free_m2
+from signature.places import AT_ONCE_M2, Places
 from signature.query import QueryMap
 from signature.retrieve import retrieve
 from signature.verify import SAME_M, SAME_RAD, Hypothesis, carry_on, distinct, search_everywhere, verify
@@ -39,7 +40,7 @@ _RIVAL_SCORE = 0.2
 class Building:
     """Maps and their places made ready to be asked again and again: isovists and likelihood fields.
 
-    Made once (tens of milliseconds a map), used for every query; it changes nothing.
+    Each map is made ready (in tens of milliseconds) when it first matters to a query, and kept.
     """
 
     def __init__(
@@ -49,30 +50,40 @@ class Building:
         made_with: Config,
         config: Config,
         labels: Mapping[str, Label] | None = None,
+        areas_m2: Mapping[str, float] | None = None,
     ) -> None:
         """grids : map of each session, in the order that `table.session_index` counts.
 
         made_with : how the places were cut and described; queries are treated alike.
         config : its relocalize section says how to search and when to be sure.
         labels : building and floor of sessions, where known.
+        areas_m2 : free space of each map, for maps that are not to be read before they are needed.
         """
         self.made_with = made_with
         self.config = config.relocalize
         self.sessions = tuple(grids)
         self.labels = tuple((labels or {}).get(name, Label()) for name in grids)
-        self.grids = tuple(grids.values())
-        self.places = Places(table, dict(enumerate(self.grids)), made_with.partition.radius_m)
-        self.fields: tuple[LikelihoodField, ...] = tuple(prepare(grid) for grid in self.grids)
-        self._free = tuple(free_squares(grid) for grid in self.grids)
-        self._area_m2 = tuple(float(grid.free.sum()) * grid.resolution_m**2 for grid in self.grids)
+        self.grids: Sequence[OccupancyGrid] = Lazily(lambda i: grids[self.sessions[i]], len(grids))
+        self.fields: Sequence[LikelihoodField] = Lazily(lambda i: prepare(self.grids[i]), len(grids))
+        self._free: Sequence[F64] = Lazily(lambda i: free_squares(self.grids[i]), len(grids))
+        areas_m2 = areas_m2 or {name: free_m2(grid) for name, grid in grids.items()}
+        self._areas_m2 = tuple(areas_m2[name] for name in self.sessions)
+        self.places = Places(table, self.grids, made_with.partition.radius_m, self._areas_m2)
 
     @staticmethod
     def of(database: SubmapDatabase, config: Config) -> Building:
-        """Everything that is in a database."""
-        sessions = database.sessions()
-        grids = {info.name: database.grid(info.name) for info in sessions}
-        labels = {info.name: info.provenance.label for info in sessions}
-        return Building(grids, database.signatures(), database.config(), config, labels)
+        """Everything that is in a database.
+
+        If that is more than `signature.places.AT_ONCE_M2` of free floor, maps are read when they first
+        matter, so the database must stay open as long as the building is asked.
+        """
+        infos = {info.name: info for info in database.sessions()}
+        areas_m2 = {name: info.area_m2 for name, info in infos.items()}
+        grids: Mapping[str, OccupancyGrid] = Stored(database, tuple(infos))
+        if sum(areas_m2.values()) <= AT_ONCE_M2:
+            grids = dict(grids)
+        labels = {name: info.provenance.label for name, info in infos.items()}
+        return Building(grids, database.signatures(), database.config(), config, labels, areas_m2)
 
     def look_up(
         self, query: QueryMap, carried: tuple[Hypothesis, ...] = (), *, driven_m: float = 0.0
@@ -84,11 +95,14 @@ class Building:
         return self._worth_keeping((*old, *new), query)
 
     def look_everywhere(self, query: QueryMap, known: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
-        """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole."""
+        """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole; in
+        a large database, on those that look most like what the query sees."""
         found = list(known)
-        for index, field in enumerate(self.fields):
-            if self._area_m2[index] <= self.config.exhaustive_m2:
-                found.extend(search_everywhere(query, index, field, self._free[index], self.config))
+        for index in self.places.sessions(query, self.config.shortlist, self.made_with.signature):
+            if self._areas_m2[index] <= self.config.exhaustive_m2:
+                found.extend(
+                    search_everywhere(query, index, self.fields[index], self._free[index], self.config)
+                )
         return self._worth_keeping(tuple(found), query)
 
     def judge(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> Verdict:

@@ -9,6 +9,7 @@ comes back is the exact answer, not an approximate one.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -42,6 +43,26 @@ class Nearest(NamedTuple):
     scores: F64
     mean: float
     spread: float
+
+    def only(self, kept: NDArray[np.bool_]) -> Nearest:
+        """Those of the rows that are `kept` (K,)."""
+        return self._replace(rows=self.rows[kept], scores=self.scores[kept])
+
+
+def sessions_by_likeness(found: Sequence[Nearest], session_index: NDArray[np.int32]) -> I64:
+    """The sessions (S,) of all the rows in `found`, likeliest first.
+
+    A session is as likely as the nearest of its rows stand out, in standard deviations, in all the lists
+    together; where it has none, it counts as the last row there.
+    """
+    sessions = np.unique(session_index[np.concatenate([near.rows for near in found])])
+    total = np.zeros(len(sessions))
+    for near in found:
+        apart = (near.scores - near.mean) / max(near.spread, 1e-12)
+        best = np.full(len(sessions), apart.max())
+        np.minimum.at(best, np.searchsorted(sessions, session_index[near.rows]), apart)
+        total += best
+    return sessions[np.argsort(total, kind="stable")].astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True)

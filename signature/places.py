@@ -7,7 +7,7 @@ one beside it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from pc2grid.geometry import F64
 from pc2grid.model import F32, I64, BoolGrid, OccupancyGrid
 from pc2grid.visibility import HIDDEN, look_around
-from signature.nearest import SignatureIndex
-from signature.query import PROFILE_BEARINGS
+from signature.config import SignatureConfig
+from signature.nearest import Nearest, SignatureIndex, sessions_by_likeness
+from signature.query import PROFILE_BEARINGS, QueryMap
 from signature.similarity import SignatureTable
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 LATTICE_M = 0.4
 """Between standpoints: a view is at most 0.28 m from one of them, about what ranges are compared by."""
+AT_ONCE_M2 = 200_000.0
+"""A query is looked for in so much free floor at once: of a larger database, where it looks likeliest."""
 _AROUND_M = 1.2
 """A standpoint farther than this from every place belongs to none."""
 _CLEARANCE_M = 0.2
@@ -85,15 +88,39 @@ class Places:
     before the first question, and what nobody asks for takes no memory.
     """
 
-    def __init__(self, table: SignatureTable, grids: Mapping[int, OccupancyGrid], sight_m: float) -> None:
-        """grids : the map of each session, by session_index."""
+    def __init__(
+        self,
+        table: SignatureTable,
+        grids: Sequence[OccupancyGrid],
+        sight_m: float,
+        areas_m2: Sequence[float],
+    ) -> None:
+        """grids, areas_m2 : the map of each session and its free space, by session_index."""
         self.table = table
         self.sight_m = sight_m
         self.index = SignatureIndex.of(table)
         self._grids = grids
+        self._areas_m2 = np.asarray(areas_m2, np.float64)
         self._grounds: dict[int, _Ground] = {}
         self._known: dict[int, tuple[F64, F32, NDArray[np.bool_]]] = {}
         self._last: tuple[I64, Standpoints] | None = None
+
+    def shortlists(self, query: QueryMap, k: int, config: SignatureConfig) -> tuple[Nearest, ...]:
+        """For each view of a query the `k` places nearest by their signatures; in a database of more than
+        `AT_ONCE_M2`, those of them that lie in the likeliest sessions."""
+        found = tuple(self.index.nearest(view.signature, k, config) for view in query.views)
+        if self._areas_m2.sum() <= AT_ONCE_M2 or not found:
+            return found
+        sessions = sessions_by_likeness(found, self.table.session_index)
+        chosen = sessions[np.cumsum(self._areas_m2[sessions]) <= max(AT_ONCE_M2, self._areas_m2[sessions[0]])]
+        return tuple(near.only(np.isin(self.table.session_index[near.rows], chosen)) for near in found)
+
+    def sessions(self, query: QueryMap, k: int, config: SignatureConfig) -> list[int]:
+        """Where the whole query may be looked for: all sessions, or those of its `shortlists`."""
+        if self._areas_m2.sum() <= AT_ONCE_M2:
+            return list(range(len(self._areas_m2)))
+        rows = [near.rows for near in self.shortlists(query, k, config)]
+        return np.unique(self.table.session_index[np.concatenate(rows)]).tolist() if rows else []
 
     def around(self, rows: I64) -> Standpoints:
         """The standpoints at places (R,), and what is seen from there."""

@@ -70,7 +70,7 @@ def retrieve(
     """
     if not query.views or not len(places.table):
         return ()
-    shortlists = [places.index.nearest(v.signature, config.shortlist, signature) for v in query.views]
+    shortlists = places.shortlists(query, config.shortlist, signature)
     rows = np.unique(np.concatenate([s.rows for s in shortlists]))
     stand = places.around(rows)
     weight = np.empty((len(query.views), len(rows)), np.float32)
@@ -78,7 +78,8 @@ def retrieve(
         apart = np.exp(
             -config.signature_weight * (shortlist.scores - shortlist.mean) / max(shortlist.spread, 1e-12)
         )
-        weight[view] = apart.min()  # what is not on its shortlist is no better than the last of it
+        # What is not on its shortlist is no better than the last of it, or than the average.
+        weight[view] = apart.min() if len(apart) else 1.0
         weight[view, np.searchsorted(rows, shortlist.rows)] = apart
     weight = weight[:, stand.place]
     ranges = np.stack([v.profile.ranges_m for v in query.views])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from signature import nearest
 from signature.config import SignatureConfig
 from signature.describe import Signature
-from signature.nearest import SignatureIndex
+from signature.nearest import Nearest, SignatureIndex, sessions_by_likeness
 from signature.similarity import SignatureTable, distances
 
 
@@ -100,3 +100,14 @@ def test_histograms_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch) -
         )
     with pytest.raises(ValueError, match="bins"):
         SignatureIndex.of(wrong).nearest(row(many(1, 0, (40, 40)), 0), 3, SignatureConfig())
+
+
+def test_the_likeliest_session_is_where_the_best_of_all_lists_stand_out() -> None:
+    session_index = np.array([5, 5, 7, 7, 9, 9], np.int32)
+    found = [
+        Nearest(np.array([2, 0, 4]), np.array([0.1, 0.5, 0.6]), mean=1.0, spread=0.5),
+        Nearest(np.array([3, 1]), np.array([10.0, 12.0]), mean=20.0, spread=4.0),
+    ]
+    # In standard deviations: 7 has -1.8 and -2.5, 5 has -1 and -2, 9 has -0.8 and nothing in the second list.
+    assert sessions_by_likeness(found, session_index).tolist() == [7, 5, 9]
+    assert found[0].only(np.array([True, False, True])).rows.tolist() == [2, 4]
