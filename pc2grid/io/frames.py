@@ -17,6 +17,7 @@ MAX_GAP_NS = 2_000_000_000
 # Before the first and after the last sample, it counts for this long.
 _HOLD_NS = 100_000_000
 _KEEP = 20_000
+_MOST_FRAMES = 10_000
 # Twice around the earth: beyond all coordinates in metres, and far from where floats overflow.
 _FARTHEST_M = 1e8
 
@@ -114,6 +115,9 @@ class FrameTree:
             )
             return
         known = self._parent.get(child)
+        if known is None and len(self._parent) >= _MOST_FRAMES:
+            self._warn(f"the log has more than {_MOST_FRAMES} frames; the others are ignored")
+            return
         if known is not None and known != parent:
             self._warn(f"frame {child} has two parents, {known} and {parent}: the latest counts")
             self._moving.pop(child, None)
@@ -130,12 +134,13 @@ class FrameTree:
 
     def chain(self, frame: str) -> list[str]:
         """The frame, its parent, and so on to the root. Raises FrameError if that goes in a circle."""
-        chain = [frame]
-        while (parent := self._parent.get(chain[-1])) is not None:
+        chain = {frame: None}  # keeps its order, and is quick to look in
+        while (parent := self._parent.get(frame)) is not None:
             if parent in chain:
-                raise FrameError(f"tf goes in a circle: {' -> '.join([*chain, parent])}")
-            chain.append(parent)
-        return chain
+                raise FrameError(f"tf goes in a circle: {' -> '.join([*chain, parent][-20:])}")
+            chain[parent] = None
+            frame = parent
+        return list(chain)
 
     def connected(self, target: str, source: str) -> bool:
         """Whether there is a path between two frames."""
