@@ -35,6 +35,7 @@ _APART_M, _APART_RAD = 0.75, math.radians(15.0)
 """Placements nearer than this are one."""
 _UNSEEN = 65535
 """A range that is not known, in units: farther from any that is than two that are alike."""
+_BLOCK = 64  # standpoints at a time, so that what is added up stays in the first cache
 _AGAINST = -1.0
 """A view can speak against a placement by no more than this many standard deviations: what stood in its
 way may be somewhere else today."""
@@ -220,13 +221,20 @@ def rotate_and_compare(
     longest_m = max(float(ranges_m.max(initial=0.0)), float(others_m.max(initial=0.0)))
     width_m = 2 * RANGE_SCALE_M
     per_m = np.float32(min(65535 // bearings / width_m, (_UNSEEN - 1) / (longest_m + width_m)))
-    units = [(m * per_m + np.float32(0.5)).astype(np.uint16) for m in (ranges_m, others_m)]
-    others = np.ascontiguousarray(np.where(others_seen, units[1], np.uint16(_UNSEEN)).T)
-    known = np.ascontiguousarray(others_seen.T)
-    likeness = np.empty((views, bearings, len(others_m)), np.float32)
-    for own, own_seen, out in zip(units[0], seen, likeness, strict=True):
-        rays = np.flatnonzero(own_seen)
-        _overlap(rays, own[rays], others, known, int(width_m * per_m), PRIOR_SHARE * bearings, out)
+    own, others = ((m * per_m + np.float32(0.5)).astype(np.uint16) for m in (ranges_m, others_m))
+    others[~others_seen] = _UNSEEN
+    likeness = np.empty((views, bearings, len(others)), np.float32)
+    for view in range(views):
+        rays = np.flatnonzero(seen[view])
+        _overlap(
+            rays,
+            own[view, rays],
+            others,
+            np.ascontiguousarray(others_seen),
+            int(width_m * per_m),
+            PRIOR_SHARE * bearings,
+            likeness[view],
+        )
     return likeness
 
 
@@ -240,19 +248,30 @@ def _overlap(
     doubt: float,
     out: F32,
 ) -> None:
-    """Compare the ranges `own` of some `rays` with all others', (B, N); those `width` apart are not alike."""
-    bearings, n = others.shape
+    """Compare the ranges `own` of some `rays` with all others', (N, B); those `width` apart are not alike."""
+    n, bearings = others.shape
     full, scale, more = np.uint16(width), np.float32(1.0 / width), np.float32(doubt)
-    total, count = np.empty(n, np.uint16), np.empty(n, np.uint16)
-    for shift in range(bearings):
+    most = bearings * min(n, _BLOCK)
+    # Ray by ray, and the circle twice over, so that what a ray meets at all rotations is one straight run.
+    there, there_known = np.empty(2 * most, np.uint16), np.empty(2 * most, np.uint16)
+    total, count = np.empty(most, np.uint16), np.empty(most, np.uint16)
+    for first in range(0, n, _BLOCK):
+        size = min(_BLOCK, n - first)
+        around = bearings * size
+        for i in range(size):
+            for k in range(bearings):
+                at = k * size + i
+                there[at] = there[at + around] = others[first + i, k]
+                there_known[at] = there_known[at + around] = known[first + i, k]
         total[:], count[:] = 0, 0
         for ray in range(len(rays)):
-            here, k = own[ray], (rays[ray] + shift) % bearings
-            there, there_known = others[k], known[k]
-            for i in range(n):
-                apart = np.uint16(max(here, there[i]) - min(here, there[i]))
-                total[i] += np.uint16(full - min(apart, full))
-                count[i] += np.uint16(there_known[i])
-        found = out[shift]
-        for i in range(n):
-            found[i] = np.float32(total[i]) * scale / (np.float32(count[i]) + more)
+            here, at = own[ray], rays[ray] * size
+            run, run_known = there[at : at + around], there_known[at : at + around]
+            for j in range(around):
+                apart = np.uint16(max(here, run[j]) - min(here, run[j]))
+                total[j] += np.uint16(full - min(apart, full))
+                count[j] += run_known[j]
+        for shift in range(bearings):
+            for i in range(size):
+                j = shift * size + i
+                out[shift, first + i] = np.float32(total[j]) * scale / (np.float32(count[j]) + more)
