@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from dataclasses import dataclass, field
 from typing import BinaryIO
@@ -12,6 +13,11 @@ from pc2grid.io.mcap_records import ChunkIndex, Damage, Definitions, Fields
 
 _READ = frozenset({rec.SCHEMA, rec.CHANNEL, rec.MESSAGE, rec.CHUNK, rec.DATA_END, rec.FOOTER})
 _KNOWN = frozenset(range(rec.HEADER, rec.DATA_END + 1))
+# Its kind, length, times, size, checksum; its compression behind its length; the length of the content.
+_CHUNK_HEAD = re.compile(
+    rb"(?=\x06(.{8}).{16}(.{8}).{4}(?:\x04\0{3}zstd|\x03\0{3}lz4|(\0{4}))(.{8}))", re.DOTALL
+)
+_LONGEST_HEAD = 53
 _WINDOW = 64 << 10  # not larger: it is read anew for each place of damage
 
 
@@ -164,30 +170,16 @@ def _check_data_crc(stream: BinaryIO, found: Survey) -> None:
 
 def _next_chunk(stream: BinaryIO, start: int, size: int) -> int:
     """Offset of the next chunk record that is plausible as a whole, or the end of the file."""
-    # A chunk is 06, a u64 length, times, size, crc, then its compression: "zstd" or "lz4" behind a length.
-    before = rec.RECORD_HEAD + 28
     at = start
     while at < size:
         stream.seek(at)
-        window = stream.read(_WINDOW + before + 8)
-        places = []
-        for mark in (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4"):
-            place = window.find(mark, before)
-            while place >= 0:
-                places.append((place - before, len(mark)))
-                place = window.find(mark, place + 1)
-        for place, mark_size in sorted(places):
-            head = window[place : place + rec.RECORD_HEAD]
-            length = int.from_bytes(head[1:], "little")
-            stored_at = place + before + mark_size
-            stored = window[stored_at : stored_at + 8]
-            if (
-                head[0] == rec.CHUNK
-                and at + place + rec.RECORD_HEAD + length <= size
-                and len(stored) == 8
-                and int.from_bytes(stored, "little") == length - 28 - mark_size - 8
-            ):
-                return at + place
+        window = stream.read(_WINDOW + _LONGEST_HEAD)  # a chunk may begin with its last byte
+        for head in _CHUNK_HEAD.finditer(window):
+            length, plain, stored = (int.from_bytes(head[i], "little") for i in (1, 2, 4))
+            place = at + head.start()
+            agrees = length == head.end(4) - head.start() - rec.RECORD_HEAD + stored
+            if agrees and (plain == stored or not head[3]) and place + rec.RECORD_HEAD + length <= size:
+                return place
         at += _WINDOW
     return size
 

@@ -1,0 +1,159 @@
+"""Behind damage in an MCAP or a bag, reading goes on at the next whole chunk, and loses nothing else."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType
+
+from pc2grid.config import ReadConfig
+from pc2grid.errors import LogError
+from pc2grid.io import bag_salvage, mcap_survey
+from pc2grid.model import ReadReport
+from tests.builders import STEP, T0, read, ros, write_bag, write_mcap
+
+SCANS = 30
+PLAIN = ReadConfig(assume_identity=True)
+CHUNK, MESSAGE_INDEX, DATA_END = 6, 7, 15
+
+
+class Part(NamedTuple):
+    """A chunk: where it and its message indexes stand, and which scans are in it."""
+
+    start: int
+    body: int
+    end: int
+    after: int
+    scans: tuple[int, ...]
+
+
+def clouds() -> list[np.ndarray]:
+    return [np.random.default_rng(i).normal(size=(50, 3)).astype("f4") for i in range(SCANS)]
+
+
+def recording(path: Path, compression: CompressionType) -> bytes:
+    messages = [ros().cloud("/points", T0 + i * STEP, points) for i, points in enumerate(clouds())]
+    return write_mcap(path, messages, chunk_size=2000, compression=compression).read_bytes()
+
+
+def parts(whole: bytes) -> list[Part]:
+    found: list[Part] = []
+    at = 8
+    while whole[at] != DATA_END:
+        length = int.from_bytes(whole[at + 1 : at + 9], "little")
+        end = at + 9 + length
+        if whole[at] == CHUNK:
+            low, high = struct.unpack("<QQ", whole[at + 9 : at + 25])
+            mark = int.from_bytes(whole[at + 37 : at + 41], "little")
+            scans = tuple(range((low - T0) // STEP, (high - T0) // STEP + 1))
+            found.append(Part(at, at + 41 + mark + 8, end, end, scans))
+        elif whole[at] == MESSAGE_INDEX:
+            found[-1] = found[-1]._replace(after=end)
+        at = end
+    return found
+
+
+def recovered(path: Path, content: bytes) -> tuple[list[int], ReadReport]:
+    """Which scans are read, each of them whole."""
+    path.write_bytes(content)
+    with pytest.raises(LogError):
+        read(path, PLAIN)
+    scans, report = read(path, PLAIN, recover=True)
+    numbers = [(scan.stamp_ns - T0) // STEP for scan in scans]
+    wanted = clouds()
+    for number, scan in zip(numbers, scans, strict=True):
+        np.testing.assert_array_equal(scan.points_m, wanted[number])
+    return numbers, report
+
+
+DAMAGES: dict[str, Callable[[Part], tuple[int, bytes]]] = {
+    "kind": lambda p: (p.start, b"\0"),
+    "length": lambda p: (p.start + 1, b"\xff" * 8),
+    "length a little": lambda p: (p.start + 1, struct.pack("<Q", p.end - p.start - 9 + 3)),
+    "stored length": lambda p: (p.body - 8, struct.pack("<Q", p.end - p.body + 1)),
+    "content": lambda p: ((p.body + p.end) // 2, b"\x55\xaa\x55\xaa"),
+    "checksum": lambda p: (p.start + 33, b"\x01\x02\x03\x04"),
+    "size": lambda p: (p.start + 25, struct.pack("<Q", 1999)),
+    "compression": lambda p: (p.start + 37, b"x"),
+    "times": lambda p: (p.start + 9, struct.pack("<Q", T0 + 10 * STEP * SCANS)),
+    "all of it": lambda p: (p.start, b"\xee" * (p.end - p.start)),
+}
+
+
+@pytest.mark.fault(7)
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_only_the_damaged_chunk_is_lost(tmp_path: Path, compression: CompressionType, damage: str) -> None:
+    path = tmp_path / "a.mcap"
+    whole = recording(path, compression)
+    chunks = parts(whole)
+    assert len(chunks) > 6
+    for chunk in (chunks[0], chunks[3], chunks[-1]):
+        content = bytearray(whole)
+        at, new = DAMAGES[damage](chunk)
+        content[at : at + len(new)] = new
+        found, report = recovered(path, bytes(content))
+        assert found == [i for i in range(SCANS) if i not in chunk.scans]
+        # Up to the next chunk, or to the end where there is none.
+        until = len(whole) if chunk is chunks[-1] else chunk.after
+        assert chunk.end - chunk.start <= report.bytes_lost <= until - chunk.start
+        assert any(f"at byte {chunk.start}" in w for w in report.warnings)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_each_place_of_damage_costs_its_own_chunk(tmp_path: Path, compression: CompressionType) -> None:
+    path = tmp_path / "a.mcap"
+    whole = recording(path, compression)
+    chunks = parts(whole)
+    hit = [chunks[i] for i in (1, 2, 5)]
+    content = bytearray(whole)
+    for chunk, damage in zip(hit, ("length", "content", "kind"), strict=True):
+        at, new = DAMAGES[damage](chunk)
+        content[at : at + len(new)] = new
+    found, report = recovered(path, bytes(content))
+    assert found == [i for i in range(SCANS) if not any(i in chunk.scans for chunk in hit)]
+    assert sum(c.end - c.start for c in hit) <= report.bytes_lost <= sum(c.after - c.start for c in hit)
+
+
+@pytest.mark.parametrize("window", [1, 45, 46, 64, 1000])
+@pytest.mark.parametrize("junk", [1, 40, 63, 64, 5000])
+def test_junk_between_chunks_hides_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, window: int, junk: int
+) -> None:
+    """Wherever the next chunk begins in the blocks that are searched."""
+    monkeypatch.setattr(mcap_survey, "_WINDOW", window)
+    path = tmp_path / "a.mcap"
+    whole = recording(path, list(CompressionType)[junk % 3])
+    at = parts(whole)[4].start
+    found, report = recovered(path, whole[:at] + b"\0" * junk + whole[at:])
+    assert found == list(range(SCANS))
+    assert report.bytes_lost == junk
+
+
+@pytest.mark.parametrize("compression", ["", "bz2", "lz4"])
+@pytest.mark.parametrize("window", [1, 90, 64 << 10])
+def test_only_the_damaged_chunk_of_a_bag_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: str, window: int
+) -> None:
+    monkeypatch.setattr(bag_salvage, "_WINDOW", window)
+    path = tmp_path / "a.bag"
+    to = ros("ros1")
+    messages = [to.cloud("/points", T0 + i * STEP, points) for i, points in enumerate(clouds())]
+    whole = write_bag(path, messages, compression, chunk_bytes=2000).read_bytes()
+    marks = [i for i in range(len(whole)) if whole.startswith(b"compression=", i)]
+    assert len(marks) > 6
+    lost = []
+    for mark in (marks[3], marks[-1]):
+        content = bytearray(whole)
+        content[mark : mark + 4] = b"xxxx"
+        found, report = recovered(path, bytes(content))
+        lost.append([i for i in range(SCANS) if i not in found])
+        assert 600 < report.bytes_lost < 4000
+    assert len(lost[0]) in (2, 3)
+    assert lost[0] == list(range(lost[0][0], lost[0][-1] + 1))
+    assert lost[1][-1] == SCANS - 1
