@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +14,7 @@ import pytest
 from mcap.writer import CompressionType
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import LogError
+from pc2grid.errors import LogCorrupt, LogError, LogTruncated
 from pc2grid.io import bag_salvage, mcap_survey
 from pc2grid.model import ReadReport
 from tests.builders import STEP, T0, read, ros, write_bag, write_mcap
@@ -157,3 +159,113 @@ def test_only_the_damaged_chunk_of_a_bag_is_lost(
     assert len(lost[0]) in (2, 3)
     assert lost[0] == list(range(lost[0][0], lost[0][-1] + 1))
     assert lost[1][-1] == SCANS - 1
+
+
+# --- records that are sound to the eye, and lie -------------------------------------------------------
+
+
+def record(kind: int, body: bytes) -> bytes:
+    return bytes([kind]) + struct.pack("<Q", len(body)) + body
+
+
+def chunk_of(content: bytes, low: int = T0, high: int = T0, crc: int | None = None) -> bytes:
+    """A chunk whose checksum is right."""
+    crc = zlib.crc32(content) if crc is None else crc
+    head = struct.pack("<QQQII", low, high, len(content), crc, 0)
+    return record(CHUNK, head + struct.pack("<Q", len(content)) + content)
+
+
+def message(channel: int, time_ns: int, data: bytes = b"") -> bytes:
+    return record(5, struct.pack("<HIQQ", channel, 0, time_ns, time_ns) + data)
+
+
+TEXT = struct.pack("<I", 1) + b"a"
+LIES = {
+    "schema too short": (record(3, b"\1"), "shorter than its fields"),
+    "schema of number 0": (record(3, b"\0\0" + TEXT + TEXT + TEXT), "schema 0 is defined twice"),
+    "schema that ends in a name": (record(3, b"\7\0\t\0\0\0a"), "shorter than its fields"),
+    "schema whose name is no text": (record(3, b"\7\0\1\0\0\0\xff"), "a name is not text"),
+    "schema defined again": (record(3, b"\1\0" + TEXT + TEXT + TEXT), "schema 1 is defined twice"),
+    "channel too short": (record(4, b"\1"), "shorter than its fields"),
+    "channel defined again": (record(4, b"\1\0\1\0" + TEXT + TEXT), "channel 1 is defined twice"),
+    "channel without schema": (record(4, b"\7\0\7\0" + TEXT + TEXT), "names schema 7, which is missing"),
+    "message too short": (record(5, bytes(21)), "shorter than its fields"),
+    "message of no channel": (message(7, T0), "names channel 7, which is missing"),
+    "chunk too short": (record(CHUNK, bytes(9)), "shorter than its fields"),
+    "chunk with another length": (record(CHUNK, bytes(41)), "contradict each other"),
+    "chunk of other size": (
+        record(CHUNK, struct.pack("<QQQIIQ", T0, T0, 5, 0, 0, 4) + bytes(4)),
+        "a chunk has 4 bytes instead of 5",
+    ),
+    "chunk of another checksum": (chunk_of(b"", crc=1), "checksum (CRC) is wrong"),
+    "chunk that ends in a head": (chunk_of(bytes(8)), "a chunk ends within a record"),
+    "chunk that ends in a record": (chunk_of(record(9, b"abc")[:-1]), "a chunk ends within a record"),
+    "message too short in a chunk": (chunk_of(record(5, bytes(21))), "a message is shorter than its fields"),
+    "message of no channel in a chunk": (chunk_of(message(7, T0)), "names channel 7, which is missing"),
+    "message before its chunk": (chunk_of(message(1, T0 - 1)), "a chunk's times contradict its messages"),
+    "message behind its chunk": (chunk_of(message(1, T0 + 1)), "a chunk's times contradict its messages"),
+    "no record": (record(0, b""), "not a record"),
+    "of a kind nobody knows": (record(0x10, b"abc"), "a record of unknown kind 0x10"),
+    "data end too short": (record(DATA_END, b"abc"), "shorter than its fields"),
+}  # fmt: skip
+
+
+@pytest.mark.fault(12)
+@pytest.mark.parametrize("lie", LIES)
+def test_a_record_that_lies_is_named_and_passed_over(tmp_path: Path, lie: str) -> None:
+    path = tmp_path / "a.mcap"
+    whole = recording(path, CompressionType.ZSTD)
+    at = parts(whole)[4].start
+    new, words = LIES[lie]
+    without_end = whole[: whole.index(record(DATA_END, b"")[:1] + struct.pack("<Q", 4), at)]
+    path.write_bytes(without_end[:at] + new + without_end[at:])
+    with pytest.raises(
+        LogCorrupt, match=re.escape(words) + rf", at byte {at} of \d+; {at_most(whole, at)} messages"
+    ):
+        read(path, PLAIN)
+    found, report = recovered(path, path.read_bytes())
+    assert found == list(range(SCANS))
+    assert report.bytes_lost == len(new)
+    assert any(words in w and f"at byte {at}" in w for w in report.warnings)
+
+
+def at_most(whole: bytes, at: int) -> int:
+    """How many messages stand before a place."""
+    return sum(len(part.scans) for part in parts(whole) if part.end <= at)
+
+
+@pytest.mark.parametrize("kind", [0x80, 0xFF, 9, 12])
+def test_records_of_other_people_are_passed_over(tmp_path: Path, kind: int) -> None:
+    path = tmp_path / "a.mcap"
+    whole = recording(path, CompressionType.ZSTD)
+    at = parts(whole)[4].start
+    for content in (
+        whole[:at] + record(kind, b"abc") + whole[at:],
+        whole[:at] + chunk_of(record(kind, b"abc")) + whole[at:],
+        whole[:at] + chunk_of(message(1, T0 + 5, whole[:0])[:0]) + whole[at:],
+    ):
+        path.write_bytes(content[: content.rindex(b"\x0f" + struct.pack("<Q", 4))])
+        scans, report = read(path, PLAIN)
+        assert len(scans) == SCANS
+        assert not report.lossy
+
+
+def test_a_file_that_ends_is_truncated_and_one_that_is_wrong_is_corrupt(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    whole = recording(path, CompressionType.ZSTD)
+    chunk = parts(whole)[-1]
+    for size in (chunk.start + 5, chunk.start + 9, chunk.start + 30, chunk.end - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(
+            LogTruncated, match=rf"at byte {chunk.start} of {size}; {SCANS - len(chunk.scans)} messages"
+        ):
+            read(path, PLAIN)
+    path.write_bytes(whole[: chunk.end] + b"\0" * 9)
+    with pytest.raises(LogCorrupt, match=f"not a record, at byte {chunk.end} of"):
+        read(path, PLAIN)
+    path.write_bytes(whole + b"\0")
+    with pytest.raises(LogCorrupt, match=f"1 bytes follow the end of the log, at byte {len(whole)} of"):
+        read(path, PLAIN)
+    path.write_bytes(whole[:-1])
+    with pytest.raises(LogTruncated, match="the end mark is missing"):
+        read(path, PLAIN)
