@@ -6,8 +6,10 @@ Every hypothesis competes with its rivals and with the possibility that the quer
 
 with s the two-way score of `pc2grid.alignment.Fit`. l is the log-odds of a wall point to agree: a lead of a
 tenth says more near 0.9 than near 0.5, for where nearly everything agrees, a little that does not is telling.
-s_0 is the score at which a lone hypothesis is as likely right as wrong, and k says how much a lead is worth;
-more walls seen make a lead worth more.
+s_0 is the score at which a lone hypothesis is as likely right as wrong, and k says how much a lead is worth:
+less, in proportion, where fewer than `ENOUGH_WALLS` wall points were seen. That more of them make a lead
+worth more was tried: the likelihood does not rise by it, for what speaks against a lead, things moved and
+rooms alike, does not average out.
 
 The coefficients are those that `fit` finds most likely for the trials of `compare sensors` in two plans,
 fr079 and intel, from 1 to 10 m of travel; how true confidence is, is judged on the other plans.
@@ -27,7 +29,7 @@ TUNED_ON = ("fr079", "intel")
 """Plans whose trials had a say in the coefficients; how far confidence is true is judged on others."""
 RIVALS = 5
 """Hypotheses that take part; further ones add next to nothing."""
-MANY_WALLS = 1000.0
+ENOUGH_WALLS = 100.0
 _SLACK = 0.1
 """Two maps of one place, drawn from one side and from the other, disagree by about as much."""
 
@@ -55,18 +57,16 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
-    """Coefficients of the model: neutral score s_0, worth k of a lead seen with `MANY_WALLS`, and the
-    power with which k grows with the walls seen."""
+    """Coefficients of the model: neutral score s_0 and worth k of a lead."""
 
-    neutral: float = 0.65
-    worth: float = 23.0
-    power: float = 0.55
+    neutral: float = 0.618
+    worth: float = 11.4
 
     def probabilities(self, evidence: Evidence) -> F64:
         """(H + 1,) probabilities: of each hypothesis in order, and last of none of them."""
-        k = self.worth * min(1.0, max(evidence.walls, 1.0) / MANY_WALLS) ** self.power
-        scores = np.array([*evidence.scores, self.neutral])
-        logits = np.log(np.clip(scores, 0.01, 1.0)) - np.log(1.0 + _SLACK - np.clip(scores, 0.01, 1.0))
+        k = self.worth * min(1.0, evidence.walls / ENOUGH_WALLS)
+        scores = np.clip([*evidence.scores, self.neutral], 0.01, 1.0)
+        logits = np.log(scores) - np.log(1.0 + _SLACK - scores)
         weights = np.exp(k * (logits - logits.max()))
         return np.asarray(weights / weights.sum())
 
@@ -78,16 +78,14 @@ def fit(evidence: Sequence[Evidence], right: Sequence[bool]) -> Calibration:
     """Coefficients under which `right` (whether the best hypothesis was right) is most likely."""
     from scipy.optimize import minimize
 
-    def loss(x: F64) -> float:
-        model = Calibration(
-            neutral=float(np.clip(x[0], 0.05, 0.95)), worth=float(np.exp(x[1])), power=float(x[2])
-        )
-        p = np.array([model.probabilities(e)[0] if e.scores else 0.0 for e in evidence])
-        p = np.clip(p, 1e-4, 1 - 1e-4)
-        truth = np.asarray(right, dtype=bool)
-        return float(-np.log(np.where(truth, p, 1 - p)).mean() + 1e-3 * float(x[2]) ** 2)
+    def model(x: F64) -> Calibration:
+        return Calibration(neutral=float(np.clip(x[0], 0.05, 0.95)), worth=float(np.exp(x[1])))
 
-    best = minimize(loss, np.array([0.6, np.log(25.0), 0.7]), method="Nelder-Mead").x
-    return Calibration(
-        neutral=float(np.clip(best[0], 0.05, 0.95)), worth=float(np.exp(best[1])), power=float(best[2])
-    )
+    truth = np.asarray(right, dtype=bool)
+
+    def loss(x: F64) -> float:
+        p = np.array([model(x).probabilities(e)[0] if e.scores else 0.0 for e in evidence])
+        p = np.clip(p, 1e-4, 1 - 1e-4)
+        return float(-np.log(np.where(truth, p, 1 - p)).mean())
+
+    return model(minimize(loss, np.array([0.6, np.log(10.0)]), method="Nelder-Mead").x)

@@ -148,9 +148,9 @@ def test_probabilities_sum_to_one_and_a_tie_is_halved() -> None:
 
 def test_the_fit_recovers_the_model_that_made_the_data() -> None:
     rng = np.random.default_rng(0)
-    truth = Calibration(neutral=0.55, worth=30.0, power=0.3)
+    truth = Calibration(neutral=0.55, worth=15.0)
     scores = np.sort(rng.uniform(0.35, 0.85, (4000, 3)), axis=1)[:, ::-1]
-    walls = rng.uniform(50, 2000, 4000)
+    walls = rng.uniform(20, 400, 4000)
     evidence = [Evidence(scores=tuple(s), walls=float(w)) for s, w in zip(scores, walls, strict=True)]
     right = [rng.random() < truth.probabilities(e)[0] for e in evidence]
     found = fit(evidence, right)
