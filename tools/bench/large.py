@@ -124,3 +124,33 @@ def open_time(folder: Path, quick: bool) -> Iterator[Row]:
     what = f"open a database of {count}, {path.stat().st_size / 1e9:.2f} GB"
     yield Row(what=what, measured=opened.wall, cpu=opened.cpu, unit="s", goal=1.0)
     yield Row(what="then to sketch them, and the first query", measured=asked.wall, cpu=asked.cpu, unit="s")
+
+
+_LOCATE = """
+import resource, sys, time
+from pc2grid.simulate import office_floorplan
+from signature.database import open_database
+from signature.relocalize import Building, locate_map
+part = office_floorplan(1).crop((12.0, 8.0), 6.0)
+wall, cpu = time.perf_counter(), time.process_time()
+with open_database(sys.argv[1]) as database:
+    answer = locate_map(part, Building.of(database, database.config()))
+taken = time.perf_counter() - wall, time.process_time() - cpu
+assert answer.session == "s1", answer.session
+print(*taken, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)
+"""
+
+
+def floors_time(folder: Path, quick: bool) -> Iterator[Row]:
+    """A part of one floor located in a database of many, from opening it to the answer."""
+    path, config = folder / "floors.submaps", Config()
+    floors, area_m2 = material.floors(path, 4 if quick else 24, 1 if quick else 9, config)
+    runs = [[float(f) for f in run_python(_LOCATE, path).stdout.split()] for _ in range(2 if quick else 4)]
+    took = median(Time(*run[:2]) for run in runs[1:])  # the first compiles
+    yield Row(
+        what=f"open {floors} floors of {area_m2:.0f} m2, and a first answer",
+        measured=took.wall,
+        cpu=took.cpu,
+        unit="s",
+        note=f"peak {runs[-1][2]:.0f} MB",
+    )

@@ -210,6 +210,24 @@ def large_database(path: Path, table: SignatureTable, sessions: int, config: Con
     store(path, entries, keep=False)
 
 
+def floors(path: Path, count: int, copies: int, config: Config) -> tuple[int, float]:
+    """Write a database of `count` office floors, each once as itself and with `copies` - 1 more under other
+    names; returns how many there are, and their free floor in square metres."""
+    still = Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
+    origin, entries, area_m2 = provenance(Path("bench"), "0" * 64, config), [], 0.0
+    for seed in range(count):
+        grid = office_floorplan(seed)
+        submaps = partition(grid, config.partition)
+        signatures = [describe(submap, config.signature) for submap in submaps]
+        for copy in range(copies):
+            name = f"s{seed}" if copy == 0 else f"s{seed}again{copy}"
+            made = SessionMap(session=name, sensor="map", grid=grid, submaps=submaps, trajectory=still)
+            entries.append((made, signatures, origin))
+            area_m2 += float(grid.free.sum()) * grid.resolution_m**2
+    store(path, entries, keep=False)
+    return len(entries), area_m2
+
+
 def signature_of(table: SignatureTable, row: int) -> Signature:
     """One row of a table."""
     return Signature(

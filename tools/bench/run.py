@@ -45,6 +45,7 @@ MEASURES: dict[str, Measure] = {
     "align": places.align_time,
     "retrieve": large.retrieve_time,
     "open": large.open_time,
+    "floors": large.floors_time,
     "relocalize": finding.relocalize_time,
     "peers": peers.compare,
     "fleet": fleet_search,
