@@ -14,14 +14,12 @@ import signature
 
 def main(recording: str, database: str) -> None:
     """Feed scans until the answer is `located`, then print it."""
-    with signature.open_database(database) as opened:
-        # Made once: the maps, ready to be asked again and again. Queries are treated as the maps were.
+    with signature.open_database(database) as opened, pc2grid.open_log(recording) as log:
+        # Made once, to be asked again and again; of a large database it reads what it needs when it needs it.
+        # Queries are treated as the maps were.
         config = opened.config()
-        building = signature.Building.of(opened, config)
-
-    relocalizer = signature.Relocalizer(building)
-    asked_m = 0.0
-    with pc2grid.open_log(recording) as log:
+        relocalizer = signature.Relocalizer(signature.Building.of(opened, config))
+        asked_m = 0.0
         for registered, sweep in pc2grid.follow(log.scans(), config):
             relocalizer.add(registered, sweep)
             if relocalizer.path_m - asked_m < 1.0:

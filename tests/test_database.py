@@ -262,6 +262,13 @@ def test_copy_and_merge_between_engines(filled: str | Path, other: str, tmp_path
         assert len(database.sessions()) == 3
 
 
+def test_a_closed_database_is_not_called_damaged(path: Path) -> None:
+    with open_database(path) as database:
+        name = database.sessions()[0].name
+    with pytest.raises(sqlite3.ProgrammingError, match="closed"):
+        database.grid(name)
+
+
 def test_queries_leave_bytes_and_folder_as_they_are(path: Path) -> None:
     before, folder = path.read_bytes(), sorted(path.parent.iterdir())
     path.chmod(0o444)

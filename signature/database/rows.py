@@ -267,9 +267,13 @@ def corrupt(path: Path | str, where: str, what: str) -> DatabaseCorrupt:
 
 @contextlib.contextmanager
 def explained(path: Path | str, where: str) -> Iterator[None]:
-    """Whatever SQLite, the decoding or a model says about unbelievable content is DatabaseCorrupt."""
+    """Whatever SQLite, the decoding or a model says about unbelievable content is DatabaseCorrupt.
+
+    Not sqlite3.ProgrammingError: to use a database that was closed is a mistake of the caller."""
     try:
         yield
+    except sqlite3.ProgrammingError:
+        raise
     except (sqlite3.Error, ValueError, TypeError, OverflowError, LookupError, AttributeError) as error:
         raise corrupt(path, where, f"{type(error).__name__}: {error}") from error
 
