@@ -269,3 +269,25 @@ def test_a_file_that_ends_is_truncated_and_one_that_is_wrong_is_corrupt(tmp_path
     path.write_bytes(whole[:-1])
     with pytest.raises(LogTruncated, match="the end mark is missing"):
         read(path, PLAIN)
+
+
+def test_the_checksum_of_the_data_section_covers_what_is_between_chunks(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    messages = [ros().cloud("/points", T0 + i * STEP, points) for i, points in enumerate(clouds())]
+    whole = write_mcap(path, messages, chunk_size=2000, enable_data_crcs=True).read_bytes()
+    words = "the checksum of the data section is wrong, outside of the chunks"
+    scans, report = read(path, PLAIN, recover=True)
+    assert len(scans) == SCANS
+    assert words not in report.warnings
+    index = parts(whole)[3]
+    content = bytearray(whole)
+    content[index.after - 1] ^= 1  # of a message index, which is not needed
+    path.write_bytes(content)
+    scans, report = read(path, PLAIN, recover=True)
+    assert len(scans) == SCANS
+    assert words in report.warnings
+    assert not report.lossy
+    path.write_bytes(whole[: index.start] + b"\0" * 9 + whole[index.start :])
+    _, report = read(path, PLAIN, recover=True)
+    assert report.bytes_lost == 9  # said once, as what it is
+    assert words not in report.warnings
