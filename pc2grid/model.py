@@ -50,6 +50,8 @@ class Scan:
     offsets_s : (N,) float32, when each point was taken relative to `stamp_ns`; None if not recorded.
     T_base_sensor : (4, 4) where the sensor sits on the base; its translation is where rays start.
     T_odom_base : (4, 4) odometry at `stamp_ns`, or None if the log has none there.
+    T_first_last : (4, 4) how the base moved from the first to the last of the points' times, by odometry;
+        None where that or the times are not recorded.
     sensor : which of the three kinds made it.
     dropped : how many returns were left out while decoding (NaN, inf, no return, out of range).
 
@@ -65,6 +67,7 @@ class Scan:
     sensor: SensorKind
     offsets_s: F32 | None = None
     T_odom_base: F64 | None = None
+    T_first_last: F64 | None = None
     dropped: int = 0
 
     def __post_init__(self) -> None:
@@ -72,6 +75,8 @@ class Scan:
         _freeze(self, "T_base_sensor", np.float64, (4, 4))
         if self.T_odom_base is not None:
             _freeze(self, "T_odom_base", np.float64, (4, 4))
+        if self.T_first_last is not None:
+            _freeze(self, "T_first_last", np.float64, (4, 4))
         if self.offsets_s is not None:
             _freeze(self, "offsets_s", np.float32, (len(self.points_m),))
 

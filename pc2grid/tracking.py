@@ -97,7 +97,8 @@ class Tracker:
         believed = True
         if odometry is not None and self._maps and _is_odd(odometry, motion_s):
             motion, odometry, believed = self._examine(scan, motion, motion_s, odometry)
-        points = self._usable(scan, motion, motion_s)
+        trusted = odometry is not None or self._last is None
+        points = self._usable(scan, *_motion_within(scan, motion, motion_s, trusted))
         predicted: F64 = self._last_pose @ motion
         if self._last is None:
             self._rolling = scan.sensor == "laser" or _rolls(scan)
@@ -340,6 +341,18 @@ def _ground_at_start(points: F32, T_base_sensor: F64) -> Ground:
     assumed = assumed_ground(T_base_sensor)
     mounted = find_ground(points, sensor, assumed) if assumed.offset_m == 0.0 else None
     return mounted or find_ground(points, sensor) or assumed
+
+
+def _motion_within(scan: Scan, motion: F64, motion_s: float, trusted: bool) -> tuple[F64, float]:
+    """How the base moves while the scan is taken, and in how many seconds.
+
+    By odometry if that is to be trusted, for a turn begins and ends within a scan; else as it moved before.
+    """
+    if trusted and scan.T_first_last is not None and scan.offsets_s is not None:
+        seconds = float(scan.offsets_s.max() - scan.offsets_s.min())
+        if not _is_odd(scan.T_first_last, seconds):
+            return scan.T_first_last, seconds
+    return motion, motion_s
 
 
 def _is_odd(odometry: F64, seconds: float) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from pc2grid.errors import (
     PointCloudError,
     UnsupportedSchema,
 )
-from pc2grid.geometry import F64
+from pc2grid.geometry import F64, invert_pose
 from pc2grid.io import choose
 from pc2grid.io.decoders import decoder_for
 from pc2grid.io.depth import T_BODY_OPTICAL
@@ -188,6 +189,7 @@ class Stream:
         try:
             T_base_sensor = self._sensor_pose(frame, stamp_ns)
             scan = self._decoder.scan(data, stamp_ns, T_base_sensor, self._odometry_at(stamp_ns))
+            scan = self._with_motion(scan)
         except (PointCloudError, LimitExceeded) as error:
             self._skip(error)
             return
@@ -234,6 +236,16 @@ class Stream:
         if found is None or self._T_child_base is None:
             return found
         return found @ self._T_child_base
+
+    def _with_motion(self, scan: Scan) -> Scan:
+        """The scan with the motion within it, if odometry knows it."""
+        if scan.T_odom_base is None or scan.offsets_s is None or not len(scan.offsets_s):
+            return scan
+        times_s = float(scan.offsets_s.min()), float(scan.offsets_s.max())
+        first, last = (self._odometry_at(scan.stamp_ns + round(time_s * 1e9)) for time_s in times_s)
+        if first is None or last is None:
+            return scan
+        return replace(scan, T_first_last=invert_pose(first) @ last)
 
     def _skip(self, error: Pc2GridError) -> None:
         self._bad += 1

@@ -100,13 +100,19 @@ class Session:
         kept = np.isfinite(reading.values_m)
         points = (reading.values_m[kept, None] * sensor.directions[kept]).astype(np.float32)
         moving = bool(sensor.offsets_s.any())
+        offsets = sensor.offsets_s[kept].astype(np.float32) if moving else None
+        odometry, motion = self.odometry, None
+        if odometry is not None and offsets is not None and len(offsets):
+            first, last = (odometry.at(reading.time_s + float(s)) for s in (offsets.min(), offsets.max()))
+            motion = (first.inverse() @ last).lift()
         return Scan(
             stamp_ns=reading.stamp_ns,
             points_m=(points @ T[:3, :3].T + T[:3, 3]).astype(np.float32),
             T_base_sensor=T,
             sensor=sensor.kind,
-            offsets_s=sensor.offsets_s[kept].astype(np.float32) if moving else None,
-            T_odom_base=None if self.odometry is None else self.odometry.at(reading.time_s).lift(),
+            offsets_s=offsets,
+            T_odom_base=None if odometry is None else odometry.at(reading.time_s).lift(),
+            T_first_last=motion,
             dropped=int((~kept).sum()),
         )
 
