@@ -281,6 +281,7 @@ def test_recording_reads_back_as_the_session_in_memory(tmp_path: Path, sensor: S
         assert (a.offsets_s is None) == (b.offsets_s is None)
         if a.offsets_s is not None:
             np.testing.assert_allclose(a.offsets_s, b.offsets_s, atol=1e-6)
+            np.testing.assert_allclose(a.T_first_last, b.T_first_last, atol=1e-4)
 
 
 def test_same_seed_same_bytes(tmp_path: Path) -> None:

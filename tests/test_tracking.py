@@ -11,6 +11,7 @@ from pc2grid.geometry import SE2, invert_pose, transform_points
 from pc2grid.model import Health, Scan
 from pc2grid.registration import KissRegistration, thin
 from pc2grid.simulate import SimulationConfig, iter_session
+from pc2grid.simulate.config import LidarConfig
 from pc2grid.tracking import Tracker
 
 
@@ -188,6 +189,34 @@ def test_deskew_puts_points_back_where_they_were():
         seen[k] = transform_points(invert_pose(pose), world[k : k + 1])[0]
     assert np.abs(deskew(seen.astype(np.float32), offsets, motion, 0.1) - world).max() < 0.005
     assert np.abs(seen - world).max() > 0.3
+
+
+def test_a_turn_that_begins_within_a_scan_is_undone_by_odometry():
+    config = SimulationConfig(length_m=6.0, seed=4, lidar=LidarConfig(rate_hz=5.0, columns=450))
+    pairs = list(iter_session(sensor="lidar", config=config))
+    first = pairs[0][1].inverse()
+
+    def worst_heading(scans):
+        found = [SE2.flatten(registered.T_map_base) for registered in follow(scans)]
+        return max(
+            abs(((first @ truth).inverse() @ pose).yaw) for pose, (_, truth) in zip(found, pairs, strict=True)
+        )
+
+    aware = worst_heading(scan for scan, _ in pairs)
+    unaware = worst_heading(dataclasses.replace(scan, T_first_last=None) for scan, _ in pairs)
+    assert aware < np.radians(1.0) and aware < 0.6 * unaware
+
+
+def test_absurd_odometry_within_a_scan_is_not_believed(laser):
+    """A counter that begins anew while a scan is taken would throw its points all over the place."""
+    far = SE2(3.0, -2.0, 2.0).lift()
+    scans = [
+        scan if scan.T_first_last is None else dataclasses.replace(scan, T_first_last=far)
+        for scan, _ in laser
+    ]
+    assert scans[0].T_first_last is not None
+    registered = follow(scans)
+    assert errors(laser, [r.T_map_base for r in registered]).max() < 0.06
 
 
 def test_thin_keeps_order_and_repeats():
