@@ -14,7 +14,7 @@ import pytest
 from mcap.writer import CompressionType
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import LogCorrupt, LogError, LogTruncated
+from pc2grid.errors import LimitExceeded, LogCorrupt, LogError, LogTruncated, UnsupportedSchema
 from pc2grid.io import bag_salvage, mcap_survey
 from pc2grid.model import ReadReport
 from tests.builders import STEP, T0, read, ros, write_bag, write_mcap
@@ -101,10 +101,11 @@ def test_only_the_damaged_chunk_is_lost(tmp_path: Path, compression: Compression
         content[at : at + len(new)] = new
         found, report = recovered(path, bytes(content))
         assert found == [i for i in range(SCANS) if i not in chunk.scans]
-        # Up to the next chunk, or to the end where there is none.
-        until = len(whole) if chunk is chunks[-1] else chunk.after
-        assert chunk.end - chunk.start <= report.bytes_lost <= until - chunk.start
-        assert any(f"at byte {chunk.start}" in w for w in report.warnings)
+        # Up to the next record, or chunk, or to the end where there is none.
+        beyond = len(whole) if chunk is chunks[-1] else chunk.after
+        hidden = damage in ("kind", "length", "length a little", "all of it")
+        assert report.bytes_lost == (beyond if hidden else chunk.end) - chunk.start
+        assert [f"at byte {chunk.start}:" in w for w in report.warnings if "skipped" in w] == [True]
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
@@ -135,6 +136,52 @@ def test_junk_between_chunks_hides_none(
     found, report = recovered(path, whole[:at] + b"\0" * junk + whole[at:])
     assert found == list(range(SCANS))
     assert report.bytes_lost == junk
+
+
+@pytest.mark.parametrize("name", [b"\4\0\0\0zstd", b"\3\0\0\0lz4", bytes(4)])
+def test_what_only_looks_like_a_chunk_is_none(tmp_path: Path, name: bytes) -> None:
+    path = tmp_path / "a.mcap"
+    whole = recording(path, CompressionType.ZSTD)
+    at = parts(whole)[4].start
+    rest = len(whole) - at
+    junk = b"\0" * 9
+    for length, plain, stored in (
+        (500, 400, 500 - 36 - len(name) + 1),  # lengths that contradict each other
+        (500, 400, 500),
+        (rest + 5000, rest + 5000 - 36 - len(name), rest + 5000 - 36 - len(name)),  # beyond the end
+        *([(500, 400, 500 - 36 - len(name))] if not any(name) else []),  # not compressed, and yet smaller
+    ):
+        junk += b"\x06" + struct.pack("<QQQQI", length, 0, 0, plain, 0) + name + struct.pack("<Q", stored)
+    found, report = recovered(path, whole[:at] + junk + whole[at:])
+    assert found == list(range(SCANS))
+    assert [w for w in report.warnings if "skipped" in w] == [
+        f"not a record, at byte {at}: {len(junk)} bytes were skipped"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("at", "new", "error", "words"),
+    [
+        (41, b"brot", UnsupportedSchema, "compressed with 'brot'"),
+        (25, struct.pack("<Q", 1 << 40), LimitExceeded, "would expand to 1099511627776 bytes"),
+    ],
+)
+def test_a_chunk_that_is_not_read_is_one_that_is_lost(
+    tmp_path: Path, at: int, new: bytes, error: type[LogError], words: str
+) -> None:
+    path = tmp_path / "a.mcap"
+    whole = recording(path, CompressionType.ZSTD)
+    chunk = parts(whole)[3]
+    at += chunk.start
+    content = whole[:at] + new + whole[at + len(new) :]
+    for whole_or_unfinished in (content, content[: parts(whole)[-1].end]):
+        path.write_bytes(whole_or_unfinished)
+        with pytest.raises(error, match=words):
+            read(path, PLAIN)
+        found, report = recovered(path, whole_or_unfinished)
+        assert found == [i for i in range(SCANS) if i not in chunk.scans]
+        assert report.bytes_lost == chunk.end - chunk.start
+        assert any(words in w for w in report.warnings)
 
 
 @pytest.mark.parametrize("compression", ["", "bz2", "lz4"])
