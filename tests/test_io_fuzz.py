@@ -42,22 +42,25 @@ UNCHECKED = [
 WARNED = [kind for kind in UNCHECKED if kind != "bag bz2"]
 KINDS = [*CHECKED, *UNCHECKED]
 COUNT = int(os.environ.get("PC2GRID_FUZZ", "30"))
+SCANS = 10  # fewer, and one that is lost would be more than the tenth that a reader puts up with
 
 
 def small_log(folder: Path, kind: str) -> Path:
     if kind in MCAP:
-        return write_mcap(folder / "a.mcap", drive(), **MCAP[kind])
+        return write_mcap(folder / "a.mcap", drive(scans=SCANS), **MCAP[kind])
     if kind == "mcap ros1":
-        return write_mcap(folder / "a.mcap", drive("ros1"), "ros1", chunk_size=2000)
+        return write_mcap(folder / "a.mcap", drive("ros1", SCANS), "ros1", chunk_size=2000)
     if kind.startswith("bag"):
-        return write_bag(folder / "a.bag", drive("ros1"), kind[4:], chunk_bytes=2000)
+        return write_bag(folder / "a.bag", drive("ros1", SCANS), kind[4:], chunk_bytes=2000)
     if kind == "db3":
-        return write_rosbag2(folder / "log", drive()) / "log.db3"
+        return write_rosbag2(folder / "log", drive(scans=SCANS)) / "log.db3"
     if kind.startswith("rosbag2"):
         suffix = kind.split()[1]
-        log = write_rosbag2(folder / "log", drive(), "mcap" if suffix == "mcap" else "sqlite3")
+        log = write_rosbag2(folder / "log", drive(scans=SCANS), "mcap" if suffix == "mcap" else "sqlite3")
         if suffix == "mcap":
-            write_mcap(log / "log.mcap", drive(), **MCAP["mcap zstd"])  # rosbags writes no checksums
+            write_mcap(
+                log / "log.mcap", drive(scans=SCANS), **MCAP["mcap zstd"]
+            )  # rosbags writes no checksums
         # Only this is read of it: elsewhere damage would change nothing.
         listed = f"rosbag2_bagfile_information:\n  version: 9\n  relative_file_paths:\n  - log.{suffix}\n"
         (log / "metadata.yaml").write_text(listed)
@@ -107,6 +110,8 @@ def test_fuzz_recordings(tmp_path: Path, kind: str) -> None:
             found = essence(scans)
             if found == clean:
                 outcomes["clean"] += 1
+                if not news(report, usual) and number % 4:
+                    break  # nothing to recover: looked at now and then
                 continue
             outcomes["said"] += 1
             if kind in CHECKED:
