@@ -227,8 +227,9 @@ def killed(folder: Path, commits: int) -> Path:
         db.commit()
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         db.execute("PRAGMA wal_autocheckpoint=0")
-        for part in range(commits):
-            db.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows[part::commits])
+        size = -(-len(rows) // commits)
+        for first in range(0, len(rows), size):
+            db.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows[first : first + size])
             db.commit()
         for name in ("log.db3", "log.db3-wal"):
             shutil.copy(source.with_name(name), folder / name)
@@ -261,15 +262,38 @@ def test_of_the_log_only_what_was_committed_counts(tmp_path: Path) -> None:
     assert 5 < len(expected) < 25
     path = killed(tmp_path / "again", 4)
     path.with_name("log.db3-wal").write_bytes(content)
+    with pytest.raises(LogCorrupt, match=r"bytes of the -wal are damaged .*--recover"):
+        read(path)
     with open_log(path, recover=True) as log:
         assert log.info.message_count == len(expected)
+        assert log.report().bytes_lost > PAGE
+    path.with_name("log.db3-wal").write_bytes(content[:-100])  # never written to its end: no damage
+    with open_log(path) as log:
+        assert log.info.message_count == len(expected)
+        assert not log.report().lossy
 
 
 def test_a_log_of_another_file_is_not_read(tmp_path: Path) -> None:
     path = write_rosbag2(tmp_path / "log", drive()) / "log.db3"
     for content in (b"junk", bytes(5000), b"\x37\x7f\x06\x82" + bytes(5000)):
         path.with_name("log.db3-wal").write_bytes(content)
-        check_drive(read(path)[0])
+        scans, report = read(path)
+        check_drive(scans)
+        assert "nothing in the -wal beside it belongs to the file" in report.warnings
+
+
+@pytest.mark.parametrize("at", [5, 14, 17, 25])
+def test_a_log_whose_beginning_is_damaged(tmp_path: Path, at: int) -> None:
+    path = killed(tmp_path, 1)
+    wal = path.with_name("log.db3-wal")
+    content = bytearray(wal.read_bytes())
+    content[at] ^= 4
+    wal.write_bytes(content)
+    with pytest.raises(LogCorrupt, match=rf"{len(content)} bytes of the -wal are damaged .*--recover"):
+        read(path)
+    with open_log(path, recover=True) as log:
+        assert log.info.message_count == 5
+        assert log.report().bytes_lost == len(content)
 
 
 def test_damage_beside_a_log_is_not_passed_over(tmp_path: Path) -> None:
@@ -320,6 +344,41 @@ def test_rows_are_those_that_sqlite_reads(
     assert all(row.values[0] is None for row in found)
     assert pages.unused() == 0
     assert pages.bytes_missing == 0
+    pages.close()
+
+
+def test_numbers_of_rows_of_every_length(tmp_path: Path) -> None:
+    numbers = sorted(
+        {sign * (1 << bits) + more for bits in range(0, 63, 7) for sign in (1, -1) for more in (-1, 0)}
+    )
+    numbers += [-(2**63), 2**63 - 1]
+    path = tmp_path / "x.db"
+    with closing(sqlite3.connect(path)) as db:
+        db.execute("CREATE TABLE rows(id INTEGER PRIMARY KEY, a)")
+        db.executemany("INSERT INTO rows VALUES (?, ?)", [(n, str(n)) for n in numbers])
+        db.commit()
+    pages = SqlitePages(path, 1 << 30)
+    found = [pages.take(place) for place in pages.places()]
+    assert sorted(row.rowid for row in found) == sorted(numbers)
+    assert all(row.values[1] == str(row.rowid) for row in found)
+    pages.close()
+
+
+@pytest.mark.parametrize("page_bytes", [512, 4096])
+def test_of_an_index_no_page_is_missed(tmp_path: Path, page_bytes: int) -> None:
+    path = tmp_path / "x.db"
+    with closing(sqlite3.connect(path)) as db:
+        db.execute(f"PRAGMA page_size={page_bytes}")
+        db.execute("CREATE TABLE rows(id INTEGER PRIMARY KEY, time INTEGER)")
+        db.execute("CREATE INDEX times ON rows(time)")
+        db.executemany("INSERT INTO rows(time) VALUES (?)", [(T0 + i * STEP,) for i in range(3000)])
+        db.commit()
+    content = path.read_bytes()
+    kinds = {content[at] for at in range(page_bytes, len(content), page_bytes)}
+    assert kinds == {0x02, 0x05, 0x0A, 0x0D}
+    pages = SqlitePages(path, 1 << 30)
+    assert [pages.take(place).values[1] for place in pages.places()] == [T0 + i * STEP for i in range(3000)]
+    assert pages.unused() == 0
     pages.close()
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogCorrupt
-from pc2grid.io.db3_log import RECOVER, UNCHECKED
+from pc2grid.io.db3_log import RECOVER, UNCHECKED, is_unfinished
 from pc2grid.io.ros_definitions import short_name
 from pc2grid.io.source import LogInfo, RawMessage, Tally, TopicInfo
 from pc2grid.io.sqlite_pages import BrokenRow, Place, Row, SqlitePages
@@ -50,6 +50,8 @@ class SalvagedDb3:
         self.tally.warn(UNCHECKED)
         if self._pages.wal_pages:
             self.tally.warn("the recorder did not close the file; what it left in the -wal was read too")
+        elif is_unfinished(path):
+            self.tally.warn("nothing in the -wal beside it belongs to the file")
         self.info = LogInfo(
             path=path,
             format="db3/ros2",
@@ -110,6 +112,8 @@ class SalvagedDb3:
             self.tally.warn(f"{unused} pages of the .db3 are damaged")
         if pages.bytes_missing:
             self.tally.warn(f"{pages.bytes_missing} bytes at the end of the .db3 are missing")
+        if pages.wal_bytes_lost:
+            self.tally.warn(f"{pages.wal_bytes_lost} bytes of the -wal are damaged")
         # Every message has some bytes: a number beyond that is damaged itself.
         numbers = found[(found[:, 1] > 0) & (found[:, 1] < pages.count * pages.page_size), 1]
         gone = int(numbers.max(initial=0)) - len(numbers)
@@ -118,7 +122,7 @@ class SalvagedDb3:
         homeless = int(np.count_nonzero(~np.isin(found[:, 2], list(self._topics))))
         if homeless:
             self.tally.warn(f"{homeless} messages are of a topic that is lost")
-        whole_pages = unused * pages.page_size + pages.bytes_missing
+        whole_pages = unused * pages.page_size + pages.bytes_missing + pages.wal_bytes_lost
         self.tally.bytes_lost += max(
             whole_pages, gone + homeless
         )  # of the numbered ones a byte each, at least

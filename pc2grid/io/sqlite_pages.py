@@ -50,7 +50,7 @@ class SqlitePages:
 
     count : whole pages there are. bytes_missing : of those behind them that its header asks for, or of a
     piece of one.
-    wal_pages : how many were read from the write-ahead log.
+    wal_pages : how many were read from the write-ahead log. wal_bytes_lost : how much of that is damaged.
 
     Raises ValueError if the header does not even say how large a page is.
     """
@@ -72,10 +72,11 @@ class SqlitePages:
         self.bytes_missing = max(wanted - self.count, 0) * self.page_size or cut_off
         self._wal: BinaryIO | None = None
         self._wal_at: dict[int, int] = {}
+        self.wal_bytes_lost = 0
         wal = path.with_name(path.name + "-wal")
         if wal.is_file():
             self._wal = wal.open("rb")
-            self._wal_at, pages = _committed(self._wal, self.page_size)
+            self._wal_at, pages, self.wal_bytes_lost = _committed(self._wal, self.page_size)
             self.count = max(self.count, pages)
         self.wal_pages = len(self._wal_at)
         self._used = bytearray(self.count + 1)
@@ -244,34 +245,46 @@ def _text(raw: bytes) -> str:
         raise BrokenRow("a text is none") from None
 
 
-def _committed(wal: BinaryIO, page_size: int) -> tuple[dict[int, int], int]:
-    """Where the log holds the newest version of each page, and of how many pages the file then consists.
+class _Log(NamedTuple):
+    """Where a write-ahead log holds the newest version of each page, and how many the file then has.
 
-    As in SQLite, what counts are the frames whose checksums are right, up to the last that ends a change.
+    lost : bytes of it that cannot be believed.
     """
+
+    places: dict[int, int]
+    pages: int
+    lost: int
+
+
+def _committed(wal: BinaryIO, page_size: int) -> _Log:
+    """As in SQLite, what counts are frames whose checksums are right, up to the last that ends a change."""
+    size = wal.seek(0, 2)
+    wal.seek(0)
     head = wal.read(_WAL_HEAD)
     order = _WAL_MAGIC.get(int.from_bytes(head[:4], "big"))
     if order is None or len(head) < _WAL_HEAD or int.from_bytes(head[8:12], "big") != page_size:
-        return {}, 0
+        return _Log({}, 0, 0)
     sums = _checksum(head[:24], order, (0, 0))
     if sums != struct.unpack(">II", head[24:32]):
-        return {}, 0
+        return _Log({}, 0, size)
     done: dict[int, int] = {}
-    pages = 0
+    pages, end, lost = 0, _WAL_HEAD, 0
     pending: dict[int, int] = {}
     while True:
         at = wal.tell() + _FRAME_HEAD
         frame, page = wal.read(_FRAME_HEAD), wal.read(page_size)
         if len(page) < page_size or frame[8:16] != head[16:24]:
-            return done, pages
+            break  # the end, or what an earlier log left there
         sums = _checksum(page, order, _checksum(frame[:8], order, sums))
         if sums != struct.unpack(">II", frame[16:24]):
-            return done, pages
+            lost = size - end
+            break
         pending[int.from_bytes(frame[:4], "big")] = at
         after = int.from_bytes(frame[4:8], "big")
         if after:
             done |= pending
-            pages, pending = after, {}
+            pages, end, pending = after, wal.tell(), {}
+    return _Log(done, pages, lost)
 
 
 def _checksum(data: bytes, order: str, sums: tuple[int, int]) -> tuple[int, int]:
