@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import sqlite3
 import sys
@@ -147,6 +148,44 @@ def test_messages_compressed_one_by_one_are_recovered(tmp_path: Path) -> None:
     scans, report = read(path, recover=True)
     check_drive(scans)
     assert report.bytes_lost == PAGE + len(b"left over")
+
+
+def test_what_is_salvaged_is_described_as_ever(tmp_path: Path) -> None:
+    path = write_rosbag2(tmp_path / "log", drive()) / "log.db3"
+    with open_log(path) as log:
+        clean = log.info
+        part = [s.stamp_ns for s in log.scans(0.3, 0.4)]
+    with path.open("r+b") as file:
+        file.seek(page_of(path.read_bytes(), 0x0A))
+        file.write(b"\x55" * PAGE)
+    with open_log(path, recover=True) as log:
+        assert dataclasses.replace(log.info, warnings=()) == dataclasses.replace(clean, warnings=())
+        assert all(topic.schema for topic in log.info.topics)
+        assert [s.stamp_ns for s in log.scans(0.3, 0.4)] == part
+        check_drive(list(log.scans()))
+    path.write_bytes(path.read_bytes()[: 2 * PAGE])  # nothing of it is left but its name
+    with open_log(path, recover=True) as log:
+        assert (log.info.start_ns, log.info.end_ns, log.info.message_count) == (0, 0, 0)
+        assert log.info.topics == ()
+        assert log.report().bytes_lost == 8 * PAGE
+
+
+def test_a_list_of_free_pages_without_end(tmp_path: Path) -> None:
+    path = db3(tmp_path)
+    clean, _ = essence(path)
+    with closing(sqlite3.connect(path)) as db, db:
+        db.execute("CREATE TABLE extra(data)")
+        db.execute("INSERT INTO extra VALUES (zeroblob(100000))")
+        db.execute("DROP TABLE extra")
+    content = bytearray(path.read_bytes())
+    trunk = int.from_bytes(content[32:36], "big")
+    assert trunk > 0
+    at = (trunk - 1) * PAGE
+    content[at : at + 8] = trunk.to_bytes(4, "big") + b"\xff" * 4  # the next one is itself
+    path.write_bytes(content)
+    found, report = essence(path)
+    assert found == clean
+    assert not report.lossy
 
 
 def test_an_index_that_misses_messages_is_noticed(tmp_path: Path) -> None:
