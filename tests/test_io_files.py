@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from pc2grid.errors import MapFileError, TrajectoryFileError
-from pc2grid.io.nav2_map import load_map, save_map
+from pc2grid.io.nav2_map import is_map_file, load_map, save_map
 from pc2grid.io.trajectory import read_tum, stamp_ns_from_text, stamp_text, write_tum
 from pc2grid.model import OccupancyGrid, Trajectory
 
@@ -112,6 +112,37 @@ def test_missing_keys_are_named(tmp_path: Path, key: str) -> None:
 
 def test_exponents_read_as_in_nav2(tmp_path: Path) -> None:
     assert load_map(write_map(tmp_path, {**GOOD, "resolution": "1e-3"})).resolution_m == 0.001
+
+
+@pytest.mark.parametrize(
+    ("key", "good", "bad"),
+    [
+        ("resolution", [1e-3, 100.0], [0.9e-3, 101]),
+        ("origin", [[1e8, -1e8, 0], [0, 0, 1e-9]], [[1.1e8, 0, 0], [0, 0, 2e-9], [0, 0], [0, 0, 0, 0], "a"]),
+        ("occupied_thresh", [0.196, 1.0], [0.19, 1.01]),
+        ("free_thresh", [0.0, 0.65], [-0.01, 0.66]),
+        ("negate", [0, 1, "0", "1", True, "false"], [2, -1, "", [0], 0.5, 10**30]),
+    ],
+)
+def test_values_up_to_their_limits(tmp_path: Path, key: str, good: list[object], bad: list[object]) -> None:
+    for value in good:
+        load_map(write_map(tmp_path, {**GOOD, key: value}))
+    for value in bad:
+        with pytest.raises(MapFileError, match=r"m\.yaml: (free_thresh|" + key + "): "):
+            load_map(write_map(tmp_path, {**GOOD, key: value}))
+
+
+def test_what_is_a_map_and_what_is_a_recording(tmp_path: Path) -> None:
+    (tmp_path / "folder.yaml").mkdir()
+    names = {"a.yaml": True, "a.yml": True, "a.mcap": False, "metadata.yaml": False, "folder.yaml": False}
+    assert {name: is_map_file(tmp_path / name) for name in names} == names
+
+
+def test_a_map_is_not_saved_in_a_mode_that_nobody_reads(tmp_path: Path) -> None:
+    grid = OccupancyGrid(cells=np.zeros((2, 3), np.int8), resolution_m=0.1, origin_m=(0.0, 0.0))
+    with pytest.raises(MapFileError, match="mode: 'odd' is not one of"):
+        save_map(grid, tmp_path / "m", mode="odd")  # type: ignore[arg-type]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_short_image_is_refused(tmp_path: Path) -> None:
