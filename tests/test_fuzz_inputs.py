@@ -31,7 +31,7 @@ from tests.test_database import make_entry
 
 RECORDINGS = ["lidar", "lidar ros1", "laser", "depth", "foxglove protobuf", "foxglove json"]
 ROUNDS = int(os.environ.get("PC2GRID_FUZZ", "90"))
-DATABASE_PARTS = 5  # which several processes can share
+DATABASE_PARTS = 5 if ROUNDS > 1000 else 1  # for several processes to share
 
 
 # --- recordings ---------------------------------------------------------------------------------------
