@@ -132,6 +132,12 @@ def test_values_up_to_their_limits(tmp_path: Path, key: str, good: list[object],
             load_map(write_map(tmp_path, {**GOOD, key: value}))
 
 
+def test_a_shade_at_a_threshold_is_neither(tmp_path: Path) -> None:
+    keys = {**GOOD, "negate": 1, "occupied_thresh": 0.2, "free_thresh": 0.2}  # 0.2 is shade 51
+    path = write_map(tmp_path, keys, bytes([50, 51, 52, 0, 255, 51]))
+    assert load_map(path).cells.tolist() == [[0, 100, -1], [0, -1, 100]]
+
+
 def test_what_is_a_map_and_what_is_a_recording(tmp_path: Path) -> None:
     (tmp_path / "folder.yaml").mkdir()
     names = {"a.yaml": True, "a.yml": True, "a.mcap": False, "metadata.yaml": False, "folder.yaml": False}
