@@ -17,6 +17,7 @@ from pc2grid.io.nav2_map import save_map
 from pc2grid_cli.compare_paper import compare_paper_command
 from pc2grid_cli.documents import schema
 from pc2grid_cli.paper_report import published, verdicts
+from signature.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES
 from signature.evaluation.published import MAPS, TABLE_3, TABLE_4
 from signature.evaluation.reproduce import load_result, paper_tasks, run_task
 from tests.rooms import cross, grid_of, l_shape, rectangle
@@ -111,3 +112,9 @@ def test_wrong_arguments_say_what_is_wrong(maps: Path, tmp_path: Path) -> None:
         compare_paper_command(maps, out=tmp_path, offset=[-1.0])
     with pytest.raises(MapFileError, match="none of the paper's maps"):
         compare_paper_command(tmp_path, out=tmp_path)
+
+
+@pytest.mark.parametrize("method", METHOD_NAMES + EXTRA_METHOD_NAMES)
+def test_every_method_that_can_be_asked_for_is_run(method: str) -> None:
+    tasks = list(paper_tasks([Path("intel.yaml")], methods=[method], offsets_m=[1.0]))
+    assert {m for task in tasks for m in task.methods} == {method}

@@ -37,6 +37,7 @@ TOGETHER = (
     ("shape_context",),
     ("shape_rings",),
     ("point_contexts",),
+    ("verified",),
 )
 """Methods that share their features and so are run together."""
 
