@@ -116,6 +116,19 @@ def test_recover_reads_the_whole_chunks_of_a_damaged_bag(tmp_path: Path, compres
         assert report.bytes_lost > 1000
 
 
+@pytest.mark.parametrize("compression", ["", "bz2"])
+def test_an_index_of_a_bag_that_names_another_topic(tmp_path: Path, compression: str) -> None:
+    path = write_bag(tmp_path / "a.bag", drive("ros1"), compression)
+    whole = path.read_bytes()
+    at = whole.index(b"conn=", whole.index(b"op=\x04")) + 5
+    path.write_bytes(whole[:at] + b"\0\x10" + whole[at + 2 :])
+    with pytest.raises(LogCorrupt, match=r"the index does not list what the chunks hold .*--recover"):
+        read(path)
+    scans, report = read(path, recover=True)
+    check_drive(scans)
+    assert not report.lossy
+
+
 def test_a_bag_that_unpacks_without_end_is_refused(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "a.bag", drive("ros1"), "bz2")
     with pytest.raises(LimitExceeded, match=r"more than 1000 bytes .*max_chunk_bytes"):

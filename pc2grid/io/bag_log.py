@@ -58,6 +58,7 @@ class BagSource:
             # A recorder writes the index last; without one it was interrupted.
             kind = LogTruncated if "not indexed" in str(error) else LogCorrupt
             raise kind(f"{path}: {error}", hint=_RECOVER) from error
+        self._check_index()
         for place, chunk in self._reader.chunks.items():
             kind_of = _compression(chunk)
             bounded = unpacker(kind_of, config.max_chunk_bytes)
@@ -82,6 +83,17 @@ class BagSource:
             topics=tuple(topics),
             warnings=tuple(self.tally.warnings),
         )
+
+    def _check_index(self) -> None:
+        """What each chunk says to hold must be what the index lists, or messages would be left out unseen."""
+        told: dict[int, int] = {}
+        for chunk in self._reader.chunk_infos:
+            for connection, count in chunk.connection_counts.items():
+                told[connection] = told.get(connection, 0) + count
+        listed = {connection: len(entries) for connection, entries in self._reader.indexes.items() if entries}
+        if listed != {connection: count for connection, count in told.items() if count}:
+            self._reader.close()
+            raise LogCorrupt(f"{self._path}: the index does not list what the chunks hold", hint=_RECOVER)
 
     def close(self) -> None:
         """Close the file."""
