@@ -10,7 +10,7 @@ from mcap.writer import CompressionType
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogCorrupt, PointCloudError, UnsupportedSchema
-from pc2grid.io import open_log
+from pc2grid.io import open_log, stream
 from tests.builders import (
     STEP,
     T0,
@@ -94,6 +94,24 @@ def test_small_disorder_is_sorted_without_loss(tmp_path: Path) -> None:
     scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
     assert [s.stamp_ns for s in scans] == [T0 + i * STEP for i in range(10)]
     assert not report.lossy
+
+
+@pytest.mark.parametrize(("limit", "taken"), [(10**9, 20), (300, 4)])
+def test_what_waits_for_its_turn_is_bounded_in_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int, taken: int
+) -> None:
+    """Scans of one moment, however many and large, are not all held in memory."""
+    monkeypatch.setattr(stream, "_MAX_WAITING_BYTES", limit)
+    seen: list[int] = []
+    take = stream.Stream._take_scan
+    monkeypatch.setattr(
+        stream.Stream, "_take_scan", lambda self, data, time: (seen.append(time), take(self, data, time))[1]
+    )
+    path = write_mcap(tmp_path / "a.mcap", [cloud(T0 + i * 1_000_000) for i in range(20)])
+    with open_log(path) as log:
+        first = next(iter(log.scans()))
+    assert first.stamp_ns == T0
+    assert len(seen) == pytest.approx(taken, abs=1)
 
 
 def test_a_scan_that_comes_far_too_late_is_skipped(tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ from pc2grid.model import Scan
 # Scans wait this long (log time) for odometry and for scans that overtook each other.
 _WAIT_NS = 500_000_000
 _MAX_WAITING = 256
+_MAX_WAITING_BYTES = 128_000_000
 # tf and odometry around the part that is read.
 _MARGIN_NS = 1_000_000_000
 _CLOCK_JUMP_NS = 60_000_000_000
@@ -59,6 +60,7 @@ class Stream:
         self._track = PoseTrack()
         self._T_child_base: F64 | None = None
         self._waiting: list[tuple[int, int, int, str, Any]] = []
+        self._waiting_bytes = 0
         self._count = self._bad = self._good = 0
         self._last_ns: int | None = None
         self._last_log_ns: int | None = None
@@ -84,7 +86,9 @@ class Stream:
             if take is not None:
                 take(message.data, message.log_time_ns)
             while self._waiting and (
-                message.log_time_ns - self._waiting[0][2] > _WAIT_NS or len(self._waiting) > _MAX_WAITING
+                message.log_time_ns - self._waiting[0][2] > _WAIT_NS
+                or len(self._waiting) > _MAX_WAITING
+                or self._waiting_bytes > _MAX_WAITING_BYTES
             ):
                 yield from self._release()
         while self._waiting:
@@ -113,6 +117,7 @@ class Stream:
             self._skip(PointCloudError("stamp is past the year 2262"))
             return
         heapq.heappush(self._waiting, (stamp_ns, self._count, log_time_ns, header.frame, data))
+        self._waiting_bytes += len(data)
 
     def _take_odometry(self) -> Callable[[Any, int], None]:
         assert self._plan.odometry is not None
@@ -171,6 +176,7 @@ class Stream:
 
     def _release(self) -> Iterator[Scan]:
         stamp_ns, _, log_time_ns, frame, data = heapq.heappop(self._waiting)
+        self._waiting_bytes -= len(data)
         if self._last_ns is not None and self._last_log_ns is not None:
             if stamp_ns == self._last_ns:
                 self._skip(PointCloudError("stamp is a duplicate"))

@@ -274,7 +274,15 @@ def explained(path: Path | str, where: str) -> Iterator[None]:
         yield
     except sqlite3.ProgrammingError:
         raise
-    except (sqlite3.Error, ValueError, TypeError, OverflowError, LookupError, AttributeError) as error:
+    except (
+        sqlite3.Error,
+        ValueError,
+        TypeError,
+        ArithmeticError,
+        LookupError,
+        AttributeError,
+        RecursionError,
+    ) as error:
         raise corrupt(path, where, f"{type(error).__name__}: {error}") from error
 
 
