@@ -59,7 +59,9 @@ def test_odometry_that_says_forward_while_the_robot_reverses_is_overruled(laser)
             step = true_step.copy()
             step[:2, 3] *= -1.0
             odometry = lying[-1][0].T_odom_base @ step
-        lying.append((dataclasses.replace(scan, T_odom_base=odometry), pose))
+        within = scan.T_first_last.copy()
+        within[:2, 3] *= -1.0
+        lying.append((dataclasses.replace(scan, T_odom_base=odometry, T_first_last=within), pose))
     poses = [r.T_map_base for r in follow(scan for scan, _ in lying)]
     assert errors(laser, poses).max() < 0.15
 
