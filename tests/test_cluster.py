@@ -208,11 +208,11 @@ def test_without_the_extra_it_says_what_to_install() -> None:
 
 def test_interrupted_leaves_what_is_done_and_goes_on_from_there(folder: Path, tmp_path: Path) -> None:
     """Ctrl-C reaches all processes of a terminal; nothing but one line comes of it."""
-    whole, database = tmp_path / "whole.submaps", tmp_path / "x.submaps"
+    whole, database, asleep = tmp_path / "whole.submaps", tmp_path / "x.submaps", tmp_path / "asleep"
     assert run("convert", *inputs(folder, *NAMES), "-o", whole) == 0
     code = (
-        "import signature.cluster as c, time, sys\n"
-        "done = iter([lambda *_: None, lambda *_: time.sleep(60)])\n"
+        "import pathlib, signature.cluster as c, time, sys\n"
+        f"done = iter([lambda: None, lambda: (pathlib.Path({str(asleep)!r}).touch(), time.sleep(300))])\n"
         "from signature.database import transfer\n"
         "store = transfer.store\n"
         "transfer.store = lambda *a, **k: (store(*a, **k), next(done)(), None)[0]\n"
@@ -226,10 +226,10 @@ def test_interrupted_leaves_what_is_done_and_goes_on_from_there(folder: Path, tm
         start_new_session=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
-    deadline = time.monotonic() + 60
-    while not (database.exists() and _sessions(database) == 2) and time.monotonic() < deadline:
+    while not asleep.exists():
         assert process.poll() is None
         time.sleep(0.05)
+    assert _sessions(database) == 2
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
