@@ -220,8 +220,7 @@ class McapSource:
                     continue
                 view = memoryview(record.data)
                 fields = Fields(view, record.offset)
-                channel_id, _, log_time_ns = fields.number("<H"), fields.number("<I"), fields.number("<Q")
-                fields.number("<Q")
+                channel_id, _, log_time_ns, _ = fields.numbers("<HIQQ")
                 if channel_id in wanted and low <= log_time_ns < high:
                     yield RawMessage(self._topic_of[channel_id], log_time_ns, view[fields.at :])
 

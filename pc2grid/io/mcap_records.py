@@ -7,6 +7,7 @@ none. Nothing here knows what the messages mean.
 
 from __future__ import annotations
 
+import functools
 import struct
 import zlib
 from collections.abc import Iterator
@@ -133,12 +134,17 @@ class Fields:
 
     def number(self, code: str) -> int:
         """One integer of a struct format."""
-        size = struct.calcsize(code)
-        if self.at + size > len(self._data):
+        (value,) = self.numbers(code)
+        return value
+
+    def numbers(self, codes: str) -> tuple[int, ...]:
+        """Integers of a struct format."""
+        layout = _struct(codes)
+        start = self.at
+        self.at = start + layout.size
+        if self.at > len(self._data):
             raise Damage(self._offset, "a record is shorter than its fields")
-        (value,) = struct.unpack_from(code, self._data, self.at)
-        self.at += size
-        return int(value)
+        return layout.unpack_from(self._data, start)
 
     def blob(self, length: str = "<I") -> memoryview:
         """Bytes behind their length."""
@@ -159,6 +165,11 @@ class Fields:
     def done(self) -> bool:
         """Whether everything is read."""
         return self.at >= len(self._data)
+
+
+@functools.cache
+def _struct(codes: str) -> struct.Struct:
+    return struct.Struct(codes)
 
 
 def read_records(
@@ -201,8 +212,7 @@ def too_large(offset: int, length: int, limits: Limits) -> LimitExceeded:
 def chunk_head(data: bytes | memoryview, offset: int) -> ChunkHead:
     """The fields in front of a chunk's data. Raises Damage if they contradict the record's length."""
     fields = Fields(data, offset)
-    start_ns, end_ns, size = fields.number("<Q"), fields.number("<Q"), fields.number("<Q")
-    crc = fields.number("<I")
+    start_ns, end_ns, size, crc = fields.numbers("<QQQI")
     compression = fields.text()
     stored = fields.number("<Q")
     if stored != len(data) - fields.at:

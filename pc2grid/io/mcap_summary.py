@@ -48,13 +48,11 @@ def read_summary(stream: BinaryIO, size: int, limits: rec.Limits) -> Survey | st
             chunks.append(_chunk_index(record, summary_at))
         elif record.opcode == rec.STATISTICS:
             fields = Fields(record.data, record.offset)
-            statistics = tuple(
-                fields.number(code) for code in ("<Q", "<H", "<I", "<I", "<I", "<I", "<Q", "<Q")
-            )
+            statistics = fields.numbers("<QHIIIIQQ")
             pairs = Fields(fields.blob(), record.offset)
             while not pairs.done:
-                key = pairs.number("<H")
-                counts[key] = pairs.number("<Q")
+                key, count = pairs.numbers("<HQ")
+                counts[key] = count
     if statistics is None:
         return "it has no statistics"
     message_count, _, channel_count, _, _, chunk_count, start_ns, end_ns = statistics
@@ -84,12 +82,12 @@ def read_summary(stream: BinaryIO, size: int, limits: rec.Limits) -> Survey | st
 
 def _chunk_index(record: rec.Record, summary_at: int) -> ChunkIndex:
     fields = Fields(record.data, record.offset)
-    start_ns, end_ns, offset, size = (fields.number("<Q") for _ in range(4))
+    start_ns, end_ns, offset, size = fields.numbers("<QQQQ")
     offsets = Fields(fields.blob(), record.offset)
     channels: set[int] = set()
     while not offsets.done:
-        channels.add(offsets.number("<H"))
-        offsets.number("<Q")
+        channel, _ = offsets.numbers("<HQ")
+        channels.add(channel)
     index_size = fields.number("<Q")
     after = offset + size + index_size
     if offset < len(rec.MAGIC) or size < rec.RECORD_HEAD or after > summary_at:

@@ -97,8 +97,7 @@ def _walk(stream: BinaryIO, at: int, size: int, limits: rec.Limits, found: Surve
             found.definitions.take(record.opcode, record.data, record.offset)
         elif record.opcode == rec.MESSAGE:
             fields = Fields(record.data, record.offset)
-            channel_id, _, log_time_ns = fields.number("<H"), fields.number("<I"), fields.number("<Q")
-            fields.number("<Q")
+            channel_id, _, log_time_ns, _ = fields.numbers("<HIQQ")
             if channel_id not in found.definitions.channels:
                 raise Damage(record.offset, f"a message names channel {channel_id}, which is missing")
             found.count(channel_id, log_time_ns)

@@ -39,6 +39,11 @@ class PointCloud2:
     data: Bytes
     origin: Seven | None = None
 
+    @property
+    def size_bytes(self) -> int:
+        """How much memory it keeps."""
+        return len(self.data)
+
 
 @dataclass(frozen=True, slots=True)
 class LaserScan:
@@ -55,6 +60,11 @@ class LaserScan:
     ranges: NDArray[Any]
     origin: Seven | None = None
 
+    @property
+    def size_bytes(self) -> int:
+        """How much memory it keeps."""
+        return self.ranges.nbytes
+
 
 @dataclass(frozen=True, slots=True)
 class Image:
@@ -68,6 +78,11 @@ class Image:
     step: int
     data: Bytes
 
+    @property
+    def size_bytes(self) -> int:
+        """How much memory it keeps."""
+        return len(self.data)
+
 
 @dataclass(frozen=True, slots=True)
 class CompressedImage:
@@ -76,6 +91,14 @@ class CompressedImage:
     header: Header
     format: str
     data: Bytes
+
+    @property
+    def size_bytes(self) -> int:
+        """How much memory it keeps."""
+        return len(self.data)
+
+
+ScanMessage = PointCloud2 | LaserScan | Image | CompressedImage
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,6 @@ from pc2grid.errors import FrameError, NoScans, PointCloudError
 from pc2grid.io import choose
 from pc2grid.io.decoders import decoder_for
 from pc2grid.io.frames import FrameTree
-from pc2grid.io.scan_decoder import ScanDecoder
 from pc2grid.io.source import Choice, Source, TopicInfo
 
 # tf that connects the sensor must come within this time of the first scan,
@@ -83,8 +82,7 @@ class _Planner:
         first = list(itertools.islice(of_topic, _LOOK_AHEAD))
         if not first:
             raise NoScans(f"{scans.topic}: no message in the log")
-        header = ScanDecoder(scans.topic, sensor, decode, config).header
-        found = [h for m in first if (h := tolerant(header, m.data, None)) is not None]
+        found = [s.header for m in first if (s := tolerant(decode, m.data, None)) is not None]
         sensor_frame = found[0].frame if found else ""  # all broken: the stream will count them
         child = self._odometry_child(odometry)
         moving = [t for t in tf_topics if not is_static(t)]

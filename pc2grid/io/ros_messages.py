@@ -37,28 +37,28 @@ class Reader:
 
     def __init__(self, data: Bytes, *, ros1: bool = False) -> None:
         self.data = memoryview(data)
+        self.size = len(self.data)
         self.ros1 = ros1
         self.order = "<"
-        self.start = self.at = 0
+        self.at = 0
         if not ros1:
-            if len(self.data) < 4:
+            if self.size < 4:
                 raise PointCloudError("the message is shorter than its encapsulation header")
             kind = self.data[1]
             if self.data[0] != 0 or kind not in (0, 1):
                 raise UnsupportedSchema(f"CDR encapsulation {bytes(self.data[:2]).hex()} is not read")
             self.order = "<" if kind == 1 else ">"
-            self.start = self.at = 4
+            self.at = 4
 
     def take(self, codes: str) -> tuple[Any, ...]:
         """Values of equal size, one per struct character."""
-        layout = _struct(self.order + codes)
-        self._align(layout.size // len(codes))
-        stop = self.at + layout.size
-        if stop > len(self.data):
+        layout, item = _struct(self.order, codes)
+        start = self.at if self.ros1 else self._aligned(item)
+        stop = start + layout.size
+        if stop > self.size:
             raise PointCloudError("the message is shorter than its schema")
-        values = layout.unpack_from(self.data, self.at)
         self.at = stop
-        return values
+        return layout.unpack_from(self.data, start)
 
     def number(self, code: str) -> Any:
         """One value of a struct character."""
@@ -67,13 +67,13 @@ class Reader:
     def blob(self, item: int = 1, count: int | None = None) -> memoryview:
         """An array of `count` items (None: its length stands in front) of `item` bytes each."""
         if count is None:
-            count = int(self.number("I"))
-        if count:
-            self._align(item)
-        stop = self.at + item * count
-        if stop > len(self.data):
+            (count,) = self.take("I")
+        assert count is not None
+        start = self.at if self.ros1 or not count else self._aligned(item)
+        stop = start + item * count
+        if stop > self.size:
             raise PointCloudError("the message is shorter than its schema")
-        self.at, start = stop, self.at
+        self.at = stop
         return self.data[start:stop]
 
     def array(self, code: str, count: int | None = None) -> NDArray[Any]:
@@ -91,19 +91,19 @@ class Reader:
 
     def header(self) -> Header:
         """std_msgs/Header; frame names lose the leading slash of old ROS 1."""
-        if self.ros1:
-            self.number("I")
-        seconds, rest = int(self.number("I" if self.ros1 else "i")), int(self.number("I"))
+        seconds, rest = self.take("III")[1:] if self.ros1 else self.take("iI")
         return Header(seconds * 1_000_000_000 + rest, self.text().lstrip("/"))
 
-    def _align(self, size: int) -> None:
-        if not self.ros1:
-            self.at += -(self.at - self.start) % size
+    def _aligned(self, size: int) -> int:
+        """The next place for values of a size: CDR counts from behind its 4-byte head."""
+        return self.at + (4 - self.at) % size
 
 
 @functools.cache
-def _struct(layout: str) -> struct.Struct:
-    return struct.Struct(layout)
+def _struct(order: str, codes: str) -> tuple[struct.Struct, int]:
+    """The layout of values, and the size of one of them."""
+    layout = struct.Struct(order + codes)
+    return layout, layout.size // len(codes)
 
 
 def _point_cloud(r: Reader) -> PointCloud2:

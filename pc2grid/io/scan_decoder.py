@@ -14,7 +14,7 @@ from pc2grid.errors import PointCloudError
 from pc2grid.geometry import F64, pose_from_xyz_quat
 from pc2grid.io import depth, laserscan, pointcloud2
 from pc2grid.io.frames import valid_pose
-from pc2grid.io.messages import CameraInfo, Header
+from pc2grid.io.messages import CameraInfo, ScanMessage
 from pc2grid.io.pointcloud2 import Points
 from pc2grid.model import F32, I64, Scan, SensorKind
 
@@ -32,15 +32,13 @@ class ScanDecoder:
         self._config = config
         self._rectified = "rect" in topic
 
-    def header(self, data: Any) -> Header:
-        """The header only. Raises PointCloudError if even that is not there."""
-        header = self._decode(data).header
-        assert isinstance(header, Header)
-        return header
+    def message(self, data: Any) -> ScanMessage:
+        """What stands in the log, taken apart but not yet understood. Raises what the decoder raises."""
+        message: ScanMessage = self._decode(data)
+        return message
 
-    def scan(self, data: Any, stamp_ns: int, T_base_sensor: F64, T_odom_base: F64 | None) -> Scan:
+    def scan(self, message: ScanMessage, stamp_ns: int, T_base_sensor: F64, T_odom_base: F64 | None) -> Scan:
         """The whole scan. Raises PointCloudError, LimitExceeded or UnsupportedSchema."""
-        message = self._decode(data)
         found = self._points(message)
         origin = getattr(message, "origin", None)
         if origin is not None:

@@ -23,7 +23,7 @@ from pc2grid.io import choose
 from pc2grid.io.decoders import decoder_for
 from pc2grid.io.depth import T_BODY_OPTICAL
 from pc2grid.io.frames import FrameTree, PoseTrack
-from pc2grid.io.messages import Odometry, Transform
+from pc2grid.io.messages import Odometry, ScanMessage, Transform
 from pc2grid.io.plan import Plan, is_static, tolerant
 from pc2grid.io.scan_decoder import ScanDecoder
 from pc2grid.io.source import Source, TopicInfo
@@ -59,7 +59,7 @@ class Stream:
         self._decoder = ScanDecoder(plan.scans.topic, plan.choice.sensor, decoder_for(plan.scans), config)
         self._track = PoseTrack()
         self._T_child_base: F64 | None = None
-        self._waiting: list[tuple[int, int, int, str, Any]] = []
+        self._waiting: list[tuple[int, int, int, int, ScanMessage]] = []
         self._waiting_bytes = 0
         self._count = self._bad = self._good = 0
         self._last_ns: int | None = None
@@ -102,11 +102,11 @@ class Stream:
             return
         self._count += 1
         try:
-            header = self._decoder.header(data)
+            message = self._decoder.message(data)
         except Pc2GridError as error:
             self._skip(error)
             return
-        stamp_ns = header.stamp_ns
+        stamp_ns = message.header.stamp_ns
         if self._plan.stampless:
             self._tally.warn("the stamps of the scans are zero: the time of recording is used instead")
             stamp_ns = log_time_ns
@@ -116,8 +116,9 @@ class Stream:
         if stamp_ns >= 1 << 63:
             self._skip(PointCloudError("stamp is past the year 2262"))
             return
-        heapq.heappush(self._waiting, (stamp_ns, self._count, log_time_ns, header.frame, data))
-        self._waiting_bytes += len(data)
+        size = max(len(data), message.size_bytes)
+        heapq.heappush(self._waiting, (stamp_ns, self._count, log_time_ns, size, message))
+        self._waiting_bytes += size
 
     def _take_odometry(self) -> Callable[[Any, int], None]:
         assert self._plan.odometry is not None
@@ -175,8 +176,8 @@ class Stream:
     # --- giving scans out -----------------------------------------------------------------------------
 
     def _release(self) -> Iterator[Scan]:
-        stamp_ns, _, log_time_ns, frame, data = heapq.heappop(self._waiting)
-        self._waiting_bytes -= len(data)
+        stamp_ns, _, log_time_ns, size, message = heapq.heappop(self._waiting)
+        self._waiting_bytes -= size
         if self._last_ns is not None and self._last_log_ns is not None:
             if stamp_ns == self._last_ns:
                 self._skip(PointCloudError("stamp is a duplicate"))
@@ -193,8 +194,8 @@ class Stream:
             elif stamp_ns - self._last_ns > _GAP_NS:
                 self._tally.warn("the log has gaps of more than 5 s between scans")
         try:
-            T_base_sensor = self._sensor_pose(frame, stamp_ns)
-            scan = self._decoder.scan(data, stamp_ns, T_base_sensor, self._odometry_at(stamp_ns))
+            T_base_sensor = self._sensor_pose(message.header.frame, stamp_ns)
+            scan = self._decoder.scan(message, stamp_ns, T_base_sensor, self._odometry_at(stamp_ns))
             scan = self._with_motion(scan)
         except (PointCloudError, LimitExceeded) as error:
             self._skip(error)
