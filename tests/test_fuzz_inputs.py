@@ -26,12 +26,12 @@ from signature.database.sqlite import store
 from signature.database.upkeep import check, copy
 from tests import test_io_foxglove as foxglove
 from tests.builders import STEP, T0, drive, read, ros, write_mcap
-from tests.mutations import mutated, patiently, put
+from tests.mutations import MOST_BYTES, mutated, parts, patiently, put
 from tests.test_database import make_entry
+from tests.watching import bounded_memory
 
 RECORDINGS = ["lidar", "lidar ros1", "laser", "depth", "foxglove protobuf", "foxglove json"]
 ROUNDS = int(os.environ.get("PC2GRID_FUZZ", "90"))
-DATABASE_PARTS = 5 if ROUNDS > 1000 else 1  # for several processes to share
 
 
 # --- recordings ---------------------------------------------------------------------------------------
@@ -113,15 +113,17 @@ def assert_possible(path: Path, recover: bool) -> None:
         assert scan.T_odom_base is None or np.isfinite(scan.T_odom_base).all()
 
 
+@pytest.mark.parametrize("part", range(parts(ROUNDS)))
 @pytest.mark.parametrize("kind", RECORDINGS)
-def test_fuzz_content_of_recordings(tmp_path: Path, kind: str) -> None:
+@bounded_memory(MOST_BYTES)
+def test_fuzz_content_of_recordings(tmp_path: Path, kind: str, part: int) -> None:
     clean = records(recording(tmp_path, kind))
     path = tmp_path / "x.mcap"
     write(path, clean)
     assert len(read(path)[0]) == 6
-    rng = np.random.default_rng(RECORDINGS.index(kind))
+    rng = np.random.default_rng([RECORDINGS.index(kind), part])
     outcomes = {"read": 0, "refused": 0}
-    for number in patiently(ROUNDS):
+    for number in patiently(ROUNDS // parts(ROUNDS)):
         entries = list(clean)
         at = int(rng.integers(len(entries)))
         if rng.random() < 0.2:  # the schema, everywhere that it is used
@@ -154,8 +156,12 @@ def sessions_of(database: SubmapDatabase) -> dict[str, str]:
     for index, info in enumerate(database.sessions()):
         digest = hashlib.sha256(repr(info).encode())
         digest.update(database.grid(info.name).cells.tobytes())
-        digest.update(database.trajectory(info.name).T_map_base.tobytes())
-        digest.update(repr(database.loops(info.name)).encode())
+        trajectory = database.trajectory(info.name)
+        digest.update(trajectory.stamps_ns.tobytes() + trajectory.T_map_base.tobytes())
+        digest.update(repr(trajectory.health).encode())
+        for loop in database.loops(info.name):
+            digest.update(repr((loop.older, loop.newer, loop.T_older_newer, loop.accepted)).encode())
+            digest.update(loop.information.tobytes())
         for submap in database.submaps(info.name):
             digest.update(repr((submap.submap_id, submap.center_m, submap.radius_m)).encode())
             digest.update(submap.grid.cells.tobytes())
@@ -165,7 +171,8 @@ def sessions_of(database: SubmapDatabase) -> dict[str, str]:
     return digests
 
 
-@pytest.mark.parametrize("part", range(DATABASE_PARTS))
+@pytest.mark.parametrize("part", range(parts(ROUNDS)))
+@bounded_memory(MOST_BYTES)
 def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int) -> None:
     """Mutated files are read whole, or refused; what is left of them is searched, and saved or added to."""
     monkeypatch.setattr(os, "fsync", lambda descriptor: None)  # nobody pulls the plug here
@@ -177,7 +184,7 @@ def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: i
         clean = sessions_of(database)
     rng = np.random.default_rng([44, part])
     outcomes = {"whole": 0, "refused": 0, "left out": 0, "saved": 0, "added": 0}
-    for number in patiently(-(-ROUNDS // DATABASE_PARTS)):
+    for number in patiently(ROUNDS // parts(ROUNDS)):
         content = mutated(whole, rng)
         put(path, content)
         try:
@@ -217,16 +224,18 @@ def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: i
 # --- maps ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("part", range(parts(ROUNDS)))
 @pytest.mark.parametrize("image_format", ["pgm", "png"])
-def test_fuzz_maps(tmp_path: Path, image_format: str) -> None:
+@bounded_memory(MOST_BYTES)
+def test_fuzz_maps(tmp_path: Path, image_format: str, part: int) -> None:
     """A map has no checksum: what loads must at least be a map, and what is not says which file it is."""
     cells = np.random.default_rng(2).choice(np.array([-1, 0, 100], np.int8), (12, 17))
     grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-1.5, 2.0))
     yaml_path, image_path = save_map(grid, tmp_path / "map", image_format=image_format)
     texts = {file: file.read_bytes() for file in (yaml_path, image_path)}
-    rng = np.random.default_rng(46)
+    rng = np.random.default_rng([46, part])
     outcomes = {"loaded": 0, "refused": 0}
-    for number in patiently(ROUNDS):
+    for number in patiently(ROUNDS // parts(ROUNDS)):
         for file, text in texts.items():
             put(file, text)
         victim = (yaml_path, image_path)[number % 2]

@@ -1,8 +1,9 @@
-"""How much memory a piece of work takes at most."""
+"""How much memory a piece of work takes at most, and may take."""
 
 from __future__ import annotations
 
 import contextlib
+import resource
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,11 +17,11 @@ class Peak:
         # 5 sets the highest size back to the present one (proc(5)); older marks would hide this one.
         with contextlib.suppress(OSError):
             _CLEAR.write_text("5")
-        self._before = _resident("VmRSS")
+        self._before = _status("VmRSS")
 
     def grown_bytes(self) -> int:
         """How far it rose above what was there."""
-        return _resident("VmHWM") - self._before
+        return _status("VmHWM") - self._before
 
 
 @contextlib.contextmanager
@@ -29,6 +30,20 @@ def peak_memory() -> Iterator[Peak]:
     yield Peak()
 
 
-def _resident(key: str) -> int:
+@contextlib.contextmanager
+def bounded_memory(most_bytes: int) -> Iterator[None]:
+    """Whoever asks for more than so much on top of what is there gets a MemoryError, touched or not.
+
+    The limit is on private writable pages (RLIMIT_DATA, getrlimit(2)): the heap, and what is mapped for it.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    resource.setrlimit(resource.RLIMIT_DATA, (_status("VmData") + most_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+def _status(key: str) -> int:
     line = next(line for line in _STATUS.read_text().splitlines() if line.startswith(key))
     return int(line.split()[1]) << 10

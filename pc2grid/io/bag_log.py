@@ -6,12 +6,15 @@ against the file before `rosbags` is let at it, and what it unpacks is bounded.
 
 from __future__ import annotations
 
+import io
+import os
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogTruncated
+from pc2grid.io.bag_records import Broken, Connection, connections_in
 from pc2grid.io.ros_definitions import short_name
 from pc2grid.io.source import LogInfo, RawMessage, Tally, TopicInfo
 from pc2grid.io.unpack import unpacker
@@ -22,19 +25,6 @@ _RECOVER = "--recover reads what is whole"
 
 
 UNCHECKED = "the bag carries no checksum: damage to its data would not be seen"
-
-
-class Connection(NamedTuple):
-    """A publisher of a topic: type and definition of its messages, and how many there are."""
-
-    topic: str
-    type: str
-    definition: str
-    messages: int
-
-    def one_more(self) -> Connection:
-        """The same with another message."""
-        return self._replace(messages=self.messages + 1)
 
 
 class BagSource:
@@ -52,6 +42,8 @@ class BagSource:
         self._path = path
         _check_records(path, config.max_record_bytes)
         self._reader = Reader(path)
+        self._reader.path = _BoundedPath(path)
+        self._reader.path.most_bytes = config.max_record_bytes
         try:
             self._reader.open()
         except ReaderError as error:
@@ -65,6 +57,7 @@ class BagSource:
             if kind_of != "bz2":
                 self.tally.warn(UNCHECKED)
             self._reader.chunks[place] = chunk._replace(decompressor=bounded)
+        self._check_connections()
         self._topic_of = topics_of(
             {
                 c.id: Connection(c.topic, c.msgtype, c.msgdef.data, c.msgcount)
@@ -95,6 +88,28 @@ class BagSource:
             self._reader.close()
             raise LogCorrupt(f"{self._path}: the index does not list what the chunks hold", hint=_RECOVER)
 
+    def _check_connections(self) -> None:
+        """What the index says of a topic, its first chunk said before; a flipped bit in it would hide it."""
+        first: dict[int, int] = {}
+        for info in sorted(self._reader.chunk_infos, key=lambda info: info.pos):
+            for key in info.connection_counts:
+                first.setdefault(key, info.pos)
+        said: dict[int, Connection] = {}
+        try:
+            for place in sorted(set(first.values())):
+                chunk = self._reader.chunks[place]
+                assert self._reader.bio is not None
+                self._reader.bio.seek(chunk.datapos)
+                said = connections_in(chunk.decompressor(self._reader.bio.read(chunk.datasize))) | said
+            for c in self._reader.connections:
+                there = said.get(c.id)
+                if there and _plain(there) != _plain(Connection(c.topic, c.msgtype, c.msgdef.data, 0)):
+                    raise Broken(f"the index describes {c.topic:.80} otherwise than its chunk does")
+        except (Broken, LogCorrupt, LimitExceeded) as error:
+            self.close()
+            kind = LimitExceeded if isinstance(error, LimitExceeded) else LogCorrupt
+            raise kind(f"{self._path}: {error}", hint=_RECOVER) from error
+
     def close(self) -> None:
         """Close the file."""
         if self._reader.bio is not None:
@@ -114,6 +129,36 @@ class BagSource:
                 yield RawMessage(self._topic_of[connection.id], time_ns, data)
         except (ReaderError, AssertionError) as error:
             raise LogCorrupt(f"{self._path}: a chunk is damaged: {error}", hint=_RECOVER) from error
+
+
+class _BoundedPath(type(Path())):  # type: ignore[misc]
+    """A path whose file hands out no more than `most_bytes` at once."""
+
+    most_bytes: int
+
+    def open(self, *arguments: Any, **options: Any) -> _BoundedFile:
+        return _BoundedFile(io.FileIO(self), self.most_bytes)
+
+
+class _BoundedFile(io.BufferedReader):
+    """Lengths that a wrong place in the index leads to are refused, and not set aside in memory."""
+
+    def __init__(self, raw: io.FileIO, most_bytes: int) -> None:
+        super().__init__(raw)
+        self._most_bytes = most_bytes
+        self._size = os.fstat(raw.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """See io.BufferedReader. Raises LogCorrupt for more than is allowed or there."""
+        if size is not None and size > min(self._most_bytes, self._size):
+            raise LogCorrupt(f"a length of {size} bytes where a record should begin", hint=_RECOVER)
+        return super().read(size)
+
+
+def _plain(connection: Connection) -> tuple[list[str], str, str]:
+    """What of it does not depend on how names are spelled: with which slashes, with `msg` or without."""
+    names = [name for name in connection.topic.split("/") if name]
+    return names, short_name(connection.type), connection.definition
 
 
 def _compression(chunk: Any) -> str:

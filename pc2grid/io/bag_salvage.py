@@ -13,12 +13,21 @@ from typing import BinaryIO, NamedTuple
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LimitExceeded, LogCorrupt
-from pc2grid.io.bag_log import MAGIC, MAX_HEADER, UNCHECKED, Connection, topics_of
+from pc2grid.io.bag_log import MAGIC, MAX_HEADER, UNCHECKED, topics_of
+from pc2grid.io.bag_records import (
+    CHUNK,
+    CONNECTION,
+    MESSAGE,
+    Broken,
+    Connection,
+    blob,
+    connection_of,
+    fields_of,
+)
 from pc2grid.io.source import LogInfo, RawMessage, Tally
 from pc2grid.io.unpack import unpacker
 
 _KINDS = (b"\x02", b"\x03", b"\x04", b"\x05", b"\x06", b"\x07")
-_MESSAGE, _CHUNK, _CONNECTION = b"\x02", b"\x05", b"\x07"
 # Only a chunk has this field; writers differ in where in its header it stands.
 _CHUNK_MARK = b"compression="
 _MAX_CHUNK_HEADER = 80
@@ -31,10 +40,6 @@ class _Chunk(NamedTuple):
     compression: str
     start_ns: int
     end_ns: int
-
-
-class _Broken(ValueError):
-    """A record does not fit."""
 
 
 class SalvagedBag:
@@ -87,7 +92,7 @@ class SalvagedBag:
         while at < size:
             try:
                 at = self._take_record(at, size)
-            except (_Broken, LogCorrupt, LimitExceeded) as error:
+            except (Broken, LogCorrupt, LimitExceeded) as error:
                 after = self._next_chunk(at + 1, size)
                 self.tally.bytes_lost += after - at
                 self.tally.warn(f"{error}, at byte {at}: {after - at} bytes were skipped")
@@ -99,11 +104,11 @@ class SalvagedBag:
         data_at = at + 4 + head_size + 4
         data_size = self._length(data_at - 4, size, self._config.max_record_bytes)
         self._stream.seek(at + 4)
-        fields = _fields(memoryview(self._stream.read(head_size)))
+        fields = fields_of(memoryview(self._stream.read(head_size)))
         kind = fields.get(b"op")
-        if kind not in _KINDS or (b"compression" in fields) != (kind == _CHUNK):
-            raise _Broken("a record of unknown kind")
-        if kind == _CHUNK:
+        if kind not in _KINDS or (b"compression" in fields) != (kind == CHUNK):
+            raise Broken("a record of unknown kind")
+        if kind == CHUNK:
             self._stream.seek(data_at)
             compression = fields.get(b"compression", b"").decode("ascii", "replace")
             found = self._messages_in(self._stream.read(data_size), compression)
@@ -121,41 +126,35 @@ class SalvagedBag:
         raw = self._stream.read(4)
         length = int.from_bytes(raw, "little")
         if len(raw) < 4 or at + 4 + length > size:
-            raise _Broken("the bag ends within a record")
+            raise Broken("the bag ends within a record")
         if length > most:
-            raise _Broken(f"a part of a record has {length} bytes; the limit is {most}")
+            raise Broken(f"a part of a record has {length} bytes; the limit is {most}")
         return length
 
     def _messages_in(self, stored: bytes, compression: str) -> list[tuple[int, int, memoryview]]:
         """Connection, time and data of the messages of a chunk; connections are taken up on the way."""
         if compression not in ("none", "bz2", "lz4"):
-            raise _Broken(f"a chunk of unknown compression {compression!r:.20}")
+            raise Broken(f"a chunk of unknown compression {compression!r:.20}")
         content = memoryview(unpacker(compression, self._config.max_chunk_bytes)(stored))
         found, at, new = [], 0, {}
         while at < len(content):
-            head, at = _blob(content, at)
-            data, at = _blob(content, at)
-            fields = _fields(head)
+            head, at = blob(content, at)
+            data, at = blob(content, at)
+            fields = fields_of(head)
             key = int.from_bytes(fields.get(b"conn", b""), "little")
-            if fields.get(b"op") == _CONNECTION:
-                inner = _fields(data)
-                new[key] = Connection(
-                    topic=fields.get(b"topic", b"").decode("utf-8", "replace"),
-                    type=inner.get(b"type", b"").decode("utf-8", "replace"),
-                    definition=inner.get(b"message_definition", b"").decode("utf-8", "replace"),
-                    messages=0,
-                )
-            elif fields.get(b"op") == _MESSAGE:
+            if fields.get(b"op") == CONNECTION:
+                new[key] = connection_of(fields, data)
+            elif fields.get(b"op") == MESSAGE:
                 time = fields.get(b"time", b"")
                 seconds, rest = (int.from_bytes(time[i : i + 4], "little") for i in (0, 4))
                 if len(time) != 8 or b"conn" not in fields:
-                    raise _Broken("a message without its time or connection")
+                    raise Broken("a message without its time or connection")
                 found.append((key, seconds * 1_000_000_000 + rest, data))
             else:
-                raise _Broken("a record of unknown kind in a chunk")
+                raise Broken("a record of unknown kind in a chunk")
         known = new | self._connections
         if any(key not in known for key, _, _ in found):
-            raise _Broken("a chunk rests on a connection that is lost")
+            raise Broken("a chunk rests on a connection that is lost")
         self._connections = known
         return found
 
@@ -177,24 +176,6 @@ def _is_chunk(view: memoryview, at: int) -> bool:
     """Whether a chunk record's header could begin here."""
     length = int.from_bytes(view[at : at + 4], "little")
     try:
-        return length <= _MAX_CHUNK_HEADER and _fields(_blob(view, at)[0]).get(b"op") == _CHUNK
-    except _Broken:
+        return length <= _MAX_CHUNK_HEADER and fields_of(blob(view, at)[0]).get(b"op") == CHUNK
+    except Broken:
         return False
-
-
-def _blob(view: memoryview, at: int) -> tuple[memoryview, int]:
-    """The bytes behind a length, and where they end."""
-    stop = at + 4 + int.from_bytes(view[at : at + 4], "little")
-    if at + 4 > len(view) or stop > len(view):
-        raise _Broken("a chunk ends within a record")
-    return view[at + 4 : stop], stop
-
-
-def _fields(head: memoryview) -> dict[bytes, bytes]:
-    """`name=value` fields, each behind its length."""
-    found, at = {}, 0
-    while at < len(head):
-        field, at = _blob(head, at)
-        name, _, value = bytes(field).partition(b"=")
-        found[name] = value
-    return found

@@ -1,0 +1,61 @@
+"""Losses that a search with mutations found to pass unseen, or to be read as something else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mcap.writer import CompressionType
+
+from pc2grid.config import ReadConfig
+from pc2grid.errors import FrameError, LogCorrupt
+from tests.builders import check_drive, drive, read, write_bag, write_mcap
+from tests.watching import bounded_memory
+
+
+def test_tf_may_be_among_what_is_lost_without_a_trace(tmp_path: Path) -> None:
+    """The chunk with tf and its channel is damaged, and so is the index: no guess where the sensor is."""
+    path = write_mcap(tmp_path / "a.mcap", drive(), chunk_size=200, compression=CompressionType.NONE)
+    content = bytearray(path.read_bytes())
+    place = content.index(b"/tf_static")
+    content[place : place + 4] = b"\xff\xff\xff\xff"
+    (tmp_path / "b.mcap").write_bytes(content[:-100])
+    with pytest.raises(FrameError, match="tf does not connect frame lidar to the base") as caught:
+        read(tmp_path / "b.mcap", recover=True)
+    assert "assume_identity" in str(caught.value.hint)
+    scans, report = read(tmp_path / "b.mcap", ReadConfig(assume_identity=True), recover=True)
+    assert scans
+    assert report.lossy
+
+
+@pytest.mark.parametrize("compression", ["", "bz2", "lz4"])
+@pytest.mark.parametrize("word", [b"topic=/tf_static", b"type=tf2_msgs/TFMessage", b"message_definition=geo"])
+def test_topic_that_the_index_of_a_bag_calls_otherwise(tmp_path: Path, word: bytes, compression: str) -> None:
+    """Without its tf every scan would be shifted: a bit in the index, behind all chunks, decided on that."""
+    path = write_bag(tmp_path / "a.bag", drive("ros1"), compression)
+    content = bytearray(path.read_bytes())
+    place = content.rindex(word)
+    if word.startswith(b"topic"):  # stands twice in each record, and the first counts
+        place = content.rindex(word, 0, place)
+    content[place + len(word) - 1] ^= 4
+    path.write_bytes(content)
+    with pytest.raises(LogCorrupt, match=r"the index (describes|does not)") as caught:
+        read(path)
+    assert "--recover" in str(caught.value.hint)
+    scans, report = read(path, recover=True)
+    check_drive(scans)
+    assert not report.lossy
+
+
+def test_index_of_a_bag_that_leads_to_an_absurd_length(tmp_path: Path) -> None:
+    """What stands where a chunk should begin is taken for a length of 4 GB; as much was set aside for it."""
+    path = write_bag(tmp_path / "a.bag", drive("ros1"), "bz2")
+    content = bytearray(path.read_bytes())
+    place = content.rindex(b"chunk_pos=") + len(b"chunk_pos=")
+    wrong = content.index(b"index_pos=") - 6  # in the header, where bytes of a name follow
+    content[place : place + 8] = wrong.to_bytes(8, "little")
+    path.write_bytes(content)
+    with bounded_memory(100 << 20), pytest.raises(LogCorrupt, match="where a record should begin"):
+        read(path)
+    scans, _ = read(path, recover=True)
+    check_drive(scans)
