@@ -20,6 +20,7 @@ import time
 import warnings
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 _numbers = itertools.count()
 
@@ -133,11 +134,12 @@ def server() -> Server:
     return made
 
 
-def new_database() -> str:
-    """URL of an empty database of its own."""
+def new_database(like: str | None = None) -> str:
+    """URL of a database of its own: empty, or a copy of another one that nobody uses at the moment."""
     name = f"fleet{next(_numbers)}"
+    template = f" TEMPLATE {urlsplit(like).path[1:]}" if like else ""
     with connect(server().url()) as connection:
-        connection.execute(f"CREATE DATABASE {name}")
+        connection.execute(f"CREATE DATABASE {name}{template}")
     return server().url(name)
 
 

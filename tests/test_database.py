@@ -26,6 +26,7 @@ from pc2grid.errors import (
 )
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, Loop, OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
+from signature.boundary import boundary_bins
 from signature.config import Config
 from signature.database import Label, Provenance, create_database, open_database, transfer
 from signature.database.rewrite import hold
@@ -33,6 +34,7 @@ from signature.database.sqlite import store
 from signature.database.transfer import store as store_anywhere
 from signature.database.upkeep import check, copy, merge
 from signature.describe import Signature
+from signature.freespace import freespace_bins
 from signature.similarity import distances
 from tests import postgresql
 
@@ -47,20 +49,18 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
         T_map_base=poses,
         health=(Health.FINE, Health.DEGENERATE, *[Health.FINE] * 4, Health.LOST),
     )
+    config = config or Config()
+    centers = [(0.1 * i % 1.4 + 1 / 3, 0.2 * i % 1.9 + 0.7) for i in range(submaps)]
     parts = tuple(
-        Submap(
-            submap_id=i,
-            center_m=(0.1 * i + 1 / 3, 0.7 - 0.2 * i),
-            radius_m=0.4,
-            grid=grid.crop((0.1 * i, 1.0), 0.4),
-        )
-        for i in range(submaps)
+        Submap(submap_id=i, center_m=center, radius_m=0.4, grid=grid.crop(center, 0.4))
+        for i, center in enumerate(centers)
     )
+    bins = [f(config.partition.radius_m, config.signature) for f in (boundary_bins, freespace_bins)]
     signatures = [
         Signature(
-            boundary=rng.random(20).astype(np.float32),
-            freespace=rng.random(10).astype(np.float32),
-            symmetry=rng.random(2).astype(np.float32),
+            boundary=rng.dirichlet(np.ones(bins[0])),
+            freespace=rng.dirichlet(np.ones(bins[1])),
+            symmetry=rng.random(2),
         )
         for _ in parts
     ]
@@ -75,7 +75,7 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
                 older=k,
                 newer=6 - k,
                 T_older_newer=SE2(*(rng.random(3) / 3).tolist()),
-                information=rng.random((3, 3)) * 1e4,
+                information=np.diag(rng.random(3) * 1e4),
                 accepted=k != 1,
             )
             for k in range(3)
@@ -83,9 +83,7 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
         report=ReadReport(scans_read=7, warnings=("no per-point time",)),
     )
     digest = hashlib.sha256(f"{name}{seed}".encode()).hexdigest()
-    origin = Provenance(
-        source=f"{name}.mcap", digest=digest, config=config or Config(), versions={"pc2grid": "0.1.0"}
-    )
+    origin = Provenance(source=f"{name}.mcap", digest=digest, config=config, versions={"pc2grid": "0.1.0"})
     return session_map, signatures, origin
 
 

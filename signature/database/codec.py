@@ -6,6 +6,7 @@ numbers for being finite. A ValueError says what is wrong; the caller knows wher
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from collections.abc import Iterable
@@ -47,13 +48,20 @@ def pack_array(array: NDArray[np.generic], dtype: str) -> bytes:
 
 def unpack_array(data: bytes, dtype: str, shape: tuple[int, ...]) -> NDArray[np.generic]:
     """The array back, without a copy and read-only. ValueError if length or numbers are impossible."""
-    wanted = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
-    if min(shape) < 0 or len(data) != wanted:
-        raise ValueError(f"{len(data)} bytes where {shape} of {dtype} needs {wanted}")
-    array = np.frombuffer(data, dtype=dtype).reshape(shape)
+    array = unpack_raw(data, dtype, shape)
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError("a number that is not finite")
     return array
+
+
+def unpack_raw(data: bytes, dtype: str, shape: tuple[int, ...]) -> NDArray[np.generic]:
+    """The same, for the caller to look at the numbers. ValueError if the length is impossible."""
+    if not all(isinstance(extent, int) and extent >= 0 for extent in shape):
+        raise ValueError(f"{len(data)} bytes cannot be {shape} of {dtype}")
+    wanted = math.prod(shape) * np.dtype(dtype).itemsize
+    if len(data) != wanted:
+        raise ValueError(f"{len(data)} bytes where {shape} of {dtype} needs {wanted}")
+    return np.frombuffer(data, dtype=dtype).reshape(shape)
 
 
 def pack_cells(grid: OccupancyGrid) -> bytes:

@@ -9,7 +9,7 @@ import numpy as np
 
 from pc2grid.errors import DatabaseError, NotADatabase, OutputError
 from pc2grid.model import Loop, OccupancyGrid, SessionMap, Submap, Trajectory
-from signature.database import codec, postgres_schema, rows
+from signature.database import codec, plausible, postgres_schema, rows
 from signature.database.postgres_schema import served
 from signature.database.protocol import Entry, Label, Neighbour, Problem, Provenance, SessionInfo, none_there
 from signature.database.search import embedding, rank
@@ -213,6 +213,16 @@ def _select(
         ]
 
 
+def _read_sizes(connection: Connection[Any], key: Key) -> plausible.Sizes | None:
+    """What the submaps and loops of a session must fit; None if its grid or trajectory is lost."""
+    query = (
+        "SELECT t.count, g.height, g.width, g.resolution_m, g.origin_x_m, g.origin_y_m FROM pc2grid.grid g"
+        " JOIN pc2grid.trajectory t USING (building, session_id) WHERE g.building = %s AND g.session_id = %s"
+    )
+    found = connection.execute(query, key).fetchone()
+    return None if found is None else plausible.Sizes(*found)
+
+
 def _read_sessions(
     connection: Connection[Any], where: str, condition: str, values: Any
 ) -> list[tuple[Key, SessionInfo]]:
@@ -233,9 +243,13 @@ def _read_sessions(
             raise rows.corrupt(where, name, f"has no {'grid' if resolution_m is None else 'trajectory'}")
         session = dict(zip(columns, row, strict=True))
         with rows.explained(where, name):
-            found.append(
-                ((session["building"], session["id"]), rows.read_info(session, resolution_m, scans, where))
-            )
+            info = rows.read_info(session, resolution_m, scans, where)
+            label = info.provenance.label
+            if (session["building"], session["floor"]) != (label.building or "", label.floor or ""):
+                raise ValueError(
+                    f"filed under {session['building']!r}, {session['floor']!r}, but is of {label}"
+                )
+            found.append(((session["building"], session["id"]), info))
     return found
 
 
@@ -320,8 +334,7 @@ class PostgresDatabase:
                 for row, sound in _select(self._connection, "signature", key):
                     self._believe(row, sound)
                     kept.append(row)
-        with rows.explained(self._where, "signatures"):
-            return _table(kept, index)
+        return self._described(kept, index)
 
     def nearest(
         self,
@@ -375,8 +388,9 @@ class PostgresDatabase:
                     index[key] = len(names)
                     names.append(name)
                 candidates.append(row)
+        table = self._described(candidates, index)
         with rows.explained(self._where, "signatures"):
-            return rank(query, _table(candidates, index), names, count, config)
+            return rank(query, table, names, count, config)
 
     def grid(self, session: str) -> OccupancyGrid:
         """Whole occupancy grid of a session."""
@@ -395,14 +409,16 @@ class PostgresDatabase:
         if "loop" not in postgres_schema.tables(self._format):
             return ()
         row = self._row("loop", session)
+        sizes = self._sizes(self._key(session))
         with rows.explained(self._where, f"loops of session {session!r}"):
-            return rows.read_loops(row)
+            return rows.read_loops(row, sizes)
 
     def submap(self, session: str, submap_id: int) -> Submap:
         """One submap. Raises DatabaseError if the session has none of that number."""
         row = self._row("submap", session, int(submap_id))
+        sizes = self._sizes(self._key(session))
         with rows.explained(self._where, f"submap {submap_id} of session {session!r}"):
-            return rows.read_submap(row)
+            return rows.read_submap(row, sizes)
 
     def submaps(self, session: str) -> Iterator[Submap]:
         """All submaps of a session, by id."""
@@ -410,6 +426,7 @@ class PostgresDatabase:
         with served(self._where):
             described = len(_select(self._connection, "signature", key))
             found = _select(self._connection, "submap", key)
+        sizes = self._sizes(key)
         # A row that no longer says whose it is would not be found, and not be missed either.
         if described > len(found):
             what = f"{described - len(found)} missing"
@@ -419,7 +436,7 @@ class PostgresDatabase:
             if not sound:
                 raise rows.corrupt(self._where, where, "wrong checksum")
             with rows.explained(self._where, where):
-                submap = rows.read_submap(row)
+                submap = rows.read_submap(row, sizes)
             yield submap
 
     def add(
@@ -526,8 +543,13 @@ class PostgresDatabase:
             raise rows.corrupt(self._where, f"{what} of session {session!r}", "wrong checksum")
         return row
 
+    def _sizes(self, key: Key) -> plausible.Sizes | None:
+        with served(self._where):
+            return _read_sizes(self._connection, key)
+
     def _damage(self, key: Key, tables: Sequence[str]) -> Iterator[Problem]:
         """What is wrong with the rows of a session in these tables, and which single ones it lacks."""
+        sizes = self._sizes(key)
         for table in tables:
             found = _select(self._connection, table, key)
             for row, sound in found:
@@ -536,7 +558,7 @@ class PostgresDatabase:
                 try:
                     if not sound:
                         raise ValueError("wrong checksum")
-                    rows.decode(table, row, self._where, lambda r: _table([r], {key: 0}))
+                    rows.decode(table, row, self._where, lambda r: _table([r], {key: 0}), sizes)
                 except Exception as error:
                     # Whatever the decoding of damaged content stumbles over is the finding.
                     yield Problem(name, str(error))
@@ -562,17 +584,31 @@ class PostgresDatabase:
     def _incomplete(self, key: Key) -> Iterator[Problem]:
         """Submaps that are missing, against what was stored."""
         (session, _), *_rest = _select(self._connection, "session", key)
-        stored = rows.read_info(session, 1.0, 0, self._where).submaps
-        ids = {
-            table: [row["submap_id"] for row, _ in _select(self._connection, table, key)]
-            for table in ("submap", "signature")
-        }
-        if ids["submap"] != ids["signature"] or len(ids["submap"]) != stored:
-            yield Problem(
-                f"session {session['name']!r}",
-                f"has {len(ids['submap'])} submaps and {len(ids['signature'])} signatures where {stored} were"
-                " stored",
-            )
+        count = rows.read_info(session, 1.0, 0, self._where).submaps
+        stored, described = (
+            [(row["submap_id"], row["center_x_m"], row["center_y_m"]) for row, _ in found]
+            for found in (_select(self._connection, table, key) for table in ("submap", "signature"))
+        )
+        what = rows.unlike(stored, described, count)
+        if what:
+            yield Problem(f"session {session['name']!r}", what)
+
+    def _described(self, described: Sequence[rows.Row], index: Mapping[Key, int]) -> SignatureTable:
+        """Rows of the table `signature` as arrays. Raises DatabaseCorrupt naming the first that cannot be."""
+        with rows.explained(self._where, "signatures"):
+            try:
+                table = _table(described, index)
+                if len(table):
+                    plausible.check_bins(table.boundary.shape[1], table.freespace.shape[1], self.config())
+                return table
+            except Exception:
+                # One by one, to say which.
+                for row in described:
+                    name = f"signature {row['submap_id']} of session {row['session_id']}"
+                    with rows.explained(self._where, name):
+                        alone = _table([row], {(row["building"], row["session_id"]): 0})
+                        plausible.check_bins(alone.boundary.shape[1], alone.freespace.shape[1], self.config())
+                raise
 
     def _believe(self, row: rows.Row, sound: bool) -> None:
         if not sound:
@@ -598,17 +634,32 @@ def _table(described: Sequence[rows.Row], index: Mapping[Key, int]) -> Signature
 
     if not described:
         return SignatureTable.of((), np.empty((0, 2)))
-    n = len(described)
 
     def joined(name: str) -> Any:
-        width = len(described[0][name]) // 4
-        return codec.unpack_array(b"".join(row[name] for row in described), "<f4", (n, width))
+        values = [row[name] for row in described]
+        width = len(values[0]) // 4
+        # Some shorter and some longer ones can have the right length together.
+        for value in values:
+            if len(value) != 4 * width:
+                raise ValueError(f"{name} of {len(value)} bytes among others of {4 * width}")
+        return codec.unpack_raw(b"".join(values), "<f4", (len(described), width))
 
+    def numbers(kind: type, *names: str) -> Any:
+        return np.array([[row[name] for name in names] for row in described], kind)
+
+    boundary, freespace, symmetry = joined("boundary"), joined("freespace"), joined("symmetry")
+    submap_id, center_m = (
+        numbers(np.int32, "submap_id")[:, 0],
+        numbers(np.float64, "center_x_m", "center_y_m"),
+    )
+    plausible.check_histograms(boundary, "boundary")
+    plausible.check_histograms(freespace, "freespace")
+    plausible.check_described(submap_id, center_m, symmetry)
     return SignatureTable(
-        boundary=joined("boundary"),
-        freespace=joined("freespace"),
-        symmetry=joined("symmetry"),
+        boundary=boundary,
+        freespace=freespace,
+        symmetry=symmetry,
         session_index=np.array([index[row["building"], row["session_id"]] for row in described], np.int32),
-        submap_id=np.array([row["submap_id"] for row in described], np.int32),
-        center_m=np.array([(row["center_x_m"], row["center_y_m"]) for row in described], np.float64),
+        submap_id=submap_id,
+        center_m=center_m,
     )

@@ -15,7 +15,7 @@ import numpy as np
 from pc2grid.errors import DatabaseCorrupt, DatabaseError, DatabaseVersion
 from pc2grid.geometry import SE2
 from pc2grid.model import Loop, OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
-from signature.database import codec, schema
+from signature.database import codec, plausible, schema
 from signature.database.protocol import Entry, Label, Provenance, SessionInfo
 
 if TYPE_CHECKING:
@@ -48,8 +48,13 @@ def select(
 
 
 def storable(entry: Entry) -> Entry:
-    """The entry with names that are text: what is none in the name of a file is shown as `\\xff`."""
+    """The entry with names that are text: what is none in the name of a file is shown as `\\xff`.
+
+    Raises ValueError for signatures that its settings do not make.
+    """
     session_map, signatures, provenance = entry
+    for signature in signatures:
+        plausible.check_bins(len(signature.boundary), len(signature.freespace), provenance.config)
     name, source = (
         text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
         for text in (session_map.session, provenance.source)
@@ -118,43 +123,56 @@ def read_info(row: Row, resolution_m: float, scans: int, path: Path | str) -> Se
 
     from signature.config import Config
 
+    name, sensor = plausible.text(row["name"], "name"), plausible.text(row["sensor"], "sensor")
     content = json.loads(row["document"])
+    versions = {plausible.text(k, "version"): plausible.text(v, k) for k, v in content["versions"].items()}
     try:
         config = Config.model_validate(content["config"])
     except ValidationError as error:
         what = ".".join(map(str, error.errors()[0]["loc"]))
-        made_by = content["versions"].get("pc2grid", "an unknown version")
+        made_by = versions.get("pc2grid", "an unknown version")
         raise DatabaseVersion(
-            f"{path}: session {row['name']!r} was made by pc2grid {made_by} with the setting {what},"
+            f"{path}: session {name!r} was made by pc2grid {made_by} with the setting {what},"
             " which this version does not understand",
             hint="convert the recording again, or use that version",
         ) from None
+
+    def not_negative(key: str) -> float:
+        return plausible.number(content[key], key, 0.0, plausible.MOST)
+
+    def text_or_none(key: str) -> str | None:
+        return None if content.get(key) is None else plausible.text(content[key], key)
+
+    digest = plausible.text(content["digest"], "digest")
     report = content["report"]
     return SessionInfo(
-        name=row["name"],
-        sensor=row["sensor"],
-        digest=content["digest"],
-        submaps=content["submaps"],
-        resolution_m=resolution_m,
-        area_m2=content["area_m2"],
-        path_m=content["path_m"],
-        duration_s=content["driven_s"],
-        scans=scans,
+        name=name,
+        sensor=sensor,
+        digest=digest,
+        submaps=plausible.count(content["submaps"], "submaps"),
+        resolution_m=plausible.number(resolution_m, "resolution_m", *plausible.RESOLUTION_M),
+        area_m2=not_negative("area_m2"),
+        path_m=not_negative("path_m"),
+        duration_s=not_negative("driven_s"),
+        scans=plausible.count(scans, "scans"),
         report=ReadReport(
-            scans_read=report["scans_read"],
-            points_dropped=report["points_dropped"],
-            scans_skipped=report["scans_skipped"],
-            bytes_lost=report["bytes_lost"],
-            warnings=tuple(report["warnings"]),
+            scans_read=plausible.count(report["scans_read"], "scans_read"),
+            points_dropped=plausible.count(report["points_dropped"], "points_dropped"),
+            scans_skipped={
+                plausible.text(reason, "reason"): plausible.count(skipped, reason)
+                for reason, skipped in report["scans_skipped"].items()
+            },
+            bytes_lost=plausible.count(report["bytes_lost"], "bytes_lost"),
+            warnings=tuple(plausible.text(warning, "warning") for warning in report["warnings"]),
         ),
         provenance=Provenance(
-            source=content["source"],
-            digest=content["digest"],
+            source=plausible.text(content["source"], "source"),
+            digest=digest,
             config=config,
-            start_s=content["start_s"],
-            duration_s=content["duration_s"],
-            versions=content["versions"],
-            label=Label(building=content.get("building"), floor=content.get("floor")),
+            start_s=plausible.number(content["start_s"], "start_s"),
+            duration_s=None if content["duration_s"] is None else not_negative("duration_s"),
+            versions=versions,
+            label=Label(building=text_or_none("building"), floor=text_or_none("floor")),
         ),
     )
 
@@ -182,53 +200,67 @@ def signature_row(submaps: Sequence[Submap], signatures: Sequence[Signature]) ->
 
 
 def read_signature_arrays(row: Row) -> dict[str, Any]:
-    """The arrays of a signature row by the names of SignatureTable. ValueError if they do not fit."""
+    """The arrays of a signature row by the names of SignatureTable. ValueError if they cannot be true."""
     n = row["count"]
-    return {
+    arrays: dict[str, Any] = {
         "submap_id": codec.unpack_array(row["submap_id"], "<i4", (n,)),
         "center_m": codec.unpack_array(row["center_m"], "<f8", (n, 2)),
-        "boundary": codec.unpack_array(row["boundary"], "<f4", (n, row["boundary_bins"])),
-        "freespace": codec.unpack_array(row["freespace"], "<f4", (n, row["freespace_bins"])),
+        "boundary": codec.unpack_raw(row["boundary"], "<f4", (n, row["boundary_bins"])),
+        "freespace": codec.unpack_raw(row["freespace"], "<f4", (n, row["freespace_bins"])),
         "symmetry": codec.unpack_array(row["symmetry"], "<f4", (n, 2)),
     }
+    for name in ("boundary", "freespace"):
+        plausible.check_histograms(arrays[name], name)
+    plausible.check_described(arrays["submap_id"], arrays["center_m"], arrays["symmetry"])
+    plausible.check_order(arrays["submap_id"])
+    return arrays
 
 
 def read_grid(row: Row) -> OccupancyGrid:
     """A grid row, or the grid half of a submap row."""
-    return OccupancyGrid(
-        cells=codec.unpack_cells(row["cells"], row["height"], row["width"]),
+    height, width = (plausible.count(row[name], name) for name in ("height", "width"))
+    grid = OccupancyGrid(
+        cells=codec.unpack_cells(row["cells"], height, width),
         resolution_m=row["resolution_m"],
         origin_m=(row["origin_x_m"], row["origin_y_m"]),
     )
+    plausible.check_grid(grid)
+    return grid
 
 
-def read_submap(row: Row) -> Submap:
-    """A submap row."""
-    return Submap(
+def read_submap(row: Row, sizes: plausible.Sizes | None) -> Submap:
+    """A submap row of a session of these sizes."""
+    submap = Submap(
         submap_id=row["submap_id"],
         center_m=(row["center_x_m"], row["center_y_m"]),
         radius_m=row["radius_m"],
         grid=read_grid(row),
     )
+    plausible.check_submap(submap, sizes)
+    return submap
 
 
 def read_trajectory(row: Row) -> Trajectory:
     """A trajectory row."""
     n = row["count"]
-    return Trajectory(
+    trajectory = Trajectory(
         stamps_ns=codec.unpack_array(row["stamps_ns"], "<i8", (n,)),  # type: ignore[arg-type]
         T_map_base=codec.unpack_poses(row["poses"], n),
         health=codec.unpack_health(row["health"]),
     )
+    plausible.check_stamps(trajectory.stamps_ns)
+    plausible.check_poses(trajectory.T_map_base)
+    return trajectory
 
 
-def read_loops(row: Row) -> tuple[Loop, ...]:
-    """A loop row: all loops of a session. ValueError if its arrays do not fit."""
+def read_loops(row: Row, sizes: plausible.Sizes | None) -> tuple[Loop, ...]:
+    """A loop row: all loops of a session of these sizes. ValueError if its arrays cannot be true."""
     n = row["count"]
-    pairs = codec.unpack_array(row["pairs"], "<i4", (n, 2))
-    measured = codec.unpack_array(row["measured"], "<f8", (n, 3))
-    information = codec.unpack_array(row["information"], "<f8", (n, 3, 3))
-    accepted = codec.unpack_array(row["accepted"], "u1", (n,))
+    pairs: Any = codec.unpack_array(row["pairs"], "<i4", (n, 2))
+    measured: Any = codec.unpack_array(row["measured"], "<f8", (n, 3))
+    information: Any = codec.unpack_array(row["information"], "<f8", (n, 3, 3))
+    accepted: Any = codec.unpack_array(row["accepted"], "u1", (n,))
+    plausible.check_loops(pairs, measured, information, accepted, None if sizes is None else sizes.scans)
     return tuple(
         Loop(
             older=int(pairs[k, 0]),
@@ -260,6 +292,21 @@ def refuse_other_settings(known: SessionInfo, config: Config, resolution_m: floa
             )
 
 
+def unlike(
+    stored: Sequence[tuple[int, float, float]], described: Sequence[tuple[int, float, float]], count: int
+) -> str | None:
+    """What is wrong between submaps and signatures, each by its number and centre; None if nothing is.
+
+    count : how many the session was stored with.
+    """
+    if not len(stored) == len(described) == count or [s[0] for s in stored] != [d[0] for d in described]:
+        return f"has {len(stored)} submaps and {len(described)} signatures where {count} were stored"
+    for submap, signature in zip(stored, described, strict=True):
+        if submap != signature:
+            return f"submap {submap[0]} lies elsewhere than its signature says"
+    return None
+
+
 def corrupt(path: Path | str, where: str, what: str) -> DatabaseCorrupt:
     """The error for a row that cannot be believed."""
     return DatabaseCorrupt(f"{path}: damaged: {where}: {what}", hint=schema.SALVAGE)
@@ -283,7 +330,9 @@ def explained(path: Path | str, where: str) -> Iterator[None]:
         AttributeError,
         RecursionError,
     ) as error:
-        raise corrupt(path, where, f"{type(error).__name__}: {error}") from error
+        # What we say of a value ourselves needs no name; what others stumble over does.
+        said = str(error) if type(error) is ValueError else f"{type(error).__name__}: {error}"
+        raise corrupt(path, where, said) from error
 
 
 def grid_row(grid: OccupancyGrid) -> Row:
@@ -331,10 +380,17 @@ def submap_row(submap: Submap) -> Row:
     }
 
 
-def decode(table: str, row: Row, where: Path | str, read_signatures: Callable[[Row], object]) -> None:
+def decode(
+    table: str,
+    row: Row,
+    where: Path | str,
+    read_signatures: Callable[[Row], object],
+    sizes: plausible.Sizes | None,
+) -> None:
     """Decode a row of any table, to see whether it can be; raises whatever its damage leads to.
 
     read_signatures : decodes a row of the table `signature`, the one that engines store differently.
+    sizes : of the row's session; None if they are not known.
     """
     if table == "session":
         read_info(row, 1.0, 0, where)
@@ -343,8 +399,8 @@ def decode(table: str, row: Row, where: Path | str, read_signatures: Callable[[R
     elif table == "trajectory":
         read_trajectory(row)
     elif table == "loop":
-        read_loops(row)
+        read_loops(row, sizes)
     elif table == "submap":
-        read_submap(row)
+        read_submap(row, sizes)
     else:
         read_signatures(row)

@@ -12,7 +12,7 @@ import numpy as np
 from pc2grid.errors import DatabaseError
 from pc2grid.io.atomic import refuse_existing
 from pc2grid.model import Loop, OccupancyGrid, SessionMap, Submap, Trajectory
-from signature.database import rows, schema, upkeep
+from signature.database import plausible, rows, schema, upkeep
 from signature.database.protocol import (
     Entry,
     Neighbour,
@@ -22,7 +22,13 @@ from signature.database.protocol import (
     none_there,
 )
 from signature.database.rewrite import BUSY_TIMEOUT_S, rewrite
-from signature.database.sqlite_file import connect, damaged_sessions, read_sessions
+from signature.database.sqlite_file import (
+    connect,
+    damaged_sessions,
+    iter_sessions,
+    read_sessions,
+    read_sizes,
+)
 
 if TYPE_CHECKING:
     from signature.config import Config
@@ -110,8 +116,8 @@ class SqliteDatabase:
         """The configuration of the first session; the default if there is none."""
         from signature.config import Config
 
-        sessions = self.sessions()
-        return sessions[0].provenance.config if sessions else Config()
+        first = next(iter_sessions(self._connection, self._path, self._left_out), None)
+        return first[1].provenance.config if first else Config()
 
     def signatures(self, session: str | None = None) -> SignatureTable:
         """All signatures, or those of one session; `session_index` counts in the order of `sessions()`."""
@@ -120,7 +126,7 @@ class SqliteDatabase:
         index = {session_id: i for i, session_id in enumerate(self._ids().values())}
         only = ("1",) if session is None else ("session_id = ?", self._id(session))
         table: dict[str, Any] = {}
-        filled = 0
+        filled, config = 0, self.config()
         with rows.explained(self._path, "signatures"):
             # Lengths of blobs are as large as the file at most, whatever a damaged row says of itself.
             query = f"SELECT sum(length(submap_id)) / 4 FROM signature WHERE {only[0]}"
@@ -133,8 +139,10 @@ class SqliteDatabase:
                     raise rows.corrupt(self._path, where, "wrong checksum")
                 if not row["count"]:
                     continue
-                arrays = rows.read_signature_arrays(row)
-                arrays["session_index"] = np.full(row["count"], index[row["session_id"]], np.int32)
+                with rows.explained(self._path, where):
+                    arrays = rows.read_signature_arrays(row)
+                    plausible.check_bins(row["boundary_bins"], row["freespace_bins"], config)
+                    arrays["session_index"] = np.full(row["count"], index[row["session_id"]], np.int32)
                 # Row by row into place, so that no more than one session is in memory twice.
                 for name, values in arrays.items():
                     if name not in table:
@@ -179,14 +187,14 @@ class SqliteDatabase:
         """Where the session came back to a place; see `SubmapDatabase.loops`."""
         row = self._row("loop", session, "session_id = ?", self._id(session))
         with rows.explained(self._path, f"loops of session {session!r}"):
-            return rows.read_loops(row)
+            return rows.read_loops(row, read_sizes(self._connection, row["session_id"]))
 
     def submap(self, session: str, submap_id: int) -> Submap:
         """One submap. Raises DatabaseError if the session has none of that number."""
         where = "session_id = ? AND submap_id = ?"
         row = self._row("submap", session, where, self._id(session), int(submap_id))
         with rows.explained(self._path, f"submap {submap_id} of session {session!r}"):
-            return rows.read_submap(row)
+            return rows.read_submap(row, read_sizes(self._connection, row["session_id"]))
 
     def submaps(self, session: str) -> Iterator[Submap]:
         """All submaps of a session, by id."""
@@ -194,11 +202,14 @@ class SqliteDatabase:
         with rows.explained(self._path, f"submaps of session {session!r}"):
             query = "SELECT count FROM signature WHERE session_id = ?"
             (missing,) = self._connection.execute(query, (session_id,)).fetchone() or (0,)
+            sizes = read_sizes(self._connection, session_id)
             for row, sound in rows.select(self._connection, "submap", "session_id = ?", session_id):
+                where = f"submap {row['submap_id']} of session {session!r}"
                 if not sound:
-                    where = f"submap {row['submap_id']} of session {session!r}"
                     raise rows.corrupt(self._path, where, "wrong checksum")
-                yield rows.read_submap(row)
+                with rows.explained(self._path, where):
+                    submap = rows.read_submap(row, sizes)
+                yield submap
                 missing -= 1
             # A row that no longer says whose it is would not be found, and not be missed either.
             if missing:

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from urllib.parse import quote
 
-from signature.database import rows, schema
+from signature.database import plausible, rows, schema
 from signature.database.older import bring_along
 from signature.database.protocol import Problem, SessionInfo
 
@@ -53,7 +53,13 @@ def read_sessions(
     connection: sqlite3.Connection, path: Path, without: Collection[int] = ()
 ) -> list[tuple[int, SessionInfo]]:
     """All sessions but those of the numbers `without`, with their numbers. Raises DatabaseCorrupt."""
-    sessions = []
+    return list(iter_sessions(connection, path, without))
+
+
+def iter_sessions(
+    connection: sqlite3.Connection, path: Path, without: Collection[int] = ()
+) -> Iterator[tuple[int, SessionInfo]]:
+    """The same, one after the other."""
     with rows.explained(path, "session"):
         # The sizes come from rows whose own checksum is looked at when they are used.
         resolution_m = dict(connection.execute("SELECT session_id, resolution_m FROM grid"))
@@ -61,17 +67,32 @@ def read_sessions(
         for row, sound in rows.select(connection, "session"):
             if row["id"] in without:
                 continue
+            where = f"session {row['id']}"
             if not sound:
-                raise rows.corrupt(path, f"session {row['id']}", "wrong checksum")
-            info = rows.read_info(row, resolution_m[row["id"]], scans[row["id"]], path)
-            sessions.append((row["id"], info))
-    return sessions
+                raise rows.corrupt(path, where, "wrong checksum")
+            with rows.explained(path, where):
+                info = rows.read_info(row, resolution_m[row["id"]], scans[row["id"]], path)
+            yield row["id"], info
+
+
+def read_sizes(connection: sqlite3.Connection, session_id: int) -> plausible.Sizes | None:
+    """What the submaps and loops of a session must fit; None if its grid or trajectory is lost.
+
+    Like all that is read of other rows, believed only until their own checksum is looked at.
+    """
+    query = (
+        "SELECT t.count, g.height, g.width, g.resolution_m, g.origin_x_m, g.origin_y_m"
+        " FROM grid g JOIN trajectory t ON t.session_id = g.session_id WHERE g.session_id = ?"
+    )
+    found = connection.execute(query, (session_id,)).fetchone()
+    return None if found is None else plausible.Sizes(*found)
 
 
 def read_table(
     connection: sqlite3.Connection, path: Path, table: str, where: str = "1", *values: int
 ) -> Iterator[tuple[rows.Row | None, Problem | None]]:
     """Each row, and what is wrong with it: it must match its checksum and decode."""
+    session_id, sizes = None, None
     try:
         for row, sound in rows.select(connection, table, where, *values):
             number = row["submap_id"] if table == "submap" else row.get("id", row.get("session_id"))
@@ -79,7 +100,9 @@ def read_table(
             try:
                 if not sound:
                     raise ValueError("wrong checksum")
-                rows.decode(table, row, path, rows.read_signature_arrays)
+                if table in ("submap", "loop") and row["session_id"] != session_id:
+                    session_id, sizes = row["session_id"], read_sizes(connection, row["session_id"])
+                rows.decode(table, row, path, rows.read_signature_arrays, sizes)
             except Exception as error:
                 # Whatever the decoding of damaged content stumbles over is the finding.
                 yield row, Problem(name, str(error))

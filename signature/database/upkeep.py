@@ -107,15 +107,16 @@ def _counts(connection: sqlite3.Connection, path: Path) -> Iterator[Problem]:
             query = f"SELECT count(*) FROM {table} WHERE session_id = ?"
             if connection.execute(query, (session_id,)).fetchone() != (1,):
                 yield Problem(f"session {info.name!r}", f"has no {table}")
-        query = "SELECT submap_id FROM submap WHERE session_id = ? ORDER BY id"
-        ids = [submap_id for (submap_id,) in connection.execute(query, (session_id,))]
+        query = "SELECT submap_id, center_x_m, center_y_m FROM submap WHERE session_id = ? ORDER BY id"
+        stored = connection.execute(query, (session_id,)).fetchall()
         row = next(rows.select(connection, "signature", "session_id = ?", session_id), None)
-        described = list(rows.read_signature_arrays(row[0])["submap_id"]) if row else []
-        if not len(ids) == len(described) == info.submaps or ids != described:
-            yield Problem(
-                f"session {info.name!r}",
-                f"has {len(ids)} submaps and {len(described)} signatures where {info.submaps} were stored",
-            )
+        if row is None:
+            continue
+        arrays = rows.read_signature_arrays(row[0])
+        described = list(zip(arrays["submap_id"].tolist(), *arrays["center_m"].T.tolist(), strict=True))
+        what = rows.unlike(stored, described, info.submaps)
+        if what:
+            yield Problem(f"session {info.name!r}", what)
 
 
 def _copy_sessions(
