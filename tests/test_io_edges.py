@@ -250,6 +250,14 @@ def test_lasers_that_contradict_themselves(scan: LaserScan, error: type[Exceptio
         laserscan.decode(scan, max_points=100)
 
 
+def test_laser_whose_beams_would_take_years_is_taken_at_one_time() -> None:
+    for wrong in (0.5, -0.5, 1e30):
+        found = laserscan.decode(beams(time_increment=wrong))
+        assert found.offsets_s is None
+        assert found.note == "time_increment makes a sweep longer than 2 s: no deskewing"
+    assert laserscan.decode(beams(time_increment=0.4)).note is None
+
+
 def test_beams_and_their_times() -> None:
     found = laserscan.decode(beams(time_increment=0.01, range_min=2.0, range_max=5.0))
     assert found.dropped == 2  # 1 m is too near, 5 m is the reach itself

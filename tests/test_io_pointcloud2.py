@@ -149,3 +149,27 @@ def test_times_that_fit_no_unit_are_refused_with_the_key_to_set() -> None:
     with pytest.raises(PointCloudError, match=r"read\.point_time"):
         decode(message)
     assert decode(message, unit="none").offsets_s is None
+
+
+@pytest.mark.parametrize(
+    ("unit", "kind", "values"),
+    [
+        ("s", 7, [0.0, 0.05, 1e30]),
+        ("s", 8, [0.0, 0.05, 1e300]),
+        ("s", 8, [0.0, 0.05, 2.1]),
+        ("s", 8, [-1e300, 0.05, 1e308]),
+        ("ns", 6, [0, 100_000_000, 0xFFFFFFFF]),
+        ("ns", 10, [STAMP, STAMP + 100_000_000, 1 << 63]),
+        ("us", 10, [STAMP, STAMP + 50_000_000, STAMP + 100_000_000]),
+    ],
+)
+def test_times_of_a_known_unit_that_no_scan_can_span(unit: str, kind: int, values: list[float]) -> None:
+    """One flipped bit, or another unit than was said: seconds become years."""
+    data = b"".join(struct.pack("<3f" + CODES[kind], 1, 2, 3, v) for v in values)
+    message = PointCloud2(
+        Header(STAMP, ""), 1, 3, (*XYZ, ("t", 12, kind, 1)), False, len(data) // 3, len(data), data
+    )
+    with pytest.raises(PointCloudError, match=rf"field t: times that span .* s, read as {unit}") as caught:
+        decode(message, unit=unit)
+    assert "read.point_time=" in str(caught.value.hint)
+    assert decode(message, unit="none").offsets_s is None

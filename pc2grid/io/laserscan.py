@@ -9,7 +9,7 @@ import numpy as np
 
 from pc2grid.errors import LimitExceeded, PointCloudError
 from pc2grid.io.messages import LaserScan
-from pc2grid.io.pointcloud2 import Points
+from pc2grid.io.pointcloud2 import LONGEST_SWEEP_S, Points
 from pc2grid.model import F32
 
 # No laser turns through so many angles, and their directions are kept.
@@ -20,7 +20,7 @@ def decode(scan: LaserScan, *, max_points: int = 20_000_000) -> Points:
     """Returns of a scan: beams with NaN, inf, or a range outside [range_min, range_max) are dropped.
 
     A range of exactly range_max is what most drivers write when nothing came back.
-    Offsets come from `time_increment` where it is set.
+    Offsets come from `time_increment` where it is set, unless no sweep can last so long.
 
     Raises PointCloudError if the angles contradict the number of ranges.
     """
@@ -45,10 +45,13 @@ def decode(scan: LaserScan, *, max_points: int = 20_000_000) -> Points:
     kept = ranges[keep]
     points = np.zeros((len(kept), 3), dtype=np.float32)
     points[:, :2] = kept[:, None] * _directions(count, scan.angle_min, scan.angle_increment)[keep]
-    offsets = None
+    offsets, note = None, None
     if math.isfinite(scan.time_increment) and abs(scan.time_increment) > 1e-9:
-        offsets = (np.flatnonzero(keep) * scan.time_increment).astype(np.float32)
-    return Points(points, offsets, count - len(kept))
+        if count * abs(scan.time_increment) <= LONGEST_SWEEP_S:
+            offsets = (np.flatnonzero(keep) * scan.time_increment).astype(np.float32)
+        else:
+            note = f"time_increment makes a sweep longer than {LONGEST_SWEEP_S:g} s: no deskewing"
+    return Points(points, offsets, count - len(kept), note)
 
 
 @functools.lru_cache(maxsize=4)

@@ -33,7 +33,8 @@ _DATATYPES = {
 _TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "offset_time", "time_offset", "time_stamp", "ts")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 # A sweep takes between 2 ms and 2 s, so the span of its times tells the unit: no two of them overlap.
-_SWEEP_S = (2e-3, 2.0)
+LONGEST_SWEEP_S = 2.0
+_SWEEP_S = (2e-3, LONGEST_SWEEP_S)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +148,7 @@ def _offsets(
     """Seconds relative to the stamp, from finite times, and how they were understood; None if all times are
     the same.
 
-    Raises PointCloudError if the unit cannot be told.
+    Raises PointCloudError if the unit cannot be told, or the times span longer than any scan.
     """
     whole = values.dtype.kind in "iu"
     if not len(values):
@@ -165,6 +166,11 @@ def _offsets(
             )
         unit = fitting[0]
     scale = _SECONDS[unit]
+    if span * scale > LONGEST_SWEEP_S:
+        raise PointCloudError(
+            f"field {name}: times that span {span * scale:g} s, read as {unit}",
+            hint="--set read.point_time=s|ms|us|ns says otherwise, none ignores them",
+        )
     stamp = stamp_ns * 1e-9
     if abs(float(first) * scale) <= 10.0 and abs(float(last) * scale) <= 10.0:
         return values if scale == 1.0 else values.astype(np.float64) * scale, None
