@@ -110,19 +110,20 @@ def pose_from_xyz_quat(xyz_m: ArrayLike, quat_xyzw: ArrayLike) -> F64:
 
     Raises ValueError for a quaternion of length zero or not finite.
     """
-    x, y, z, w = (float(v) for v in np.asarray(quat_xyzw, dtype=np.float64))
+    x, y, z, w = np.asarray(quat_xyzw, dtype=np.float64).tolist()
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     if not math.isfinite(norm) or norm < 1e-9:
         raise ValueError(f"quaternion has no direction: {(x, y, z, w)}")
     x, y, z, w = x / norm, y / norm, z / norm, w / norm
-    pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    pose[:3, 3] = np.asarray(xyz_m, dtype=np.float64)
-    return pose
+    tx, ty, tz = np.asarray(xyz_m, dtype=np.float64).tolist()
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), tx],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), ty],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), tz],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def quat_xyzw_from_pose(T_target_source: F64) -> F64:

@@ -45,20 +45,23 @@ UNCHECKED = [
 WARNED = [kind for kind in UNCHECKED if kind != "bag bz2"]
 KINDS = [*CHECKED, *UNCHECKED]
 COUNT = int(os.environ.get("PC2GRID_FUZZ", "30"))
-SCANS = 10  # fewer, and one that is lost would be more than the tenth that a reader puts up with
+# Fewer, and one that is lost would be more than the tenth that a reader puts up with; where every chunk has
+# a checksum, whole chunks are lost and not single scans.
+SCANS, SCANS_IN_CHUNKS = 10, 6
 WITH_ODOMETRY = 3  # of them: each has as many bytes as all of the clouds, and most are covariances
 
 
-def messages(dialect: Dialect = "ros2") -> list[Message]:
+def messages(dialect: Dialect = "ros2", scans: int = SCANS) -> list[Message]:
     last_ns = T0 + WITH_ODOMETRY * STEP
-    return [m for m in drive(dialect, SCANS) if m.topic != "/odom" or m.log_time_ns < last_ns]
+    return [m for m in drive(dialect, scans) if m.topic != "/odom" or m.log_time_ns < last_ns]
 
 
 def small_log(folder: Path, kind: str) -> Path:
     if kind in MCAP:
-        return write_mcap(folder / "a.mcap", messages(), **MCAP[kind])
+        scans = SCANS_IN_CHUNKS if "chunk_size" in MCAP[kind] else SCANS
+        return write_mcap(folder / "a.mcap", messages(scans=scans), **MCAP[kind])
     if kind == "mcap ros1":
-        return write_mcap(folder / "a.mcap", messages("ros1"), "ros1", chunk_size=1500)
+        return write_mcap(folder / "a.mcap", messages("ros1", SCANS_IN_CHUNKS), "ros1", chunk_size=1500)
     if kind.startswith("bag"):
         return write_bag(folder / "a.bag", messages("ros1"), kind[4:], chunk_bytes=1500)
     if kind == "db3":
@@ -66,8 +69,8 @@ def small_log(folder: Path, kind: str) -> Path:
     if kind.startswith("rosbag2"):
         suffix = kind.split()[1]
         log = write_rosbag2(folder / "log", messages(), "mcap" if suffix == "mcap" else "sqlite3")
-        if suffix == "mcap":
-            write_mcap(log / "log.mcap", messages(), **MCAP["mcap zstd"])  # rosbags writes no checksums
+        if suffix == "mcap":  # rosbags writes no checksums
+            write_mcap(log / "log.mcap", messages(scans=SCANS_IN_CHUNKS), **MCAP["mcap zstd"])
         else:
             with_one_profile(log / "log.db3")
         # Only this is read of it: elsewhere damage would change nothing.

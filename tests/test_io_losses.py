@@ -9,7 +9,7 @@ from mcap.writer import CompressionType
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import FrameError, LogCorrupt
-from tests.builders import check_drive, drive, read, write_bag, write_mcap
+from tests.builders import check_drive, drive, read, write_bag, write_mcap, write_rosbag2
 from tests.watching import bounded_memory
 
 
@@ -59,3 +59,16 @@ def test_index_of_a_bag_that_leads_to_an_absurd_length(tmp_path: Path) -> None:
         read(path)
     scans, _ = read(path, recover=True)
     check_drive(scans)
+
+
+def test_last_message_of_a_db3_whose_row_became_another(tmp_path: Path) -> None:
+    """A bit in the types of its columns: the number of the last one is not missed between others."""
+    path = write_rosbag2(tmp_path / "log", drive()) / "log.db3"
+    content = bytearray(path.read_bytes())
+    place = content.index(bytes([6, 0, 1, 6]))  # length; null for the number, then the topic and the time
+    content[place + 1] = 0x80
+    path.write_bytes(content)
+    scans, report = read(path, recover=True)
+    assert len(scans) == 11
+    assert report.lossy
+    assert "1 rows are of no kind that rosbag2 writes" in report.warnings

@@ -95,6 +95,7 @@ class SalvagedBag:
             except (Broken, LogCorrupt, LimitExceeded) as error:
                 after = self._next_chunk(at + 1, size)
                 self.tally.bytes_lost += after - at
+                self.tally.topics_lost |= after < size
                 self.tally.warn(f"{error}, at byte {at}: {after - at} bytes were skipped")
                 at = after
 

@@ -38,6 +38,7 @@ class SalvagedDb3:
             raise LogCorrupt(f"{path}: a damaged .db3: {error}", hint="nothing to recover") from error
         self._topics: dict[int, Row] = {}
         self._definitions: dict[str, Row] = {}
+        self._strange = 0
         found = self._survey()
         self._count_losses(found)
         if self.tally.bytes_lost and not recover:
@@ -93,15 +94,18 @@ class SalvagedDb3:
                 self.tally.warn(f"{error}, on page {place.page}")
                 continue
             match row.values:
-                case (None, int(topic), int(time_ns), bytes()) if row.rowid not in numbers:
-                    numbers.add(row.rowid)
-                    index.extend((time_ns, row.rowid, topic, *place))
+                case (None, int(topic), int(time_ns), bytes()):
+                    if row.rowid not in numbers:
+                        numbers.add(row.rowid)
+                        index.extend((time_ns, row.rowid, topic, *place))
                 case (None, str(), str(kind), str(), *_) if "/" in kind:
                     self._topics.setdefault(row.rowid, row)
                 case (None, str(kind), str(), str(), *_):
                     self._definitions.setdefault(kind, row)
+                case (None, str()) | (None, int(), str()) | (str(), str(), str(), *_):
+                    pass  # versions, what metadata.yaml says, tables: nobody here reads them
                 case _:
-                    pass  # of a table that nobody here reads
+                    self._strange += 1
         return np.frombuffer(index, np.int64).reshape(-1, 5)
 
     def _count_losses(self, found: I64) -> None:
@@ -122,10 +126,12 @@ class SalvagedDb3:
         homeless = int(np.count_nonzero(~np.isin(found[:, 2], list(self._topics))))
         if homeless:
             self.tally.warn(f"{homeless} messages are of a topic that is lost")
+            self.tally.topics_lost = True
+        if self._strange:
+            self.tally.warn(f"{self._strange} rows are of no kind that rosbag2 writes")
         whole_pages = unused * pages.page_size + pages.bytes_missing + pages.wal_bytes_lost
-        self.tally.bytes_lost += max(
-            whole_pages, gone + homeless
-        )  # of the numbered ones a byte each, at least
+        # Of the numbered ones a byte each, at least.
+        self.tally.bytes_lost += max(whole_pages, gone + homeless + self._strange)
 
     def _topic(self, key: int) -> TopicInfo:
         _, name, kind, serialization, *_ = self._topics[key].values

@@ -75,6 +75,7 @@ class McapSource:
                 found = read_summary(self._stream, size, self._limits)
                 if isinstance(found, Survey):
                     known, listed = found.definitions, found.chunks
+        told = bool(known.channels)
         made = survey(self._stream, size, self._limits, resync=self._recover, known=known)
         there = {chunk.offset for chunk in made.chunks}
         hidden = [chunk for chunk in listed if chunk.offset not in there]
@@ -84,6 +85,7 @@ class McapSource:
             made.warnings.append(f"{len(hidden)} chunks that the index lists are not there")
         self.tally.warnings += made.warnings
         self.tally.bytes_lost += made.bytes_lost
+        self.tally.topics_lost = made.holes and not told
         if made.damage is not None and not self._recover:
             seconds = (made.end_ns - made.start_ns) * 1e-9
             count = sum(made.counts.values())

@@ -27,7 +27,8 @@ class Survey:
 
     chunks : whole chunks, by place. loose : byte spans that hold messages outside chunks.
     counts : messages per channel, complete if `counted`. data_end, data_crc : end and checksum of the data
-    section (0: none). damage : the first thing that is wrong, or None. bytes_lost : how much was given up.
+    section (0: none). damage : the first thing that is wrong, or None. bytes_lost : how much was given up,
+    and holes : whether in front of something that was read.
     """
 
     definitions: Definitions = field(default_factory=Definitions)
@@ -41,6 +42,7 @@ class Survey:
     data_crc: int = 0
     damage: Damage | None = None
     bytes_lost: int = 0
+    holes: bool = False
     warnings: list[str] = field(default_factory=list)
 
     def count(self, channel_id: int, log_time_ns: int) -> None:
@@ -73,6 +75,7 @@ def survey(stream: BinaryIO, size: int, limits: rec.Limits, *, resync: bool, kno
                 f"{damage.what}, at byte {damage.offset}: {next_at - damage.offset} bytes were skipped"
             )
             found.bytes_lost += next_at - damage.offset
+            found.holes |= next_at < size
             at = next_at
     found.loose = _joined(found.loose)
     return found
@@ -92,6 +95,7 @@ def _walk(stream: BinaryIO, at: int, size: int, limits: rec.Limits, found: Surve
                 # Only what is inside is damaged: the next record stands where it should.
                 found.damage = found.damage or damage
                 found.bytes_lost += record.size
+                found.holes = True
                 found.warnings.append(f"{damage.what}, at byte {damage.offset}: the chunk was skipped")
         elif record.opcode in (rec.SCHEMA, rec.CHANNEL):
             found.definitions.take(record.opcode, record.data, record.offset)

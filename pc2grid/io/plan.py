@@ -161,7 +161,9 @@ class _Planner:
             return base
         name = sensor_frame or "(empty)"
         # Where parts of the file or of tf are lost, a guess would shift every scan.
-        lost = self._source.tally.bytes_lost > 0 or bool(frames.warnings)
+        tally = self._source.tally
+        lost = tally.topics_lost or (tally.bytes_lost and any(t.type in choose.TF for t in self._topics))
+        lost = lost or bool(frames.warnings)
         if not frames.frames and self._config.base_frame is None and not lost:
             self._source.tally.warn(
                 f"the log has no tf: frame {name} of the scans is taken for the robot's base"

@@ -84,11 +84,15 @@ class RawMessage(NamedTuple):
 
 @dataclass(slots=True)
 class Tally:
-    """What has been read and what could not be, counted on the way."""
+    """What has been read and what could not be, counted on the way.
+
+    topics_lost : whether what was lost may have held topics that nothing else tells of.
+    """
 
     scans_read: int = 0
     points_dropped: int = 0
     bytes_lost: int = 0
+    topics_lost: bool = False
     skipped: dict[str, int] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 

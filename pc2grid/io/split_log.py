@@ -22,6 +22,7 @@ class SplitSource:
         self.tally = tally
         for part in parts:
             tally.bytes_lost += part.tally.bytes_lost
+            tally.topics_lost |= part.tally.topics_lost
             for sentence in part.tally.warnings:
                 tally.warn(sentence)
             part.tally = tally
