@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,11 +11,14 @@ import numpy as np
 
 from tests.watching import Peak
 
+# Of each kind; in parts, so that several processes share them evenly.
+ROUNDS = int(os.environ.get("PC2GRID_FUZZ", "1000"))
+PARTS = -(-ROUNDS // 5000)
+
 # A round takes milliseconds; a decoder that is talked into a loop or a huge allocation takes far longer.
 PATIENCE_S = 10.0
 # On top of an interpreter with all libraries, which has less than 200 MB.
 MOST_BYTES = 300 << 20
-_PART = 5000
 _EXTREMES = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x7FC00000, 0x7F800000, 0x7E000000)
 
 
@@ -64,14 +68,9 @@ def _swap_lengths(content: bytearray, rng: np.random.Generator) -> None:
         content[a : a + 4], content[b : b + 4] = content[b : b + 4], content[a : a + 4]
 
 
-def parts(rounds: int) -> int:
-    """In how many parts to do so many rounds, for several processes to share them evenly."""
-    return -(-rounds // _PART)
-
-
-def patiently(rounds: int) -> Iterator[int]:
-    """Count, and watch the time of each round and the memory of all: what a round leaks counts, too."""
-    peak = Peak()
+def patiently() -> Iterator[int]:
+    """The numbers of a part's rounds: with an eye on the time of each, and on the memory of all together."""
+    rounds, peak = ROUNDS // PARTS, Peak()
     for number in range(rounds):
         begin = time.process_time()
         yield number
