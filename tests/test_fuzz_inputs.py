@@ -18,6 +18,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
+from pc2grid.config import ReadConfig
 from pc2grid.errors import DatabaseError, MapFileError, Pc2GridError
 from pc2grid.io.nav2_map import load_map, save_map
 from pc2grid.model import OccupancyGrid
@@ -25,12 +26,14 @@ from signature.database import SubmapDatabase, open_database
 from signature.database.sqlite import store
 from signature.database.upkeep import check, copy
 from tests import test_io_foxglove as foxglove
-from tests.builders import STEP, T0, drive, read, ros, write_mcap
+from tests.builders import STEP, T0, Message, drive, read, ros, write_mcap
 from tests.mutations import MOST_BYTES, PARTS, mutated, patiently, put
 from tests.test_database import make_entry
 from tests.watching import bounded_memory
 
-RECORDINGS = ["lidar", "lidar ros1", "laser", "depth", "foxglove protobuf", "foxglove json"]
+RECORDINGS = ["lidar", "lidar ros1", "laser", "depth", "foxglove protobuf", "foxglove json", "lidar timed"]
+# Times within a scan are at most 10 s away from its stamp, and span 2 s.
+FARTHEST_S = 12.0
 
 
 # --- recordings ---------------------------------------------------------------------------------------
@@ -52,6 +55,9 @@ def recording(folder: Path, kind: str) -> Path:
     """A small log of six scans."""
     path, to, rng = folder / "clean.mcap", ros(), np.random.default_rng(1)
     stamps = [T0 + i * STEP for i in range(6)]
+    if kind == "lidar timed":
+        mount = to.tf(T0, "base_link", "lidar", 0.2, topic="/tf_static")
+        return write_mcap(path, [mount, *(timed_cloud(t, rng.uniform(1, 9, (20, 3))) for t in stamps)])
     if kind.startswith("lidar"):
         dialect = "ros1" if kind == "lidar ros1" else "ros2"
         return write_mcap(path, drive(dialect, 6), dialect)
@@ -68,6 +74,20 @@ def recording(folder: Path, kind: str) -> Path:
     contents = [foxglove.cloud(t, rng.uniform(1, 9, (5, 3))) for t in stamps]
     mount = ("/tf", "FrameTransform", T0, foxglove.edge(T0, "base_link", "lidar", 0.2))
     return foxglove.write(path, [mount, *contents], kind.split()[1])
+
+
+def timed_cloud(stamp_ns: int, points_m: np.ndarray) -> Message:
+    """A cloud of 0.1 s, with the nanoseconds of each point since the stamp."""
+    to, count = ros(), len(points_m)
+    rows = np.zeros(count, [("xyz", "<f4", 3), ("t", "<u4")])
+    rows["xyz"], rows["t"] = points_m, np.linspace(0, 1e8, count)
+    fields = [
+        to.make("sensor_msgs/PointField", name, 4 * i, datatype, 1)
+        for i, (name, datatype) in enumerate(zip("xyzt", (7, 7, 7, 6), strict=True))
+    ]
+    data, header = np.frombuffer(rows.tobytes(), np.uint8), to.header(stamp_ns, "lidar")
+    cloud = to.make("sensor_msgs/PointCloud2", header, 1, count, fields, False, 16, 16 * count, data, True)
+    return to.message("/points", stamp_ns, cloud)
 
 
 def records(path: Path) -> list[Record]:
@@ -96,9 +116,9 @@ def write(path: Path, entries: list[Record]) -> None:
         writer.finish()
 
 
-def assert_possible(path: Path, recover: bool) -> None:
-    """What is read can be what a robot saw: finite, in order, fields aligned."""
-    scans, report = read(path, recover=recover)
+def assert_possible(path: Path, config: ReadConfig | None, recover: bool) -> None:
+    """What is read can be what a robot saw: finite, in order, fields aligned, times near the stamp."""
+    scans, report = read(path, config, recover=recover)
     assert report.scans_read == len(scans)
     last = -1
     for scan in scans:
@@ -107,7 +127,9 @@ def assert_possible(path: Path, recover: bool) -> None:
         assert scan.points_m.ndim == 2
         assert scan.points_m.shape[1] == 3
         assert np.isfinite(scan.points_m).all()
-        assert scan.offsets_s is None or len(scan.offsets_s) == len(scan.points_m)
+        if scan.offsets_s is not None:
+            assert len(scan.offsets_s) == len(scan.points_m)
+            assert (np.abs(scan.offsets_s) <= FARTHEST_S).all()
         assert np.isfinite(scan.T_base_sensor).all()
         assert scan.T_odom_base is None or np.isfinite(scan.T_odom_base).all()
 
@@ -133,7 +155,9 @@ def test_fuzz_content_of_recordings(tmp_path: Path, kind: str, part: int) -> Non
             entries[at] = entries[at]._replace(data=mutated(entries[at].data, rng))
         write(path, entries)
         try:
-            assert_possible(path, recover=bool(number % 2))
+            named = kind == "lidar timed" and number % 4 < 2  # else the unit is told by the times
+            config = ReadConfig(point_time="ns") if named else None
+            assert_possible(path, config, recover=bool(number % 2))
         except Pc2GridError as error:
             assert error.message
             assert "\n" not in error.message
