@@ -365,6 +365,7 @@ class PostgresDatabase:
         if session is not None:
             values["own"], values["number"] = self._key(session)
             wanted.append("building = %(own)s AND session_id = %(number)s")
+        wanted.append(f"vector_dims(embedding) = {len(vector)}")  # as in the index, or it is not used
         columns = tuple(postgres_schema.TYPES["signature"])
         inside = (
             f"SELECT {', '.join(columns)}, crc32 FROM pc2grid.signature WHERE {' AND '.join(wanted)}"

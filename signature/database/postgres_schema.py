@@ -243,6 +243,8 @@ def index_embeddings(connection: Connection[Any], dimensions: int) -> None:
     connection.execute(
         "CREATE INDEX signature_embedding ON pc2grid.signature"
         f" USING hnsw ((embedding::halfvec({dimensions})) halfvec_ip_ops)"
+        # Rows of others, deleted a moment ago, are still looked at.
+        f" WHERE vector_dims(embedding) = {dimensions}"
     )
 
 
