@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import fcntl
 import hashlib
 import json
 import multiprocessing
@@ -21,17 +24,19 @@ import pytest
 from pc2grid.errors import (
     DatabaseBusy,
     DatabaseCorrupt,
+    DatabaseError,
     DatabaseVersion,
     NotADatabase,
     OutputError,
     Pc2GridError,
 )
 from pc2grid.io.nav2_map import save_map
+from pc2grid.model import ReadReport
 from signature.build import add_session, provenance
 from signature.config import Config
-from signature.database import open_database, postgres_schema, transfer
+from signature.database import Label, open_database, postgres_schema, rows, transfer
 from signature.database.postgres_schema import is_url
-from signature.database.rewrite import hold
+from signature.database.rewrite import hold, rewrite
 from signature.database.schema import APPLICATION_ID, COLUMNS
 from signature.database.sqlite import store
 from signature.database.upkeep import check, copy, merge
@@ -426,3 +431,132 @@ def test_table_definitions_that_are_no_text(path: Path, before: bytes, after: by
     assert check(path) != ()
     assert path.read_bytes() == content
     assert list(path.parent.iterdir()) == [path]
+
+
+# --- what is lost as a whole, and what stands in a writer's way ---------------------------------------
+
+
+def change(path: Path, *statements: str) -> None:
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        for statement in statements:
+            connection.execute(statement)
+        connection.commit()
+
+
+@pytest.mark.parametrize("table", ["grid", "trajectory", "loop", "signature"])
+def test_a_row_that_is_gone_is_missed_by_name(path: Path, tmp_path: Path, table: str) -> None:
+    change(path, f"DELETE FROM {table} WHERE session_id = 1")
+    assert check(path) != ()
+    uses: dict[str, Callable[[Any], object]] = {
+        "grid": lambda database: database.grid("monday"),
+        "trajectory": lambda database: database.trajectory("monday"),
+        "loop": lambda database: database.loops("monday"),
+        "signature": lambda database: list(database.submaps("monday")),
+    }
+    words = rf"session 1: has no {table}" if table in ("grid", "trajectory") else "missing"
+    with open_database(path) as database, pytest.raises(DatabaseCorrupt, match=words):
+        database.sessions()
+        uses[table](database)
+    good = tmp_path / "good.submaps"
+    assert copy(path, good, recover=True) != ()
+    assert check(good) == ()
+    with open_database(good) as database:
+        assert [info.name for info in database.sessions()] == ["tuesday"]
+
+
+def test_a_submap_too_many_or_too_few_is_found(path: Path) -> None:
+    change(path, "DELETE FROM submap WHERE session_id = 2 AND submap_id = 4")
+    (problem,) = check(path)
+    assert problem.where == "session 'tuesday'"
+    assert problem.what == "has 4 submaps and 5 signatures where 5 were stored"
+    with open_database(path) as database, pytest.raises(DatabaseCorrupt, match="'tuesday': 1 missing"):
+        list(database.submaps("tuesday"))
+
+
+@pytest.mark.parametrize("table", ["session", "submap", "loop"])
+def test_merging_takes_nothing_from_a_damaged_file(path: Path, tmp_path: Path, table: str) -> None:
+    other, target = tmp_path / "other.submaps", tmp_path / "target.submaps"
+    store(other, [make_entry("friday", 5)], keep=False)
+    change(path, f"UPDATE {table} SET crc32 = crc32 + 1 WHERE rowid = 2")
+    with pytest.raises(DatabaseCorrupt, match=rf"x\.submaps: damaged: {table} .*wrong checksum"):
+        merge([other, path], target)
+    assert not target.exists()
+
+
+def test_what_is_not_worth_recovering_is_left_behind(path: Path, tmp_path: Path) -> None:
+    """A damaged submap costs itself, and its signature; a damaged grid the session."""
+    change(
+        path,
+        "UPDATE submap SET crc32 = crc32 + 1 WHERE session_id = 2 AND submap_id = 3",
+        "UPDATE grid SET crc32 = crc32 + 1 WHERE session_id = 1",
+    )
+    good = tmp_path / "good.submaps"
+    assert len(copy(path, good, recover=True)) == 2
+    assert check(good) == ()
+    with open_database(good) as database:
+        (info,) = database.sessions()
+        assert (info.name, info.submaps) == ("tuesday", 4)
+        assert [submap.submap_id for submap in database.submaps("tuesday")] == [0, 1, 2, 4]
+        assert database.signatures().submap_id.tolist() == [0, 1, 2, 4]
+        wanted = make_entry("tuesday", 1, submaps=5)[1]
+        assert np.array_equal(database.signatures().boundary[3], wanted[4].boundary)
+
+
+def test_a_lock_that_its_holder_took_away_is_not_held(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between our opening the lock file and locking it, its holder removes it: another may lock a new one."""
+    lock, plain, seen = path.with_name(f".{path.name}.lock"), fcntl.flock, []
+
+    def flock(descriptor: int, how: int) -> None:
+        seen.append(descriptor)
+        if len(seen) <= 2:
+            lock.unlink()
+        if len(seen) == 2:
+            lock.write_text("another one's")
+        plain(descriptor, how)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with hold(path, 1.0):
+        assert len(seen) == 3
+        assert lock.read_text().startswith(f"process {os.getpid()} on ")
+        monkeypatch.undo()
+        with pytest.raises(DatabaseBusy), hold(path, 0.0):
+            pass
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_mistake_of_the_body_stays_its_own(path: Path) -> None:
+    """Not called a full disk, nor damage: there was nothing that could be damaged."""
+    target = path.with_name("new.submaps")
+    with pytest.raises(sqlite3.IntegrityError, match="UNIQUE"), rewrite(target, keep=False) as connection:
+        for number in (1, 2):
+            row = {"id": number, "name": "monday", "sensor": "lidar", "document": "{}"}
+            rows.insert(connection, "session", row)
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_names_that_cannot_be_files(tmp_path: Path) -> None:
+    with pytest.raises(NotADatabase, match="cannot be read: embedded null"):
+        open_database(Path("a\0b"))
+    with pytest.raises(NotADatabase, match="cannot be read: File name too long"):
+        open_database(tmp_path / ("a" * 300))
+
+
+@pytest.mark.parametrize("engine", ["sqlite", "postgres"])
+def test_words_that_are_no_text_are_shown(tmp_path: Path, engine: str) -> None:
+    """As a shell or a file system of another encoding gives them."""
+    place: transfer.Place = tmp_path / "x.submaps" if engine == "sqlite" else postgresql.new_database()
+    session_map, signatures, origin = make_entry("friday", 5)
+    label = Label(building="north\udcff", floor="\udcff")
+    origin = dataclasses.replace(origin, source="fri\udcffday.mcap", label=label)
+    report = ReadReport(scans_skipped={"of \udcff": 2}, warnings=("odd\udcff.pcd: empty",))
+    session_map = dataclasses.replace(session_map, session="fri\udcffday", report=report)
+    transfer.store(place, [(session_map, signatures, origin)], keep=True)
+    with open_database(place) as database:
+        (info,) = database.sessions()
+        assert (info.name, info.provenance.source) == (r"fri\xffday", r"fri\xffday.mcap")
+        assert info.provenance.label == Label(building=r"north\xff", floor=r"\xff")
+        assert info.report.scans_skipped == {r"of \xff": 2}
+        assert info.warnings == (r"odd\xff.pcd: empty",)
+        assert database.check() == ()
+        with pytest.raises(DatabaseError, match=r"no session|UTF-8 only"):
+            database.grid("fri\udcffday")

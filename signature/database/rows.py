@@ -48,18 +48,32 @@ def select(
 
 
 def storable(entry: Entry) -> Entry:
-    """The entry with names that are text: what is none in the name of a file is shown as `\\xff`.
+    """The entry with words that are text: what is none in the name of a file, or typed, is shown as `\\xff`.
 
     Raises ValueError for signatures that its settings do not make.
     """
     session_map, signatures, provenance = entry
     for signature in signatures:
         plausible.check_bins(len(signature.boundary), len(signature.freespace), provenance.config)
-    name, source = (
-        text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
-        for text in (session_map.session, provenance.source)
+    report, label = session_map.report, provenance.label
+    report = replace(
+        report,
+        scans_skipped={_text(reason): count for reason, count in report.scans_skipped.items()},
+        warnings=tuple(map(_text, report.warnings)),
     )
-    return replace(session_map, session=name), signatures, replace(provenance, source=source)
+    label = Label(
+        building=None if label.building is None else _text(label.building),
+        floor=None if label.floor is None else _text(label.floor),
+    )
+    return (
+        replace(session_map, session=_text(session_map.session), report=report),
+        signatures,
+        replace(provenance, source=_text(provenance.source), label=label),
+    )
+
+
+def _text(word: str) -> str:
+    return word.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def insert_session(

@@ -70,6 +70,9 @@ def iter_sessions(
             where = f"session {row['id']}"
             if not sound:
                 raise rows.corrupt(path, where, "wrong checksum")
+            for table, known in (("grid", resolution_m), ("trajectory", scans)):
+                if row["id"] not in known:
+                    raise rows.corrupt(path, where, f"has no {table}")
             with rows.explained(path, where):
                 info = rows.read_info(row, resolution_m[row["id"]], scans[row["id"]], path)
             yield row["id"], info

@@ -102,21 +102,25 @@ def _structure(connection: sqlite3.Connection, path: Path) -> list[Problem]:
 
 def _counts(connection: sqlite3.Connection, path: Path) -> Iterator[Problem]:
     """Every session must be complete: no row lost as a whole."""
-    for session_id, info in read_sessions(connection, path):
-        for table in schema.ONE_EACH:
-            query = f"SELECT count(*) FROM {table} WHERE session_id = ?"
-            if connection.execute(query, (session_id,)).fetchone() != (1,):
-                yield Problem(f"session {info.name!r}", f"has no {table}")
+    for session, _ in rows.select(connection, "session"):
+        where, session_id = f"session {session['name']!r}", session["id"]
+        query = "SELECT count(*) FROM {} WHERE session_id = ?"
+        lost = [
+            table
+            for table in schema.ONE_EACH
+            if connection.execute(query.format(table), (session_id,)).fetchone() != (1,)
+        ]
+        if lost:
+            yield Problem(where, f"has no {' and no '.join(lost)}")
+            continue
         query = "SELECT submap_id, center_x_m, center_y_m FROM submap WHERE session_id = ? ORDER BY id"
         stored = connection.execute(query, (session_id,)).fetchall()
-        row = next(rows.select(connection, "signature", "session_id = ?", session_id), None)
-        if row is None:
-            continue
-        arrays = rows.read_signature_arrays(row[0])
+        ((row, _),) = rows.select(connection, "signature", "session_id = ?", session_id)
+        arrays = rows.read_signature_arrays(row)
         described = list(zip(arrays["submap_id"].tolist(), *arrays["center_m"].T.tolist(), strict=True))
-        what = rows.unlike(stored, described, info.submaps)
+        what = rows.unlike(stored, described, rows.read_info(session, 1.0, 0, path).submaps)
         if what:
-            yield Problem(f"session {info.name!r}", what)
+            yield Problem(where, what)
 
 
 def _copy_sessions(
