@@ -61,14 +61,18 @@ def test_index_of_a_bag_that_leads_to_an_absurd_length(tmp_path: Path) -> None:
     check_drive(scans)
 
 
-def test_last_message_of_a_db3_whose_row_became_another(tmp_path: Path) -> None:
-    """A bit in the types of its columns: the number of the last one is not missed between others."""
+@pytest.mark.parametrize(
+    ("at", "value"),
+    [(1, 0x80), (-1, 6)],  # the first column becomes a number of its own; the row gets another's number
+)
+def test_last_message_of_a_db3_whose_row_became_another(tmp_path: Path, at: int, value: int) -> None:
+    """It is missed between no others by its number."""
     path = write_rosbag2(tmp_path / "log", drive()) / "log.db3"
     content = bytearray(path.read_bytes())
-    place = content.index(bytes([6, 0, 1, 6]))  # length; null for the number, then the topic and the time
-    content[place + 1] = 0x80
+    place = content.index(bytes([25, 6, 0, 1, 6])) + 1  # 25, its columns: null for 25, the topic, the time
+    content[place + at] = value
     path.write_bytes(content)
     scans, report = read(path, recover=True)
-    assert len(scans) == 11
+    check_drive(scans, 11)
     assert report.lossy
-    assert "1 rows are of no kind that rosbag2 writes" in report.warnings
+    assert "1 rows are of no kind that rosbag2 writes, or there twice" in report.warnings

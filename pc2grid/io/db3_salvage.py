@@ -94,10 +94,9 @@ class SalvagedDb3:
                 self.tally.warn(f"{error}, on page {place.page}")
                 continue
             match row.values:
-                case (None, int(topic), int(time_ns), bytes()):
-                    if row.rowid not in numbers:
-                        numbers.add(row.rowid)
-                        index.extend((time_ns, row.rowid, topic, *place))
+                case (None, int(topic), int(time_ns), bytes()) if row.rowid not in numbers:
+                    numbers.add(row.rowid)
+                    index.extend((time_ns, row.rowid, topic, *place))
                 case (None, str(), str(kind), str(), *_) if "/" in kind:
                     self._topics.setdefault(row.rowid, row)
                 case (None, str(kind), str(), str(), *_):
@@ -128,7 +127,7 @@ class SalvagedDb3:
             self.tally.warn(f"{homeless} messages are of a topic that is lost")
             self.tally.topics_lost = True
         if self._strange:
-            self.tally.warn(f"{self._strange} rows are of no kind that rosbag2 writes")
+            self.tally.warn(f"{self._strange} rows are of no kind that rosbag2 writes, or there twice")
         whole_pages = unused * pages.page_size + pages.bytes_missing + pages.wal_bytes_lost
         # Of the numbered ones a byte each, at least.
         self.tally.bytes_lost += max(whole_pages, gone + homeless + self._strange)
