@@ -61,6 +61,21 @@ def test_index_of_a_bag_that_leads_to_an_absurd_length(tmp_path: Path) -> None:
     check_drive(scans)
 
 
+def test_page_of_a_db3_that_was_made_to_look_empty(tmp_path: Path) -> None:
+    """Its last page, with the last messages: only the number of its rows is zeroed, or all of its head."""
+    path = write_rosbag2(tmp_path / "log", drive()) / "log.db3"
+    content = bytearray(path.read_bytes())
+    places = [
+        p for p in range(4096, len(content), 4096) if content[p] == 0x0D and content[p + 3 : p + 5] != b"\0\0"
+    ]
+    for size in (5, 8):
+        path.write_bytes(content[: places[-1] + 3] + bytes(size - 3) + content[places[-1] + size :])
+        scans, report = read(path, recover=True)
+        assert 0 < len(scans) < 12
+        assert report.bytes_lost >= 4096
+        assert "1 pages of the .db3 are damaged" in report.warnings
+
+
 @pytest.mark.parametrize(
     ("at", "value"),
     [(1, 0x80), (-1, 6)],  # the first column becomes a number of its own; the row gets another's number

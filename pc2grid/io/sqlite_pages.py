@@ -15,7 +15,7 @@ from typing import BinaryIO, NamedTuple
 Value = int | float | str | bytes | None
 
 MAGIC = b"SQLite format 3\0"
-_LEAF, _EMPTY_LEAF = 0x0D, b"\x0d\0\0"
+_LEAF = 0x0D
 # Inner pages of tables and indexes, and the bottom of indexes: no row is lost with them.
 _INNER, _INDEX_LEAF = (0x02, 0x05), 0x0A
 _INT_SIZES = (0, 1, 2, 3, 4, 6, 8)
@@ -126,7 +126,9 @@ class SqlitePages:
         """Whether there is nothing on a page that would be missed."""
         if page[0] in _INNER:
             return 1 < int.from_bytes(page[8:12], "big") <= self.count  # its last child
-        return page[0] == _INDEX_LEAF or page[:1] + page[3:5] == _EMPTY_LEAF
+        # With no row on it, SQLite says that the rows begin where the page ends; for 65536 it writes 0.
+        empty = bytes([_LEAF, 0, 0, 0, 0]) + (self._usable & 0xFFFF).to_bytes(2, "big") + b"\0"
+        return page[0] == _INDEX_LEAF or page[:8] == empty
 
     def _page(self, number: int) -> bytes:
         if number in self._wal_at:
