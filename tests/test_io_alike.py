@@ -1,0 +1,98 @@
+"""Two ways to read one format give the same: by its index, and by going through what is there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from pc2grid.config import ReadConfig
+from pc2grid.io.bag_log import BagSource
+from pc2grid.io.bag_salvage import SalvagedBag
+from pc2grid.io.db3_log import Db3Source
+from pc2grid.io.db3_salvage import SalvagedDb3
+from pc2grid.io.mcap_log import McapSource
+from pc2grid.io.source import Source
+from tests.builders import STEP, T0, Message, drive, write_bag, write_mcap, write_rosbag2
+
+CONFIG = ReadConfig()
+PARTS: list[tuple[int | None, int | None]] = [
+    (None, None),
+    (T0 + STEP, None),
+    (None, T0 + 5 * STEP),
+    (T0 + 3 * STEP, T0 + 4 * STEP),
+    (T0 + 3 * STEP + 1, T0 + 4 * STEP + 1),
+    (T0 + 99 * STEP, None),
+    (None, T0),
+]
+
+
+def late(messages: list[Message]) -> list[Message]:
+    """Some recorded out of order, within a chunk and beyond."""
+    moved = list(messages)
+    for i in (3, 9, 15):
+        moved[i], moved[i + 2] = moved[i + 2], moved[i]
+    return moved
+
+
+def everything(
+    source: Source, topics: set[str], part: tuple[int | None, int | None]
+) -> list[tuple[str, str, int, bytes]]:
+    found = source.messages(topics, *part)
+    return [(m.channel.topic, m.channel.type, m.log_time_ns, bytes(m.data)) for m in found]
+
+
+def alike(indexed: Source, gone_through: Source, messages: list[Message]) -> None:
+    assert gone_through.tally.bytes_lost == 0
+    for name in ("format", "size_bytes", "start_ns", "end_ns", "message_count", "topics"):
+        assert getattr(gone_through.info, name) == getattr(indexed.info, name), name
+    assert indexed.info.message_count == len(messages)
+    assert indexed.info.start_ns == min(m.log_time_ns for m in messages)
+    assert indexed.info.end_ns == max(m.log_time_ns for m in messages)
+    names = {m.topic for m in messages}
+    for topics in (names, {"/points"}, {"/odom", "/tf"}, {"/none"}, set[str]()):
+        for low, high in PARTS:
+            wanted = sorted(
+                (m.topic, m.type, m.log_time_ns, m.data)
+                for m in messages
+                if m.topic in topics
+                and (low is None or m.log_time_ns >= low)
+                and (high is None or m.log_time_ns < high)
+            )
+            for source in (indexed, gone_through):
+                found = everything(source, topics, (low, high))
+                assert sorted(found) == wanted
+    indexed.close()
+    gone_through.close()
+
+
+@pytest.mark.parametrize("compression", ["", "bz2", "lz4"])
+@pytest.mark.parametrize("order", [list, late])
+def test_a_bag(tmp_path: Path, compression: str, order: Callable[[list[Message]], list[Message]]) -> None:
+    messages = order(drive("ros1"))
+    path = write_bag(tmp_path / "a.bag", messages, compression, chunk_bytes=3000)
+    alike(BagSource(path, CONFIG), SalvagedBag(path, CONFIG), messages)
+    found = everything(SalvagedBag(path, CONFIG), {m.topic for m in messages}, (None, None))
+    if order is list:
+        assert [m[2] for m in found] == sorted(m.log_time_ns for m in messages)
+
+
+def test_messages_of_a_salvaged_chunk_come_by_their_times(tmp_path: Path) -> None:
+    messages = late(drive("ros1"))
+    source = SalvagedBag(write_bag(tmp_path / "a.bag", messages), CONFIG)
+    found = everything(source, {m.topic for m in messages}, (None, None))
+    assert [m[2] for m in found] == sorted(m.log_time_ns for m in messages)
+
+
+def test_a_db3(tmp_path: Path) -> None:
+    messages = drive()
+    (path,) = write_rosbag2(tmp_path / "log", messages).glob("*.db3")
+    alike(Db3Source(path, CONFIG), SalvagedDb3(path, CONFIG, recover=True), messages)
+
+
+@pytest.mark.parametrize("options", [{}, {"use_chunking": False}, {"chunk_size": 2000}])
+def test_an_mcap(tmp_path: Path, options: dict[str, object]) -> None:
+    messages = drive()
+    path = write_mcap(tmp_path / "a.mcap", messages, **options)
+    alike(McapSource(path, CONFIG), McapSource(path, CONFIG, recover=True), messages)
