@@ -1,188 +1,249 @@
 """Closing loops: the same place, seen again, makes the map agree with itself.
 
-The session is cut into pieces of a few metres. Each new piece is held against older ones that may
-overlap it, found by where it should be or proposed by whoever recognises places; a correlative search
-over the uncertainty places it, and only placements that both pieces' free space agrees with count. Then
-every keyframe is matched to every piece it overlaps, and a robust pose graph settles all of them (the
-scan-to-submap constraints of Hess et al., "Real-time loop closure in 2D lidar SLAM", 2016).
+The session is cut into pieces of a few metres. Each new piece is held against older ones that it may
+overlap: a correlative search over the uncertainty places it, and only placements that both pieces' free
+space agrees with count. A robust pose graph of the pieces settles where each belongs (the scan-to-submap
+constraints of Hess et al., "Real-time loop closure in 2D lidar SLAM", 2016, from piece to piece); between
+their anchors the correction passes linearly, as the error of tracking grew.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from array import array
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F64, SE2
-from pc2grid.matching import evenly
-from pc2grid.model import Loop
-from pc2grid.pieces import Keyframe, PieceStore, cut
-from pc2grid.pose_graph import Edge, optimise
+from pc2grid.keyframes import Keyframe, Keyframes
+from pc2grid.matching import Match, evenly
+from pc2grid.model import I64, Loop
+from pc2grid.pieces import Piece, Pieces
+from pc2grid.pose_graph import Edge, Solution, optimise
 
-_ROUNDS = 3
+_PIECE_TRAVEL_M = 4.0
 _SEARCH_POINTS = 400
-_KEYFRAME_POINTS = 300
 _NEAR_M = 8.0
+_MOST = 6
+_SURE_M, _SURE_RAD = 0.3, math.radians(4.0)  # of the search, where nothing has drifted
+_DRIFT_PER_M, _DRIFT_RAD_PER_M = 0.02, 0.006
 _MAX_WINDOW_M = 3.0
 _MAX_WINDOW_RAD = math.radians(20.0)
+_LOST_M = 150.0  # of travel, the drift that a lost stretch counts as: the widest window
 _MIN_SEEN = 0.35
 _MIN_AGREEMENT = 0.8
-_SAME_M, _SAME_RAD = 0.01, 0.002
-
-
-@dataclass(frozen=True, slots=True)
-class Proposal:
-    """A claim that piece `newer` overlaps piece `older`, to be verified.
-
-    T_older_newer : where the newer piece's anchor should be in the older one's frame, right to within the
-        window (metres, radians).
-    """
-
-    older: int
-    newer: int
-    T_older_newer: SE2
-    window_m: float
-    window_rad: float
-
-
-class LoopProposer(Protocol):
-    """Whoever recognises places: by nearness here, by signatures elsewhere."""
-
-    def propose(self, pieces: PieceStore, newest: int, drift_m: float) -> Iterable[Proposal]:
-        """Overlaps of piece `newest` with older ones; `drift_m` metres since its pose was last sure."""
-
-
-@dataclass(frozen=True, slots=True)
-class Nearness:
-    """Proposes the pieces that are close enough to overlap, given how far the pose may have drifted."""
-
-    drift_per_m: float = 0.02
-    drift_rad_per_m: float = 0.006
-    most: int = 6
-
-    def propose(self, pieces: PieceStore, newest: int, drift_m: float) -> Iterable[Proposal]:
-        """Nearest first, at most `most`."""
-        here = pieces.pose(pieces.anchor(newest))
-        window_m = min(0.3 + self.drift_per_m * drift_m, _MAX_WINDOW_M)
-        window_rad = min(math.radians(4.0) + self.drift_rad_per_m * drift_m, _MAX_WINDOW_RAD)
-        found = []
-        for older in range(newest - 1):
-            relative = pieces.pose(pieces.anchor(older)).inverse() @ here
-            distance = math.hypot(relative.x, relative.y)
-            if distance < _NEAR_M + window_m:
-                found.append((distance, Proposal(older, newest, relative, window_m, window_rad)))
-        found.sort(key=lambda entry: entry[0])
-        return [proposal for _, proposal in found[: self.most]]
+_AGREE_M, _AGREE_RAD = 0.1, math.radians(1.0)
+_REDRAWN = 2
+_TIE_TRUST = 0.1  # of what a fit says of itself: the points on one wall err together
+_BENT_M, _BENT_RAD = 0.01, math.radians(0.2)
 
 
 @dataclass(frozen=True, slots=True)
 class Closed:
-    """poses (K, 3): x, y, yaw of each keyframe in the map frame. loops: between keyframes in the middle of
-    pieces found to overlap, `older` and `newer` counting keyframes. proposals: how many were verified to get
-    them."""
+    """Where the keyframes of a session belong.
 
+    scans : (K,) number of each one's scan. poses : (K, 3) x, y, yaw of each in the map frame.
+    loops : between scans in the middle of pieces found to overlap.
+    tried : how many pairs of pieces were compared to get them.
+    """
+
+    scans: I64
     poses: F64
     loops: tuple[Loop, ...]
-    proposals: int
+    tried: int
 
 
-def close_loops(keyframes: Sequence[Keyframe], proposers: Sequence[LoopProposer] = (Nearness(),)) -> Closed:
-    """Keyframe poses that agree with each other wherever the robot came back to a place."""
-    tracked = np.array([(k.T_map_base.x, k.T_map_base.y, k.T_map_base.yaw) for k in keyframes])
-    runs = cut(keyframes)
-    store = PieceStore(keyframes, runs, tracked)
-    found, proposals = _find_loops(store, proposers)
-    if not found:
-        return Closed(tracked, (), proposals)
-    chain = _tracking_edges(keyframes, runs)
-    poses = store.poses
-    matched: dict[tuple[int, int], tuple[SE2, list[Edge]]] = {}
-    for _ in range(_ROUNDS):
-        loops: list[Edge] = []
-        for older, newer in _overlapping(store):
-            relative = store.pose(store.anchor(older)).inverse() @ store.pose(store.anchor(newer))
-            at, edges = matched.get((older, newer), (None, []))
-            if at is None or not _same(at.inverse() @ relative):
-                edges = list(_match_keyframes(store, older, newer))
-                matched[older, newer] = relative, edges
-            loops += edges
-        poses = optimise(poses, chain + loops).poses
-        store.move(poses, redraw=True)
-    return Closed(poses, found, proposals)
+class LoopCloser:
+    """Closes loops while the session goes on; of a keyframe it keeps no more than its place.
 
+    keyframes : of the session, which pieces are made from when they are needed.
+    """
 
-# --- finding overlaps, piece by piece ---------------------------------------------------------------------
+    def __init__(self, keyframes: Keyframes) -> None:
+        self._pieces = Pieces(keyframes)
+        self._scans = array("q")
+        self._poses = array("d")  # as tracked: x, y, yaw of one keyframe after the other
+        self._begun = 0  # the keyframe that the next piece starts with
+        self._travel_m = 0.0
+        self._restarts: set[int] = set()
+        self._nodes = np.empty((0, 3))  # settled poses of the pieces' anchors
+        self._edges: list[Edge] = []
+        self._drift_m = 0.0  # of travel since the pose was last sure
+        self._tried = 0
 
+    def extend(self, keyframe: Keyframe) -> None:
+        """Take note of the keyframe that was appended last; every few metres that completes a piece."""
+        number = len(self._scans)
+        if number:
+            step = _pose(self._tracked(), number - 1).inverse() @ keyframe.T_map_base
+            self._travel_m += math.hypot(step.x, step.y) + 0.3 * abs(step.yaw)
+            if self._travel_m > _PIECE_TRAVEL_M or keyframe.restart:
+                self._complete_piece()
+        if keyframe.restart:
+            self._restarts.add(number)
+        self._scans.append(keyframe.index)
+        self._poses.extend((keyframe.T_map_base.x, keyframe.T_map_base.y, keyframe.T_map_base.yaw))
 
-def _find_loops(store: PieceStore, proposers: Sequence[LoopProposer]) -> tuple[tuple[Loop, ...], int]:
-    """Verified overlaps, between anchors; on return `store` holds poses that honour them."""
-    anchors = [store.anchor(piece) for piece in range(len(store.runs))]
-    tracked = store.poses
-    edges: list[Edge] = []
-    believed: Sequence[bool] = ()
-    nodes = tracked[anchors].copy()
-    drift_m, proposals = 0.0, 0
-    for newest in range(1, len(store.runs)):
-        step = _pose(tracked, anchors[newest - 1]).inverse() @ _pose(tracked, anchors[newest])
-        length = math.hypot(step.x, step.y)
-        drift_m += length
-        sigma_m, sigma_rad = 0.02 + 0.01 * length, math.radians(0.5 + 0.1 * length)
-        edges.append(Edge(newest - 1, newest, step, np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])))
-        arrived = _pose(nodes, newest - 1) @ step
-        nodes[newest] = arrived.x, arrived.y, arrived.yaw
-        store.move(_carry(tracked, store, anchors, nodes, newest), redraw=False)
-        found = []
-        for proposer in proposers:
-            for proposal in proposer.propose(store, newest, drift_m):
-                proposals += 1
-                edge = _verify(store, proposal)
-                if edge is not None:
-                    found.append(edge)
-        if found:
-            edges += found
-            solution = optimise(nodes[: newest + 1], edges)
-            nodes[: newest + 1], believed = solution.poses, solution.believed.tolist()
-            drift_m = 0.0
-    store.move(_carry(tracked, store, anchors, nodes, len(store.runs) - 1), redraw=False)
-    loops = (
-        Loop(
-            older=anchors[edge.first],
-            newer=anchors[edge.second],
-            T_older_newer=edge.T_first_second,
-            information=edge.information,
-            accepted=accepted,
+    def finish(self) -> Closed:
+        """What came of it. Without a loop everything stays as it was tracked."""
+        if not self._scans:
+            return Closed(np.empty(0, np.int64), np.empty((0, 3)), (), 0)
+        self._complete_piece()
+        solution = self._settle()
+        loops = tuple(
+            Loop(
+                older=self._scans[self._pieces.anchor(edge.first)],
+                newer=self._scans[self._pieces.anchor(edge.second)],
+                T_older_newer=edge.T_first_second,
+                information=edge.information,
+                accepted=bool(believed),
+            )
+            for edge, believed in zip(self._edges, solution.believed, strict=True)
+            if edge.loop
         )
-        # What came after the last loop is no loop.
-        for edge, accepted in zip(edges, believed, strict=False)
-        if edge.loop
-    )
-    return tuple(loops), proposals
+        poses = self._settled() if loops else self._tracked()
+        return Closed(np.array(self._scans, dtype=np.int64), poses, loops, self._tried)
+
+    # --- as the session goes on ---------------------------------------------------------------------------
+
+    def _complete_piece(self) -> None:
+        """The last keyframes become a piece: put where tracking says, and compared with older ones."""
+        self._pieces.append(range(self._begun, len(self._scans)))
+        restart = self._begun in self._restarts
+        self._begun, self._travel_m = len(self._scans), 0.0
+        newest = len(self._nodes)
+        tracked = self._tracked()
+        pose = _pose(tracked, self._pieces.anchor(newest))
+        if newest > 0:
+            step = _pose(tracked, self._pieces.anchor(newest - 1)).inverse() @ pose
+            length_m = math.hypot(step.x, step.y)
+            self._drift_m += _LOST_M if restart else length_m
+            self._edges.append(Edge(newest - 1, newest, step, _tracked_information(length_m, restart)))
+            pose = _pose(self._nodes, newest - 1) @ step
+        self._nodes = np.vstack((self._nodes, (pose.x, pose.y, pose.yaw)))
+        found = list(self._compare(newest))
+        if found:
+            self._edges += found
+            self._drift_m = 0.0
+            if not all(self._agrees(edge) for edge in found):
+                self._nodes = optimise(self._nodes, self._edges).poses
+
+    def _compare(self, newest: int) -> Iterator[Edge]:
+        """Verified overlaps of the newest piece with older ones."""
+        window_m = min(_SURE_M + _DRIFT_PER_M * self._drift_m, _MAX_WINDOW_M)
+        window_rad = min(_SURE_RAD + _DRIFT_RAD_PER_M * self._drift_m, _MAX_WINDOW_RAD)
+        # The one before shares its walls with the newest anyway: tracking held them together.
+        distance_m = np.hypot(*(self._nodes[: newest - 1, :2] - self._nodes[newest, :2]).T)
+        for older in _few_of_each_visit(distance_m, _NEAR_M + window_m):
+            self._tried += 1
+            edge = self._tie(older, newest, window_m, window_rad)
+            if edge is not None:
+                yield edge
+
+    def _tie(self, older: int, newer: int, window_m: float, window_rad: float) -> Edge | None:
+        """The measured relative pose of two pieces, near where they are thought to be."""
+        guess = _pose(self._nodes, older).inverse() @ _pose(self._nodes, newer)
+        match = _fit(self._pieces[older], self._pieces[newer], guess, window_m, window_rad)
+        return (
+            None
+            if match is None
+            else Edge(older, newer, match.pose, _TIE_TRUST * match.information, loop=True)
+        )
+
+    def _agrees(self, edge: Edge) -> bool:
+        """Whether a loop leaves everything where it is: then settling can wait."""
+        held = _pose(self._nodes, edge.first).inverse() @ _pose(self._nodes, edge.second)
+        apart = edge.T_first_second.inverse() @ held
+        return math.hypot(apart.x, apart.y) < _AGREE_M and abs(apart.yaw) < _AGREE_RAD
+
+    # --- at its end -----------------------------------------------------------------------------------------
+
+    def _settle(self) -> Solution:
+        """The pose graph, solved.
+
+        Where its solution bends pieces, what was measured between them was measured on a wrong shape: they
+        are drawn again as they are now, and compared again.
+        """
+        drawn = self._tracked()
+        for _ in range(_REDRAWN):
+            self._nodes = optimise(self._nodes, self._edges).poses
+            settled = self._settled()
+            bent = [_bends(drawn[run], settled[run]) for run in self._pieces.runs]
+            if not any(bent):
+                break
+            drawn = settled
+            self._pieces.redraw(settled)
+            for k, edge in enumerate(self._edges):
+                if edge.loop and (bent[edge.first] or bent[edge.second]):
+                    self._edges[k] = self._tie(edge.first, edge.second, _SURE_M, _SURE_RAD) or edge
+        solution = optimise(self._nodes, self._edges)
+        self._nodes = solution.poses
+        return solution
+
+    def _settled(self) -> F64:
+        """(K, 3) keyframe poses that follow their pieces' anchors, gradually from one to the next; but no
+        error grows gradually where tracking was lost, so there each piece keeps its shape to its end."""
+        tracked = self._tracked()
+        known: dict[int, SE2] = {}
+        for piece, run in enumerate(self._pieces.runs):
+            anchor = self._pieces.anchor(piece)
+            correction = _pose(self._nodes, piece) @ _pose(tracked, anchor).inverse()
+            ends = [k for k, at in ((run[0], run.start), (run[-1], run.stop)) if at in self._restarts]
+            for k in sorted({anchor, *ends}):
+                known[k] = correction @ _pose(tracked, k)
+        return spread(tracked, list(known), np.array([(p.x, p.y, p.yaw) for p in known.values()]))
+
+    def _tracked(self) -> F64:
+        """(K, 3) keyframe poses before loops were closed."""
+        return np.array(self._poses).reshape(-1, 3)
 
 
-def _carry(tracked: F64, store: PieceStore, anchors: list[int], nodes: F64, newest: int) -> F64:
-    """Keyframe poses when each piece moves rigidly with its anchor."""
-    poses = tracked.copy()
-    for piece in range(newest + 1):
-        correction = _pose(nodes, piece) @ _pose(tracked, anchors[piece]).inverse()
-        run = store.runs[piece]
-        part = tracked[run.start : run.stop]
-        poses[run.start : run.stop, :2] = correction.apply(part[:, :2])
-        poses[run.start : run.stop, 2] = part[:, 2] + correction.yaw
-    return poses
+def _pose(poses: F64, index: int) -> SE2:
+    x, y, yaw = poses[index]
+    return SE2(float(x), float(y), float(yaw))
 
 
-def _verify(store: PieceStore, proposal: Proposal) -> Edge | None:
-    """The measured relative pose of two pieces, or None if they do not overlap or fit in several ways."""
-    older, newer = store[proposal.older], store[proposal.newer]
+def _bends(drawn: F64, settled: F64) -> bool:
+    """Whether the shape of a piece, poses (N, 3) of its keyframes, has changed by more than its noise."""
+    before = _pose(drawn, 0).inverse() @ _pose(drawn, -1)
+    apart = before.inverse() @ _pose(settled, 0).inverse() @ _pose(settled, -1)
+    return math.hypot(apart.x, apart.y) > _BENT_M or abs(apart.yaw) > _BENT_RAD
+
+
+def _tracked_information(length_m: float, restart: bool) -> F64:
+    """What tracking knows of a step between anchors; next to nothing if it was lost in between."""
+    sigma_m, sigma_rad = 0.02 + 0.01 * length_m, math.radians(0.5 + 0.1 * length_m)
+    if restart:
+        sigma_m, sigma_rad = 1.5, math.radians(60.0)
+    return np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
+
+
+def _few_of_each_visit(distance_m: F64, near_m: float) -> list[int]:
+    """Which of the older pieces, (N,) away from the newest, to compare it with.
+
+    A robot that drives up and down sees a place dozens of times. The nearest piece of the first visit, of
+    the last and of some in between tie the newest to all of them.
+    """
+    near = np.flatnonzero(distance_m < near_m)
+    if not len(near):
+        return []
+    visits = np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)
+    chosen = [visits[k] for k in evenly(len(visits), _MOST)]
+    nearest = [int(visit[np.argmin(distance_m[visit])]) for visit in chosen]
+    others = [int(k) for k in near[np.argsort(distance_m[near], kind="stable")] if k not in nearest]
+    return nearest + others[: _MOST - len(nearest)]
+
+
+def _fit(older: Piece, newer: Piece, guess: SE2, window_m: float, window_rad: float) -> Match | None:
+    """Where the newer piece lies in the older one, or None if they do not overlap or fit in several ways."""
     chosen = evenly(len(newer.points_m), _SEARCH_POINTS)
     points, face = newer.points_m[chosen], newer.facing_rad[chosen]
     back = older.points_m[evenly(len(older.points_m), _SEARCH_POINTS)]
     fits = []
-    for _, start in older.search(points, proposal.T_older_newer, proposal.window_m, proposal.window_rad):
+    for _, start in older.search(points, guess, window_m, window_rad):
         match = older.match(points, face, start)
         seen, agree = older.agreement(points, match.pose)
         seen_back, agree_back = newer.agreement(back, match.pose.inverse())
@@ -198,99 +259,19 @@ def _verify(store: PieceStore, proposal: Proposal) -> Edge | None:
         apart = best.pose.inverse() @ other.pose
         if math.hypot(apart.x, apart.y) > 0.5 and other_score > score - 0.05:
             return None
-    return Edge(proposal.older, proposal.newer, best.pose, 0.1 * best.information, loop=True)
-
-
-# --- settling the keyframes ----------------------------------------------------------------------------
-
-
-def _overlapping(store: PieceStore) -> list[tuple[int, int]]:
-    """Pairs of pieces close enough to share walls, now that the map is roughly right."""
-    anchors = [store.anchor(piece) for piece in range(len(store.runs))]
-    places = store.poses[anchors][:, :2]
-    pairs = []
-    for older in range(len(anchors)):
-        distance = np.linalg.norm(places[older + 2 :] - places[older], axis=1)
-        pairs += [
-            (older, older + 2 + int(n)) for n in np.argsort(distance, kind="stable")[:8] if distance[n] < 6.0
-        ]
-    return pairs
-
-
-def _same(apart: SE2) -> bool:
-    """Whether matching two pieces again would tell nothing new."""
-    return math.hypot(apart.x, apart.y) < _SAME_M and abs(apart.yaw) < _SAME_RAD
-
-
-def _match_keyframes(store: PieceStore, older: int, newer: int) -> Iterable[Edge]:
-    """Each keyframe of either piece against the other piece as a whole."""
-    for target, source in ((older, newer), (newer, older)):
-        piece, anchor = store[target], store.anchor(target)
-        T_anchor_map = store.pose(anchor).inverse()
-        for k in store.runs[source]:
-            guess = T_anchor_map @ store.pose(k)
-            hits = store.keyframes[k].sweep.hits_m
-            chosen = evenly(len(hits), _KEYFRAME_POINTS)
-            points = hits[chosen].astype(np.float64)
-            if len(points) < 30 or piece.agreement(points, guess)[0] < _MIN_SEEN:
-                continue
-            match = piece.match(points, store.facing(k)[chosen], guess)
-            seen, agree = piece.agreement(points, match.pose)
-            apart = guess.inverse() @ match.pose
-            if (
-                seen > _MIN_SEEN
-                and agree > _MIN_AGREEMENT
-                and math.hypot(apart.x, apart.y) < 0.4
-                and abs(apart.yaw) < 0.1
-            ):
-                yield Edge(anchor, k, match.pose, _soften(match.information, 0.01, 0.003), loop=True)
-
-
-def _tracking_edges(keyframes: Sequence[Keyframe], runs: Sequence[range]) -> list[Edge]:
-    """What tracking said: each keyframe relative to the anchors of its own piece and of the one before."""
-    edges = []
-    for number, run in enumerate(runs):
-        for anchor_run in runs[max(number - 1, 0) : number + 1]:
-            anchor = anchor_run[len(anchor_run) // 2]
-            T_anchor_map = keyframes[anchor].T_map_base.inverse()
-            c, s = math.cos(T_anchor_map.yaw), math.sin(T_anchor_map.yaw)
-            turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-            for k in run:
-                if k == anchor or (keyframes[run.start].restart and anchor_run is not run):
-                    continue
-                relative = T_anchor_map @ keyframes[k].T_map_base
-                information = turn @ keyframes[k].information @ turn.T
-                distance = math.hypot(relative.x, relative.y)
-                edges.append(Edge(anchor, k, relative, _soften(information, 0.01 + 0.003 * distance, 0.003)))
-    for k in range(1, len(keyframes)):
-        step = keyframes[k - 1].T_map_base.inverse() @ keyframes[k].T_map_base
-        loose = 1e-3 if keyframes[k].restart else 1.0
-        edges.append(Edge(k - 1, k, step, loose * np.diag([0.05**-2, 0.05**-2, math.radians(2.0) ** -2])))
-    return edges
-
-
-def _soften(information: F64, sigma_m: float, sigma_rad: float) -> F64:
-    """Information after adding independent errors: what a match does not know about itself."""
-    covariance = np.linalg.inv(information + 1e-3 * np.eye(3))
-    softened: F64 = np.linalg.inv(covariance + np.diag([sigma_m**2, sigma_m**2, sigma_rad**2]))
-    return 0.5 * (softened + softened.T)
-
-
-def _pose(poses: F64, index: int) -> SE2:
-    x, y, yaw = poses[index]
-    return SE2(float(x), float(y), float(yaw))
+    return best
 
 
 # --- back to every scan ----------------------------------------------------------------------------------
 
 
-def spread(tracked: F64, keyframe_index: Sequence[int], corrected: F64) -> F64:
-    """Poses (N, 3) of all scans, from the corrected poses (K, 3) of the keyframes among them.
+def spread(tracked: F64, known: Sequence[int] | I64, corrected: F64) -> F64:
+    """Poses (N, 3) of all scans, from the corrected poses (K, 3) of those of them that are `known`.
 
-    Between two keyframes the correction passes linearly from one to the other, so the motion that was
+    Between two of them the correction passes linearly from one to the other, so the motion that was
     tracked between them stays smooth.
     """
-    index = np.asarray(keyframe_index)
+    index = np.asarray(known)
     scans = np.arange(len(tracked))
     left = np.clip(np.searchsorted(index, scans, side="right") - 1, 0, len(index) - 1)
     right = np.minimum(left + 1, len(index) - 1)

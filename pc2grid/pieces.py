@@ -2,83 +2,49 @@
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.facing import facing
 from pc2grid.geometry import F64, SE2
+from pc2grid.keyframes import Keyframe, Keyframes
 from pc2grid.matching import Match, PointGrid, best_placements
 from pc2grid.model import I64
-from pc2grid.sweep import Sweep
 
-PIECE_TRAVEL_M = 4.0
 RANGE_M = 12.0  # what is seen from farther away is too thin to match
 CELL_M = 0.1
 _FREE, _HIT = 1, 2
 _RADII = (3, 2, 2, 1, 1, 1, 1, 1)
-_CACHE = 64
-
-
-@dataclass(frozen=True, slots=True)
-class Keyframe:
-    """A sweep worth keeping: the robot had moved since the one before.
-
-    index : number of its scan in the session. T_map_base : as tracked, before loops are closed.
-    information : (3, 3) of that pose relative to the local map it was tracked on, in the map's axes.
-    restart : the first after a lost stretch: its place relative to those before is a guess.
-    """
-
-    index: int
-    sweep: Sweep
-    T_map_base: SE2
-    information: F64
-    restart: bool = False
-
-
-def cut(keyframes: Sequence[Keyframe]) -> list[range]:
-    """Runs of keyframes of about `PIECE_TRAVEL_M` each; a lost stretch always starts a new one."""
-    runs, first, travel = [], 0, 0.0
-    for k in range(1, len(keyframes)):
-        step = keyframes[k - 1].T_map_base.inverse() @ keyframes[k].T_map_base
-        travel += math.hypot(step.x, step.y) + 0.3 * abs(step.yaw)
-        if travel > PIECE_TRAVEL_M or keyframes[k].restart:
-            runs.append(range(first, k))
-            first, travel = k, 0.0
-    runs.append(range(first, len(keyframes)))
-    return runs
+_CACHE = 24
+_DRAWN_EVERY = 2  # keyframes, 0.2 m apart: more of them show the same walls again
 
 
 class Piece:
     """The local map of a run of keyframes, in the frame of its anchor, the keyframe in the middle.
 
-    Made from the keyframes, which way the surfaces at their hits face (radians), and their poses.
+    Made from the keyframes and where they are in that frame.
 
     points_m : (N, 2) obstacle points, thinned to one a cell. facing_rad : (N,) which way each one faces.
     """
 
-    def __init__(
-        self,
-        keyframes: Sequence[Keyframe],
-        facings: Sequence[NDArray[np.floating]],
-        T_anchor_base: Sequence[SE2],
-    ) -> None:
+    def __init__(self, keyframes: Sequence[Keyframe], T_anchor_base: Sequence[SE2]) -> None:
         import cv2
 
         hits, faces, outlines = [], [], []
-        for keyframe, face_rad, pose in zip(keyframes, facings, T_anchor_base, strict=True):
+        for keyframe, pose in zip(keyframes, T_anchor_base, strict=True):
             sweep = keyframe.sweep
-            near = np.linalg.norm(sweep.hits_m - sweep.origin_m, axis=1) < RANGE_M
+            face_rad = facing(sweep.hits_m, sweep.origin_m)
+            away = sweep.hits_m - sweep.origin_m
+            near = np.einsum("ij,ij->i", away, away) < RANGE_M**2
             hits.append(pose.apply(sweep.hits_m[near]))
             faces.append(face_rad[near] + pose.yaw)
             outlines.append(pose.apply(sweep.free_polygon(RANGE_M)))
         points, face = np.concatenate(hits), np.concatenate(faces)
-        everything = np.concatenate((points, *outlines))
-        low, high = everything.min(axis=0) - 0.6, everything.max(axis=0) + 0.6
+        x, y = np.concatenate((points, *outlines)).T
+        low, high = np.array([x.min(), y.min()]) - 0.6, np.array([x.max(), y.max()]) + 0.6
         self._grid = PointGrid(low, high, CELL_M)
         self._grid.add(points, face)
         self._low_m = low
@@ -133,49 +99,48 @@ class Piece:
         return cells
 
 
-class PieceStore:
-    """Pieces made on demand from keyframes and their poses; only the last used ones are kept."""
+class Pieces:
+    """The pieces of a session, made on demand from their keyframes; only the last used ones are kept.
 
-    def __init__(self, keyframes: Sequence[Keyframe], runs: Sequence[range], poses: F64) -> None:
-        self.keyframes = keyframes
-        self.runs = runs
-        self.poses = poses
+    runs : of each, the numbers of its keyframes.
+    """
+
+    def __init__(self, keyframes: Keyframes) -> None:
+        self._keyframes = keyframes
+        self.runs: list[range] = []
+        self._settled: F64 | None = None
         self._made: OrderedDict[int, Piece] = OrderedDict()
-        self._facing: dict[int, NDArray[np.float16]] = {}
 
-    def anchor(self, piece: int) -> int:
-        """The keyframe whose frame the piece lives in."""
-        run = self.runs[piece]
+    def append(self, run: range) -> None:
+        """One more, as it was tracked."""
+        self.runs.append(run)
+
+    def anchor(self, number: int) -> int:
+        """The keyframe whose frame a piece lives in."""
+        run = self.runs[number]
         return run[len(run) // 2]
 
-    def pose(self, keyframe: int) -> SE2:
-        """Present estimate of a keyframe's T_map_base."""
-        x, y, yaw = self.poses[keyframe]
-        return SE2(float(x), float(y), float(yaw))
+    def redraw(self, settled: F64) -> None:
+        """From now on the keyframes are where they are settled, (K, 3) x, y, yaw, and no more as tracked."""
+        self._settled = settled
+        self._made.clear()
 
-    def facing(self, keyframe: int) -> NDArray[np.float16]:
-        """Which way the surfaces at the keyframe's hits face, radians in its frame; worked out once."""
-        if keyframe not in self._facing:
-            sweep = self.keyframes[keyframe].sweep
-            self._facing[keyframe] = facing(sweep.hits_m, sweep.origin_m).astype(np.float16)
-        return self._facing[keyframe]
-
-    def __getitem__(self, piece: int) -> Piece:
-        if piece not in self._made:
-            T_anchor_map = self.pose(self.anchor(piece)).inverse()
-            run = self.runs[piece]
-            self._made[piece] = Piece(
-                [self.keyframes[k] for k in run],
-                [self.facing(k) for k in run],
-                [T_anchor_map @ self.pose(k) for k in run],
-            )
+    def __getitem__(self, number: int) -> Piece:
+        if number not in self._made:
+            run, anchor = self.runs[number], self.anchor(number)
+            drawn = run[(anchor - run.start) % _DRAWN_EVERY :: _DRAWN_EVERY]
+            keyframes = [self._keyframes[k] for k in drawn]
+            T_anchor_map = self._pose(self._keyframes[anchor], anchor).inverse()
+            poses = [T_anchor_map @ self._pose(f, k) for f, k in zip(keyframes, drawn, strict=True)]
+            self._made[number] = Piece(keyframes, poses)
             if len(self._made) > _CACHE:
                 self._made.popitem(last=False)
-        self._made.move_to_end(piece)
-        return self._made[piece]
+        self._made.move_to_end(number)
+        return self._made[number]
 
-    def move(self, poses: F64, *, redraw: bool) -> None:
-        """New estimates; `redraw` also changes the shape of the pieces, else they move as they are."""
-        self.poses = poses
-        if redraw:
-            self._made.clear()
+    def _pose(self, keyframe: Keyframe, number: int) -> SE2:
+        """T_map_base of a keyframe, by now."""
+        if self._settled is None:
+            return keyframe.T_map_base
+        x, y, yaw = self._settled[number]
+        return SE2(float(x), float(y), float(yaw))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from array import array
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -12,7 +14,6 @@ from pc2grid.config import PartitionConfig, ProjectionConfig, RegistrationConfig
 from pc2grid.errors import NoScans
 from pc2grid.geometry import F64, SE2
 from pc2grid.model import (
-    F32,
     Health,
     Loop,
     OccupancyGrid,
@@ -123,7 +124,8 @@ def map_scans(
     """Grid and trajectory of scans, and the loops found on the way. `watch` is called with each scan where
     tracking puts it, before loops are closed.
 
-    Only keyframes are kept, as sweeps of a few kilobytes; a robot that stands still adds nothing.
+    Of a scan only its pose is kept, and of a keyframe its sweep in a temporary file: memory follows the area,
+    not the length. A robot that stands still adds nothing.
 
     >>> import pc2grid, signature
     >>> with pc2grid.open_log("monday.mcap") as log:
@@ -132,59 +134,52 @@ def map_scans(
     (0.05, True)
     """
     from pc2grid.glimpses import Glimpses
-    from pc2grid.loops import close_loops, spread
-    from pc2grid.pieces import Keyframe
+    from pc2grid.keyframes import Keyframe, Keyframes
+    from pc2grid.loops import LoopCloser, spread
     from pc2grid.tracking import Tracker
 
     tracker = Tracker(config.registration, config.projection)
-    stamps: list[int] = []
-    poses: list[F64] = []
+    stamps, poses = array("q"), array("d")
     health: list[Health] = []
-    keyframes: list[Keyframe] = []
     between = Glimpses(config.projection.max_range_m, config.projection.resolution_m)
-    glimpsed: list[F32] = []
-    for scan in scans:
-        tracked = tracker.track(scan)
-        registered = tracked.registered
-        pose = SE2.flatten(registered.T_map_base)
-        if tracked.keyframe:
-            if keyframes:
-                glimpsed.append(between.take())
-            between.restart(tracked.sweep, pose)
-            keyframes.append(
-                Keyframe(len(stamps), tracked.sweep, pose, tracked.information, restart=tracked.restart)
-            )
-        elif keyframes and registered.health is not Health.LOST:
-            between.add(tracked.sweep, pose)
-        stamps.append(scan.stamp_ns)
-        poses.append(registered.T_map_base)
-        health.append(registered.health)
-        watch(registered)
-    if keyframes:
-        glimpsed.append(between.take())
     builder = GridBuilder(config.projection)
-    if not stamps:
-        nothing = Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
-        return builder.grid(), nothing, ()
-    T_map_base = np.array(poses)
-    loops: tuple[Loop, ...] = ()
-    if len(keyframes) > 2:
-        flat = np.array([(p.x, p.y, p.yaw) for p in map(SE2.flatten, poses)])
-        closed = close_loops(keyframes)
-        settled = spread(flat, [k.index for k in keyframes], closed.poses)
-        T_map_base = _replant(T_map_base, flat, settled)
-        loops = tuple(
-            dataclasses.replace(loop, older=keyframes[loop.older].index, newer=keyframes[loop.newer].index)
-            for loop in closed.loops
-        )
-    for keyframe, glimpses in zip(keyframes, glimpsed, strict=True):
-        pose = SE2.flatten(T_map_base[keyframe.index])
-        builder.add(keyframe.sweep, pose)
-        builder.glimpse(pose.apply(glimpses))
+    with closing(Keyframes()) as keyframes:
+        closer = LoopCloser(keyframes)
+        latest: Keyframe | None = None
+
+        def keep() -> None:
+            if latest is not None:
+                keyframes.append(dataclasses.replace(latest, glimpses_m=between.take()))
+                closer.extend(latest)
+
+        for scan in scans:
+            tracked = tracker.track(scan)
+            registered = tracked.registered
+            pose = SE2.flatten(registered.T_map_base)
+            if tracked.keyframe:
+                keep()
+                latest = Keyframe(len(stamps), tracked.sweep, pose, tracked.restart)
+                between.restart(tracked.sweep, pose)
+            elif latest is not None and registered.health is not Health.LOST:
+                between.add(tracked.sweep, pose)
+            stamps.append(scan.stamp_ns)
+            poses.extend(registered.T_map_base.ravel())
+            health.append(registered.health)
+            watch(registered)
+        keep()
+        T_map_base = np.frombuffer(poses).reshape(-1, 4, 4)
+        closed = closer.finish()
+        if closed.loops:
+            flat = np.array([(p.x, p.y, p.yaw) for p in map(SE2.flatten, T_map_base)])
+            T_map_base = _replant(T_map_base, flat, spread(flat, closed.scans, closed.poses))
+        for keyframe in keyframes:
+            pose = SE2.flatten(T_map_base[keyframe.index])
+            builder.add(keyframe.sweep, pose)
+            builder.glimpse(pose.apply(keyframe.glimpses_m))
     trajectory = Trajectory(
         stamps_ns=np.array(stamps, dtype=np.int64), T_map_base=T_map_base, health=tuple(health)
     )
-    return builder.grid(), trajectory, loops
+    return builder.grid(), trajectory, closed.loops
 
 
 def _with_health(report: ReadReport, trajectory: Trajectory) -> ReadReport:

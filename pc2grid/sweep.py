@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -43,10 +44,18 @@ class Sweep:
 
     def free_polygon(self, limit_m: float = np.inf) -> F64:
         """(B, 2) outline in the levelled base frame of the free space no farther than `limit_m`, metres."""
-        bearings = np.arange(len(self.free_m)) * (2.0 * np.pi / len(self.free_m))
         free_m = np.minimum(self.free_m, limit_m)
-        outline: F64 = self.origin_m + free_m[:, None] * np.column_stack((np.cos(bearings), np.sin(bearings)))
+        outline: F64 = self.origin_m + free_m[:, None] * _directions(len(self.free_m))
         return outline
+
+
+@lru_cache(maxsize=4)
+def _directions(count: int) -> F64:
+    """(count, 2) unit vectors, equally spaced around, the first along +x."""
+    bearings = np.arange(count) * (2.0 * np.pi / count)
+    directions: F64 = np.column_stack((np.cos(bearings), np.sin(bearings)))
+    directions.flags.writeable = False
+    return directions
 
 
 def flatten(

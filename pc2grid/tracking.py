@@ -53,15 +53,12 @@ class Tracked:
     """What became of one scan.
 
     sweep : the scan reduced to the plane.
-    information : (3, 3) of the planar pose (x, y, yaw in the map frame) relative to the local map, from
-        what the scan sees; what it does not see rests on the odometry.
     keyframe : whether the robot had moved enough for the scan to become part of the local map.
     restart : the first keyframe after a lost stretch: where it is relative to those before is a guess.
     """
 
     registered: RegisteredScan
     sweep: Sweep
-    information: F64
     keyframe: bool
     restart: bool = False
 
@@ -115,11 +112,9 @@ class Tracker:
         planar = SE2.flatten(pose)
         T_level_base = planar.inverse().lift() @ pose
         sweep = self._flatten(points, scan, T_level_base)
-        information, health = np.zeros((3, 3)), Health.FINE
+        health = Health.FINE
         if self._maps:
             refined, match = self._refine(sweep, planar, predicted, odometry)
-            if match is not None:
-                information = match.information
             if self._rolling:
                 planar = refined
                 pose = planar.lift() @ T_level_base
@@ -146,7 +141,6 @@ class Tracker:
         return Tracked(
             registered=registered,
             sweep=sweep,
-            information=information,
             keyframe=keyframe,
             restart=keyframe and was_restarted,
         )

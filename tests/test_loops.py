@@ -1,13 +1,16 @@
 """The pose graph, and maps that agree with themselves."""
 
+import errno
+import io
 import math
 
 import numpy as np
 import pytest
 
+from pc2grid.errors import OutputError
 from pc2grid.geometry import SE2
-from pc2grid.loops import close_loops, spread
-from pc2grid.pieces import Keyframe
+from pc2grid.keyframes import Keyframe, Keyframes
+from pc2grid.loops import LoopCloser, spread
 from pc2grid.pose_graph import Edge, optimise
 from pc2grid.sweep import BEARINGS, Sweep
 
@@ -102,28 +105,102 @@ def ring_sweep(pose, walls):
     )
 
 
+def closed(poses, sweeps, restart=None):
+    """What the closer makes of keyframes, as poses of all of them and as it says it."""
+    keyframes = Keyframes()
+    closer = LoopCloser(keyframes)
+    for k, (pose, sweep) in enumerate(zip(poses, sweeps, strict=True)):
+        keyframes.append(Keyframe(k, sweep, pose, restart=k == restart))
+        closer.extend(keyframes[k])
+    found = closer.finish()
+    return spread(array(poses), found.scans, found.poses), found
+
+
+BLOCK = [
+    *[((-2, -2), (14, -2)), ((14, -2), (14, 12)), ((14, 12), (-2, 12)), ((-2, 12), (-2, -2))],
+    *[((2, 2), (8, 2)), ((8, 2), (8, 5)), ((8, 5), (5, 8)), ((5, 8), (2, 8)), ((2, 8), (2, 2))],
+]
+"""A block in a hall."""
+
+
 def test_two_laps_around_a_block_with_drift_agree_after_closing():
-    outer = [((-2, -2), (14, -2)), ((14, -2), (14, 12)), ((14, 12), (-2, 12)), ((-2, 12), (-2, -2))]
-    block = [((2, 2), (8, 2)), ((8, 2), (8, 5)), ((8, 5), (5, 8)), ((5, 8), (2, 8)), ((2, 8), (2, 2))]
     truth = square(100) * 2
-    walls = outer + block
     poses, _ = drifting(truth, veer=0.003)
-    keyframes = [
-        Keyframe(k, ring_sweep(true, walls), pose, INFORMATION)
-        for k, (true, pose) in enumerate(zip(truth, poses, strict=True))
-    ]
     before = np.linalg.norm(array(poses)[:, :2] - array(truth)[:, :2], axis=1)
-    closed = close_loops(keyframes)
-    after = np.linalg.norm(closed.poses[:, :2] - array(truth)[:, :2], axis=1)
-    assert before.max() > 3.0 and len(closed.loops) > 3
-    lap = closed.poses[100:, :2] - closed.poses[:100, :2]
-    assert np.linalg.norm(lap, axis=1).max() < 0.08
-    assert after.max() < 0.1
-    for loop in closed.loops:
+    settled, found = closed(poses, [ring_sweep(pose, BLOCK) for pose in truth])
+    assert before.max() > 3.0 and len(found.loops) > 3
+    lap = settled[100:, :2] - settled[:100, :2]
+    assert np.linalg.norm(lap, axis=1).max() < 0.04
+    # Half a piece veers by a degree before its anchor: so much the whole map may be turned about its start.
+    T_truth_map = SE2.fit(settled[:, :2], array(truth)[:, :2])
+    assert abs(T_truth_map.yaw) < math.radians(1.0)
+    assert np.linalg.norm(T_truth_map.apply(settled[:, :2]) - array(truth)[:, :2], axis=1).max() < 0.04
+    for loop in found.loops:
         assert loop.older < loop.newer
         apart = (truth[loop.older].inverse() @ truth[loop.newer]).inverse() @ loop.T_older_newer
         assert math.hypot(apart.x, apart.y) < 0.1 and abs(apart.yaw) < 0.03
         # The information is right about the size of that error: 16 is beyond 0.1 % of what it promises.
         error = np.array([apart.x, apart.y, apart.yaw])
         assert error @ loop.information @ error < 16.0 and np.linalg.eigvalsh(loop.information)[0] > 10.0
-    assert sum(loop.accepted for loop in closed.loops) > 0.9 * len(closed.loops)
+    assert sum(loop.accepted for loop in found.loops) > 0.9 * len(found.loops)
+
+
+def test_a_lost_stretch_is_a_guess_and_its_error_stays_in_it():
+    """After the first lap tracking is lost, and begins anew 1 m and 10 degrees beside the truth."""
+    truth = square(100) * 2
+    beside = truth[100] @ SE2(0.8, -0.6, math.radians(10.0)) @ truth[100].inverse()
+    poses = truth[:100] + [beside @ pose for pose in truth[100:]]
+    settled, found = closed(poses, [ring_sweep(pose, BLOCK) for pose in truth], restart=100)
+    assert {99, 100} <= set(found.scans.tolist())
+    apart = np.linalg.norm(settled[:, :2] - array(truth)[:, :2], axis=1)
+    assert apart.max() < 0.1
+
+
+def test_work_and_ties_grow_with_the_way_and_not_with_its_square():
+    """A lap more does not add to what each piece is compared with."""
+    found = {}
+    for laps in (2, 8):
+        truth = square(50) * laps
+        sweeps = [ring_sweep(pose, BLOCK) for pose in truth[:50]] * laps
+        found[laps] = closed(truth, sweeps)[1]
+    assert found[8].tried <= 8 * found[2].tried
+    assert len(found[8].loops) <= found[8].tried <= 4 * len(found[8].scans)
+
+
+def test_keyframes_come_back_from_a_file_as_they_were():
+    small, spilled = Keyframes(), Keyframes(in_memory_bytes=1)
+    rng = np.random.default_rng(0)
+    kept = []
+    for k in range(20):
+        sweep = Sweep(
+            stamp_ns=2**60 + k,
+            hits_m=rng.normal(size=(k, 2)).astype(np.float32),
+            origin_m=rng.normal(size=2),
+            free_m=rng.random(8).astype(np.float32),
+        )
+        glimpses = rng.normal(size=(20 - k, 2)).astype(np.float32)
+        kept.append(Keyframe(3 * k, sweep, SE2(*rng.normal(size=3)), k == 7, glimpses))
+        small.append(kept[-1])
+        spilled.append(kept[-1])
+        spilled[k // 2]  # reading moves the file; the next goes to its end all the same
+    for keyframes in (small, spilled):
+        assert len(keyframes) == 20
+        for got, want in zip(keyframes, kept, strict=True):
+            assert (got.index, got.restart, got.T_map_base) == (want.index, want.restart, want.T_map_base)
+            assert got.sweep.stamp_ns == want.sweep.stamp_ns
+            for name in ("hits_m", "origin_m", "free_m"):
+                assert np.array_equal(getattr(got.sweep, name), getattr(want.sweep, name))
+            assert np.array_equal(got.glimpses_m, want.glimpses_m)
+        keyframes.close()
+
+
+def test_a_full_disk_under_the_keyframes_is_an_error_of_ours(monkeypatch):
+    class Full(io.BytesIO):
+        def write(self, data):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("tempfile.SpooledTemporaryFile", lambda max_size: Full())
+    sweep = ring_sweep(SE2(), BLOCK)
+    with pytest.raises(OutputError, match="no room for the scans of the map: No space left") as caught:
+        Keyframes().append(Keyframe(0, sweep, SE2()))
+    assert "TMPDIR" in caught.value.hint
