@@ -3,7 +3,7 @@
 The containers of recordings are mutated in test_io_fuzz.py, where checksums catch most of it. Here the
 container stays sound and its content lies, so that the decoders behind the checksums are reached.
 Whatever is changed, the result is whole and possible, or a Pc2GridError; never another exception.
-PC2GRID_FUZZ is the number of mutations of each kind.
+PC2GRID_FUZZ is the number of mutations of each kind: hundreds, as every outcome has to come up.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ in no other time and with no other memory than a small file deserves. What canno
   Whole chunks can be missing without a trace in a file that was not closed: that is what the warning about
   the recorder is for.
 
-PC2GRID_FUZZ is the number of mutations of each kind.
+PC2GRID_FUZZ is the number of mutations of each kind: hundreds, as every outcome has to come up.
 """
 
 from __future__ import annotations
