@@ -1,0 +1,143 @@
+"""What the parts refuse, and with which words; what is left alone."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pc2grid.errors import ClusterError, ConfigError
+from pc2grid.geometry import SE2
+from pc2grid.io.atomic import replace_file
+from pc2grid.model import Health, Loop, OccupancyGrid, Scan, SessionMap, Trajectory
+from pc2grid.settings import load_settings
+from signature.config import Config
+from signature.describe import Signature
+from signature.evaluation.relations import read_relations, relation_error
+from signature.maps import Lazily
+from signature.similarity import SignatureTable
+
+GRID = OccupancyGrid(cells=np.zeros((2, 2)), resolution_m=0.05, origin_m=(0.0, 0.0))
+STILL = Trajectory(stamps_ns=np.arange(3), T_map_base=np.stack([np.eye(4)] * 3))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (
+            lambda: Scan(stamp_ns=0, points_m=np.ones((5, 2)), T_base_sensor=np.eye(4), sensor="lidar"),
+            r"Scan\.points_m: expected shape \('N', 3\), got \(5, 2\)",
+        ),
+        (
+            lambda: Trajectory(stamps_ns=np.arange(3), T_map_base=np.stack([np.eye(4)] * 2)),
+            r"Trajectory\.T_map_base: expected shape \(3, 4, 4\), got \(2, 4, 4\)",
+        ),
+        (
+            lambda: Trajectory(stamps_ns=STILL.stamps_ns, T_map_base=STILL.T_map_base, health=(Health.FINE,)),
+            r"Trajectory\.health: expected 3 entries, got 1",
+        ),
+        (
+            lambda: OccupancyGrid(cells=np.zeros((2, 2)), resolution_m=math.nan, origin_m=(0.0, 0.0)),
+            r"OccupancyGrid\.resolution_m: expected > 0, got nan",
+        ),
+        (
+            lambda: SessionMap(
+                session="a",
+                sensor="map",
+                grid=GRID,
+                submaps=(),
+                trajectory=STILL,
+                loops=(Loop(older=1, newer=3, T_older_newer=SE2(), information=np.eye(3)),),
+            ),
+            r"SessionMap\.loops: expected poses of 0\.\.2, got 1 and 3",
+        ),
+        (
+            lambda: Signature(boundary=np.ones((1, 3)), freespace=np.ones(3), symmetry=np.ones(2)),
+            r"Signature\.boundary: expected one axis, got shape \(1, 3\)",
+        ),
+        (
+            lambda: SignatureTable.of((), np.empty((0, 2)), submap_id=[1]),
+            r"SignatureTable\.submap_id: expected 0 entries",
+        ),
+    ],
+)
+def test_values_that_do_not_fit_together(make: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_settings_that_cannot_be_read(tmp_path: Path) -> None:
+    for name, words in (("none.toml", "no such file"), (".", "cannot be read: Is a directory")):
+        with pytest.raises(ConfigError, match=words):
+            load_settings(Config, tmp_path / name)
+    (tmp_path / "a.toml").write_bytes(b"[read]\ntopic = '\xff'\n")
+    with pytest.raises(ConfigError, match=r"a\.toml: not TOML"):
+        load_settings(Config, tmp_path / "a.toml")
+    assert load_settings(Config, environment={}) == Config()
+
+
+def test_what_a_killed_writer_left_is_swept_and_nothing_else(tmp_path: Path) -> None:
+    dead = os.spawnlp(os.P_NOWAIT, "true", "true")
+    os.waitpid(dead, 0)
+    swept = [f".a.pc2grid-{dead}.tmp", f".a.pc2grid-{os.getpid()}.tmp"]
+    kept = [
+        f".a.pc2grid-{os.getppid()}.tmp",  # that process is at it
+        f".a.pc2grid-{10**30}.tmp",  # no process of ours
+        ".a.pc2grid-x.tmp",
+        f".a.pc2grid-{dead}",
+        f".b.pc2grid-{dead}.tmp",
+    ]
+    for name in (*swept, *kept):
+        (tmp_path / name).touch()
+    with replace_file(tmp_path / "a") as temporary:
+        temporary.write_text("new")
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(["a", *kept])
+
+
+def test_a_job_that_kills_its_workers_fails_and_a_lost_scheduler_ends_all(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    from distributed.client import FutureCancelledError
+
+    from signature.cluster import Job, _outcome
+
+    job = Job(path=tmp_path / "a.mcap", name="a", config=Config())
+
+    def failing(error: Exception) -> Any:
+        def result() -> None:
+            raise error
+
+        return SimpleNamespace(result=result)
+
+    killed = distributed.KilledWorker("key", None, 3)
+    error = _outcome(job, failing(killed)).error
+    assert isinstance(error, ClusterError)
+    assert error.message == f"{job.path}: 4 workers died on it, one after the other"
+    for gone in (FutureCancelledError("key", "lost"), OSError("closed")):
+        with pytest.raises(ClusterError, match="the scheduler went away") as caught:
+            _outcome(job, failing(gone))
+        assert caught.value.hint is not None and "the same command goes on" in caught.value.hint
+
+
+def test_relations_that_a_trajectory_says_nothing_of(tmp_path: Path) -> None:
+    (tmp_path / "a.relations").write_text("# t1 t2 x y z roll pitch yaw\n\n5 6 1 0 0 0 0 0\n")
+    relations = read_relations(tmp_path / "a.relations")
+    nothing = Trajectory(stamps_ns=np.empty(0), T_map_base=np.empty((0, 4, 4)))
+    for trajectory in (STILL, nothing):
+        error = relation_error(trajectory, relations)
+        assert (error.used, error.total) == (0, 1)
+        assert math.isnan(error.translation_m) and math.isnan(error.rotation_deg)
+
+
+def test_things_made_lazily_are_made_once_and_only_when_asked_for() -> None:
+    made: list[int] = []
+    things = Lazily(lambda i: made.append(i) or i * i, 10)
+    assert len(things) == 10 and made == []
+    assert (things[-1], things[2:5], things[9]) == (81, (4, 9, 16), 81)
+    assert made == [9, 2, 3, 4]
+    with pytest.raises(IndexError):
+        things[10]
