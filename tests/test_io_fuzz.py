@@ -157,3 +157,11 @@ def test_fuzz_leaves_something_to_find() -> None:
     rng = np.random.default_rng(0)
     data = ros().cloud("/points", 1, [[1, 2, 3]]).data
     assert sum(mutated(data * 20, rng) != data * 20 for _ in range(50)) > 45
+
+
+def test_fuzz_notices_memory_that_is_asked_for_and_never_touched() -> None:
+    with bounded_memory(MOST_BYTES):
+        assert len(bytearray(MOST_BYTES // 2)) == MOST_BYTES // 2
+        with pytest.raises(MemoryError):
+            bytearray(MOST_BYTES + 1)
+    assert len(bytearray(MOST_BYTES + 1)) > MOST_BYTES
