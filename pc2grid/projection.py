@@ -26,6 +26,7 @@ _HIT = 150
 _MISS = -75
 _CLAMP = 500
 _GLIMPSED = round(OCCUPIED / (1.0 + math.exp(-_HIT / 100.0)))
+_HALF, _MANY_GLIMPSED = 1 << 31, 200_000
 BODY_M = 0.15
 """Around the origin of the base nothing but the robot has room."""
 
@@ -41,7 +42,8 @@ class GridBuilder:
         self._config = config
         self._log_odds: dict[tuple[int, int], NDArray[np.int16]] = {}
         self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
-        self._glimpsed: list[I64] = []
+        self._glimpsed = np.empty(0, np.int64)  # cells, row and column in one number
+        self._more_glimpsed: list[I64] = []
 
     def add(self, sweep: Sweep, T_map_base: SE2) -> None:
         """Draw one sweep taken at `T_map_base`. Raises LimitExceeded if the map grows past `max_cells`."""
@@ -70,7 +72,15 @@ class GridBuilder:
 
     def glimpse(self, hits_m: F64) -> None:
         """Obstacles (N, 2) in the map frame that count only where no sweep says anything, now or later."""
-        self._glimpsed.append(np.floor(hits_m / self._config.resolution_m).astype(np.int64))
+        columns, rows = np.floor(hits_m / self._config.resolution_m).astype(np.int64).T
+        self._more_glimpsed.append((rows << 32) + (columns + _HALF))
+        if sum(map(len, self._more_glimpsed)) > _MANY_GLIMPSED:
+            self._merge_glimpsed()
+
+    def _merge_glimpsed(self) -> None:
+        """Each cell once, so that they are as many as the area has, however often the robot comes by."""
+        self._glimpsed = np.unique(np.concatenate((self._glimpsed, *self._more_glimpsed)))
+        self._more_glimpsed = []
 
     def grid(self) -> OccupancyGrid:
         """The map so far: 0..100 where seen, unknown elsewhere, cropped to what was seen."""
@@ -109,9 +119,9 @@ class GridBuilder:
         In front of a drawn wall it is the wall's noise; where a wall goes on or has a gap, fewer than five
         cells around are drawn.
         """
-        if not self._glimpsed:
-            return
-        at = np.unique(np.concatenate(self._glimpsed)[:, ::-1] - first, axis=0)
+        self._merge_glimpsed()
+        rows, columns = self._glimpsed >> 32, (self._glimpsed & (2 * _HALF - 1)) - _HALF
+        at = np.column_stack((rows, columns)) - first
         row, column = at[((at >= 0) & (at < cells.shape)).all(axis=1)].T
         walls = _count_around(cells >= 65, 5)
         kept = (cells[row, column] == UNKNOWN) & (walls[row, column] < 5)
