@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseVersion
-from signature.database import codec, open_database, postgres_schema, schema, transfer
+from pc2grid.model import OccupancyGrid, Submap
+from signature.database import codec, open_database, plausible, postgres_schema, schema, transfer
 from signature.database.sqlite import store as store_file
 from tests import postgresql
 from tests.test_database import assert_holds, make_entry
@@ -113,6 +114,7 @@ CASES: list[tuple[str, Change, str]] = [
     ("trajectory", array("stamps_ns", "<i8", 0, 2**63 - 1), "stamp 1 is earlier"),
     ("trajectory", pose(0, 1.001), "pose 3 is not rigid"),
     ("trajectory", pose(10, -1.0), "pose 3 is not rigid"),  # a mirror image
+    ("trajectory", pose(10, -0.99999), "pose 3 is not rigid"),
     ("trajectory", pose(5, 0.0, number=6), "pose 6 is not rigid"),
     ("trajectory", pose(2, 1e200), "pose 3 is not rigid"),
     ("trajectory", pose(3, NAN), "not finite"),
@@ -225,6 +227,43 @@ def test_what_cannot_be_true_is_refused_by_row(place: Any, table: str, change: C
     if table in ("loop", "submap"):  # the others are what a search rests on
         with open_database(place) as database:
             assert len(database.signatures()) == 8
+
+
+@pytest.mark.parametrize("side", [(0, 4), (8, 4), (4, 0), (4, 8)])
+def test_cells_beyond_each_side_of_the_map(side: tuple[int, int]) -> None:
+    """A submap of 9 x 9 cells in the middle of a map of 7 x 7."""
+    grid = OccupancyGrid(cells=np.full((9, 9), -1), resolution_m=0.1, origin_m=(2.0, 3.0))
+    sizes = plausible.Sizes(
+        scans=0, height=7, width=7, resolution_m=0.1, origin_x_m=2.0 + 0.1, origin_y_m=3.0 + 0.1
+    )
+    submap = Submap(submap_id=0, center_m=(2.45, 3.45), radius_m=0.4, grid=grid)
+    inside = grid.cells.copy()
+    inside[1:8, 1:8] = 0
+    plausible.check_submap(replace(submap, grid=replace(grid, cells=inside)), sizes)
+    outside = grid.cells.copy()
+    outside[side] = 0
+    with pytest.raises(ValueError, match="it knows cells outside its map"):
+        plausible.check_submap(replace(submap, grid=replace(grid, cells=outside)), sizes)
+    plausible.check_submap(replace(submap, grid=replace(grid, cells=outside)), None)
+
+
+def test_rounding_is_no_lie() -> None:
+    """What computing leaves behind is believed."""
+    rng = np.random.default_rng(2)
+    pairs, measured, accepted = np.array([[0, 5]]), np.zeros((1, 3)), np.ones(1, np.uint8)
+    for scale in (1e-9, 1.0, 1e9):
+        root = rng.normal(size=(3, 2))  # one direction rests on nothing
+        information = (root @ root.T)[None] * scale
+        information[0, 0, 1] *= 1 + 1e-12
+        plausible.check_loops(pairs, measured, information, accepted, 6)
+    turned = np.tile(np.eye(4), (1, 1, 1))
+    turned[0, :3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turned[0, :3, :3] *= np.sign(np.linalg.det(turned[0, :3, :3])) * (1 + 1e-6)
+    plausible.check_poses(turned)
+    plausible.check_stamps(np.array([5, 5, 6]))
+    histograms = rng.dirichlet(np.ones(80), 1000).astype(np.float32)
+    histograms[7] = 0
+    plausible.check_histograms(histograms, "boundary")
 
 
 def test_recovering_keeps_what_can_be_true(place: Any, tmp_path: Path) -> None:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+import struct
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from pc2grid.config import ReadConfig
-from pc2grid.io.bag_log import BagSource
+from pc2grid.io.bag_log import MAGIC, BagSource
+from pc2grid.io.bag_records import blob
 from pc2grid.io.bag_salvage import SalvagedBag
 from pc2grid.io.db3_log import Db3Source
 from pc2grid.io.db3_salvage import SalvagedDb3
 from pc2grid.io.mcap_log import McapSource
 from pc2grid.io.source import Source
-from tests.builders import STEP, T0, Message, drive, write_bag, write_mcap, write_rosbag2
+from tests.builders import STEP, T0, Dialect, Message, drive, write_bag, write_mcap, write_rosbag2
 
 CONFIG = ReadConfig()
 PARTS: list[tuple[int | None, int | None]] = [
@@ -26,6 +29,11 @@ PARTS: list[tuple[int | None, int | None]] = [
     (T0 + 99 * STEP, None),
     (None, T0),
 ]
+
+
+def at_odd_times(dialect: Dialect = "ros2") -> list[Message]:
+    """A drive whose times have no zeros in their last bytes."""
+    return [m._replace(log_time_ns=m.log_time_ns + 7 + 3 * i) for i, m in enumerate(drive(dialect))]
 
 
 def late(messages: list[Message]) -> list[Message]:
@@ -70,7 +78,7 @@ def alike(indexed: Source, gone_through: Source, messages: list[Message]) -> Non
 @pytest.mark.parametrize("compression", ["", "bz2", "lz4"])
 @pytest.mark.parametrize("order", [list, late])
 def test_a_bag(tmp_path: Path, compression: str, order: Callable[[list[Message]], list[Message]]) -> None:
-    messages = order(drive("ros1"))
+    messages = order(at_odd_times("ros1"))
     path = write_bag(tmp_path / "a.bag", messages, compression, chunk_bytes=3000)
     alike(BagSource(path, CONFIG), SalvagedBag(path, CONFIG), messages)
     found = everything(SalvagedBag(path, CONFIG), {m.topic for m in messages}, (None, None))
@@ -79,20 +87,58 @@ def test_a_bag(tmp_path: Path, compression: str, order: Callable[[list[Message]]
 
 
 def test_messages_of_a_salvaged_chunk_come_by_their_times(tmp_path: Path) -> None:
-    messages = late(drive("ros1"))
+    messages = late(at_odd_times("ros1"))
     source = SalvagedBag(write_bag(tmp_path / "a.bag", messages), CONFIG)
     found = everything(source, {m.topic for m in messages}, (None, None))
     assert [m[2] for m in found] == sorted(m.log_time_ns for m in messages)
 
 
+@pytest.mark.parametrize("order", list(itertools.permutations((b"op=", b"compression=", b"size="))))
+def test_a_chunk_is_found_whatever_its_header_begins_with(tmp_path: Path, order: tuple[bytes, ...]) -> None:
+    """Writers differ in the order of its fields; behind damage it is looked for by one of them."""
+    path = write_bag(tmp_path / "a.bag", at_odd_times("ros1"), chunk_bytes=3000)
+    content = bytearray(path.read_bytes())
+    chunks = []
+    at = len(MAGIC)
+    while at < len(content):
+        header, begin = blob(memoryview(bytes(content)), at)
+        fields = [bytes(field) for field in split(header)]
+        if any(field == b"op=\x05" for field in fields):
+            fields.sort(key=lambda field: [field.startswith(name) for name in order].index(True))
+            content[at + 4 : begin] = b"".join(struct.pack("<I", len(f)) + f for f in fields)
+            chunks.append(at)
+        _, at = blob(memoryview(bytes(content)), begin)
+    assert len(chunks) > 3
+    whole = SalvagedBag(rewritten(path, content), CONFIG)
+    hit = chunks[-2]  # the first ones say what the topics are
+    content[hit : hit + 4] = b"\xff" * 4
+    damaged = SalvagedBag(rewritten(path, content), CONFIG)
+    assert damaged.tally.bytes_lost == chunks[-1] - hit
+    assert whole.tally.bytes_lost == 0
+    lost = (whole.info.message_count or 0) - (damaged.info.message_count or 0)
+    assert 0 < lost < (whole.info.message_count or 0) / 2
+
+
+def split(header: memoryview) -> Iterator[memoryview]:
+    at = 0
+    while at < len(header):
+        field, at = blob(header, at)
+        yield field
+
+
+def rewritten(path: Path, content: bytes | bytearray) -> Path:
+    path.write_bytes(content)
+    return path
+
+
 def test_a_db3(tmp_path: Path) -> None:
-    messages = drive()
+    messages = at_odd_times()
     (path,) = write_rosbag2(tmp_path / "log", messages).glob("*.db3")
     alike(Db3Source(path, CONFIG), SalvagedDb3(path, CONFIG, recover=True), messages)
 
 
 @pytest.mark.parametrize("options", [{}, {"use_chunking": False}, {"chunk_size": 2000}])
 def test_an_mcap(tmp_path: Path, options: dict[str, object]) -> None:
-    messages = drive()
+    messages = at_odd_times()
     path = write_mcap(tmp_path / "a.mcap", messages, **options)
     alike(McapSource(path, CONFIG), McapSource(path, CONFIG, recover=True), messages)
