@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import multiprocessing
 import os
 import sqlite3
@@ -173,6 +174,35 @@ def test_what_goes_in_comes_out(filled: str | Path) -> None:
             database.submap("monday", 99)
         with pytest.raises(DatabaseError, match="reading only"):
             database.add(*make_entry("wednesday", 2))
+
+
+def test_a_session_is_summed_up(filled: str | Path) -> None:
+    session_map, _, origin = make_entry("monday", 0)
+    with open_database(filled) as database:
+        info = database.sessions()[0]
+    grid, steps = session_map.grid, [math.hypot(0.1, 0.01 * (2 * i + 1)) for i in range(6)]
+    free = int(((grid.cells >= 0) & (grid.cells < 20)).sum())
+    assert info.area_m2 == pytest.approx(free * 0.0025, abs=6e-4)
+    assert info.path_m == pytest.approx(sum(steps), abs=6e-4)
+    assert (info.duration_s, info.scans, info.submaps, info.resolution_m) == (0.6, 7, 3, 0.05)
+    assert (info.sensor, info.report, info.provenance) == ("lidar", session_map.report, origin)
+
+
+def test_sessions_without_submaps_or_poses(filled: str | Path) -> None:
+    session_map, signatures, origin = make_entry("empty", 5, submaps=0)
+    nowhere = Trajectory(stamps_ns=np.empty(0), T_map_base=np.empty((0, 4, 4)))
+    entry = replace(session_map, trajectory=nowhere, loops=()), signatures, origin
+    query = make_entry("q", 99)[1][0]
+    for keep in (True, False):
+        store_anywhere(filled, [entry], keep=keep)
+        with open_database(filled) as database:
+            assert_holds(database, entry)
+            info = database.sessions(["empty"])[0]
+            assert (info.path_m, info.duration_s, info.scans, info.submaps) == (0.0, 0.0, 0, 0)
+            assert database.check() == ()
+            assert len(database.signatures("empty")) == 0
+            assert database.nearest(query, 3, session="empty") == ()
+            assert len(database.nearest(query, 3)) == (3 if keep else 0)
 
 
 def test_nothing_there_is_no_database(empty: str | Path) -> None:

@@ -123,16 +123,3 @@ def test_another_number_of_bins_gets_another_index(url: str) -> None:
         ).fetchone()
     signature = entry[1][0]
     assert f"halfvec({len(signature.boundary) + len(signature.freespace)})" in index
-
-
-def test_sessions_without_submaps(url: str) -> None:
-    store(url, [make_entry("empty", 5, submaps=0)], keep=True)
-    with open_database(url) as database:
-        assert_holds(database, make_entry("empty", 5, submaps=0))
-        assert database.check() == ()
-        assert len(database.signatures("empty")) == 0
-        assert database.nearest(make_entry("q", 99)[1][0], 3, session="empty") == ()
-    alone = postgresql.new_database()
-    store(alone, [make_entry("empty", 5, submaps=0)], keep=False)
-    with open_database(alone) as database:
-        assert database.nearest(make_entry("q", 99)[1][0], 3) == ()
