@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from pc2grid.errors import (
@@ -532,6 +533,24 @@ def test_a_mistake_of_the_body_stays_its_own(path: Path) -> None:
             row = {"id": number, "name": "monday", "sensor": "lidar", "document": "{}"}
             rows.insert(connection, "session", row)
     assert list(path.parent.iterdir()) == [path]
+    assert not any(target.name in file.path for file in psutil.Process().open_files())
+
+
+def test_waiting_for_another_writer_keeps_nothing_open(path: Path) -> None:
+    with hold(path, 1.0):
+        before = psutil.Process().num_fds()
+        with pytest.raises(DatabaseBusy), hold(path, 0.2):
+            pass
+        assert psutil.Process().num_fds() == before
+
+
+def test_a_file_of_one_byte_is_somebodys(tmp_path: Path) -> None:
+    file = tmp_path / "x.submaps"
+    file.write_bytes(b"S")
+    with pytest.raises(NotADatabase, match="not a pc2grid database"):
+        store(file, [make_entry()], keep=True)
+    assert file.read_bytes() == b"S"
+    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_names_that_cannot_be_files(tmp_path: Path) -> None:
