@@ -527,21 +527,22 @@ def test_a_lock_that_its_holder_took_away_is_not_held(path: Path, monkeypatch: p
 
 def test_a_mistake_of_the_body_stays_its_own(path: Path) -> None:
     """Not called a full disk, nor damage: there was nothing that could be damaged."""
-    target = path.with_name("new.submaps")
+    target, before = path.with_name("new.submaps"), psutil.Process().num_fds()
     with pytest.raises(sqlite3.IntegrityError, match="UNIQUE"), rewrite(target, keep=False) as connection:
         for number in (1, 2):
             row = {"id": number, "name": "monday", "sensor": "lidar", "document": "{}"}
             rows.insert(connection, "session", row)
     assert list(path.parent.iterdir()) == [path]
-    assert not any(target.name in file.path for file in psutil.Process().open_files())
+    assert psutil.Process().num_fds() == before
 
 
 def test_waiting_for_another_writer_keeps_nothing_open(path: Path) -> None:
+    before = psutil.Process().num_fds()
     with hold(path, 1.0):
-        before = psutil.Process().num_fds()
         with pytest.raises(DatabaseBusy), hold(path, 0.2):
             pass
-        assert psutil.Process().num_fds() == before
+        assert psutil.Process().num_fds() == before + 1
+    assert psutil.Process().num_fds() == before
 
 
 def test_a_file_of_one_byte_is_somebodys(tmp_path: Path) -> None:
