@@ -484,6 +484,40 @@ def test_merging_takes_nothing_from_a_damaged_file(path: Path, tmp_path: Path, t
     assert not target.exists()
 
 
+def test_merging_does_not_mix_settings(path: Path, tmp_path: Path) -> None:
+    other, target = tmp_path / "other.submaps", tmp_path / "target.submaps"
+    config = Config.model_validate({"signature": {"boundary_bin_m": 0.3}})
+    store(other, [make_entry("friday", 5, config=config)], keep=False)
+    words = r"other\.submaps: sessions made with signature\.boundary_bin_m = 0\.2 and with 0\.3"
+    with pytest.raises(DatabaseError, match=words):
+        merge([path, other], target)
+    assert not target.exists()
+
+
+def test_checking_what_is_no_database_of_ours(path: Path, tmp_path: Path) -> None:
+    text = tmp_path / "text"
+    text.write_text("hello")
+    with pytest.raises(NotADatabase, match="not a pc2grid database"):
+        check(text)
+    path.write_bytes(set_header(60, 7)(path.read_bytes()))
+    with pytest.raises(DatabaseVersion, match="format 7"):
+        check(path)
+
+
+@pytest.mark.parametrize(
+    ("statement", "words"),
+    [
+        ("CREATE VIEW more AS SELECT * FROM grid", "its tables are not those of format 2 ('more')"),
+        ("CREATE TRIGGER t AFTER DELETE ON grid BEGIN DELETE FROM loop; END", "format 2 ('t')"),
+        ("DELETE FROM session WHERE id = 2", "belongs to no session"),
+    ],
+)
+def test_structure_that_no_row_shows(path: Path, statement: str, words: str) -> None:
+    change(path, statement)
+    problems = check(path)
+    assert any(words in problem.what for problem in problems), problems
+
+
 def test_what_is_not_worth_recovering_is_left_behind(path: Path, tmp_path: Path) -> None:
     """A damaged submap costs itself, and its signature; a damaged grid the session."""
     change(
