@@ -36,6 +36,8 @@ one side has not seen speaks neither for nor against a pose."""
 FIXED_M = 2.0
 """What is at least that long is taken to stay where it is."""
 _ENOUGH_POINTS = 300
+_CORRELATED = 5.0  # so many neighbouring points say what one says
+_STILL_CELLS, _STILL_RAD = 0.02, 2e-4  # a millimetre at the end of a room
 _BLOCK = 64  # cells at a time
 REACHES_M = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.3, 1.6)
 """Radii of the sliding maxima; the first is the field itself."""
@@ -46,12 +48,14 @@ class LikelihoodField:
     """A map prepared for alignment.
 
     levels : (L, H, W) uint8, sliding maxima of the field over `reaches_m`; 255 = on a wall.
+    halves : (L, H // 2, W // 2) uint8, every second cell of it, the second first.
     known : (H, W) cells that are occupied or free.
     walls_m : (K, 2) float32 occupied cell centres, map frame, one per 0.1 m square.
     weights : (K,) float32, 0..1, how surely each of them stays where it is, see `steadiness`.
     """
 
     levels: U8
+    halves: U8
     reaches_m: tuple[float, ...]
     known: NDArray[np.bool_]
     walls_m: F32
@@ -145,8 +149,10 @@ def prepare(grid: OccupancyGrid) -> LikelihoodField:
         levels.append(np.asarray(cv2.dilate(field, kernel, borderType=cv2.BORDER_REPLICATE), np.uint8))
     cells = cells_of(padded.occupied)
     cells = cells[thin_evenly(padded.to_point(cells), 0.1)]
+    stacked = np.stack(levels)
     return LikelihoodField(
-        levels=np.stack(levels),
+        levels=stacked,
+        halves=np.ascontiguousarray(stacked[:, 1::2, 1::2]),
         reaches_m=REACHES_M,
         known=known,
         walls_m=padded.to_point(cells).astype(np.float32),
@@ -465,16 +471,39 @@ def search(
     return found
 
 
+@numba.njit(cache=True, nogil=True)
+def _solve(
+    a: float, b: float, c: float, d: float, e: float, f: float, g0: float, g1: float, g2: float, x: F64
+) -> None:
+    """x (3,) of [[a, b, c], [b, d, e], [c, e, f]] x = g, positive definite, by Cholesky's way."""
+    l10, l20 = b / a, c / a
+    d1 = d - l10 * b
+    l21 = (e - l20 * b) / d1
+    d2 = f - l20 * c - l21 * l21 * d1
+    y1 = g1 - l10 * g0
+    x[2] = (g2 - l20 * g0 - l21 * y1) / d2
+    x[1] = y1 / d1 - l21 * x[2]
+    x[0] = g0 / a - l10 * x[1] - l20 * x[2]
+
+
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _gauss_newton(
-    field: U8, x: F64, y: F64, tx: float, ty: float, yaw: float, steps: int
+    field: U8,
+    x: NDArray[np.floating],
+    y: NDArray[np.floating],
+    tx: float,
+    ty: float,
+    yaw: float,
+    steps: int,
 ) -> tuple[float, float, float, F64, float]:
-    """Climb the interpolated field; lengths in cells. Returns pose, Hessian (3, 3), mean squared misfit."""
+    """Climb the interpolated field; lengths in cells. Returns pose, Hessian (3, 3), mean squared misfit.
+
+    Where hardly anything fits, it wanders about by parts of a cell: `steps` ends that.
+    """
     height, width = field.shape
     flat, down, one = field.reshape(-1), np.uint64(width), np.uint64(1)
     right, top = width - 1 - 1e-6, height - 1 - 1e-6
-    H = np.zeros((3, 3))
-    g = np.zeros(3)
+    H, step = np.zeros((3, 3)), np.zeros(3)
     misfit, unit = 1.0, 1.0 / 255.0
     for _ in range(steps):
         c, s = math.cos(yaw), math.sin(yaw)
@@ -511,91 +540,124 @@ def _gauss_newton(
         H[0, 0], H[0, 1], H[0, 2] = h00, h01, h02
         H[1, 0], H[1, 1], H[1, 2] = h01, h11, h12
         H[2, 0], H[2, 1], H[2, 2] = h02, h12, h22
-        g[0], g[1], g[2] = g0, g1, g2
         if count < 10:
             break
         misfit = total / count
-        damped = H.copy()
-        for m in range(3):
-            damped[m, m] = H[m, m] * 1.05 + 1e-3
-        step = np.linalg.solve(damped, g)
+        d00, d11, d22 = 1.05 * h00 + 1e-3, 1.05 * h11 + 1e-3, 1.05 * h22 + 1e-3
+        _solve(d00, h01, h02, d11, h12, d22, g0, g1, g2, step)
         size = math.sqrt(step[0] ** 2 + step[1] ** 2)
         if size > 2.0:
             step *= 2.0 / size
         tx += step[0]
         ty += step[1]
         yaw += step[2]
-        if size < 0.005 and abs(step[2]) < 1e-4:
+        if size < _STILL_CELLS and abs(step[2]) < _STILL_RAD:
             break
     return tx, ty, yaw, H, misfit
 
 
-def refine(target: LikelihoodField, query: Query, T_map_query: SE2, *, steps: int = 12) -> tuple[SE2, F64]:
+def refine(target: LikelihoodField, query: Query, T_map_query: SE2, *, steps: int = 8) -> tuple[SE2, F64]:
     """Improve a pose below the cell size; returns it with its covariance (3, 3) of x, y, yaw in the map.
 
     The covariance is the inverse of the Gauss-Newton Hessian, scaled for the correlation of neighbouring
     points, with the neighbourhood that the field can see (0.5 m, 0.1 rad) as its prior, so that a direction
     the walls do not constrain is answered with that width and not with infinity.
     """
-    res = target.resolution_m
-    cx, cy = query.center_m
-    at = T_map_query.apply(np.array([[cx, cy]]))[0]
-    local = (query.walls_m.astype(np.float64) - (cx, cy)) / res
-    x, y = np.ascontiguousarray(local[:, 0]), np.ascontiguousarray(local[:, 1])
-    tx, ty = (at - target.origin_m) / res
-    yaw = T_map_query.yaw
-    if len(x) >= 4 * _ENOUGH_POINTS:  # a few of many bring it near, in a fraction of the time
-        every = len(x) // _ENOUGH_POINTS
-        tx, ty, yaw, _, _ = _gauss_newton(target.levels[0], x[::every], y[::every], tx, ty, yaw, steps)
-    tx, ty, yaw, H, misfit = _gauss_newton(target.levels[0], x, y, tx, ty, yaw, steps)
-    center = SE2(tx * res + target.origin_m[0], ty * res + target.origin_m[1], wrap_angle(yaw))
-    scale = np.array([res, res, 1.0])
-    correlated = 5.0
-    information = H / np.outer(scale, scale) / (correlated * max(misfit, 0.02))
-    information += np.diag([1 / 0.5**2, 1 / 0.5**2, 1 / 0.1**2])
-    return center @ SE2(-cx, -cy, 0.0), np.asarray(np.linalg.inv(information), np.float64)
+    pose, covariance = _refined(
+        target.levels[0],
+        query.walls_m,
+        *query.center_m,
+        *(T_map_query.x, T_map_query.y, T_map_query.yaw),
+        target.resolution_m,
+        *target.origin_m,
+        steps,
+    )
+    return SE2(pose[0], pose[1], wrap_angle(pose[2])), np.asarray(covariance, np.float64)
+
+
+@numba.njit(cache=True, nogil=True)
+def _refined(
+    field: U8,
+    walls: F32,
+    cx: float,
+    cy: float,
+    x: float,
+    y: float,
+    yaw: float,
+    resolution: float,
+    origin_x: float,
+    origin_y: float,
+    steps: int,
+) -> tuple[tuple[float, float, float], NDArray[np.floating]]:
+    """`refine` for walls (M, 2) that turn about (cx, cy), from the pose (x, y, yaw) on; lengths in metres."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    tx = (c * cx - s * cy + x - origin_x) / resolution
+    ty = (s * cx + c * cy + y - origin_y) / resolution
+    u, v = (walls[:, 0] - cx) / resolution, (walls[:, 1] - cy) / resolution
+    if len(walls) >= 4 * _ENOUGH_POINTS:  # a few of many bring it near, in a fraction of the time
+        every = len(walls) // _ENOUGH_POINTS
+        tx, ty, yaw, _, _ = _gauss_newton(field, u[::every].copy(), v[::every].copy(), tx, ty, yaw, steps)
+    tx, ty, yaw, H, misfit = _gauss_newton(field, u, v, tx, ty, yaw, steps)
+    information = H / (_CORRELATED * max(misfit, 0.02))
+    information[:2, :2] /= resolution * resolution
+    information[:2, 2] /= resolution
+    information[2, :2] /= resolution
+    information += np.diag(np.array([1 / 0.5**2, 1 / 0.5**2, 1 / 0.1**2]))
+    c, s = math.cos(yaw), math.sin(yaw)
+    at_x, at_y = tx * resolution + origin_x, ty * resolution + origin_y
+    return (at_x - c * cx + s * cy, at_y - s * cx - c * cy, yaw), np.linalg.inv(information)
 
 
 @numba.njit(cache=True, nogil=True)
 def _agreement(
-    walls: F32, weights: F32, pose: F64, field: U8, known: NDArray[np.bool_], resolution: float, origin: F64
+    walls: F32,
+    weights: F32,
+    x: float,
+    y: float,
+    yaw: float,
+    field: U8,
+    known: NDArray[np.bool_],
+    resolution: float,
+    origin: tuple[float, float],
 ) -> tuple[float, float]:
-    """Of walls (K, 2) moved by `pose` (x, y, yaw): the weight of those that land on known ground, and the
-    weighted sum of their likelihood 0..1 there."""
+    """Of walls (K, 2) moved by a pose: the weight of those that land on known ground, and the weighted sum
+    of their likelihood 0..1 there."""
     height, width = field.shape
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+    known_cells, values = known.reshape(-1), field.reshape(-1)
+    c, s = math.cos(yaw) / resolution, math.sin(yaw) / resolution
+    tx, ty = (x - origin[0]) / resolution, (y - origin[1]) / resolution
     weight, total = 0.0, 0.0
     for p in range(len(walls)):
-        x, y = walls[p, 0], walls[p, 1]
-        j = math.floor((c * x - s * y + pose[0] - origin[0]) / resolution)
-        i = math.floor((s * x + c * y + pose[1] - origin[1]) / resolution)
-        if 0 <= i < height and 0 <= j < width and known[i, j]:
-            weight += weights[p]
-            total += weights[p] * field[i, j] / 255.0
-    return weight, total
+        u, v = c * walls[p, 0] - s * walls[p, 1] + tx, s * walls[p, 0] + c * walls[p, 1] + ty
+        if (u >= 0.0) & (u < width) & (v >= 0.0) & (v < height):
+            at = np.uint64(int(v) * width + int(u))
+            # By weight: which cells are known is as good as random, and a wrong guess costs more.
+            w = weights[p] * known_cells[at]
+            weight += w
+            total += w * values[at]
+    return weight, total / 255.0
 
 
 def assess(target: LikelihoodField, query: Query, T_map_query: SE2, covariance: F64) -> Fit:
     """Score a pose both ways: query walls on the map, and map walls on what the query has looked at."""
-    there = np.array([T_map_query.x, T_map_query.y, T_map_query.yaw])
-    back = T_map_query.inverse()
+    there, back = T_map_query, T_map_query.inverse()
     seen, total = _agreement(
         query.walls_m,
         query.weights,
-        there,
+        *(there.x, there.y, there.yaw),
         target.levels[0],
         target.known,
         target.resolution_m,
-        np.array(target.origin_m),
+        target.origin_m,
     )
     looked, echoed = _agreement(
         target.walls_m,
         target.weights,
-        np.array([back.x, back.y, back.yaw]),
+        *(back.x, back.y, back.yaw),
         query.field,
         query.known,
         query.resolution_m,
-        np.array(query.origin_m),
+        query.origin_m,
     )
     walls = query.walls
     forward = (total + NEUTRAL * (walls - seen)) / walls if walls else 0.0

@@ -52,37 +52,34 @@ def search_windows(
         raise ValueError(f"{len(walls_m)} points; at most {MOST_POINTS}")
     if not len(walls_m) or not len(starts):
         return np.empty((0, 4))
-    res, origin = target.resolution_m, np.asarray(target.origin_m)
-    x, y = np.ascontiguousarray(walls_m.T / res, np.float32)
+    res = target.resolution_m
+    origin = (target.origin_m[0], target.origin_m[1], 0.0)
     turns = max(1, math.ceil(2 * half_a_rad / step_rad))
     step_rad = 2 * half_a_rad / turns
-    half = max(1, math.ceil(half_t_m / res))
-    level = levels_for(np.hypot(x, y), 0.5, 0.5 * step_rad, np.asarray(target.reaches_m) / res)
-    # The first maximum that covers what `level` does, from the middle of a quarter to all its cells.
-    reach = np.array([math.ceil(reach_m / res) for reach_m in target.reaches_m])
-    cover = np.searchsorted(reach, reach[level] + (half + 1) // 2)
     found = _best_of_quarters(
         target.levels,
-        level,
-        cover,
-        x,
-        y,
-        np.column_stack(((starts[:, :2] - origin) / res, starts[:, 2])),
-        half,
+        target.halves,
+        np.array(target.reaches_m) / res,
+        np.asarray(walls_m, np.float32) / np.float32(res),
+        (starts - origin) / (res, res, 1.0),
+        2 * max(1, math.ceil(half_t_m / res / 2)),
         np.asarray(step_rad * (np.arange(turns) - 0.5 * (turns - 1)), np.float64),
+        step_rad,
         int(255 * NEUTRAL),
         floor,
-        keep,
+        keep if most > 1 else 1.0,
     )
     found = found[np.argsort(-found[:, 3], kind="stable")]
     found = found[found[:, 3] >= max(floor, keep * float(found[0, 3]))]
-    found[:, :2] = found[:, :2] * res + origin
+    found[:, :2] = found[:, :2] * res + origin[:2]
     return _apart(found, most, apart_m, apart_rad)
 
 
 def _apart(found: F64, most: int, apart_m: float, apart_rad: float) -> F64:
     """Up to `most` of the poses (N, 4), best first, no two alike."""
     kept: list[int] = []
+    if most == 1:
+        return found[:1]
     for k in range(len(found)):
         if len(kept) == most:
             break
@@ -122,105 +119,183 @@ def _add_windows(flat: U8, corners: I64, width: int, sums: NDArray[np.uint16]) -
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_hanging_window(level: U8, row: int, column: int, sums: NDArray[np.uint16], outside: int) -> None:
-    """The same for one window that hangs over the map: every cell out there counts `outside`."""
-    height, width = level.shape
+def _add_hanging_window(image: U8, row: int, column: int, sums: NDArray[np.uint16], outside: int) -> None:
+    """The same for one window that hangs over the map, less what every cell out there counts: `outside`.
+
+    Less than nothing wraps around, and comes back when `outside` is added."""
+    height, width = image.shape
     tall, wide = sums.shape
     begin, end = min(max(-column, 0), wide), min(max(width - column, 0), wide)
-    out = np.uint16(outside)
-    for r in range(tall):
-        total = sums[r]
-        if 0 <= row + r < height and begin < end:
-            inside = level[row + r, column + begin : column + end]
-            for k in range(begin):
-                total[k] += out
+    less = np.uint16(outside)
+    for r in range(min(max(-row, 0), tall), min(max(height - row, 0), tall)):
+        if begin < end:
+            inside, total = image[row + r, column + begin : column + end], sums[r, begin:end]
             for k in range(end - begin):
-                total[begin + k] += inside[k]
-            for k in range(end, wide):
-                total[k] += out
-        else:
-            for k in range(wide):
-                total[k] += out
+                total[k] += np.uint16(np.uint16(inside[k]) - less)
 
 
 @numba.njit(cache=True, nogil=True)
-def _most_around(levels: U8, cover: I64, rows: I64, columns: I64, down: int, right: int, outside: int) -> int:
-    """What no sum of the points comes to that `cover` covers, from their cells moved `down` and `right`."""
-    count, height, width = levels.shape
-    total = 0
-    for p in range(len(rows)):
-        i, j = rows[p] + down, columns[p] + right
-        if cover[p] < count and 0 <= i < height and 0 <= j < width:
-            total += max(int(levels[cover[p], i, j]), outside)
+def _turned(
+    points: F32, start: F64, turn: float, half: int, height: int, width: int, level: I64, cells: I64
+) -> int:
+    """Cells of points (N, 2) at a start (x, y, yaw) turned by `turn`, as level, row, column: `cells` (N, 3).
+
+    First come those whose window, `half` cells and one to all sides, lies within the map. Returns how many.
+    """
+    c, s = math.cos(start[2] + turn), math.sin(start[2] + turn)
+    inside, beyond = 0, len(points)
+    for p in range(len(points)):
+        x, y = points[p, 0], points[p, 1]
+        i, j = math.floor(s * x + c * y + start[1]), math.floor(c * x - s * y + start[0])
+        if half <= i < height - half - 1 and half <= j < width - half - 1:
+            k = inside
+            inside += 1
         else:
-            total += 255
-    return total
+            beyond -= 1
+            k = beyond
+        cells[k, 0], cells[k, 1], cells[k, 2] = level[p], i, j
+    return inside
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_blocks(
+    halves: U8, cover: I64, cells: I64, half: int, outside: int, sums: NDArray[np.uint16]
+) -> None:
+    """What no pose in a block of 2 x 2 cells exceeds, for all blocks of a window at one heading.
+
+    cover : (L,) which maximum to look at for each level. cells : (N, 3) level, row, column of the points in
+    the middle of the window. sums : written, a row of blocks each.
+    """
+    count, height, width = halves.shape
+    tall, wide = sums.shape
+    sums[:] = 0
+    flat, corners, whole, base = halves.reshape(-1), np.empty(len(cells), np.int64), 0, 0
+    for p in range(len(cells)):
+        image, i, j = cover[cells[p, 0]], (cells[p, 1] - half) >> 1, (cells[p, 2] - half) >> 1
+        if image >= count:
+            base += 255
+        elif i >= 0 and j >= 0 and i + tall < height and j + wide <= width:
+            corners[whole] = (image * height + i) * width + j
+            whole += 1
+        else:
+            base += outside
+            _add_hanging_window(halves[image], i, j, sums, outside)
+    _add_windows(flat, corners[:whole], width, sums)
+    for r in range(tall):
+        total = sums[r]
+        for k in range(wide):
+            total[k] += np.uint16(base)
+
+
+@numba.njit(cache=True, nogil=True)
+def _best_in_block(
+    levels: U8, cells: I64, inside: int, down: int, right: int, last: int, outside: int
+) -> tuple[int, int, int]:
+    """The highest sum of the points' cells (N, 3) moved `down` and `right` or one further, but by `last` at
+    most; and how far they were moved for it. The first `inside` stay within the map wherever they go."""
+    _, height, width = levels.shape
+    flat, one, below = levels.reshape(-1), np.uint64(1), np.uint64(width)
+    s00, s01, s10, s11 = 0, 0, 0, 0
+    for p in range(inside):
+        at = np.uint64((cells[p, 0] * height + cells[p, 1] + down) * width + cells[p, 2] + right)
+        s00 += flat[at]
+        s01 += flat[at + one]
+        s10 += flat[at + below]
+        s11 += flat[at + below + one]
+    for p in range(inside, len(cells)):
+        image, i, j = levels[cells[p, 0]], cells[p, 1] + down, cells[p, 2] + right
+        upper, lower = 0 <= i < height, -1 <= i < height - 1
+        before, after = 0 <= j < width, -1 <= j < width - 1
+        s00 += image[i, j] if upper and before else outside
+        s01 += image[i, j + 1] if upper and after else outside
+        s10 += image[i + 1, j] if lower and before else outside
+        s11 += image[i + 1, j + 1] if lower and after else outside
+    best, i, j = s00, down, right
+    if right < last and s01 > best:
+        best, j = s01, right + 1
+    if down < last and s10 > best:
+        best, i, j = s10, down + 1, right
+    if right < last and down < last and s11 > best:
+        best, i, j = s11, down + 1, right + 1
+    return best, i, j
+
+
+@numba.njit(cache=True, nogil=True)
+def _highest(bounds: NDArray[np.uint16], span: I64) -> I64:
+    """The one block of a span (heading, row, column: from, to) whose bound is the highest, as a span."""
+    t0, t1, i0, i1, j0, j1 = span
+    top, at = -1, span.copy()
+    for t in range(t0, t1):
+        for i in range(i0, i1):
+            row = bounds[t, i, j0:j1]
+            highest = np.uint16(0)
+            for k in range(len(row)):
+                highest = max(highest, row[k])
+            if highest > top:
+                top, j = int(highest), j0 + np.argmax(row)
+                at[:] = t, t + 1, i, i + 1, j, j + 1
+    return at
 
 
 @numba.njit(cache=True, nogil=True)
 def _best_of_quarters(
     levels: U8,
-    point_level: I64,
-    cover: I64,
-    x: F32,
-    y: F32,
+    halves: U8,
+    reaches: F64,
+    points: F32,
     starts: F64,
     half: int,
     turns: F64,
+    step: float,
     outside: int,
     floor: float,
     keep: float,
 ) -> F64:
-    """For each start the best pose in each quarter of its window (4 B, 4): x, y (cells), yaw, score.
+    """For each start the best pose in each quarter of its window (4 B, 4): x, y, yaw, score; in cells.
 
-    Left out is what would not be reported: the upper or lower half of a window at a heading at which neither
-    of its quarters can come to `floor`, to `keep` times the best so far, and to more than at other headings.
+    A block of cells is looked at only if it may hold more than what the quarter has shown so far, and enough
+    to be reported: `floor`, and `keep` times the best of all. `half` is even, so that no block lies in two
+    quarters.
     """
+    n, blocks, middle = len(points), half + 1, half // 2
     _, height, width = levels.shape
-    n, size = len(x), 2 * half + 1
+    level = levels_for(np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2), 0.5, 0.5 * step, reaches)
+    # The first maximum that covers what a level does, from one cell to all beside it.
+    whole_cells = np.ceil(reaches - 1e-6)
+    cover = np.searchsorted(whole_cells, whole_cells + 1.0)
     best = np.empty((4 * len(starts), 4))
     full, least = 255.0 * n, floor
     # Whole vectors: what lies beyond the window belongs to other cells and is not looked at.
-    sums = np.empty((half + 1, -(-size // _LANES) * _LANES), np.uint16)
-    flat, corners = levels.reshape(-1), np.empty(n, np.int64)
-    rows, columns = np.empty(n, np.int64), np.empty(n, np.int64)
-    middles = (-half // 2, (half + 1) // 2)
+    bounds = np.empty((len(turns), blocks, -(-blocks // _LANES) * _LANES), np.uint16)
+    cells, inside = np.empty((len(turns), n, 3), np.int64), np.empty(len(turns), np.int64)
+    spans, shown = np.empty((2, 4, 6), np.int64), np.empty(4, np.int64)
+    for q in range(4):
+        spans[1, q, :2] = 0, len(turns)
+        spans[1, q, 2:4] = (middle, blocks) if q >= 2 else (0, middle)
+        spans[1, q, 4:] = (middle, blocks) if q % 2 else (0, middle)
     for b in range(len(starts)):
+        for t in range(len(turns)):
+            inside[t] = _turned(points, starts[b], turns[t], half, height, width, level, cells[t])
+            _add_blocks(halves, cover, cells[t], half, outside, bounds[t])
         for q in range(4):
             best[4 * b + q] = starts[b, 0], starts[b, 1], starts[b, 2], -1.0
-        for turn in turns:
-            yaw = starts[b, 2] + turn
-            c, s = math.cos(yaw), math.sin(yaw)
-            for p in range(n):
-                rows[p] = math.floor(s * x[p] + c * y[p] + starts[b, 1])
-                columns[p] = math.floor(c * x[p] - s * y[p] + starts[b, 0])
-            for upper in range(2):
-                hope = False
-                for right in range(2):
-                    most = _most_around(levels, cover, rows, columns, middles[upper], middles[right], outside)
-                    hope |= most / full >= least and most / full > best[4 * b + 2 * upper + right, 3]
-                if not hope:
-                    continue
-                first, tall = (0, half + 1) if upper else (-half, half)
-                sums[:] = 0
-                whole = 0
-                for p in range(n):
-                    i, j = rows[p] + first, columns[p] - half
-                    if i >= 0 and j >= 0 and i + tall < height and j + size <= width:
-                        corners[whole] = (point_level[p] * height + i) * width + j
-                        whole += 1
-                    else:
-                        _add_hanging_window(levels[point_level[p]], i, j, sums[:tall], outside)
-                _add_windows(flat, corners[:whole], width, sums[:tall])
-                for r in range(tall):
-                    for right in range(2):
-                        part = sums[r, half:size] if right else sums[r, :half]
-                        top = np.uint16(0)
-                        for k in range(len(part)):
-                            top = max(top, part[k])
-                        q = 4 * b + 2 * upper + right
-                        if top / full > best[q, 3]:
-                            at = np.argmax(part) + (half if right else 0)
-                            best[q] = starts[b, 0] + at - half, starts[b, 1] + first + r, yaw, top / full
-                            least = max(least, keep * best[q, 3])
+            spans[0, q], shown[q] = _highest(bounds, spans[1, q]), -1
+        # First the most promising block of each quarter: what it shows spares most of the others.
+        for k in range(8):
+            q = k % 4
+            t0, t1, i0, i1, j0, j1 = spans[k // 4, q]
+            for t in range(t0, t1):
+                for i in range(i0, i1):
+                    for j in range(j0, j1):
+                        if bounds[t, i, j] <= shown[q] or bounds[t, i, j] < full * least:
+                            continue
+                        down, right = 2 * i - half, 2 * j - half
+                        total, down, right = _best_in_block(
+                            levels, cells[t], inside[t], down, right, half, outside
+                        )
+                        if total > shown[q]:
+                            shown[q], score = total, total / full
+                            best[4 * b + q, :2] = starts[b, 0] + right, starts[b, 1] + down
+                            best[4 * b + q, 2:] = starts[b, 2] + turns[t], score
+                            least = max(least, keep * score)
     return best
