@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import sqlite3
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 
 from pc2grid.config import ReadConfig
+from pc2grid.errors import LogCorrupt
 from pc2grid.io.bag_log import MAGIC, BagSource
 from pc2grid.io.bag_records import blob
 from pc2grid.io.bag_salvage import SalvagedBag
@@ -135,6 +139,23 @@ def test_a_db3(tmp_path: Path) -> None:
     messages = at_odd_times()
     (path,) = write_rosbag2(tmp_path / "log", messages).glob("*.db3")
     alike(Db3Source(path, CONFIG), SalvagedDb3(path, CONFIG, recover=True), messages)
+
+
+def test_a_db3_whose_messages_are_gone(tmp_path: Path) -> None:
+    """Deleted as by a program, so that every page is whole: only their numbers tell."""
+    (path,) = write_rosbag2(tmp_path / "log", at_odd_times()).glob("*.db3")
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        connection.execute("DELETE FROM messages WHERE id IN (3, 4, 9)")
+        connection.commit()
+    before = psutil.Process().num_fds()
+    with pytest.raises(LogCorrupt, match=r"a damaged \.db3: .*lost") as caught:
+        SalvagedDb3(path, CONFIG, recover=False)
+    assert psutil.Process().num_fds() == before, caught
+    source = SalvagedDb3(path, CONFIG, recover=True)
+    assert "3 messages between others are lost" in source.tally.warnings
+    assert source.tally.bytes_lost >= 3
+    assert any("no checksum" in sentence for sentence in source.tally.warnings)
+    source.close()
 
 
 @pytest.mark.parametrize("options", [{}, {"use_chunking": False}, {"chunk_size": 2000}])
