@@ -63,8 +63,9 @@ def alike(indexed: Source, gone_through: Source, messages: list[Message]) -> Non
     assert indexed.info.start_ns == min(m.log_time_ns for m in messages)
     assert indexed.info.end_ns == max(m.log_time_ns for m in messages)
     names = {m.topic for m in messages}
+    exactly = [(m.log_time_ns, m.log_time_ns + 1) for m in messages]
     for topics in (names, {"/points"}, {"/odom", "/tf"}, {"/none"}, set[str]()):
-        for low, high in PARTS:
+        for low, high in (*PARTS, *exactly):
             wanted = sorted(
                 (m.topic, m.type, m.log_time_ns, m.data)
                 for m in messages
