@@ -21,7 +21,7 @@ from pc2grid.io.db3_log import Db3Source
 from pc2grid.io.db3_salvage import SalvagedDb3
 from pc2grid.io.mcap_log import McapSource
 from pc2grid.io.source import Source
-from tests.builders import STEP, T0, Dialect, Message, drive, write_bag, write_mcap, write_rosbag2
+from tests.builders import STEP, T0, Dialect, Message, drive, ros, write_bag, write_mcap, write_rosbag2
 
 CONFIG = ReadConfig()
 PARTS: list[tuple[int | None, int | None]] = [
@@ -89,6 +89,23 @@ def test_a_bag(tmp_path: Path, compression: str, order: Callable[[list[Message]]
     found = everything(SalvagedBag(path, CONFIG), {m.topic for m in messages}, (None, None))
     if order is list:
         assert [m[2] for m in found] == sorted(m.log_time_ns for m in messages)
+
+
+def test_a_topic_of_a_bag_that_has_no_messages(tmp_path: Path) -> None:
+    from rosbags.rosbag1 import Writer
+
+    messages = at_odd_times("ros1")
+    with Writer(tmp_path / "a.bag") as out:
+        for topic, kind in dict.fromkeys((m.topic, m.type) for m in messages):
+            out.add_connection(topic, kind.replace("/", "/msg/"), typestore=ros("ros1").store)
+        of = {connection.topic: connection for connection in out.connections}
+        out.add_connection("/silent", "sensor_msgs/msg/LaserScan", typestore=ros("ros1").store)
+        for topic, _, log_time_ns, data in messages:
+            out.write(of[topic], log_time_ns, data)
+    sources = BagSource(tmp_path / "a.bag", CONFIG), SalvagedBag(tmp_path / "a.bag", CONFIG)
+    for source in sources:
+        assert {t.topic: t.message_count for t in source.info.topics}["/silent"] == 0
+    alike(*sources, messages)
 
 
 def test_messages_of_a_salvaged_chunk_come_by_their_times(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import pytest
 from mcap.writer import CompressionType
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import LimitExceeded, LogCorrupt, LogError, LogTruncated, UnsupportedSchema
+from pc2grid.errors import FrameError, LimitExceeded, LogCorrupt, LogError, LogTruncated, UnsupportedSchema
 from pc2grid.io import bag_salvage, mcap_survey
 from pc2grid.model import ReadReport
 from tests.builders import STEP, T0, read, ros, write_bag, write_mcap
@@ -121,6 +121,24 @@ def test_each_place_of_damage_costs_its_own_chunk(tmp_path: Path, compression: C
     found, report = recovered(path, bytes(content))
     assert found == [i for i in range(SCANS) if not any(i in chunk.scans for chunk in hit)]
     assert sum(c.end - c.start for c in hit) <= report.bytes_lost <= sum(c.after - c.start for c in hit)
+
+
+def test_whether_tf_is_lost_is_known_where_the_summary_lists_the_topics(tmp_path: Path) -> None:
+    """Without a summary the lost chunk may have been the one with the tf: no frame is guessed then."""
+    path = tmp_path / "a.mcap"
+    whole = recording(path, CompressionType.ZSTD)
+    chunk = parts(whole)[3]
+    at, new = DAMAGES["content"](chunk)
+    content = whole[:at] + new + whole[at + len(new) :]
+    path.write_bytes(content)
+    scans, report = read(path, recover=True)
+    assert len(scans) == SCANS - len(chunk.scans)
+    assert any("taken for the robot's base" in w for w in report.warnings)
+    path.write_bytes(content[: parts(whole)[-1].end])
+    with pytest.raises(FrameError, match="lidar"):
+        read(path, recover=True)
+    path.write_bytes(whole[: parts(whole)[-1].end - 1])  # nothing is lost in front of what is read
+    assert len(read(path, recover=True)[0]) == SCANS - len(parts(whole)[-1].scans)
 
 
 @pytest.mark.parametrize("window", [1, 45, 46, 64, 1000])
