@@ -62,6 +62,7 @@ def test_arrays_survive(dtype: str) -> None:
         (bytes(13), (3,), "13 bytes"),
         (bytes(0), (-1, 2), "0 bytes"),
         (bytes(8), (-1, -2), "8 bytes"),
+        (bytes(4), (-1, -1), "4 bytes cannot be"),
         (bytes(8), (1 << 40, 1 << 40), "8 bytes"),
         (np.array([1, np.nan], "<f4").tobytes(), (2,), "not finite"),
         (np.array([-np.inf, 1], "<f4").tobytes(), (2,), "not finite"),
@@ -78,6 +79,7 @@ def cells_of(*values: int) -> bytes:
 
 def test_cells_survive() -> None:
     cells = np.random.default_rng(3).integers(-1, 101, (7, 5)).astype(np.int8)
+    cells[0, :2] = -1, 100
     grid = OccupancyGrid(cells=np.asfortranarray(cells), resolution_m=1.0, origin_m=(0, 0))
     np.testing.assert_array_equal(codec.unpack_cells(codec.pack_cells(grid), 7, 5), cells)
     assert codec.unpack_cells(zlib.compress(b""), 0, 5).shape == (0, 5)
