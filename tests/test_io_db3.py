@@ -421,6 +421,28 @@ def test_of_an_index_no_page_is_missed(tmp_path: Path, page_bytes: int) -> None:
     pages.close()
 
 
+def test_the_page_that_locks_stand_on_is_not_missed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SQLite never uses the page with the byte 2^30."""
+    path = tmp_path / "x.db"
+    with closing(sqlite3.connect(path)) as db:
+        db.execute("PRAGMA page_size=65536")
+        db.execute("CREATE TABLE rows(id INTEGER PRIMARY KEY, a)")
+        db.commit()
+    with path.open("r+b") as stream:
+        stream.truncate((1 << 30) + 3 * 65536)  # the disk keeps no page of zeros
+    pages, looked = SqlitePages(path, 1 << 30), list[int]()
+    begin, read_page = pages.count - 5, pages._page
+
+    def page(number: int) -> bytes:
+        looked.append(number)
+        return read_page(number) if number <= 2 or number > begin else b"\x0a" * 8
+
+    monkeypatch.setattr(pages, "_page", page)
+    assert pages.unused() == 4
+    assert set(range(2, pages.count + 1)) - set(looked) == {(1 << 30) // 65536 + 1}
+    pages.close()
+
+
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_no_bytes_make_it_stumble(tmp_path: Path, data: st.DataObject) -> None:
