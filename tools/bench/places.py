@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import material
@@ -61,6 +61,7 @@ def align_time(folder: Path, quick: bool) -> Iterator[Row]:
     grid = material.grid_of(material.drive(30.0 if quick else 100.0, seed=0))
     field, sight_m = prepare(grid), config.partition.radius_m
     centers = [(float(x), float(y)) for x, y in submap_centers(grid, config.partition)][:: 4 if quick else 1]
+    places = [isovist(grid, at, sight_m, bearings=90) for at in centers]  # the database knows them beforehand
     times: dict[str, list[Time]] = {"exact": [], "fast": []}
     right = {"exact": 0, "fast": 0}
     near = 0
@@ -72,19 +73,19 @@ def align_time(folder: Path, quick: bool) -> Iterator[Row]:
             isovist(query.grid, query.aligned.center_m, sight_m, bearings=90),
         )
         points = coarse_points(query, query.aligned.center_m)  # the same for all candidates
-        for at in centers:
-            place = isovist(grid, at, sight_m, bearings=90)  # the database knows it beforehand
+        # How each is turned against the query comes out of one comparison with all of them.
+        turns: list[F64] = []
+        compared = timed(lambda a=profile, t=turns: t.append(_turns(a, places)))
+        share = Time(compared.wall / len(centers), compared.cpu / len(centers))
+        for at, turn in zip(centers, turns[0], strict=True):
             found: list[Fit | None] = []
             times["exact"].append(
                 timed(lambda q=query, p=points, at=at, f=found: f.append(_exact(field, q, p, at)))
             )
-            times["fast"].append(
-                timed(
-                    lambda q=query, p=points, at=at, f=found, a=profile, b=place: f.append(
-                        _fast(field, q, p, at, a, b)
-                    )
-                )
+            fast = timed(
+                lambda q=query, p=points, at=at, f=found, t=turn: f.append(_fast(field, q, p, at, t))
             )
+            times["fast"].append(Time(fast.wall + share.wall, fast.cpu + share.cpu))
             if math.dist(at, truth) < 1.0:
                 near += 1
                 for name, fit in zip(times, found, strict=True):
@@ -112,21 +113,22 @@ def _exact(field: LikelihoodField, query: QueryMap, points: F32, at: tuple[float
     return _fit(field, query, found)
 
 
-def _fast(
-    field: LikelihoodField,
-    query: QueryMap,
-    points: F32,
-    at: tuple[float, float],
-    profile: Isovist,
-    place: Isovist,
-) -> Fit | None:
+def _turns(profile: Isovist, places: Sequence[Isovist]) -> F64:
+    """How the query is turned at each of the places, radians, as their isovists say."""
     overlap = rotate_and_compare(
         profile.ranges_m[None],
         (profile.ends != HIDDEN)[None],
-        place.ranges_m[None],
-        (place.ends != HIDDEN)[None],
-    )
-    start = np.array([(*at, np.argmax(overlap) * 2 * np.pi / overlap.size)])
+        np.stack([place.ranges_m for place in places]),
+        np.stack([place.ends != HIDDEN for place in places]),
+    )[0]
+    turns: F64 = np.argmax(overlap, axis=0) * 2 * np.pi / len(overlap)
+    return turns
+
+
+def _fast(
+    field: LikelihoodField, query: QueryMap, points: F32, at: tuple[float, float], turn: float
+) -> Fit | None:
+    start = np.array([(*at, turn)])
     found = search_windows(field, points, start, half_t_m=1.5, half_a_rad=np.radians(5.0), most=1)
     return _fit(field, query, found)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -210,6 +211,14 @@ def growth(folder: Path, quick: bool) -> Iterator[Row]:
         unit="x",
         goal=1.15,
         note=", ".join(f"{scans} scans {cpu:.1f} s" for scans, cpu in runs) + f", start {start:.1f} s",
+    )
+    further = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(runs)]
+    yield Row(
+        what="convert: cpu time of a further scan, from 4x to 16x over from 1x to 4x",
+        measured=further[1] / further[0],
+        unit="x",
+        goal=1.15,
+        note=", ".join(f"{1e3 * seconds:.2f} ms" for seconds in further) + "; start and first metres cancel",
     )
     seconds = []
     for side in (1, 2, 4):
