@@ -21,6 +21,8 @@ from pc2grid.io.lzf import decompress
 from pc2grid.matching import PointGrid
 from pc2grid.sweep import Sweep, flatten
 from pc2grid.windows import search_windows
+from signature.baselines import sdf, surf
+from signature.retrieve import _distinct, _peaks
 from tests.drives import office
 
 FIELD = prepare(office())
@@ -175,3 +177,41 @@ def test_lzf_is_expanded_as_by_its_description(parts: list[bytes], more: int) ->
     elif size >= 0:
         with pytest.raises(PointCloudError, match="damaged"):
             decompress(data, size)
+
+
+def test_peaks_are_found_around_the_circle_and_one_on_each_plateau() -> None:
+    rng = np.random.default_rng(2)
+    likeness = rng.integers(0, 4, (12, 30)).astype(np.float32)
+    likeness[:, 0] = 1.0  # as good everywhere: no peak
+    columns = rng.permutation(30)[:20]
+    columns[0] = 0
+    at, shift = _peaks(likeness, columns)
+    expected = [
+        (column, k)
+        for column in columns.tolist()
+        for k in range(12)
+        if likeness[k - 1, column] <= likeness[k, column] > likeness[(k + 1) % 12, column]
+    ]
+    assert list(zip(at.tolist(), shift.tolist(), strict=True)) == expected
+    assert 0 in shift and 11 in shift and 0 not in at
+
+
+def test_placements_beside_a_better_one_are_left_out() -> None:
+    base = np.array([[0.0, 0.0], [0.3, 0.3], [0.3, 0.3], [0.3, 0.3], [0.0, 5.0], [9.0, 0.0]])
+    yaw = np.array([math.pi - 0.01, 0.01 - math.pi, 0.0, 0.01 - math.pi, 0.0, 0.0])
+    session = np.array([0, 0, 0, 1, 0, 0])
+    order = np.array([0, 1, 2, 3, 4, 5])
+    assert _distinct(order, base, yaw, session, 10).tolist() == [0, 2, 3, 4, 5]
+    assert _distinct(order, base, yaw, session, 3).tolist() == [0, 2, 3]
+    assert _distinct(order[::-1].copy(), base, yaw, session, 10).tolist() == [5, 4, 3, 2, 1]
+
+
+def test_where_nothing_changes_descriptors_say_so_and_stay_finite() -> None:
+    """Of a window that leaves the map, what is inside counts."""
+    flat = np.zeros((40, 40), np.float32)
+    keypoints = np.array([[0, 0], [20, 20], [39, 5]])
+    distance = np.full((40, 40), 2.0, np.float32)
+    found = sdf._descriptors(keypoints, np.array([0.0, 1.0, 2.0]), distance, flat, flat, 10.0, 2.0, 0.25)
+    assert not found[:, :-1].any()
+    assert found[:, -1] == pytest.approx(np.full(3, 0.5))
+    assert not surf._describe(np.zeros((41, 41)), np.array([[20.0, 20.0, 1.2], [0.0, 0.0, 2.0]])).any()
