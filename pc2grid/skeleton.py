@@ -91,8 +91,10 @@ def _thin(image: NDArray[np.uint8], deletable: NDArray[np.bool_]) -> None:
     codes = _codes(image).reshape(-1)
     flat = image.reshape(-1)
     pending = np.zeros(height * width, np.uint8)
-    waiting = np.empty(height * width, np.int32)
-    gone = np.empty(height * width, np.int32)
+    most = 0
+    for i in range(len(flat)):
+        most += flat[i]
+    waiting, gone = np.empty(most, np.int32), np.empty(most, np.int32)
     # Seen from a neighbour in direction k, the pixel itself lies in direction k + 4.
     steps = np.array([-width, 1 - width, 1, width + 1, width, width - 1, -1, -width - 1])
     keep = np.array([255 - (1 << ((k + 4) % 8)) for k in range(8)], np.uint8)

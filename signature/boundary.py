@@ -56,24 +56,24 @@ def _pair_distance_counts(points: NDArray[np.int64], bins_per_cell: float, bins:
     columns = (points[:, 1] * bins_per_cell).astype(np.float32)
     # More than float32's rounding, less than two distances of cells differ: on an edge the upper bin counts.
     nudge = np.float32(1e-4)
-    last = np.int32(bins - 1)
-    found = np.empty(n, np.int32)
+    last = np.float32(bins - 1)
+    found = np.empty(n, np.uint16)
     for i in range(n):
         r, c = rows[i], columns[i]
         others_r, others_c = rows[i + 1 :], columns[i + 1 :]
         for j in range(len(others_r)):
             dr, dc = others_r[j] - r, others_c[j] - c
-            found[j] = np.int32(np.sqrt(dr * dr + dc * dc) + nudge)
+            found[j] = np.uint16(np.int32(min(np.sqrt(dr * dr + dc * dc) + nudge, last)))
         # Four counters in turn, as neighbours often fall into the same bin and would wait for each other.
         j = 0
         while j + 4 <= len(others_r):
-            counts[0, min(found[j], last)] += 1
-            counts[1, min(found[j + 1], last)] += 1
-            counts[2, min(found[j + 2], last)] += 1
-            counts[3, min(found[j + 3], last)] += 1
+            counts[0, found[j]] += 1
+            counts[1, found[j + 1]] += 1
+            counts[2, found[j + 2]] += 1
+            counts[3, found[j + 3]] += 1
             j += 4
         while j < len(others_r):
-            counts[0, min(found[j], last)] += 1
+            counts[0, found[j]] += 1
             j += 1
     total: NDArray[np.int64] = counts[0] + counts[1] + counts[2] + counts[3]
     return total

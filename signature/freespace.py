@@ -17,6 +17,8 @@ from signature.config import SignatureConfig
 if TYPE_CHECKING:
     import networkx as nx
 
+_STRIDE = 3
+
 
 def freespace_nodes(submap: Submap, config: SignatureConfig) -> I64:
     """Free-space nodes V^F (N, 2) as (row, column): evenly sampled pixels of the free-space skeleton.
@@ -95,6 +97,28 @@ def freespace_histogram(lengths_m: F32, radius_m: float, config: SignatureConfig
 
 
 @numba.njit(cache=True)
+def _walled_off(occupied: NDArray[np.bool_], width: int, r0: int, c0: int, r1: int, c1: int) -> bool:
+    """Whether a few of the cells on the straight line between two cell centres show that it is blocked.
+
+    Every `_STRIDE`-th column (or row, if there are more) is looked at where the line passes its middle. On a
+    border of two cells either will do: it passes through both.
+    """
+    dr, dc = r1 - r0, c1 - c0
+    major, minor = abs(dc), abs(dr)
+    ahead, aside = (1 if dc > 0 else -1), (width if dr > 0 else -width)
+    if minor > major:
+        major, minor, ahead, aside = minor, major, aside, ahead
+    slope = int(minor / max(major, 1) * 4294967296.0) * _STRIDE
+    at, beside = r0 * width + c0, 2147483648
+    for _ in range(major // _STRIDE):
+        at += ahead * _STRIDE
+        beside += slope
+        if occupied[np.uint64(at + (beside >> 32) * aside)]:
+            return True
+    return False
+
+
+@numba.njit(cache=True)
 def _in_sight(occupied: NDArray[np.bool_], width: int, r0: int, c0: int, r1: int, c1: int) -> bool:
     """Whether the straight line between two cell centres meets no occupied cell; `occupied` row by row.
 
@@ -132,7 +156,9 @@ def _adjacency(nodes: NDArray[np.int64], occupied: NDArray[np.bool_], reach: flo
         for j in range(i + 1, n):
             r1, c1 = nodes[j]
             d = math.sqrt((r1 - r0) ** 2 + (c1 - c0) ** 2)
-            if d <= reach and _in_sight(flat, width, r0, c0, r1, c1):
+            if d > reach or _walled_off(flat, width, r0, c0, r1, c1):
+                continue
+            if _in_sight(flat, width, r0, c0, r1, c1):
                 weights[i, j] = d
                 weights[j, i] = d
     return weights
@@ -140,17 +166,24 @@ def _adjacency(nodes: NDArray[np.int64], occupied: NDArray[np.bool_], reach: flo
 
 @numba.njit(cache=True, fastmath={"nnan"})
 def _floyd_warshall(lengths: NDArray[np.float32]) -> None:
+    """In place, for lengths (N, N) that are the same both ways: of each pair one half is worked on."""
     n = len(lengths)
+    via = np.empty(n, np.float32)
     for k in range(n):
-        via = lengths[k]
+        via[:k] = lengths[k, :k]
+        for i in range(k, n):
+            via[i] = lengths[i, k]
         for i in range(n):
-            first = lengths[i, k]
+            first = via[i]
             if i == k or first == np.float32(np.inf):
                 continue
-            row = lengths[i]
-            for j in range(n):
+            row = lengths[i, :i]
+            for j in range(len(row)):
                 total = first + via[j]
                 row[j] = total if total < row[j] else row[j]
+    for i in range(n):
+        for j in range(i):
+            lengths[j, i] = lengths[i, j]
 
 
 @numba.njit(cache=True)

@@ -7,15 +7,14 @@ import math
 from typing import NamedTuple
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F64
-from pc2grid.model import F32, I64, BoolGrid
+from pc2grid.model import F32, BoolGrid
 from pc2grid.skeleton import cells_of
 from signature.config import SignatureConfig
-
-_DEGREES = np.arange(180)
 
 
 class Axes(NamedTuple):
@@ -48,43 +47,66 @@ def symmetry_axes(segments: F64, config: SignatureConfig) -> Axes | None:
     around the half circle; beta is the best at least `config.axis_separation_deg` from alpha, or alpha's
     perpendicular when no segment lies there.
     """
-    steps = segments[:, 2:] - segments[:, :2]
-    lengths = np.hypot(steps[:, 0], steps[:, 1])
-    if not lengths.any():
+    if not len(segments):
         return None
-    angles = np.arctan2(steps[:, 1], steps[:, 0]) % math.pi
-    votes = np.bincount(np.degrees(angles).round().astype(np.int64) % 180, lengths, 180)
-    smooth = np.fft.irfft(np.fft.rfft(votes) * _blur(config.axis_smoothing_deg), 180)
-    alpha = int(np.argmax(smooth))
-    rest = np.where(_apart_deg(_DEGREES, alpha) >= config.axis_separation_deg, smooth, 0.0)
-    beta = int(np.argmax(rest)) if rest.max() > 1e-6 * smooth[alpha] else (alpha + 90) % 180
-    return Axes(
-        _refined(alpha, angles, lengths, 2 * config.axis_smoothing_deg),
-        _refined(beta, angles, lengths, 2 * config.axis_smoothing_deg),
+    alpha, beta, found = _axes(
+        segments,
+        _blur(config.axis_smoothing_deg),
+        config.axis_separation_deg,
+        math.radians(2 * config.axis_smoothing_deg),
     )
+    return Axes(alpha, beta) if found else None
 
 
 @functools.cache
-def _blur(sigma_deg: float) -> NDArray[np.complex128]:
-    """Fourier transform of the kernel that votes are blurred with."""
-    return np.fft.rfft(np.exp(-0.5 * (_apart_deg(_DEGREES, 0) / sigma_deg) ** 2))
+def _blur(sigma_deg: float) -> F64:
+    """What a vote adds to the directions around it, (180,), from its own on."""
+    apart = np.minimum(np.arange(180), 180 - np.arange(180))
+    return np.asarray(np.exp(-0.5 * (apart / sigma_deg) ** 2), np.float64)
 
 
-def _apart_deg(a_deg: I64, b_deg: int) -> I64:
-    """Angle between undirected lines, 0 .. 90 degrees."""
-    return np.asarray(np.abs((a_deg - b_deg + 90) % 180 - 90))
+@numba.njit(cache=True)
+def _axes(segments: F64, blur: F64, separation_deg: float, window_rad: float) -> tuple[float, float, bool]:
+    """`symmetry_axes` as two angles, and whether there are any."""
+    count = len(segments)
+    angles, lengths, votes = np.empty(count), np.empty(count), np.zeros(180)
+    for k in range(count):
+        x, y = segments[k, 2] - segments[k, 0], segments[k, 3] - segments[k, 1]
+        angles[k], lengths[k] = math.atan2(y, x) % math.pi, math.hypot(x, y)
+        votes[round(math.degrees(angles[k])) % 180] += lengths[k]
+    if lengths.sum() == 0.0:
+        return 0.0, 0.0, False
+    smooth = np.zeros(180)
+    for d in range(180):
+        if votes[d] > 0.0:
+            smooth[d:] += votes[d] * blur[: 180 - d]
+            smooth[:d] += votes[d] * blur[180 - d :]
+    alpha = int(np.argmax(smooth))
+    highest, beta = 1e-6 * smooth[alpha], (alpha + 90) % 180
+    for d in range(180):
+        apart = abs((d - alpha + 90) % 180 - 90)
+        if apart >= separation_deg and smooth[d] > highest:
+            highest, beta = smooth[d], d
+    return (
+        _refined(alpha, angles, lengths, window_rad),
+        _refined(beta, angles, lengths, window_rad),
+        True,
+    )
 
 
-def _refined(peak_deg: int, angles_rad: F64, lengths: F64, window_deg: float) -> float:
+@numba.njit(cache=True)
+def _refined(peak_deg: int, angles: F64, lengths: F64, window_rad: float) -> float:
     """Mean direction of the segments within a window around a whole degree, finer than the vote.
 
     A segment's direction is the surer the longer it is: weights are squared lengths, inverse variances.
     """
-    away = (angles_rad - math.radians(peak_deg) + math.pi / 2) % math.pi - math.pi / 2
-    near = np.abs(away) <= math.radians(window_deg)
-    weights = lengths[near] ** 2
-    shift = float((away[near] * weights).sum() / weights.sum()) if near.any() else 0.0
-    return (math.radians(peak_deg) + shift) % math.pi
+    peak, shift, weight = math.radians(peak_deg), 0.0, 0.0
+    for k in range(len(angles)):
+        away = (angles[k] - peak + math.pi / 2) % math.pi - math.pi / 2
+        if abs(away) <= window_rad:
+            shift += away * lengths[k] ** 2
+            weight += lengths[k] ** 2
+    return (peak + (shift / weight if weight > 0.0 else 0.0)) % math.pi
 
 
 def blurred(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F32:
