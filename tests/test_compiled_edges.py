@@ -22,6 +22,8 @@ from pc2grid.matching import PointGrid
 from pc2grid.sweep import Sweep, flatten
 from pc2grid.windows import search_windows
 from signature.baselines import sdf, surf
+from signature.config import SignatureConfig
+from signature.freespace import adjacency
 from signature.retrieve import _distinct, _peaks
 from tests.drives import office
 
@@ -215,3 +217,16 @@ def test_where_nothing_changes_descriptors_say_so_and_stay_finite() -> None:
     assert not found[:, :-1].any()
     assert found[:, -1] == pytest.approx(np.full(3, 0.5))
     assert not surf._describe(np.zeros((41, 41)), np.array([[20.0, 20.0, 1.2], [0.0, 0.0, 2.0]])).any()
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_a_line_through_a_corner_is_blocked_by_both_cells_beside_it(turns: int) -> None:
+    for beside, joined in (([], True), ([(3, 4)], True), ([(4, 3)], True), ([(3, 4), (4, 3)], False)):
+        occupied, ends = np.zeros((8, 8), np.bool_), np.zeros((8, 8), np.bool_)
+        ends[2, 2] = ends[5, 5] = True
+        for cell in beside:
+            occupied[cell] = True
+        nodes = np.argwhere(np.rot90(ends, turns))
+        walls = np.ascontiguousarray(np.rot90(occupied, turns))
+        weights = adjacency(nodes, walls, 0.05, SignatureConfig())
+        assert np.isfinite(weights[0, 1]) == joined
