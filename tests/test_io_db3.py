@@ -421,6 +421,35 @@ def test_of_an_index_no_page_is_missed(tmp_path: Path, page_bytes: int) -> None:
     pages.close()
 
 
+@pytest.mark.parametrize(
+    ("size", "ahead", "new", "words"),
+    [
+        (20, 5, bytes([23 + 20]), "leaves its page"),
+        (20, 3, bytes([24]), "head of a row is longer"),
+        (20, 1, bytes([12 + 2 * 19]), "not as long as its columns"),
+        (20, 1, bytes([12 + 2 * 21]), "shorter than its columns"),
+        (3000, 7, b"\x93\x40", "longer than it says"),  # 2496 of 3004 bytes: a page less
+    ],
+)
+def test_what_is_broken_in_a_row_is_said(
+    tmp_path: Path, size: int, ahead: int, new: bytes, words: str
+) -> None:
+    path = tmp_path / "x.db"
+    with closing(sqlite3.connect(path)) as db:
+        db.execute("PRAGMA page_size=512")
+        db.execute("CREATE TABLE rows(id INTEGER PRIMARY KEY, a)")
+        db.execute("INSERT INTO rows(a) VALUES (?)", (b"x" * size,))
+        db.commit()
+    content = bytearray(path.read_bytes())
+    at = content.index(b"x" * 20) - ahead  # in front: bytes and number of the row, and its head
+    content[at : at + len(new)] = new
+    path.write_bytes(content)
+    pages = SqlitePages(path, 1 << 30)
+    with pytest.raises(BrokenRow, match=words):
+        pages.row(next(pages.places()))
+    pages.close()
+
+
 def test_the_page_that_locks_stand_on_is_not_missed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """SQLite never uses the page with the byte 2^30."""
     path = tmp_path / "x.db"
