@@ -27,7 +27,7 @@ from pc2grid.pose_graph import Edge, Solution, optimise
 _PIECE_TRAVEL_M = 4.0
 _SEARCH_POINTS = 400
 _NEAR_M = 8.0
-_MOST = 6
+_MOST = 10
 _SURE_M, _SURE_RAD = 0.3, math.radians(4.0)  # of the search, where nothing has drifted
 _DRIFT_PER_M, _DRIFT_RAD_PER_M = 0.02, 0.006
 _MAX_WINDOW_M = 3.0
