@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
 from pc2grid.config import ReadConfig
@@ -91,3 +92,38 @@ def test_last_message_of_a_db3_whose_row_became_another(tmp_path: Path, at: int,
     check_drive(scans, 11)
     assert report.lossy
     assert "1 rows are of no kind that rosbag2 writes, or there twice" in report.warnings
+
+
+@pytest.mark.parametrize("recover", [False, True])
+@pytest.mark.parametrize("counted", [True, False])
+def test_chunk_of_an_mcap_that_is_cut_out_with_its_indexes(
+    tmp_path: Path, recover: bool, counted: bool
+) -> None:
+    """Every record that is left stands where it should; only the summary tells of the messages."""
+    path = write_mcap(tmp_path / "a.mcap", drive(), chunk_size=2000, use_statistics=counted)
+    whole, chunks = path.read_bytes(), chunks_of(path)
+    path.write_bytes(whole[: chunks[2]] + whole[chunks[3] :])
+    scans, report = read(path, recover=recover)
+    assert 0 < len(scans) < 12
+    assert any("the index is not usable" in warning for warning in report.warnings)
+    said = any("messages that the log counts are not there" in warning for warning in report.warnings)
+    assert said == counted
+
+
+def test_chunk_of_an_mcap_with_tf_that_is_cut_out(tmp_path: Path) -> None:
+    """Where the sensor is stood in it, and nothing is amiss but a count: that is no log without tf."""
+    path = write_mcap(tmp_path / "a.mcap", drive(), chunk_size=200, compression=CompressionType.NONE)
+    whole, chunks = path.read_bytes(), chunks_of(path)
+    after = next(place for place in chunks if place > whole.index(b"/tf_static"))
+    path.write_bytes(whole[: chunks[0]] + whole[after:])
+    for recover in (False, True):
+        with pytest.raises(FrameError, match="tf does not connect frame lidar to the base"):
+            read(path, recover=recover)
+
+
+def chunks_of(path: Path) -> list[int]:
+    """Where the chunks of a sound MCAP begin."""
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return [index.chunk_start_offset for index in summary.chunk_indexes]

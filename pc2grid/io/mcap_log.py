@@ -7,7 +7,6 @@ start and the index is made from what is there.
 
 from __future__ import annotations
 
-import contextlib
 import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -58,23 +57,20 @@ class McapSource:
     def _look(self) -> Survey:
         """The index of the file: its own if it is sound, else one made by reading everything."""
         size = self._path.stat().st_size
-        if not self._recover:
-            try:
-                found = read_summary(self._stream, size, self._limits)
-            except Damage as damage:
-                self.tally.warn(f"the index is not usable ({damage.what}); the log was read in full instead")
-            else:
-                if isinstance(found, Survey):
-                    self.tally.warnings += found.warnings
-                    return found
-                self.tally.warn(f"the log has no index ({found}); it was read in full instead")
         known, listed = Definitions(), list[ChunkIndex]()
-        if self._recover:
-            # A chunk may rest on definitions in an earlier one that is lost; the summary repeats them.
-            with contextlib.suppress(Damage):
-                found = read_summary(self._stream, size, self._limits)
-                if isinstance(found, Survey):
-                    known, listed = found.definitions, found.chunks
+        try:
+            found = read_summary(self._stream, size, self._limits)
+        except Damage as damage:
+            self.tally.warn(f"the index is not usable ({damage.what}); the log was read in full instead")
+        else:
+            if not isinstance(found, Survey):
+                self.tally.warn(f"the log has no index ({found}); it was read in full instead")
+            elif self._recover:
+                # A chunk may rest on definitions in an earlier one that is lost; the summary repeats them.
+                known, listed = found.definitions, found.chunks
+            else:
+                self.tally.warnings += found.warnings
+                return found
         told = bool(known.channels)
         made = survey(self._stream, size, self._limits, resync=self._recover, known=known)
         there = {chunk.offset for chunk in made.chunks}
@@ -85,7 +81,8 @@ class McapSource:
             made.warnings.append(f"{len(hidden)} chunks that the index lists are not there")
         self.tally.warnings += made.warnings
         self.tally.bytes_lost += made.bytes_lost
-        self.tally.topics_lost = made.holes and not told
+        unexplained = made.missing > 0 and not made.bytes_lost
+        self.tally.topics_lost = (made.holes and not told) or unexplained
         if made.damage is not None and not self._recover:
             seconds = (made.end_ns - made.start_ns) * 1e-9
             count = sum(made.counts.values())

@@ -93,6 +93,22 @@ class ChunkIndex(NamedTuple):
     after: int  # offset behind the chunk and its message indexes
 
 
+class Statistics(NamedTuple):
+    """What a writer counted; `counts` of each channel may be left out."""
+
+    message_count: int
+    channel_count: int
+    chunk_count: int
+    start_ns: int
+    end_ns: int
+    counts: dict[int, int]
+
+    @property
+    def counted(self) -> bool:
+        """Whether the counts of the channels agree with that of all messages."""
+        return sum(self.counts.values()) == self.message_count
+
+
 class ChunkMessage(NamedTuple):
     """A message in a chunk or in the data section."""
 
@@ -207,6 +223,18 @@ def too_large(offset: int, length: int, limits: Limits) -> LimitExceeded:
         f"a record at byte {offset} has {length} bytes; the limit is {limits.record_bytes}",
         hint="--set read.max_record_bytes=N raises it",
     )
+
+
+def statistics(record: Record) -> Statistics:
+    """The fields of a statistics record. Raises Damage if they do not fit into it."""
+    fields = Fields(record.data, record.offset)
+    messages, _, channels, _, _, chunks, start_ns, end_ns = fields.numbers("<QHIIIIQQ")
+    pairs = Fields(fields.blob(), record.offset)
+    counts: dict[int, int] = {}
+    while not pairs.done:
+        key, count = pairs.numbers("<HQ")
+        counts[key] = count
+    return Statistics(messages, channels, chunks, start_ns, end_ns, counts)
 
 
 def chunk_head(data: bytes | memoryview, offset: int) -> ChunkHead:

@@ -38,8 +38,7 @@ def read_summary(stream: BinaryIO, size: int, limits: rec.Limits) -> Survey | st
 
     definitions = Definitions()
     chunks: list[ChunkIndex] = []
-    statistics: tuple[int, ...] | None = None
-    counts: dict[int, int] = {}
+    statistics: rec.Statistics | None = None
     kinds = frozenset({rec.SCHEMA, rec.CHANNEL, rec.CHUNK_INDEX, rec.STATISTICS})
     for record in rec.read_records(stream, summary_at, foot, limits, wanted=kinds):
         if record.opcode in (rec.SCHEMA, rec.CHANNEL):
@@ -47,34 +46,27 @@ def read_summary(stream: BinaryIO, size: int, limits: rec.Limits) -> Survey | st
         elif record.opcode == rec.CHUNK_INDEX:
             chunks.append(_chunk_index(record, summary_at))
         elif record.opcode == rec.STATISTICS:
-            fields = Fields(record.data, record.offset)
-            statistics = fields.numbers("<QHIIIIQQ")
-            pairs = Fields(fields.blob(), record.offset)
-            while not pairs.done:
-                key, count = pairs.numbers("<HQ")
-                counts[key] = count
+            statistics = rec.statistics(record)
     if statistics is None:
         return "it has no statistics"
-    message_count, _, channel_count, _, _, chunk_count, start_ns, end_ns = statistics
-    if chunk_count != len(chunks):
+    if statistics.chunk_count != len(chunks):
         return "it does not list the chunks"
-    if channel_count > len(definitions.channels):
+    if statistics.channel_count > len(definitions.channels):
         return "it does not list the channels"
     if any(c.channels is not None and not c.channels <= definitions.channels.keys() for c in chunks):
         raise Damage(summary_at, "it names channels that are missing")
-    if message_count and not (chunks or definitions.channels):
+    if statistics.message_count and not (chunks or definitions.channels):
         return "it does not list the channels"
-    counted = sum(counts.values()) == message_count
     chunks.sort(key=lambda c: c.offset)
     loose, data_end, data_crc = _between_chunks(stream, chunks, summary_at, limits)
     return Survey(
         definitions=definitions,
         chunks=chunks,
         loose=loose,
-        counts=counts,
-        counted=counted,
-        start_ns=start_ns,
-        end_ns=end_ns,
+        counts=statistics.counts,
+        counted=statistics.counted,
+        start_ns=statistics.start_ns,
+        end_ns=statistics.end_ns,
         data_end=data_end,
         data_crc=data_crc,
     )

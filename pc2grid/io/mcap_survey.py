@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import zlib
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from pc2grid.errors import LimitExceeded, UnsupportedSchema
 from pc2grid.io import mcap_records as rec
 from pc2grid.io.mcap_records import ChunkIndex, Damage, Definitions, Fields
 
-_READ = frozenset({rec.SCHEMA, rec.CHANNEL, rec.MESSAGE, rec.CHUNK, rec.DATA_END, rec.FOOTER})
+_READ = frozenset({rec.SCHEMA, rec.CHANNEL, rec.MESSAGE, rec.CHUNK, rec.STATISTICS, rec.DATA_END, rec.FOOTER})
 _KNOWN = frozenset(range(rec.HEADER, rec.DATA_END + 1))
 # Its kind, length, times, size, checksum; its compression behind its length; the length of the content.
 _CHUNK_HEAD = re.compile(
@@ -28,7 +29,8 @@ class Survey:
     chunks : whole chunks, by place. loose : byte spans that hold messages outside chunks.
     counts : messages per channel, complete if `counted`. data_end, data_crc : end and checksum of the data
     section (0: none). damage : the first thing that is wrong, or None. bytes_lost : how much was given up,
-    and holes : whether in front of something that was read.
+    and holes : whether in front of something that was read. missing : messages that the writer counted on
+    top of those.
     """
 
     definitions: Definitions = field(default_factory=Definitions)
@@ -36,6 +38,7 @@ class Survey:
     loose: list[tuple[int, int]] = field(default_factory=list)
     counts: dict[int, int] = field(default_factory=dict)
     counted: bool = True
+    missing: int = 0
     start_ns: int = 0
     end_ns: int = 0
     data_end: int = 0
@@ -106,6 +109,8 @@ def _walk(stream: BinaryIO, at: int, size: int, limits: rec.Limits, found: Surve
                 raise Damage(record.offset, f"a message names channel {channel_id}, which is missing")
             found.count(channel_id, log_time_ns)
             found.loose.append((record.offset, at))
+        elif record.opcode == rec.STATISTICS:
+            _compare(record, found)
         elif record.opcode == rec.DATA_END:
             closed = True
             found.data_end = record.offset
@@ -139,6 +144,16 @@ def _take_chunk(record: rec.Record, limits: rec.Limits, found: Survey, resync: b
     channels = frozenset(m.channel_id for m in messages)
     after = record.offset + record.size
     found.chunks.append(ChunkIndex(record.offset, record.size, head.start_ns, head.end_ns, channels, after))
+
+
+def _compare(record: rec.Record, found: Survey) -> None:
+    """Note how many messages are missing: of chunks that are cut out as a whole nothing else may tell."""
+    with contextlib.suppress(Damage):  # damaged statistics tell nothing, and cost nothing
+        statistics = rec.statistics(record)
+        total = statistics.message_count
+        found.missing = max(total - sum(found.counts.values()), 0) if statistics.counted else 0
+        if found.missing:
+            found.warnings.append(f"{found.missing} of {total} messages that the log counts are not there")
 
 
 def _is_record(stream: BinaryIO, at: int, size: int) -> bool:
