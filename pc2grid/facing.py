@@ -46,8 +46,8 @@ def _normals(away: F64, order: NDArray[np.intp], bearings: F64) -> F32:
             window = reach / max(distance, reach)
             n = 1.0
             sx = sy = sxx = sxy = syy = 0.0
-            for step in (-1, 1):
-                for k in range(1, count):
+            for step, farthest in ((-1, (count - 1) // 2), (1, count // 2)):  # each neighbour once
+                for k in range(1, farthest + 1):
                     j = order[(place + step * k) % count]
                     turn = abs(bearings[j] - bearings[i])
                     if min(turn, 2.0 * math.pi - turn) > window:
