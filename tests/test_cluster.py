@@ -224,6 +224,8 @@ def test_interrupted_leaves_what_is_done_and_goes_on_from_there(folder: Path, tm
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        # Whoever was started in the background by a shell has Ctrl-C ignored, and would hand that on.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
     while not asleep.exists():
