@@ -21,7 +21,7 @@ from pc2grid.geometry import F64, SE2
 from pc2grid.keyframes import Keyframe, Keyframes
 from pc2grid.matching import Match, evenly
 from pc2grid.model import I64, Loop
-from pc2grid.pieces import Piece, Pieces
+from pc2grid.pieces import Piece, Pieces, pose_at
 from pc2grid.pose_graph import Edge, Solution, optimise
 
 _PIECE_TRAVEL_M = 4.0
@@ -78,7 +78,7 @@ class LoopCloser:
         """Take note of the keyframe that was appended last; every few metres that completes a piece."""
         number = len(self._scans)
         if number:
-            step = _pose(self._tracked(), number - 1).inverse() @ keyframe.T_map_base
+            step = SE2(*self._poses[-3:]).inverse() @ keyframe.T_map_base
             self._travel_m += math.hypot(step.x, step.y) + 0.3 * abs(step.yaw)
             if self._travel_m > _PIECE_TRAVEL_M or keyframe.restart:
                 self._complete_piece()
@@ -116,13 +116,13 @@ class LoopCloser:
         self._begun, self._travel_m = len(self._scans), 0.0
         newest = len(self._nodes)
         tracked = self._tracked()
-        pose = _pose(tracked, self._pieces.anchor(newest))
+        pose = pose_at(tracked, self._pieces.anchor(newest))
         if newest > 0:
-            step = _pose(tracked, self._pieces.anchor(newest - 1)).inverse() @ pose
+            step = pose_at(tracked, self._pieces.anchor(newest - 1)).inverse() @ pose
             length_m = math.hypot(step.x, step.y)
             self._drift_m += _LOST_M if restart else length_m
             self._edges.append(Edge(newest - 1, newest, step, _tracked_information(length_m, restart)))
-            pose = _pose(self._nodes, newest - 1) @ step
+            pose = pose_at(self._nodes, newest - 1) @ step
         self._nodes = np.vstack((self._nodes, (pose.x, pose.y, pose.yaw)))
         found = list(self._compare(newest))
         if found:
@@ -145,7 +145,7 @@ class LoopCloser:
 
     def _tie(self, older: int, newer: int, window_m: float, window_rad: float) -> Edge | None:
         """The measured relative pose of two pieces, near where they are thought to be."""
-        guess = _pose(self._nodes, older).inverse() @ _pose(self._nodes, newer)
+        guess = pose_at(self._nodes, older).inverse() @ pose_at(self._nodes, newer)
         match = _fit(self._pieces[older], self._pieces[newer], guess, window_m, window_rad)
         return (
             None
@@ -155,7 +155,7 @@ class LoopCloser:
 
     def _agrees(self, edge: Edge) -> bool:
         """Whether a loop leaves everything where it is: then settling can wait."""
-        held = _pose(self._nodes, edge.first).inverse() @ _pose(self._nodes, edge.second)
+        held = pose_at(self._nodes, edge.first).inverse() @ pose_at(self._nodes, edge.second)
         apart = edge.T_first_second.inverse() @ held
         return math.hypot(apart.x, apart.y) < _AGREE_M and abs(apart.yaw) < _AGREE_RAD
 
@@ -190,10 +190,10 @@ class LoopCloser:
         known: dict[int, SE2] = {}
         for piece, run in enumerate(self._pieces.runs):
             anchor = self._pieces.anchor(piece)
-            correction = _pose(self._nodes, piece) @ _pose(tracked, anchor).inverse()
+            correction = pose_at(self._nodes, piece) @ pose_at(tracked, anchor).inverse()
             ends = [k for k, at in ((run[0], run.start), (run[-1], run.stop)) if at in self._restarts]
             for k in sorted({anchor, *ends}):
-                known[k] = correction @ _pose(tracked, k)
+                known[k] = correction @ pose_at(tracked, k)
         return spread(tracked, list(known), np.array([(p.x, p.y, p.yaw) for p in known.values()]))
 
     def _tracked(self) -> F64:
@@ -201,15 +201,10 @@ class LoopCloser:
         return np.array(self._poses).reshape(-1, 3)
 
 
-def _pose(poses: F64, index: int) -> SE2:
-    x, y, yaw = poses[index]
-    return SE2(float(x), float(y), float(yaw))
-
-
 def _bends(drawn: F64, settled: F64) -> bool:
     """Whether the shape of a piece, poses (N, 3) of its keyframes, has changed by more than its noise."""
-    before = _pose(drawn, 0).inverse() @ _pose(drawn, -1)
-    apart = before.inverse() @ _pose(settled, 0).inverse() @ _pose(settled, -1)
+    before = pose_at(drawn, 0).inverse() @ pose_at(drawn, -1)
+    apart = before.inverse() @ pose_at(settled, 0).inverse() @ pose_at(settled, -1)
     return math.hypot(apart.x, apart.y) > _BENT_M or abs(apart.yaw) > _BENT_RAD
 
 

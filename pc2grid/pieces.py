@@ -22,6 +22,12 @@ _CACHE = 24
 _DRAWN_EVERY = 2  # keyframes, 0.2 m apart: more of them show the same walls again
 
 
+def pose_at(poses: F64, index: int) -> SE2:
+    """One of poses (N, 3): x, y, yaw."""
+    x, y, yaw = poses[index]
+    return SE2(float(x), float(y), float(yaw))
+
+
 class Piece:
     """The local map of a run of keyframes, in the frame of its anchor, the keyframe in the middle.
 
@@ -142,5 +148,4 @@ class Pieces:
         """T_map_base of a keyframe, by now."""
         if self._settled is None:
             return keyframe.T_map_base
-        x, y, yaw = self._settled[number]
-        return SE2(float(x), float(y), float(yaw))
+        return pose_at(self._settled, number)
