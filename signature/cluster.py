@@ -213,7 +213,20 @@ def _connected(address: str, processes: int) -> Iterator[Any]:
             f"a cluster needs an extra that is not installed ({error})", hint="pip install 'pc2grid[cluster]'"
         ) from None
 
-    make: Any = distributed.Client  # untyped
+    class Client(distributed.Client):
+        """Closes itself if it cannot connect.
+
+        Left half made, one is closed by the garbage collector, wherever that happens to run: while another
+        client starts, both wait for one lock for ever.
+        """
+
+        def __init__(self, address: str) -> None:
+            try:
+                super().__init__(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)  # type: ignore[no-untyped-call]
+            except BaseException:
+                self.close()  # type: ignore[no-untyped-call]
+                raise
+
     # Its own complaints about lost connections are many lines each; ours is one.
     for name in ("distributed", "tornado", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
@@ -222,7 +235,7 @@ def _connected(address: str, processes: int) -> Iterator[Any]:
             address = stack.enter_context(_processes(processes)).scheduler_address
         what = "does not answer"
         try:
-            client = stack.enter_context(make(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False))
+            client = stack.enter_context(Client(address))
             what = "has no workers"
             client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
         except (OSError, ValueError) as error:

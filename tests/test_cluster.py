@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import re
@@ -188,6 +189,8 @@ def test_no_scheduler_and_no_workers(folder: Path, monkeypatch) -> None:
         with pytest.raises(ClusterError, match="does not answer") as caught:
             list(on_cluster(jobs, address, 2, print))
         assert address in str(caught.value)
+        clients = [thing for thing in gc.get_objects() if isinstance(thing, distributed.Client)]
+        assert all(client.status == "closed" for client in clients if str(client._start_arg) == address)
     with (
         distributed.LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as empty,
         pytest.raises(ClusterError, match="has no workers"),
