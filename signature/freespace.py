@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import TYPE_CHECKING
 
@@ -37,8 +38,8 @@ def freespace_nodes(submap: Submap, config: SignatureConfig) -> I64:
 def _all_in_blocks(mask: BoolGrid, block: int) -> BoolGrid:
     """Whether all cells of each block x block square are set; a rest at the far edges is left out."""
     height, width = mask.shape[0] // block * block, mask.shape[1] // block * block
-    rows = np.logical_and.reduce([mask[k:height:block] for k in range(block)])
-    return np.asarray(np.logical_and.reduce([rows[:, k:width:block] for k in range(block)]))
+    rows = functools.reduce(np.logical_and, [mask[k:height:block] for k in range(block)])
+    return np.asarray(functools.reduce(np.logical_and, [rows[:, k:width:block] for k in range(block)]))
 
 
 def adjacency(nodes: I64, occupied: BoolGrid, resolution_m: float, config: SignatureConfig) -> F32:

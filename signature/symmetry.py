@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F64
-from pc2grid.model import F32, BoolGrid
+from pc2grid.model import F32, I64, BoolGrid
 from pc2grid.skeleton import cells_of
 from signature.config import SignatureConfig
 
@@ -112,30 +112,78 @@ def _refined(peak_deg: int, angles: F64, lengths: F64, window_rad: float) -> flo
 def blurred(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F32:
     """S^G (H, W): the edge map under a Gaussian, scaled so that a straight line peaks at `symmetry_peak`."""
     sigma = config.symmetry_blur_m / resolution_m
-    width = 2 * math.ceil(3 * sigma) + 1
+    kernel = cv2.getGaussianKernel(2 * math.ceil(3 * sigma) + 1, sigma)[:, 0].astype(np.float32)
     crest = config.symmetry_peak * sigma * math.sqrt(2 * math.pi)
-    image = cv2.GaussianBlur(
-        edges.astype(np.float32) * np.float32(crest), (width, width), sigma, borderType=cv2.BORDER_CONSTANT
-    )
-    return np.asarray(np.minimum(image, config.symmetry_peak), np.float32)
+    return _blurred(cells_of(edges), edges.shape, kernel, np.float32(crest), np.float32(config.symmetry_peak))
 
 
-def reflection_score(cells: NDArray[np.integer], image: F32, axis_rad: float) -> float:
+@numba.njit(cache=True)
+def _blurred(
+    cells: I64, shape: tuple[int, int], kernel: F32, crest: np.float32, most: np.float32
+) -> NDArray[np.float32]:
+    """Cells (N, 2) of value `crest` under a separable, symmetric kernel (K,), at most `most`.
+
+    Few cells are set: along the rows only they are worked on. What falls beyond the image is lost.
+    """
+    height, width = shape
+    half, end = len(kernel) // 2, len(kernel) // 2 + width
+    rows = np.zeros((height + 2 * half, width + 2 * half), np.float32)
+    for p in range(len(cells)):
+        r, c = cells[p, 0] + half, cells[p, 1]
+        for k in range(len(kernel)):
+            rows[r, c + k] += crest * kernel[k]
+    image = np.empty((height, width), np.float32)
+    for r in range(height):
+        total, middle, last = image[r], rows[r + half, half:end], r + 2 * half
+        for c in range(width):
+            total[c] = kernel[half] * middle[c]
+        k = 0
+        while k + 3 <= half:  # three at a time: the sums stay in registers meanwhile
+            w0, a0, b0 = kernel[k], rows[r + k, half:end], rows[last - k, half:end]
+            w1, a1, b1 = kernel[k + 1], rows[r + k + 1, half:end], rows[last - k - 1, half:end]
+            w2, a2, b2 = kernel[k + 2], rows[r + k + 2, half:end], rows[last - k - 2, half:end]
+            for c in range(width):
+                total[c] += w0 * (a0[c] + b0[c]) + w1 * (a1[c] + b1[c]) + w2 * (a2[c] + b2[c])
+            k += 3
+        for q in range(k, half):
+            weight, above, below = kernel[q], rows[r + q, half:end], rows[last - q, half:end]
+            for c in range(width):
+                total[c] += weight * (above[c] + below[c])
+        for c in range(width):
+            total[c] = min(total[c], most)
+    return image
+
+
+def reflection_score(cells: I64, image: F32, axis_rad: float) -> float:
     """Eq. 5: mean of the blurred image at the mirror images of the boundary pixels.
 
     cells : (N, 2) as (row, column), mirrored at the line of direction `axis_rad` through the image's centre.
     The paper rotates the image until the axis is upright and flips it; mirroring the pixels and reading the
     blurred image between its cells is the same without resampling twice. Mirror images outside count 0.
     """
-    if len(cells) == 0:
-        return 0.0
-    center = (np.array(image.shape) - 1) / 2
-    rows, columns = (cells - center).T
-    c, s = math.cos(2 * axis_rad), math.sin(2 * axis_rad)
-    x = (c * columns + s * rows + center[1]).astype(np.float32)
-    y = (s * columns - c * rows + center[0]).astype(np.float32)
-    values = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    return float(values.mean())
+    return float(_reflected(cells, image, math.cos(2 * axis_rad), math.sin(2 * axis_rad)))
+
+
+@numba.njit(cache=True)
+def _reflected(cells: I64, image: F32, c: float, s: float) -> float:
+    """`reflection_score` by cosine and sine of twice the axis' direction."""
+    height, width = image.shape
+    middle_r, middle_c, total = 0.5 * (height - 1), 0.5 * (width - 1), 0.0
+    for p in range(len(cells)):
+        row, column = cells[p, 0] - middle_r, cells[p, 1] - middle_c
+        x, y = c * column + s * row + middle_c, s * column - c * row + middle_r
+        i, j = math.floor(y), math.floor(x)
+        a, b = x - j, y - i
+        if 0 <= i < height - 1 and 0 <= j < width - 1:
+            upper = (1.0 - a) * image[i, j] + a * image[i, j + 1]
+            lower = (1.0 - a) * image[i + 1, j] + a * image[i + 1, j + 1]
+            total += (1.0 - b) * upper + b * lower
+        elif -1 <= i < height and -1 <= j < width:  # beside the image there is nothing
+            for di, weight in ((0, 1.0 - b), (1, b)):
+                for dj, share in ((0, 1.0 - a), (1, a)):
+                    if 0 <= i + di < height and 0 <= j + dj < width:
+                        total += weight * share * image[i + di, j + dj]
+    return total / max(len(cells), 1)
 
 
 def symmetry_scores(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F32:

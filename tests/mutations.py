@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tests.watching import Peak
 
@@ -29,10 +31,10 @@ def put(path: Path, content: bytes) -> None:
 
 
 def mutated(whole: bytes, rng: np.random.Generator) -> bytes:
-    """The bytes truncated, flipped, spliced, shifted, or with other lengths in them."""
+    """The bytes truncated, flipped, spliced, shifted, with other lengths in them, or whole records gone."""
     content = bytearray(whole)
     a, b = sorted(int(v) for v in rng.integers(0, len(content), 2))
-    match int(rng.integers(10)):
+    match int(rng.integers(12)):
         case 0:
             del content[a:]
         case 1:
@@ -51,21 +53,72 @@ def mutated(whole: bytes, rng: np.random.Generator) -> bytes:
             content[a : a + 4] = int(rng.integers(1 << 32)).to_bytes(4, "little")
         case 8:  # where summaries, indexes and footers are
             content[-int(rng.integers(1, min(800, len(content) + 1)))] ^= 1 << int(rng.integers(8))
+        case 9:
+            _swap_lengths(content, _lengths(whole), rng)
         case _:
-            _swap_lengths(content, rng)
+            content = _other_records(content, _borders(whole) or [0, a, b, len(content)], rng)
     return bytes(content)
 
 
-def _swap_lengths(content: bytearray, rng: np.random.Generator) -> None:
+def _swap_lengths(content: bytearray, places: NDArray[np.intp], rng: np.random.Generator) -> None:
     """Exchange two words that look like lengths of, or offsets into, the content."""
-    if len(content) < 8:
-        return
-    words = np.lib.stride_tricks.sliding_window_view(np.frombuffer(bytes(content), np.uint8), 4)
-    values = words.astype(np.int64) @ np.array([1, 1 << 8, 1 << 16, 1 << 24])
-    places = np.flatnonzero((values > 0) & (values <= len(content)))
     if len(places) >= 2:
         a, b = (int(v) for v in rng.choice(places, 2, replace=False))
         content[a : a + 4], content[b : b + 4] = content[b : b + 4], content[a : a + 4]
+
+
+@functools.lru_cache(maxsize=64)
+def _lengths(whole: bytes) -> NDArray[np.intp]:
+    if len(whole) < 8:
+        return np.empty(0, np.intp)
+    words = np.lib.stride_tricks.sliding_window_view(np.frombuffer(whole, np.uint8), 4)
+    values = words.astype(np.int64) @ np.array([1, 1 << 8, 1 << 16, 1 << 24])
+    return np.flatnonzero((values > 0) & (values <= len(whole)))
+
+
+def _other_records(content: bytearray, borders: list[int], rng: np.random.Generator) -> bytearray:
+    """Some records in a row are left out, come twice, or come before those in front of them.
+
+    Each of them stays as it was written, checksum and all: that some are missing, only the others can say.
+    """
+    a, b, c = sorted(rng.choice(len(borders), 3, replace=False).tolist())
+    front, first, second, rest = (
+        content[: borders[a]],
+        content[borders[a] : borders[b]],
+        content[borders[b] : borders[c]],
+        content[borders[c] :],
+    )
+    match int(rng.integers(4)):
+        case 0:
+            return front + second + first + rest
+        case 1:
+            return front + first + first + second + rest
+        case _:
+            return front + second + rest
+
+
+@functools.lru_cache(maxsize=64)
+def _borders(whole: bytes) -> list[int]:
+    """Where the records of a file begin and end; none if it is of a kind without."""
+    size, at = len(whole), 0
+    if whole.startswith(b"SQLite format 3"):  # its pages, but for the first, without which nothing is left
+        page = int.from_bytes(whole[16:18], "big")
+        return list(range(page, size + 1, page))
+    if whole.startswith(b"\x89MCAP"):
+        borders = [8]
+        while borders[-1] < size - 8:
+            at = borders[-1]
+            borders.append(at + 9 + int.from_bytes(whole[at + 1 : at + 9], "little"))
+        return borders
+    if whole.startswith(b"#ROSBAG"):
+        borders = [whole.index(b"\n") + 1]
+        while borders[-1] < size:
+            at = borders[-1]
+            for _ in range(2):  # header and data
+                at += 4 + int.from_bytes(whole[at : at + 4], "little")
+            borders.append(at)
+        return borders
+    return []
 
 
 def patiently() -> Iterator[int]:

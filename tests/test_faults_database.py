@@ -10,6 +10,7 @@ import json
 import multiprocessing
 import os
 import sqlite3
+import struct
 import subprocess
 import sys
 import time
@@ -44,6 +45,7 @@ from signature.database.upkeep import check, copy, merge
 from tests import postgresql
 from tests.test_database import assert_holds, make_entry
 from tests.test_faults_durability import small_house
+from tests.watching import bounded_memory
 
 ROOT = Path(__file__).resolve().parent.parent
 FUZZ = int(os.environ.get("PC2GRID_FUZZ", "0"))
@@ -208,6 +210,38 @@ def test_fuzz_flipped_bit_anywhere_in_any_blob_is_found(path: Path) -> None:
                 with pytest.raises(DatabaseCorrupt, match=r"damaged: .*wrong checksum") as caught:
                     read_all(path)
                 assert "--recover" in str(caught.value)
+
+
+def test_pages_that_are_met_again_and_again(path: Path) -> None:
+    """Two pages with four hundred times the page below make 160,000 rows of one, in a few kilobytes."""
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        ((root,),) = connection.execute("SELECT rootpage FROM sqlite_master WHERE name = 'session'")
+    content, size = bytearray(path.read_bytes()), 4096
+    rows_at, pages = (root - 1) * size, len(content) // size
+    rows_of_it = content[rows_at : rows_at + size]
+
+    def many_times(page: int) -> bytes:
+        """An inner page of a table with four hundred children, all of them one page."""
+        begin = size - 400 * 6  # where the cells stand: a page, and the largest number of a row below it
+        head = struct.pack(">BHHHBI", 0x05, 0, 400, begin, 0, page)
+        places = struct.pack(">400H", *range(begin, size, 6))
+        cells = struct.pack(">IH", page, 0x8101) * 400
+        return head + places + bytes(begin - len(head) - len(places)) + cells
+
+    content[rows_at : rows_at + size] = many_times(pages + 1)
+    content += many_times(pages + 2) + rows_of_it
+    content[28:32] = (pages + 2).to_bytes(4, "big")
+    path.write_bytes(content)
+    with bounded_memory(64 << 20):
+        assert any("more rows than fit" in problem.what for problem in check(path))
+        with (
+            pytest.raises(DatabaseCorrupt, match="more rows than fit into the file"),
+            open_database(path) as db,
+        ):
+            db.sessions()
+        with pytest.raises(DatabaseCorrupt, match="more rows than fit into the file"):
+            store(path, [make_entry("sunday", 9, submaps=1)], keep=True)
+    assert path.read_bytes() == content
 
 
 @pytest.mark.parametrize("table", list(COLUMNS))

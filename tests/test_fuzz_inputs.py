@@ -231,7 +231,7 @@ def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: i
             except DatabaseError:
                 assert not whole_again
         try:
-            if number % 3 == 0:
+            if number % 5 == 0:  # dearer than all else together
                 problems = check(path)
                 copy(path, saved, recover=True, force=True)
                 assert check(saved) == ()

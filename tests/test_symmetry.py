@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 
 from signature.boundary import boundary_edges
 from signature.config import SignatureConfig
@@ -77,6 +78,31 @@ def test_eq_5_by_hand() -> None:
     assert reflection_score(np.array([[3, 3]]), image, 0.0) == pytest.approx(10.0)
     # Diagonal axis: row and column swap.
     assert reflection_score(np.array([[3, 1], [0, 4]]), image, math.pi / 4) == pytest.approx((10 + 30) / 2)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (7, 40), (101, 90)])
+@pytest.mark.parametrize("share", [0.0, 0.05, 1.0])
+def test_a_few_cells_are_blurred_as_opencv_blurs_all_of_them(shape: tuple[int, int], share: float) -> None:
+    edges = np.random.default_rng(1).random(shape) < share
+    sigma, peak = CONFIG.symmetry_blur_m / RESOLUTION_M, CONFIG.symmetry_peak
+    plain = cv2.GaussianBlur(
+        edges.astype(np.float32), (2 * math.ceil(3 * sigma) + 1,) * 2, sigma, borderType=cv2.BORDER_CONSTANT
+    )
+    expected = np.minimum(plain * peak * sigma * math.sqrt(2 * math.pi), peak)
+    assert blurred(edges, RESOLUTION_M, CONFIG) == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 1.2, math.pi / 2, 3.0])
+def test_mirror_images_are_read_between_the_cells_and_beyond_the_rim(angle: float) -> None:
+    rng = np.random.default_rng(2)
+    image, cells = rng.random((9, 14), np.float32), rng.integers(0, (9, 14), (200, 2))
+    inside = np.pad(image, 20)  # of zeros, so that nothing is outside
+    mirrored = np.array(
+        [[math.cos(2 * angle), math.sin(2 * angle)], [math.sin(2 * angle), -math.cos(2 * angle)]]
+    )
+    columns, rows = mirrored @ (cells - [4.0, 6.5])[:, ::-1].T + [[26.5], [24.0]]
+    expected = ndimage.map_coordinates(inside, [rows, columns], order=1).mean()
+    assert reflection_score(cells, image, angle) == pytest.approx(float(expected), rel=1e-5)
 
 
 def test_mirroring_the_pixels_is_rotating_and_flipping_the_image() -> None:

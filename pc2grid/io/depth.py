@@ -156,7 +156,8 @@ def _rays(
     if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
         raise PointCloudError(f"a CameraInfo without focal length (fx {fx}, fy {fy})")
     u, v = np.arange(0, width, stride, dtype=float), np.arange(0, height, stride, dtype=float)
-    x, y = (u - cx) / fx, ((v - cy) / fy)[:, None]
+    with np.errstate(over="ignore"):  # too steep, then, and refused below
+        x, y = (u - cx) / fx, ((v - cy) / fy)[:, None]
     if any(d):
         columns, rows = np.meshgrid(u, v)
         x, y = _undistorted(columns, rows, np.reshape(k, (3, 3)), np.asarray(d), distortion_model)

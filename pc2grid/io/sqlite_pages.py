@@ -15,9 +15,10 @@ from typing import BinaryIO, NamedTuple
 Value = int | float | str | bytes | None
 
 MAGIC = b"SQLite format 3\0"
-_LEAF = 0x0D
+_LEAF, _INNER_OF_TABLE = 0x0D, 0x05
 # Inner pages of tables and indexes, and the bottom of indexes: no row is lost with them.
-_INNER, _INDEX_LEAF = (0x02, 0x05), 0x0A
+_INNER, _INDEX_LEAF = (0x02, _INNER_OF_TABLE), 0x0A
+_OF_INDEX = (0x02, _INDEX_LEAF)
 _INT_SIZES = (0, 1, 2, 3, 4, 6, 8)
 _WAL_MAGIC = {0x377F0682: "<", 0x377F0683: ">"}
 _WAL_HEAD, _FRAME_HEAD = 32, 24
@@ -79,7 +80,7 @@ class SqlitePages:
             self._wal_at, pages, self.wal_bytes_lost = _committed(self._wal, self.page_size)
             self.count = max(self.count, pages)
         self.wal_pages = len(self._wal_at)
-        self._used = bytearray(self.count + 1)
+        self._used, self._of_table = bytearray(self.count + 1), bytearray(self.count + 1)
 
     def close(self) -> None:
         """Close the files."""
@@ -90,11 +91,13 @@ class SqlitePages:
     def places(self) -> Iterator[Place]:
         """Where rows should be; those that are free are left out."""
         free = self._free()
-        for number in range(
-            2, self.count + 1
-        ):  # the first describes the tables, and holds none of their rows
+        for number in range(2, self.count + 1):  # the first describes the tables: none of their rows is there
             page = self._page(number)
-            if number in free or page[:1] != bytes([_LEAF]):
+            if number in free:
+                continue
+            if page[:1] == bytes([_INNER_OF_TABLE]):
+                self._note_children(page)
+            if page[:1] != bytes([_LEAF]):
                 continue
             cells = int.from_bytes(page[3:5], "big")
             for cell in range(min(cells, self._usable // 4)):
@@ -117,13 +120,26 @@ class SqlitePages:
         return row
 
     def unused(self) -> int:
-        """How many pages belong to no row that was taken, and are not free or above the rows either."""
-        known = self._free() | self._maps() | {1, _LOCK_BYTE // self.page_size + 1}
-        pages = (self._page(n) for n in range(2, self.count + 1) if n not in known and not self._used[n])
-        return sum(not self._is_rowless(page) for page in pages)
+        """How many pages belong to no row that was taken, and are not free or above the rows either.
 
-    def _is_rowless(self, page: bytes) -> bool:
+        To be asked when all `places` were seen.
+        """
+        known = self._free() | self._maps() | {1, _LOCK_BYTE // self.page_size + 1}
+        pages = (n for n in range(2, self.count + 1) if n not in known and not self._used[n])
+        return sum(not self._is_rowless(self._page(n), bool(self._of_table[n])) for n in pages)
+
+    def _note_children(self, page: bytes) -> None:
+        """A page further up in a table says which pages belong to it: no index may stand there."""
+        cells = min(int.from_bytes(page[3:5], "big"), (self._usable - 12) // 2)
+        for at in (8, *struct.unpack_from(f">{cells}H", page, 12)):
+            child = int.from_bytes(page[at : at + 4], "big")
+            if child <= self.count:
+                self._of_table[child] = 1
+
+    def _is_rowless(self, page: bytes, of_table: bool) -> bool:
         """Whether there is nothing on a page that would be missed."""
+        if of_table and page[0] in _OF_INDEX:
+            return False
         if page[0] in _INNER:
             return 1 < int.from_bytes(page[8:12], "big") <= self.count  # its last child
         # With no row on it, SQLite says that the rows begin where the page ends; for 65536 it writes 0.

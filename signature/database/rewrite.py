@@ -21,6 +21,7 @@ from pathlib import Path
 from pc2grid.errors import DatabaseBusy, DatabaseCorrupt, OutputError
 from pc2grid.io.atomic import replace_file
 from signature.database import schema
+from signature.database.connection import BoundedConnection
 from signature.database.older import bring_along
 
 BUSY_TIMEOUT_S = 30.0
@@ -42,7 +43,7 @@ def rewrite(path: Path, *, keep: bool, timeout_s: float = BUSY_TIMEOUT_S) -> Ite
         if kept:
             schema.inspect_header(target)
             shutil.copyfile(target, copy)
-        connection = sqlite3.connect(copy, isolation_level=None)
+        connection = sqlite3.connect(copy, isolation_level=None, factory=BoundedConnection)
         try:
             # The copy is nobody's yet: neither journal nor flushing has anything to protect.
             connection.execute("PRAGMA journal_mode = OFF")

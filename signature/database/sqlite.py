@@ -129,8 +129,8 @@ class SqliteDatabase:
         filled, config = 0, self.config()
         with rows.explained(self._path, "signatures"):
             # Lengths of blobs are as large as the file at most, whatever a damaged row says of itself.
-            query = f"SELECT sum(length(submap_id)) / 4 FROM signature WHERE {only[0]}"
-            (capacity,) = self._connection.execute(query, only[1:]).fetchone()
+            query = f"SELECT length(submap_id) FROM signature WHERE {only[0]}"
+            capacity = sum(length for (length,) in self._connection.execute(query, only[1:])) // 4
             for row, sound in rows.select(self._connection, "signature", *only):
                 if row["session_id"] in self._left_out:
                     continue

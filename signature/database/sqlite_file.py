@@ -10,6 +10,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from signature.database import plausible, rows, schema
+from signature.database.connection import BoundedConnection
 from signature.database.older import bring_along
 from signature.database.protocol import Problem, SessionInfo
 
@@ -27,7 +28,9 @@ def connect(path: Path) -> sqlite3.Connection:
     immutable = "" if any(journal.exists() for journal in journals) else "&immutable=1"
     uri = f"file:{quote(real)}?mode=ro{immutable}"
     with rows.explained(path, "header"):
-        connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+        connection = sqlite3.connect(
+            uri, uri=True, isolation_level=None, check_same_thread=False, factory=BoundedConnection
+        )
         try:
             connection.execute("PRAGMA trusted_schema = OFF")
             connection.execute("PRAGMA mmap_size = 1073741824")
@@ -43,7 +46,8 @@ def connect(path: Path) -> sqlite3.Connection:
 def whatever_it_holds(path: Path) -> Iterator[sqlite3.Connection]:
     """A connection to a file that may be damaged in any way; nothing is believed yet."""
     uri = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
-    with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
+    opened = sqlite3.connect(uri, uri=True, isolation_level=None, factory=BoundedConnection)
+    with contextlib.closing(opened) as connection:
         with contextlib.suppress(*schema.COMPLAINTS):  # each use of the connection meets the damage again
             bring_along(connection, beside=True)
         yield connection
