@@ -135,15 +135,16 @@ def in_child(body: Callable[[], object]) -> tuple[int, str]:
 
 
 @pytest.mark.fault(40)
-def test_fuzz_kill_at_random_moments_of_convert(inputs: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("part", range(4 if FUZZ else 1))
+def test_fuzz_kill_at_random_moments_of_convert(inputs: Path, tmp_path: Path, part: int) -> None:
     """Every second one while the temporary file is there, the others anywhere from the start."""
-    rng = np.random.default_rng(40)
+    rng = np.random.default_rng([40, part])
     source, made = ("drive.mcap", "drive.submaps") if FUZZ else ("house.yaml", "house.submaps")
     source, wanted = inputs / source, (inputs / made).read_bytes()
     output = tmp_path / "x.submaps"
     usual_s = 1.0
     killed = turn = 0
-    while killed < (min(FUZZ, 200) or 5):  # those that were done before they were hit do not count
+    while killed < (min(FUZZ, 200) // 4 or 5):  # those that were done before they were hit do not count
         turn += 1
         convert = Convert(source, "-o", output, cwd=tmp_path)
         if turn % 2:

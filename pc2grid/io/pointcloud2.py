@@ -5,6 +5,7 @@ Points and times come out of one row selection, so they cannot fall out of step.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,11 +101,26 @@ def _rows(cloud: PointCloud2, max_points: int) -> NDArray[Any]:
             f"a scan of {height * width} points; the limit is {max_points}",
             hint="--set read.max_points=N raises it",
         )
+    dtype = _layout(cloud.fields, step, cloud.is_bigendian)
+    if height * width == 0:
+        return np.empty((0, 0), dtype=dtype)
+    row_step = cloud.row_step if height > 1 and cloud.row_step else width * step
+    if row_step < width * step:
+        raise PointCloudError(f"rows of {row_step} bytes cannot hold {width} points of {step} bytes")
+    needed = (height - 1) * row_step + width * step
+    if len(cloud.data) < needed:
+        raise PointCloudError(f"{len(cloud.data)} bytes of data where {needed} are declared")
+    return np.ndarray((height, width), dtype=dtype, buffer=cloud.data, strides=(row_step, step))
+
+
+@functools.lru_cache(maxsize=16)
+def _layout(fields: tuple[tuple[str, int, int, int], ...], step: int, big: bool) -> np.dtype[Any]:
+    """Where in a point of `step` bytes the fields that are used stand; the same for all clouds of a topic."""
     if step >= 1 << 31:
         raise PointCloudError(f"points of {step} bytes")
     names, formats, offsets = [], [], []
     seen: set[str] = set()
-    for name, offset, datatype, count in cloud.fields:
+    for name, offset, datatype, count in fields:
         if name not in ("x", "y", "z") and name.lower() not in _TIME_FIELDS:
             continue
         if name in seen:
@@ -112,7 +128,7 @@ def _rows(cloud: PointCloud2, max_points: int) -> NDArray[Any]:
         seen.add(name)
         if datatype not in _DATATYPES:
             raise PointCloudError(f"field {name}: unknown datatype {datatype}")
-        kind = np.dtype(("<", ">")[cloud.is_bigendian] + _DATATYPES[datatype])
+        kind = np.dtype(("<", ">")[big] + _DATATYPES[datatype])
         if count > 1:
             raise PointCloudError(f"field {name}: {count} values per point instead of one")
         if offset + kind.itemsize > step:
@@ -125,16 +141,7 @@ def _rows(cloud: PointCloud2, max_points: int) -> NDArray[Any]:
     for name in ("x", "y", "z"):
         if name not in seen:
             raise PointCloudError(f"field {name}: missing")
-    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
-    if height * width == 0:
-        return np.empty((0, 0), dtype=dtype)
-    row_step = cloud.row_step if height > 1 and cloud.row_step else width * step
-    if row_step < width * step:
-        raise PointCloudError(f"rows of {row_step} bytes cannot hold {width} points of {step} bytes")
-    needed = (height - 1) * row_step + width * step
-    if len(cloud.data) < needed:
-        raise PointCloudError(f"{len(cloud.data)} bytes of data where {needed} are declared")
-    return np.ndarray((height, width), dtype=dtype, buffer=cloud.data, strides=(row_step, step))
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
 
 
 def _time_field(cloud: PointCloud2) -> str | None:
