@@ -84,7 +84,7 @@ def _thin(image: NDArray[np.uint8], deletable: NDArray[np.bool_]) -> None:
     """Thin a 0/1 image with a border of zeros in place.
 
     Whether a pixel goes depends on its neighbours alone, so it is looked at again only after one of them
-    went: `pending` says in which half of an iteration it still has to be, and `waiting` lists the pixels
+    went: `pending` says in how many halves of an iteration it still has to be, and `waiting` lists the pixels
     with something pending. All that go in one half go together, as the parallel algorithm has it.
     """
     height, width = image.shape
@@ -94,7 +94,7 @@ def _thin(image: NDArray[np.uint8], deletable: NDArray[np.bool_]) -> None:
     most = 0
     for i in range(len(flat)):
         most += flat[i]
-        pending[i] = np.uint8(3) if (flat[i] != 0) & (codes[i] != 255) else np.uint8(0)
+        pending[i] = np.uint8(2) if (flat[i] != 0) & (codes[i] != 255) else np.uint8(0)
     # One more than there are pixels: what is written behind the last does not count.
     waiting, gone = np.empty(most + 1, np.int32), np.empty(most, np.int32)
     # Seen from a neighbour in direction k, the pixel itself lies in direction k + 4.
@@ -103,22 +103,20 @@ def _thin(image: NDArray[np.uint8], deletable: NDArray[np.bool_]) -> None:
     count = 0
     for i in range(width, (height - 1) * width):
         waiting[count] = i
-        count += pending[i] & 1
+        count += pending[i] >> 1
     half = 0
     while count > 0:
         left, losses = 0, 0
         for k in range(count):
             i = waiting[k]
-            if pending[i] & (1 << half):
-                if deletable[half, codes[i]]:
-                    pending[i] = 0
-                    gone[losses] = i
-                    losses += 1
-                    continue
-                pending[i] &= 2 >> half
-            if pending[i]:
+            if deletable[half, codes[i]]:
+                pending[i] = 0
+                gone[losses] = i
+                losses += 1
+            else:
+                pending[i] -= 1
                 waiting[left] = i
-                left += 1
+                left += pending[i]
         count = left
         for k in range(losses):
             flat[gone[k]] = 0
@@ -130,7 +128,7 @@ def _thin(image: NDArray[np.uint8], deletable: NDArray[np.bool_]) -> None:
                 # By arithmetic: which neighbours wait already is as good as random, a wrong guess costs more.
                 waiting[count] = j
                 count += int((flat[j] != 0) & (pending[j] == 0))
-                pending[j] = 3 * flat[j]
+                pending[j] = 2 * flat[j]
         half = 1 - half
 
 

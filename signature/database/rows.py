@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
@@ -135,13 +136,11 @@ def read_info(row: Row, resolution_m: float, scans: int, path: Path | str) -> Se
     """A session row as the caller sees it. Raises DatabaseVersion if its settings are from the future."""
     from pydantic import ValidationError
 
-    from signature.config import Config
-
     name, sensor = plausible.text(row["name"], "name"), plausible.text(row["sensor"], "sensor")
     content = json.loads(row["document"])
     versions = {plausible.text(k, "version"): plausible.text(v, k) for k, v in content["versions"].items()}
     try:
-        config = Config.model_validate(content["config"])
+        config = _config(json.dumps(content["config"]))
     except ValidationError as error:
         what = ".".join(map(str, error.errors()[0]["loc"]))
         made_by = versions.get("pc2grid", "an unknown version")
@@ -189,6 +188,14 @@ def read_info(row: Row, resolution_m: float, scans: int, path: Path | str) -> Se
             label=Label(building=text_or_none("building"), floor=text_or_none("floor")),
         ),
     )
+
+
+@functools.lru_cache(maxsize=64)
+def _config(text: str) -> Config:
+    """The settings in a session's document: of a database with thousands, most sessions have the same."""
+    from signature.config import Config
+
+    return Config.model_validate(json.loads(text))
 
 
 def signature_row(submaps: Sequence[Submap], signatures: Sequence[Signature]) -> Row:
