@@ -97,7 +97,7 @@ def draw(graph: nx.DiGraph) -> str:
             f'<text x="16" y="{top + 24:.0f}" font-weight="bold" fill="{color}">{band}</text>'
             f'<text x="{WIDTH - 16}" y="{top + 24:.0f}" text-anchor="end" fill="#555">{ABOUT[band]}</text>'
         )
-        for a, b in essential(inside):
+        for a, b in sorted(essential(inside)):
             (xa, ya, _), (xb, yb, _) = places[a], places[b]
             bend = (yb - ya) / 2
             parts.append(
