@@ -100,7 +100,7 @@ def _other_records(content: bytearray, borders: list[int], rng: np.random.Genera
 @functools.lru_cache(maxsize=64)
 def _borders(whole: bytes) -> list[int]:
     """Where the records of a file begin and end; none if it is of a kind without."""
-    size, at = len(whole), 0
+    size = len(whole)
     if whole.startswith(b"SQLite format 3"):  # its pages, but for the first, without which nothing is left
         page = int.from_bytes(whole[16:18], "big")
         return list(range(page, size + 1, page))

@@ -54,10 +54,8 @@ def page_of(content: bytes, kind: int, number: int = 0) -> int:
         (lambda c: (page_of(c, 0x0D, 4), b"\x55" * PAGE), 7),  # the rows of a page
         (lambda c: (page_of(c, 0x0D, 4), b"\x00"), 7),  # what it says it is
         (lambda c: (page_of(c, 0x0D, -1), b"\x05"), 7),  # the same of the last
-        (
-            lambda c: (page_of(c, 0x0D, -1), c[page_of(c, 0x0A) :][:PAGE]),
-            7,
-        ),  # an index there
+        # A page of an index in its place.
+        (lambda c: (page_of(c, 0x0D, -1), c[page_of(c, 0x0A) :][:PAGE]), 7),
         (lambda c: (page_of(c, 0x0D, 4) + 4, b"\x00"), 7),  # how many rows it has
         (lambda c: (page_of(c, 0x0D, 4) + 8, b"\xff\xff"), 1),  # where the first is
         (lambda c: (page_of(c, 0x00, 20), b"\x00\x00\x00\x09"), 2),  # where a row goes on: in another's page
