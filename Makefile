@@ -47,8 +47,8 @@ FUZZ_FOLDER = $(shell test -w /dev/shm && echo --basetemp=/dev/shm/pc2grid-fuzz 
 FUZZ = $(ONE_THREAD) PC2GRID_FUZZ=20000 $(BIN)/python -m pytest -q -n auto --dist worksteal --timeout 1200 $(PYTEST_ARGS)
 
 fuzz: $(READY)
-	$(FUZZ) $(FUZZ_FOLDER) tests/test_io_fuzz.py tests/test_fuzz_inputs.py
-	$(FUZZ) tests/test_faults_database.py tests/test_faults_durability.py -k fuzz
+	$(FUZZ) $(FUZZ_FOLDER) tests/pc2grid/io/test_fuzz.py tests/test_fuzz_inputs.py
+	$(FUZZ) tests/signature/database/test_faults.py tests/signature/database/test_durability.py -k fuzz
 
 picture: $(READY)
 	PYTHONPATH=tools $(BIN)/python tools/architecture.py examples/architecture.svg

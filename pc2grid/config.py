@@ -1,35 +1,22 @@
-"""Every number that a user may turn, with its unit, default and reason, for the point-cloud half.
+"""The settings of the point-cloud half: a name, unit, default and meaning for each number a user may change.
 
-A section per stage; each stage takes only its own. Sections are frozen; unknown keys and values out of
-range are `ConfigError`s that name the key and the closest known one. The whole tree with the sections
-of `signature` is `signature.config.Config`.
+There is one section for each stage, and a stage takes only its own section. Sections are frozen. An
+unknown key or a value out of range is an error. `Config` holds the sections of this package;
+`signature.config.Config` adds those of the package above.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field
+from typing_extensions import Self
 
 
 class Section(BaseModel):
     """Base of all sections: frozen, no unknown keys, finite numbers only."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _complete(cls, data: Any) -> Any:
-        """A section given in part keeps the other defaults of this tree, which may not be its class's."""
-        if not isinstance(data, dict):
-            return data
-        parts = {name: field.default for name, field in cls.model_fields.items()}
-        return {
-            key: parts[key].model_dump() | value
-            if isinstance(value, dict) and isinstance(parts.get(key), Section)
-            else value
-            for key, value in data.items()
-        }
 
 
 class ReadConfig(Section):
@@ -49,7 +36,7 @@ class ReadConfig(Section):
     point_time: Literal["auto", "s", "ms", "us", "ns", "none"] = Field(
         "auto", description="unit of the per-point times of a cloud; none: ignore them"
     )
-    max_range_m: float = Field(1000.0, gt=0, description="farther returns are not believed by any sensor")
+    max_range_m: float = Field(1000.0, gt=0, description="farther returns of any sensor are ignored")
     max_chunk_bytes: int = Field(256 << 20, gt=0, description="a chunk that expands to more is refused")
     max_record_bytes: int = Field(1 << 30, gt=0, description="a larger record of a log is refused")
     max_points: int = Field(20_000_000, gt=0, description="a scan that claims more points is refused")
@@ -61,7 +48,7 @@ class RegistrationConfig(Section):
     voxel_m: float | None = Field(
         default=None, gt=0, description="KISS-ICP voxel; null: chosen from the data"
     )
-    min_range_m: float = Field(default=0.3, ge=0, description="nearer returns are the robot itself")
+    min_range_m: float = Field(default=0.3, ge=0, description="nearer returns are from the robot itself")
     max_range_m: float | None = Field(default=None, gt=0, description="null: chosen from the data")
     deskew: bool = Field(
         default=True, description="undo the motion within a scan where per-point times exist"
@@ -81,13 +68,23 @@ class ProjectionConfig(Section):
 
 
 class PartitionConfig(Section):
-    """Occupancy grid -> submaps (paper III-A)."""
+    """Occupancy grid -> submaps (paper III-A).
+
+    There are two presets. `paper` is the method of the paper: one disc of 8 m around each junction of the
+    free space. `travelled` is the default: what is seen within 5 m from a point every metre along the free
+    space. A robot that has driven a few metres has seen only a part of a disc, but all of such a view.
+
+    >>> PartitionConfig() == PartitionConfig.travelled()
+    True
+    >>> PartitionConfig.paper().view, PartitionConfig.paper().radius_m
+    ('disc', 8.0)
+    """
 
     view: Literal["disc", "isovist"] = Field(
-        "disc",
-        description="disc: all within the radius, as III-A; isovist: only what is seen from the centre",
+        "isovist",
+        description="isovist: only what is seen from the centre; disc: all within the radius, as III-A",
     )
-    radius_m: float = Field(8.0, gt=0, description="submap radius r (Table II)")
+    radius_m: float = Field(5.0, gt=0, description="submap radius r; the paper's is 8 (Table II)")
     clearance_m: float = Field(
         0.3,
         ge=0,
@@ -98,7 +95,38 @@ class PartitionConfig(Section):
         "zhang_suen", description="zhang_suen keeps fewer side branches than guo_hall, so fewer junctions"
     )
     spacing_m: float | None = Field(
-        None,
+        1.0,
         gt=0,
         description="also a submap every so far along the skeleton; null: junctions only, as III-A",
     )
+
+    @classmethod
+    def paper(cls, radius_m: float = 8.0) -> Self:
+        """Discs around junctions, as in the paper (III-A; 8 m is r of Table II)."""
+        return cls(view="disc", radius_m=radius_m, spacing_m=None)
+
+    @classmethod
+    def travelled(cls) -> Self:
+        """Views close enough that every place a robot drives by has one."""
+        return cls(view="isovist", radius_m=5.0, spacing_m=1.0)
+
+
+class Config(Section):
+    """The settings of a recording's way to a map with submaps.
+
+    >>> config = Config()
+    >>> config.partition.radius_m, config.projection.resolution_m
+    (5.0, 0.05)
+    >>> Config.paper().partition.radius_m
+    8.0
+    """
+
+    read: ReadConfig = ReadConfig()
+    registration: RegistrationConfig = RegistrationConfig()
+    projection: ProjectionConfig = ProjectionConfig()
+    partition: PartitionConfig = PartitionConfig()
+
+    @classmethod
+    def paper(cls) -> Self:
+        """The defaults, but with the submaps of the paper."""
+        return cls(partition=PartitionConfig.paper())

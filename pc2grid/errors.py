@@ -8,7 +8,7 @@ from __future__ import annotations
 
 
 def one_line(text: str) -> str:
-    """The text without line breaks and control characters, which names in a file may be made of."""
+    """The text with line breaks and control characters escaped: names in a file may contain them."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
@@ -44,7 +44,7 @@ class LogNotFound(LogError):
 
 
 class NotALog(LogError):
-    """The file is of a kind that pc2grid does not read."""
+    """The file is of a kind that pc2grid does not read, or the folder holds several recordings."""
 
 
 class LogTruncated(LogError):
@@ -68,7 +68,11 @@ class TopicError(LogError):
 
 
 class NoScans(LogError):
-    """There is nothing in the recording (or in the part asked for) to make a map from."""
+    """The recording, or the part of it that is asked for, holds no scans to make a map from."""
+
+
+class TrackingLost(LogError):
+    """The scans of a laser cannot be followed, and no odometry bridges the gaps: there is no map."""
 
 
 class PointCloudError(LogError):
@@ -120,7 +124,7 @@ class DatabaseBusy(DatabaseError):
 
 
 class DatabaseUnreachable(DatabaseError):
-    """The server of a database does not answer, turns us away, or went away."""
+    """The server of a database does not answer, refuses the connection, or closed it."""
 
 
 class ClusterError(Pc2GridError):

@@ -8,17 +8,30 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-F64 = NDArray[np.float64]
+from pc2grid.arrays import F64
 
 
-def wrap_angle(angle_rad: float) -> float:
-    """The same angle in (-pi, pi]."""
-    wrapped = math.remainder(angle_rad, 2.0 * math.pi)
-    return math.pi if wrapped == -math.pi else wrapped
+@overload
+def wrap_angle(angle_rad: float) -> float: ...
+
+
+@overload
+def wrap_angle(angle_rad: F64) -> F64: ...
+
+
+def wrap_angle(angle_rad: float | F64) -> float | F64:
+    """The same angle, or each of an array of angles, in (-pi, pi]."""
+    if isinstance(angle_rad, np.ndarray):
+        turns = np.round(angle_rad / (2.0 * math.pi))
+        wrapped = angle_rad - 2.0 * math.pi * turns
+        return np.where(wrapped <= -math.pi, wrapped + 2.0 * math.pi, wrapped)
+    remainder = math.remainder(angle_rad, 2.0 * math.pi)
+    return math.pi if remainder == -math.pi else remainder
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +96,7 @@ class SE2:
         return SE2(float(x), float(y), yaw)
 
     @staticmethod
-    def flatten(T_target_source: F64) -> SE2:
+    def from_matrix(T_target_source: F64) -> SE2:
         """The planar part of a spatial pose (4, 4): x, y and the heading of its x axis."""
         return SE2(
             float(T_target_source[0, 3]),

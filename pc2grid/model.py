@@ -1,7 +1,7 @@
-"""The nouns that travel between the stages: frozen, with units in their names.
+"""The types that the stages hand on: frozen, with units in their names.
 
-Metres, radians, int64 nanoseconds. Arrays inside are made read-only, so a stage cannot change what
-another one holds.
+Metres, radians, int64 nanoseconds. The arrays inside are read-only, and no other code can write to them, so
+a stage cannot change what another one holds.
 """
 
 from __future__ import annotations
@@ -9,46 +9,37 @@ from __future__ import annotations
 import enum
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F64, SE2
+from pc2grid.arrays import F32, F64, I64, BoolGrid, freeze, hand_over
+from pc2grid.geometry import SE2
 
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
-BoolGrid = NDArray[np.bool_]
+if TYPE_CHECKING:
+    import networkx as nx
 
 SensorKind = Literal["lidar", "laser", "depth"]
 
+# Values of nav_msgs/OccupancyGrid: a probability in percent, or -1.
 UNKNOWN = -1
 FREE = 0
 OCCUPIED = 100
-
-
-def _freeze(owner: object, name: str, dtype: type, shape: tuple[int | None, ...]) -> None:
-    """Check shape and type of an array field once, at the seam, and make it read-only."""
-    value: NDArray[np.generic] = np.asarray(getattr(owner, name), dtype=dtype)
-    if value.ndim != len(shape) or any(
-        want is not None and want != got for want, got in zip(shape, value.shape, strict=True)
-    ):
-        wanted = tuple("N" if n is None else n for n in shape)
-        raise ValueError(f"{type(owner).__name__}.{name}: expected shape {wanted}, got {value.shape}")
-    if value.flags.writeable:
-        value = value.view()
-        value.flags.writeable = False
-    object.__setattr__(owner, name, value)
+# The thresholds of nav2_map_server (trinary mode), in percent: occupied_thresh 0.65, free_thresh 0.196.
+# A cell is occupied if it is >= OCCUPIED_FROM, free if 0 <= cell < FREE_BELOW, otherwise undecided.
+OCCUPIED_FROM = 65
+FREE_BELOW = 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scan:
-    """One sweep of one sensor, in the base frame.
+    """One scan of one sensor, in the base frame.
 
-    stamp_ns : when the sweep was taken (`header.stamp`).
+    stamp_ns : when the scan was taken (`header.stamp`).
     points_m : (N, 3) float32, returns in the base frame (x forward, y left, z up); finite.
     offsets_s : (N,) float32, when each point was taken relative to `stamp_ns`; None if not recorded.
-    T_base_sensor : (4, 4) where the sensor sits on the base; its translation is where rays start.
+    T_base_sensor : (4, 4) where the sensor sits on the base; its translation is the origin of the rays.
     T_odom_base : (4, 4) odometry at `stamp_ns`, or None if the log has none there.
     T_first_last : (4, 4) how the base moved from the first to the last of the points' times, by odometry;
         None where that or the times are not recorded.
@@ -71,18 +62,18 @@ class Scan:
     dropped: int = 0
 
     def __post_init__(self) -> None:
-        _freeze(self, "points_m", np.float32, (None, 3))
-        _freeze(self, "T_base_sensor", np.float64, (4, 4))
+        freeze(self, "points_m", np.float32, (None, 3))
+        freeze(self, "T_base_sensor", np.float64, (4, 4))
         if self.T_odom_base is not None:
-            _freeze(self, "T_odom_base", np.float64, (4, 4))
+            freeze(self, "T_odom_base", np.float64, (4, 4))
         if self.T_first_last is not None:
-            _freeze(self, "T_first_last", np.float64, (4, 4))
+            freeze(self, "T_first_last", np.float64, (4, 4))
         if self.offsets_s is not None:
-            _freeze(self, "offsets_s", np.float32, (len(self.points_m),))
+            freeze(self, "offsets_s", np.float32, (len(self.points_m),))
 
 
 class Health(enum.Enum):
-    """What registration can honestly say of one scan."""
+    """How well the pose of a scan is determined."""
 
     FINE = "fine"
     DEGENERATE = "degenerate"
@@ -91,24 +82,25 @@ class Health(enum.Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegisteredScan:
-    """A scan with its place in the session's map.
+    """A scan with its pose in the frame of its session.
 
     scan : the scan, its points deskewed to `scan.stamp_ns` (base frame at that time).
-    T_map_base : (4, 4) pose of the base at `scan.stamp_ns`. The map frame is the base at the first scan.
+    T_session_base : (4, 4) pose of the base at `scan.stamp_ns`. The session frame is the base at the
+        session's first scan, levelled (z up).
     health : FINE; DEGENERATE (some direction rests on odometry or the motion model); LOST (do not map).
 
     >>> import numpy as np
     >>> scan = Scan(stamp_ns=0, points_m=np.ones((5, 3)), T_base_sensor=np.eye(4), sensor="lidar")
-    >>> RegisteredScan(scan=scan, T_map_base=np.eye(4)).health.value
+    >>> RegisteredScan(scan=scan, T_session_base=np.eye(4)).health.value
     'fine'
     """
 
     scan: Scan
-    T_map_base: F64
+    T_session_base: F64
     health: Health = Health.FINE
 
     def __post_init__(self) -> None:
-        _freeze(self, "T_map_base", np.float64, (4, 4))
+        freeze(self, "T_session_base", np.float64, (4, 4))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,24 +108,25 @@ class Trajectory:
     """Poses of the base over time.
 
     stamps_ns : (N,) int64, increasing.
-    T_map_base : (N, 4, 4) float64.
+    T_session_base : (N, 4, 4) float64. The session frame is the base at the session's first scan, levelled
+        (z up); for poses from a file it is the frame of that file.
     health : N entries, parallel to `stamps_ns`; empty means all fine.
 
     >>> import numpy as np
     >>> from pc2grid import SE2
     >>> poses = np.array([SE2(x, 0.0, 0.0).lift() for x in (0.0, 1.0, 3.0)])
-    >>> way = Trajectory(stamps_ns=np.array([0, 10, 20]), T_map_base=poses)
+    >>> way = Trajectory(stamps_ns=np.array([0, 10, 20]), T_session_base=poses)
     >>> way.path_m().tolist(), way.planar()[-1].tolist()
     ([0.0, 1.0, 3.0], [3.0, 0.0, 0.0])
     """
 
     stamps_ns: I64
-    T_map_base: F64
+    T_session_base: F64
     health: tuple[Health, ...] = ()
 
     def __post_init__(self) -> None:
-        _freeze(self, "stamps_ns", np.int64, (None,))
-        _freeze(self, "T_map_base", np.float64, (len(self.stamps_ns), 4, 4))
+        freeze(self, "stamps_ns", np.int64, (None,))
+        freeze(self, "T_session_base", np.float64, (len(self.stamps_ns), 4, 4))
         if self.health and len(self.health) != len(self.stamps_ns):
             raise ValueError(
                 f"Trajectory.health: expected {len(self.stamps_ns)} entries, got {len(self.health)}"
@@ -143,13 +136,13 @@ class Trajectory:
         return len(self.stamps_ns)
 
     def planar(self) -> F64:
-        """(N, 3): x, y, yaw of the base in the map frame; metres and radians."""
-        T = self.T_map_base
+        """(N, 3): x, y, yaw of the base in the session frame; metres and radians."""
+        T = self.T_session_base
         return np.column_stack((T[:, 0, 3], T[:, 1, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0])))
 
     def path_m(self) -> F64:
         """(N,): planar distance driven up to each pose, metres."""
-        steps = np.linalg.norm(np.diff(self.T_map_base[:, :2, 3], axis=0), axis=1)
+        steps = np.linalg.norm(np.diff(self.T_session_base[:, :2, 3], axis=0), axis=1)
         return np.concatenate(([0.0], np.cumsum(steps)))[: len(self)]
 
     def poses(self) -> Iterator[SE2]:
@@ -180,19 +173,26 @@ class OccupancyGrid:
     origin_m: tuple[float, float]
 
     def __post_init__(self) -> None:
-        _freeze(self, "cells", np.int8, (None, None))
+        freeze(self, "cells", np.int8, (None, None))
         if not (np.isfinite(self.resolution_m) and self.resolution_m > 0):
             raise ValueError(f"OccupancyGrid.resolution_m: expected > 0, got {self.resolution_m}")
 
     @property
     def occupied(self) -> BoolGrid:
-        """(H, W) cells at or above 65 (nav2's occupied_thresh)."""
-        return self.cells >= 65
+        """(H, W) cells that are occupied: `OCCUPIED_FROM` percent or more."""
+        return self.cells >= OCCUPIED_FROM
 
     @property
     def free(self) -> BoolGrid:
-        """(H, W) cells known to be below 20 (nav2's free_thresh, 0.196, in percent)."""
-        return (self.cells >= 0) & (self.cells < 20)
+        """(H, W) cells that are known and free: below `FREE_BELOW` percent."""
+        return (self.cells >= 0) & (self.cells < FREE_BELOW)
+
+    def is_free(self, x_m: float, y_m: float) -> bool:
+        """Whether a point of the map frame lies in a free cell of the grid."""
+        row, column = (int(v) for v in self.to_cell(np.array([(x_m, y_m)]))[0])
+        height, width = self.cells.shape
+        inside = 0 <= row < height and 0 <= column < width
+        return inside and 0 <= int(self.cells[row, column]) < FREE_BELOW
 
     def to_cell(self, points_m: NDArray[np.floating]) -> I64:
         """Map points (N, 2) in the map frame to (N, 2) cells as (row, column); may lie outside."""
@@ -217,7 +217,7 @@ class OccupancyGrid:
             self.origin_m[0] + (column - n) * self.resolution_m,
             self.origin_m[1] + (row - n) * self.resolution_m,
         )
-        return OccupancyGrid(cells=cells, resolution_m=self.resolution_m, origin_m=origin)
+        return OccupancyGrid(cells=hand_over(cells), resolution_m=self.resolution_m, origin_m=origin)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -232,7 +232,7 @@ class Submap:
     >>> import pc2grid
     >>> submap = pc2grid.submaps_of(pc2grid.load_map("map.yaml"))[0]
     >>> submap.submap_id, submap.radius_m, submap.grid.cells.shape
-    (0, 8.0, (321, 321))
+    (0, 5.0, (201, 201))
     """
 
     submap_id: int
@@ -241,11 +241,21 @@ class Submap:
     grid: OccupancyGrid
 
 
+MISSING_FILES = "files of the recording that are missing"
+"""The reason in `ReadReport.scans_skipped` for files of a split recording that are not there."""
+SEVERE_SHARE = 0.01
+"""Lost scans per scan read from which on a loss is severe; chosen by hand."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadReport:
-    """What was read from a log and what was lost on the way; any loss makes the program exit with 3.
+    """What was read from a log, and what was lost; if much was lost, the program exits with 3.
 
     scans_skipped counts by reason; warnings are whole sentences for the user.
+
+    >>> few = ReadReport(scans_read=7373, scans_skipped={"registration lost": 1})
+    >>> few.lossy, few.severe
+    (True, False)
     """
 
     scans_read: int = 0
@@ -259,16 +269,27 @@ class ReadReport:
         """Whether data was lost."""
         return bool(self.scans_skipped) or self.bytes_lost > 0
 
+    @property
+    def severe(self) -> bool:
+        """Whether so much was lost that the result may be incomplete.
+
+        That is: a part of a file was damaged or a file was missing, or for each hundred scans that were read
+        (`SEVERE_SHARE`) at least one was lost.
+        """
+        damaged = self.bytes_lost > 0 or MISSING_FILES in self.scans_skipped
+        lost = sum(self.scans_skipped.values())
+        return damaged or (lost > 0 and lost >= SEVERE_SHARE * self.scans_read)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Loop:
-    """A place that a session came back to, as measured there: what closed a loop, or would have.
+    """A place that a session came back to, with the relative pose measured there.
 
-    older, newer : which poses of the trajectory saw it.
-    T_older_newer : the newer base in the older one's frame, in the plane, as the two views fit each other.
-        The trajectory honours it as far as the other loops and the way between agree.
+    older, newer : indices of the two poses in the trajectory.
+    T_older_newer : the newer base in the frame of the older one, in the plane, by matching the two views.
+        The trajectory agrees with it as far as the other loops and the odometry between allow.
     information : (3, 3) inverse covariance of its x, y, yaw in the older base's axes.
-    accepted : whether the others bear it out; otherwise it has lost most of its say.
+    accepted : whether it agrees with the other measurements; otherwise its weight in the pose graph is low.
 
     >>> import numpy as np
     >>> from pc2grid import SE2
@@ -284,24 +305,71 @@ class Loop:
     accepted: bool = True
 
     def __post_init__(self) -> None:
-        _freeze(self, "information", np.float64, (3, 3))
+        freeze(self, "information", np.float64, (3, 3))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contradiction:
+    """A stretch of a trajectory where the scans do not agree with the map that was drawn from them.
+
+    from_ns, to_ns : stamps of its first and last scan.
+    x_m, y_m : position of the base, in the session frame, where the scans agree least.
+    length_m : planar distance driven.
+    share : of the wall hits there that lie on ground which the map calls free, 0..1.
+    """
+
+    from_ns: int
+    to_ns: int
+    x_m: float
+    y_m: float
+    length_m: float
+    share: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Consistency:
+    """How well a map agrees with its own scans (`pc2grid.mapping.consistency`).
+
+    hits_on_free : share of all wall hits that lie on ground which the map calls free, 0..1. Hits on what
+        moves are not counted.
+    contradicted : share of the travel along which many do, 0..1.
+    bent : whether this is so much that parts of the map are probably drawn in the wrong place.
+    stretches : where this is so, the longest first; of very many the longest only.
+
+    >>> Consistency().bent
+    False
+    """
+
+    hits_on_free: float = 0.0
+    contradicted: float = 0.0
+    bent: bool = False
+    stretches: tuple[Contradiction, ...] = ()
+
+
+def _empty_graph() -> nx.Graph:
+    import networkx as nx
+
+    return nx.Graph()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionMap:
-    """What one recording became: the end of the point-cloud half of pc2grid.
+    """The map made of one recording: the result of the point-cloud half of pc2grid.
 
     session : name, unique within a database.
     sensor : the kind that made the map, or "map" for an imported map.yaml.
-    grid : the whole occupancy grid in the session's map frame.
+    grid : the whole occupancy grid, in the session frame.
     submaps : its partition.
     trajectory : poses of the base; empty for an imported map.
     loops : where the recording came back to a place it had seen.
+    graph : the junction graph of the free space (`pc2grid.submaps.junction_graph`), which the submaps were
+        made from; empty if none was made.
+    consistency : how well the map agrees with its own scans; None if that is not known.
 
     >>> import numpy as np
     >>> import pc2grid
     >>> grid = pc2grid.load_map("map.yaml")
-    >>> none = Trajectory(stamps_ns=np.empty(0), T_map_base=np.empty((0, 4, 4)))
+    >>> none = Trajectory(stamps_ns=np.empty(0), T_session_base=np.empty((0, 4, 4)))
     >>> plan = SessionMap(
     ...     session="plan", sensor="map", grid=grid, submaps=pc2grid.submaps_of(grid), trajectory=none
     ... )
@@ -315,6 +383,8 @@ class SessionMap:
     submaps: tuple[Submap, ...]
     trajectory: Trajectory
     loops: tuple[Loop, ...] = ()
+    graph: nx.Graph = field(default_factory=_empty_graph)
+    consistency: Consistency | None = None
     report: ReadReport = field(default_factory=ReadReport)
 
     def __post_init__(self) -> None:

@@ -1,8 +1,8 @@
-"""Where settings come from: defaults, then a TOML file, then `section.key=value`; and back to TOML.
+"""Reads settings from a TOML file and from `section.key=value`, and writes them as TOML.
 
-Works on any tree of `Section`s, so that the packages above can add theirs. TOML has no null: in a dump, a
-setting at null is a commented line if that is its default, else the text "null"; on the command line it is
-`section.key=null`.
+The functions take any tree of `Section`s, so that the package above can add its own sections. TOML has no
+null. In a dump, a setting that is null is a commented line if null is its default, else the text "null".
+On the command line it is `section.key=null`.
 """
 
 from __future__ import annotations
@@ -35,24 +35,26 @@ def load_settings(
     file: Path | None = None,
     assignments: Sequence[str] = (),
     environment: Mapping[str, str] = os.environ,
+    *,
+    preset: T | None = None,
 ) -> T:
-    """Settings of a tree: `assignments` win over `file`, which wins over the defaults.
+    """Settings of a tree: `assignments` override `file`, which overrides `preset`.
 
     file : a TOML file; None: the one that the environment variable PC2GRID_CONFIG names, if any.
     assignments : "section.key=value" each, the value as in TOML; text needs no quotes.
+    preset : the settings that nothing else sets; None: the defaults of `model`.
 
     Raises ConfigError naming the key and the closest known one.
     """
     named = environment.get(ENVIRONMENT)
     path = file or (Path(named) if named else None)
     tree = _read_toml(path) if path else {}
-    origin = str(path) if path else "--set"
-    if path and not assignments:
-        return _validated(model, tree, origin)
-    _validated(model, tree, origin)
+    settings = _validated(model, tree, preset, str(path) if path else "--set")
+    if not assignments:
+        return settings
     for assignment in assignments:
-        _assign(model, tree, assignment)
-    return _validated(model, tree, "--set")
+        _assign(tree, assignment)
+    return _validated(model, tree, preset, "--set")
 
 
 def dump_settings(settings: Section) -> str:
@@ -89,7 +91,7 @@ def _with_nulls(section: Any) -> Any:
     return {key: None if value == "null" else value for key, value in section.items()}
 
 
-def _assign(model: type[Section], tree: dict[str, Any], assignment: str) -> None:
+def _assign(tree: dict[str, Any], assignment: str) -> None:
     name, equals, text = assignment.partition("=")
     section, dot, key = name.strip().partition(".")
     if not equals or not dot or not key:
@@ -105,9 +107,9 @@ def _assign(model: type[Section], tree: dict[str, Any], assignment: str) -> None
         branch[key] = value
 
 
-def _validated(model: type[T], tree: dict[str, Any], origin: str) -> T:
+def _validated(model: type[T], tree: dict[str, Any], preset: T | None, origin: str) -> T:
     try:
-        return model.model_validate(tree)
+        return model.model_validate(tree if preset is None else _over(preset, tree))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
@@ -120,6 +122,15 @@ def _validated(model: type[T], tree: dict[str, Any], origin: str) -> T:
             f"{origin}: {key}: {complaint}, found {first['input']!r:.60}",
             hint="`pc2grid config dump` explains every setting",
         ) from None
+
+
+def _over(preset: Section, tree: dict[str, Any]) -> dict[str, Any]:
+    """The tree with the values of `preset` where it has none."""
+    full = preset.model_dump()
+    for name, section in tree.items():
+        both = isinstance(section, dict) and isinstance(full.get(name), dict)
+        full[name] = full[name] | section if both else section
+    return full
 
 
 def _closest(model: type[Section], key: str) -> str | None:

@@ -1,8 +1,8 @@
 """Submaps -> signatures -> database -> retrieval -> verified pose.
 
-The back of pc2grid: one file per section of the paper (`boundary`, `freespace`, `symmetry`,
-`similarity`), the database behind one protocol, and the decision where a query is. Importing this package
-costs nothing: its names load their modules when first used.
+The back of pc2grid: one file for each section of the paper (`boundary`, `freespace`, `symmetry`,
+`similarity`), the database behind one protocol, and relocalization. Importing this package loads no library:
+each name loads its module when it is first used.
 
 >>> import pc2grid, signature
 >>> with signature.open_database("building.submaps") as database, pc2grid.open_log("tuesday.mcap") as log:
@@ -16,12 +16,9 @@ from typing import TYPE_CHECKING
 
 from pc2grid.lazy import lazy_names
 
+# The only list of the public names. A function with the name of its module has another name here, because the
+# module would hide it.
 if TYPE_CHECKING:
-    from signature.answer import Answer as Answer
-    from signature.build import add_session as add_session
-    from signature.build import build_session as build_session
-    from signature.build import provenance as provenance
-    from signature.building import Building as Building
     from signature.config import Config as Config
     from signature.database import Label as Label
     from signature.database import SubmapDatabase as SubmapDatabase
@@ -29,34 +26,19 @@ if TYPE_CHECKING:
     from signature.database import open_database as open_database
     from signature.describe import Signature as Signature
     from signature.describe import describe as signature_of  # noqa: F401
-    from signature.relocalize import Relocalizer as Relocalizer
-    from signature.relocalize import locate_map as locate_map
-    from signature.relocalize import relocalize as locate  # noqa: F401
+    from signature.relocalization.answer import Answer as Answer
+    from signature.relocalization.map_index import MapIndex as MapIndex
+    from signature.relocalization.relocalizer import Relocalizer as Relocalizer
+    from signature.relocalization.relocalizer import locate_map as locate_map
+    from signature.relocalization.relocalizer import relocalize as locate  # noqa: F401
+    from signature.sessions import add_session as add_session
+    from signature.sessions import build_session as build_session
+    from signature.sessions import provenance as provenance
     from signature.similarity import SignatureTable as SignatureTable
     from signature.similarity import distances as distances
 
-# A function whose module has its name goes by another one here: the module would hide it.
-_HOMES = {
-    "Answer": "answer.Answer",
-    "Building": "building.Building",
-    "Config": "config.Config",
-    "Label": "database.Label",
-    "Relocalizer": "relocalize.Relocalizer",
-    "Signature": "describe.Signature",
-    "SignatureTable": "similarity.SignatureTable",
-    "SubmapDatabase": "database.SubmapDatabase",
-    "add_session": "build.add_session",
-    "build_session": "build.build_session",
-    "create_database": "database.create_database",
-    "distances": "similarity.distances",
-    "locate": "relocalize.relocalize",
-    "locate_map": "relocalize.locate_map",
-    "open_database": "database.open_database",
-    "provenance": "build.provenance",
-    "signature_of": "describe.describe",
-}
-__all__ = [*_HOMES]
-__getattr__ = lazy_names(__name__, _HOMES)
+__getattr__, _names = lazy_names(__name__, __file__)
+__all__ = [*_names]
 
 
 def __dir__() -> list[str]:

@@ -6,7 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from pc2grid.config import PartitionConfig, ProjectionConfig, ReadConfig, RegistrationConfig, Section
+import pc2grid.config
+from pc2grid.config import Section
 
 
 class SignatureConfig(Section):
@@ -15,9 +16,6 @@ class SignatureConfig(Section):
     Names in brackets are the paper's; their defaults are Table II's. The rest the paper leaves open.
     """
 
-    occupied_percent: int = Field(
-        65, ge=1, le=100, description="cells at or above are boundary (T^B); 65 is nav2's occupied_thresh"
-    )
     thinning: Literal["guo_hall", "zhang_suen"] = Field(
         "guo_hall", description="of boundary and free space; guo_hall treats all directions of a line alike"
     )
@@ -47,18 +45,22 @@ class SignatureConfig(Section):
     )
 
     segment_min_m: float = Field(0.3, gt=0, description="least length of a line segment (lambda_theta)")
-    segment_gap_m: float = Field(0.1, ge=0, description="Hough joins collinear pixels across this much")
+    segment_gap_m: float = Field(
+        0.1, ge=0, description="largest gap between collinear pixels that Hough joins"
+    )
     segment_votes: int = Field(
-        6, gt=0, description="Hough votes a line needs; about 0.3 m of pixels at 0.05 m"
+        6, gt=0, description="least number of Hough votes of a line; 0.3 m has 6 pixels of 0.05 m"
     )
     segment_step_deg: float = Field(
         2.0,
         gt=0,
         le=15,
-        description="Hough's step in angle; a segment's direction comes from its ends, not from it",
+        description="Hough's step in angle; the direction of a segment follows from its ends instead",
     )
     axis_smoothing_deg: float = Field(
-        2.0, gt=0, description="blur of the vote on angles; a pixel's step in a 1 m segment is 3 degrees"
+        2.0,
+        gt=0,
+        description="blur of the vote on angles, standard deviation; a pixel in 1 m is 3 degrees",
     )
     axis_separation_deg: float = Field(
         30.0,
@@ -72,13 +74,16 @@ class SignatureConfig(Section):
     symmetry_peak: float = Field(
         34.0,
         gt=0,
-        description="crest of a straight line after the blur: what 0 and 255 give at 0.05 m, unscaled",
+        description="value of a straight line after the blur, and the limit of all values, which is not the "
+        "paper's; 34 is what an image of 0 and 255 gives at 0.05 m",
     )
 
     weight_boundary: float = Field(
         0.9, ge=0, le=1, description="weight of the boundary histogram (omega_b); omega_f is the rest"
     )
-    symmetry_scale: float = Field(0.08, gt=0, description="scaling factor of Eq. 8 (eta); orders nothing")
+    symmetry_scale: float = Field(
+        0.08, gt=0, description="scaling factor of Eq. 8 (eta); does not change the order of candidates"
+    )
     symmetry_sigma: float = Field(120.0, gt=0, description="larger: symmetry counts less in Eq. 8 (sigma)")
     histogram_distance: Literal["hellinger", "bhattacharyya"] = Field(
         "hellinger",
@@ -86,32 +91,53 @@ class SignatureConfig(Section):
     )
 
 
+class LoopsConfig(Section):
+    """Which loops are closed when a recording becomes a session."""
+
+    recognize: bool = Field(
+        True,
+        description="recognise earlier places by signatures and shape, however far tracking has drifted; "
+        "false: search near the tracked pose only",
+    )
+
+
 class RelocalizeConfig(Section):
     """Query -> hypotheses -> answer."""
 
-    window_m: float = Field(15.0, gt=0, description="how far back along its path a query remembers")
-    step_m: float = Field(1.0, gt=0, description="a new look at the database every so many metres of travel")
-    views: int = Field(8, gt=0, description="places of its path at which a query is described")
+    window_m: float = Field(
+        15.0, gt=0, description="length of the latest part of its path that a query is made of"
+    )
+    step_m: float = Field(1.0, gt=0, description="the database is asked again after so many metres of travel")
+    views: int = Field(8, gt=0, description="number of views that describe a query, along its path")
     view_spacing_m: float = Field(1.2, gt=0, description="least distance of two views")
+    all_places: int = Field(
+        10_000, ge=0, description="in a database of up to so many places, the isovists of all are compared"
+    )
     shortlist: int = Field(
-        400, gt=0, description="places that the signatures hand to the comparison of isovists"
+        400,
+        gt=0,
+        description="in a larger one, the places that the signatures select for this, for each view",
     )
     signature_weight: float = Field(
-        0.2, ge=0, description="say of the signatures against the isovists' ranges; 0: none"
+        0.2, ge=0, description="weight of the signatures relative to the isovists there; 0: not used"
     )
-    top_k: int = Field(50, gt=0, description="placements that retrieval hands to alignment")
-    coarse_floor: float = Field(0.4, ge=0, le=1, description="coarse scores below this are not looked at")
-    coarse_keep: float = Field(0.8, gt=0, le=1, description="nor those below this share of the best")
-    hypotheses: int = Field(20, gt=0, description="hypotheses kept at most")
+    top_k: int = Field(50, gt=0, description="placements that retrieval passes to alignment")
+    coarse_floor: float = Field(
+        0.4, ge=0, le=1, description="placements with a lower coarse score are dropped"
+    )
+    coarse_keep: float = Field(
+        0.8, gt=0, le=1, description="and so are those below this share of the best one"
+    )
+    hypotheses: int = Field(20, gt=0, description="largest number of hypotheses that are kept")
     exhaustive_m2: float = Field(
         20_000.0,
         ge=0,
-        description="where signatures do not settle it, maps up to this free area are searched as a whole",
+        description="without a clear answer by signatures, maps up to this free area are searched as a whole",
     )
     accept: float = Field(0.9, gt=0, lt=1, description="least confidence to answer located")
 
 
-class Config(Section):
+class Config(pc2grid.config.Config):
     """All sections; what `pc2grid config dump` prints.
 
     >>> config = Config()
@@ -121,11 +147,6 @@ class Config(Section):
     0.99
     """
 
-    read: ReadConfig = ReadConfig()
-    registration: RegistrationConfig = RegistrationConfig()
-    projection: ProjectionConfig = ProjectionConfig()
-    # A robot that has driven a few metres knows part of a disc of III-A, so by default submaps hold what is
-    # seen from their centre, nearby, and lie close enough for every place to have one.
-    partition: PartitionConfig = PartitionConfig(view="isovist", radius_m=5.0, spacing_m=1.0)
     signature: SignatureConfig = SignatureConfig()
+    loops: LoopsConfig = LoopsConfig()
     relocalize: RelocalizeConfig = RelocalizeConfig()

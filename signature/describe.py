@@ -1,4 +1,4 @@
-"""A submap to its three signatures (paper III, Figure 1)."""
+"""From a submap to its three signatures (paper III, Figure 1)."""
 
 from __future__ import annotations
 
@@ -6,20 +6,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.model import F32, Submap
+from pc2grid.arrays import F32, freeze
+from pc2grid.model import Submap
 from signature.boundary import boundary_edges, boundary_histogram, boundary_points
 from signature.config import SignatureConfig
-from signature.freespace import adjacency, freespace_histogram, freespace_nodes, shortest_paths
+from signature.freespace import freespace_graph, freespace_histogram, shortest_paths
 from signature.symmetry import symmetry_scores
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Signature:
-    """What a submap is remembered by.
+    """The three signatures of a submap.
 
     boundary : (Nb,) float32, H^b of Eq. 2; sum 1, or all 0 if fewer than two boundary points are known.
     freespace : (Nf,) float32, H^f of Eq. 4; sum 1, or all 0 if no two free places are connected.
     symmetry : (2,) float32, s^alpha and s^beta of Eq. 5; 0 where there is no axis.
+
+    Raises ValueError if an array does not have one axis.
     """
 
     boundary: F32
@@ -28,13 +31,7 @@ class Signature:
 
     def __post_init__(self) -> None:
         for name in ("boundary", "freespace", "symmetry"):
-            value = np.asarray(getattr(self, name), np.float32)
-            if value.ndim != 1:
-                raise ValueError(f"Signature.{name}: expected one axis, got shape {value.shape}")
-            if value.flags.writeable:
-                value = value.view()
-                value.flags.writeable = False
-            object.__setattr__(self, name, value)
+            freeze(self, name, np.float32, (None,))
 
 
 def describe(submap: Submap, config: SignatureConfig = SignatureConfig()) -> Signature:
@@ -44,17 +41,16 @@ def describe(submap: Submap, config: SignatureConfig = SignatureConfig()) -> Sig
     >>> submaps = pc2grid.submaps_of(pc2grid.load_map("map.yaml"))
     >>> signature = describe(submaps[0])
     >>> signature.boundary.shape, signature.freespace.shape, signature.symmetry.shape
-    ((80,), (80,), (2,))
+    ((50,), (50,), (2,))
     >>> round(float(signature.boundary.sum()), 5)
     1.0
     """
-    grid, radius_m = submap.grid, submap.radius_m
+    radius_m, resolution_m = submap.radius_m, submap.grid.resolution_m
     edges = boundary_edges(submap, config)
-    points = boundary_points(edges, grid.resolution_m, config)
-    nodes = freespace_nodes(submap, config)
-    weights = adjacency(nodes, grid.cells >= config.occupied_percent, grid.resolution_m, config)
+    points = boundary_points(edges, resolution_m, config)
+    paths_m = shortest_paths(freespace_graph(submap, config))
     return Signature(
-        boundary=boundary_histogram(points, radius_m, grid.resolution_m, config),
-        freespace=freespace_histogram(shortest_paths(weights), radius_m, config),
-        symmetry=symmetry_scores(edges, grid.resolution_m, config),
+        boundary=boundary_histogram(points, radius_m, resolution_m, config),
+        freespace=freespace_histogram(paths_m, radius_m, config),
+        symmetry=symmetry_scores(edges, resolution_m, config),
     )

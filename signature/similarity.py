@@ -3,28 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pc2grid.geometry import F64
-from pc2grid.model import F32
+from pc2grid.arrays import F32, F64
 from signature.config import SignatureConfig
 from signature.describe import Signature
 
 I32 = NDArray[np.int32]
 
 FARTHEST = 20.0
-"""Cap of -ln BC: BC below 2e-9 means that no bin is shared."""
+"""Cap of -ln BC, chosen by hand: BC is below 2e-9 only if no bin is shared."""
+
+_BC_ROUNDING = 1e-7
+"""Float32 histograms have rounding errors of this size; 1 - BC of equal ones is not more."""
+
+_LARGEST_EXPONENT = 300.0
+"""In Eq. 8, so that exp stays finite in float64 (limit 709) and so does the product of two factors."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SignatureTable:
-    """Signatures of N submaps side by side, a row each.
+    """Signatures of N submaps, one row each.
 
     boundary (N, Nb), freespace (N, Nf), symmetry (N, 2) : float32, as in `Signature`.
-    session_index (N,), submap_id (N,) : int32, whose they are.
+    session_index (N,), submap_id (N,) : int32, the submap that a row describes.
     center_m (N, 2) : float64, centre of the submap in its session's map frame.
     """
 
@@ -56,7 +61,7 @@ class SignatureTable:
         submap_id: ArrayLike | None = None,
         session_index: ArrayLike | None = None,
     ) -> SignatureTable:
-        """A table of signatures with their centres (N, 2); ids default to 0.. N - 1, sessions to 0."""
+        """A table of signatures with their centres (N, 2); ids default to 0 .. N - 1, sessions to 0."""
         n = len(signatures)
 
         def stack(name: str) -> F32:
@@ -74,12 +79,18 @@ class SignatureTable:
             center_m=np.asarray(center_m, np.float64).reshape(n, 2),
         )
 
+    @staticmethod
+    def concatenated(tables: Sequence[SignatureTable]) -> SignatureTable:
+        """The rows of several tables, one table after the other."""
+        names = [field.name for field in fields(SignatureTable)]
+        return SignatureTable(**{name: np.concatenate([getattr(t, name) for t in tables]) for name in names})
+
 
 def distances(query: Signature, table: SignatureTable, config: SignatureConfig = SignatureConfig()) -> F64:
     """The matching score s of Eq. 6 against every row of a table, (N,); smaller is more alike, never NaN.
 
-    s = Omega * (omega_b d(H^b) + omega_f d(H^f)). A histogram without entries knows nothing and shares no
-    bin with any, not even with another empty one: its distance is the largest there is.
+    s = Omega * (omega_b d(H^b) + omega_f d(H^f)). An empty histogram shares no bin with any other, not
+    even with another empty one: its distance is the largest possible.
 
     >>> import pc2grid, signature
     >>> submaps = pc2grid.submaps_of(pc2grid.load_map("map.yaml"))
@@ -117,9 +128,9 @@ def histogram_distance(a: F32, b: F32, config: SignatureConfig) -> F64:
         raise ValueError(f"histograms of {a.shape[-1]} and {b.shape[-1]} bins: other radius or bin width")
     if len(b) == 0:
         return np.zeros((len(a), 0))
-    # float32 histograms carry 1e-7 a bin: 1 - BC of equal ones is rounding, and the root would blow it up.
+    # Of equal histograms 1 - BC is only rounding, which the square root would enlarge.
     bc = np.sqrt(a.astype(np.float64)) @ np.sqrt(b.astype(np.float64)).T
-    bc = np.where(bc > 1.0 - 1e-7, 1.0, bc)
+    bc = np.where(bc > 1.0 - _BC_ROUNDING, 1.0, bc)
     if config.histogram_distance == "hellinger":
         return np.asarray(np.sqrt(1.0 - bc))
     return np.asarray(-np.log(np.maximum(bc, np.exp(-FARTHEST))))
@@ -128,9 +139,10 @@ def histogram_distance(a: F32, b: F32, config: SignatureConfig) -> F64:
 def structural_factor(a: F32, b: F32, config: SignatureConfig) -> F64:
     """Omega of Eq. 7-8 between symmetry scores (M, 2) and (N, 2): (M, N), at least eta^2.
 
-    Eq. 8 prints "eta e(-(s_i - s_j)^2 / 2 sigma^2)^-1". The reciprocal is of the exponential: the score of
-    Eq. 6 must grow as the symmetries differ, so phi = eta exp(+(s_i - s_j)^2 / (2 sigma^2)).
+    Eq. 8 as printed is the reciprocal of an exponential with a negative exponent. That agrees with Eq. 6,
+    where the score must grow with the difference of the symmetries: phi = eta exp(+(s_i - s_j)^2 / (2
+    sigma^2)).
     """
     differences = a[:, None].astype(np.float64) - b[None].astype(np.float64)
     exponent = (differences**2).sum(axis=-1) / (2.0 * config.symmetry_sigma**2)
-    return np.asarray(config.symmetry_scale**2 * np.exp(np.minimum(exponent, 300.0)))
+    return np.asarray(config.symmetry_scale**2 * np.exp(np.minimum(exponent, _LARGEST_EXPONENT)))

@@ -12,7 +12,7 @@ import pytest
 from pc2grid.io.nav2_map import save_map
 from pc2grid.model import SensorKind
 from pc2grid.simulate import SimulationConfig, simulate_session
-from tests.test_faults_durability import small_house
+from tests.helpers.rooms import small_house
 
 ROOT = Path(__file__).resolve().parent.parent
 

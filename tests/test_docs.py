@@ -32,8 +32,8 @@ from typer.testing import CliRunner
 import pc2grid
 import signature
 from pc2grid_cli.main import app
-from tests import desk
-from tests.test_io_files import oracle
+from tests.helpers import doc_files
+from tests.helpers.nav2_map import oracle
 
 ROOT = Path(__file__).resolve().parent.parent
 FLAGS = doctest.NORMALIZE_WHITESPACE
@@ -42,14 +42,14 @@ FLAGS = doctest.NORMALIZE_WHITESPACE
 @pytest.fixture(scope="module")
 def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("furnished")
-    desk.furnish(folder)
+    doc_files.furnish(folder)
     return folder
 
 
 @pytest.fixture
 def folder(furnished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The user's folder, and the working directory."""
-    monkeypatch.chdir(desk.copy(furnished, tmp_path))
+    monkeypatch.chdir(doc_files.copy(furnished, tmp_path))
     return tmp_path
 
 
@@ -98,16 +98,17 @@ def test_importing_a_package_loads_no_library(package: str) -> None:
 
 DOCUMENTS = ("README.md", "CONTRIBUTING.md", "examples/nav2.md", "examples/fleet.md")
 NOT_RUN = {
-    "make": "test_house.py looks at the Makefile; `make demo` takes minutes",
+    "make": "test_repository.py looks at the Makefile; `make demo` takes minutes",
     "pc2grid compare paper": "needs the paper's maps, and hours",
     "pc2grid compare sensors": "needs the paper's maps, and an hour",
+    "pc2grid compare real": "needs a real 3D scan; test_real_sensors.py does a small run",
     "pc2grid compare log": "needs a long recording with its truth",
     "pc2grid compare maps": "drives hundreds of metres",
     "ros2": "needs ROS; test_example_nav2 has one that listens",
     "pip": "the network is not asked in tests",
     "createdb": "needs a PostgreSQL server; test_postgres.py brings one",
     "pc2grid relocalize tuesday.mcap --rerun": "needs a display and the extra viz; see test_rerun.py",
-    "pc2grid convert logs": "several processes; test_cluster.py does it",
+    "pc2grid convert logs": "several processes; test_conversion_jobs.py does it",
 }
 SHORTER = {"--length 20": "--length 1"}
 """What a command says, and what is run in its place so that it takes a second."""
@@ -227,7 +228,9 @@ def test_example_own_sensor(run: Run) -> None:
             out.write(f"{scan.stamp_ns * 1e-9:.4f} {words}\n")
     (said,) = run("own_sensor.py", "scans.txt", "own.submaps")
     with pc2grid.open_log("tuesday.mcap") as log:
-        wanted = pc2grid.build_map(log, signature.Config(), session="tuesday", duration_s=4.0)
+        wanted = pc2grid.build_map(
+            log, signature.Config(), session="tuesday", span=pc2grid.TimeSpan(0.0, 4.0)
+        )
     with signature.open_database("own.submaps") as database:
         way = database.trajectory("scans").planar()
     assert said.startswith(f"{len(wanted.trajectory)} scans, ")
@@ -259,11 +262,10 @@ def test_the_picture_of_the_architecture_shows_every_module(folder: Path) -> Non
         [sys.executable, ROOT / "tools" / "architecture.py", "out.svg"], check=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "tools")))},
     )  # fmt: skip
-    shown = set(re.findall(r'text-anchor="middle">(\w+)<', Path("out.svg").read_text()))
-    for package in ("pc2grid", "signature", "tools/pc2grid_cli"):
-        for file in (ROOT / package).iterdir():
-            if (file.suffix == ".py" or (file / "__init__.py").exists()) and file.stem != "__init__":
-                assert file.stem in shown
+    shown = set(re.findall(r"\w+", " ".join(re.findall(r">([^<>]+)</text>", Path("out.svg").read_text()))))
+    for package in (ROOT / "pc2grid", ROOT / "signature", ROOT / "tools" / "pc2grid_cli"):
+        for file in package.rglob("*.py"):
+            assert {*file.relative_to(package.parent).parent.parts, file.stem} - {"__init__"} <= shown, file
 
 
 # --- nav2 and Foxglove ------------------------------------------------------------------------------------

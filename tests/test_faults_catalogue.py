@@ -1,10 +1,10 @@
 """The catalogue of faults: what goes wrong with inputs, and what `pc2grid` answers.
 
-Each case is a command on files that a builder makes: its exit code (0 done, 1 failed, 2 usage, 3 done with
-loss), the class of the error, words of what is said, and that nothing is left behind or changed but a whole
+Each case is a command on files that a function makes: its exit code (0 done, 1 failed, 2 usage, 3 done with
+loss), the class of the error, words of the message, and that nothing is left behind or changed except a whole
 database where one was asked for. `same`: the map, the trajectory and the signatures are those of the clean
-recording, to the last bit. Other files hold what needs processes, clocks or file systems; there a test
-belongs to a case by the mark `fault(number)`. The last test counts that no number is missing:
+recording, to the last bit. Cases that need processes, clocks or file systems stand in other files, where the
+mark `fault(number)` assigns a test to its case. The last test checks that no number is missing:
 
  1 missing, folder, no permission      17 a type in two schema records    33 odd stamps
  2 zero bytes                          18 another type on the topic       34 gap in the log
@@ -42,11 +42,22 @@ from pc2grid import errors
 from pc2grid.errors import Pc2GridError
 from pc2grid_cli import console
 from signature.database import open_database
-from signature.database.sqlite import store
-from signature.database.upkeep import check
-from tests.builders import STEP, T0, Message, drive, raw_log, read, ros, write_bag, write_mcap, write_rosbag2
-from tests.test_database import make_entry
-from tests.watching import Peak
+from signature.database.maintenance import check
+from signature.database.sqlite.database import store
+from tests.helpers.databases import make_entry
+from tests.helpers.memory import Peak
+from tests.helpers.recordings import (
+    STEP,
+    T0,
+    Message,
+    drive,
+    raw_log,
+    read,
+    ros,
+    write_bag,
+    write_mcap,
+    write_rosbag2,
+)
 
 CONVERT = "convert log.mcap -o x.submaps"
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -56,7 +67,7 @@ SCANS = 12
 # --- a small recording --------------------------------------------------------------------------------
 
 
-def sweep(x_m: float) -> np.ndarray:
+def planar_scan(x_m: float) -> np.ndarray:
     """(1080, 3) float32: the walls of a room of 8 x 6 m, seen from (x_m, 0)."""
     angle = np.linspace(-3.1, 3.1, 360)
     c, s = np.cos(angle), np.sin(angle)
@@ -82,7 +93,7 @@ def cloud(
     extra: tuple[str, int, np.ndarray] | None = None,
 ) -> Message:
     """Scan i; `extra` is a further field: name, datatype and a value per point."""
-    to, xyz = ros(), sweep(0.1 * i + 0.2) if points is None else points
+    to, xyz = ros(), planar_scan(0.1 * i + 0.2) if points is None else points
     columns = [("x", dtype), ("y", dtype), ("z", dtype)] + ([("t", extra[2].dtype)] if extra else [])
     rows = np.zeros(len(xyz), np.dtype(columns))
     for axis, name in enumerate("xyz"):
@@ -132,7 +143,7 @@ def changed(change: Callable[[int], Message | None], *others: Message) -> list[M
 
 
 class Case(NamedTuple):
-    """What is to happen when the command that `make` returns is run in the folder that it filled."""
+    """What must happen when the command that `make` returns is run in the folder that it filled."""
 
     number: int
     code: int
@@ -187,7 +198,7 @@ def magic_only(folder: Path) -> str:
 
 @fault(4, 1, errors.NotALog, "log.mcap: not a recording; looks like text", "pc2grid reads MCAP, ROS 1 bags")
 def text(folder: Path) -> str:
-    (folder / "log.mcap").write_text("a recording, honestly\n")
+    (folder / "log.mcap").write_text("not a recording\n")
     return CONVERT
 
 
@@ -201,12 +212,12 @@ def compressed(folder: Path) -> str:
 
 @fault(4, 0, None, same=True)
 def bag_that_is_called_mcap(folder: Path) -> str:
-    """What a file is called does not matter."""
+    """The name of a file does not matter."""
     to = ros("ros1")
     again = [to.tf(T0, "base_link", "lidar", 0.25, topic="/tf_static")]
     for i in range(SCANS):
         again.append(to.odometry("/odom", T0 + i * STEP, 0.1 * i))
-        again.append(to.cloud("/points", T0 + i * STEP, sweep(0.1 * i + 0.2)))
+        again.append(to.cloud("/points", T0 + i * STEP, planar_scan(0.1 * i + 0.2)))
     write_bag(folder / "a.bag", again).rename(folder / "log.mcap")
     return CONVERT
 
@@ -266,7 +277,7 @@ def unknown_compression(folder: Path) -> str:
 
 @fault(11, 1, errors.LimitExceeded, "limit", "read.max_chunk_bytes")
 def bomb(folder: Path) -> str:
-    """A chunk of zeros, of 16 kB, that says truly that it expands to 512 MiB."""
+    """A chunk of zeros: 16 kB that expand to 512 MiB, as its fields say."""
     import zstandard
 
     whole = log(folder, chunk_size=1 << 20)
@@ -357,10 +368,10 @@ def many_messages_cut_short(folder: Path) -> str:
 
 @fault(21, 0, None, same=True)
 def points_that_are_not_finite(folder: Path) -> str:
-    """Dropped with their times, and the others stay where they are."""
+    """They are dropped with their times, and the other points keep theirs."""
     rng, worse = np.random.default_rng(21), []
     for i in range(SCANS):
-        points = sweep(0.1 * i + 0.2)
+        points = planar_scan(0.1 * i + 0.2)
         at = np.sort(rng.integers(0, len(points), 40))
         bad = rng.choice(np.array([np.nan, np.inf, -np.inf], "f4"), (40, 3))
         worse.append(cloud(i, np.insert(points, at, bad, axis=0)))
@@ -381,8 +392,8 @@ def padded_rows(folder: Path) -> str:
 
 
 def short_data(i: int) -> Message:
-    """Twice as many points declared as are there; the message itself is whole."""
-    whole, many = CLOUDS[i].data, len(sweep(0))
+    """Twice as many points are declared as there are; the message itself is whole."""
+    whole, many = CLOUDS[i].data, len(planar_scan(0))
     declared = struct.pack("<II", 1, many)
     assert whole.count(declared) == 1
     return CLOUDS[i]._replace(data=whole.replace(declared, struct.pack("<II", 1, 2 * many)))
@@ -425,7 +436,7 @@ def float64(folder: Path) -> str:
 @fault(26, 0, None, "log: 12 lidar scans")
 def int64_as_pcl_writes_it(folder: Path) -> str:
     """Metres as whole numbers are coarse, but they are read."""
-    log(folder, changed(lambda i: cloud(i, np.round(sweep(0.1 * i + 0.2)), dtype="<i8", code=9)))
+    log(folder, changed(lambda i: cloud(i, np.round(planar_scan(0.1 * i + 0.2)), dtype="<i8", code=9)))
     return CONVERT
 
 
@@ -437,20 +448,20 @@ def scan_without_points(folder: Path) -> str:
 
 @fault(28, 3, None, "1 scans skipped (every point is farther than 1000 m from the sensor)")
 def one_scan_out_of_range(folder: Path) -> str:
-    log(folder, changed(lambda i: cloud(i, sweep(0) + 5000) if i == 6 else None))
+    log(folder, changed(lambda i: cloud(i, planar_scan(0) + 5000) if i == 6 else None))
     return CONVERT
 
 
 @fault(28, 1, errors.PointCloudError, "every point is farther than 1000 m")
 @fault(29, 1, errors.PointCloudError, "every point is farther than 1000 m", "a global frame such as UTM")
 def all_scans_in_a_global_frame(folder: Path) -> str:
-    log(folder, changed(lambda i: cloud(i, sweep(0.1 * i) + np.float32([4e5, 5e6, 0]))))
+    log(folder, changed(lambda i: cloud(i, planar_scan(0.1 * i) + np.float32([4e5, 5e6, 0]))))
     return CONVERT
 
 
 @fault(29, 0, None, same=True)
 def one_outlier(folder: Path) -> str:
-    log(folder, changed(lambda i: cloud(i, np.vstack((sweep(0.1 * i + 0.2), [[1e30, -1e30, 1e7]])))))
+    log(folder, changed(lambda i: cloud(i, np.vstack((planar_scan(0.1 * i + 0.2), [[1e30, -1e30, 1e7]])))))
     return CONVERT
 
 
@@ -467,10 +478,10 @@ def no_times(folder: Path) -> str:
 
 
 def times(dtype: str, code: int, scale: float, offset: float = 0.0, *flags: str) -> Callable[[Path], str]:
-    """A sweep of 0.1 s that ends at the stamp."""
+    """A planar scan of 0.1 s that ends at the stamp."""
 
     def make(folder: Path) -> str:
-        count = len(sweep(0))
+        count = len(planar_scan(0))
         seconds = np.tile(np.linspace(-0.09, 0.0, count // 3), 3)
         offsets = (np.round(seconds * scale) + offset).astype(dtype)
         log(folder, changed(lambda i: cloud(i, extra=("t", code, offsets))))
@@ -595,7 +606,7 @@ def depth_of_zeros(folder: Path) -> str:
 
 @fault(38, 3, None, "registration was lost for 5 of 12 scans, first 0.7 s after", "they are not in the map")
 def carried_off(folder: Path) -> str:
-    """From one scan to the next into quite another place, and no odometry says so."""
+    """The sensor is in another place from one scan to the next, and there is no odometry."""
     rng = np.random.default_rng(38)
     elsewhere = rng.uniform(5, 9, (800, 3)).astype("f4")
     log(folder, changed(lambda i: cloud(i, elsewhere + np.float32(0.5 * i)) if i > 6 else None))
@@ -627,8 +638,8 @@ for _command in (*USES, CONVERT + " --add"):
         database(lambda d: bytes(reversed(d)), _command)
     )
     fault(43, 1, errors.NotADatabase, "another program's SQLite file")(database(header(68, 0), _command))
-    fault(44, 1, errors.DatabaseVersion, "database format 3; this pc2grid reads up to 2", "a newer pc2grid")(
-        database(header(60, 3), _command)
+    fault(44, 1, errors.DatabaseVersion, "database format 4; this pc2grid reads up to 3", "a newer pc2grid")(
+        database(header(60, 4), _command)
     )
 for _command in USES:
     fault(43, 1, errors.NotADatabase, "x.submaps: empty file")(database(lambda d: b"", _command))
@@ -730,19 +741,19 @@ def session_named_after_it(folder: Path) -> str:
 def run(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> Callable[[str, Path], tuple[int, BaseException | None, str]]:
-    """Run a command in a folder, within this process: exit code, error, and all that is said."""
+    """Run a command in a folder, within this process: exit code, error, and everything printed."""
     from pc2grid_cli.main import main
 
-    plain = console.report_error
+    plain = console.Console.report_error
 
     def run(command: str, folder: Path) -> tuple[int, BaseException | None, str]:
         raised: list[BaseException] = []
 
-        def noted(error: BaseException) -> int:
+        def noted(terminal: console.Console, error: BaseException) -> int:
             raised.append(error)
-            return plain(error)
+            return plain(terminal, error)
 
-        monkeypatch.setattr(console, "report_error", noted)
+        monkeypatch.setattr(console.Console, "report_error", noted)
         monkeypatch.setattr(sys, "argv", ["pc2grid", *shlex.split(command)])
         monkeypatch.chdir(folder)
         monkeypatch.setenv("PC2GRID_CONFIG", "")
@@ -761,12 +772,12 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 def map_of(database: Path) -> list[bytes]:
-    """Everything of the one session in it, but for what is said about where it came from."""
+    """Everything in its one session except where that came from."""
     with open_database(database) as opened:
         (info,) = opened.sessions()
         table, trajectory = opened.signatures(), opened.trajectory(info.name)
         grids = [opened.grid(info.name), *(submap.grid for submap in opened.submaps(info.name))]
-        arrays = [table.boundary, table.freespace, table.symmetry, table.center_m, trajectory.T_map_base]
+        arrays = [table.boundary, table.freespace, table.symmetry, table.center_m, trajectory.T_session_base]
         return [
             info.name.encode(),
             repr([(grid.origin_m, grid.resolution_m, grid.cells.shape) for grid in grids]).encode(),
@@ -778,8 +789,8 @@ def map_of(database: Path) -> list[bytes]:
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     """The map of the undamaged recording."""
-    from signature.build import add_session, build_session
     from signature.config import Config
+    from signature.sessions import add_session, build_session
 
     folder = tmp_path_factory.mktemp("clean")
     log(folder)
@@ -838,7 +849,7 @@ def test_names_that_a_terminal_would_obey(tmp_path: Path, run: Callable[..., Any
 
 @pytest.mark.fault(5)
 def test_a_cut_at_every_boundary_of_a_record(tmp_path: Path) -> None:
-    """Between records nothing is torn, and a recorder that was killed there is believed; else it is said."""
+    """A cut between two records looks like a killed recorder, and is warned of; any other cut is refused."""
     whole = write_mcap(tmp_path / "whole.mcap", drive(), chunk_size=400).read_bytes()
     scans = [scan.points_m.tobytes() for scan in read(tmp_path / "whole.mcap")[0]]
     boundaries, at = [], 8
@@ -873,7 +884,7 @@ def test_a_cut_at_every_boundary_of_a_record(tmp_path: Path) -> None:
 def test_every_case_of_the_catalogue_has_a_test() -> None:
     marked = {
         int(number)
-        for path in Path(__file__).parent.glob("test_*.py")
+        for path in Path(__file__).parent.rglob("test_*.py")
         for number in re.findall(r"^(?:@pytest\.mark\.|@| *)fault\((\d+)", path.read_text(), re.MULTILINE)
     }
     assert sorted(set(range(1, 47)) - marked) == []

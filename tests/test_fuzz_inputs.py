@@ -1,9 +1,9 @@
 """Seeded mutations of inputs: what is inside the messages of a recording, databases, nav2 maps.
 
-The containers of recordings are mutated in test_io_fuzz.py, where checksums catch most of it. Here the
-container stays sound and its content lies, so that the decoders behind the checksums are reached.
+The containers of recordings are mutated in tests/pc2grid/io/test_fuzz.py, where checksums catch most of it.
+Here the container stays sound and its content is wrong, so that decoders behind the checksums are reached.
 Whatever is changed, the result is whole and possible, or a Pc2GridError; never another exception.
-PC2GRID_FUZZ is the number of mutations of each kind: hundreds, as every outcome has to come up.
+PC2GRID_FUZZ is the number of mutations of each kind: at least hundreds, so that every outcome occurs.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from pc2grid.errors import DatabaseError, MapFileError, Pc2GridError
 from pc2grid.io.nav2_map import load_map, save_map
 from pc2grid.model import OccupancyGrid
 from signature.database import SubmapDatabase, open_database
-from signature.database.sqlite import store
-from signature.database.upkeep import check, copy
-from tests import test_io_foxglove as foxglove
-from tests.builders import STEP, T0, Message, drive, read, ros, write_mcap
-from tests.mutations import MOST_BYTES, PARTS, mutated, patiently, put
-from tests.test_database import make_entry
-from tests.watching import bounded_memory
+from signature.database.maintenance import check, copy
+from signature.database.sqlite.database import store
+from tests.helpers import foxglove_messages as foxglove
+from tests.helpers.databases import make_entry
+from tests.helpers.memory import bounded_memory
+from tests.helpers.mutations import MOST_BYTES, PARTS, mutated, patiently, put
+from tests.helpers.recordings import STEP, T0, Message, drive, read, ros, write_mcap
 
 RECORDINGS = ["lidar", "lidar ros1", "laser", "depth", "foxglove protobuf", "foxglove json", "lidar timed"]
 # Times within a scan are at most 10 s away from its stamp, and span 2 s.
@@ -40,7 +40,7 @@ FARTHEST_S = 12.0
 
 
 class Record(NamedTuple):
-    """A message with all that a log says about it."""
+    """A message with its topic, type and time."""
 
     topic: str
     type: str
@@ -100,7 +100,7 @@ def records(path: Path) -> list[Record]:
 
 
 def write(path: Path, entries: list[Record]) -> None:
-    """A sound container around whatever the entries are."""
+    """A sound container around the entries, whatever they are."""
     path.unlink(missing_ok=True)
     with path.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.NONE)
@@ -117,7 +117,7 @@ def write(path: Path, entries: list[Record]) -> None:
 
 
 def assert_possible(path: Path, config: ReadConfig | None, recover: bool) -> None:
-    """What is read can be what a robot saw: finite, in order, fields aligned, times near the stamp."""
+    """What is read is possible: finite, in order, fields aligned, times near the stamp."""
     scans, report = read(path, config, recover=recover)
     assert report.scans_read == len(scans)
     last = -1
@@ -173,14 +173,14 @@ def test_fuzz_content_of_recordings(tmp_path: Path, kind: str, part: int) -> Non
 
 
 def sessions_of(database: SubmapDatabase) -> dict[str, str]:
-    """A digest of everything of each session, but not of what is said about the others."""
+    """A digest of everything in each session."""
     digests = {}
     table = database.signatures()
     for index, info in enumerate(database.sessions()):
         digest = hashlib.sha256(repr(info).encode())
         digest.update(database.grid(info.name).cells.tobytes())
         trajectory = database.trajectory(info.name)
-        digest.update(trajectory.stamps_ns.tobytes() + trajectory.T_map_base.tobytes())
+        digest.update(trajectory.stamps_ns.tobytes() + trajectory.T_session_base.tobytes())
         digest.update(repr(trajectory.health).encode())
         for loop in database.loops(info.name):
             digest.update(repr((loop.older, loop.newer, loop.T_older_newer, loop.accepted)).encode())
@@ -197,8 +197,8 @@ def sessions_of(database: SubmapDatabase) -> dict[str, str]:
 @pytest.mark.parametrize("part", range(PARTS))
 @bounded_memory(MOST_BYTES)
 def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int) -> None:
-    """Mutated files are read whole, or refused; what is left of them is searched, and saved or added to."""
-    monkeypatch.setattr(os, "fsync", lambda descriptor: None)  # nobody pulls the plug here
+    """Mutated files are read whole, or refused; what is left of them is read, and copied or added to."""
+    monkeypatch.setattr(os, "fsync", lambda descriptor: None)  # no power failure is simulated here
     path, saved = tmp_path / "x.submaps", tmp_path / "saved.submaps"
     names = ["monday", "tuesday"]
     store(path, [make_entry(name, i, submaps=2) for i, name in enumerate(names)], keep=False)
@@ -219,7 +219,7 @@ def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: i
             whole_again = True
         except DatabaseError:
             outcomes["refused"] += 1
-        if not whole_again or number % 4 == 0:  # nothing is to be left out: looked at now and then
+        if not whole_again or number % 4 == 0:  # nothing is to be left out: tried for every fourth only
             try:
                 with open_database(path) as database:
                     left_out = database.leave_out_damaged()
@@ -231,7 +231,7 @@ def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: i
             except DatabaseError:
                 assert not whole_again
         try:
-            if number % 5 == 0:  # dearer than all else together
+            if number % 5 == 0:  # costs more than all the rest
                 problems = check(path)
                 copy(path, saved, recover=True, force=True)
                 assert check(saved) == ()
@@ -256,7 +256,7 @@ def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: i
 @pytest.mark.parametrize("image_format", ["pgm", "png"])
 @bounded_memory(MOST_BYTES)
 def test_fuzz_maps(tmp_path: Path, image_format: str, part: int) -> None:
-    """A map has no checksum: what loads must at least be a map, and what is not says which file it is."""
+    """A map has no checksum: what loads must at least be a map, and an error must name the file."""
     cells = np.random.default_rng(2).choice(np.array([-1, 0, 100], np.int8), (12, 17))
     grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-1.5, 2.0))
     yaml_path, image_path = save_map(grid, tmp_path / "map", image_format=image_format)

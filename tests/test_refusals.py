@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pc2grid.arrays import hand_over
 from pc2grid.errors import ClusterError, ConfigError
 from pc2grid.geometry import SE2
 from pc2grid.io.atomic import replace_file
@@ -18,12 +20,12 @@ from pc2grid.model import Health, Loop, OccupancyGrid, Scan, SessionMap, Traject
 from pc2grid.settings import load_settings
 from signature.config import Config
 from signature.describe import Signature
-from signature.evaluation.relations import read_relations, relation_error
-from signature.maps import Lazily
+from signature.evaluation.slam_relations import read_relations, relation_error
+from signature.relocalization.lazy_maps import LazySequence
 from signature.similarity import SignatureTable
 
 GRID = OccupancyGrid(cells=np.zeros((2, 2)), resolution_m=0.05, origin_m=(0.0, 0.0))
-STILL = Trajectory(stamps_ns=np.arange(3), T_map_base=np.stack([np.eye(4)] * 3))
+STILL = Trajectory(stamps_ns=np.arange(3), T_session_base=np.stack([np.eye(4)] * 3))
 
 
 @pytest.mark.parametrize(
@@ -34,11 +36,13 @@ STILL = Trajectory(stamps_ns=np.arange(3), T_map_base=np.stack([np.eye(4)] * 3))
             r"Scan\.points_m: expected shape \('N', 3\), got \(5, 2\)",
         ),
         (
-            lambda: Trajectory(stamps_ns=np.arange(3), T_map_base=np.stack([np.eye(4)] * 2)),
-            r"Trajectory\.T_map_base: expected shape \(3, 4, 4\), got \(2, 4, 4\)",
+            lambda: Trajectory(stamps_ns=np.arange(3), T_session_base=np.stack([np.eye(4)] * 2)),
+            r"Trajectory\.T_session_base: expected shape \(3, 4, 4\), got \(2, 4, 4\)",
         ),
         (
-            lambda: Trajectory(stamps_ns=STILL.stamps_ns, T_map_base=STILL.T_map_base, health=(Health.FINE,)),
+            lambda: Trajectory(
+                stamps_ns=STILL.stamps_ns, T_session_base=STILL.T_session_base, health=(Health.FINE,)
+            ),
             r"Trajectory\.health: expected 3 entries, got 1",
         ),
         (
@@ -58,7 +62,7 @@ STILL = Trajectory(stamps_ns=np.arange(3), T_map_base=np.stack([np.eye(4)] * 3))
         ),
         (
             lambda: Signature(boundary=np.ones((1, 3)), freespace=np.ones(3), symmetry=np.ones(2)),
-            r"Signature\.boundary: expected one axis, got shape \(1, 3\)",
+            r"Signature\.boundary: expected shape \('N',\), got \(1, 3\)",
         ),
         (
             lambda: SignatureTable.of((), np.empty((0, 2)), submap_id=[1]),
@@ -69,6 +73,24 @@ STILL = Trajectory(stamps_ns=np.arange(3), T_map_base=np.stack([np.eye(4)] * 3))
 def test_values_that_do_not_fit_together(make: Any, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         make()
+
+
+def test_other_code_cannot_change_the_arrays_of_a_frozen_type() -> None:
+    points = np.ones((5, 3), np.float32)
+    shown = points.view()
+    shown.flags.writeable = False
+    for given in (points, points[::-1], shown, memoryview(points)):
+        scan = Scan(stamp_ns=0, points_m=np.asarray(given), T_base_sensor=np.eye(4), sensor="lidar")
+        with pytest.raises(ValueError, match="read-only"):
+            scan.points_m[0] = 2.0
+        points[:] += 1.0
+        assert np.ptp(scan.points_m) == 0.0 and scan.points_m[0, 0] == points[0, 0] - 1.0
+    again = replace(scan, stamp_ns=1)
+    assert again.points_m is scan.points_m  # nobody can write to it: no need for a copy
+    mine = hand_over(np.zeros((2, 2), np.int8))
+    assert OccupancyGrid(cells=mine, resolution_m=0.05, origin_m=(0.0, 0.0)).cells is mine
+    from_bytes = np.frombuffer(bytes(4), np.int8).reshape(2, 2)
+    assert OccupancyGrid(cells=from_bytes, resolution_m=0.05, origin_m=(0.0, 0.0)).cells is from_bytes
 
 
 def test_settings_that_cannot_be_read(tmp_path: Path) -> None:
@@ -103,7 +125,7 @@ def test_a_job_that_kills_its_workers_fails_and_a_lost_scheduler_ends_all(tmp_pa
     distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")
     from distributed.client import FutureCancelledError
 
-    from signature.cluster import Job, _outcome
+    from signature.conversion_jobs import Job, _outcome
 
     job = Job(path=tmp_path / "a.mcap", name="a", config=Config())
 
@@ -120,13 +142,13 @@ def test_a_job_that_kills_its_workers_fails_and_a_lost_scheduler_ends_all(tmp_pa
     for gone in (FutureCancelledError("key", "lost"), OSError("closed")):
         with pytest.raises(ClusterError, match="the scheduler went away") as caught:
             _outcome(job, failing(gone))
-        assert caught.value.hint is not None and "the same command goes on" in caught.value.hint
+        assert caught.value.hint is not None and "the same command continues" in caught.value.hint
 
 
 def test_relations_that_a_trajectory_says_nothing_of(tmp_path: Path) -> None:
     (tmp_path / "a.relations").write_text("# t1 t2 x y z roll pitch yaw\n\n5 6 1 0 0 0 0 0\n")
     relations = read_relations(tmp_path / "a.relations")
-    nothing = Trajectory(stamps_ns=np.empty(0), T_map_base=np.empty((0, 4, 4)))
+    nothing = Trajectory(stamps_ns=np.empty(0), T_session_base=np.empty((0, 4, 4)))
     for trajectory in (STILL, nothing):
         error = relation_error(trajectory, relations)
         assert (error.used, error.total) == (0, 1)
@@ -135,7 +157,7 @@ def test_relations_that_a_trajectory_says_nothing_of(tmp_path: Path) -> None:
 
 def test_things_made_lazily_are_made_once_and_only_when_asked_for() -> None:
     made: list[int] = []
-    things = Lazily(lambda i: made.append(i) or i * i, 10)
+    things = LazySequence(lambda i: made.append(i) or i * i, 10)
     assert len(things) == 10 and made == []
     assert (things[-1], things[2:5], things[9]) == (81, (4, 9, 16), 81)
     assert made == [9, 2, 3, 4]

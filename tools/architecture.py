@@ -1,125 +1,218 @@
-"""Draw which module imports which, as SVG: `python tools/architecture.py OUT.svg` (what `make picture` does).
+"""Draw the folders, their files, and what they import, as SVG: `python tools/architecture.py OUT.svg`.
 
-A band for each package, the importing above the imported; folders are one box. An arrow that others imply
-(a -> b -> c makes a -> c) is left out. Made from the code by grimp, which import-linter brings.
+A band for each package; the importing package stands above the imported one. In a band each folder, and
+each file that lies beside the folders, is a box; what imports stands above what it imports. An arrow that
+others imply (a -> b -> c implies a -> c) is left out. Files that nearly everything imports share one box at
+the bottom, without arrows. The picture is made from the code by grimp, which import-linter installs.
 """
 
 from __future__ import annotations
 
 import sys
+from collections import defaultdict
+from dataclasses import dataclass
 from pathlib import Path
+from xml.sax.saxutils import escape
 
 import grimp
 import networkx as nx
 
-BANDS = {"pc2grid_cli": "#CC79A7", "signature": "#009E73", "pc2grid": "#0072B2"}
+BANDS = {"pc2grid_cli": "#B0568A", "signature": "#00805C", "pc2grid": "#0066A6"}
 ABOUT = {
-    "pc2grid_cli": "the program: a file a command",
-    "signature": "submaps to signatures, database, answer",
-    "pc2grid": "recordings to scans, grids, submaps",
+    "pc2grid_cli": "the program: one file for each command",
+    "signature": "submaps to signatures, database, relocalization",
+    "pc2grid": "recordings to clouds, trajectories, maps, submaps",
 }
-WIDTH, HEIGHT, ROW, PAD = 1240, 24, 46, 14
+PAPER = ("boundary", "freespace", "symmetry", "describe", "similarity", "_kernels")
+"""Files of `signature` that share the box "the paper"."""
+STAGES = ("pipeline",)
+"""Files of `pc2grid` beside the folders that have a box of their own; the others share the box "types"."""
+
+WIDTH, GAP, LINE, TITLE = 1180, 26, 15, 20
+CHARACTER = 6.3  # mean width of a character, pixels
 
 
-def imports() -> nx.DiGraph:
-    """Boxes ("signature.verify", "pc2grid.io") and what they import; type-checking imports left out."""
+@dataclass(frozen=True)
+class Box:
+    """A folder or file: its name, and the lines of text in it."""
+
+    name: str
+    lines: tuple[str, ...]
+
+    @property
+    def width(self) -> float:
+        """Pixels."""
+        longest = max([len(self.name) * 1.15, *map(len, self.lines)])
+        return CHARACTER * longest + 22
+
+    @property
+    def height(self) -> float:
+        """Pixels."""
+        return TITLE + LINE * len(self.lines) + 9
+
+
+def imports() -> tuple[nx.DiGraph, dict[str, list[str]]]:
+    """What each folder or file imports of its own package, and the modules in each of them.
+
+    Their names are like "signature.relocalization" and "pc2grid.pipeline". Imports for type checking only are
+    left out, and the `__init__` files of the three packages, which only pass names on.
+    """
     code = grimp.build_graph(*BANDS, exclude_type_checking_imports=True)
-    graph = nx.DiGraph()
-    for module in sorted(code.modules):
-        box = ".".join(module.split(".")[:2])
-        if box in BANDS:  # a package's own file only hands names on
-            continue
-        graph.add_node(box)
-        for other in sorted(code.find_modules_directly_imported_by(module)):
+    graph, members = nx.DiGraph(), defaultdict(list)
+    for module in sorted(code.modules - set(BANDS)):
+        owner = ".".join(module.split(".")[:2])
+        graph.add_node(owner)
+        if not code.find_children(module):
+            members[owner].append(module)
+        for other in sorted(code.find_modules_directly_imported_by(module) - set(BANDS)):
             target = ".".join(other.split(".")[:2])
-            if target not in (*BANDS, box):
-                graph.add_edge(box, target)
-    return graph
+            if target != owner and target.split(".")[0] == owner.split(".")[0]:
+                graph.add_edge(owner, target)
+    return graph, members
 
 
-def levels(graph: nx.DiGraph) -> list[list[str]]:
-    """Boxes of one package in rows: what imports stands above what it imports (circles side by side)."""
+def grouped(
+    package: str, graph: nx.DiGraph, members: dict[str, list[str]]
+) -> tuple[nx.DiGraph, dict[str, Box]]:
+    """The boxes of one package and the imports between them."""
+    inside = graph.subgraph(n for n in graph if n.startswith(f"{package}."))
+    group = {n: n.partition(".")[2] for n in inside}
+    if package == "pc2grid_cli":
+        group = dict.fromkeys(inside, "commands, and what they share")
+    for n in inside:
+        name = n.partition(".")[2]
+        if package == "signature" and name in PAPER:
+            group[n] = "the paper"
+        if package == "pc2grid" and members[n] == [n] and name not in STAGES:
+            group[n] = "types"
+    boxes: dict[str, list[str]] = defaultdict(list)
+    for n in sorted(inside):
+        boxes[group[n]] += members[n]
+    edges = {(group[a], group[b]) for a, b in inside.edges if group[a] != group[b]}
+    merged = nx.DiGraph(edges)
+    merged.add_nodes_from(boxes)
+    return merged, {name: Box(name, lines(package, name, modules)) for name, modules in boxes.items()}
+
+
+def lines(package: str, name: str, modules: list[str]) -> tuple[str, ...]:
+    """The files of a box as lines of text; a folder inside it begins a line."""
+    if [f"{package}.{name}"] == modules:
+        return ()
+    by_folder: dict[str, list[str]] = defaultdict(list)
+    for module in modules:
+        *folders, file = module.removeprefix(f"{package}.").removeprefix(f"{name}.").split(".")
+        by_folder["/".join(folders)].append(file)
+    most = 150 if package == "pc2grid_cli" else 64 if len(by_folder) > 2 else 34
+    found: list[str] = []
+    for folder, files in sorted(by_folder.items()):
+        line = f"{folder}/ " if folder else ""
+        for file in files:
+            if len(line) + len(file) > most:
+                found.append(line)
+                line = "   " if folder else ""
+            line += file + "  "
+        found.append(line)
+    return tuple(line.rstrip() for line in found)
+
+
+def rows(graph: nx.DiGraph) -> list[list[str]]:
+    """The boxes of one package in rows: what imports stands above what it imports."""
     whole = nx.condensation(graph)
     depth: dict[int, int] = {}
     for node in reversed(list(nx.topological_sort(whole))):
         depth[node] = 1 + max((depth[n] for n in whole[node]), default=-1)
-    rows: list[list[str]] = [[] for _ in range(max(depth.values()) + 1)]
+    found: list[list[str]] = [[] for _ in range(max(depth.values()) + 1)]
     for node, level in depth.items():
-        rows[-1 - level] += sorted(whole.nodes[node]["members"])
-    return rows
+        found[-1 - level] += sorted(whole.nodes[node]["members"])
+    return found
 
 
 def essential(graph: nx.DiGraph) -> list[tuple[str, str]]:
-    """The imports that no chain of others implies, and all within a circle."""
+    """The imports that no chain of others implies."""
     whole = nx.condensation(graph)
     group = whole.graph["mapping"]
     kept = set(nx.transitive_reduction(whole).edges)
     return [(a, b) for a, b in graph.edges if group[a] == group[b] or (group[a], group[b]) in kept]
 
 
-def place(rows: list[list[str]], graph: nx.DiGraph, top: float) -> dict[str, tuple[float, float, float]]:
-    """Box -> x, y of its middle, width; each row in the order of the middles of what stands above it."""
-    places: dict[str, tuple[float, float, float]] = {}
-    for row in rows:
+def place(graph: nx.DiGraph, boxes: dict[str, Box], top: float) -> dict[str, tuple[float, float]]:
+    """Middle of the upper edge of each box; rows are ordered by the middles of the importing boxes."""
+    places: dict[str, tuple[float, float]] = {}
+    for row in rows(graph):
+        importing = {name: [places[a][0] for a in graph.predecessors(name) if a in places] for name in row}
+        middle = {name: sum(xs) / len(xs) if xs else WIDTH / 2 for name, xs in importing.items()}
         wrapped: list[list[str]] = [[]]
-        above = {box: [places[a][0] for a in graph.predecessors(box) if a in places] for box in row}
-        middle = {box: sum(xs) / len(xs) if xs else WIDTH / 2 for box, xs in above.items()}
-        for box in sorted(row, key=lambda b: (middle[b], b)):
-            if sum(size(b) + PAD for b in (*wrapped[-1], box)) > WIDTH - 2 * PAD:
+        for name in sorted(row, key=lambda n: (middle[n], n)):
+            if wrapped[-1] and sum(boxes[n].width + GAP for n in (*wrapped[-1], name)) > WIDTH - GAP:
                 wrapped.append([])
-            wrapped[-1].append(box)
+            wrapped[-1].append(name)
         for line in wrapped:
-            gap = (WIDTH - sum(map(size, line))) / (len(line) + 1)
-            x = gap
-            for box in line:
-                places[box] = (x + size(box) / 2, top, size(box))
-                x += size(box) + gap
-            top += ROW
+            space = (WIDTH - sum(boxes[n].width for n in line)) / (len(line) + 1)
+            x = space
+            for name in line:
+                places[name] = (x + boxes[name].width / 2, top)
+                x += boxes[name].width + space
+            top += max(boxes[n].height for n in line) + GAP
     return places
 
 
-def size(box: str) -> float:
-    """Width of a box by its text."""
-    return 7.0 * len(box.rpartition(".")[2]) + 16
+def arrow(start: tuple[float, float], end: tuple[float, float], color: str) -> str:
+    """A curve from the lower edge of one box to the upper edge of another."""
+    (xa, ya), (xb, yb) = start, end
+    bend = max((yb - ya) / 2, 14)
+    return (
+        f'<path d="M{xa:.0f} {ya:.0f} C{xa:.0f} {ya + bend:.0f} {xb:.0f} {yb - bend:.0f} '
+        f'{xb:.0f} {yb - 1:.0f}" fill="none" stroke="{color}" stroke-opacity="0.55" marker-end="url(#head)"/>'
+    )
 
 
-def draw(graph: nx.DiGraph) -> str:
+def text_box(box: Box, x: float, y: float, color: str) -> str:
+    """A box with its name and its lines; x is the middle, y the upper edge."""
+    left = x - box.width / 2
+    parts = [
+        f'<rect x="{left:.0f}" y="{y:.0f}" width="{box.width:.0f}" height="{box.height:.0f}" rx="5" '
+        f'fill="#fff" stroke="{color}"/>',
+        f'<text x="{x:.0f}" y="{y + 17:.0f}" text-anchor="middle" font-weight="bold">'
+        f"{escape(box.name)}</text>",
+    ]
+    for k, line in enumerate(box.lines):
+        parts.append(
+            f'<text x="{left + 10:.0f}" y="{y + TITLE + 12 + LINE * k:.0f}" font-size="11" fill="#444" '
+            f'xml:space="preserve">{escape(line)}</text>'
+        )
+    return "".join(parts)
+
+
+def draw() -> str:
     """The whole picture."""
+    graph, members = imports()
     parts: list[str] = []
     top = 0.0
-    for band, color in BANDS.items():
-        inside = graph.subgraph(box for box in graph if box.startswith(f"{band}."))
-        places = place(levels(inside), inside, top + 52)
-        bottom = max(y for _, y, _ in places.values()) + ROW / 2 + 4
+    for package, color in BANDS.items():
+        inside, boxes = grouped(package, graph, members)
+        places = place(inside, boxes, top + 42)
+        bottom = max(y + boxes[name].height for name, (_, y) in places.items()) + 16
         parts.append(
-            f'<rect x="2" y="{top + 4:.0f}" width="{WIDTH - 4}" height="{bottom - top - 8:.0f}" rx="10" '
-            f'fill="{color}" fill-opacity="0.08" stroke="{color}"/>'
-            f'<text x="16" y="{top + 24:.0f}" font-weight="bold" fill="{color}">{band}</text>'
-            f'<text x="{WIDTH - 16}" y="{top + 24:.0f}" text-anchor="end" fill="#555">{ABOUT[band]}</text>'
+            f'<rect x="2" y="{top + 4:.0f}" width="{WIDTH - 4}" height="{bottom - top - 6:.0f}" rx="10" '
+            f'fill="{color}" fill-opacity="0.07" stroke="{color}"/>'
+            f'<text x="16" y="{top + 26:.0f}" font-size="15" font-weight="bold" fill="{color}">'
+            f"{package}</text>"
+            f'<text x="{WIDTH - 16}" y="{top + 26:.0f}" text-anchor="end" fill="#555">{ABOUT[package]}</text>'
         )
         for a, b in sorted(essential(inside)):
-            (xa, ya, _), (xb, yb, _) = places[a], places[b]
-            bend = (yb - ya) / 2
-            parts.append(
-                f'<path d="M{xa:.0f} {ya + 12:.0f} C{xa:.0f} {ya + bend:.0f} {xb:.0f} {yb - bend:.0f} '
-                f'{xb:.0f} {yb - 13:.0f}" fill="none" stroke="{color}" stroke-opacity="0.45" '
-                'marker-end="url(#head)"/>'
-            )
-        for box, (x, y, width) in sorted(places.items()):
-            parts.append(
-                f'<rect x="{x - width / 2:.0f}" y="{y - 12:.0f}" width="{width:.0f}" height="{HEIGHT}" '
-                f'rx="5" fill="#fff" stroke="{color}"/>'
-                f'<text x="{x:.0f}" y="{y + 4:.0f}" text-anchor="middle">{box.rpartition(".")[2]}</text>'
-            )
+            (xa, ya), end = places[a], places[b]
+            if b != "types":
+                parts.append(arrow((xa, ya + boxes[a].height), end, color))
+        parts += [text_box(boxes[name], x, y, color) for name, (x, y) in sorted(places.items())]
         top = bottom
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {top:.0f}" '
-        'font-family="sans-serif" font-size="12">'
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {top + 4:.0f}" '
+        'font-family="sans-serif" font-size="13">'
         '<defs><marker id="head" viewBox="0 0 6 6" refX="5" refY="3" markerWidth="6" markerHeight="6" '
-        'orient="auto"><path d="M0 0 L6 3 L0 6 z" fill="#777"/></marker></defs>'
-        f'<rect width="{WIDTH}" height="{top:.0f}" fill="#fff"/>\n' + "\n".join(parts) + "\n</svg>\n"
+        'orient="auto"><path d="M0 0 L6 3 L0 6 z" fill="#666"/></marker></defs>'
+        f'<rect width="{WIDTH}" height="{top + 4:.0f}" fill="#fff"/>\n' + "\n".join(parts) + "\n</svg>\n"
     )
 
 
 if __name__ == "__main__":
-    Path(sys.argv[1]).write_text(draw(imports()), encoding="utf-8")
+    Path(sys.argv[1]).write_text(draw(), encoding="utf-8")

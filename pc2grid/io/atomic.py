@@ -1,4 +1,4 @@
-"""Files that are either whole or not there.
+"""Files that exist completely or not at all.
 
 A result is written to a temporary file in the folder of its target, flushed to the disk and renamed
 over it, so a reader (or a crash) sees the old content or the new, never a part.
@@ -29,12 +29,12 @@ def replace_file(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.name}{_MARK}{os.getpid()}.tmp")
+    temporary = _temporary(target)
     if target.is_dir():
         raise OutputError(f"{path}: is a folder", hint="name a file to write to")
-    _sweep(target)
+    _remove_left_over(target)
     try:
-        # Not mkstemp: the result shall have the permissions that the user's umask asks for.
+        # Not mkstemp, which ignores the user's umask.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
         with temporary.open("rb+") as written:
@@ -43,9 +43,9 @@ def replace_file(path: str | Path) -> Iterator[Path]:
         _fsync_folder(target.parent)
     except OSError as error:
         ours = (None, temporary, str(temporary))
-        # copyfile names its source first, and complains about a full disk with both names.
+        # On a full disk shutil.copyfile raises an error with both names, the source first.
         if error.filename not in ours and error.filename2 not in ours[1:]:
-            raise  # the body failed on some other file: not ours to explain
+            raise  # the body failed on another file
         raise OutputError(f"{path}: cannot write: {error.strerror or error}", hint=_advice(error)) from error
     finally:
         temporary.unlink(missing_ok=True)
@@ -57,6 +57,35 @@ def refuse_existing(path: str | Path, force: bool) -> None:
         raise OutputError(f"{path}: exists already", hint="--force replaces it")
 
 
+def require_writable(path: str | Path, force: bool) -> None:
+    """Refuse a target that cannot be written, before the work for it begins.
+
+    A temporary file is made in the folder of the target and removed: permissions alone do not tell, for
+    example on a read-only disk.
+
+    Raises OutputError if `path` exists and `force` is not set, if it is a folder, or if its folder is missing
+    or not writable.
+    """
+    path = Path(path)
+    try:
+        if path.is_dir():
+            raise OutputError(f"{path}: is a folder", hint="name a file to write to")
+        refuse_existing(path, force)
+        temporary = _temporary(Path(os.path.realpath(path)))
+        if not temporary.parent.is_dir():
+            raise OutputError(
+                f"{path}: cannot write: no folder {path.parent}", hint="create the folder first"
+            )
+        os.close(os.open(temporary, os.O_CREAT | os.O_WRONLY, 0o666))
+        temporary.unlink()
+    except OSError as error:
+        raise OutputError(f"{path}: cannot write: {error.strerror or error}", hint=_advice(error)) from error
+
+
+def _temporary(target: Path) -> Path:
+    return target.with_name(f".{target.name}{_MARK}{os.getpid()}.tmp")
+
+
 def _advice(error: OSError) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return "free some space, or write to another disk"
@@ -66,7 +95,7 @@ def _advice(error: OSError) -> str:
 
 
 def _fsync_folder(folder: Path) -> None:
-    with contextlib.suppress(OSError):  # some network file systems cannot; the data itself is safe
+    with contextlib.suppress(OSError):  # some network file systems refuse it; the file itself is on disk
         descriptor = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(descriptor)
@@ -74,8 +103,8 @@ def _fsync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def _sweep(target: Path) -> None:
-    """Remove temporaries of `target` whose writer is no longer alive."""
+def _remove_left_over(target: Path) -> None:
+    """Remove the temporary files of `target` whose process does not exist any more."""
     prefix = f".{target.name}{_MARK}"
     with contextlib.suppress(OSError):
         for left_over in target.parent.iterdir():

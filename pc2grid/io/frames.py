@@ -1,37 +1,42 @@
-"""The tree of coordinate frames of a log (tf), and looking up where one frame is in another."""
+"""The tree of coordinate frames of a log (tf, REP-105), and the pose of one frame in another over time."""
 
 from __future__ import annotations
 
 import bisect
 import difflib
-import math
+from dataclasses import dataclass
 
 import numpy as np
 
+from pc2grid.arrays import F64
 from pc2grid.errors import FrameError
-from pc2grid.geometry import F64, interpolate_pose, invert_pose, pose_from_xyz_quat
-from pc2grid.io.messages import Seven, Transform
-
-# Between two samples farther apart than this nothing is known (a gap in the log).
-MAX_GAP_NS = 2_000_000_000
-# Before the first and after the last sample, it counts for this long.
-_HOLD_NS = 100_000_000
-_KEEP = 20_000
-_MOST_FRAMES = 10_000
-# Twice around the earth: beyond all coordinates in metres, and far from where floats overflow.
-_FARTHEST_M = 1e8
+from pc2grid.geometry import interpolate_pose, invert_pose, pose_from_xyz_quat
+from pc2grid.io.messages.types import Seven, Transform, valid_pose
 
 
-def valid_pose(pose: Seven) -> bool:
-    """Whether the quaternion has a direction, all is finite, and the translation is one on earth."""
-    finite = all(map(math.isfinite, pose))
-    return finite and max(map(abs, pose[:3])) <= _FARTHEST_M and 1e-12 < sum(v * v for v in pose[3:]) < 1e12
+@dataclass(frozen=True, slots=True)
+class FrameParameters:
+    """How poses over time are interpolated, and how many are kept; chosen by hand.
+
+    max_gap_ns : two samples farther apart are not interpolated (a gap in the log).
+    hold_ns : time before the first and after the last sample for which that sample is used.
+    kept_samples : samples of one track; a multiple of a minute at any usual rate.
+    max_frames : frames of one tree, against hostile files.
+    """
+
+    max_gap_ns: int = 2_000_000_000
+    hold_ns: int = 100_000_000
+    kept_samples: int = 20_000
+    max_frames: int = 10_000
+
+
+PARAMETERS = FrameParameters()
 
 
 class PoseTrack:
     """Poses over time, of which the recent ones are kept; interpolated on demand.
 
-    lasting : a pose holds until the next one, and a single one always.
+    lasting : a pose is valid until the next one, and a single pose always.
     """
 
     def __init__(self, *, lasting: bool = False) -> None:
@@ -40,7 +45,7 @@ class PoseTrack:
         self._poses: list[Seven] = []
 
     def add(self, stamp_ns: int, pose: Seven) -> bool:
-        """Insert a sample by its stamp; a second one of the same stamp, or an invalid one, is not taken."""
+        """Insert a sample by its stamp, unless there is one with this stamp; returns whether it is valid."""
         if not valid_pose(pose):
             return False
         at = len(self._stamps)
@@ -50,8 +55,9 @@ class PoseTrack:
                 return True
         self._stamps.insert(at, stamp_ns)
         self._poses.insert(at, pose)
-        if len(self._stamps) > 2 * _KEEP:
-            del self._stamps[:_KEEP], self._poses[:_KEEP]
+        if len(self._stamps) > 2 * PARAMETERS.kept_samples:
+            oldest = slice(PARAMETERS.kept_samples)
+            del self._stamps[oldest], self._poses[oldest]
         return True
 
     def __len__(self) -> int:
@@ -63,14 +69,14 @@ class PoseTrack:
         after = bisect.bisect_left(stamps, stamp_ns)
         if after < len(stamps) and stamps[after] == stamp_ns:
             return self._pose(after)
-        if 0 < after < len(stamps) and stamps[after] - stamps[after - 1] <= MAX_GAP_NS:
+        if 0 < after < len(stamps) and stamps[after] - stamps[after - 1] <= PARAMETERS.max_gap_ns:
             fraction = (stamp_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
             return interpolate_pose(self._pose(after - 1), self._pose(after), fraction)
         if self._lasting and stamps and (after or len(stamps) == 1):
             return self._pose(max(after - 1, 0))
         near = [i for i in (after - 1, after) if 0 <= i < len(stamps)]
         nearest = min(near, key=lambda i: abs(stamps[i] - stamp_ns), default=None)
-        if nearest is None or abs(stamps[nearest] - stamp_ns) > _HOLD_NS:
+        if nearest is None or abs(stamps[nearest] - stamp_ns) > PARAMETERS.hold_ns:
             return None
         return self._pose(nearest)
 
@@ -100,14 +106,14 @@ class FrameTree:
     def add_all(
         self, edges: tuple[Transform, ...] | None, *, static: bool = False, log_time_ns: int = 0
     ) -> None:
-        """Take up the transforms of one message; None is one that could not be decoded."""
+        """Add the transforms of one message; None stands for a message that could not be decoded."""
         if edges is None:
             self._warn("some tf messages are unreadable and were ignored")
         for edge in edges or ():
             self.add(edge, static=static, log_time_ns=log_time_ns)
 
     def add(self, edge: Transform, *, static: bool, log_time_ns: int = 0) -> None:
-        """Take up one transform; as in tf2, the latest parent of a frame counts."""
+        """Add one transform; as in tf2, a frame's parent is the one that was named last."""
         parent, child = edge.header.frame, edge.child
         if not parent or not child or parent == child or not valid_pose(edge.pose):
             self._warn(
@@ -115,8 +121,8 @@ class FrameTree:
             )
             return
         known = self._parent.get(child)
-        if known is None and len(self._parent) >= _MOST_FRAMES:
-            self._warn(f"the log has more than {_MOST_FRAMES} frames; the others are ignored")
+        if known is None and len(self._parent) >= PARAMETERS.max_frames:
+            self._warn(f"the log has more than {PARAMETERS.max_frames} frames; the others are ignored")
             return
         if known is not None and known != parent:
             self._warn(f"frame {child} has two parents, {known} and {parent}: the latest counts")
@@ -133,8 +139,8 @@ class FrameTree:
             track.add(edge.header.stamp_ns or log_time_ns, edge.pose)
 
     def chain(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on to the root. Raises FrameError if that goes in a circle."""
-        chain = {frame: None}  # keeps its order, and is quick to look in
+        """The frame, its parent, and so on to the root. Raises FrameError if the parents form a circle."""
+        chain = {frame: None}  # a dict as an ordered set
         while (parent := self._parent.get(frame)) is not None:
             if parent in chain:
                 raise FrameError(f"tf goes in a circle: {' -> '.join([*chain, parent][-20:])}")

@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.errors import MapFileError
-from pc2grid.io import png
+from pc2grid.io.sensors import png
 
 MAX_CELLS = 100_000_000
-_MAX_TEXT_CELLS = 10_000_000  # a number as text becomes an object of its own
+_MAX_TEXT_CELLS = 10_000_000  # each number of a text becomes a Python object
 _MAX_BYTES = 4 * MAX_CELLS + (1 << 20)
 _MAX_HEADER = 1 << 16
 
 
 class GreyImage(NamedTuple):
-    """Pixels as they stand in the file: an image may be large, so shades are made of values, not of pixels.
+    """Pixels with the values of the file, so that cells can be looked up by value instead of computed.
 
     values : (H, W) 0 (black) .. top (white). alpha : (H, W) 0 .. 255, or None if it has none.
     """
@@ -35,13 +35,17 @@ def read_image(path: Path) -> GreyImage:
     Raises MapFileError for what is not a whole image of 8 bits and grey, or is larger than MAX_CELLS.
     """
     try:
-        if path.exists() and not path.is_file():  # a device or a pipe would never end
+        if path.exists() and not path.is_file():  # reading a device or a pipe might not end
             raise MapFileError(f"{path}: the map's image is not a regular file")
         if path.stat().st_size > _MAX_BYTES:
             raise MapFileError(f"{path}: larger than {_MAX_BYTES} bytes: not the image of a map")
         data = path.read_bytes()
     except (OSError, ValueError) as error:
-        raise MapFileError(f"{path}: cannot read the map's image: {error}") from error
+        what = getattr(error, "strerror", None) or error
+        raise MapFileError(
+            f"{path.absolute()}: cannot read the map's image: {what}",
+            hint="the key `image` of the .yaml names it: copy it to that place, or correct the name",
+        ) from error
     if data[:2] in (b"P5", b"P2"):
         return _decode_pgm(path, data)
     if data[:8] == png.MAGIC:
@@ -85,7 +89,7 @@ def _checked_png(path: Path, data: bytes) -> bytes:
 
 
 def _check_bmp(path: Path, data: bytes) -> None:
-    """Uncompressed, and as large as its header says (BITMAPINFOHEADER)."""
+    """Check that the image is uncompressed and as large as its header (BITMAPINFOHEADER) says."""
     width, height = (int.from_bytes(data[at : at + 4], "little", signed=True) for at in (18, 22))
     _check_size(path, width, abs(height))
     pixels, bits, packing = (int.from_bytes(data[a:b], "little") for a, b in ((10, 14), (28, 30), (30, 34)))
@@ -116,7 +120,7 @@ def _decode_pgm(path: Path, data: bytes) -> GreyImage:
 
 
 def _text_values(path: Path, body: bytes, count: int) -> NDArray[np.uint8]:
-    """Numbers as text; a comment goes to the end of its line."""
+    """Pixels written as decimal numbers; `#` starts a comment up to the end of the line."""
     if count > _MAX_TEXT_CELLS:
         raise MapFileError(f"{path}: {count} pixels as text", hint="save the map as binary pgm (P5)")
     words = re.sub(rb"#[^\n]*", b"", body).split(maxsplit=count)[:count]
@@ -127,7 +131,7 @@ def _text_values(path: Path, body: bytes, count: int) -> NDArray[np.uint8]:
 
 
 def encode_image(pixels: NDArray[np.uint8], suffix: str, resolution_m: float) -> bytes:
-    """Pixels (H, W) as `pgm` or `png`; the resolution goes into a comment where there is one."""
+    """Pixels (H, W) as `pgm` or `png`; a pgm carries the resolution in a comment."""
     if suffix == "pgm":
         height, width = pixels.shape
         header = f"P5\n# CREATOR: pc2grid {resolution_m:.3f} m/pix\n{width} {height}\n255\n"

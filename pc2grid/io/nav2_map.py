@@ -16,17 +16,22 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pc2grid.arrays import hand_over
 from pc2grid.errors import MapFileError
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.map_image import GreyImage, encode_image, read_image
+from pc2grid.io.messages.types import FARTHEST_M
 from pc2grid.model import UNKNOWN, OccupancyGrid
 
 MapMode = Literal["trinary", "scale", "raw"]
 
 _MAX_YAML_BYTES = 65_536
-# Beyond this it is a slip of the pen: submaps are metres across, and the earth 4e7 m around.
+# Metres per pixel outside of this range are a typing error: submaps are some metres wide.
 _RESOLUTION_M = (1e-3, 100.0)
-_FARTHEST_M = 1e8
+# Defaults of nav2_map_server for a written map. 0.196 and not 0.25: an unknown pixel, grey 205, has the
+# occupancy 0.196078, which a free_thresh of 0.25 would read as free.
+_OCCUPIED_THRESH, _FREE_THRESH = 0.65, 0.196
+_FREE_GREY, _UNKNOWN_GREY, _OCCUPIED_GREY = 254, 205, 0
 _log = logging.getLogger(__name__)
 
 
@@ -71,9 +76,11 @@ def load_map(yaml_path: str | Path) -> OccupancyGrid:
     image = read_image(image_path)
     table = _cell_of(image, mode, negate, occupied_thresh, free_thresh)
     cells = np.empty(image.values.shape, np.int8)
-    for row, target in enumerate(cells[::-1]):  # by rows: an index takes eight times the room of a pixel
+    for row, target in enumerate(
+        cells[::-1]
+    ):  # row by row: the index takes eight times the memory of a pixel
         target[:] = table[image.values[row], 0 if image.alpha is None else image.alpha[row]]
-    return OccupancyGrid(cells=cells, resolution_m=resolution_m, origin_m=origin)
+    return OccupancyGrid(cells=hand_over(cells), resolution_m=resolution_m, origin_m=origin)
 
 
 def _cell_of(
@@ -83,7 +90,7 @@ def _cell_of(
     opacity = np.ones(1) if image.alpha is None else np.arange(256) / 255.0
     grey, alpha = np.meshgrid(np.arange(image.top + 1) / image.top, opacity, indexing="ij")
     if mode == "trinary" and image.alpha is not None:
-        grey = (3.0 * grey + alpha) / 4.0  # nav2 averages the alpha channel in with the colours here
+        grey = (3.0 * grey + alpha) / 4.0  # nav2 includes the alpha channel in the mean of the colours
     occupancy = grey if negate else 1.0 - grey
     cells = np.full(grey.shape, UNKNOWN, dtype=np.int8)
     if mode == "raw":
@@ -120,19 +127,18 @@ def save_map(
     if mode not in ("trinary", "scale", "raw"):
         raise MapFileError(f"mode: {mode!r} is not one of trinary, scale, raw")
     suffix = "png" if mode == "scale" else image_format
-    cells = grid.cells[::-1].astype(np.int16)
+    cells = grid.cells[::-1].astype(np.int16)  # row 0 of an image has the largest y
     known = cells >= 0
-    # 0.196 and not 0.25: grey 205 is p = 0.196078, which a threshold of 0.25 would read as free.
-    occupied_thresh, free_thresh = 0.65, 0.196
+    occupied_thresh, free_thresh = _OCCUPIED_THRESH, _FREE_THRESH
     pixels: NDArray[np.uint8]
     if mode == "trinary":
-        pixels = np.full(cells.shape, 205, dtype=np.uint8)
-        pixels[known & (cells < 20)] = 254
-        pixels[cells >= 65] = 0
+        pixels = np.full(cells.shape, _UNKNOWN_GREY, dtype=np.uint8)
+        pixels[grid.free[::-1]] = _FREE_GREY
+        pixels[grid.occupied[::-1]] = _OCCUPIED_GREY
     elif mode == "raw":
         pixels = np.where(known, cells, 255).astype(np.uint8)
     else:
-        occupied_thresh, free_thresh = 1.0, 0.0  # so that every value between comes back as it was
+        occupied_thresh, free_thresh = 1.0, 0.0  # every value between them is read back unchanged
         grey = np.where(known, np.rint((100 - cells) * 2.55), 128).astype(np.uint8)
         pixels = np.dstack((grey, grey, grey, np.where(known, 255, 0).astype(np.uint8)))
 
@@ -148,7 +154,7 @@ def save_map(
         f"occupied_thresh: {occupied_thresh}\n"
         f"free_thresh: {free_thresh}\n"
     )
-    # Both are written before either takes its place: a full disk leaves the old pair, not a mixed one.
+    # Both files are complete before the first is renamed: a full disk leaves the old pair, not a mixed one.
     with replace_file(yaml_path) as new_yaml, replace_file(image_path) as new_image:
         new_image.write_bytes(encode_image(pixels, suffix, grid.resolution_m))
         new_yaml.write_text(text, encoding="utf-8")
@@ -178,7 +184,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _shown(value: object) -> str:
-    """A value for a message: a few lines of YAML can stand for billions of items, or digits without end."""
+    """A value shortened for a message: with aliases, a few lines of YAML can hold billions of items."""
     if isinstance(value, int) and abs(value) >= 10**18:
         return "a huge number"
     if isinstance(value, (list, tuple)):
@@ -193,7 +199,7 @@ def _value(path: Path, keys: dict[str, Any], key: str) -> Any:
 
 
 def _as_float(value: object) -> float:
-    """A YAML number as yaml-cpp reads it: `1e-3` is one, although PyYAML gives it as text."""
+    """A number as yaml-cpp reads it: `1e-3` is a number there, but text to PyYAML."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise ValueError(value)
     number = float(value)
@@ -224,7 +230,7 @@ def _origin(path: Path, keys: dict[str, Any]) -> tuple[float, float]:
         x, y, yaw = (_as_float(v) for v in value)
     except (TypeError, ValueError, OverflowError):
         raise MapFileError(f"{path}: origin: expected [x, y, yaw], found {_shown(value)}") from None
-    if max(abs(x), abs(y)) > _FARTHEST_M:
+    if max(abs(x), abs(y)) > FARTHEST_M:
         raise MapFileError(f"{path}: origin: {x:g}, {y:g} m is nowhere on earth")
     if abs(yaw) > 1e-9:
         raise MapFileError(
@@ -245,5 +251,5 @@ def _image_path(path: Path, keys: dict[str, Any]) -> Path:
 
 def _yaml_number(value: float) -> str:
     text = repr(float(value))
-    # "1e-05" is text to PyYAML, which wants a point in the mantissa.
+    # PyYAML reads "1e-05" as text, because the mantissa has no decimal point.
     return text.replace("e", ".0e", 1) if "e" in text and "." not in text else text

@@ -11,12 +11,13 @@ from typing import Literal
 
 import numpy as np
 
+from pc2grid.arrays import F64
 from pc2grid.errors import TrajectoryFileError
-from pc2grid.geometry import F64, pose_from_xyz_quat, quat_xyzw_from_pose
+from pc2grid.geometry import pose_from_xyz_quat, quat_xyzw_from_pose
 from pc2grid.io.atomic import replace_file
 from pc2grid.model import Trajectory
 
-_MAX_BYTES = 128 << 20
+_MAX_BYTES = 128 << 20  # some million poses
 TrajectoryFormat = Literal["tum", "kitti"]
 
 
@@ -26,11 +27,11 @@ def stamp_ns_from_text(text: str) -> int:
     Raises ValueError if it is not a finite decimal number that fits.
     """
     mantissa, e, _ = text.strip().lower().partition("e")
-    if e:  # numpy.savetxt writes 1.283e+09; rare enough for the slow way
+    if e:  # as numpy.savetxt writes: 1.283e+09
         from decimal import Decimal
 
         seconds = Decimal(text)
-        if seconds.adjusted() > 10:  # 1e999000 as an integer would take minutes
+        if seconds.adjusted() > 10:  # the integer of 1e999000 would take minutes
             raise ValueError(f"not a time: {text!r:.60}")
         stamp = int((seconds * 1_000_000_000).to_integral_value())
     else:
@@ -57,7 +58,7 @@ def read_tum(path: str | Path) -> Trajectory:
     Raises TrajectoryFileError with the line that is wrong.
 
     >>> truth = read_tum("tuesday.tum")
-    >>> truth.T_map_base.shape[1:], bool((truth.stamps_ns[1:] > truth.stamps_ns[:-1]).all())
+    >>> truth.T_session_base.shape[1:], bool((truth.stamps_ns[1:] > truth.stamps_ns[:-1]).all())
     ((4, 4), True)
     """
     stamps: list[int] = []
@@ -92,8 +93,8 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     True
     """
     with replace_file(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
-        for stamp_ns, T_map_base in zip(trajectory.stamps_ns, trajectory.T_map_base, strict=True):
-            values = (*T_map_base[:3, 3], *quat_xyzw_from_pose(T_map_base))
+        for stamp_ns, T_session_base in zip(trajectory.stamps_ns, trajectory.T_session_base, strict=True):
+            values = (*T_session_base[:3, 3], *quat_xyzw_from_pose(T_session_base))
             out.write(" ".join((stamp_text(int(stamp_ns)), *(f"{v:.9f}" for v in values))) + "\n")
 
 
@@ -121,7 +122,7 @@ def read_kitti(path: str | Path) -> F64:
 
 
 def is_rigid(T: F64) -> bool:
-    """Whether a (4, 4) pose turns and shifts, as far as numbers rounded in a text can say."""
+    """Whether a (4, 4) pose is rigid, within the rounding of numbers in a text file."""
     R = T[:3, :3]
     return bool(np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-2 and np.linalg.det(R) > 0)
 
@@ -136,8 +137,8 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     True
     """
     with replace_file(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
-        for T_map_base in trajectory.T_map_base:
-            out.write(" ".join(f"{v:.9e}" for v in T_map_base[:3].ravel()) + "\n")
+        for T_session_base in trajectory.T_session_base:
+            out.write(" ".join(f"{v:.9e}" for v in T_session_base[:3].ravel()) + "\n")
 
 
 def write_trajectory(path: str | Path, trajectory: Trajectory, kind: TrajectoryFormat | None = None) -> None:
@@ -169,4 +170,4 @@ def lines_of(path: str | Path) -> list[str]:
 
 def _trajectory(stamps: list[int], poses: list[F64]) -> Trajectory:
     matrices = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
-    return Trajectory(stamps_ns=np.array(stamps, dtype=np.int64), T_map_base=matrices)
+    return Trajectory(stamps_ns=np.array(stamps, dtype=np.int64), T_session_base=matrices)

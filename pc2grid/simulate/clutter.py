@@ -1,4 +1,4 @@
-"""Things that stand around and are somewhere else the next time: chairs, boxes, tables, people."""
+"""Objects that are in other places in each session: chairs, boxes, tables, people."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.geometry import F64, SE2
-from pc2grid.model import BoolGrid, OccupancyGrid
+from pc2grid.arrays import F64, BoolGrid
+from pc2grid.geometry import SE2
+from pc2grid.model import OccupancyGrid
 from pc2grid.simulate.passage import Passages, outline_mask
 from pc2grid.simulate.scene import Mesh, prism
 
+_TRIES_PER_OBJECT = 40
+_SQUARE_SHARE = 0.5  # of the objects are aligned with the axes of the map
+_KEPT_FREE_M = 1.0  # around the start of the drive
+
 
 @dataclass(frozen=True, slots=True)
-class Part:
-    """A prism of a piece: outline (N, 2) in the piece's frame, between two heights, metres."""
+class Prism:
+    """One part of an object: a convex outline (N, 2) in the object's frame, between two heights, metres."""
 
     outline_m: F64
     bottom_m: float
@@ -24,16 +29,16 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
-    """One movable thing.
+class Furniture:
+    """One movable object; people who stand still count as such.
 
-    kind : its name. pose : T_map_piece. outline_m : (N, 2) convex hull on the floor, in its own frame.
+    kind : a key of `KINDS`. pose : T_map_object. outline_m : (N, 2) convex hull on the floor, in its frame.
     """
 
     kind: str
     pose: SE2
     outline_m: F64
-    parts: tuple[Part, ...]
+    parts: tuple[Prism, ...]
 
     def mesh(self) -> Mesh:
         """Its triangles in the map frame."""
@@ -49,50 +54,50 @@ def _disc(radius_m: float) -> F64:
     return radius_m * np.column_stack((np.cos(angles), np.sin(angles)))
 
 
-def _legs(width: float, depth: float, thickness: float, top: float) -> list[Part]:
+def _legs(width: float, depth: float, thickness: float, top: float) -> list[Prism]:
     x, y, t = width / 2, depth / 2, thickness
     corners = ((-x, -y), (x - t, -y), (x - t, y - t), (-x, y - t))
-    return [Part(_rectangle(a, b, a + t, b + t), 0.0, top) for a, b in corners]
+    return [Prism(_rectangle(a, b, a + t, b + t), 0.0, top) for a, b in corners]
 
 
-def _box(rng: np.random.Generator) -> tuple[F64, list[Part]]:
+def _box(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
     width, depth, height = rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.6), rng.uniform(0.3, 1.2)
     outline = _rectangle(-width / 2, -depth / 2, width / 2, depth / 2)
-    return outline, [Part(outline, 0.0, height)]
+    return outline, [Prism(outline, 0.0, height)]
 
 
-def _person(rng: np.random.Generator) -> tuple[F64, list[Part]]:
+def _person(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
     outline = _disc(rng.uniform(0.18, 0.26))
-    return outline, [Part(outline, 0.0, rng.uniform(1.55, 1.9))]
+    return outline, [Prism(outline, 0.0, rng.uniform(1.55, 1.9))]
 
 
-def _bin(rng: np.random.Generator) -> tuple[F64, list[Part]]:
+def _bin(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
     outline = _disc(rng.uniform(0.14, 0.22))
-    return outline, [Part(outline, 0.0, rng.uniform(0.3, 0.75))]
+    return outline, [Prism(outline, 0.0, rng.uniform(0.3, 0.75))]
 
 
-def _chair(rng: np.random.Generator) -> tuple[F64, list[Part]]:
+def _chair(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
     size, seat, back = rng.uniform(0.42, 0.5), rng.uniform(0.42, 0.48), rng.uniform(0.8, 1.0)
     half = size / 2
     outline = _rectangle(-half, -half, half, half)
-    rest = Part(_rectangle(-half, -half, -half + 0.04, half), seat, back)
-    return outline, [Part(outline, seat - 0.05, seat), rest, *_legs(size, size, 0.04, seat)]
+    rest = Prism(_rectangle(-half, -half, -half + 0.04, half), seat, back)
+    return outline, [Prism(outline, seat - 0.05, seat), rest, *_legs(size, size, 0.04, seat)]
 
 
-def _table(rng: np.random.Generator) -> tuple[F64, list[Part]]:
+def _table(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
     width, depth, height = rng.uniform(1.0, 1.6), rng.uniform(0.6, 0.8), rng.uniform(0.7, 0.76)
     outline = _rectangle(-width / 2, -depth / 2, width / 2, depth / 2)
-    return outline, [Part(outline, height - 0.03, height), *_legs(width, depth, 0.06, height)]
+    return outline, [Prism(outline, height - 0.03, height), *_legs(width, depth, 0.06, height)]
 
 
-KINDS: dict[str, tuple[Callable[[np.random.Generator], tuple[F64, list[Part]]], float]] = {
+KINDS: dict[str, tuple[Callable[[np.random.Generator], tuple[F64, list[Prism]]], float]] = {
     "chair": (_chair, 0.35),
     "box": (_box, 0.25),
     "table": (_table, 0.15),
     "person": (_person, 0.15),
     "bin": (_bin, 0.10),
 }
-"""Each kind, how to make one, and its share."""
+"""For each kind the function that makes one, and its share of all objects (chosen by hand)."""
 
 
 def place_clutter(
@@ -102,42 +107,41 @@ def place_clutter(
     *,
     robot_m: float,
     keep_free_m: tuple[tuple[float, float], ...] = (),
-) -> tuple[Piece, ...]:
-    """Put up to `count` pieces on free cells so that a robot of radius `robot_m` still gets everywhere.
+) -> tuple[Furniture, ...]:
+    """Put up to `count` objects on free cells so that a robot of radius `robot_m` still gets everywhere.
 
-    keep_free_m : points of the map frame that nothing may stand on or within a metre of. Fewer pieces come
-    back where there is no room for all.
+    keep_free_m : points of the map frame; objects stay `_KEPT_FREE_M` away from them.
+    Returns fewer objects if there is no room for all.
     """
     passages = Passages(grid.free, grid.resolution_m, robot_m)
     places = np.flatnonzero(grid.free)
     names = list(KINDS)
     shares = np.array([KINDS[name][1] for name in names])
-    pieces: list[Piece] = []
-    for _ in range(40 * count if len(places) else 0):
-        if len(pieces) == count:
+    placed: list[Furniture] = []
+    for _ in range(_TRIES_PER_OBJECT * count if len(places) else 0):
+        if len(placed) == count:
             break
         name = names[rng.choice(len(names), p=shares / shares.sum())]
         outline, parts = KINDS[name][0](rng)
         cell = np.array([np.unravel_index(places[rng.integers(len(places))], grid.cells.shape)])
         x, y = (float(v) for v in grid.to_point(cell)[0])
-        # Half of what people put down stands square to the walls.
-        square = rng.random() < 0.5
+        square = rng.random() < _SQUARE_SHARE
         yaw = rng.choice(4) * math.pi / 2 if square else rng.uniform(-math.pi, math.pi)
-        piece = Piece(name, SE2(x, y, float(yaw)), outline, tuple(parts))
+        candidate = Furniture(name, SE2(x, y, float(yaw)), outline, tuple(parts))
         reach = float(np.linalg.norm(outline, axis=1).max())
-        if any(math.hypot(x - px, y - py) < 1.0 + reach for px, py in keep_free_m):
+        if any(math.hypot(x - px, y - py) < _KEPT_FREE_M + reach for px, py in keep_free_m):
             continue
-        footprint = (piece.pose.apply(outline) - grid.origin_m) / grid.resolution_m
+        footprint = (candidate.pose.apply(outline) - grid.origin_m) / grid.resolution_m
         if passages.put(footprint):
-            pieces.append(piece)
-    return tuple(pieces)
+            placed.append(candidate)
+    return tuple(placed)
 
 
-def covered(grid: OccupancyGrid, pieces: tuple[Piece, ...]) -> BoolGrid:
-    """Cells (H, W) that some piece stands over."""
+def covered(grid: OccupancyGrid, clutter: tuple[Furniture, ...]) -> BoolGrid:
+    """Cells (H, W) below any of the objects."""
     shape = (grid.cells.shape[0], grid.cells.shape[1])
     mask: BoolGrid = np.zeros(shape, bool)
-    for piece in pieces:
-        footprint = (piece.pose.apply(piece.outline_m) - grid.origin_m) / grid.resolution_m
+    for furniture in clutter:
+        footprint = (furniture.pose.apply(furniture.outline_m) - grid.origin_m) / grid.resolution_m
         mask |= outline_mask(footprint, shape)
     return mask

@@ -1,4 +1,8 @@
-"""Every number of a simulated session: the building, the drive, the sensors and the odometry."""
+"""The settings of a simulated session: the building, the drive, the sensors and the odometry.
+
+Defaults are chosen by hand, near to the data sheets of common devices (VLP-16, RealSense D400, 270 degree
+scanners) and to the odometry of a differential drive. They are fitted to no recording.
+"""
 
 from __future__ import annotations
 
@@ -19,20 +23,49 @@ class DriveConfig(Section):
 
 
 class OdometryConfig(Section):
-    """Wheel odometry: relative errors that persist for a while (slip), and a bias per session."""
+    """Wheel odometry: relative errors correlated in time (slip), and a bias constant in a session."""
 
     enabled: bool = Field(default=True, description="false: the log has no odometry topic and no odom frame")
     rate_hz: float = Field(default=50.0, ge=5, le=200)
     distance_error: float = Field(default=0.02, ge=0, description="standard deviation, share of the distance")
     rotation_error: float = Field(default=0.03, ge=0, description="standard deviation, share of the rotation")
-    slip_s: float = Field(default=0.5, gt=0, description="how long a wheel slips the same way")
+    slip_s: float = Field(default=0.5, gt=0, description="correlation time of the slip")
     distance_bias: float = Field(default=0.005, ge=0, description="the same, constant in a session")
     rotation_bias: float = Field(default=0.005, ge=0, description="the same, constant in a session")
     veer_rpm: float = Field(default=0.001, ge=0, description="standard deviation, radians per metre")
 
 
+class ChangeConfig(Section):
+    """What differs from the building as it was drawn or scanned. Shares are 0..1; nothing by default.
+
+    Doors and furniture change from session to session; glass, mirrors and relief are part of the building.
+    """
+
+    doors: float = Field(default=0.0, ge=0, le=1, description="share of the doorways with a door leaf")
+    closed: float = Field(
+        default=0.5, ge=0, le=1, description="share of these that are shut; others stand ajar"
+    )
+    furniture: float = Field(
+        default=0.0, ge=0, le=1, description="share of the free-standing furniture moved or exchanged"
+    )
+    exchanged: float = Field(default=0.3, ge=0, le=1, description="share of this that is exchanged")
+    relief_per_m: float = Field(
+        default=0.0, ge=0, le=2, description="radiators, pilasters and cases on a metre of wall"
+    )
+    glass: float = Field(default=0.0, ge=0, le=1, description="share of the visible walls that is glass")
+    mirrors: float = Field(default=0.0, ge=0, le=0.5, description="share of the visible walls that is mirror")
+    glass_return: float = Field(
+        default=0.1, ge=0, le=1, description="share of the rays that glass returns at an angle"
+    )
+
+    @classmethod
+    def of_share(cls, share: float) -> ChangeConfig:
+        """Doors and furniture changed by a share."""
+        return cls(doors=share, furniture=share)
+
+
 class LidarConfig(Section):
-    """A spinning lidar in the manner of a VLP-16."""
+    """A spinning lidar like a VLP-16."""
 
     beams: int = Field(default=16, ge=1, le=256)
     elevation_deg: float = Field(
@@ -84,11 +117,12 @@ class SimulationConfig(Section):
 
     length_m: float = Field(default=40.0, gt=0, le=20_000, description="distance to drive")
     seed: int = Field(default=0, ge=0, description="route, clutter, noise and odometry")
-    clutter: int = Field(default=30, ge=0, le=10_000, description="movable pieces, placed by the seed")
+    clutter: int = Field(default=30, ge=0, le=10_000, description="movable objects, placed by the seed")
     walkers: int = Field(default=0, ge=0, le=1000, description="people who walk about during the drive")
     start_m: tuple[float, float] | None = Field(default=None, description="x, y in the map; null: anywhere")
     building_seed: int = Field(default=0, ge=0, description="the procedural office, when no map is given")
     wall_height_m: float = Field(default=2.5, gt=0.5, le=20)
+    change: ChangeConfig = ChangeConfig()
     drive: DriveConfig = DriveConfig()
     odometry: OdometryConfig = OdometryConfig()
     lidar: LidarConfig = LidarConfig()

@@ -1,4 +1,4 @@
-"""When the robot is where on its route: speeds, turns in place and short stops."""
+"""The motion along a route: speeds, turns in place and short stops."""
 
 from __future__ import annotations
 
@@ -7,17 +7,22 @@ from itertools import pairwise
 
 import numpy as np
 
-from pc2grid.geometry import F64, SE2, wrap_angle
-from pc2grid.model import _freeze
+from pc2grid.arrays import F64, freeze
+from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.simulate.config import DriveConfig
 from pc2grid.simulate.route import Route
 
 RATE_HZ = 100.0
+"""Samples of a drive in a second."""
+
+_PAUSE_S = (0.5, 2.5)  # shortest and longest stop
+_SMOOTHING_S = 0.08  # standard deviation in time that inertia gives to every change of speed
+_LEAST_MPS = 0.02  # mean speed of a step; keeps the time of a step finite
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """True motion of the base, sampled evenly from time 0.
+    """The true motion of the base, sampled evenly from time 0.
 
     poses : (N, 3) x, y, yaw in the map frame, RATE_HZ apart; metres and radians, yaw without jumps.
     """
@@ -25,7 +30,7 @@ class Drive:
     poses: F64
 
     def __post_init__(self) -> None:
-        _freeze(self, "poses", np.float64, (None, 3))
+        freeze(self, "poses", np.float64, (None, 3))
 
     @property
     def duration_s(self) -> float:
@@ -38,7 +43,7 @@ class Drive:
         return float(np.linalg.norm(np.diff(self.poses[:, :2], axis=0), axis=1).sum())
 
     def at(self, times_s: F64) -> F64:
-        """Poses (..., 3) at times (...) in seconds; before the start and behind the end it stands still."""
+        """Poses (..., 3) at times (...) in seconds; before the start and after the end the robot stands."""
         position = np.clip(np.asarray(times_s) * RATE_HZ, 0, len(self.poses) - 1)
         low = np.minimum(position.astype(np.int64), max(len(self.poses) - 2, 0))
         high = np.minimum(low + 1, len(self.poses) - 1)
@@ -53,7 +58,7 @@ class Drive:
 
 
 def _headings(points_m: F64) -> F64:
-    """Direction of the line at each of its points, without jumps."""
+    """Direction of the line at each of its points, radians, without jumps of 2 pi."""
     reach = min(2, len(points_m) - 1)
     index = np.arange(len(points_m))
     ahead = points_m[np.minimum(index + reach, len(points_m) - 1)]
@@ -74,13 +79,13 @@ def _follow(points_m: F64, yaws: F64, config: DriveConfig) -> F64:
         speed[i] = min(speed[i], np.sqrt(speed[i - 1] ** 2 + 2 * config.acceleration_mps2 * steps[i - 1]))
     for i in range(len(speed) - 2, -1, -1):
         speed[i] = min(speed[i], np.sqrt(speed[i + 1] ** 2 + 2 * config.acceleration_mps2 * steps[i]))
-    seconds = 2 * steps / np.maximum(speed[1:] + speed[:-1], 0.02)
+    seconds = 2 * steps / np.maximum(speed[1:] + speed[:-1], _LEAST_MPS)
     seconds = np.maximum(seconds, np.abs(np.diff(yaws)) / config.yaw_rate_rps)
     return np.concatenate(([0.0], np.cumsum(seconds)))
 
 
 def _turn(angle_rad: float, config: DriveConfig) -> tuple[F64, F64]:
-    """Times and angles of a turn in place: speeding up, steady, slowing down."""
+    """Times and angles of a turn in place with a trapezoidal profile of the yaw rate."""
     size = abs(angle_rad)
     top = min(config.yaw_rate_rps, np.sqrt(size * config.yaw_acceleration_rps2))
     ramp_s = top / config.yaw_acceleration_rps2
@@ -93,7 +98,7 @@ def _turn(angle_rad: float, config: DriveConfig) -> tuple[F64, F64]:
 
 
 def drive_along(route: Route, config: DriveConfig, rng: np.random.Generator) -> Drive:
-    """Drive a route from rest to rest; it stops for a moment now and then, and at its turns."""
+    """Drive a route from rest to rest, with random short stops and a stop at each turn in place."""
     from scipy.ndimage import gaussian_filter1d
 
     points = route.points_m
@@ -101,7 +106,7 @@ def drive_along(route: Route, config: DriveConfig, rng: np.random.Generator) -> 
     gap = config.pause_every_m
     pauses = np.cumsum(rng.exponential(gap, size=int(3 * route.length_m / gap) + 10))
     driven = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
-    stops = {int(np.searchsorted(driven, s)): float(rng.uniform(0.5, 2.5)) for s in pauses if s < driven[-1]}
+    stops = {int(np.searchsorted(driven, s)): float(rng.uniform(*_PAUSE_S)) for s in pauses if s < driven[-1]}
     turns = [int(v) for v in route.turns if 0 < v < last]
     times, poses = [np.array([0.0, 0.5])], [np.tile([*points[0], 0.0], (2, 1))]
     yaw: float | None = None
@@ -129,5 +134,4 @@ def drive_along(route: Route, config: DriveConfig, rng: np.random.Generator) -> 
     when, where = np.concatenate(times), np.concatenate(poses)
     even = np.arange(int(when[-1] * RATE_HZ) + 1) / RATE_HZ
     sampled = np.column_stack([np.interp(even, when, where[:, k]) for k in range(3)])
-    # Motors and mass take the corners off every change of speed.
-    return Drive(gaussian_filter1d(sampled, 0.08 * RATE_HZ, axis=0, mode="nearest"))
+    return Drive(gaussian_filter1d(sampled, _SMOOTHING_S * RATE_HZ, axis=0, mode="nearest"))

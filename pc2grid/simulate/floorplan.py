@@ -1,13 +1,13 @@
-"""A procedural office floor as an occupancy grid: what belongs to the building and never moves."""
+"""A procedural office floor as an occupancy grid: walls, doors and everything that does not move."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pc2grid.arrays import F64, BoolGrid
 from pc2grid.errors import ConfigError
-from pc2grid.geometry import F64
-from pc2grid.model import FREE, OCCUPIED, UNKNOWN, BoolGrid, OccupancyGrid
+from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.simulate.layout import Box, Layout, lay_out
 from pc2grid.simulate.passage import Passages
 
@@ -29,7 +29,7 @@ def _touch(box: Box, other: Box) -> bool:
 
 
 def _corners(box: Box) -> F64:
-    # Through the centres of its outermost cells, so that exactly the cells of the box are covered.
+    # Through the centres of the outermost cells, so that exactly the cells of the box are covered.
     x0, y0, x1, y1 = box.x0 + 0.5, box.y0 + 0.5, box.x1 - 0.5, box.y1 - 0.5
     return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
 
@@ -37,9 +37,9 @@ def _corners(box: Box) -> F64:
 def office_floorplan(
     seed: int, width_m: float = 44.0, height_m: float = 32.0, *, resolution_m: float = 0.05
 ) -> OccupancyGrid:
-    """An office floor that no other seed has: corridors, rooms, doors, pillars, niches, built-in shelves.
+    """An office floor, different for each seed: corridors, rooms, doors, pillars, niches, built-in shelves.
 
-    Outside and in shafts the cells are unknown. The origin is the outer corner of the building.
+    Cells outside and in shafts are unknown. The origin is the outer corner of the building.
     Raises ConfigError below 20 x 20 m, where corridors and rooms do not fit, or for cells above 0.1 m.
     """
     if min(width_m, height_m) < 20:
@@ -67,7 +67,7 @@ def office_floorplan(
 
 
 def _carve(cells: NDArray[np.int8], layout: Layout, inside: Box, wall: int) -> None:
-    """Take the free space out of the solid block."""
+    """Make rooms, corridors and doors free in the solid block."""
     reached = {side for door in layout.doors for side in door.sides}
     for number, room in enumerate(layout.rooms):
         _fill(cells, room.grown(-wall), FREE if number in reached else UNKNOWN)
@@ -78,7 +78,7 @@ def _carve(cells: NDArray[np.int8], layout: Layout, inside: Box, wall: int) -> N
 
 
 def _keep_doors_clear(passages: Passages, layout: Layout, margin: int) -> None:
-    """Nobody builds a cupboard in front of a door."""
+    """Reserve the space in front of doors."""
     reserved: BoolGrid = np.zeros(passages.free.shape, bool)
     for door in layout.doors:
         box = door.box.grown(round(0.7 * layout.unit))
@@ -87,7 +87,7 @@ def _keep_doors_clear(passages: Passages, layout: Layout, margin: int) -> None:
 
 
 def _relief(passages: Passages, layout: Layout, wall: int, margin: int, rng: np.random.Generator) -> None:
-    """Pilasters, pipes, radiators and cases on corridor walls, so that no corridor is smooth."""
+    """Put pilasters, pipes, radiators and cases on corridor walls, so that no corridor is smooth."""
     unit = layout.unit
     for whole in layout.corridors:
         corridor = whole.grown(-wall)
@@ -114,7 +114,7 @@ def _relief(passages: Passages, layout: Layout, wall: int, margin: int, rng: np.
 
 
 def _columns(passages: Passages, inside: Box, margin: int, unit: float, rng: np.random.Generator) -> None:
-    """The structure's columns on their regular pitch, wherever they leave the way open."""
+    """Put structural columns on a regular pitch, where they leave passages open."""
     pitch_x, pitch_y = rng.uniform(5.0, 7.5, size=2) * unit
     half = round(float(rng.uniform(0.15, 0.25)) * unit)
     start_x, start_y = rng.uniform(0.3, 0.7, size=2) * (pitch_x, pitch_y)
@@ -125,7 +125,7 @@ def _columns(passages: Passages, inside: Box, margin: int, unit: float, rng: np.
 
 
 def _shelves(passages: Passages, layout: Layout, wall: int, margin: int, rng: np.random.Generator) -> None:
-    """Shelves and cabinets along the walls of rooms; kitchen islands and partitions in halls."""
+    """Put shelves and cabinets along the walls of rooms, and some free-standing ones in halls."""
     unit = layout.unit
     for room in layout.rooms:
         free = room.grown(-wall)

@@ -1,6 +1,6 @@
-"""How an office floor is divided: corridors first, rooms in what they leave over, doors between.
+"""How an office floor is divided: corridors first, then rooms in the remaining space, then doors.
 
-All lengths in whole cells of the floor plan; rectangles are half-open, x to the right and y up.
+All lengths are whole cells of the floor plan; rectangles are half-open, x to the right and y up.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Box(NamedTuple):
 
 
 class Door(NamedTuple):
-    """An opening: the cells of the wall that it takes out, and the two places that it joins."""
+    """An opening: the cells of the wall that it removes, and the two places that it connects."""
 
     box: Box
     sides: tuple[int, int]
@@ -57,7 +57,7 @@ def _cells(metres: float, unit: float) -> int:
 
 
 def _corridors(inside: Box, unit: float, rng: np.random.Generator) -> list[Box]:
-    """A ring, a ladder or a comb, with widths and places by the dice."""
+    """Corridors as a ring, a ladder or a comb, with random widths and positions."""
 
     def wide() -> int:
         return _cells(float(rng.uniform(1.7, 2.5)), unit)
@@ -72,7 +72,7 @@ def _corridors(inside: Box, unit: float, rng: np.random.Generator) -> list[Box]:
     if kind == "ring":
         corridors += [Box(x0, y0, x1, y0 + wide()), Box(x0, y1 - wide(), x1, y1)]
         corridors += [Box(x0, y0, x0 + wide(), y1), Box(x1 - wide(), y0, x1, y1)]
-        # A cross through the core, off the middle so that no two arms are alike.
+        # A cross through the core, not in the middle, so that its arms differ.
         x, y = x0 + int((x1 - x0) * rng.uniform(0.3, 0.7)), y0 + int((y1 - y0) * rng.uniform(0.35, 0.65))
         corridors.append(Box(x, y0, x + wide(), y1))
         if rng.random() < 0.7:
@@ -103,7 +103,7 @@ def _corridors(inside: Box, unit: float, rng: np.random.Generator) -> list[Box]:
             if side > 0.3:
                 x = min(x + int(rng.uniform(-0.1, 0.1) * pitch), inside.x1 - wide())
                 corridors.append(Box(x, y0, x + wide(), spine.y1))
-        # One cross-way makes a loop of two teeth.
+        # A crossing corridor closes loops between the teeth.
         corridors.append(
             Box(int(inside.x0 + 0.2 * inside.width), y1 - wide(), int(inside.x1 - 0.2 * inside.width), y1)
         )
@@ -111,7 +111,7 @@ def _corridors(inside: Box, unit: float, rng: np.random.Generator) -> list[Box]:
 
 
 def _blocks(inside: Box, corridors: list[Box], rng: np.random.Generator) -> list[Box]:
-    """What the corridors leave over, as few large rectangles."""
+    """The space between the corridors as few large rectangles."""
     xs = sorted(
         {inside.x0, inside.x1, *(v for c in corridors for v in (c.x0, c.x1) if inside.x0 < v < inside.x1)}
     )
@@ -140,7 +140,7 @@ def _blocks(inside: Box, corridors: list[Box], rng: np.random.Generator) -> list
 
 
 def _rooms(block: Box, unit: float, rng: np.random.Generator) -> list[Box]:
-    """Halve a block until its parts are rooms: offices mostly, now and then a hall."""
+    """Divide a block until its parts are rooms: mostly offices, sometimes a hall."""
     long, short = max(block.width, block.height) / unit, min(block.width, block.height) / unit
     area = long * short
     if (
@@ -171,7 +171,7 @@ def _shared_wall(a: Box, b: Box) -> tuple[bool, int, int, int] | None:
 
 
 def _door(a: Box, b: Box, wall: int, unit: float, rng: np.random.Generator) -> Box | None:
-    """An opening of 0.9 to 1.0 m, rarely a wide one, well away from the corners."""
+    """An opening with the width of a door, sometimes of a double one, away from the corners."""
     shared = _shared_wall(a, b)
     if shared is None:
         return None
@@ -234,7 +234,7 @@ def _doors(
 def lay_out(inside: Box, wall: int, unit: float, rng: np.random.Generator) -> Layout:
     """Divide the inside of the outer walls.
 
-    wall : half the thickness of an inner wall, cells. Rooms that no door reaches are shafts.
+    wall : half the thickness of an inner wall, cells. Rooms without a door are shafts.
     """
     corridors = _corridors(inside, unit, rng)
     rooms = [room for block in _blocks(inside, corridors, rng) for room in _rooms(block, unit, rng)]

@@ -1,4 +1,4 @@
-"""What the wheels say about a drive."""
+"""Wheel odometry of a simulated drive."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.geometry import F64, SE2
-from pc2grid.model import _freeze
+from pc2grid.arrays import F64, freeze
+from pc2grid.geometry import SE2
 from pc2grid.simulate.config import OdometryConfig
 from pc2grid.simulate.drive import Drive
 
@@ -25,8 +25,8 @@ class Odometry:
     poses: F64
 
     def __post_init__(self) -> None:
-        _freeze(self, "times_s", np.float64, (None,))
-        _freeze(self, "poses", np.float64, (len(self.times_s), 3))
+        freeze(self, "times_s", np.float64, (None,))
+        freeze(self, "poses", np.float64, (len(self.times_s), 3))
 
     def at(self, time_s: float) -> SE2:
         """T_odom_base between two messages."""
@@ -35,7 +35,7 @@ class Odometry:
 
 
 def _slip(steps: int, error: float, step_s: float, memory_s: float, rng: np.random.Generator) -> F64:
-    """(steps,): a relative error of standard deviation `error` that forgets itself over `memory_s`."""
+    """(steps,) relative errors of standard deviation `error`, correlated over `memory_s`."""
     from scipy.signal import lfilter
 
     keep = math.exp(-step_s / memory_s)
@@ -46,11 +46,11 @@ def _slip(steps: int, error: float, step_s: float, memory_s: float, rng: np.rand
 
 
 def odometry_of(drive: Drive, config: OdometryConfig, rng: np.random.Generator) -> Odometry:
-    """Integrate the drive's own steps with wheel-like errors.
+    """Integrate the steps of the drive with the errors of wheel odometry.
 
-    Each step's distance and rotation is off by a share that stays alike for `slip_s` (an
-    Ornstein-Uhlenbeck process), by a share that is the same all session, and the robot veers a little
-    per metre: errors grow with what was driven, never while standing.
+    Three relative errors are added to the distance and rotation of each step: slip, which is correlated over
+    `slip_s` (an Ornstein-Uhlenbeck process), a bias that is constant in the session, and a rotation per metre
+    driven. The error grows with the distance, and not while the robot stands.
     """
     step_s = 1.0 / config.rate_hz
     times_s = (np.arange(math.floor(drive.duration_s * config.rate_hz) + 2) * step_s).astype(np.float64)

@@ -1,24 +1,25 @@
-"""Where a robot can pass, and whether something may stand in its way."""
+"""The space in which a robot can pass, and objects that may be placed in it."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F64
-from pc2grid.model import F32, BoolGrid
+from pc2grid.arrays import F32, F64, BoolGrid
+
+_WINDOW_M = 1.2  # around an object, beyond the radius of the robot
 
 
 def clearance_m(free: BoolGrid, resolution_m: float) -> F32:
     """Distance (H, W) from each cell's centre to the edge of the nearest cell that is not free, metres.
 
-    Beyond the grid nothing is free.
+    Cells outside of the grid are not free.
     """
     return _distance_m(np.pad(free, 1), resolution_m)[1:-1, 1:-1]
 
 
 def _distance_m(free: BoolGrid, resolution_m: float) -> F32:
-    """The same where nothing is known beyond the grid."""
+    """The same without assuming anything outside of the grid."""
     import cv2
 
     cells = cv2.distanceTransform(free.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
@@ -38,10 +39,10 @@ def outline_mask(outline_cells: F64, shape: tuple[int, int]) -> BoolGrid:
 
 
 class Passages:
-    """Free space that is being furnished, piece by piece, without ever cutting it in two.
+    """Free space in which objects are placed so that it stays connected for a robot.
 
-    free : (H, W) cells that are empty; changes as pieces are put down.
-    reserved : (H, W) cells that must stay as they are.
+    free : (H, W) cells that are empty; changes with each object.
+    reserved : (H, W) cells on which no object may be placed.
     """
 
     def __init__(self, free: BoolGrid, resolution_m: float, robot_m: float) -> None:
@@ -52,22 +53,21 @@ class Passages:
         self._passable = clearance_m(free, resolution_m) >= robot_m
 
     def reserve(self, cells: BoolGrid) -> None:
-        """Nothing may be put on these cells (H, W) any more, though they stay passable."""
+        """No object may be placed on these cells (H, W) from now on; they stay passable."""
         self.reserved |= cells
 
     def put(self, outline_cells: F64, *, overlap: bool = False) -> bool:
-        """Put down a piece if it stands on free cells only and every way past it stays open.
+        """Place an object if it stands on free cells only and leaves every passage beside it open.
 
         outline_cells : (N, 2) convex outline, x and y in cells from the grid's corner.
-        overlap : it may reach into walls and other pieces.
+        overlap : the object may reach into walls and other objects.
 
-        Decided in a window around the piece: what was connected there must stay so. That is stricter
-        than connectivity of the whole building, and right: nobody blocks a corridor because there is
-        another way round.
+        The passable space in a window around the object must stay connected. This is stricter than
+        connectivity of the whole building: a corridor is not blocked even if there is another way.
         """
         from scipy import ndimage
 
-        margin = int(np.ceil((self.robot_m + 1.2) / self.resolution_m))
+        margin = int(np.ceil((self.robot_m + _WINDOW_M) / self.resolution_m))
         low = np.floor(outline_cells.min(axis=0)).astype(int) - margin
         high = np.ceil(outline_cells.max(axis=0)).astype(int) + margin
         height, width = self.free.shape

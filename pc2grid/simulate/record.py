@@ -1,4 +1,4 @@
-"""A simulated session as a recording: standard ROS 2 MCAP, and the truth beside it."""
+"""A simulated session as a recording: standard ROS 2 MCAP, with the ground truth in a TUM file beside it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import numpy as np
 
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.io.atomic import refuse_existing
-from pc2grid.io.mcap_out import LogWriter
+from pc2grid.io.export.mcap import LogWriter
 from pc2grid.io.trajectory import write_tum
 from pc2grid.model import OccupancyGrid, SensorKind, Trajectory
+from pc2grid.simulate.building import Building
+from pc2grid.simulate.change import Change
 from pc2grid.simulate.config import DepthConfig, LaserConfig, SimulationConfig
 from pc2grid.simulate.sensors import depth_intrinsics, laser_angle_min, laser_time_increment
 from pc2grid.simulate.session import EPOCH_NS, Reading, Session, prepare_session
@@ -32,7 +34,8 @@ class SimulatedSession:
     """What was written.
 
     path : the MCAP. truth_path : TUM file of true base poses in the floor plan's map frame, one per scan.
-    scans, duration_s, length_m : how many, how long, how far. clutter : pieces that found room.
+    scans : their number. duration_s, length_m : of the drive. clutter : how many objects could be placed.
+    change : what differs from the building as drawn.
     """
 
     path: Path
@@ -42,26 +45,28 @@ class SimulatedSession:
     duration_s: float
     length_m: float
     clutter: int
+    change: Change
 
 
 def simulate_session(
     out: str | Path,
     *,
     sensor: SensorKind,
-    grid: OccupancyGrid | None = None,
+    grid: OccupancyGrid | Building | None = None,
     config: SimulationConfig | None = None,
     progress: Callable[[float], None] | None = None,
     force: bool = False,
 ) -> SimulatedSession:
     """Drive through a building and record it.
 
-    out : MCAP to write; the truth goes beside it as `.tum`. Existing files are refused unless `force`.
-    grid : the floor plan; None for the procedural office of `config.building_seed`.
+    out : MCAP to write; the ground truth is written beside it as `.tum`. Existing files are refused without
+        `force`.
+    grid : the floor plan, or a real building; None for the procedural office of `config.building_seed`.
     progress : called with the share that is done, 0..1.
 
     Topics: the sensor's (TOPICS; a camera has INFO_TOPIC too), /tf_static base_link -> sensor and, unless
     switched off, nav_msgs/Odometry with /tf odom -> base_link. The same arguments give the same bytes.
-    Raises ConfigError when the robot has no room, OutputError when a file cannot be written.
+    Raises ConfigError if there is no room for the robot, OutputError if a file cannot be written.
 
     >>> made = simulate_session("drive.mcap", sensor="laser", config=SimulationConfig(length_m=1.0))
     >>> made.truth_path.name, made.scans > 10
@@ -86,7 +91,7 @@ def simulate_session(
             if progress is not None:
                 progress((reading.index + 1) / count)
         _write_odometry(log, session, odometry_sent, np.inf)
-    write_tum(truth_path, Trajectory(stamps_ns=np.array(stamps), T_map_base=np.array(poses)))
+    write_tum(truth_path, Trajectory(stamps_ns=np.array(stamps), T_session_base=np.array(poses)))
     return SimulatedSession(
         path=out,
         truth_path=truth_path,
@@ -94,12 +99,13 @@ def simulate_session(
         scans=count,
         duration_s=session.drive.duration_s,
         length_m=session.drive.length_m,
-        clutter=len(session.pieces),
+        clutter=len(session.clutter),
+        change=session.change,
     )
 
 
 def _write_odometry(log: LogWriter, session: Session, sent: int, until_s: float) -> int:
-    """All odometry up to a time that has not been sent; returns how many messages that makes."""
+    """Write the odometry up to a time, from message `sent` on; returns how many messages are written then."""
     odometry = session.odometry
     if odometry is None:
         return 0
@@ -113,7 +119,7 @@ def _write_odometry(log: LogWriter, session: Session, sent: int, until_s: float)
 
 
 def _write_reading(log: LogWriter, session: Session, reading: Reading) -> None:
-    """One scan as its sensor's driver would publish it."""
+    """Write one scan as the driver of its sensor publishes it."""
     sensor, values, stamp_ns = session.sensor, reading.values_m, reading.stamp_ns
     topic, config = TOPICS[sensor.kind], sensor.config
     if isinstance(config, LaserConfig):

@@ -1,4 +1,4 @@
-"""Where a robot drives: through free space, to new places first, back where a way ends."""
+"""The route of a robot through free space: first to places that it has not visited."""
 
 from __future__ import annotations
 
@@ -9,16 +9,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pc2grid.arrays import F32, F64, I64, freeze
 from pc2grid.errors import ConfigError
-from pc2grid.geometry import F64
-from pc2grid.model import F32, I64, OccupancyGrid, _freeze
+from pc2grid.model import OccupancyGrid
 from pc2grid.simulate.passage import clearance_m
 
 STEP_M = 0.05
-"""Distance between the points of a route."""
+"""Distance between two points of a route."""
 
 SEEN_M = 1.5
-"""Places this close to the route count as visited."""
+"""Places this near to the route count as visited."""
+
+START_M = 1.0
+"""A start may be this far from the nearest place where the robot fits."""
+
+_LATTICE_M = 0.1  # distance between the points among which the route is planned
+_CENTRE_WINDOW_M, _CENTRE_SHARE = (
+    0.6,
+    0.95,
+)  # a centre has this share of the largest clearance within the window
+_COMFORT_M, _DISCOMFORT = (
+    0.5,
+    2.0,
+)  # with less clearance than this more than needed, an edge weighs up to 1 + 2
+_SEARCH_M = (8.0, 30.0, math.inf)  # goals are looked for within these distances, one after another
+_NEAREST_GOAL_M = 0.5
+_BLOCK_M, _TASTE_M = 2.0, 4.0  # edge of a block, and largest detour for its preference
+_AHEAD_M = 1.5  # detour accepted for a goal that lies ahead and not beside
+_LONGER, _LONGER_M = 1.3, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +51,8 @@ class Route:
     turns: I64
 
     def __post_init__(self) -> None:
-        _freeze(self, "points_m", np.float64, (None, 2))
-        _freeze(self, "turns", np.int64, (None,))
+        freeze(self, "points_m", np.float64, (None, 2))
+        freeze(self, "turns", np.int64, (None,))
 
     @property
     def length_m(self) -> float:
@@ -44,10 +62,10 @@ class Route:
 
 @dataclass(frozen=True, slots=True)
 class _Lattice:
-    """Passable points some cells apart, with the ways between neighbours.
+    """Passable points some cells apart, connected with their neighbours.
 
-    points_m : (N, 2). cells : (N, 2) row, column. graph : (N, N) sparse, edges weigh their length, more
-    where it is narrow. centres : (N,) whether the point is in the middle of its surroundings.
+    points_m : (N, 2). cells : (N, 2) row, column. graph : (N, N) sparse; the weight of an edge is its length,
+    and up to three times that near walls. centres : (N,) whether the clearance is about the largest around.
     """
 
     points_m: F64
@@ -59,14 +77,14 @@ class _Lattice:
 def _lattice(
     grid: OccupancyGrid, clearance: F32, least_m: float, start_m: tuple[float, float] | None
 ) -> _Lattice:
-    """The largest connected part of the passable space, or the one that holds the start.
+    """The largest connected part of the passable space, or the one that contains the start.
 
-    Raises ConfigError when nothing is passable, or nothing within 1 m of the start.
+    Raises ConfigError if nothing is passable, or nothing within `START_M` of the start.
     """
     from scipy import ndimage
     from scipy.sparse import coo_matrix
 
-    stride = max(1, round(0.1 / grid.resolution_m))
+    stride = max(1, round(_LATTICE_M / grid.resolution_m))
     here = clearance[::stride, ::stride]
     passable = here >= least_m
     labels, count = ndimage.label(passable, np.ones((3, 3), bool))
@@ -81,23 +99,22 @@ def _lattice(
     if start_m is not None:
         cells = np.argwhere(passable)
         away = np.linalg.norm(grid.to_point(cells * stride) - start_m, axis=1)
-        if away.min() > 1.0:
+        if away.min() > START_M:
             x, y = grid.to_point(cells[[np.argmin(away)]] * stride)[0]
             raise ConfigError(
                 f"the start ({start_m[0]:g}, {start_m[1]:g}) is {away.min():.1f} m from where a robot fits",
                 hint=f"the nearest such place is ({x:.2f}, {y:.2f})",
             )
-        near = labels[tuple(cells[away <= 1.0].T)]
+        near = labels[tuple(cells[away <= START_M].T)]
         label = int(near[np.argmax(sizes[near])])
     part = labels == label
-    # In the middle: nowhere around is clearly more room.
-    size = 2 * round(0.6 / (stride * grid.resolution_m)) + 1
-    centres = part & (here >= 0.95 * ndimage.maximum_filter(np.where(part, here, 0), size=size))
+    size = 2 * round(_CENTRE_WINDOW_M / (stride * grid.resolution_m)) + 1
+    centres = part & (here >= _CENTRE_SHARE * ndimage.maximum_filter(np.where(part, here, 0), size=size))
     number = np.full(part.shape, -1, np.int64)
     cells = np.argwhere(part)
     number[part] = np.arange(len(cells))
-    comfort_m = least_m + 0.5
-    discomfort = 1 + 2 * np.clip((comfort_m - here) / comfort_m, 0, 1)
+    comfort_m = least_m + _COMFORT_M
+    discomfort = 1 + _DISCOMFORT * np.clip((comfort_m - here) / comfort_m, 0, 1)
     padded = np.pad(number, 1, constant_values=-1)
     height, width = part.shape
     rows, columns, weights = [], [], []
@@ -117,7 +134,7 @@ def _lattice(
 
 
 class _Explorer:
-    """Chooses one goal after the other and remembers where it has been."""
+    """Chooses one goal after another; keeps which places were visited."""
 
     def __init__(self, lattice: _Lattice, at: int, rng: np.random.Generator) -> None:
         from scipy.spatial import cKDTree
@@ -127,9 +144,9 @@ class _Explorer:
         self.rng = rng
         self.new = np.ones(len(lattice.points_m), bool)
         self._tree = cKDTree(lattice.points_m)
-        # A taste that changes from place to place sends each session another way.
-        blocks = np.floor((lattice.points_m - lattice.points_m.min(axis=0)) / 2.0).astype(int)
-        self._taste_m = rng.uniform(0, 4, size=blocks.max(axis=0) + 1)[blocks[:, 0], blocks[:, 1]]
+        # A random preference for each block of the map makes the routes of two seeds differ.
+        blocks = np.floor((lattice.points_m - lattice.points_m.min(axis=0)) / _BLOCK_M).astype(int)
+        self._taste_m = rng.uniform(0, _TASTE_M, size=blocks.max(axis=0) + 1)[blocks[:, 0], blocks[:, 1]]
         self._visit(np.array([at]))
 
     def _visit(self, path: I64) -> None:
@@ -137,18 +154,20 @@ class _Explorer:
             self.new[near] = False
 
     def next_path(self, heading: F64 | None) -> I64:
-        """Points (indices) to the next goal: near, new, and rather ahead than behind.
+        """Points (indices) to the next goal: near, not visited, and preferably ahead.
 
-        Once all is visited, the farthest place becomes the goal and everything behind it new again.
+        When everything is visited, a random place far away becomes the goal and all places count as new.
         """
         from scipy.sparse.csgraph import dijkstra
 
         points = self.lattice.points_m
-        for limit in (8.0, 30.0, np.inf):
+        for limit in _SEARCH_M:
             away, before = dijkstra(
                 self.lattice.graph, directed=False, indices=self.at, return_predecessors=True, limit=limit
             )
-            goals = np.flatnonzero(self.lattice.centres & self.new & np.isfinite(away) & (away > 0.5))
+            goals = np.flatnonzero(
+                self.lattice.centres & self.new & np.isfinite(away) & (away > _NEAREST_GOAL_M)
+            )
             if len(goals):
                 break
         else:
@@ -161,7 +180,7 @@ class _Explorer:
         score = away[goals] + self._taste_m[goals]
         if heading is not None:
             direction = points[goals] - points[self.at]
-            score += 1.5 * (1 - direction @ heading / np.linalg.norm(direction, axis=1))
+            score += _AHEAD_M * (1 - direction @ heading / np.linalg.norm(direction, axis=1))
         goal = int(goals[np.argmin(score)])
         path = [goal]
         while path[-1] != self.at:
@@ -173,7 +192,7 @@ class _Explorer:
 
 
 def _resample(points_m: F64) -> F64:
-    """The same line with points STEP_M apart; its ends stay."""
+    """The same line with points STEP_M apart and the same ends."""
     lengths = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))))
     count = max(round(float(lengths[-1]) / STEP_M), 1)
     at = np.linspace(0, lengths[-1], count + 1)
@@ -181,7 +200,7 @@ def _resample(points_m: F64) -> F64:
 
 
 def _smooth(points_m: F64, grid: OccupancyGrid, clearance: F32, least_m: float) -> F64:
-    """Pull the line straight as far as its clearance allows (an elastic band); ends stay."""
+    """Straighten the line as far as its clearance allows (an elastic band); its ends stay."""
     if len(points_m) < 3:
         return points_m
 
@@ -211,11 +230,11 @@ def plan_route(
     least_m: float,
     rng: np.random.Generator,
 ) -> Route:
-    """A drive of `length_m` that stays `least_m` away from all that is not free.
+    """A route of `length_m` that stays `least_m` away from everything that is not free.
 
-    blocked : (H, W) cells that clutter stands on. New places come first; where a way ends the robot turns;
-    what is seen twice closes loops.
-    Raises ConfigError when there is no room, or none at the start.
+    blocked : (H, W) cells below clutter. Places that were not visited come first; at dead ends the robot
+    turns; later it comes back to places, which closes loops.
+    Raises ConfigError if there is no room, or none at the start.
     """
     clearance = clearance_m(grid.free & ~blocked, grid.resolution_m)
     lattice = _lattice(grid, clearance, least_m, start_m)
@@ -225,21 +244,21 @@ def plan_route(
     else:
         at = int(np.argmin(np.linalg.norm(lattice.points_m - start_m, axis=1)))
     explorer = _Explorer(lattice, at, rng)
-    # Between two turns in place the line is one smooth piece.
-    pieces: list[list[F64]] = [[lattice.points_m[[at]]]]
+    # The line is smooth between two turns in place.
+    segments: list[list[F64]] = [[lattice.points_m[[at]]]]
     heading: F64 | None = None
     driven_m = 0.0
-    # Smoothing takes the corners off, so plan for more than is asked for.
-    while driven_m < 1.3 * length_m + 2.0:
+    # Smoothing shortens the line, so more than the length is planned.
+    while driven_m < _LONGER * length_m + _LONGER_M:
         leg = lattice.points_m[explorer.next_path(heading)]
         driven_m += float(np.linalg.norm(np.diff(leg, axis=0), axis=1).sum())
         leaving = leg[min(5, len(leg) - 1)] - leg[0]
         if heading is not None and heading @ leaving < 0:
-            pieces.append([leg[:1]])
-        pieces[-1].append(leg[1:])
+            segments.append([leg[:1]])
+        segments[-1].append(leg[1:])
         arriving = leg[-1] - leg[max(-6, -len(leg))]
         heading = arriving / np.linalg.norm(arriving)
-    lines = [_smooth(_resample(np.concatenate(piece)), grid, clearance, least_m) for piece in pieces]
+    lines = [_smooth(_resample(np.concatenate(part)), grid, clearance, least_m) for part in segments]
     points = np.concatenate([lines[0], *(line[1:] for line in lines[1:])])
     turns = np.cumsum([len(line) - 1 for line in lines])
     lengths = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))

@@ -1,4 +1,4 @@
-"""A floor plan as a solid building that rays can be cast into."""
+"""A floor plan as a mesh of walls, floor and ceiling, and casting rays into it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F64
-from pc2grid.model import F32, BoolGrid, OccupancyGrid, _freeze
+from pc2grid.arrays import F32, F64, BoolGrid, freeze
+from pc2grid.model import OccupancyGrid
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,8 +24,8 @@ class Mesh:
     triangles: NDArray[np.uint32]
 
     def __post_init__(self) -> None:
-        _freeze(self, "vertices_m", np.float32, (None, 3))
-        _freeze(self, "triangles", np.uint32, (None, 3))
+        freeze(self, "vertices_m", np.float32, (None, 3))
+        freeze(self, "triangles", np.uint32, (None, 3))
 
     @staticmethod
     def join(meshes: Iterable[Mesh]) -> Mesh:
@@ -66,7 +66,7 @@ def prism(outline_m: F64, bottom_m: float, top_m: float) -> Mesh:
 
 
 def _runs(mask: BoolGrid) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Maximal runs of True along the rows: row, first column, column behind the last."""
+    """Maximal runs of True along the rows: row, first column, column after the last."""
     padded = np.pad(mask, ((0, 0), (1, 1)))
     rows, starts = np.nonzero(padded[:, 1:] & ~padded[:, :-1])
     _, ends = np.nonzero(~padded[:, 1:] & padded[:, :-1])
@@ -76,9 +76,9 @@ def _runs(mask: BoolGrid) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray
 def extrude(grid: OccupancyGrid, height_m: float) -> Mesh:
     """Walls where the grid is occupied, and a floor (z = 0) and ceiling over its whole extent.
 
-    Only faces between an occupied and another cell are made, and faces in one line are one face: a
-    building of a million cells has some ten thousand of them. Walls reach the ceiling, so they need no
-    lids. Unknown cells are empty space.
+    Faces are made only between an occupied and another cell, and faces in one line are joined: a building of
+    a million cells has about ten thousand. Walls reach the ceiling, so they have no top. Unknown cells are
+    empty.
     """
     solid = np.pad(grid.occupied, 1)
     along_x = _runs(solid[1:, 1:-1] != solid[:-1, 1:-1])
@@ -100,7 +100,7 @@ def extrude(grid: OccupancyGrid, height_m: float) -> Mesh:
 
 
 class Scene:
-    """Casts rays into a mesh (Open3D RaycastingScene, Embree). Loads Open3D when made."""
+    """Casts rays into a mesh (Open3D RaycastingScene, Embree). The constructor loads Open3D."""
 
     def __init__(self, mesh: Mesh) -> None:
         import open3d as o3d
@@ -108,7 +108,7 @@ class Scene:
         tensor: Any = o3d.core.Tensor
         self._tensor = tensor
         self._scene: Any = o3d.t.geometry.RaycastingScene()
-        # Open3D's tensors do not take read-only memory.
+        # Open3D's tensors need writable memory.
         self._scene.add_triangles(tensor(mesh.vertices_m.copy()), tensor(mesh.triangles.copy()))
 
     def cast(self, rays: F32) -> F32:
@@ -116,3 +116,8 @@ class Scene:
         first hit, inf without one."""
         hits: F32 = self._scene.cast_rays(self._tensor.from_numpy(rays))["t_hit"].numpy()
         return hits
+
+    def cast_with_normals(self, rays: F32) -> tuple[F32, F32]:
+        """The same, and the unit normals (N, 3) of the surfaces that were hit, on either side."""
+        found = self._scene.cast_rays(self._tensor.from_numpy(rays))
+        return found["t_hit"].numpy(), found["primitive_normals"].numpy()

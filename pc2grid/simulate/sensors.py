@@ -1,4 +1,4 @@
-"""The three sensors: where their rays go, when, and what comes back."""
+"""The three sensors: directions and times of their rays, and noise and losses of their readings."""
 
 from __future__ import annotations
 
@@ -7,19 +7,23 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pc2grid.geometry import F64
-from pc2grid.model import F32, SensorKind, _freeze
+from pc2grid.arrays import F32, F64, freeze
+from pc2grid.model import SensorKind
 from pc2grid.simulate.config import DepthConfig, LaserConfig, LidarConfig, SimulationConfig
 
 OPTICAL = np.array([(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
 """R_body_optical (REP-103): z forward, x right, y down, in body axes."""
 
 
+# A neighbour whose depth differs by more than this share of the depth and this distance is a depth jump.
+_JUMP_SHARE, _JUMP_M = 0.1, 0.1
+
+
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """A bundle of rays that is cast again and again.
+    """A sensor as the rays that it casts in each scan.
 
-    kind, frame : what it is; the name of its frame.
+    kind : of the sensor. frame : name of its frame.
     T_base_sensor : (4, 4) mounting.
     rate_hz : scans per second.
     directions : (R, 3) in the sensor frame; a reading times its direction is the point. Unit vectors for
@@ -38,12 +42,12 @@ class Sensor:
     image: tuple[int, int] | None = field(default=None)
 
     def __post_init__(self) -> None:
-        _freeze(self, "T_base_sensor", np.float64, (4, 4))
-        _freeze(self, "directions", np.float64, (None, 3))
-        _freeze(self, "offsets_s", np.float64, (len(self.directions),))
+        freeze(self, "T_base_sensor", np.float64, (4, 4))
+        freeze(self, "directions", np.float64, (None, 3))
+        freeze(self, "offsets_s", np.float64, (len(self.directions),))
 
     def measure(self, true_m: F32, rng: np.random.Generator) -> F32:
-        """True distances (R,), inf for none, to readings (R,) float32 with NaN where nothing comes back."""
+        """True distances (R,), inf for none, to readings (R,) float32, NaN without a return."""
         if isinstance(self.config, DepthConfig):
             return _measure_depth(true_m, self.config, rng)
         noise = rng.standard_normal(len(true_m), dtype=np.float32) * np.float32(self.config.noise_m)
@@ -54,7 +58,7 @@ class Sensor:
 
 
 def _measure_depth(true_m: F32, config: DepthConfig, rng: np.random.Generator) -> F32:
-    """Noise that grows with the square of the depth, holes at jumps, whole millimetres as cameras send."""
+    """Noise that grows with the square of the depth, losses at depth jumps, rounding to millimetres."""
     from scipy import ndimage
 
     depth = np.where(np.isfinite(true_m), true_m, 0).astype(np.float32)
@@ -62,7 +66,7 @@ def _measure_depth(true_m: F32, config: DepthConfig, rng: np.random.Generator) -
     lost = np.full(len(depth), config.dropout, np.float32)
     image = depth.reshape(config.height, config.width)
     near, far = ndimage.minimum_filter(image, 3), ndimage.maximum_filter(image, 3)
-    lost[((far - near) > 0.1 * image + 0.1).ravel()] = config.edge_dropout
+    lost[((far - near) > _JUMP_SHARE * image + _JUMP_M).ravel()] = config.edge_dropout
     noise = rng.standard_normal(len(depth), dtype=np.float32) * spread
     reading = np.round((depth + noise) * 1000) / np.float32(1000)
     kept = rng.random(len(depth), dtype=np.float32) >= lost
@@ -77,7 +81,7 @@ def _mount(xyz_m: tuple[float, float, float]) -> F64:
 
 
 def lidar(config: LidarConfig) -> Sensor:
-    """Columns of beams, fired one after the other while the head turns once; stamp = first column."""
+    """Columns of beams, fired one after another during one turn; the stamp is that of the first column."""
     azimuth = np.arange(config.columns) * (2 * math.pi / config.columns) - math.pi
     top = math.radians(config.elevation_deg) if config.beams > 1 else 0.0
     elevation = np.linspace(-top, top, config.beams)
@@ -88,7 +92,7 @@ def lidar(config: LidarConfig) -> Sensor:
 
 
 def laser(config: LaserConfig) -> Sensor:
-    """One level row from right to left, fired while the mirror turns; stamp = first ray."""
+    """One horizontal row of rays from right to left, one after another; the stamp is that of the first."""
     count = round(config.field_deg / config.step_deg) + 1
     angle = laser_angle_min(config) + np.arange(count) * math.radians(config.step_deg)
     directions = np.column_stack((np.cos(angle), np.sin(angle), np.zeros(count)))

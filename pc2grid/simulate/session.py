@@ -1,4 +1,4 @@
-"""One simulated session: a building, things in it, a drive, and what a sensor saw."""
+"""One simulated session: a building with clutter, a drive through it, and the readings of a sensor."""
 
 from __future__ import annotations
 
@@ -7,25 +7,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.geometry import F64, SE2
-from pc2grid.model import F32, OccupancyGrid, Scan, SensorKind
-from pc2grid.simulate.clutter import Piece, covered, place_clutter
+from pc2grid.arrays import F32, F64
+from pc2grid.geometry import SE2
+from pc2grid.model import OccupancyGrid, Scan, SensorKind
+from pc2grid.simulate.building import Building
+from pc2grid.simulate.change import NO_CHANGE, Change, change_building
+from pc2grid.simulate.clutter import Furniture, covered, place_clutter
 from pc2grid.simulate.config import SimulationConfig
 from pc2grid.simulate.drive import Drive, drive_along
 from pc2grid.simulate.floorplan import office_floorplan
 from pc2grid.simulate.odometry import Odometry, odometry_of
+from pc2grid.simulate.panes import Panes
 from pc2grid.simulate.route import plan_route
 from pc2grid.simulate.scene import Mesh, Scene, extrude
 from pc2grid.simulate.sensors import Sensor, make_sensor
 from pc2grid.simulate.walkers import Walker, send_walkers
 
 EPOCH_NS = 1_700_000_000_000_000_000
-"""Every session starts at the same moment, so that the same seed gives the same bytes."""
+"""Stamp of the start of every session; constant, so that the same seed gives the same bytes."""
 
-RAYS_PER_CAST = 300_000
+RAYS_PER_CAST = 300_000  # bounds the memory of one call of the ray caster
 
-# Independent streams of random numbers: more clutter must not change the noise.
-_CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE, _WALKERS = range(6)
+# Each purpose has its own stream of random numbers, so that more clutter does not change the noise.
+_CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE, _WALKERS, _CHANGE, _PANES = range(8)
+_BUILDING = 0xB011D  # stream of what belongs to the building, whatever the session
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +38,7 @@ class Reading:
     """What the sensor measured in one scan.
 
     index : number of the scan. time_s : of its stamp, since the session's start. values_m : (R,) float32, one
-    per ray, NaN where nothing came back.
+    per ray, NaN for a ray without a return.
     """
 
     index: int
@@ -48,20 +53,29 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """All that a session's seed decides, before the first ray is cast.
+    """Everything that the seed of a session determines, before the first ray is cast.
 
-    grid : the true floor plan. pieces : the clutter in it. walkers : people on their way.
+    grid : the true floor plan. clutter : movable objects in it. walkers : people who walk.
     drive : true motion in the plan's map frame.
     odometry : None when switched off. scan_count : scans of the sensor during the drive.
+    shell : geometry of a real building; None where the plan is extruded.
+    change : what differs from the building as drawn; `grid` is the plan after the change.
     """
 
     sensor: Sensor
     grid: OccupancyGrid
-    pieces: tuple[Piece, ...]
+    clutter: tuple[Furniture, ...]
     walkers: tuple[Walker, ...]
     drive: Drive
     odometry: Odometry | None
     config: SimulationConfig
+    shell: Mesh | None = None
+    change: Change = NO_CHANGE
+
+    @property
+    def objects(self) -> tuple[Furniture, ...]:
+        """All that stands in the plan: the clutter, and what the change has added."""
+        return (*self.clutter, *self.change.added)
 
     @property
     def scan_count(self) -> int:
@@ -69,15 +83,16 @@ class Session:
         return max(int(self.drive.duration_s * self.sensor.rate_hz), 1)
 
     def mesh(self) -> Mesh:
-        """Building and clutter as triangles in the map frame."""
-        return Mesh.join(
-            [extrude(self.grid, self.config.wall_height_m), *(piece.mesh() for piece in self.pieces)]
-        )
+        """Building and objects as triangles in the map frame."""
+        shell = extrude(self.grid, self.config.wall_height_m) if self.shell is None else self.shell
+        return Mesh.join([shell, *(furniture.mesh() for furniture in self.objects)])
 
     def readings(self) -> Iterator[Reading]:
-        """Cast all scans, many per call, each ray from where the robot is at its own time."""
+        """Cast all scans, several in a call; each ray starts at the robot's pose at the time of the ray."""
         sensor = self.sensor
         scene = Scene(self.mesh())
+        kind = self.change.kind
+        panes = None if kind is None else Panes(scene, self.grid, kind, self.config.change.glass_return)
         T = sensor.T_base_sensor
         directions = sensor.directions @ T[:3, :3].T
         batch = max(RAYS_PER_CAST // len(directions), 1)
@@ -86,7 +101,12 @@ class Session:
             times_s = indices[:, None] / sensor.rate_hz + sensor.offsets_s
             poses = self.drive.at(times_s)
             rays = _rays(poses, T[:3, 3], directions)
-            true_m = scene.cast(rays.reshape(-1, 6)).reshape(times_s.shape)
+            flat = rays.reshape(-1, 6)
+            if panes is None:
+                true_m = scene.cast(flat).reshape(times_s.shape)
+            else:
+                pane_rng = np.random.default_rng([self.config.seed, _PANES, first])
+                true_m = panes.cast(flat, pane_rng).reshape(times_s.shape)
             for walker in self.walkers:
                 true_m = np.minimum(true_m, walker.hits(rays, times_s, poses[:, 0, :2]))
             for index, ranges in zip(indices, true_m, strict=True):
@@ -94,7 +114,7 @@ class Session:
                 yield Reading(int(index), float(index) / sensor.rate_hz, sensor.measure(ranges, rng))
 
     def scan(self, reading: Reading) -> Scan:
-        """A reading as the scan that `pc2grid.io` would make of it."""
+        """A reading as the scan that `pc2grid.io` decodes from the recording."""
         sensor = self.sensor
         T = sensor.T_base_sensor
         kept = np.isfinite(reading.values_m)
@@ -138,38 +158,56 @@ def _rays(poses: F64, mount_m: F64, directions: F64) -> F32:
 
 
 def prepare_session(
-    *, sensor: SensorKind, grid: OccupancyGrid | None = None, config: SimulationConfig | None = None
+    *,
+    sensor: SensorKind,
+    grid: OccupancyGrid | Building | None = None,
+    config: SimulationConfig | None = None,
 ) -> Session:
-    """Furnish the building, plan the drive and its odometry.
+    """Place the clutter, plan the drive and compute its odometry.
 
-    grid : the floor plan; None for the procedural office of `config.building_seed`.
-    Raises ConfigError when the robot has no room, or none at the given start.
+    grid : the floor plan, or a real building; None for the procedural office of `config.building_seed`.
+    Raises ConfigError if there is no room for the robot in the building, or at the given start.
     """
     config = config or SimulationConfig()
-    plan = office_floorplan(config.building_seed) if grid is None else grid
+    building = office_floorplan(config.building_seed) if grid is None else grid
+    plan, shell = (building, None) if isinstance(building, OccupancyGrid) else (building.plan, building.shell)
 
     def stream(number: int) -> np.random.Generator:
         return np.random.default_rng([config.seed, number])
 
-    pieces = place_clutter(
+    plan, shell, change = change_building(
+        plan,
+        shell,
+        config.change,
+        stream(_CHANGE),
+        np.random.default_rng([config.building_seed, _BUILDING]),
+        robot_m=config.drive.clearance_m,
+        start_m=config.start_m,
+    )
+    clutter = place_clutter(
         plan,
         config.clutter,
         stream(_CLUTTER),
         robot_m=config.drive.clearance_m,
         keep_free_m=() if config.start_m is None else (config.start_m,),
     )
-    blocked, clearance_m = covered(plan, pieces), config.drive.clearance_m
+    blocked, clearance_m = covered(plan, (*clutter, *change.added)), config.drive.clearance_m
     route = plan_route(
         plan, blocked, config.length_m, start_m=config.start_m, least_m=clearance_m, rng=stream(_ROUTE)
     )
     drive = drive_along(route, config.drive, stream(_DRIVE))
     walkers = send_walkers(plan, blocked, config.walkers, drive.duration_s, stream(_WALKERS))
     odometry = odometry_of(drive, config.odometry, stream(_ODOMETRY)) if config.odometry.enabled else None
-    return Session(make_sensor(sensor, config), plan, pieces, walkers, drive, odometry, config)
+    return Session(
+        make_sensor(sensor, config), plan, clutter, walkers, drive, odometry, config, shell, change
+    )
 
 
 def iter_session(
-    *, sensor: SensorKind, grid: OccupancyGrid | None = None, config: SimulationConfig | None = None
+    *,
+    sensor: SensorKind,
+    grid: OccupancyGrid | Building | None = None,
+    config: SimulationConfig | None = None,
 ) -> Iterator[tuple[Scan, SE2]]:
     """A session in memory: each scan with the true T_map_base at its stamp.
 

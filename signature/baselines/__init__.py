@@ -1,6 +1,6 @@
 """The paper's method and its six rivals (paper IV-A) behind one protocol.
 
-A method is fitted to the submaps of a map and then asked, for a query, how alike it is to each of them.
+A method is fitted to the submaps of a map. Then it compares queries with each of them.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-from pc2grid.geometry import F64
+from pc2grid.arrays import F64
 from pc2grid.model import Submap
 
 if TYPE_CHECKING:
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Matcher(Protocol):
-    """A method that has seen a map."""
+    """A method that is fitted to the submaps of a map."""
 
     def similarities(self, query: Submap) -> F64:
-        """How alike the query is to each of the N submaps fitted: (N,), larger is more alike, never NaN."""
+        """Similarity of the query to each of the N fitted submaps: (N,), larger is more alike, never NaN."""
         ...
 
 
@@ -29,7 +29,7 @@ class Method(Protocol):
     """A way to describe and compare submaps."""
 
     def fit(self, submaps: Sequence[Submap]) -> Matcher:
-        """Describe the submaps of a map, and learn what the method learns from them."""
+        """Describe the submaps of a map and learn from them what the method needs, such as a vocabulary."""
         ...
 
 
@@ -51,15 +51,15 @@ EXTRA_METHOD_NAMES = ("point_contexts", "shape_rings", "verified")
 def make_methods(names: Iterable[str]) -> dict[str, Method]:
     """Methods by name, with the paper's parameters.
 
-    Methods on the same local features share them when they are made together, so that evaluating them
-    side by side extracts the features of a submap once. Raises KeyError for a name that is not known.
+    Methods with the same local features share them when they are made together, so that the features of a
+    submap are extracted once. Raises KeyError for a name that is not known.
     """
     vocabularies: dict[str, Vocabulary] = {}
     return {name: _make(name, vocabularies) for name in names}
 
 
 def _make(name: str, vocabularies: dict[str, Vocabulary]) -> Method:
-    # Imports are here because each method brings a library that the others do not need.
+    # Imported here because each method needs a library that the others do not need.
     if name == "proposed":
         from signature.baselines.proposed import Proposed
 

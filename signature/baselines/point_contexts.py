@@ -1,28 +1,28 @@
 """Shape Context as its authors use it (Belongie et al. 2002): a context for each of many boundary points.
 
-Not in the paper's tables, which speak of one shape for the whole submap (`shape_context`). It is here because
-a fair comparison has to name the strongest form of a rival.
+It is not in the paper's tables, which use one shape for the whole submap (`shape_context`). It is here
+because a fair comparison contains the strongest form of a rival.
 
-A point's context is the log-polar histogram of where the other boundary points lie. Turned submaps are
-made comparable by measuring angles from the direction towards the centroid of the boundary. Two submaps
-are compared by representative contexts (Mori, Belongie and Malik 2005): some of the query's contexts, each
-against the one of the other submap that fits best, by the chi-square statistic. This is what the full
-assignment of all points costs too much for: every query meets every submap.
+The context of a point is the log-polar histogram of the places of the other boundary points. Angles are
+measured from the direction towards the centroid of the boundary, so that contexts do not change when a
+submap is turned. Two submaps are compared by representative contexts (Mori, Belongie and Malik 2005): some
+contexts of the query, each with the context of the other submap that fits best, by the chi-square
+statistic. A full assignment of all points would cost too much, as every query is compared with every
+submap.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F64
-from pc2grid.model import F32, Submap
-from pc2grid.skeleton import cells_of, sample_evenly, thin
+from pc2grid.arrays import F32, F64
+from pc2grid.model import Submap
+from pc2grid.submaps.sampling import sample_evenly
+from pc2grid.submaps.skeleton import cells_of, thin
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,9 +30,10 @@ class PointContexts:
     """Parameters; bins as in the paper.
 
     centers : points of a submap that get a context (Belongie et al. use 100).
-    representatives : contexts of the query that are looked for.
-    spacing_m : least distance of the boundary points that a context counts.
-    inner_m : radius of the innermost ring; rings grow by a constant factor up to the submap's diameter.
+    representatives : contexts of the query that are compared.
+    spacing_m : least distance of the boundary points that a context counts; chosen by hand.
+    inner_m : radius of the innermost ring; rings grow by a constant factor up to the submap's diameter;
+        chosen by hand.
     """
 
     angular_bins: int = 24
@@ -50,7 +51,7 @@ class PointContexts:
         return _Contexts(self, np.concatenate([np.empty((0, bins), np.float32), *tables]), starts)
 
     def contexts(self, submap: Submap, count: int) -> F32:
-        """Contexts (K, angular * radial), K <= count, each of sum 1, around evenly chosen boundary points."""
+        """Contexts (K, radial * angular), K <= count, each of sum 1, around evenly chosen boundary points."""
         resolution = submap.grid.resolution_m
         cells = sample_evenly(cells_of(thin(submap.grid.occupied)), self.spacing_m / resolution)
         points = (cells[:, ::-1] * resolution).astype(np.float64)
@@ -58,8 +59,7 @@ class PointContexts:
             return np.empty((0, self.angular_bins * self.radial_bins), np.float32)
         chosen = np.linspace(0, len(points) - 1, min(count, len(points))).astype(np.int64)
         rings = np.geomspace(self.inner_m, 2 * submap.radius_m, self.radial_bins)
-        histograms: F32 = _histograms(points, points[chosen], rings, self.angular_bins)
-        return histograms
+        return _histograms(points, points[chosen], rings, self.angular_bins)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,46 +73,32 @@ class _Contexts:
         return np.asarray(-_mean_best_costs(wanted, self.table, self.starts))
 
 
-@numba.njit(cache=True)
-def _histograms(points: F64, centers: F64, rings: F64, angular_bins: int) -> NDArray[np.float32]:
-    out = np.zeros((len(centers), len(rings) * angular_bins), np.float32)
-    middle_x, middle_y = points[:, 0].mean(), points[:, 1].mean()
-    share = np.float32(1.0 / (len(points) - 1))
-    for i in range(len(centers)):
-        x, y = centers[i]
-        front = math.atan2(middle_y - y, middle_x - x)
-        for j in range(len(points)):
-            dx, dy = points[j, 0] - x, points[j, 1] - y
-            if dx == 0.0 and dy == 0.0:
-                continue
-            ring = min(int(np.searchsorted(rings, math.sqrt(dx * dx + dy * dy))), len(rings) - 1)
-            turn = ((math.atan2(dy, dx) - front) / (2 * math.pi)) % 1.0
-            sector = ring * angular_bins + int(turn * angular_bins) % angular_bins
-            out[i, sector] += share
-    return out
+def _histograms(points: F64, centers: F64, rings: F64, angular_bins: int) -> F32:
+    """Shares of the other points (N, 2), by ring and sector around each centre: (K, radial * angular)."""
+    x, y = np.moveaxis(points - centers[:, None], -1, 0)
+    towards_x, towards_y = (points.mean(axis=0) - centers).T
+    front = np.arctan2(towards_y, towards_x)[:, None]
+    ring = np.minimum(np.searchsorted(rings, np.hypot(x, y)), len(rings) - 1)
+    turn = (np.arctan2(y, x) - front) / (2 * np.pi) % 1.0
+    sector = (turn * angular_bins).astype(np.int64) % angular_bins
+    bins = len(rings) * angular_bins
+    at = np.arange(len(centers))[:, None] * bins + ring * angular_bins + sector
+    others = (x != 0.0) | (y != 0.0)
+    counts = np.bincount(at[others], minlength=len(centers) * bins).reshape(len(centers), bins)
+    return np.asarray(counts / (len(points) - 1), np.float32)
 
 
-@numba.njit(cache=True, fastmath=True)
-def _mean_best_costs(
-    wanted: NDArray[np.float32], table: NDArray[np.float32], starts: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Mean over the wanted contexts of the least chi-square cost in each submap; 1 without any."""
-    n = len(starts) - 1
-    costs = np.ones(n)
-    for s in range(n):
-        if starts[s] == starts[s + 1] or len(wanted) == 0:
-            continue
-        total = 0.0
-        for i in range(len(wanted)):
-            a = wanted[i]
-            best = 2.0
-            for j in range(starts[s], starts[s + 1]):
-                b = table[j]
-                cost = np.float32(0.0)
-                for k in range(len(a)):
-                    difference = a[k] - b[k]
-                    cost += difference * difference / (a[k] + b[k] + np.float32(1e-12))
-                best = min(best, float(cost))
-            total += best
-        costs[s] = 0.5 * total / len(wanted)
+def _mean_best_costs(wanted: F32, table: F32, starts: NDArray[np.int64]) -> F64:
+    """Chi-square cost (N,), 0 .. 1, of each submap: the mean over the wanted contexts of the least cost.
+
+    wanted (K, B), table (M, B): contexts; submap s has the rows starts[s] to starts[s + 1] of the table.
+    Without any context on either side the cost is 1.
+    """
+    from sklearn.metrics.pairwise import additive_chi2_kernel
+
+    costs = np.ones(len(starts) - 1)
+    if len(wanted) and len(table):
+        pairs = -0.5 * additive_chi2_kernel(wanted, table)
+        filled = np.flatnonzero(np.diff(starts))
+        costs[filled] = np.minimum.reduceat(pairs, starts[filled], axis=1).mean(axis=0)
     return costs

@@ -1,11 +1,11 @@
-"""The paper's own method as a `Method`, for its comparison with the others."""
+"""The paper's own method as a `Method`, for the comparison with the others."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from pc2grid.geometry import F64
+from pc2grid.arrays import F64
 from pc2grid.model import Submap
 from signature.config import SignatureConfig
 from signature.describe import describe

@@ -1,31 +1,34 @@
 """Free-space features: global localization in distance function maps (Millane et al., IROS 2019).
 
-The distance function D of a submap tells, of every place, how far the nearest wall is. Where it is strongly
-curved in two directions (peaks in the middle of rooms, saddles in doors, creases in corners) are keypoints;
-each is described by which way D falls around it (SIFT's orientation histograms over D's gradient) and by
-how large D is on average, so that wide places do not match narrow ones. Two submaps are as alike as the
-share of keypoints that one rigid motion, found by RANSAC, brings together.
+The distance function D of a submap is the distance of every place to the nearest wall. Keypoints are the
+places where D is strongly curved in two directions: peaks in the middle of rooms, saddles in doors, creases
+in corners. A keypoint is described by the directions of D's gradient around it (SIFT's orientation
+histograms) and by the mean of D, so that wide places do not match narrow ones. The similarity of two
+submaps is the share of keypoints that one rigid motion, found by RANSAC, brings together.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import cv2
-import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from pc2grid.geometry import F64
-from pc2grid.model import F32, Submap
-from pc2grid.skeleton import cells_of
+from pc2grid.arrays import F32, F64, I64, BoolGrid
+from pc2grid.model import Submap
+from pc2grid.submaps.skeleton import cells_of
 
-I32 = NDArray[np.int32]
+_GRID, _ORIENTATIONS = 4, 8
+"""SIFT's layout (Lowe 2004): 4 x 4 fields with 8 directions each."""
 
-_GRID, _ORIENTATIONS = 4, 8  # SIFT's layout: 4 x 4 fields of 8 directions
+_DIRECTION_BINS = 36
+"""Of the histogram in which a keypoint's own direction is found (Lowe 2004)."""
+
+_LEAST_PAIR_M = 1.0
+"""Two matches nearer to each other than this do not determine a rotation well enough; chosen by hand."""
 
 
 class Features(NamedTuple):
@@ -41,17 +44,18 @@ class Features(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DistanceFeatures:
-    """Parameters of the method.
+    """Parameters of the method; all but the first are chosen by hand.
 
-    max_keypoints : the most curved ones are kept (200 in the letter's comparison).
-    smooth_m : Gaussian on D before it is differentiated; D has creases, whose curvature is not finite.
+    max_keypoints : the most curved ones are kept (200: paper IV-A).
+    smooth_m : standard deviation of the Gaussian on D before it is differentiated, as creases have no
+        finite curvature.
     apart_m : a keypoint is the most curved place within this distance.
     orient_m : radius in which the keypoint's own direction is found.
     window_m : half the width of the square that is described.
     sample_m : step of the samples in it.
     distance_weight : of the mean distance in metres against the orientation part of length 1.
-    inlier_m : matched keypoints this near after the motion agree with it.
-    iterations : pairs of matches that RANSAC tries a submap.
+    inlier_m : matched keypoints this near to each other after the motion agree with it.
+    iterations : pairs of matches that RANSAC tries for each submap.
     """
 
     max_keypoints: int = 200
@@ -83,25 +87,21 @@ class DistanceFeatures:
         keypoints = self._keypoints(distance, submap)
         gradient_y, gradient_x = (np.asarray(g, np.float32) for g in np.gradient(distance, resolution))
         directions = _directions(keypoints, gradient_x, gradient_y, self.orient_m / resolution)
-        descriptors = _descriptors(
-            keypoints,
-            directions,
-            distance,
-            gradient_x,
-            gradient_y,
-            self.window_m / resolution,
-            self.sample_m / resolution,
-            self.distance_weight,
-        )
+        window, step = self.window_m / resolution, self.sample_m / resolution
+        shares = _orientation_shares(keypoints, directions, gradient_x, gradient_y, window, step)
+        mean_m = _mean_distances(keypoints, directions, distance, window, step)
+        descriptors = np.column_stack((shares, self.distance_weight * mean_m)).astype(np.float32)
         return Features((keypoints[:, ::-1] * resolution).astype(np.float32), descriptors)
 
-    def _keypoints(self, distance: F32, submap: Submap) -> NDArray[np.int64]:
+    def _keypoints(self, distance: F32, submap: Submap) -> I64:
         """Cells (K, 2) where |det Hessian of D| is a local maximum in known free space."""
+        import cv2
+
         resolution = submap.grid.resolution_m
         dy, dx = np.gradient(distance, resolution)
         (dyy, dyx), (dxy, dxx) = np.gradient(dy, resolution), np.gradient(dx, resolution)
         curvature = np.abs(dxx * dyy - dxy * dyx).astype(np.float32)
-        # Next to a wall D's own kink is all there is to see.
+        # Next to a wall the curvature is that of D's kink at the wall.
         curvature[~submap.grid.free | (distance < 2 * self.smooth_m)] = 0.0
         width = 2 * round(self.apart_m / resolution) + 1
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
@@ -112,7 +112,9 @@ class DistanceFeatures:
 
 
 def distance_function(submap: Submap, smooth_m: float) -> F32:
-    """D (H, W) in metres: distance to the nearest occupied cell, smoothed; unknown counts as passable."""
+    """D (H, W) in metres: distance to the nearest occupied cell, smoothed; unknown cells are no walls."""
+    import cv2
+
     resolution = submap.grid.resolution_m
     cells = cv2.distanceTransform((~submap.grid.occupied).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(cv2.GaussianBlur(cells, (0, 0), smooth_m / resolution) * resolution, np.float32)
@@ -123,153 +125,137 @@ class _FeatureTable:
     method: DistanceFeatures
     places_m: F32
     descriptors: F32
-    starts: NDArray[np.int64]
+    starts: I64
 
     def similarities(self, query: Submap) -> F64:
         wanted = self.method.features(query)
         n = len(self.starts) - 1
         if len(wanted.places_m) == 0 or len(self.places_m) == 0:
             return np.zeros(n)
-        # |a - b|^2 without |a|^2, which does not change which b is nearest; added where it does matter.
+        # |a - b|^2 without |a|^2, which is the same for every b and does not change which is the nearest.
         costs = (self.descriptors**2).sum(axis=1) - 2 * (wanted.descriptors @ self.descriptors.T)
         nearest = _nearest(costs, self.starts)
-        inliers = np.array(
-            [
-                _consensus(
-                    wanted.places_m[nearest[:, s] >= 0],
-                    self.places_m[nearest[nearest[:, s] >= 0, s]],
-                    self.method.inlier_m,
-                    self.method.iterations,
-                )
-                for s in range(n)
-            ]
-        )
-        # The larger of both counts: a bare submap must not look like everything it is a part of.
+        inliers = np.array([self._agreeing(wanted, column[column >= 0], column >= 0) for column in nearest.T])
+        # The larger number of keypoints, so that a submap with few is not similar to all that contain it.
         return np.asarray(inliers / np.maximum(len(wanted.places_m), np.diff(self.starts)))
 
-
-@numba.njit(cache=True)
-def _directions(
-    keypoints: NDArray[np.int64], gx: NDArray[np.float32], gy: NDArray[np.float32], radius: float
-) -> NDArray[np.float64]:
-    """Dominant direction of the gradient around each keypoint, radians (K,)."""
-    bins = 36
-    out = np.empty(len(keypoints))
-    reach = int(radius)
-    for i in range(len(keypoints)):
-        votes = np.zeros(bins)
-        r0, c0 = keypoints[i]
-        for r in range(max(r0 - reach, 0), min(r0 + reach + 1, gx.shape[0])):
-            for c in range(max(c0 - reach, 0), min(c0 + reach + 1, gx.shape[1])):
-                d2 = (r - r0) ** 2 + (c - c0) ** 2
-                if d2 <= radius * radius:
-                    x, y = gx[r, c], gy[r, c]
-                    weight = math.sqrt(x * x + y * y) * math.exp(-2.0 * d2 / (radius * radius))
-                    turn = (math.atan2(y, x) / (2 * math.pi)) % 1.0 * bins
-                    low = int(turn)
-                    votes[low % bins] += weight * (1 - (turn - low))
-                    votes[(low + 1) % bins] += weight * (turn - low)
-        smooth = np.empty(bins)
-        for k in range(bins):
-            smooth[k] = votes[k - 1] + 2 * votes[k] + votes[(k + 1) % bins]
-        k = int(np.argmax(smooth))
-        before, at, after = smooth[k - 1], smooth[k], smooth[(k + 1) % bins]
-        bend = before - 2 * at + after
-        shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
-        out[i] = (k + shift) * 2 * math.pi / bins
-    return out
+    def _agreeing(self, wanted: Features, matches: I64, matched: BoolGrid) -> int:
+        """How many of the matches of the wanted keypoints one rigid motion explains."""
+        return _consensus(
+            wanted.places_m[matched], self.places_m[matches], self.method.inlier_m, self.method.iterations
+        )
 
 
-@numba.njit(cache=True)
-def _descriptors(
-    keypoints: NDArray[np.int64],
-    directions: NDArray[np.float64],
-    distance: NDArray[np.float32],
-    gx: NDArray[np.float32],
-    gy: NDArray[np.float32],
-    window: float,
-    step: float,
-    distance_weight: float,
-) -> NDArray[np.float32]:
-    """Orientation histograms on a 4 x 4 grid turned with the keypoint, and the mean distance: (K, 129)."""
-    out = np.zeros((len(keypoints), _GRID * _GRID * _ORIENTATIONS + 1), np.float32)
+def _turns(gx: F32, gy: F32) -> F64:
+    """Directions (H, W) of a gradient as shares of a turn, 0 .. 1."""
+    return np.asarray(np.arctan2(gy.astype(np.float64), gx) / (2 * math.pi) % 1.0)
+
+
+def _directions(keypoints: I64, gx: F32, gy: F32, radius: float) -> F64:
+    """Main direction (K,), radians, of the gradient (H, W) in the `radius` (cells) of keypoints (K, 2)."""
+    bins, reach = _DIRECTION_BINS, int(radius)
+    down, across = (axis.ravel() for axis in np.mgrid[-reach : reach + 1, -reach : reach + 1])
+    squared = down**2 + across**2
+    near = squared <= radius * radius
+    rows, columns, inside = _cells_inside(
+        keypoints[:, :1] + down[near], keypoints[:, 1:] + across[near], gx.shape
+    )
+    weights = np.hypot(gx, gy)[rows, columns] * np.exp(-2.0 * squared[near] / (radius * radius)) * inside
+    turn = (_turns(gx, gy) * bins)[rows, columns]
+    low = np.floor(turn).astype(np.int64)
+    owner = np.arange(len(keypoints))[:, None] * bins
+    votes = np.zeros(len(keypoints) * bins)
+    for at, share in ((low, 1 - (turn - low)), (low + 1, turn - low)):
+        votes += np.bincount((owner + at % bins).ravel(), (weights * share).ravel(), len(votes))
+    rings = votes.reshape(len(keypoints), bins)
+    smooth = np.roll(rings, 1, axis=1) + 2 * rings + np.roll(rings, -1, axis=1)
+    peak = smooth.argmax(axis=1)
+    before, at_peak, after = (smooth[np.arange(len(smooth)), (peak + k) % bins] for k in (-1, 0, 1))
+    # The vertex of the parabola through the highest vote and its neighbours.
+    bend = before - 2 * at_peak + after
+    shift = np.divide(0.5 * (before - after), bend, out=np.zeros_like(bend), where=bend < 0)
+    return np.asarray((peak + shift) * (2 * math.pi / bins))
+
+
+def _cells_inside(rows: I64, columns: I64, shape: tuple[int, ...]) -> tuple[I64, I64, BoolGrid]:
+    """Cells moved to (0, 0) where they lie outside an image of a shape, and whether they lie inside."""
+    inside = (rows >= 0) & (columns >= 0) & (rows < shape[0]) & (columns < shape[1])
+    return np.where(inside, rows, 0), np.where(inside, columns, 0), inside
+
+
+def _samples(
+    keypoints: I64, directions: F64, shape: tuple[int, ...], window: float, step: float
+) -> tuple[I64, I64, BoolGrid]:
+    """Cells (K, S) of the samples in a square around each keypoint, turned with it; as of `_cells_inside`."""
     half = int(window / step)
-    for i in range(len(keypoints)):
-        c, s = math.cos(directions[i]), math.sin(directions[i])
-        total, count = 0.0, 0
-        for v in range(-half, half + 1):
-            for u in range(-half, half + 1):
-                row = math.floor(keypoints[i, 0] + (s * u + c * v) * step + 0.5)
-                column = math.floor(keypoints[i, 1] + (c * u - s * v) * step + 0.5)
-                if row < 0 or column < 0 or row >= distance.shape[0] or column >= distance.shape[1]:
-                    continue
-                total += distance[row, column]
-                count += 1
-                x, y = gx[row, column], gy[row, column]
-                weight = math.sqrt(x * x + y * y) * math.exp(-0.5 * (u * u + v * v) / (half * half))
-                field_u = (u / (2 * half + 1) + 0.5) * _GRID - 0.5
-                field_v = (v / (2 * half + 1) + 0.5) * _GRID - 0.5
-                turn = ((math.atan2(y, x) - directions[i]) / (2 * math.pi)) % 1.0 * _ORIENTATIONS
-                iu, iv, io = math.floor(field_u), math.floor(field_v), int(turn)
-                for a in range(2):
-                    for b in range(2):
-                        if 0 <= iu + a < _GRID and 0 <= iv + b < _GRID:
-                            share = weight * (1 - abs(field_u - iu - a)) * (1 - abs(field_v - iv - b))
-                            base = ((iv + b) * _GRID + iu + a) * _ORIENTATIONS
-                            out[i, base + io % _ORIENTATIONS] += share * (1 - (turn - io))
-                            out[i, base + (io + 1) % _ORIENTATIONS] += share * (turn - io)
-        length = math.sqrt(np.sum(out[i] ** 2))
-        if length > 0:
-            out[i] /= length
-        out[i, -1] = distance_weight * total / max(count, 1)
-    return out
+    v, u = (axis.ravel() for axis in np.mgrid[-half : half + 1, -half : half + 1])
+    c, s = np.cos(directions)[:, None], np.sin(directions)[:, None]
+    rows = np.floor(keypoints[:, :1] + (s * u + c * v) * step + 0.5).astype(np.int64)
+    columns = np.floor(keypoints[:, 1:] + (c * u - s * v) * step + 0.5).astype(np.int64)
+    return _cells_inside(rows, columns, shape)
 
 
-@numba.njit(cache=True)
-def _nearest(costs: NDArray[np.float32], starts: NDArray[np.int64]) -> NDArray[np.int64]:
+def _mean_distances(keypoints: I64, directions: F64, distance: F32, window: float, step: float) -> F64:
+    """Mean (K,) of D over the samples of each keypoint that lie inside the map."""
+    rows, columns, inside = _samples(keypoints, directions, distance.shape, window, step)
+    sums = (distance.astype(np.float64)[rows, columns] * inside).sum(axis=1)
+    return np.asarray(sums / np.maximum(inside.sum(axis=1), 1))
+
+
+def _orientation_shares(keypoints: I64, directions: F64, gx: F32, gy: F32, window: float, step: float) -> F64:
+    """Orientation histograms (K, 128) of length 1 on 4 x 4 fields that are turned with the keypoint.
+
+    window, step : half the width of the square and the step of its samples, cells. A sample counts in the
+    nearest fields and directions by linear interpolation. All 0 where D does not change.
+    """
+    rows, columns, inside = _samples(keypoints, directions, gx.shape, window, step)
+    half = int(window / step)
+    steps = np.arange(-half, half + 1)
+    centers = (steps / (2 * half + 1) + 0.5) * _GRID - 0.5
+    shares = np.maximum(0.0, 1.0 - np.abs(centers[:, None] - np.arange(_GRID)))
+    fields = np.kron(shares, shares)  # (S, 16): how much each sample counts in each field
+    falloff = np.exp(-0.5 * (steps[:, None] ** 2 + steps**2).ravel() / (half * half))
+    weights = np.hypot(gx, gy)[rows, columns] * falloff * inside
+    turn = (_turns(gx, gy)[rows, columns] - directions[:, None] / (2 * math.pi)) % 1.0 * _ORIENTATIONS
+    found = np.empty((len(keypoints), _GRID * _GRID, _ORIENTATIONS))
+    for k in range(_ORIENTATIONS):
+        apart = np.abs((turn - k + _ORIENTATIONS / 2) % _ORIENTATIONS - _ORIENTATIONS / 2)
+        found[:, :, k] = (weights * np.maximum(0.0, 1.0 - apart)) @ fields
+    histograms = found.reshape(len(keypoints), _GRID * _GRID * _ORIENTATIONS)
+    lengths = np.linalg.norm(histograms, axis=1, keepdims=True)
+    return np.asarray(histograms / np.where(lengths > 0, lengths, 1.0))
+
+
+def _nearest(costs: F32, starts: I64) -> I64:
     """For each wanted keypoint (row) the cheapest of each submap, (K, N); -1 if the submap has none."""
-    n = len(starts) - 1
-    out = np.full((len(costs), n), -1, np.int64)
-    for i in range(len(costs)):
-        for s in range(n):
-            best = np.float32(np.inf)
-            for j in range(starts[s], starts[s + 1]):
-                if costs[i, j] < best:
-                    best = costs[i, j]
-                    out[i, s] = j
+    out = np.full((len(costs), len(starts) - 1), -1, np.int64)
+    for s, (start, stop) in enumerate(itertools.pairwise(starts.tolist())):
+        if stop > start:
+            out[:, s] = start + costs[:, start:stop].argmin(axis=1)
     return out
 
 
-@numba.njit(cache=True)
-def _consensus(a: NDArray[np.float32], b: NDArray[np.float32], inlier_m: float, iterations: int) -> int:
-    """RANSAC: the most matches a[i] ~ b[i] that one rigid motion of the plane explains."""
-    n = len(a)
-    if n < 2:
+def _consensus(a: F32, b: F32, inlier_m: float, iterations: int) -> int:
+    """RANSAC: the most matches a[i] ~ b[i], (M, 2) each, that one rigid motion of the plane explains.
+
+    The motion follows from two matches; the same pairs are drawn on every call.
+    """
+    if len(a) < 2:
         return 0
-    best = 0
-    state = np.uint64(88172645463325252)  # xorshift: the same draws on every call
-    for _ in range(iterations):
-        state ^= state << np.uint64(13)
-        state ^= state >> np.uint64(7)
-        state ^= state << np.uint64(17)
-        i = int((state >> np.uint64(8)) % np.uint64(n))
-        j = int((state >> np.uint64(36)) % np.uint64(n))
-        ax, ay = a[j, 0] - a[i, 0], a[j, 1] - a[i, 1]
-        bx, by = b[j, 0] - b[i, 0], b[j, 1] - b[i, 1]
-        length_a, length_b = math.sqrt(ax * ax + ay * ay), math.sqrt(bx * bx + by * by)
-        # A pair close together says little of the turn; pairs of other length are no rigid motion.
-        if length_a < 1.0 or length_b < 1.0 or abs(length_a - length_b) > 2 * inlier_m:
-            continue
-        scale = 1.0 / (length_a * length_b)
-        c, s = (ax * bx + ay * by) * scale, (ax * by - ay * bx) * scale
-        middle_ax, middle_ay = (a[i, 0] + a[j, 0]) / 2, (a[i, 1] + a[j, 1]) / 2
-        middle_bx, middle_by = (b[i, 0] + b[j, 0]) / 2, (b[i, 1] + b[j, 1]) / 2
-        count = 0
-        for k in range(n):
-            x, y = a[k, 0] - middle_ax, a[k, 1] - middle_ay
-            ex = c * x - s * y + middle_bx - b[k, 0]
-            ey = s * x + c * y + middle_by - b[k, 1]
-            if ex * ex + ey * ey <= inlier_m * inlier_m:
-                count += 1
-        best = max(best, count)
-    return best
+    i, j = np.random.default_rng(0).integers(0, len(a), (2, iterations))
+    along_a, along_b = a[j] - a[i], b[j] - b[i]
+    length_a, length_b = np.hypot(*along_a.T), np.hypot(*along_b.T)
+    # Pairs of different lengths do not follow from a rigid motion.
+    usable = np.minimum(length_a, length_b) >= _LEAST_PAIR_M
+    usable &= np.abs(length_a - length_b) <= 2 * inlier_m
+    if not usable.any():
+        return 0
+    i, j = i[usable], j[usable]
+    # Points as complex numbers: the rotation is the quotient of the directions of both pairs.
+    za, zb = a[:, 0] + 1j * a[:, 1], b[:, 0] + 1j * b[:, 1]
+    rotation = (zb[j] - zb[i]) * np.conj(za[j] - za[i])
+    rotation /= np.abs(rotation)
+    shift = (zb[i] + zb[j]) / 2 - rotation * (za[i] + za[j]) / 2
+    errors = rotation[:, None] * za + shift[:, None] - zb
+    agreeing = errors.real**2 + errors.imag**2 <= inlier_m**2
+    return int(agreeing.sum(axis=1).max())

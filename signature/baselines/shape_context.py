@@ -1,8 +1,8 @@
 """Shape Context of a whole submap: 24 angular, 12 radial bins (paper IV-A, "describes global shapes").
 
 One log-polar histogram of the boundary around the submap's centre (the descriptor of Belongie et al. 2002),
-compared by the chi-square statistic in every of the 24 turns. The paper does not say what it does about
-rotation; `turns=False`, which adds up each ring, comes nearest to its figures.
+compared by the chi-square statistic in every of the 24 turns. The paper does not describe
+how it treats rotation; `turns=False`, which adds up each ring, gives the figures nearest to the paper's.
 """
 
 from __future__ import annotations
@@ -12,16 +12,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.geometry import F64
-from pc2grid.model import F32, Submap
-from pc2grid.skeleton import cells_of, thin
+from pc2grid.arrays import F32, F64
+from pc2grid.model import Submap
+from pc2grid.submaps.skeleton import cells_of, thin
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShapeContext:
     """Bins as in the paper; rings grow by a constant factor from a radius of `inner_m` to the submap's.
 
-    turns : compare in every turn. False: only how much each ring holds, which no turn changes.
+    turns : compare in every turn. False: compare only the share of each ring, which does not change by
+    turning.
+    inner_m : chosen by hand.
     """
 
     angular_bins: int = 24
@@ -64,7 +66,7 @@ class _Shapes:
             turned = np.roll(shape, turn, axis=1)
             total = self.table + turned
             terms = np.divide((self.table - turned) ** 2, total, out=np.zeros_like(total), where=total > 0)
-            # An empty submap shares no bin with any: it keeps the worst cost, 1.
+            # An empty submap shares no bin with any other: its cost is the largest, 1.
             cost = 0.5 * terms.sum(axis=(1, 2)) if shape.any() else np.ones(len(self.table))
             best = np.minimum(best, np.where(self.table.any(axis=(1, 2)), cost, 1.0))
         return -best

@@ -1,28 +1,31 @@
-"""SURF (Bay et al. 2008): mahotas's detector with a descriptor of our own.
+"""SURF (Bay et al. 2008): the detector of mahotas with a descriptor of our own.
 
-OpenCV's wheels refuse SURF. mahotas finds the same points again after a turn (96 % of them after half a
-turn), but its descriptors do not turn with them: only 27 % of the points find themselves. So orientation
-and descriptor are computed here, from Haar wavelets on the integral image as published.
+OpenCV's wheels do not contain SURF. The detector of mahotas finds 96 % of its points again after half a
+turn of the image, but its descriptors do not turn with the points: only 27 % of the points match
+themselves. So orientations and descriptors are computed here, from Haar wavelets on the integral image as
+published.
 """
 
 from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.model import F32
+from pc2grid.arrays import F32, F64, I64
+
+_SECTORS = 36
+"""Directions in which the sector of 60 degrees is tried for the orientation; chosen by hand."""
 
 
 def surf_descriptors(image: NDArray[np.uint8], max_points: int) -> F32:
-    """Up to `max_points` SURF descriptors (K, 64) of length 1, of the strongest points."""
+    """Up to `max_points` SURF descriptors (K, 64) of length 1, of the points with the strongest response."""
     return describe_points(image, interest_points(image, max_points))
 
 
-def interest_points(image: NDArray[np.uint8], max_points: int) -> NDArray[np.float64]:
-    """Points (K, 3) as y, x, scale, pixels; the strongest of mahotas's Fast-Hessian detector."""
+def interest_points(image: NDArray[np.uint8], max_points: int) -> F64:
+    """Points (K, 3) as y, x, scale in pixels; the strongest of mahotas's Fast-Hessian detector."""
     from mahotas.features import surf
 
     if min(image.shape) < 16:  # smaller than the smallest filter
@@ -33,86 +36,64 @@ def interest_points(image: NDArray[np.uint8], max_points: int) -> NDArray[np.flo
     return np.ascontiguousarray(points.reshape(len(points), -1)[:, :3])
 
 
-def describe_points(image: NDArray[np.uint8], points: NDArray[np.float64]) -> F32:
-    """SURF descriptors (K, 64) of points (K, 3) as y, x, scale."""
+def describe_points(image: NDArray[np.uint8], points: F64) -> F32:
+    """SURF descriptors (K, 64) of points (K, 3) as y, x, scale.
+
+    For each of 4 x 4 fields of a square of 20 scales, turned with the point: the sums of dx, dy, |dx|, |dy|
+    of 5 x 5 wavelets. A descriptor has length 1, or 0 where the image does not change.
+    """
     integral = np.zeros((image.shape[0] + 1, image.shape[1] + 1))
     integral[1:, 1:] = image.astype(np.float64).cumsum(axis=0).cumsum(axis=1)
-    descriptors: F32 = _describe(integral, points)
-    return descriptors
+    y, x, scale = points.T[:, :, None]
+    turn = orientations(integral, points)[:, None]
+    c, s = np.cos(turn), np.sin(turn)
+    v, u = (axis.ravel() + 0.5 for axis in np.mgrid[-10:10, -10:10])
+    half = np.maximum(1, np.floor(scale + 0.5)).astype(np.int64)
+    dx, dy = _haar(integral, y + scale * (s * u + c * v), x + scale * (c * u - s * v), half)
+    weights = np.exp(-(u**2 + v**2) / (2 * 3.3**2))
+    along, across = weights * (c * dx + s * dy), weights * (c * dy - s * dx)
+    responses = np.stack((along, across, np.abs(along), np.abs(across)), axis=-1)
+    fields = responses.reshape(len(points), 4, 5, 4, 5, 4).sum(axis=(2, 4))
+    descriptors = fields.reshape(len(points), 64)
+    lengths = np.linalg.norm(descriptors, axis=1, keepdims=True)
+    return np.asarray(descriptors / np.where(lengths > 0, lengths, 1.0), np.float32)
 
 
-@numba.njit(cache=True)
-def _box(integral: NDArray[np.float64], r0: int, c0: int, r1: int, c1: int) -> float:
-    """Sum of the image over rows r0 .. r1 - 1 and columns c0 .. c1 - 1, as far as they are inside."""
+def orientations(integral: F64, points: F64) -> F64:
+    """Directions (K,), radians, in which the wavelets within 6 scales have the largest 60 degree sum."""
+    y, x, scale = points.T
+    i, j = (axis.reshape(-1, 1) for axis in np.mgrid[-6:7, -6:7])
+    near = (i**2 + j**2 < 36)[:, 0]
+    i, j = i[near], j[near]
+    half = np.maximum(1, np.floor(2 * scale + 0.5)).astype(np.int64)
+    dx, dy = _haar(integral, y + i * scale, x + j * scale, half)
+    weights = np.exp(-(i**2 + j**2) / (2 * 2.5 * 2.5))
+    dx, dy = weights * dx, weights * dy
+    angles = np.arctan2(dy, dx)
+    sums = np.empty((_SECTORS, 2, len(points)))
+    for k in range(_SECTORS):
+        ahead = angles - (k * math.pi / (_SECTORS / 2) - math.pi)
+        inside = ((ahead >= 0) & (ahead < math.pi / 3)) | (ahead + 2 * math.pi < math.pi / 3)
+        sums[k] = (dx * inside).sum(axis=0), (dy * inside).sum(axis=0)
+    best = (sums**2).sum(axis=1).argmax(axis=0)
+    sum_x, sum_y = sums[best, :, np.arange(len(points))].T
+    return np.asarray(np.arctan2(sum_y, sum_x))
+
+
+def _haar(integral: F64, y: F64, x: F64, half: I64) -> tuple[F64, F64]:
+    """Haar wavelets in x and y, 2 * half pixels wide, at places y, x; all broadcast with `half`.
+
+    They are 0 where the wavelet would leave the image.
+    """
+    rows, columns = np.floor(y + 0.5).astype(np.int64), np.floor(x + 0.5).astype(np.int64)
     height, width = integral.shape
-    r0, r1 = min(max(r0, 0), height - 1), min(max(r1, 0), height - 1)
-    c0, c1 = min(max(c0, 0), width - 1), min(max(c1, 0), width - 1)
-    return float(integral[r1, c1] - integral[r0, c1] - integral[r1, c0] + integral[r0, c0])
-
-
-@numba.njit(cache=True)
-def _haar(integral: NDArray[np.float64], y: float, x: float, half: int) -> tuple[float, float]:
-    """Haar wavelets in x and y of 2 * half pixels around a place; 0 where they would leave the image."""
-    r, c = math.floor(y + 0.5), math.floor(x + 0.5)
-    if r < half or c < half or r + half >= integral.shape[0] or c + half >= integral.shape[1]:
-        return 0.0, 0.0
-    left = _box(integral, r - half, c - half, r + half, c)
-    right = _box(integral, r - half, c, r + half, c + half)
-    upper = _box(integral, r - half, c - half, r, c + half)
-    lower = _box(integral, r, c - half, r + half, c + half)
+    inside = (rows >= half) & (columns >= half) & (rows + half < height) & (columns + half < width)
+    # Integral image at the nine corners of the four quarters of the wavelet.
+    r = [np.where(inside, rows + step * half, 0) for step in (-1, 0, 1)]
+    c = [np.where(inside, columns + step * half, 0) for step in (-1, 0, 1)]
+    at = [[integral[r[a], c[b]] for b in range(3)] for a in range(3)]
+    left = at[2][1] - at[0][1] - at[2][0] + at[0][0]
+    right = at[2][2] - at[0][2] - at[2][1] + at[0][1]
+    upper = at[1][2] - at[0][2] - at[1][0] + at[0][0]
+    lower = at[2][2] - at[1][2] - at[2][0] + at[1][0]
     return right - left, lower - upper
-
-
-@numba.njit(cache=True)
-def _orientation(integral: NDArray[np.float64], y: float, x: float, s: float) -> float:
-    """Direction in which the wavelets within 6 s sum up the most over a sector of 60 degrees."""
-    half = max(1, math.floor(2 * s + 0.5))
-    angles = np.empty(169)
-    dxs, dys = np.empty(169), np.empty(169)
-    count = 0
-    for i in range(-6, 7):
-        for j in range(-6, 7):
-            if i * i + j * j < 36:
-                weight = math.exp(-(i * i + j * j) / (2 * 2.5 * 2.5))
-                dx, dy = _haar(integral, y + i * s, x + j * s, half)
-                dxs[count], dys[count] = weight * dx, weight * dy
-                angles[count] = math.atan2(dy, dx)
-                count += 1
-    best, direction = -1.0, 0.0
-    for k in range(36):
-        start = k * math.pi / 18 - math.pi
-        sx = sy = 0.0
-        for n in range(count):
-            ahead = angles[n] - start
-            if 0 <= ahead < math.pi / 3 or ahead + 2 * math.pi < math.pi / 3:
-                sx += dxs[n]
-                sy += dys[n]
-        if sx * sx + sy * sy > best:
-            best, direction = sx * sx + sy * sy, math.atan2(sy, sx)
-    return direction
-
-
-@numba.njit(cache=True)
-def _describe(integral: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Sums of dx, dy, |dx|, |dy| over 4 x 4 fields of a square of 20 s, turned with the point."""
-    out = np.zeros((len(points), 64), np.float32)
-    for n in range(len(points)):
-        y, x, s = points[n]
-        turn = _orientation(integral, y, x, s)
-        c, d = math.cos(turn), math.sin(turn)
-        half = max(1, math.floor(s + 0.5))
-        for i in range(-10, 10):
-            for j in range(-10, 10):
-                v, u = (i + 0.5) * s, (j + 0.5) * s
-                dx, dy = _haar(integral, y + d * u + c * v, x + c * u - d * v, half)
-                weight = math.exp(-((i + 0.5) ** 2 + (j + 0.5) ** 2) / (2 * 3.3 * 3.3))
-                along, across = weight * (c * dx + d * dy), weight * (c * dy - d * dx)
-                field = (((i + 10) // 5) * 4 + (j + 10) // 5) * 4
-                out[n, field] += along
-                out[n, field + 1] += across
-                out[n, field + 2] += abs(along)
-                out[n, field + 3] += abs(across)
-        length = math.sqrt(np.sum(out[n] ** 2))
-        if length > 0:
-            out[n] /= length
-    return out

@@ -1,6 +1,6 @@
-"""The paper's method with its answer checked: signatures propose submaps, alignment decides among them.
+"""The paper's method with verification: signatures propose submaps, alignment decides among them.
 
-Not in the paper. It stands beside the others to show what verification adds on the paper's own terms.
+It is not in the paper. It shows what verification adds in the paper's own experiment.
 """
 
 from __future__ import annotations
@@ -11,22 +11,28 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pc2grid.alignment import LikelihoodField, assess, prepare, prepare_query, refine, search, thin_evenly
-from pc2grid.geometry import F64, SE2
+from pc2grid.arrays import F64
+from pc2grid.geometry import SE2
 from pc2grid.model import Submap
 from signature.baselines import Matcher
 from signature.baselines.proposed import Proposed
 from signature.config import SignatureConfig
+from signature.verification.refinement import refine
+from signature.verification.two_way_score import score_fit
+from signature.verification.walls import Walls, thin_evenly
+from signature.verification.window_search import SearchMap, SearchParameters, search_windows
 
 _HALF_T_M, _HALF_A_RAD = 0.5, math.radians(7.5)
 
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """Eq. 6 proposes `candidates` submaps; the query is aligned on each, every heading, `reach_m` around.
+    """Eq. 6 proposes `candidates` submaps; the query is aligned with each of them.
 
-    The similarity is the two-way score of the best pose, given to the submap whose centre is nearest to
-    where that pose puts the query: overlapping submaps fit equally well, but only one of them is the place.
+    All headings and positions up to `reach_m` from the centre of the submap are searched. The similarity is
+    the two-way score of the best pose. It is given to the submap whose centre is nearest to the query at
+    that pose: overlapping submaps fit equally well, but only one of them is the right one. Both numbers are
+    chosen by hand.
     """
 
     config: SignatureConfig = field(default_factory=SignatureConfig)
@@ -37,7 +43,7 @@ class Verified:
         """Describe every submap and prepare it for alignment."""
         return _Verifier(
             proposer=Proposed(self.config).fit(submaps),
-            fields=[prepare(submap.grid) for submap in submaps],
+            maps=[SearchMap.of(submap.grid) for submap in submaps],
             centers_m=np.array([submap.center_m for submap in submaps]),
             candidates=self.candidates,
             reach_m=self.reach_m,
@@ -47,7 +53,7 @@ class Verified:
 @dataclass(frozen=True, slots=True)
 class _Verifier:
     proposer: Matcher
-    fields: list[LikelihoodField]
+    maps: list[SearchMap]
     centers_m: F64
     candidates: int
     reach_m: float
@@ -57,27 +63,26 @@ class _Verifier:
         proposed = self.proposer.similarities(query)
         order = np.argsort(-proposed, kind="stable")
         result = -1.0 - np.argsort(np.argsort(-proposed, kind="stable"), kind="stable") / len(proposed)
-        prepared = prepare_query(query.grid, center_m=(0.0, 0.0))
-        if not len(prepared.walls_m):
+        walls = Walls.of(query.grid)
+        if not len(walls.points_m):
             return np.asarray(result)
-        coarse = prepared.walls_m[thin_evenly(prepared.walls_m, 0.25)]
+        coarse = walls.points_m[thin_evenly(walls.points_m, 0.25)]
         coarse = coarse[np.linspace(0, len(coarse) - 1, min(len(coarse), 160)).astype(int)]
         best = 0.0
         for index in order[: self.candidates]:
-            poses = search(
-                self.fields[index],
+            poses = search_windows(
+                self.maps[index],
                 coarse,
                 self._boxes(self.centers_m[index]),
                 half_t_m=_HALF_T_M,
                 half_a_rad=_HALF_A_RAD,
-                floor=max(0.4, 0.9 * best),
-                keep=0.95,
-                most=2,
+                parameters=SearchParameters(floor=max(0.4, 0.9 * best), keep=0.95, most=2),
             )
             for x, y, yaw, score in poses:
                 best = max(best, float(score))
-                pose, covariance = refine(self.fields[index], prepared, SE2(float(x), float(y), float(yaw)))
-                fit = assess(self.fields[index], prepared, pose, covariance)
+                start = SE2(float(x), float(y), float(yaw))
+                pose, covariance = refine(self.maps[index].field, walls.points_m, start, (0.0, 0.0))
+                fit = score_fit(self.maps[index].walls, walls, pose, covariance)
                 away = np.hypot(*(self.centers_m - (pose.x, pose.y)).T)
                 nearest = int(index if away[index] <= away.min() else np.argmin(away))
                 result[nearest] = max(result[nearest], fit.score)

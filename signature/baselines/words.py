@@ -1,4 +1,4 @@
-"""Bags of visual words: SIFT or SURF features, counted (BoW) or weighed by rarity (TF-IDF) (paper IV-A).
+"""Bags of visual words: SIFT or SURF features, counted (BoW) or weighted by rarity (TF-IDF) (paper IV-A).
 
 At most 300 features a submap, 1024 words. The words are learned from the submaps of the map itself.
 """
@@ -9,12 +9,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F64
-from pc2grid.model import F32, Submap
+from pc2grid.arrays import F32, F64
+from pc2grid.model import Submap
 
 Feature = Callable[[NDArray[np.uint8]], F32]
 
@@ -23,11 +22,14 @@ WORDS = 1024
 
 
 def submap_image(submap: Submap) -> NDArray[np.uint8]:
-    """The submap as the picture (H, W) it is published as: walls black, free white, unknown grey.
+    """The submap as an image (H, W) like the published maps: walls black, free cells white, unknown cells
+    grey.
 
-    Blurred by one cell, as a camera would: without it both features find the stairs that turning leaves in
-    lines one cell wide, and recognise a third less.
+    The image is blurred by one cell. Without the blur both features respond to the steps in slanted lines
+    of one cell, and recognise a third less.
     """
+    import cv2
+
     image = np.full(submap.grid.cells.shape, 127, np.uint8)
     image[submap.grid.free] = 255
     image[submap.grid.occupied] = 0
@@ -35,10 +37,12 @@ def submap_image(submap: Submap) -> NDArray[np.uint8]:
 
 
 def sift(image: NDArray[np.uint8]) -> F32:
-    """Up to 300 SIFT descriptors (K, 128), the ones of strongest contrast; OpenCV's."""
+    """Up to 300 SIFT descriptors (K, 128) of OpenCV, those of the strongest contrast."""
+    import cv2
+
     detector: Any = cv2.SIFT.create(nfeatures=MAX_FEATURES)
     _, descriptors = detector.detectAndCompute(image, None)
-    # OpenCV keeps all that share the last place.
+    # OpenCV returns more than asked for if several have the contrast of the last.
     return (
         np.empty((0, 128), np.float32)
         if descriptors is None
@@ -47,7 +51,7 @@ def sift(image: NDArray[np.uint8]) -> F32:
 
 
 def surf(image: NDArray[np.uint8]) -> F32:
-    """Up to 300 SURF descriptors (K, 64), the ones of strongest response."""
+    """Up to 300 SURF descriptors (K, 64), those of the strongest response."""
     from signature.baselines.surf import surf_descriptors
 
     return surf_descriptors(image, MAX_FEATURES)
@@ -60,8 +64,8 @@ FEATURES: dict[str, Feature] = {"sift": sift, "surf": surf}
 class Vocabulary:
     """1024 words for one kind of feature, learned by k-means.
 
-    Remembers the last map learned and the last submap read, so that methods which share a vocabulary do the
-    work once.
+    The last map and the last submap are cached, so that methods which share a vocabulary extract features
+    once.
     """
 
     feature: Feature
@@ -73,7 +77,7 @@ class Vocabulary:
     _count: F64 = field(default_factory=lambda: np.empty(0))
 
     def learn(self, submaps: Sequence[Submap]) -> F64:
-        """Words of the submaps' features, and how often each occurs in each submap (N, words)."""
+        """Learn the words from the features of N submaps; counts of each word in each submap (N, words)."""
         if self._learned is submaps:
             return self.counts
         from sklearn.cluster import KMeans
@@ -82,26 +86,26 @@ class Vocabulary:
         everything = np.concatenate(features)
         size = min(WORDS, len(np.unique(everything, axis=0)))
         if size:
-            # Ten rounds: a vocabulary has to be spread out, not converged.
+            # Ten iterations: the words need to be spread over the features, not to have converged.
             means = KMeans(size, init="random", n_init=1, max_iter=10, random_state=self.seed)
             self.words = means.fit(everything).cluster_centers_.astype(np.float32)
         else:
             self.words = np.empty((0, everything.shape[1]), np.float32)
-        self.counts = np.array([self._spell(descriptors) for descriptors in features])
+        self.counts = np.array([self._word_counts(descriptors) for descriptors in features])
         self._learned, self._read = submaps, None
         return self.counts
 
     def read(self, submap: Submap) -> F64:
-        """How often each word occurs in a submap, (words,)."""
+        """Counts of each word in a submap, (words,)."""
         if self._read is not submap:
-            self._count = self._spell(self.feature(submap_image(submap)))
+            self._count = self._word_counts(self.feature(submap_image(submap)))
             self._read = submap
         return self._count
 
-    def _spell(self, descriptors: F32) -> F64:
+    def _word_counts(self, descriptors: F32) -> F64:
         if len(self.words) == 0 or len(descriptors) == 0:
             return np.zeros(len(self.words))
-        # |a - b|^2 without |a|^2, which is the same for every word.
+        # |a - b|^2 without |a|^2, which is the same for all words b.
         nearest = np.argmin((self.words**2).sum(axis=1) - 2 * descriptors @ self.words.T, axis=1)
         return np.bincount(nearest, minlength=len(self.words)).astype(np.float64)
 
@@ -110,7 +114,7 @@ class Vocabulary:
 class Words:
     """Submaps compared by the cosine between their word counts.
 
-    tfidf : weigh a word by how few submaps of the map have it.
+    tfidf : weight a word by its inverse document frequency, which is larger the fewer submaps contain it.
     """
 
     vocabulary: Vocabulary
@@ -139,6 +143,6 @@ class _Counts:
 
 
 def _unit(rows: F64) -> F64:
-    """Rows of length 1; a row of zeros stays one, and is alike to nothing."""
+    """Rows scaled to length 1; a row of zeros stays zero, and its similarity to all others is 0."""
     lengths = np.linalg.norm(rows, axis=-1, keepdims=True)
     return np.asarray(rows / np.where(lengths > 0, lengths, 1.0))

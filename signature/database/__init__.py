@@ -1,7 +1,7 @@
 """The submap database: sessions, their grids and submaps, and the signatures to search in.
 
-`open_database` and `create_database` hand out something with the protocol `SubmapDatabase`: one SQLite file
-for a path, a PostgreSQL database with pgvector for a postgresql:// URL.
+`open_database` and `create_database` return an object with the protocol `SubmapDatabase`: one SQLite file for
+a path, a PostgreSQL database with pgvector for a postgresql:// URL.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pc2grid.errors import DatabaseError
-from signature.database.postgres_schema import is_url
+from signature.database.postgres.schema import is_url
 from signature.database.protocol import Label, Neighbour, Problem, Provenance, SessionInfo, SubmapDatabase
 
 __all__ = [
@@ -25,10 +25,10 @@ __all__ = [
 
 
 def open_database(path_or_url: str | Path, *, writable: bool = False) -> SubmapDatabase:
-    """Open an existing database; without `writable` nothing can change it, and no query does.
+    """Open an existing database; only with `writable` can it be changed, and only by `add`.
 
     Raises NotADatabase, DatabaseCorrupt, DatabaseVersion, DatabaseUnreachable for a server that does not
-    answer or turns us away, or DatabaseError for a URL of an engine that this version does not know.
+    answer or refuses the connection, or DatabaseError for a URL of an engine that this version does not know.
 
     >>> with open_database("building.submaps") as database:
     ...     session = database.sessions()[0].name
@@ -36,10 +36,10 @@ def open_database(path_or_url: str | Path, *, writable: bool = False) -> SubmapD
     ('monday', 0.05, True)
     """
     if is_url(path_or_url):
-        from signature.database.postgres import PostgresDatabase
+        from signature.database.postgres.database import PostgresDatabase
 
         return PostgresDatabase(str(path_or_url), writable=writable)
-    from signature.database.sqlite import SqliteDatabase
+    from signature.database.sqlite.database import SqliteDatabase
 
     return SqliteDatabase(_local(path_or_url), writable=writable)
 
@@ -55,16 +55,16 @@ def create_database(path_or_url: str | Path, *, force: bool = False) -> SubmapDa
     ()
     """
     if is_url(path_or_url):
-        from signature.database.postgres import PostgresDatabase
+        from signature.database.postgres.database import PostgresDatabase
 
         return PostgresDatabase.create(str(path_or_url), force=force)
-    from signature.database.sqlite import SqliteDatabase
+    from signature.database.sqlite.database import SqliteDatabase
 
     return SqliteDatabase.create(_local(path_or_url), force=force)
 
 
 def _local(path_or_url: str | Path) -> Path:
-    """A path, or the complaint that the engine of a URL is not there."""
+    """The path of a file. Raises DatabaseError for a URL of an unknown engine."""
     scheme, separator, _ = str(path_or_url).partition("://")
     if isinstance(path_or_url, str) and separator:
         raise DatabaseError(

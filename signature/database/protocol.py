@@ -1,4 +1,4 @@
-"""What every engine of the submap database promises."""
+"""The methods that every engine of the submap database has, and the types they use."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pc2grid.errors import DatabaseError
-from pc2grid.model import Loop, OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
+from pc2grid.model import Consistency, Loop, OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
 
 if TYPE_CHECKING:
+    import networkx as nx
+
     from signature.config import Config
     from signature.describe import Signature
     from signature.similarity import SignatureTable
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Label:
-    """Where a session was recorded, in the user's words; None: not said."""
+    """Where a session was recorded, in the user's words; None: not given."""
 
     building: str | None = None
     floor: str | None = None
@@ -26,21 +28,20 @@ class Label:
         return ", ".join(word for word in (self.building, self.floor) if word) or "no label"
 
     def fits(self, building: str | None, floor: str | None) -> bool:
-        """Whether it is this building and floor; None: any, "": not said."""
+        """Whether it is this building and floor; None: any, "": those that were not given."""
         return building in (None, self.building or "") and floor in (None, self.floor or "")
 
     def contradicts(self, other: Label) -> bool:
-        """Whether the two name different buildings, or different floors; what was not said rules nothing
-        out."""
+        """Whether the two name different buildings, or different floors; None differs from nothing."""
         pairs = ((self.building, other.building), (self.floor, other.floor))
         return any(a is not None and b is not None and a != b for a, b in pairs)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Provenance:
-    """What made a session: enough to make it again. Holds no clock, so equal inputs give equal bytes.
+    """What made a session: enough to make it again. It has no time of day, so equal inputs give equal bytes.
 
-    source : file name of the recording or map (no folder: databases travel).
+    source : file name of the recording or map, without its folder, which differs between machines.
     digest : sha256 of the recording, hex.
     config : the whole effective configuration.
     start_s, duration_s : which part of the recording, seconds from its start; duration None: to the end.
@@ -65,10 +66,12 @@ class SessionInfo:
     sensor : kind that made it, or "map".
     submaps : how many.
     area_m2 : free space in its grid.
-    path_m : distance driven; 0 for an imported map.
+    path_m : distance driven, metres; 0 for an imported map.
     duration_s : time between first and last pose.
     scans : poses in its trajectory.
-    report : what was read, and lost on the way.
+    report : what was read, and what was lost while reading.
+    consistency : how well its map agrees with its own scans; None for an imported map, and for a session that
+        was stored before this was measured.
     """
 
     name: str
@@ -82,15 +85,16 @@ class SessionInfo:
     scans: int
     report: ReadReport
     provenance: Provenance
+    consistency: Consistency | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What reading and mapping had to say."""
+        """The warnings of reading and mapping."""
         return self.report.warnings
 
     @property
     def lossy(self) -> bool:
-        """Whether data was lost on the way."""
+        """Whether data was lost while reading."""
         return self.report.lossy
 
 
@@ -103,7 +107,7 @@ def none_there(where: str, building: str | None, floor: str | None, labels: Sequ
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing that `check` found: where (table and session) and what."""
+    """One finding of `check`: where (table and session) and what."""
 
     where: str
     what: str
@@ -111,9 +115,9 @@ class Problem:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Neighbour:
-    """A submap that looks like a query.
+    """A submap that is similar to a query.
 
-    center_m : (x, y) in the map frame of its session. score : Eq. 6, smaller is more alike.
+    center_m : (x, y) in the map frame of its session. score : Eq. 6, smaller is more similar.
     """
 
     session: str
@@ -123,7 +127,7 @@ class Neighbour:
 
 
 Entry = tuple[SessionMap, "Sequence[Signature]", Provenance]
-"""All there is to store of one session."""
+"""Everything that is stored of one session: the map, the signature of each submap, the provenance."""
 
 
 class SubmapDatabase(Protocol):
@@ -142,7 +146,10 @@ class SubmapDatabase(Protocol):
         ...
 
     def config(self) -> Config:
-        """The configuration that its sessions share (of the first); the default if there is none."""
+        """The configuration of the first session, whose signature and partition settings all sessions share.
+
+        The default configuration if there is no session.
+        """
         ...
 
     def signatures(self, session: str | None = None) -> SignatureTable:
@@ -158,7 +165,7 @@ class SubmapDatabase(Protocol):
         floor: str | None = None,
         session: str | None = None,
     ) -> tuple[Neighbour, ...]:
-        """The `count` submaps most alike by Eq. 6, best first, of those that the filters let through."""
+        """The `count` most similar submaps by Eq. 6, best first, of this building, floor and session."""
         ...
 
     def grid(self, session: str) -> OccupancyGrid:
@@ -170,7 +177,14 @@ class SubmapDatabase(Protocol):
         ...
 
     def loops(self, session: str) -> tuple[Loop, ...]:
-        """Where the session came back to a place; `older` and `newer` count poses of its trajectory."""
+        """The loops of a session; their `older` and `newer` are indices of poses of its trajectory."""
+        ...
+
+    def graph(self, session: str) -> nx.Graph:
+        """The junction graph of a session's free space (`pc2grid.submaps.junction_graph`).
+
+        Made again from the grid if none was stored, as in databases of formats 1 and 2.
+        """
         ...
 
     def submap(self, session: str, submap_id: int) -> Submap:
@@ -194,7 +208,7 @@ class SubmapDatabase(Protocol):
         ...
 
     def check(self) -> tuple[Problem, ...]:
-        """Everything that is wrong with it; empty if sound."""
+        """All damage; empty if there is none."""
         ...
 
     def keep_only(self, *, building: str | None = None, floor: str | None = None) -> None:
@@ -205,14 +219,14 @@ class SubmapDatabase(Protocol):
         ...
 
     def leave_out_damaged(self) -> tuple[Problem, ...]:
-        """From now on, do without the sessions that cannot be searched because they are damaged.
+        """From now on, leave out the sessions that cannot be searched because they are damaged.
 
         Returns what is wrong with each of them. Raises DatabaseCorrupt if none is left.
         """
         ...
 
     def close(self) -> None:
-        """Let go of the file or connection."""
+        """Close the file or connection."""
         ...
 
     def __enter__(self) -> SubmapDatabase: ...

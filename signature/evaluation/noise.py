@@ -1,8 +1,7 @@
-"""Noise of the paper's experiments: mapping errors at walls, things that stand in the way (paper IV-B).
+"""Noise of the paper's experiments: mapping errors at walls, and objects in the free space (paper IV-B).
 
-The paper gives the counts and Figure 8, not the sizes. They were fixed from the text before any result
-was seen, and are not tuned: a person or a chair is half a metre across, a speckle spreads two cells of
-0.05 m.
+The paper gives the counts and Figure 8, not the sizes. These were chosen before any result was known, and are
+not tuned: a person or a chair is half a metre wide, a speckle spreads over two cells of 0.05 m.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid, Submap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Noise:
-    """How much of both kinds, and in which shapes.
+    """How much noise of both kinds, and of which size.
 
     boundary : N_b, occupied cells around which speckles are put.
     freespace : N_f, free cells on which obstacles are put.
-    speckles : occupied cells put around each of the N_b, with normally distributed offsets ...
-    speckle_sigma_m : ... of this standard deviation per axis.
-    obstacle_m : r_n, radius of the circles and half the width of the squares; both are filled, and
-        equally likely.
+    speckles : number of occupied cells put around each of the N_b, with normally distributed offsets.
+    speckle_sigma_m : standard deviation of these offsets, per axis.
+    obstacle_m : r_n, radius of the circles and half the width of the squares; both are filled, and equally
+        likely.
     """
 
     boundary: int
@@ -39,11 +38,13 @@ NOISE_LEVELS = (
     Noise(boundary=50, freespace=10),
     Noise(boundary=100, freespace=20),
 )
-"""Without noise, level 1 and level 2 of Figure 8."""
+"""No noise, level 1 and level 2 of Figure 8."""
 
 
 def add_noise(submap: Submap, noise: Noise, rng: np.random.Generator) -> Submap:
-    """The submap with noise inside its radius; without occupied (free) cells nothing is put there."""
+    """The submap with noise inside its radius. Boundary noise needs occupied cells, free-space noise free
+    ones.
+    """
     grid = submap.grid
     image = np.ascontiguousarray(grid.cells).astype(np.int16)
     occupied, free = np.argwhere(grid.occupied), np.argwhere(grid.free)

@@ -1,14 +1,12 @@
-"""A real recording against itself: one part becomes the map, later parts are located in it.
+"""A real recording located in itself: one part becomes the map, later parts are the queries.
 
-The truth is a trajectory that somebody else computed over the whole recording. It need not cover every
-scan; a query is judged by the last of its scans that it does cover.
+The truth is a trajectory that another program has computed over the whole recording. It need not contain
+every scan: a query is judged by the last of its scans that have a true pose.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,147 +14,107 @@ import numpy as np
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2
 from pc2grid.model import Scan, Trajectory
+from pc2grid.observer import Observer
 from pc2grid.pipeline import build_map
-from signature.build import describe_all
+from pc2grid.time_span import TimeSpan
 from signature.config import Config
-from signature.evaluation.driven import Driven, register
-from signature.evaluation.mapped import Mapped
-from signature.evaluation.trial import MAPPED, Trial, judge
-from signature.relocalize import Building, Relocalizer
+from signature.evaluation.judgement import judge
+from signature.evaluation.registered_session import RegisteredSession, register
+from signature.evaluation.sensor_map import SensorMap
+from signature.evaluation.trial import JUDGEMENT, Trial
+from signature.relocalization.place_recognition import recognizer_for
+from signature.relocalization.relocalizer import MapIndex, localize
+from signature.sessions import describe_all
 from signature.similarity import SignatureTable
 
 if TYPE_CHECKING:
     from pc2grid.io import Log
 
-RIGHT_M = 0.3
-"""The truth itself, a filter's map, is no better than a few centimetres."""
+_SAME_NS = 1_000_000  # a true pose belongs to a scan if their stamps differ by no more than this
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Part:
-    """A part of a recording, seconds from its start."""
-
-    start_s: float
-    length_s: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Tally:
-    """What became of the queries.
-
-    inside : how many look at ground that the map covers, by the truth; only these have a right answer.
-    right, wrong : of those, located and right; located and wrong. unsure : neither located.
-    outside : the rest. refused : of those, not located, as it should be.
-    wrong_outside : of those, located all the same, and wrong.
-    """
-
-    inside: int
-    right: int
-    wrong: int
-    unsure: int
-    outside: int
-    refused: int
-    wrong_outside: int
-
-    @staticmethod
-    def of(trials: Sequence[Trial]) -> Tally:
-        """Count; a query outside the map that is located rightly (at its edge) is neither gain nor loss."""
-        inside = [t for t in trials if t.mapped >= MAPPED]
-        outside = [t for t in trials if t.mapped < MAPPED]
-        return Tally(
-            inside=len(inside),
-            right=sum(t.status == "located" and t.right for t in inside),
-            wrong=sum(t.status == "located" and not t.right for t in inside),
-            unsure=sum(t.status != "located" for t in inside),
-            outside=len(outside),
-            refused=sum(t.status != "located" for t in outside),
-            wrong_outside=sum(t.status == "located" and not t.right for t in outside),
-        )
-
-
-def spread(first_s: float, last_s: float, count: int, length_s: float) -> tuple[Part, ...]:
-    """`count` parts of `length_s`, evenly over the time from `first_s` to `last_s`."""
-    starts = np.linspace(first_s, max(last_s - length_s, first_s), count)
-    return tuple(Part(start_s=float(s), length_s=length_s) for s in starts)
+def spread(first_s: float, last_s: float, count: int, duration_s: float) -> tuple[TimeSpan, ...]:
+    """`count` parts of `duration_s`, evenly distributed over the time from `first_s` to `last_s`."""
+    starts_s = np.linspace(first_s, max(last_s - duration_s, first_s), count)
+    return tuple(TimeSpan(float(start_s), duration_s) for start_s in starts_s)
 
 
 class Replay:
-    """A recording with its truth, ready to be cut.
-
-    truth : poses of the sensor, as ground truths of lasers are, or of the base with `of_base`.
-    """
+    """A recording with its true poses, of which parts are mapped and located."""
 
     def __init__(self, log: Log, truth: Trajectory, config: Config, *, of_base: bool = False) -> None:
+        """truth : poses of the sensor, as ground truths of lasers are; with `of_base` poses of the base."""
         self._log, self._config = log, config
         self.name, self.sensor = log.info.path.stem, log.choose().sensor
-        mount = SE2() if of_base else SE2.flatten(next(iter(log.scans())).T_base_sensor)
+        T_base_sensor = SE2() if of_base else SE2.from_matrix(next(iter(log.scans())).T_base_sensor)
         self._stamps_ns = truth.stamps_ns
-        self._T_world_base = [pose @ mount.inverse() for pose in truth.poses()]
+        self._T_world_base = [pose @ T_base_sensor.inverse() for pose in truth.poses()]
 
     def truth(self, stamp_ns: int) -> SE2 | None:
-        """T_world_base of the scan of that stamp, None if nobody knows."""
+        """True pose T_world_base of the scan with that stamp; None if it is not known."""
         i = int(np.searchsorted(self._stamps_ns, stamp_ns - _SAME_NS))
         if i == len(self._stamps_ns) or self._stamps_ns[i] > stamp_ns + _SAME_NS:
             return None
         return self._T_world_base[i]
 
-    def map(self, part: Part, progress: Callable[[float], None] | None = None) -> Mapped:
-        """One part as a building. Raises ConfigError if the truth covers less than two of its scans."""
+    def map(self, span: TimeSpan, observer: Observer = Observer()) -> SensorMap:
+        """The map made of one part. Raises ConfigError if fewer than two of its scans have a true pose."""
         made = build_map(
             self._log,
             self._config,
             session=self.name,
-            start_s=part.start_s,
-            duration_s=part.length_s,
-            progress=progress,
+            span=span,
+            observer=observer,
+            recognizer=recognizer_for(self._config),
         )
-        here = list(zip(made.trajectory.poses(), map(self.truth, made.trajectory.stamps_ns), strict=True))
-        pairs = [(a, b) for a, b in here if b is not None]
+        table = SignatureTable.of(describe_all(made, self._config), [s.center_m for s in made.submaps])
+        return SensorMap(
+            name=self.name,
+            sensor=self.sensor,
+            T_plan_map=self.T_world_map(made.trajectory),
+            index=MapIndex({self.name: made.grid}, table, self._config, self._config),
+        )
+
+    def T_world_map(self, trajectory: Trajectory) -> SE2:
+        """The frame of a map in the world of the true poses, fitted over the trajectory of the map.
+
+        Raises ConfigError if fewer than two of its scans have a true pose.
+        """
+        truths = map(self.truth, trajectory.stamps_ns)
+        pairs = [(a, b) for a, b in zip(trajectory.poses(), truths, strict=True) if b is not None]
         if len(pairs) < 2:
             raise ConfigError(
                 f"{self.name}: the truth has no poses at the stamps of the part that becomes the map",
                 hint="its stamps must be those of the scans",
             )
-        table = SignatureTable.of(describe_all(made, self._config), [s.center_m for s in made.submaps])
-        return Mapped(
-            name=self.name,
-            sensor=self.sensor,
-            T_plan_map=SE2.fit([(a.x, a.y) for a, _ in pairs], [(b.x, b.y) for _, b in pairs]),
-            building=Building({self.name: made.grid}, table, self._config, self._config),
-        )
+        return SE2.fit([(a.x, a.y) for a, _ in pairs], [(b.x, b.y) for _, b in pairs])
 
-    def drive(self, part: Part) -> Driven:
+    def register(self, span: TimeSpan) -> RegisteredSession:
         """One part, registered as a query."""
 
         def scans() -> Iterator[tuple[Scan, SE2 | None]]:
-            for scan in self._log.scans(part.start_s, part.length_s):
+            for scan in self._log.scans(span.start_s, span.duration_s):
                 yield scan, self.truth(scan.stamp_ns)
 
         return register(scans(), self._config, sensor=self.sensor)
 
-    def locate(self, part: Part, mapped: Mapped) -> Trial | None:
-        """The answer for one part beside the truth; None if the truth says nothing of it."""
-        driven = self.drive(part)
-        if np.isnan(driven.T_world_base[:, 0]).all():
+    def locate(self, span: TimeSpan, sensor_map: SensorMap) -> Trial | None:
+        """The judged answer for one part; None if none of its scans has a true pose."""
+        session = self.register(span)
+        if np.isnan(session.T_world_base[:, 0]).all():
             return None
-        relocalizer = Relocalizer(mapped.building)
-        for registered, sweep, _ in driven.scans():
-            relocalizer.add(registered, sweep)
-        begin = time.perf_counter()
-        query = relocalizer.query()
-        answer = relocalizer.searches[0].answer(query)
+        scans = ((registered, planar_scan) for registered, planar_scan, _ in session.scans())
+        (asked,) = localize(scans, [sensor_map.index])
+        (answer,) = asked.answers
         return judge(
-            mapped,
-            query,
+            sensor_map,
+            asked.query,
             answer,
-            driven.T_world_odom() @ answer.T_odom_base,
+            session.T_world_odom() @ answer.T_odom_base,
             building=self.name,
             query_sensor=self.sensor,
-            seed=round(part.start_s),
+            seed=round(span.start_s),
             travel_m=answer.path_m,
-            look_up_ms=1000.0 * (time.perf_counter() - begin),
-            right_m=RIGHT_M,
+            look_up_ms=asked.elapsed_ms[0],
+            right_m=JUDGEMENT.right_recorded_m,
         )
-
-
-_SAME_NS = 1_000_000

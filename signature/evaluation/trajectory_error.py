@@ -1,7 +1,7 @@
-"""How far a trajectory is from the truth: absolute (ATE) and over a metre of travel (RPE).
+"""The error of a trajectory: absolute (ATE) and over a metre of travel (RPE).
 
-As evo computes them with alignment and without scale (Sturm et al., "A benchmark for the evaluation of
-RGB-D SLAM systems", 2012).
+Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (2012); computed as evo does, with
+alignment and without scale.
 """
 
 from __future__ import annotations
@@ -11,17 +11,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.geometry import F64, interpolate_pose
-from pc2grid.model import I64, Health, Trajectory
+from pc2grid.arrays import F64, I64
+from pc2grid.geometry import interpolate_pose
+from pc2grid.model import Health, Trajectory
 
 MAX_GAP_S = 1.0
-"""The truth is interpolated between two poses no farther apart than this."""
+"""The truth is interpolated between two poses that differ by no more than this in time; chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryError:
-    """ate_m : RMS distance from the truth after the best rigid alignment (not of scans that are lost).
-    rpe_m, rpe_deg : RMS error of the motion over a metre of travel. poses : how many were compared."""
+    """The errors of a trajectory; poses of lost scans are left out.
+
+    ate_m : RMS distance from the truth after the best rigid alignment. rpe_m, rpe_deg : RMS error of the
+    motion over a metre of travel, NaN if the path is shorter. poses : how many were compared.
+    """
 
     ate_m: float
     rpe_m: float
@@ -30,16 +34,16 @@ class TrajectoryError:
 
 
 def trajectory_error(estimated: Trajectory, truth: Trajectory) -> TrajectoryError:
-    """How far a trajectory is from the truth, which is interpolated at its stamps.
+    """The error of a trajectory with respect to the truth, which is interpolated at its stamps.
 
-    The two may name the axes of the base differently (a camera's optical frame): one constant rotation
-    between them is taken out of the errors of motion, as one between the maps is out of the positions.
-    Raises ValueError if fewer than three poses have a truth.
+    The two may name the axes of the base differently (for example a camera's optical frame). Therefore one
+    constant rotation is fitted and removed from the errors of motion, as the alignment removes one from the
+    positions. Raises ValueError if fewer than three poses have a true pose.
     """
     index, true = _truth_at(estimated, truth)
     if len(index) < 3:
         raise ValueError("fewer than three poses of the trajectory have a truth in time")
-    guess = estimated.T_map_base[index]
+    guess = estimated.T_session_base[index]
     a, b = guess[:, :3, 3], true[:, :3, 3]
     R = _rotation(np.einsum("ni,nj->ij", b - b.mean(axis=0), a - a.mean(axis=0)))
     apart = np.linalg.norm((a - a.mean(axis=0)) @ R.T - (b - b.mean(axis=0)), axis=1)
@@ -57,7 +61,7 @@ def trajectory_error(estimated: Trajectory, truth: Trajectory) -> TrajectoryErro
 
 
 def _truth_at(estimated: Trajectory, truth: Trajectory) -> tuple[I64, F64]:
-    """Poses that are not lost and have a truth: their indices, and the true poses (N, 4, 4)."""
+    """Indices (N,) of the poses that are not lost and have a true pose, and the true poses (N, 4, 4)."""
     index, poses = [], []
     for k, stamp in enumerate(estimated.stamps_ns):
         if estimated.health and estimated.health[k] is Health.LOST:
@@ -65,13 +69,15 @@ def _truth_at(estimated: Trajectory, truth: Trajectory) -> tuple[I64, F64]:
         after = int(np.searchsorted(truth.stamps_ns, stamp))
         if after < len(truth) and truth.stamps_ns[after] == stamp:
             index.append(k)
-            poses.append(truth.T_map_base[after])
+            poses.append(truth.T_session_base[after])
         elif 0 < after < len(truth):
             span = int(truth.stamps_ns[after] - truth.stamps_ns[after - 1])
             if span <= MAX_GAP_S * 1e9:
                 part = int(stamp - truth.stamps_ns[after - 1]) / span
                 index.append(k)
-                poses.append(interpolate_pose(truth.T_map_base[after - 1], truth.T_map_base[after], part))
+                poses.append(
+                    interpolate_pose(truth.T_session_base[after - 1], truth.T_session_base[after], part)
+                )
     return np.array(index, np.int64), np.array(poses).reshape(-1, 4, 4)
 
 

@@ -1,4 +1,4 @@
-"""A fleet's database on a real PostgreSQL: what the index finds, how fast, and for how many at once.
+"""A fleet's database on a real PostgreSQL: recall of the index, latency, and queries per second.
 
 python tools/bench/fleet.py [--submaps N]     also a measure of run.py
 """
@@ -16,16 +16,17 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import material
+import fixtures
 import numpy as np
-from large import _disturbed as disturbed
+from large_database import disturbed
 from measure import ROOT, Row, machine, table
 
 from pc2grid.model import OccupancyGrid, SessionMap, Trajectory
-from signature.build import provenance
 from signature.config import Config
-from signature.database import Label, open_database, postgres, postgres_schema
+from signature.database import Label, open_database
+from signature.database.postgres import database, schema
 from signature.describe import Signature
+from signature.sessions import provenance
 from signature.similarity import SignatureTable, distances
 
 COUNT, QUICK = 100_000, 5_000
@@ -41,7 +42,7 @@ def fleet_search(folder: Path, quick: bool) -> Iterator[Row]:
 
 def measured(count: int, seconds: float) -> Iterator[Row]:
     """The rows of the table for a database of `count` submaps."""
-    signatures = material.many_signatures(count, Config())
+    signatures = fixtures.many_signatures(count, Config())
     rng = np.random.default_rng(2)
     chosen = rng.integers(0, count, 100)
     queries = [disturbed(signatures, int(row), rng) for row in chosen]
@@ -50,8 +51,8 @@ def measured(count: int, seconds: float) -> Iterator[Row]:
         begin, cpu = time.perf_counter(), made.cpu_s() + time.process_time()
         fill(url, signatures)
         loaded, fill_s = time.perf_counter(), made.cpu_s() + time.process_time() - cpu
-        with postgres_schema.connect(url, url) as connection:
-            postgres_schema.inspect(connection, url)
+        with schema.connect(url, url) as connection:
+            schema.inspect(connection, url)
             cpu = made.cpu_s()
             index(connection, signatures)
             built, index_s = time.perf_counter(), made.cpu_s() - cpu
@@ -81,7 +82,7 @@ def measured(count: int, seconds: float) -> Iterator[Row]:
 def searched(
     what: str, made: Any, signatures: SignatureTable, queries: Sequence[Signature], chosen: Any
 ) -> Iterator[Row]:
-    """One client: what it finds, against Eq. 6 on everything, and how long it takes."""
+    """One client: recall against Eq. 6 on all submaps, and the time of a query."""
     config = Config().signature
     found, first = 0, 0
     filters: dict[str, list[dict[str, str]]] = {
@@ -90,7 +91,7 @@ def searched(
     }
     with open_database(made.url()) as database:
         for name, wanted in filters.items():
-            database.nearest(queries[0], K)  # the first one loads the index
+            database.nearest(queries[0], K)  # the first query loads the index
             answers, times = [], []
             cpu = made.cpu_s() + time.process_time()
             for query, more in zip(queries, wanted, strict=True):
@@ -120,11 +121,13 @@ def searched(
         goal=0.99,
         at_least=True,
     )
-    yield Row(what=f"{what}: the nearest one is the nearest one", measured=first / len(queries), unit="")
+    yield Row(
+        what=f"{what}: the first result is the nearest by Eq. 6", measured=first / len(queries), unit=""
+    )
 
 
 def at_once(what: str, made: Any, queries: Sequence[Signature], seconds: float) -> Iterator[Row]:
-    """Many clients, each a process with a connection of its own, asking one query after the other."""
+    """Queries per second of many clients, each a process with a connection of its own."""
     context = multiprocessing.get_context("fork")
     ready, go = context.Barrier(CLIENTS + 1), context.Event()
     answers = context.Queue()
@@ -167,23 +170,25 @@ def _client(
 
 
 def number_of(session: str, submap_id: int) -> int:
-    """Row of the table that a submap came from."""
+    """Row of the table that a submap was made from."""
     return int(session[1:]) * IN_A_BUILDING + submap_id
 
 
 def fill(url: str, signatures: SignatureTable) -> None:
-    """Store the signatures, a session in a building of its own for every thousand. No index yet: one that
-    is there row by row takes several times as long."""
+    """Store the signatures: a session for every thousand, in a building of its own.
+
+    The index is made afterwards, because adding rows to an existing one takes several times as long.
+    """
     grid = OccupancyGrid(cells=np.zeros((2, 2), np.int8), resolution_m=0.05, origin_m=(0.0, 0.0))
-    still = Trajectory(stamps_ns=np.empty(0, np.int64), T_map_base=np.empty((0, 4, 4)))
+    still = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
     config, entries = Config(), []
     for s in range(-(-len(signatures) // IN_A_BUILDING)):
         session = SessionMap(session=f"s{s}", sensor="map", grid=grid, submaps=(), trajectory=still)
         origin = provenance("bench", "0" * 64, config, label=Label(building=f"b{s}"))
         entries.append((session, [], origin))
-    postgres.store(url, entries, keep=False)
-    with postgres_schema.connect(url, url) as connection:
-        postgres_schema.inspect(connection, url)
+    database.store(url, entries, keep=False)
+    with schema.connect(url, url) as connection:
+        schema.inspect(connection, url)
         keys = dict(connection.execute("SELECT name, id FROM pc2grid.session").fetchall())
         for s in range(len(entries)):
             first = s * IN_A_BUILDING
@@ -201,22 +206,22 @@ def fill(url: str, signatures: SignatureTable) -> None:
                 }
                 for row in range(first, min(first + IN_A_BUILDING, len(signatures)))
             ]
-            postgres.copy_signatures(connection, described, config)
+            database.copy_signatures(connection, described, config)
 
 
 def index(connection: Any, signatures: SignatureTable) -> None:
-    """Make the index as `convert` into an empty database makes it, only later."""
+    """Build the index that `convert` builds in an empty database."""
     connection.execute("SET max_parallel_maintenance_workers = 1")
     bins = signatures.boundary.shape[1] + signatures.freespace.shape[1]
-    postgres_schema.index_embeddings(connection, bins)
+    schema.index_embeddings(connection, bins)
     connection.execute("ANALYZE pc2grid.signature")
 
 
 @contextlib.contextmanager
 def server() -> Iterator[Any]:
-    """A PostgreSQL of its own, with as much shared memory as a database server is given."""
+    """A PostgreSQL server with the shared memory that a database server usually has."""
     sys.path.append(str(ROOT))
-    from tests.postgresql import Server
+    from tests.helpers.postgresql import Server
 
     made = Server(shared_buffers="4GB", maintenance_work_mem="4GB", max_wal_size="8GB")
     try:

@@ -1,4 +1,4 @@
-"""What every measurement is made of: rows of the table, interleaved timing, children and their memory."""
+"""Parts of every measurement: rows of the table, interleaved timing, processes and their memory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "open3d-cpu", "kiss-icp", "faiss-cpu")
 
-# VmHWM starts anew with each program; getrusage would count the parent's pages too.
+# VmHWM starts at zero in each program; getrusage would count the pages of the parent too.
 _PEAK = (
     "import atexit, sys; atexit.register(lambda: print(next(line for line in open('/proc/self/status')"
     " if line.startswith('VmHWM')), file=sys.stderr))\n"
@@ -28,13 +28,13 @@ _CLI = "from pc2grid_cli.main import main; main()"
 
 @dataclass(frozen=True, slots=True)
 class Time:
-    """Seconds by the clock on the wall, and seconds of processor (user and system, all threads)."""
+    """Elapsed seconds, and seconds of processor time (user and system, all threads)."""
 
     wall: float
     cpu: float
 
     def times(self, factor: float) -> tuple[float, float]:
-        """Both in another unit."""
+        """Both times in another unit."""
         return factor * self.wall, factor * self.cpu
 
 
@@ -42,9 +42,9 @@ class Time:
 class Row:
     """One line of the table.
 
-    goal : what to reach, at most (`at_least`: at least) that much; None where there is nothing to reach.
-    measured : a median, in `unit`. None: could not be measured, `note` says why.
-    cpu : the same by processor time: what it would be on a machine with nothing else to do.
+    goal : largest (with `at_least`: smallest) figure that is good enough; None if there is no goal.
+    measured : a median, in `unit`; None if it could not be measured, then `note` gives the reason.
+    cpu : the same by processor time, which is about what an idle machine would measure.
     """
 
     what: str
@@ -57,7 +57,7 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """ok, missed, or nothing to say."""
+        """Whether the goal is reached; empty without a goal."""
         if self.goal is None:
             return ""
         if self.measured is None:
@@ -71,7 +71,7 @@ class Row:
         return value >= self.goal if self.at_least else value <= self.goal
 
     def cells(self) -> tuple[str, ...]:
-        """As it is printed."""
+        """The row as it is printed."""
         goal = "" if self.goal is None else f"{'>=' if self.at_least else '<='} {self.goal:g} {self.unit}"
         return self.what, goal, self._number(self.measured), self._number(self.cpu), self.verdict, self.note
 
@@ -81,25 +81,25 @@ class Row:
         return f"{value:.0f} {self.unit}" if abs(value) >= 1000 else f"{value:.3g} {self.unit}"
 
     def to_json(self) -> dict[str, Any]:
-        """Plain types only."""
+        """The row in plain types."""
         return {**asdict(self), "verdict": self.verdict}
 
 
 def timed(action: Callable[[], object]) -> Time:
-    """How long one call takes."""
+    """The time of one call."""
     wall, cpu = time.perf_counter(), time.process_time()
     action()
     return Time(time.perf_counter() - wall, time.process_time() - cpu)
 
 
 def median(times: Iterable[Time]) -> Time:
-    """Of wall and processor time, each for itself."""
+    """Medians of elapsed and of processor time, computed separately."""
     taken = list(times)
     return Time(statistics.median(t.wall for t in taken), statistics.median(t.cpu for t in taken))
 
 
 def interleaved(actions: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, Time]:
-    """Median time of each action; they take turns, so that a busy moment hits all alike."""
+    """Median time of each action. They take turns, so that other load on the machine affects all equally."""
     taken: dict[str, list[Time]] = {name: [] for name in actions}
     for _ in range(rounds):
         for name, action in actions.items():
@@ -109,22 +109,22 @@ def interleaved(actions: Mapping[str, Callable[[], object]], rounds: int) -> dic
 
 @dataclass(frozen=True, slots=True)
 class Child:
-    """A finished process: how long it took, its peak resident memory, what it printed."""
+    """A finished process: its time, its peak resident memory, its output."""
 
     time: Time
     peak_mb: float
     stdout: str
 
 
-def program(*arguments: str | Path) -> Child:
-    """Run `pc2grid` as a process of its own, as a user does."""
-    return run_python(_PEAK + _CLI, *arguments)
+def program(*arguments: str | Path, environment: Mapping[str, str] | None = None) -> Child:
+    """Run `pc2grid` as a process of its own, as a user does. environment : additional variables."""
+    return run_python(_PEAK + _CLI, *arguments, environment=environment)
 
 
-def run_python(code: str, *arguments: str | Path) -> Child:
-    """Run Python code as a process of its own; raises RuntimeError if it failed.
+def run_python(code: str, *arguments: str | Path, environment: Mapping[str, str] | None = None) -> Child:
+    """Run Python code as a process of its own. environment : additional variables.
 
-    Exit codes 3 and 4 of the program are answers, not failures.
+    Raises RuntimeError if it fails; exit codes 3 and 4 of the program are results, not failures.
     """
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     done = subprocess.run(
@@ -133,7 +133,11 @@ def run_python(code: str, *arguments: str | Path) -> Child:
         capture_output=True,
         text=True,
         cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tools")))},
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tools"))),
+            **(environment or {}),
+        },
     )
     wall, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
@@ -145,7 +149,7 @@ def run_python(code: str, *arguments: str | Path) -> Child:
 
 
 def machine() -> dict[str, str]:
-    """What the figures were measured on."""
+    """The machine and the versions."""
     cpu = next(
         (
             line.split(":")[1].strip()
@@ -175,7 +179,7 @@ def _version(library: str) -> str:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Rows under each other, a Markdown table."""
+    """The rows as a Markdown table."""
     lines = [("what", "goal", "measured", "by cpu time", "", "note"), *(row.cells() for row in rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(6)]
     text = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |" for line in lines]

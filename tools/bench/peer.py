@@ -1,9 +1,9 @@
-"""One peer, in the peers' environment: reads numbers of queries, answers with time and pose.
+"""One peer, run in the peers' environment: it reads numbers of queries and writes times and poses.
 
 python peer.py map_closures|kiss_matcher FOLDER
 
-Parameters are those that did best on rooms and corridors of this size; MapClosures' own are for streets
-and find nothing here.
+The parameters are those that performed best in rooms and corridors of this size. The default ones of
+MapClosures are made for streets and locate nothing here.
 """
 
 import json
@@ -24,7 +24,7 @@ def load(path):
 
 
 def voxels(points, size_m):
-    """One point a voxel."""
+    """One point for each voxel."""
     _, index = np.unique(np.floor(points / size_m).astype(np.int64), axis=0, return_index=True)
     return points[np.sort(index)]
 
@@ -40,10 +40,10 @@ class MapClosures:
         config.density_map_resolution = 0.15
         self._closures = Closures(config)
         path, clouds = np.load(folder / "path.npy"), load(folder / "map.npz")
-        driven = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
+        travel_m = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
         self._poses = []
-        for k in range(int(driven[-1] // SUBMAP_M) + 1):
-            members = np.flatnonzero(driven // SUBMAP_M == k)
+        for k in range(int(travel_m[-1] // SUBMAP_M) + 1):
+            members = np.flatnonzero(travel_m // SUBMAP_M == k)
             self._poses.append(matrix(path[members[0]]))
             inverse = np.linalg.inv(self._poses[-1])
             local = np.concatenate([clouds[i] for i in members]) @ inverse[:3, :3].T + inverse[:3, 3]
@@ -51,12 +51,13 @@ class MapClosures:
         self._next = len(self._poses)
 
     def prepare(self, clouds):
-        """The query as `locate` wants it; not timed."""
+        """The query in the form that `locate` takes; not timed."""
         return np.ascontiguousarray(np.concatenate(clouds), np.float64)
 
     def locate(self, points):
         """T_map_base (4, 4), or None."""
-        # The newest three are never matched, so each query takes a number far from the map's.
+        # The three newest submaps are never matched. Therefore each query gets a number far from those of the
+        # map.
         self._next += 10
         found = self._closures.get_best_closure(self._next, points)
         if not 0 <= found.source_id < len(self._poses) or found.number_of_inliers <= 2:
@@ -65,7 +66,7 @@ class MapClosures:
 
 
 class KissMatcher:
-    """The query's cloud against the whole building's."""
+    """The cloud of the query is matched with that of the whole building."""
 
     def __init__(self, folder):
         import kiss_matcher
@@ -74,7 +75,7 @@ class KissMatcher:
         self._map = voxels(np.concatenate(load(folder / "map.npz")), 0.3).astype(np.float32)
 
     def prepare(self, clouds):
-        """The query as `locate` wants it; not timed."""
+        """The query in the form that `locate` takes; not timed."""
         return voxels(np.concatenate(clouds), 0.3).astype(np.float32)
 
     def locate(self, points):
@@ -94,7 +95,7 @@ def matrix(pose):
 
 
 def main():
-    """Answer until the input ends."""
+    """Answer queries until the input ends."""
     name, folder = sys.argv[1], Path(sys.argv[2])
     peer = {"map_closures": MapClosures, "kiss_matcher": KissMatcher}[name](folder)
     for line in sys.stdin:

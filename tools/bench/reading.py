@@ -1,4 +1,4 @@
-"""From the file to the map: start-up, info, decoding, convert's time and memory, growth."""
+"""From the file to the map: start of the program, info, decoding, time and memory of convert, growth."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
-import material
+import fixtures
 import numpy as np
 from measure import Row, Time, interleaved, median, program, run_python, timed
 
-from pc2grid.io import pointcloud2
-from pc2grid.io.messages import Header, PointCloud2
-from pc2grid.partition import partition
+from pc2grid.io.messages.types import Header, PointCloud2
+from pc2grid.io.sensors import pointcloud2
+from pc2grid.submaps.partition import partition
 from signature.config import Config
 
 
 def help_time(folder: Path, quick: bool) -> Iterator[Row]:
-    """`pc2grid --help` beside an interpreter that does nothing."""
+    """`pc2grid --help`, compared with an interpreter that does nothing."""
     actions = {"help": lambda: program("--help"), "python": lambda: run_python("pass")}
     runs: dict[str, list[Time]] = {name: [] for name in actions}
     for _ in range(3 if quick else 11):
@@ -41,7 +41,7 @@ def info_time(folder: Path, quick: bool) -> Iterator[Row]:
     """`pc2grid info` on a large recording."""
     size = 500_000_000 if quick else 10_000_000_000
     log = folder / "huge.mcap"
-    material.huge_log(log, size)
+    fixtures.huge_log(log, size)
     took = median(program("info", log).time for _ in range(3 if quick else 7))
     yield Row(
         what=f"pc2grid info, {log.stat().st_size / 1e9:.1f} GB",
@@ -53,7 +53,7 @@ def info_time(folder: Path, quick: bool) -> Iterator[Row]:
 
 
 def decode_speed(folder: Path, quick: bool) -> Iterator[Row]:
-    """PointCloud2 messages to points and times, beside kiss-icp's reader, fed from memory."""
+    """PointCloud2 messages in memory to points and times, compared with kiss-icp's reader."""
     from kiss_icp.tools.point_cloud2 import read_point_cloud
 
     rng = np.random.default_rng(0)
@@ -66,7 +66,8 @@ def decode_speed(folder: Path, quick: bool) -> Iterator[Row]:
         ours = PointCloud2(
             Header(0, "lidar"), 1, len(points), fields, False, 4 * columns, points.nbytes, points.tobytes()
         )
-        # With the constants of PointField, which mcap-ros2-support leaves out and its reader looks for.
+        # With the constants of PointField: kiss-icp's reader uses them and mcap-ros2-support does not have
+        # them.
         theirs = SimpleNamespace(
             fields=[
                 SimpleNamespace(name=n, offset=o, datatype=d, count=c, FLOAT32=7) for n, o, d, c in fields
@@ -97,7 +98,7 @@ import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 from pc2grid.io import open_log
-from pc2grid.tracking import Tracker
+from pc2grid.odometry.tracker import Tracker
 from signature.config import Config
 
 path, duration = sys.argv[1], float(sys.argv[2]) or None
@@ -106,11 +107,11 @@ with open_log(path) as log:
 tracker = Tracker(Config().registration)
 for scan in scans[:3]:
     tracker.track(scan)
-chosen = tracker._kiss._kiss.config  # the voxel that pc2grid takes for this log
-found = {"scans": len(scans), "voxel": chosen.mapping.voxel_size}
+voxel_m, range_m = tracker.kiss.voxel_and_range_m  # what pc2grid chooses for this log
+found = {"scans": len(scans), "voxel": voxel_m}
 points = [np.asarray(scan.points_m, np.float64) for scan in scans]
 for name, voxel, reach in (
-    ("same", chosen.mapping.voxel_size, chosen.data.max_range),
+    ("same", voxel_m, range_m),
     ("default", KISSConfig().mapping.voxel_size or 1.0, KISSConfig().data.max_range),
 ):
     config = KISSConfig()
@@ -128,9 +129,9 @@ print(json.dumps(found))
 
 @dataclass(frozen=True, slots=True)
 class BareKiss:
-    """Bare `KissICP.register_frame` over the decoded scans of a log, one thread.
+    """Time of bare `KissICP.register_frame` over the decoded scans of a log, with one thread.
 
-    same : at the voxel and range that pc2grid chooses. default : as KISS-ICP comes, 1 m.
+    same : with the voxel size and range that pc2grid chooses. default : with KISS-ICP's default of 1 m.
     """
 
     scans: int
@@ -148,8 +149,8 @@ def bare_kiss(log: Path, duration_s: float = 0.0) -> BareKiss:
 def convert_time(folder: Path, quick: bool) -> Iterator[Row]:
     """`pc2grid convert` from start to end over bare KISS-ICP on the same scans."""
     simulated = folder / "lidar.mcap"
-    material.lidar_log(simulated, 8.0 if quick else 40.0)
-    logs = {"simulated lidar": simulated, "hall.mcap": material.data_file("lidar/hall.mcap")}
+    fixtures.lidar_log(simulated, 8.0 if quick else 40.0)
+    logs = {"simulated lidar": simulated, "hall.mcap": fixtures.data_file("lidar/hall.mcap")}
     for name, log in logs.items():
         what = f"convert {name}, over KISS-ICP at the same voxel"
         if log is None:
@@ -177,7 +178,7 @@ def convert_memory(folder: Path, quick: bool) -> Iterator[Row]:
     peaks = []
     for minutes, goal in ((3, None), (6, 600.0)) if quick else ((15, None), (60, 600.0)):
         log = folder / "long.mcap"
-        scans = material.lidar_log(log, 34.0 * minutes, lidar=material.THIN)
+        scans = fixtures.lidar_log(log, 34.0 * minutes, lidar=fixtures.SPARSE)
         child = program("convert", log, "-o", folder / "out.submaps", "--force")
         peaks.append(child.peak_mb)
         yield Row(
@@ -196,11 +197,11 @@ def growth(folder: Path, quick: bool) -> Iterator[Row]:
     """Processor time of convert per scan, and of partition per area, at 1x, 4x and 16x."""
     config, base_m = Config().partition, 5.0 if quick else 20.0
     runs = []
-    material.lidar_log(folder / "warm.mcap", 2.0, lidar=material.THIN)
-    program("convert", folder / "warm.mcap", "-o", folder / "out.submaps", "--force")  # compiles
+    fixtures.lidar_log(folder / "short.mcap", 2.0, lidar=fixtures.SPARSE)
+    program("convert", folder / "short.mcap", "-o", folder / "out.submaps", "--force")  # compiles
     for times in (1, 4, 16):
         log = folder / f"{times}.mcap"
-        scans = material.lidar_log(log, base_m * times, lidar=material.THIN)
+        scans = fixtures.lidar_log(log, base_m * times, lidar=fixtures.SPARSE)
         child = program("convert", log, "-o", folder / "out.submaps", "--force")
         runs.append((scans, child.time.cpu))
     start = program("convert", log, "--duration", "1", "-o", folder / "out.submaps", "--force").time.cpu
@@ -222,7 +223,7 @@ def growth(folder: Path, quick: bool) -> Iterator[Row]:
     )
     seconds = []
     for side in (1, 2, 4):
-        grid = material.office(0, side)
+        grid = fixtures.office(0, side)
         partition(grid, config)
         seconds.append(median(timed(lambda g=grid: partition(g, config)) for _ in range(3)).cpu)
     yield Row(

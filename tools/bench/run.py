@@ -1,9 +1,10 @@
-"""Measure what the program promises, goal beside measured: `make bench`.
+"""Measure the program and compare the figures with the goals: `make bench`.
 
 python tools/bench/run.py [--only NAME]... [--quick] [--out DIR]
 
-Machines differ and are noisy: figures are medians of interleaved runs, ratios where there is something to
-compare with. The table goes to stdout and, with machine and versions, to DIR/bench.md and DIR/bench.json.
+Machines differ and their load varies. Therefore the figures are medians of interleaved runs, and ratios where
+there is another program to compare with. The table is printed to stdout and written, with the machine and the
+versions, to DIR/bench.md and DIR/bench.json.
 """
 
 from __future__ import annotations
@@ -17,18 +18,18 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import finding
-import large
+import large_database
+import locating
 import peers
-import places
 import reading
+import submaps
 from measure import ROOT, Row, machine, table
 
 Measure = Callable[[Path, bool], Iterator[Row]]
 
 
 def fleet_search(folder: Path, quick: bool) -> Iterator[Row]:
-    """As `fleet.fleet_search`; PostgreSQL's libraries are an extra."""
+    """`fleet.fleet_search`, imported only when it runs, because PostgreSQL's libraries are an extra."""
     import fleet
 
     yield from fleet.fleet_search(folder, quick)
@@ -41,12 +42,12 @@ MEASURES: dict[str, Measure] = {
     "convert": reading.convert_time,
     "memory": reading.convert_memory,
     "growth": reading.growth,
-    "describe": places.describe_time,
-    "align": places.align_time,
-    "retrieve": large.retrieve_time,
-    "open": large.open_time,
-    "floors": large.floors_time,
-    "relocalize": finding.relocalize_time,
+    "describe": submaps.describe_time,
+    "align": submaps.align_time,
+    "retrieve": large_database.retrieve_time,
+    "open": large_database.open_time,
+    "floors": large_database.floors_time,
+    "relocalize": locating.relocalize_time,
     "peers": peers.compare,
     "fleet": fleet_search,
 }
@@ -74,13 +75,13 @@ def main() -> None:
             except Exception as error:
                 rows.append(Row(what=name, measured=None, unit="", note=f"failed: {error}"))
         print(f"{name}: {time.perf_counter() - begin:.0f} s", file=sys.stderr)
-        facts["load"] = f"{os.getloadavg()[0]:.1f} processes, one of them this"
+        facts["load"] = f"{os.getloadavg()[0]:.1f} processes, including this one"
         write(arguments.out, rows, facts, quick=arguments.quick)
     print((arguments.out / "bench.md").read_text(), end="")
 
 
 def write(folder: Path, rows: list[Row], facts: dict[str, str], *, quick: bool) -> None:
-    """What is known so far, as bench.md and bench.json; after every measure, for the whole takes long."""
+    """Write the rows so far to bench.md and bench.json, after every measure, because all take long."""
     folder.mkdir(parents=True, exist_ok=True)
     text = table(rows) + "\n\n" + "\n".join(f"{key}: {value}" for key, value in facts.items()) + "\n"
     (folder / "bench.md").write_text(text)

@@ -13,13 +13,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pc2grid_cli.options import OUTPUT_FOLDER
+from pc2grid_cli.output_files import make_folder
+
 if TYPE_CHECKING:
-    from signature.evaluation.map_quality import Mapped
+    from signature.evaluation.map_quality import MappingRun
 
 Row = dict[str, Any]
 
 
 def compare_maps_command(
+    context: typer.Context,
     plans: Annotated[
         list[Path] | None, typer.Argument(metavar="[MAP.yaml]...", help="floor plans to drive through")
     ] = None,
@@ -32,7 +36,7 @@ def compare_maps_command(
     length: Annotated[float, typer.Option(min=1.0, metavar="M", help="metres to drive")] = 200.0,
     seeds: Annotated[str, typer.Option(help="of the simulated sessions, for example 1,2,3")] = "1",
     no_odometry: Annotated[bool, typer.Option("--no-odometry", help="leave odometry out of them")] = False,
-    out: Annotated[Path, typer.Option("--out", help="folder for results; run again to go on")] = Path(
+    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="folder for results; run again to go on")] = Path(
         "map-quality"
     ),
     jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="processes [one a core]")] = None,
@@ -42,8 +46,8 @@ def compare_maps_command(
 
     Example: pc2grid compare maps fr079.yaml intel.yaml --log hall.mcap --truth hall.tum
     """
-    from pc2grid.errors import ConfigError, OutputError
-    from pc2grid_cli.console import print_json, progress
+    from pc2grid.errors import ConfigError
+    from pc2grid_cli.console import of, print_json
 
     logs, truths = log or [], truth or []
     tasks = _simulated_tasks(plans or [], sensors, length, seeds, not no_odometry)
@@ -58,12 +62,9 @@ def compare_maps_command(
         for file in (Path(task[key]) for key in ("plan", "log", "truth") if key in task):
             if not file.exists():
                 raise ConfigError(f"{file}: no such file")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{out}: {error.strerror}", hint="choose another --out") from error
+    make_folder(out)
     waiting = [task for task in tasks if not _result(task, out).exists()]
-    with progress("map") as advance:
+    with of(context).progress("map") as advance:
         for done, _ in enumerate(_run_all(waiting, str(out), jobs or os.cpu_count() or 1), start=1):
             advance(done / len(waiting))
     rows = [json.loads(_result(task, out).read_text()) for task in tasks]
@@ -81,7 +82,7 @@ def compare_maps_command(
 def _simulated_tasks(
     plans: list[Path], sensors: str, length_m: float, seeds: str, odometry: bool
 ) -> list[dict[str, Any]]:
-    """One task a plan, sensor and seed. Raises ConfigError for what cannot be read."""
+    """A task for each plan, sensor and seed. Raises ConfigError for words that cannot be read."""
     from pc2grid.errors import ConfigError
     from signature.evaluation.sensor_matrix import SENSORS
 
@@ -110,7 +111,7 @@ def _result(task: dict[str, Any], out: str | Path) -> Path:
 
 
 def _run_all(tasks: list[dict[str, Any]], out: str, jobs: int) -> Iterator[None]:
-    """Yields once for each task that is done; in processes of their own if there is more than one job."""
+    """Yield once for each task that is done. With more than one job the tasks run in processes."""
     if jobs == 1 or len(tasks) < 2:
         for task in tasks:
             _run(task, out)
@@ -123,7 +124,7 @@ def _run_all(tasks: list[dict[str, Any]], out: str, jobs: int) -> Iterator[None]
 
 
 def _run(task: dict[str, Any], out: str) -> None:
-    """Map one session or log, and keep what came of it."""
+    """Map one session or log, and store the result."""
     from pc2grid.io.atomic import replace_file
 
     row = _of_log(task) if "log" in task else _of_plan(task)
@@ -145,11 +146,11 @@ def _of_plan(task: dict[str, Any]) -> Row:
         length_m=task["length_m"], seed=task["seed"], odometry=OdometryConfig(enabled=task["odometry"])
     )
     session = prepare_session(sensor=task["sensor"], grid=load_map(Path(task["plan"])), config=simulation)
-    mapped, truth, quality = map_simulated(session, Config())
+    run, truth, quality = map_simulated(session, Config())
     return {
-        **_health(mapped),
-        "ours": asdict(trajectory_error(mapped.trajectory, truth)),
-        "bare": asdict(trajectory_error(mapped.bare, truth)),
+        **_health(run),
+        "ours": asdict(trajectory_error(run.trajectory, truth)),
+        "bare": asdict(trajectory_error(run.bare, truth)),
         "grid": asdict(quality),
     }
 
@@ -161,40 +162,40 @@ def _of_log(task: dict[str, Any]) -> Row:
     from pc2grid.io.trajectory import read_tum
     from signature.config import Config
     from signature.evaluation.map_quality import map_beside_bare
-    from signature.evaluation.relations import read_relations, relation_error
+    from signature.evaluation.slam_relations import read_relations, relation_error
     from signature.evaluation.trajectory_error import trajectory_error
 
     config = Config()
     truth = Path(task["truth"])
     with open_log(Path(task["log"]), config.read) as log:
-        mapped = map_beside_bare(log.scans(), config)
-        row = {**_health(mapped), "sensor": log.choose().sensor}
+        run = map_beside_bare(log.scans(), config)
+        row = {**_health(run), "sensor": log.choose().sensor}
     if truth.suffix != ".relations":
         true = read_tum(truth)
         return {
             **row,
-            "ours": asdict(trajectory_error(mapped.trajectory, true)),
-            "bare": asdict(trajectory_error(mapped.bare, true)),
+            "ours": asdict(trajectory_error(run.trajectory, true)),
+            "bare": asdict(trajectory_error(run.bare, true)),
         }
     relations = read_relations(truth)
-    x, y = (float(v) for v in mapped.T_base_sensor[:2, 3])
+    x, y = (float(v) for v in run.T_base_sensor[:2, 3])
     return {
         **row,
-        "ours": asdict(relation_error(mapped.trajectory, relations, base_to_reference_m=(x, y))),
-        "bare": asdict(relation_error(mapped.bare, relations, base_to_reference_m=(x, y))),
+        "ours": asdict(relation_error(run.trajectory, relations, base_to_reference_m=(x, y))),
+        "bare": asdict(relation_error(run.bare, relations, base_to_reference_m=(x, y))),
     }
 
 
-def _health(mapped: Mapped) -> Row:
+def _health(run: MappingRun) -> Row:
     from pc2grid.model import Health
 
     return {
-        "scans": len(mapped.trajectory),
-        "lost": mapped.share(Health.LOST),
-        "degenerate": mapped.share(Health.DEGENERATE),
-        "loops": mapped.loops,
-        "map_ms": mapped.map_ms,
-        "bare_ms": mapped.bare_ms,
+        "scans": len(run.trajectory),
+        "lost": run.share(Health.LOST),
+        "degenerate": run.share(Health.DEGENERATE),
+        "loops": run.loops,
+        "map_ms": run.map_ms,
+        "bare_ms": run.bare_ms,
     }
 
 

@@ -12,21 +12,26 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pc2grid_cli.options import OUTPUT_FOLDER
+from pc2grid_cli.output_files import make_folder
+
 if TYPE_CHECKING:
-    from signature.evaluation.reproduce import Result, Task
+    from pc2grid_cli.console import Console
+    from signature.evaluation.paper_task import PaperCell, PaperTask
 
 _COSTS = {"proposed": 1.0, "shape_context": 1.0, "sdf": 14.0, "sift_bow": 8.0, "surf_bow": 14.0}
 
 
 def compare_paper_command(
+    context: typer.Context,
     maps: Annotated[
         Path, typer.Option("--maps", help="Folder with fr079.yaml, intel.yaml, ... of the paper.")
     ],
-    out: Annotated[Path, typer.Option("--out", help="Folder for results; run again to go on.")] = Path(
+    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="Folder for results; run again to go on.")] = Path(
         "paper-tables"
     ),
     queries: Annotated[
-        int, typer.Option("--queries", min=1, help="Queries a map; 200 for a quick look.")
+        int, typer.Option("--queries", min=1, help="Queries a map. 2000 take hours; 200 for a quick look.")
     ] = 2000,
     methods: Annotated[
         list[str] | None,
@@ -54,11 +59,11 @@ def compare_paper_command(
 
     Example: pc2grid compare paper --maps maps/ --queries 200
     """
-    from pc2grid.errors import ConfigError, MapFileError, OutputError
+    from pc2grid.errors import ConfigError, MapFileError
     from pc2grid_cli import paper_report
-    from pc2grid_cli.console import print_json
+    from pc2grid_cli.console import of, print_json
     from signature.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES
-    from signature.evaluation.reproduce import known_maps, paper_tasks
+    from signature.evaluation.paper_task import known_maps, paper_tasks
 
     chosen = tuple(methods or METHOD_NAMES)
     known = METHOD_NAMES + EXTRA_METHOD_NAMES
@@ -74,10 +79,8 @@ def compare_paper_command(
             f"{maps}: none of the paper's maps is here", hint="a folder with intel.yaml, fr079.yaml, ..."
         )
     cells = out / "cells"
-    try:
-        cells.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{cells}: {error.strerror}") from error
+    make_folder(out)
+    make_folder(cells)
     tasks = list(
         paper_tasks(
             map_paths,
@@ -88,7 +91,7 @@ def compare_paper_command(
             open_choices=open_choices,
         )
     )
-    run_tasks(tasks, cells, jobs or os.cpu_count() or 1)
+    run_tasks(tasks, cells, jobs or os.cpu_count() or 1, of(context))
     results = _results(tasks, cells)
     document = _write(results, out, queries, seed)
     pictures = paper_report.draw_figures(results, out)
@@ -99,34 +102,24 @@ def compare_paper_command(
         print(f"written: {out / 'results.json'}, {out / 'results.csv'}, {', '.join(map(str, pictures))}")
 
 
-def run_tasks(tasks: Sequence[Task], cells: Path, jobs: int) -> None:
-    """Run the tasks that have no result yet in `jobs` processes, with a progress bar on stderr."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from signature.evaluation.reproduce import load_result
+def run_tasks(tasks: Sequence[PaperTask], cells: Path, jobs: int, terminal: Console) -> None:
+    """Run the tasks that have no result yet in `jobs` processes, and show the progress on `terminal`."""
+    from signature.evaluation.paper_task import load_result
 
     open_tasks = [t for t in tasks if any(load_result(t, m, cells) is None for m in t.methods)]
     if not open_tasks:
         return
-    # One thread a process, as the processes are the parallelism; libraries read this when they are loaded.
+    # One thread in each process, because the processes run in parallel; libraries read this when loaded.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    context = multiprocessing.get_context("spawn")
-    done_shares = context.SimpleQueue()
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
+    spawn = multiprocessing.get_context("spawn")
+    done_shares = spawn.SimpleQueue()
     with (
-        Progress(*columns, console=Console(stderr=True)) as progress,
+        terminal.progress(f"{len(open_tasks)} cells of the tables") as advance,
         ProcessPoolExecutor(
-            jobs, mp_context=context, initializer=_start_worker, initargs=(done_shares,)
+            jobs, mp_context=spawn, initializer=_start_worker, initargs=(done_shares,)
         ) as pool,
     ):
-        bar = progress.add_task("cells of the tables", total=len(open_tasks))
         shares = dict.fromkeys(range(len(open_tasks)), 0.0)
         costs = [_cost(task) for task in open_tasks]
         pending = {pool.submit(_run, index, task, cells) for index, task in enumerate(open_tasks)}
@@ -138,16 +131,15 @@ def run_tasks(tasks: Sequence[Task], cells: Path, jobs: int) -> None:
                 while not done_shares.empty():
                     index, share = done_shares.get()
                     shares[index] = max(shares[index], share)
-                weighted = sum(costs[i] * share for i, share in shares.items()) / sum(costs)
-                progress.update(bar, completed=round(weighted * len(open_tasks), 2))
+                advance(sum(costs[i] * share for i, share in shares.items()) / sum(costs))
         except BaseException:
-            # Whole cells are kept; what is queued must not go on after the user has stopped.
+            # Finished cells are kept; tasks that wait must not start after the user has stopped the program.
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
 
-def _cost(task: Task) -> float:
-    """Rough relative time of a task, so that the bar moves evenly."""
+def _cost(task: PaperTask) -> float:
+    """Approximate relative time of a task, for an even progress bar."""
     return _COSTS.get(task.methods[0], 10.0) * (5.0 if task.reading == "true" else 1.0)
 
 
@@ -162,8 +154,8 @@ def _start_worker(shares: Any) -> None:
     cv2.setNumThreads(1)
 
 
-def _run(index: int, task: Task, cells: Path) -> int:
-    from signature.evaluation.reproduce import run_task
+def _run(index: int, task: PaperTask, cells: Path) -> int:
+    from signature.evaluation.paper_task import run_task
 
     reported = 0.0
 
@@ -177,14 +169,14 @@ def _run(index: int, task: Task, cells: Path) -> int:
     return index
 
 
-def _results(tasks: Iterable[Task], cells: Path) -> list[Result]:
-    from signature.evaluation.reproduce import load_result
+def _results(tasks: Iterable[PaperTask], cells: Path) -> list[PaperCell]:
+    from signature.evaluation.paper_task import load_result
 
     found = (load_result(task, method, cells) for task in tasks for method in task.methods)
     return [result for result in found if result is not None]
 
 
-def _write(results: Sequence[Result], out: Path, queries: int, seed: int) -> dict[str, Any]:
+def _write(results: Sequence[PaperCell], out: Path, queries: int, seed: int) -> dict[str, Any]:
     """results.json and results.csv; returns the JSON document."""
     from pc2grid import __version__
     from pc2grid.io.atomic import replace_file

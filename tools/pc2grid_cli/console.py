@@ -1,4 +1,4 @@
-"""What the user sees: one-line errors, exit codes, notes, progress. stdout is the result, stderr the rest."""
+"""What the user sees: errors, exit codes, notes, progress. stdout is the result, stderr the rest."""
 
 from __future__ import annotations
 
@@ -14,38 +14,156 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
+import typer
+
 from pc2grid.errors import one_line
+from pc2grid.observer import Observer
 
 OK, FAILED, USAGE, LOSSY, UNSURE, INTERRUPTED = 0, 1, 2, 3, 4, 130
 PIPE_CLOSED = 128 + signal.SIGPIPE
-_LEAST_S, _LEAST_DONE = 2.0, 0.03  # of work, before anything is said about the rest of it
+_LEAST_S, _LEAST_SHARE = 2.0, 0.03
+"""Time and share of the work that must pass before the time left is estimated; chosen by hand."""
+_LINE_EVERY_S = 10.0
+"""How often progress is printed where there is no terminal; chosen by hand."""
+_COMPILING = "compiling, once after each installation: about 15 s"
 
 
-class State:
-    """What the global options say; set once by `main`."""
+class Console:
+    """The terminal of one run of the program, with what the global options say.
 
-    verbosity = 0
-    debug = bool(os.environ.get("PC2GRID_DEBUG"))
+    verbose : how often -v was given. quiet : -q. debug : --debug, or PC2GRID_DEBUG is set.
+    compiling : whether the user knows that functions are compiled.
+    """
+
+    def __init__(self) -> None:
+        self.verbose = 0
+        self.quiet = False
+        self.debug = bool(os.environ.get("PC2GRID_DEBUG"))
+        self.compiling = False
+        self._pace: _Pace | None = None
+
+    def apply(self, word: str) -> bool:
+        """Apply a word of the command line if it is a global option; returns whether it is one."""
+        if word in ("-v", "-vv", "--verbose"):
+            self.verbose += word.count("v") if word != "--verbose" else 1
+        elif word in ("-q", "--quiet"):
+            self.quiet = True
+        elif word == "--debug":
+            self.debug = True
+        else:
+            return False
+        return True
+
+    def note(self, message: str, *, level: int = 0) -> None:
+        """A line for the user, unless -q is given; one of level 1 is only printed with -v."""
+        if not self.quiet and self.verbose >= level:
+            print(f"pc2grid: {message}", file=sys.stderr)
+
+    @contextlib.contextmanager
+    def progress(self, what: str, recorded_s: float | None = None) -> Iterator[Callable[[float], None]]:
+        """Show the share 0..1 of the work that is done: a bar on a terminal, else a line every ten seconds.
+
+        recorded_s : length of the recording that is worked through, for a pace in multiples of real time.
+        """
+        if self.quiet:
+            yield lambda share: None
+            return
+        pace = self._pace = _Pace(recorded_s)
+        if not sys.stderr.isatty():
+            yield _plain_progress(what, pace)
+            return
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TextColumn("{task.fields[pace]}"),
+        )
+        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task(what, total=1.0, pace="")
+            yield lambda share: bar.update(task, completed=share, pace=pace.told(share))
+
+    def compiling_begins(self) -> None:
+        """Tell the user, once, that functions are compiled."""
+        if not self.compiling:
+            self.compiling = True
+            self.note(_COMPILING)
+
+    def compiling_ends(self) -> None:
+        """Measure the pace again: the time for compiling is no measure for the rest of the work."""
+        if self._pace is not None:
+            self._pace.restart()
+
+    def observer(self) -> ConsoleObserver:
+        """Shows the news of some work on this console."""
+        return ConsoleObserver(self)
+
+    def report_error(self, error: BaseException) -> int:
+        """Print what went wrong in one line, and what to do next in another; returns the exit code."""
+        from pc2grid.errors import Pc2GridError
+
+        if self.debug:
+            import traceback
+
+            traceback.print_exception(error)
+        if isinstance(error, Pc2GridError):
+            message, hint, code = error.message, error.hint, error.exit_code
+        elif isinstance(error, MemoryError):
+            message, hint, code = "out of memory", "try a shorter part: --start and --duration", FAILED
+        elif isinstance(error, OSError):
+            where = f"{error.filename}: " if error.filename else ""
+            message, hint, code = f"{where}{error.strerror or error}", None, FAILED
+        else:
+            message = f"internal error: {type(error).__name__}: {error}"
+            hint, code = "this is a bug; run again with --debug and report what it prints", FAILED
+        print(f"pc2grid: error: {one_line(message)}", file=sys.stderr)
+        if hint:
+            print(f"hint: {one_line(hint)}", file=sys.stderr)
+        return code
+
+    def run(self, command: Callable[[], Any]) -> int:
+        """Run a command; its result or error becomes an exit code."""
+        signal.signal(signal.SIGTERM, _terminate)
+        if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may hold undecodable bytes
+            sys.stdout.reconfigure(errors="backslashreplace")
+        try:
+            result = command()
+            sys.stdout.flush()
+            return result if isinstance(result, int) else OK
+        except KeyboardInterrupt:
+            print("pc2grid: interrupted", file=sys.stderr)
+            return INTERRUPTED
+        except BrokenPipeError:
+            return _pipe_closed()
+        except SystemExit as stop:
+            if isinstance(stop.__context__, BrokenPipeError):  # click turns it into exit code 1
+                return _pipe_closed()
+            raise
+        except Exception as error:
+            if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of typer's
+                return _report_usage(error)
+            return self.report_error(error)
 
 
-def note(message: str, *, level: int = 0) -> None:
-    """A line for the user; level 0 unless -q, level 1 with -v."""
-    if State.verbosity >= level:
-        print(f"pc2grid: {message}", file=sys.stderr)
+def of(context: typer.Context) -> Console:
+    """The console of the run that a command belongs to."""
+    return context.ensure_object(Console)
 
 
 def warn(message: str) -> None:
-    """Something that the user should know although it worked; shown even with -q."""
+    """Print what the user should know although the command worked; also with -q."""
     print(f"pc2grid: warning: {one_line(message)}", file=sys.stderr)
 
 
 def print_json(document: Any) -> None:
-    """The one document on stdout."""
-    print(json_text(document))
+    """Print the document of a command to stdout."""
+    print(json_text(document), flush=True)
 
 
 def json_text(document: Any) -> str:
-    """A document as JSON. That knows no NaN and no infinity: what is not known is null."""
+    """A document as JSON. JSON has no NaN and no infinity: such a value becomes null."""
     return json.dumps(_finite(document), indent=1, ensure_ascii=False, allow_nan=False)
 
 
@@ -59,41 +177,60 @@ def _finite(value: Any) -> Any:
     return value
 
 
+class ConsoleObserver(Observer):
+    """Shows the news of some work on stderr: progress, warnings, and notes with -v."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._update: Callable[[float], None] | None = None
+
+    def step(self, what: str, recorded_s: float | None = None) -> contextlib.AbstractContextManager[None]:
+        """Shows the progress of a step."""
+        return self._shown(what, recorded_s)
+
+    @contextlib.contextmanager
+    def _shown(self, what: str, recorded_s: float | None) -> Iterator[None]:
+        with self._console.progress(what, recorded_s) as self._update, _compiling_noted(self._console):
+            yield
+        self._update = None
+
+    def on_progress(self, share: float) -> None:
+        """See `Observer.on_progress`."""
+        if self._update is not None:
+            self._update(share)
+
+    def on_note(self, text: str) -> None:
+        """See `Observer.on_note`."""
+        self._console.note(text, level=1)
+
+    def on_warning(self, text: str) -> None:
+        """See `Observer.on_warning`."""
+        warn(text)
+
+
 @contextlib.contextmanager
-def progress(what: str, recorded_s: float | None = None) -> Iterator[Callable[[float], None]]:
-    """Report a share 0..1 of the work: a bar on a terminal, otherwise a line every ten seconds.
+def _compiling_noted(console: Console) -> Iterator[None]:
+    """Print a note, once, when numba begins to compile a function that is not in its cache."""
+    from numba.core import event
 
-    recorded_s : length of the recording that is worked through, to say how much faster than it was made.
-    """
-    if State.verbosity < 0:
-        yield lambda share: None
-        return
-    if not sys.stderr.isatty():
-        yield _plain_progress(what, recorded_s)
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+    class Note(event.Listener):
+        def on_start(self, event: Any) -> None:
+            console.compiling_begins()
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.fields[pace]}"),
-    )
-    pace = _Pace(recorded_s)
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=1.0, pace="")
-        yield lambda share: bar.update(task, completed=share, pace=pace.told(share))
+        def on_end(self, event: Any) -> None:
+            console.compiling_ends()
+
+    with event.install_listener("numba:compile", Note()):
+        yield
 
 
-def _plain_progress(what: str, recorded_s: float | None) -> Callable[[float], None]:
+def _plain_progress(what: str, pace: _Pace) -> Callable[[float], None]:
     last = time.monotonic()
-    pace = _Pace(recorded_s)
 
     def update(share: float) -> None:
         nonlocal last
         told = pace.told(share)
-        if time.monotonic() - last >= 10.0:
+        if time.monotonic() - last >= _LINE_EVERY_S:
             last = time.monotonic()
             print(f"pc2grid: {what}: {share:.0%}{', ' if told else ''}{told}", file=sys.stderr)
 
@@ -101,24 +238,31 @@ def _plain_progress(what: str, recorded_s: float | None) -> Callable[[float], No
 
 
 class _Pace:
-    """How fast work goes, and how long it will take at that, once that can be said."""
+    """Estimates how fast the work goes and how long the rest takes at that pace."""
 
     def __init__(self, recorded_s: float | None) -> None:
         self._recorded_s = recorded_s
         self._first: tuple[float, float] | None = None
+        self._least_left_s = math.inf
+
+    def restart(self) -> None:
+        """Measure from the next share on."""
+        self._first = None
 
     def told(self, share: float) -> str:
-        """In words; nothing while too little is done to judge by.
+        """Pace and time left in words; nothing while too little is done to estimate them.
 
-        Measured from the first share reported: what was prepared before is not part of the pace.
+        The pace is measured from the first share reported, because the preparations before are not part of
+        it. The time left never goes up: an estimate that is higher than the one before is not shown.
         """
         now = time.monotonic()
         begin, done_before = self._first = self._first or (now, share)
         spent_s, done = now - begin, share - done_before
-        if spent_s < _LEAST_S or done < _LEAST_DONE:
+        if spent_s < _LEAST_S or done < _LEAST_SHARE:
             return ""
         rate = f"{done * self._recorded_s / spent_s:.1f}x real time, " if self._recorded_s else ""
-        return f"{rate}{_duration(spent_s * (1.0 - share) / done)} left"
+        self._least_left_s = min(self._least_left_s, spent_s * (1.0 - share) / done)
+        return f"{rate}{_duration(self._least_left_s)} left"
 
 
 def _duration(seconds: float) -> str:
@@ -126,60 +270,12 @@ def _duration(seconds: float) -> str:
     return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-def report_error(error: BaseException) -> int:
-    """Say what went wrong in one line, and what to do next in another; returns the exit code."""
-    from pc2grid.errors import Pc2GridError
-
-    if State.debug:
-        import traceback
-
-        traceback.print_exception(error)
-    if isinstance(error, Pc2GridError):
-        message, hint, code = error.message, error.hint, error.exit_code
-    elif isinstance(error, MemoryError):
-        message, hint, code = "out of memory", "try a shorter part: --start and --duration", FAILED
-    elif isinstance(error, OSError):
-        where = f"{error.filename}: " if error.filename else ""
-        message, hint, code = f"{where}{error.strerror or error}", None, FAILED
-    else:
-        message = f"internal error: {type(error).__name__}: {error}"
-        hint, code = "this is a bug; run again with --debug and report what it prints", FAILED
-    print(f"pc2grid: error: {one_line(message)}", file=sys.stderr)
-    if hint:
-        print(f"hint: {one_line(hint)}", file=sys.stderr)
-    return code
-
-
-def run(command: Callable[[], Any]) -> int:
-    """Run a command and turn everything that can happen into an exit code."""
-    signal.signal(signal.SIGTERM, _terminate)
-    if isinstance(sys.stdout, io.TextIOWrapper):  # names of files need not be text
-        sys.stdout.reconfigure(errors="backslashreplace")
-    try:
-        result = command()
-        sys.stdout.flush()
-        return result if isinstance(result, int) else OK
-    except KeyboardInterrupt:
-        print("pc2grid: interrupted", file=sys.stderr)
-        return INTERRUPTED
-    except BrokenPipeError:
-        return _pipe_closed()
-    except SystemExit as stop:
-        if isinstance(stop.__context__, BrokenPipeError):  # click turns it into exit code 1
-            return _pipe_closed()
-        raise
-    except Exception as error:
-        if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of typer's
-            return _report_usage(error)
-        return report_error(error)
-
-
 def _pipe_closed() -> int:
-    """Whoever read our output has seen enough: end like any other program whose reader has gone.
+    """The exit code after the reader of our output has closed it, as of any other program in a pipe.
 
-    Quietly, and not with 0: what the rest would have said (`db check`) is not known to anybody.
+    Nothing is printed. The code is not 0, because the rest of the output (of `db check`) was not read.
     """
-    # Python must not complain at exit either.
+    # Otherwise Python prints an error when it flushes stdout at exit.
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return PIPE_CLOSED
 
@@ -189,7 +285,8 @@ def _report_usage(error: Any) -> int:
     if type(error).__name__ == "NoArgsIsHelpError":
         print(error.ctx.get_help(), file=sys.stderr)
         return USAGE
-    print(f"pc2grid: error: {one_line(error.format_message())}", file=sys.stderr)
+    message = " ".join(error.format_message().split())  # click lists choices on lines of their own
+    print(f"pc2grid: error: {one_line(message)}", file=sys.stderr)
     if context is not None:
         print(f"hint: {context.command_path} --help", file=sys.stderr)
     return USAGE

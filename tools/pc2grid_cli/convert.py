@@ -7,22 +7,28 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pc2grid.errors import DatabaseError, one_line
-from pc2grid_cli import console
-from pc2grid_cli import settings as options
+from pc2grid.errors import ConfigError, DatabaseError, one_line
+from pc2grid.observer import Observer, Observers
+from pc2grid.time_span import TimeSpan
+from pc2grid_cli import console, data_loss
+from pc2grid_cli import options as options
+from pc2grid_cli.output_files import check_database, check_database_name
 
 if TYPE_CHECKING:
     from pc2grid.model import SessionMap
-    from signature.cluster import Job
-    from signature.database import Provenance
+    from pc2grid_cli.json_schemas import Convert, Converted
+    from signature.config import Config
+    from signature.conversion_jobs import Job
+    from signature.database import Label, Provenance
     from signature.database.protocol import Entry
 
 
 def convert_command(
+    context: typer.Context,
     inputs: Annotated[list[Path], typer.Argument(metavar="LOG|MAP.yaml...", help="recordings, or nav2 maps")],
     output: options.WrittenDatabase,
     topic: options.Topic = None,
@@ -33,7 +39,7 @@ def convert_command(
         str | None, typer.Option("--name", help="of the session; default: the file's name")
     ] = None,
     building: Annotated[
-        str | None, typer.Option("--building", metavar="NAME", help="where it was recorded; answers say so")
+        str | None, typer.Option("--building", metavar="NAME", help="where it was recorded; answers name it")
     ] = None,
     floor: Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, within it")] = None,
     add: Annotated[bool, typer.Option("--add", help="add to an existing database")] = False,
@@ -47,108 +53,131 @@ def convert_command(
     rerun: options.Rerun = None,
     config: options.ConfigFile = None,
     set_: options.Assignments = None,
+    preset: options.Preset = options.PresetName.default,
     force: options.Force = False,
     recover: options.Recover = False,
+    strict: options.Strict = False,
     assume_identity: options.AssumeIdentity = False,
     json: options.AsJson = False,
 ) -> None:
     """Make a submap database from recordings or maps; several become a session each.
 
-    Of several, each is stored when it is done: after an interruption the same command goes on from there.
+    Of several, each is stored when it is done: after an interruption the same command continues from there.
 
     Example: pc2grid convert monday.mcap -o building.submaps
     """
-    from pc2grid.errors import ConfigError
-    from signature.cluster import LOCAL, Job
-    from signature.database import Label, transfer
+    from signature.conversion_jobs import LOCAL
+    from signature.database import Label, maintenance
 
     settings = options.make_config(
-        config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
+        config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity, preset=preset
     )
     if rerun is not None:
-        from pc2grid_cli.rerun_target import require_target, url_of
-
-        if dask is not None or jobs is not None:
-            raise ConfigError("--rerun shows what is done in this process: not with --dask or --jobs")
-        if len(inputs) > 1 and url_of(rerun) is None:
-            raise ConfigError(
-                "--rerun writes one recording to a file, but there are several inputs",
-                hint="watch them in the viewer: --rerun, or --rerun HOST:PORT",
-            )
-        require_target(rerun, force)
-    if name is not None and len(inputs) > 1:
-        raise ConfigError("--name names one session, but there are several inputs")
-    wanted = [
-        Job(
-            path=path,
-            name=name or path.stem,
-            config=settings,
-            start_s=start,
-            duration_s=duration,
-            recover=recover,
-            label=Label(building=building, floor=floor),
+        _check_rerun(
+            rerun, several=len(inputs) > 1, parallel=dask is not None or jobs is not None, force=force
         )
-        for path in inputs
-    ]
-    names = [job.name for job in wanted]
-    twice = sorted({n for n in names if names.count(n) > 1})
-    if twice:
-        raise ConfigError(
-            f"two inputs would both be the session {twice[0]!r}", hint="convert one later with --add --name"
-        )
+    span, label = TimeSpan(start, duration), Label(building=building, floor=floor)
+    wanted = _jobs(inputs, name, settings, span=span, recover=recover, label=label)
     stored = _stored(output, wanted, add=add, force=force)
-    if dask is None and jobs is not None:
-        dask = LOCAL
+    if any(job.name not in stored for job in wanted):
+        check_database(output)
     done = _convert_all(
         [replace(job, stored=stored.get(job.name)) for job in wanted],
         output,
+        console.of(context),
         keep=add or bool(stored),
         force=force,
-        dask=dask,
+        dask=LOCAL if dask is None and jobs is not None else dask,
         processes=jobs or os.cpu_count() or 1,
         rerun=rerun,
         quiet=json,
+        strict=strict,
     )
-    where = transfer.shown(output)
+    where = maintenance.shown(output)
     if json:
-        console.print_json(
-            {
-                "schema_version": 1,
-                "database": where,
-                "lossy": done.lossy,
-                "sessions": done.sessions,
-                "unchanged": done.unchanged,
-                "failed": done.failed,
-            }
-        )
-    else:
-        path = Path(output)
-        if path.is_file():
-            print(f"{where}: {path.stat().st_size / 1e6:.1f} MB")
+        console.print_json(_document(where, done))
+    elif Path(output).is_file():
+        print(f"{where}: {Path(output).stat().st_size / 1e6:.1f} MB")
     for warning in done.warnings:
         console.warn(warning)
     if done.failed:
         console.warn(f"{len(done.failed)} of {len(inputs)} failed: {', '.join(done.failed)}")
     if len(done.failed) == len(inputs):
         raise typer.Exit(console.FAILED)
-    if done.lossy:
+    if done.severe:
         raise typer.Exit(console.LOSSY)
+
+
+def _check_rerun(target: str, *, several: bool, parallel: bool, force: bool) -> None:
+    """Raises ConfigError or OutputError if the conversion cannot be streamed to this target."""
+    from pc2grid_cli.rerun_target import require_target, url_of
+
+    if parallel:
+        raise ConfigError("--rerun shows what is done in this process: not with --dask or --jobs")
+    if several and url_of(target) is None:
+        raise ConfigError(
+            "--rerun writes one recording to a file, but there are several inputs",
+            hint="watch them in the viewer: --rerun, or --rerun HOST:PORT",
+        )
+    require_target(target, force)
+
+
+def _jobs(
+    inputs: list[Path],
+    name: str | None,
+    settings: Config,
+    *,
+    span: TimeSpan,
+    recover: bool,
+    label: Label,
+) -> list[Job]:
+    """A job for each input. Raises ConfigError if two of them have the same name."""
+    from signature.conversion_jobs import Job
+
+    if name is not None and len(inputs) > 1:
+        raise ConfigError("--name names one session, but there are several inputs")
+    names = [name or path.stem for path in inputs]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise ConfigError(
+            f"two inputs would both be the session {twice[0]!r}", hint="convert one later with --add --name"
+        )
+    return [
+        Job(path=path, name=session, config=settings, span=span, recover=recover, label=label)
+        for path, session in zip(inputs, names, strict=True)
+    ]
 
 
 @dataclass(kw_only=True)
 class _Done:
-    """What became of all inputs."""
+    """The results of all inputs so far.
 
-    sessions: list[dict[str, Any]] = field(default_factory=list)
+    lossy : data was lost, or an input failed. severe : so much that the exit code is 3.
+    """
+
+    sessions: list[Converted] = field(default_factory=list)
     unchanged: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     lossy: bool = False
+    severe: bool = False
+
+
+def _document(database: str, done: _Done) -> Convert:
+    return {
+        "schema_version": 1,
+        "database": database,
+        "lossy": done.lossy,
+        "sessions": done.sessions,
+        "unchanged": done.unchanged,
+        "failed": done.failed,
+    }
 
 
 def _convert_all(
     jobs: list[Job],
     output: str,
+    terminal: console.Console,
     *,
     keep: bool,
     force: bool,
@@ -156,68 +185,68 @@ def _convert_all(
     processes: int,
     rerun: str | None,
     quiet: bool,
+    strict: bool,
 ) -> _Done:
-    """Convert, here or on a cluster, and store what comes back, in order, a transaction each."""
-    from signature import cluster
-    from signature.database import transfer
+    """Convert, here or on a cluster, and store each result in a transaction of its own, in order."""
+    from signature import conversion_jobs
+    from signature.database import maintenance
 
     done = _Done()
     with contextlib.ExitStack() as stack:
         if len(jobs) > 1:
-            stack.enter_context(_say_how_far(done, len(jobs)))
+            stack.enter_context(_note_stored(terminal, done, len(jobs)))
         shown = None
+        observer: Observer = terminal.observer()
         if rerun is not None:
             from pc2grid_cli.rerun_stream import Conversions
 
             shown = stack.enter_context(Conversions(rerun))
+            observer = Observers(observer, shown)
         if dask is None:
-            watch = None if shown is None else shown.watch
-            outcomes = cluster.here(jobs, console.progress, lambda line: console.note(line, level=1), watch)
+            outcomes = conversion_jobs.here(jobs, observer)
         else:
-            outcomes = cluster.on_cluster(jobs, dask, min(processes, len(jobs)), console.warn)
-            update = stack.enter_context(console.progress(f"convert {len(jobs)} recordings"))
-        # Whatever ends this early ends the cluster too, before anything is said about it.
+            outcomes = conversion_jobs.on_cluster(jobs, dask, min(processes, len(jobs)), observer)
+            stack.enter_context(observer.step(f"convert {len(jobs)} recordings"))
+        # If this block is left early, the cluster ends before anything is printed about it.
         stack.enter_context(contextlib.closing(outcomes))
-        for number, outcome in enumerate(outcomes, start=1):
+        for outcome in outcomes:
             error = outcome.error
             if outcome.entry is not None:
                 try:
-                    transfer.store(output, [outcome.entry], keep=keep, force=force)
+                    maintenance.store(output, [outcome.entry], keep=keep, force=force)
                     keep = True
-                    _tell(done, outcome.entry, quiet)
+                    _tell(done, outcome.entry, quiet=quiet, strict=strict)
                     if shown is not None:
                         shown.show(outcome.entry[0], outcome.job.config)
                 except DatabaseError as refusal:
-                    if type(refusal) is not DatabaseError:  # the database itself is in trouble
+                    if type(refusal) is not DatabaseError:  # a subclass: the database itself cannot be used
                         raise
                     error = refusal
             if error is not None:
                 if len(jobs) == 1:
                     raise error
-                console.report_error(error)
+                terminal.report_error(error)
                 done.failed.append(str(outcome.job.path))
-                done.lossy = True
+                done.lossy = done.severe = True
             elif outcome.entry is None:
-                console.note(f"{outcome.job.name}: stored already")
+                terminal.note(f"{outcome.job.name}: stored already")
                 done.unchanged.append(outcome.job.name)
-            if dask is not None:
-                update(number / len(jobs))
     return done
 
 
 @contextlib.contextmanager
-def _say_how_far(done: _Done, count: int) -> Iterator[None]:
-    """What is stored stays when the rest is given up."""
+def _note_stored(terminal: console.Console, done: _Done, count: int) -> Iterator[None]:
+    """If the block fails, print how many sessions are stored: they stay."""
     try:
         yield
     except BaseException:
         ready = len(done.sessions) + len(done.unchanged)
-        console.note(f"{ready} of {count} are stored; the same command goes on from there")
+        terminal.note(f"{ready} of {count} are stored; the same command continues from there")
         raise
 
 
-def _tell(done: _Done, entry: Entry, quiet: bool) -> None:
-    """Remember and print what became of one input."""
+def _tell(done: _Done, entry: Entry, *, quiet: bool, strict: bool) -> None:
+    """Keep and print the result of one input."""
     session, _, origin = entry
     document = summary(session, origin)
     done.sessions.append(document)
@@ -227,29 +256,29 @@ def _tell(done: _Done, entry: Entry, quiet: bool) -> None:
     if not session.submaps:
         done.warnings.append(f"{session.session}: no free space to cut submaps from: nothing is found in it")
     if session.report.lossy:
-        done.warnings.append(f"{session.session}: data was lost: {_losses(session)}")
+        done.warnings.append(f"{session.session}: {data_loss.sentence(session.report)}")
         done.lossy = True
+        done.severe = done.severe or data_loss.ends_with_3(session.report, strict)
 
 
 def _stored(output: str, jobs: list[Job], *, add: bool, force: bool) -> dict[str, Provenance]:
-    """Sessions that are there already and shall stay as they are; without any, a new database is made.
+    """Provenance of the sessions that are stored already and stay; without any, a new database is made.
 
-    Raises OutputError if there is a database that the inputs must not be written to.
+    Raises OutputError if a database exists that the inputs must not be written to.
     """
     from pc2grid.errors import OutputError
-    from signature.database import open_database, transfer
-    from signature.database.postgres_schema import is_url
+    from signature.database import maintenance, open_database
+    from signature.database.postgres.schema import is_url
 
-    where = transfer.shown(output)
-    if not is_url(output) and not Path(output).parent.is_dir():
-        raise OutputError(
-            f"{output}: cannot write: no folder {Path(output).parent}", hint="create the folder first"
-        )
-    if not transfer.exists(output) or (force and not add):
+    where = maintenance.shown(output)
+    there = maintenance.exists(output)
+    if not is_url(output) and not (there and add):
+        check_database_name(output)
+    if not there or (force and not add):
         return {}
     try:
         with open_database(output) as opened:
-            # Of what a whole fleet has stored, only namesakes matter for adding.
+            # A database may hold a whole fleet: for adding, only sessions of the same names matter.
             known = opened.sessions([job.name for job in jobs] if add else None)
         present = {info.name: info.provenance for info in known}
     except DatabaseError:
@@ -277,15 +306,16 @@ def _stored(output: str, jobs: list[Job], *, add: bool, force: bool) -> dict[str
     return present
 
 
-def summary(session: SessionMap, origin: Provenance) -> dict[str, Any]:
-    """What became of one input, plain types only."""
-    from dataclasses import asdict
-
+def summary(session: SessionMap, origin: Provenance) -> Converted:
+    """The session made of one input, as the JSON document describes it."""
     import numpy as np
+
+    from pc2grid_cli.json_schemas import consistency_document
 
     path_m = session.trajectory.path_m()
     grid = session.grid
     stamps = session.trajectory.stamps_ns
+    report = session.report
     return {
         "session": session.session,
         "building": origin.label.building,
@@ -298,17 +328,25 @@ def summary(session: SessionMap, origin: Provenance) -> dict[str, Any]:
         "duration_s": round(float(stamps[-1] - stamps[0]) / 1e9, 2) if len(stamps) else 0.0,
         "area_m2": round(float(np.count_nonzero(grid.free)) * grid.resolution_m**2, 1),
         "submaps": len(session.submaps),
-        "report": {**asdict(session.report), "lossy": session.report.lossy},
+        "consistency": consistency_document(session.consistency),
+        "report": {
+            "scans_read": report.scans_read,
+            "points_dropped": report.points_dropped,
+            "scans_skipped": report.scans_skipped,
+            "bytes_lost": report.bytes_lost,
+            "warnings": list(report.warnings),
+            "lossy": report.lossy,
+        },
     }
 
 
 def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
-    """What tells a session that is there from the one that was asked for, as the end of a sentence.
+    """How a stored session differs from the one that is asked for, as the end of a sentence; empty: not.
 
-    Of several inputs the content is not looked at: whoever converts them does that.
+    The content of the input is compared only if there is one input; of several, each job compares its own.
     """
     from pc2grid.errors import Pc2GridError
-    from signature.build import digest_of
+    from signature.sessions import digest_of
 
     for job in jobs:
         if job.name not in present:
@@ -316,7 +354,10 @@ def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
         was = present[job.name]
         asked = job.made_from(was.digest)
         if was.label != asked.label:
-            return f", {job.name!r} with {was.label} instead of {asked.label} (--building, --floor)"
+            return (
+                f"; its session {job.name!r} has the label {str(was.label)!r}, this one would have"
+                f" {str(asked.label)!r} (--building, --floor)"
+            )
         if (was.start_s, was.duration_s) != (asked.start_s, asked.duration_s):
             return f", {job.name!r} made from another part of the recording (--start, --duration)"
         for section, settings in job.config:
@@ -335,24 +376,16 @@ def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
             try:
                 digest = digest_of(job.path, job.config)
             except Pc2GridError:
-                return ""  # an input that cannot be read: the next attempt with --force says so
+                return ""  # the input cannot be read; with --force its error is shown
             if digest != was.digest:
                 return other
     return ""
 
 
-def _as_text(d: dict[str, Any]) -> str:
+def _as_text(d: Converted) -> str:
     travel = (
         f"{d['scans']} {d['sensor']} scans, {d['path_m']:.1f} m in {d['duration_s']:.0f} s, "
         if d["scans"]
         else ""
     )
     return f"{d['session']}: {travel}{d['area_m2']:.0f} m2 free, {d['submaps']} submaps"
-
-
-def _losses(session: SessionMap) -> str:
-    report = session.report
-    parts = [f"{count} scans skipped ({reason})" for reason, count in report.scans_skipped.items()]
-    if report.bytes_lost:
-        parts.append(f"{report.bytes_lost} bytes unreadable")
-    return ", ".join(parts)

@@ -1,4 +1,4 @@
-"""`pc2grid demo`: the whole way with simulated robots: map, query, answer, picture."""
+"""`pc2grid demo`: everything with simulated robots: map, query, answer, picture."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Annotated
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.settings import Force
+from pc2grid_cli.options import OUTPUT_FOLDER, Force
+from pc2grid_cli.output_files import make_folder
 
 BUILDING_SEED = 3
 MAP_LENGTH_M = 60.0
@@ -19,7 +20,8 @@ QUERY_START_M = (7.6, 8.0)
 
 
 def demo_command(
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="where to leave the files")] = Path(
+    context: typer.Context,
+    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, metavar="DIR", help="where to leave the files")] = Path(
         "demo_out"
     ),
     force: Force = False,
@@ -28,29 +30,31 @@ def demo_command(
 
     Example: pc2grid demo
     """
+    from pc2grid.geometry import wrap_angle
     from pc2grid.io import open_log
-    from pc2grid.io.atomic import refuse_existing
+    from pc2grid.io.atomic import require_writable
     from pc2grid.io.trajectory import read_tum
     from pc2grid.simulate import SimulationConfig, simulate_session
     from pc2grid.simulate.config import LidarConfig
-    from pc2grid_cli.finding import Found, locate
+    from pc2grid_cli.locate import Found, about_log, locate
     from pc2grid_cli.picture import draw_answer
     from pc2grid_cli.relocalize import as_text
     from pc2grid_cli.report import write_report
-    from signature.build import add_sessions, build_session
     from signature.config import Config
     from signature.database import open_database
+    from signature.sessions import add_sessions, build_session
 
+    terminal = console.of(context)
     begin = time.monotonic()
     lidar, depth = out / "lidar.mcap", out / "depth.mcap"
     database, picture, page = out / "office.submaps", out / "answer.png", out / "report.html"
+    make_folder(out)
     for path in (lidar, depth, database, picture, page):
-        refuse_existing(path, force)
-    out.mkdir(parents=True, exist_ok=True)
+        require_writable(path, force)
 
-    console.note("1/4 simulate a robot with a lidar, and days later one with a depth camera")
-    with console.progress("simulate lidar") as update:
-        # Half of a VLP-16's turns and firings: enough for an indoor map, and the demo stays short.
+    terminal.note("1/4 simulate a robot with a lidar, and days later one with a depth camera")
+    with terminal.progress("simulate lidar") as update:
+        # Half of the rate and columns of a VLP-16: enough for an indoor map, and the demo stays short.
         mapper = SimulationConfig(
             length_m=MAP_LENGTH_M,
             seed=1,
@@ -58,31 +62,30 @@ def demo_command(
             lidar=LidarConfig(rate_hz=5.0, columns=450),
         )
         simulate_session(lidar, sensor="lidar", grid=None, config=mapper, progress=update, force=force)
-    with console.progress("simulate depth") as update:
+    with terminal.progress("simulate depth") as update:
         visitor = SimulationConfig(
             length_m=QUERY_LENGTH_M, seed=12, start_m=QUERY_START_M, building_seed=BUILDING_SEED
         )
         simulate_session(depth, sensor="depth", grid=None, config=visitor, progress=update, force=force)
 
-    console.note("2/4 convert the lidar's recording into a database")
+    terminal.note("2/4 convert the lidar's recording into a database")
     config = Config()
-    with console.progress(f"map {lidar.name}") as update:
-        session, origin = build_session(lidar, "lidar", config, progress=update)
+    session, origin = build_session(lidar, "lidar", config, observer=terminal.observer())
     add_sessions(database, [(session, origin)], config, keep=False)
 
-    console.note("3/4 relocalize the depth camera's recording in it")
+    terminal.note("3/4 relocalize the depth camera's recording in it")
     truth_map, truth_query = read_tum(lidar.with_suffix(".tum")), read_tum(depth.with_suffix(".tum"))
     with open_database(database) as opened, open_log(depth, config.read) as query:
-        answer, poses = locate(query, opened, config)
-        # The database's frame is the lidar robot's first pose, the truth is in the floor plan's.
+        answer, poses = locate(query, opened, config, observer=terminal.observer())
+        # The frame of the database is the first pose of the lidar robot; the truth is in that of the plan.
         T_map_plan = next(truth_map.poses()).inverse()
         true_poses = [T_map_plan @ pose for pose in truth_query.poses()]
-        console.note("4/4 draw it")
+        terminal.note("4/4 draw it")
         import numpy as np
 
         truth_m = np.array([(p.x, p.y) for p in true_poses])
         draw_answer(picture, opened, answer, poses, truth_m)
-        about = {"source": depth.name, "sensor": "depth"}
+        about = about_log(depth, query, answer, scans=len(poses))
         found = Found(answer=answer, poses=poses, about=about)
         write_report(page, opened, found=found, accept=config.relocalize.accept, truth_m=truth_m)
     print(f"map: {len(session.trajectory)} lidar scans, {len(session.submaps)} submaps: {database}")
@@ -90,7 +93,7 @@ def demo_command(
     if answer.T_map_base is not None:
         pose, true = answer.T_map_base, true_poses[-1]
         distance = math.hypot(pose.x - true.x, pose.y - true.y)
-        turn = abs(math.degrees(math.remainder(pose.yaw - true.yaw, 2 * math.pi)))
+        turn = abs(math.degrees(wrap_angle(pose.yaw - true.yaw)))
         print(f"truth: x {true.x:.2f} m, y {true.y:.2f} m: off by {distance:.2f} m and {turn:.1f} deg")
     print(f"picture: {picture}, page to look into it: {page}   ({time.monotonic() - begin:.0f} s)")
     if answer.status != "located":

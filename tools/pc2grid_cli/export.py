@@ -1,18 +1,21 @@
-"""`pc2grid export`: what is in a database, in the formats of others."""
+"""`pc2grid export`: the sessions of a database in the formats of other programs."""
 
 from __future__ import annotations
 
 import enum
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.settings import AsJson, Database, Force, Rerun
+from pc2grid_cli.options import AsJson, Database, Force, Rerun
+from pc2grid_cli.output_files import check_file, map_stem
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory
+    from pc2grid_cli.json_schemas import Export
     from signature.database import SubmapDatabase
 
 
@@ -23,7 +26,14 @@ class TrajectoryKind(str, enum.Enum):
     kitti = "kitti"
 
 
+_FORMATS: dict[TrajectoryKind, Literal["tum", "kitti"]] = {
+    TrajectoryKind.tum: "tum",
+    TrajectoryKind.kitti: "kitti",
+}
+
+
 def export_command(
+    context: typer.Context,
     database: Database,
     map_: Annotated[
         Path | None, typer.Option("--map", metavar="STEM", help="STEM.yaml and STEM.pgm for nav2")
@@ -64,85 +74,151 @@ def export_command(
 
     Example: pc2grid export building.submaps --map building --trajectory building.tum
     """
-    from pc2grid.errors import ConfigError, DatabaseError
-    from pc2grid.io.atomic import refuse_existing
     from signature.database import open_database
 
-    of_session = [path for path in (trajectory, cloud, graph, g2o, mcap, plot) if path is not None]
-    if map_ is not None:
-        of_session += [map_.with_name(map_.name + ".yaml"), map_.with_name(map_.name + ".pgm")]
-    targets = of_session + ([report] if report is not None else [])
-    if not targets and rerun is None:
-        raise ConfigError(
-            "nothing to export",
-            hint="name one of --map, --trajectory, --cloud, --graph, --g2o, --mcap, --rerun, --plot,"
-            " --report",
-        )
-    for path in targets:
-        refuse_existing(path, force)
-    if rerun is not None:
-        from pc2grid_cli.rerun_target import require_target, url_of
-
-        require_target(rerun, force)
+    terminal = console.of(context)
+    outputs = _Outputs(
+        map_stem=None if map_ is None else map_stem(map_),
+        trajectory=trajectory,
+        trajectory_format=None if format_ is None else _FORMATS[format_],
+        cloud=cloud,
+        graph=graph,
+        g2o=g2o,
+        mcap=mcap,
+        rerun=rerun,
+        plot=plot,
+        report=report,
+        force=force,
+    )
+    outputs.check()
     with open_database(database) as opened:
         where = opened.location
-        names = [info.name for info in opened.sessions()]
-        if (of_session or rerun) and session is None and len(names) != 1:
-            there = ", ".join(names) or "none"
-            raise DatabaseError(
-                f"{where}: holds {len(names)} sessions: {there}", hint="choose one with --session"
-            )
-        name = session or (names[0] if names else "")
-        # What the session cannot give is refused before anything is written.
-        poses = _poses(opened, name) if trajectory or g2o else None
-        if map_ is not None:
-            from pc2grid.io.nav2_map import save_map
-
-            save_map(opened.grid(name), map_)
-        if trajectory is not None and poses is not None:
-            from pc2grid.io.trajectory import write_trajectory
-
-            write_trajectory(trajectory, poses, None if format_ is None else format_.value)
-        if cloud is not None:
-            _write_cloud(cloud, opened, name)
-        if graph is not None:
-            from pc2grid.io.graph_out import write_graph
-            from pc2grid.partition import junction_graph
-
-            write_graph(graph, junction_graph(opened.grid(name), opened.config().partition))
-        if g2o is not None and poses is not None:
-            from pc2grid.io.g2o_out import write_g2o
-
-            write_g2o(g2o, poses, opened.loops(name))
-        if mcap is not None:
-            from pc2grid_cli.foxglove import write_session
-
-            write_session(mcap, opened, name, force)
-        if rerun is not None:
-            from pc2grid_cli.rerun_stream import write_session as stream_session
-
-            stream_session(rerun, opened, name)
-            if url_of(rerun) is None:
-                targets.append(Path(rerun))
-        if plot is not None:
-            from pc2grid_cli.picture import draw_session
-
-            draw_session(plot, opened, name)
+        name = _session_name(opened, session) if outputs.of_session() else None
+        if name is not None:
+            _write_session(outputs, opened, name, terminal)
         if report is not None:
             from pc2grid_cli.report import write_report
 
             write_report(report, opened)
-    for path in targets:
-        console.note(f"wrote {path}")
+    for path in outputs.written():
+        terminal.note(f"wrote {path}")
     if json:
-        console.print_json(
-            {
-                "schema_version": 1,
-                "database": where,
-                "session": name if of_session or rerun else None,
-                "written": [str(path) for path in targets],
-            }
+        document: Export = {
+            "schema_version": 1,
+            "database": where,
+            "session": name,
+            "written": [str(path) for path in outputs.written()],
+        }
+        console.print_json(document)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Outputs:
+    """What the command writes; None: not this."""
+
+    map_stem: Path | None
+    trajectory: Path | None
+    trajectory_format: Literal["tum", "kitti"] | None
+    cloud: Path | None
+    graph: Path | None
+    g2o: Path | None
+    mcap: Path | None
+    rerun: str | None
+    plot: Path | None
+    report: Path | None
+    force: bool
+
+    def files(self) -> list[Path]:
+        """The files of a session, but for those of rerun."""
+        one = (self.trajectory, self.cloud, self.graph, self.g2o, self.mcap, self.plot)
+        return [path for path in one if path is not None] + self.map_files()
+
+    def map_files(self) -> list[Path]:
+        """The files of a nav2 map."""
+        stem = self.map_stem
+        return [] if stem is None else [stem.with_name(f"{stem.name}{end}") for end in (".yaml", ".pgm")]
+
+    def of_session(self) -> bool:
+        """Whether anything is written of a single session."""
+        return bool(self.files()) or self.rerun is not None
+
+    def written(self) -> list[Path]:
+        """All files, in the order in which they are listed for the user."""
+        from pc2grid_cli.rerun_target import url_of
+
+        paths = self.files() + ([] if self.report is None else [self.report])
+        return paths + ([Path(self.rerun)] if self.rerun is not None and url_of(self.rerun) is None else [])
+
+    def check(self) -> None:
+        """Raises ConfigError if there is nothing to write, OutputError if a target cannot be written."""
+        from pc2grid.errors import ConfigError
+
+        if not self.of_session() and self.report is None:
+            raise ConfigError(
+                "nothing to export",
+                hint="name one of --map, --trajectory, --cloud, --graph, --g2o, --mcap, --rerun, --plot,"
+                " --report",
+            )
+        for option in ("trajectory", "cloud", "graph", "g2o", "mcap", "plot", "report"):
+            named = option == "trajectory" and self.trajectory_format is not None
+            check_file(option, getattr(self, option), self.force, any_suffix=named)
+        for path in self.map_files():
+            check_file("map", path, self.force)
+        if self.rerun is not None:
+            from pc2grid_cli.rerun_target import require_target
+
+            require_target(self.rerun, self.force)
+
+
+def _session_name(database: SubmapDatabase, asked: str | None) -> str:
+    """The session to write. Raises DatabaseError if none is asked for and there is not exactly one."""
+    from pc2grid.errors import DatabaseError
+
+    if asked is not None:
+        return asked
+    names = [info.name for info in database.sessions()]
+    if len(names) != 1:
+        raise DatabaseError(
+            f"{database.location}: holds {len(names)} sessions: {', '.join(names) or 'none'}",
+            hint="choose one with --session",
         )
+    return names[0]
+
+
+def _write_session(outputs: _Outputs, database: SubmapDatabase, name: str, terminal: console.Console) -> None:
+    """Write all files of a session."""
+    # A session without a trajectory is refused before anything is written.
+    poses = _poses(database, name) if outputs.trajectory or outputs.g2o else None
+    if outputs.map_stem is not None:
+        from pc2grid.io.nav2_map import save_map
+
+        save_map(database.grid(name), outputs.map_stem)
+    if outputs.trajectory is not None and poses is not None:
+        from pc2grid.io.trajectory import write_trajectory
+
+        write_trajectory(outputs.trajectory, poses, outputs.trajectory_format)
+    if outputs.cloud is not None:
+        _write_cloud(outputs.cloud, database, name, terminal)
+    if outputs.graph is not None:
+        from pc2grid.io.export.graphml import write_graph
+
+        write_graph(outputs.graph, database.graph(name))
+    if outputs.g2o is not None and poses is not None:
+        from pc2grid.io.export.g2o import write_g2o
+
+        write_g2o(outputs.g2o, poses, database.loops(name))
+    if outputs.mcap is not None:
+        from pc2grid_cli.foxglove import write_session
+
+        write_session(outputs.mcap, database, name, outputs.force)
+    if outputs.rerun is not None:
+        from pc2grid_cli.rerun_stream import write_session as stream_session
+
+        stream_session(outputs.rerun, database, name)
+    if outputs.plot is not None:
+        from pc2grid_cli.picture import draw_session
+
+        draw_session(outputs.plot, database, name)
 
 
 def _poses(database: SubmapDatabase, session: str) -> Trajectory:
@@ -156,13 +232,13 @@ def _poses(database: SubmapDatabase, session: str) -> Trajectory:
     return poses
 
 
-def _write_cloud(path: Path, database: SubmapDatabase, session: str) -> None:
-    """A database keeps the map, not the recording's points: one point for each occupied cell."""
+def _write_cloud(path: Path, database: SubmapDatabase, session: str, terminal: console.Console) -> None:
+    """One point for each occupied cell: a database keeps the map, not the points of the recording."""
     import numpy as np
 
-    from pc2grid.io.cloud_out import write_cloud
+    from pc2grid.io.export.cloud import write_cloud
 
     grid = database.grid(session)
     walls = grid.to_point(np.argwhere(grid.occupied))
     write_cloud(path, np.column_stack((walls, np.zeros(len(walls)))))
-    console.note(f"{path}: {len(walls)} occupied cells at z = 0; a database holds no 3D points")
+    terminal.note(f"{path}: {len(walls)} occupied cells at z = 0; a database holds no 3D points")

@@ -11,27 +11,27 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pc2grid.io.mcap_out import LogWriter, Marker
+from pc2grid.io.export.mcap import LogWriter, Marker
 
 if TYPE_CHECKING:
-    from pc2grid.geometry import F64
+    from pc2grid.arrays import F64
     from pc2grid.model import OccupancyGrid, Trajectory
-    from signature.answer import Answer
     from signature.database import SubmapDatabase
+    from signature.relocalization.answer import Answer
 
 # Okabe and Ito's green, grey and purple.
 _GREEN, _GREY, _PURPLE = (0.0, 0.62, 0.45, 1.0), (0.4, 0.4, 0.4, 0.6), (0.8, 0.47, 0.65, 1.0)
 
 
 def write_session(path: Path, database: SubmapDatabase, session: str, force: bool) -> None:
-    """A session's map, path and submaps, and where its robot was when."""
+    """A session's map, path and submaps, and the poses of its robot over time."""
     poses = database.trajectory(session)
     with LogWriter(path, force=force) as writer:
         _write_map(writer, database, session, int(poses.stamps_ns[0]) if len(poses) else 0)
         if len(poses):
             writer.path("/path", poses)
-        for stamp_ns, T_map_base in zip(poses.stamps_ns, poses.T_map_base, strict=True):
-            writer.tf(int(stamp_ns), "map", "base_link", T_map_base)
+        for stamp_ns, T_session_base in zip(poses.stamps_ns, poses.T_session_base, strict=True):
+            writer.tf(int(stamp_ns), "map", "base_link", T_session_base)
 
 
 def write_answer(
@@ -51,7 +51,7 @@ def write_answer(
         writer.tf(first, "map", "odom", answer.T_map_odom.lift())
         writer.path("/query_path", located, stamp_ns=first)
         T_odom_map = answer.T_map_odom.inverse().lift()
-        for stamp_ns, T_map_base in zip(located.stamps_ns, located.T_map_base, strict=True):
+        for stamp_ns, T_map_base in zip(located.stamps_ns, located.T_session_base, strict=True):
             writer.tf(int(stamp_ns), "odom", "base_link", T_odom_map @ T_map_base)
         writer.markers("/hypotheses", last, [_hypotheses(answer)])
         for topic in ("/pose", "/initialpose"):
@@ -74,13 +74,11 @@ def write_located_map(
 
 
 def _write_map(writer: LogWriter, database: SubmapDatabase, session: str, stamp_ns: int) -> None:
-    from pc2grid.partition import junction_graph
-
     grid = database.grid(session)
     writer.occupancy_grid("/map", stamp_ns, grid)
     table = database.signatures()
     index = [info.name for info in database.sessions()].index(session)
-    graph = junction_graph(grid, database.config().partition)
+    graph = database.graph(session)
     ways = [graph.nodes[node]["center_m"] for edge in graph.edges for node in edge]
     centers = Marker(
         name="submaps",
@@ -94,7 +92,7 @@ def _write_map(writer: LogWriter, database: SubmapDatabase, session: str, stamp_
 
 
 def _hypotheses(answer: Answer) -> Marker:
-    """Where else it could have been, the best first."""
+    """Markers of the hypotheses, the best first."""
     poses = [hypothesis.fit.T_map_query @ answer.T_odom_base for hypothesis in answer.hypotheses]
     same = [answer.sessions[h.session_index] == answer.session for h in answer.hypotheses]
     points = [(pose.x, pose.y) for pose, here in zip(poses, same, strict=True) if here]

@@ -1,37 +1,114 @@
-"""`pc2grid info`: what is in a recording, and what `convert` would use of it and why."""
+"""`pc2grid info`: what is in a recording, and what `convert` would use of it; in a map or a database."""
 
 from __future__ import annotations
 
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pc2grid.errors import one_line
 from pc2grid_cli.console import print_json
-from pc2grid_cli.settings import AsJson, Recover, Topic
+from pc2grid_cli.options import AsJson, Recover, Topic
+
+if TYPE_CHECKING:
+    from pc2grid.io.message_source import LogInfo
+    from pc2grid_cli.json_schemas import Choice, Info, InfoMap
+
+_WIDEST = 1000
+"""Characters of the widest table of topics."""
 
 
 def info_command(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="the recording to look at")],
+    log: Annotated[
+        str,
+        typer.Argument(metavar="LOG|MAP.yaml|DATABASE", help="recording, nav2 map or database to look at"),
+    ],
     topic: Topic = None,
     recover: Recover = False,
     json: AsJson = False,
 ) -> None:
-    """Say what is in a recording, and which topic convert would use and why.
+    """Say what is in a recording, and which topic convert would use and why; or in a map, or a database.
 
     Example: pc2grid info monday.mcap
     """
-    document = describe(log, topic=topic, recover=recover)
+    from pc2grid.io.nav2_map import is_map_file
+
+    if is_database(log):
+        from pc2grid_cli.db_info import db_info_command
+
+        db_info_command(log, json)
+        return
+    if is_map_file(Path(log)):
+        of_map = describe_map(Path(log))
+        if json:
+            print_json(of_map)
+        else:
+            print(one_line(_map_as_text(of_map)))
+        return
+    document = describe(Path(log), topic=topic, recover=recover)
     if json:
         print_json(document)
     else:
         _show(document)
 
 
-def describe(path: Path, *, topic: str | None = None, recover: bool = False) -> dict[str, Any]:
-    """The answer as one JSON-able document; `choice` is null and `problem` says why, if convert could not.
+def is_database(name: str) -> bool:
+    """Whether this is the URL or the file of a submap database."""
+    from pc2grid.io.containers.detect import is_submap_database
+    from signature.database.postgres.schema import is_url
+
+    if is_url(name):
+        return True
+    try:
+        with Path(name).open("rb") as file:
+            return is_submap_database(file.read(100))
+    except OSError:
+        return False
+
+
+def describe_map(path: Path) -> InfoMap:
+    """The document of a nav2 map. Raises MapFileError if it cannot be read."""
+    import numpy as np
+
+    from pc2grid.io.nav2_map import load_map
+
+    grid = load_map(path)
+    height, width = grid.cells.shape
+    cell_m2 = grid.resolution_m**2
+    return {
+        "schema_version": 1,
+        "path": str(path),
+        "format": "nav2 map",
+        "width": width,
+        "height": height,
+        "resolution_m": grid.resolution_m,
+        "origin_m": list(grid.origin_m),
+        "free_m2": round(float(np.count_nonzero(grid.free)) * cell_m2, 2),
+        "occupied_m2": round(float(np.count_nonzero(grid.occupied)) * cell_m2, 2),
+    }
+
+
+def _camera_topic(log: LogInfo, images: str) -> str:
+    """The topic with the calibration of the camera whose depth images are used."""
+    from pc2grid.io.topics import camera_info_topic
+
+    image = next(topic for topic in log.topics if topic.topic == images)
+    return camera_info_topic(image, log.topics).topic
+
+
+def _map_as_text(d: InfoMap) -> str:
+    x, y = d["origin_m"]
+    return (
+        f"{d['path']}: nav2 map, {d['width']} x {d['height']} cells of {d['resolution_m']:g} m"
+        f" ({d['width'] * d['resolution_m']:.1f} x {d['height'] * d['resolution_m']:.1f} m),"
+        f" {d['free_m2']:.0f} m2 free, lower left corner at x {x:.2f} m, y {y:.2f} m"
+    )
+
+
+def describe(path: Path, *, topic: str | None = None, recover: bool = False) -> Info:
+    """The document of a recording. If convert could not use it, `choice` is null and `problem` says why.
 
     Reads the log's summary and a few messages only, unless it has no summary.
     Raises LogError if the file cannot be opened.
@@ -42,7 +119,7 @@ def describe(path: Path, *, topic: str | None = None, recover: bool = False) -> 
 
     with open_log(path, ReadConfig(topic=topic), recover=recover) as log:
         found = log.info
-        choice: dict[str, Any] | None = None
+        choice: Choice | None = None
         problem: str | None = None
         try:
             chosen = log.choose()
@@ -53,8 +130,9 @@ def describe(path: Path, *, topic: str | None = None, recover: bool = False) -> 
                 "topic": chosen.topic,
                 "sensor": chosen.sensor,
                 "odometry_topic": chosen.odometry_topic,
+                "camera_topic": _camera_topic(found, chosen.topic) if chosen.sensor == "depth" else None,
                 "base_frame": chosen.base_frame,
-                "sensor_frame": chosen.sensor_frame,
+                "sensor_frame": chosen.sensor_frame or "",
                 "reason": chosen.reason,
             }
         report = log.report()
@@ -78,17 +156,19 @@ def describe(path: Path, *, topic: str | None = None, recover: bool = False) -> 
         }
 
 
-def _show(document: dict[str, Any]) -> None:
+def _show(document: Info) -> None:
     from rich import markup
     from rich.console import Console
     from rich.table import Table
 
+    from pc2grid.io.topics import TF
+
     def escape(text: str) -> str:
-        # Names come from the log, and may hold what a terminal would obey.
+        # Names come from the log, and may hold control sequences for a terminal.
         return markup.escape(one_line(text))
 
     console = Console()
-    choice = document["choice"] or {}
+    choice = document["choice"]
     count = document["message_count"]
     console.print(f"[bold]{escape(document['path'])}[/bold]", soft_wrap=True, highlight=False)
     console.print(
@@ -100,12 +180,17 @@ def _show(document: dict[str, Any]) -> None:
     table = Table(box=None, pad_edge=False)
     for name in ("topic", "type", "messages", "used as"):
         table.add_column(name, justify="right" if name == "messages" else "left", overflow="fold")
-    uses = {choice.get("odometry_topic"): "odometry", choice.get("topic"): f"scans ({choice.get('sensor')})"}
+    uses: dict[str | None, str] = {}
+    if choice is not None:
+        uses = {t["topic"]: "transforms" for t in document["topics"] if t["type"] in TF}
+        uses |= {choice["camera_topic"]: "calibration"}
+        uses |= {choice["odometry_topic"]: "odometry", choice["topic"]: f"scans ({choice['sensor']})"}
     for topic in document["topics"]:
         number = "?" if topic["message_count"] is None else str(topic["message_count"])
         table.add_row(escape(topic["topic"]), escape(topic["type"]), number, uses.get(topic["topic"], ""))
-    console.print(table)
-    if choice:
+    # As wide as the names are: a terminal wraps long lines better than a table breaks names.
+    Console(width=_WIDEST).print(table)
+    if choice is not None:
         console.print(f"convert uses {escape(choice['topic'])}: {escape(choice['reason'])}", soft_wrap=True)
         frames = f"base frame {choice['base_frame']}, scans in frame {choice['sensor_frame'] or '(unnamed)'}"
         console.print(escape(frames), soft_wrap=True, highlight=False)

@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from signature.evaluation.contribution import Independence
-    from signature.evaluation.summary import Cell
+    from signature.evaluation.ablation import Independence
+    from signature.evaluation.metrics import MatrixCell
     from signature.evaluation.trial import Trial
 
 _SENSORS = ("lidar", "laser", "depth")
 
 
 def _wide() -> Console:
-    """Of the terminal's width; in a file wide enough for every column."""
+    """A console as wide as the terminal; for a file, wide enough for all columns."""
     from rich.console import Console
 
     console = Console()
     return console if console.is_terminal else Console(width=140)
 
 
-def tables(cells: Sequence[Cell], elsewhere: Sequence[Trial]) -> None:
-    """Print located-and-right by metres driven, and what else there is to know of each cell."""
+def tables(cells: Sequence[MatrixCell], elsewhere: Sequence[Trial]) -> None:
+    """Print the share located and right by metres driven, and the other figures of each cell."""
     from rich.table import Table
 
     console = _wide()
@@ -49,7 +49,8 @@ def tables(cells: Sequence[Cell], elsewhere: Sequence[Trial]) -> None:
         detail.add_column(heading, justify="left" if heading in ("map", "query") else "right")
     for map_sensor, query_sensor in ((m, q) for m in _SENSORS for q in _SENSORS):
         row = {c.travel_m: c for c in cells if (c.map_sensor, c.query_sensor) == (map_sensor, query_sensor)}
-        if not row:
+        if not row:  # no query of this sensor drove where the map is
+            shares.add_row(map_sensor, query_sensor, *("-" for _ in distances), "0")
             continue
         shares.add_row(
             map_sensor,
@@ -65,9 +66,9 @@ def tables(cells: Sequence[Cell], elsewhere: Sequence[Trial]) -> None:
                 f"{cell.wrong:.3f}",
                 f"{cell.ambiguous:.2f}",
                 f"{cell.not_found:.2f}",
-                "/".join(f"{value:.2f}" for value in cell.recall.values()),
-                f"{cell.median_error_m:.3f} m",
-                f"{cell.p95_error_m:.3f} m",
+                _recall(cell.recall),
+                _metres(cell.median_error_m),
+                _metres(cell.p95_error_m),
                 f"{cell.look_up_ms:.0f}",
             )
     console.print(shares)
@@ -77,8 +78,8 @@ def tables(cells: Sequence[Cell], elsewhere: Sequence[Trial]) -> None:
         console.print(f"queries from another building: {right} of {len(elsewhere)} answered not_found")
 
 
-def draw(path: Path, cells: Sequence[Cell], reliability: Sequence[tuple[float, float, int]]) -> None:
-    """One picture: located-and-right against metres for each map sensor, and how far confidence is true."""
+def draw(path: Path, cells: Sequence[MatrixCell], reliability: Sequence[tuple[float, float, int]]) -> None:
+    """One picture: share located and right by metres for each map sensor; calibration of confidence."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -99,14 +100,15 @@ def draw(path: Path, cells: Sequence[Cell], reliability: Sequence[tuple[float, f
                 color=colours[query_sensor],
                 label=f"{query_sensor} query",
             )
-        ax.set(title=f"{map_sensor} map", xlabel="driven, m", ylim=(0, 1.03))
+        farthest_m = max((c.travel_m for c in cells), default=1.0)
+        ax.set(title=f"{map_sensor} map", xlabel="driven, m", xlim=(0, 1.05 * farthest_m), ylim=(0, 1.03))
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("located and right")
     axes[0].legend(loc="lower right")
     axes[3].plot([0, 1], [0, 1], color="0.6", lw=1)
     if reliability:
-        said, true, count = zip(*reliability, strict=True)
-        axes[3].scatter(said, true, s=[20 + 2 * min(n, 200) for n in count], color=BLUE, alpha=0.7)
+        confidence, right, count = zip(*reliability, strict=True)
+        axes[3].scatter(confidence, right, s=[20 + 2 * min(n, 200) for n in count], color=BLUE, alpha=0.7)
     axes[3].set(title="confidence on plans not tuned on", xlabel="confidence", ylabel="share that was right")
     axes[3].grid(alpha=0.3)
     with replace_file(path) as draft:
@@ -114,7 +116,16 @@ def draw(path: Path, cells: Sequence[Cell], reliability: Sequence[tuple[float, f
     plt.close(figure)
 
 
-Recalls = Mapping[str, Mapping[str, Mapping[int, float]]]
+Recalls = Mapping[str, Mapping[str, Mapping[int, float | None]]]
+"""Recall by query sensor, by what is used, and by the number of retrieved places."""
+
+
+def _metres(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f} m"
+
+
+def _recall(shares: Mapping[int, float | None]) -> str:
+    return "/".join("-" if share is None else f"{share:.2f}" for share in shares.values())
 
 
 def contribution_table(independent: Mapping[str, Independence], recalls: Recalls, travel_m: float) -> None:
@@ -126,7 +137,7 @@ def contribution_table(independent: Mapping[str, Independence], recalls: Recalls
         table.add_column(heading, justify="left" if heading == "signatures" else "right")
     for name in recalls["all"]:
         auc = f"{independent[name].auc:.3f}" if name in independent else ""
-        shares = ("/".join(f"{v:.2f}" for v in row[name].values()) for row in recalls.values())
+        shares = (_recall(row[name]) for row in recalls.values())
         table.add_row(name, auc, *shares)
     _wide().print(table)
 
@@ -161,7 +172,9 @@ def draw_signatures(path: Path, independent: Mapping[str, Independence], recalls
     height = 0.27
     for offset, (k, colour) in enumerate(zip((1, 5, 20), (VERMILLION, ORANGE, BLUE), strict=True)):
         at = np.arange(len(rows)) + (offset - 1) * height
-        right.barh(at, [recalls["all"][name][k] for name in rows], height, color=colour, label=f"at {k}")
+        right.barh(
+            at, [recalls["all"][name][k] or 0.0 for name in rows], height, color=colour, label=f"at {k}"
+        )
     right.set(title="recall of the right place, all sensors", xlim=(0.0, 1.0))
     right.set_yticks(np.arange(len(rows)), rows)
     right.invert_yaxis()

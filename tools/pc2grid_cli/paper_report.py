@@ -11,14 +11,14 @@ from rich.console import Console
 from rich.table import Table
 
 from pc2grid.io.atomic import replace_file
-from signature.evaluation.published import MAPS, SUBMAPS, TABLE_3, TABLE_4, Measures
-from signature.evaluation.reproduce import RADII_M, Result
+from signature.evaluation.paper_tables import MAPS, SUBMAPS, TABLE_3, TABLE_4, Measures
+from signature.evaluation.paper_task import RADII_M, PaperCell
 
 _LEVELS = ("without noise", "noise level 1", "noise level 2")
 
 
-def published(result: Result) -> Measures | None:
-    """The paper's number for a cell, if it printed one."""
+def published(result: PaperCell) -> Measures | None:
+    """The published number for a cell; None if there is none."""
     if result.overrides or result.map_name not in MAPS or result.reading != "paper":
         return None
     if result.radius_m == 8.0:
@@ -28,7 +28,7 @@ def published(result: Result) -> Measures | None:
     return None
 
 
-def print_tables(results: Sequence[Result], methods: Sequence[str]) -> None:
+def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
     """Tables I, III and IV on stdout: published, ours and the difference, in thousandths."""
     console = Console(width=120, highlight=False)
     plain = [r for r in results if not r.overrides]
@@ -59,15 +59,15 @@ def print_tables(results: Sequence[Result], methods: Sequence[str]) -> None:
 
 
 def _table(title: str, *heads: str) -> Table:
-    """A table with a column a map; killian* is killian at its true size."""
+    """A table with a column for each map; killian* is killian at its true size."""
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for head in (*heads, *MAPS, "killian*"):
         table.add_column(head, no_wrap=True, justify="left" if head in heads else "right")
     return table
 
 
-def _cells(row: Sequence[Result], measure: str) -> list[str]:
-    """One text a map, and one for killian at its true size."""
+def _cells(row: Sequence[PaperCell], measure: str) -> list[str]:
+    """A text for each map, and one for killian at its true size."""
     texts = []
     for name, reading in [*((name, "paper") for name in MAPS), ("killian", "true")]:
         found = [r for r in row if (r.map_name, r.reading) == (name, reading)]
@@ -83,7 +83,7 @@ def _cells(row: Sequence[Result], measure: str) -> list[str]:
     return texts
 
 
-def _print_submaps(console: Console, results: Sequence[Result]) -> None:
+def _print_submaps(console: Console, results: Sequence[PaperCell]) -> None:
     table = Table(title="Table I, number of submaps", title_justify="left", box=SIMPLE_HEAD)
     for head in ("map", "paper", "ours", "difference"):
         table.add_column(head, justify="right")
@@ -100,8 +100,8 @@ def _print_submaps(console: Console, results: Sequence[Result]) -> None:
     )
 
 
-def verdicts(results: Sequence[Result]) -> list[str]:
-    """What the tables say, in words: how near, who leads. Results of one offset."""
+def verdicts(results: Sequence[PaperCell]) -> list[str]:
+    """The tables in words: the differences, and the best method. Results of one offset."""
     cells = {
         (r.method, r.level, r.map_name): r.auc
         for r in results
@@ -126,7 +126,7 @@ def verdicts(results: Sequence[Result]) -> list[str]:
     return lines
 
 
-def _print_open_choices(console: Console, results: Sequence[Result], where: str) -> None:
+def _print_open_choices(console: Console, results: Sequence[PaperCell], where: str) -> None:
     changed = [r for r in results if r.overrides]
     if not changed:
         return
@@ -145,7 +145,7 @@ def _print_open_choices(console: Console, results: Sequence[Result], where: str)
     console.print(table)
 
 
-def _is_base(result: Result) -> bool:
+def _is_base(result: PaperCell) -> bool:
     return (
         not result.overrides
         and result.method == "proposed"
@@ -154,7 +154,7 @@ def _is_base(result: Result) -> bool:
     )
 
 
-def draw_figures(results: Sequence[Result], out: Path) -> list[Path]:
+def draw_figures(results: Sequence[PaperCell], out: Path) -> list[Path]:
     """figure-9-OFFSET.png and figure-10-OFFSET.png: precision over recall; returns their paths."""
     import matplotlib
 
@@ -185,11 +185,11 @@ def draw_figures(results: Sequence[Result], out: Path) -> list[Path]:
     return paths
 
 
-def _draw_curves(axis: Any, curves: Sequence[tuple[str, Result]]) -> None:
+def _draw_curves(axis: Any, curves: Sequence[tuple[str, PaperCell]]) -> None:
     for label, result in curves:
-        curve = result.outcome.curve()
+        curve = result.matches.curve()
         if len(curve.recall):
-            # As the area is taken: from recall 0 at the precision of the first point.
+            # Like the area under the curve: from recall 0 at the precision of the first point.
             axis.plot(
                 [0.0, *curve.recall], [curve.precision[0], *curve.precision], label=label, linewidth=1.2
             )

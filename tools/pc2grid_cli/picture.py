@@ -1,4 +1,4 @@
-"""Pictures of maps and answers. Colours after Okabe and Ito, which everybody can tell apart."""
+"""Pictures of maps and answers, in the colours of Okabe and Ito, which colour-blind people can tell apart."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pc2grid.io.atomic import replace_file
+from pc2grid_cli.probability import probability
 
 if TYPE_CHECKING:
     from pc2grid.model import OccupancyGrid, Trajectory
     from signature.database import SubmapDatabase
-    from signature.relocalize import Answer
+    from signature.relocalization.relocalizer import Answer
 
 BLUE, ORANGE, GREEN, VERMILLION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
 YELLOW = "#F0E442"
@@ -20,7 +21,7 @@ _SHADES = {"unknown": 0.87, "free": 1.0, "wall": 0.15}
 
 
 def draw_session(path: Path, database: SubmapDatabase, session: str) -> None:
-    """The map of a session with its submaps and the way the robot took."""
+    """The map of a session with its submaps and the path of the robot."""
     figure, axes = _canvas(database.grid(session))
     _draw_submaps(axes, database, session)
     poses = database.trajectory(session).planar()
@@ -37,7 +38,7 @@ def draw_answer(
     poses: Trajectory,
     truth_m: np.ndarray | None = None,
 ) -> None:
-    """The map with what was found: the query's path where the answer puts it, and the hypotheses.
+    """The map with the answer: the path of the query in it, and the hypotheses.
 
     poses : the query in its own frame. truth_m : (N, 2) its true path in the map frame, if known.
     """
@@ -77,7 +78,7 @@ def draw_answer(
         axes.plot(
             pose.x, pose.y, "o", color=VERMILLION, mec="white", ms=9, zorder=7, label="robot at the last scan"
         )
-    axes.set_title(f"{answer.status.replace('_', ' ')}, confidence {answer.confidence:.2f}")
+    axes.set_title(f"{answer.status.replace('_', ' ')}, confidence {probability(answer.confidence)}")
     _finish(figure, axes, path)
 
 
@@ -89,8 +90,8 @@ def _canvas(grid: OccupancyGrid) -> tuple[Any, Any]:
     (r0, c0), (r1, c1) = (
         (known.min(axis=0), known.max(axis=0) + 1) if len(known) else ((0, 0), grid.cells.shape)
     )
-    cells = grid.cells[r0:r1, c0:c1]
-    grey = np.where(cells < 0, _SHADES["unknown"], np.where(cells >= 65, _SHADES["wall"], _SHADES["free"]))
+    cells, occupied = grid.cells[r0:r1, c0:c1], grid.occupied[r0:r1, c0:c1]
+    grey = np.where(cells < 0, _SHADES["unknown"], np.where(occupied, _SHADES["wall"], _SHADES["free"]))
     x0, y0 = grid.origin_m[0] + c0 * grid.resolution_m, grid.origin_m[1] + r0 * grid.resolution_m
     width, height = (c1 - c0) * grid.resolution_m, (r1 - r0) * grid.resolution_m
     ratio = float(np.clip(height / max(width, 1e-6), 0.35, 1.6))

@@ -4,23 +4,49 @@ from __future__ import annotations
 
 import contextlib
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pc2grid.errors import one_line
-from pc2grid_cli import console
-from pc2grid_cli import settings as options
-from pc2grid_cli.answer_files import write_initialpose
-from pc2grid_cli.finding import find_log, find_map, in_map
+from pc2grid.time_span import TimeSpan
+from pc2grid_cli import console, data_loss
+from pc2grid_cli import options as options
+from pc2grid_cli.locate import Found, find_log, find_map, in_map
+from pc2grid_cli.nav2_pose import write_initialpose
+from pc2grid_cli.output_files import check_file
+from pc2grid_cli.probability import probability
 
 if TYPE_CHECKING:
-    from signature.relocalize import Answer
-    from signature.verify import Hypothesis
+    from pc2grid.model import Trajectory
+    from pc2grid_cli.json_schemas import Relocalize
+    from signature.config import Config
+    from signature.database import SubmapDatabase
+    from signature.relocalization.hypotheses import Hypothesis
+    from signature.relocalization.relocalizer import Answer
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Outputs:
+    """What the command writes, beside the answer on stdout."""
+
+    trajectory: Path | None
+    initialpose: Path | None
+    output: Path | None
+    plot: Path | None
+    report: Path | None
+    force: bool
+
+    def check(self) -> None:
+        """Raises OutputError if a file cannot be written, or exists and must not be replaced."""
+        for option in ("trajectory", "initialpose", "output", "plot", "report"):
+            check_file(option, getattr(self, option), self.force)
 
 
 def relocalize_command(
+    context: typer.Context,
     log: Annotated[Path, typer.Argument(metavar="LOG|MAP.yaml", help="the recording or nav2 map to locate")],
     database: Annotated[
         str, typer.Option("--database", "-d", metavar=options.DATABASE, help="where to look")
@@ -38,10 +64,12 @@ def relocalize_command(
         Path | None, typer.Option("--trajectory", metavar="OUT.tum", help="the query's poses in the map")
     ] = None,
     initialpose: Annotated[
-        Path | None, typer.Option("--initialpose", metavar="OUT.json", help="the pose as nav2 wants it")
+        Path | None,
+        typer.Option("--initialpose", metavar="OUT.json", help="the pose in the form that nav2 takes"),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", metavar="OUT.mcap", help="map, pose and path for Foxglove")
+        Path | None,
+        typer.Option("--output", "-o", metavar="OUT.mcap", help="map, pose, path for Foxglove"),
     ] = None,
     rerun: options.Rerun = None,
     plot: Annotated[
@@ -54,6 +82,7 @@ def relocalize_command(
     set_: options.Assignments = None,
     force: options.Force = False,
     recover: options.Recover = False,
+    strict: options.Strict = False,
     assume_identity: options.AssumeIdentity = False,
     json: options.AsJson = False,
 ) -> None:
@@ -61,94 +90,165 @@ def relocalize_command(
 
     Example: pc2grid relocalize tuesday.mcap --database building.submaps
     """
-    from pc2grid.errors import ConfigError
-    from pc2grid.io.atomic import refuse_existing
-    from pc2grid.io.nav2_map import is_map_file
     from signature.database import open_database
 
-    for path in (trajectory, initialpose, output, plot, report):
-        if path is not None:
-            refuse_existing(path, force)
-    for option, asked in (("--trajectory", trajectory), ("--initialpose", initialpose), ("--rerun", rerun)):
-        if asked is not None and is_map_file(log):
-            raise ConfigError(
-                f"{option}: there is no robot in a map", hint="--json and --output have its pose"
-            )
+    outputs = _Outputs(
+        trajectory=trajectory,
+        initialpose=initialpose,
+        output=output,
+        plot=plot,
+        report=report,
+        force=force,
+    )
+    outputs.check()
+    _check_options_for_maps(log, outputs, rerun)
     if rerun is not None:
         from pc2grid_cli.rerun_target import require_target
 
         require_target(rerun, force)
     settings = options.make_config(
-        config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
+        config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity, top_k=top_k
     )
-    if top_k is not None:
-        settings = settings.model_copy(
-            update={"relocalize": settings.relocalize.model_copy(update={"top_k": top_k})}
-        )
-    with open_database(database) as opened, contextlib.ExitStack() as stack:
+    _check_not_swapped(log, database)
+    with open_database(database) as opened:
         where = opened.location
         if building is not None or floor is not None:
             opened.keep_only(building=building, floor=floor)
         left_out = [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
+        found, located = _find(
+            log,
+            opened,
+            settings,
+            span=TimeSpan(start, duration),
+            recover=recover,
+            rerun=rerun,
+            terminal=console.of(context),
+        )
+        # Printed first: a file that cannot be written must not cost the answer.
+        _print(found, where, left_out, as_json=json)
+        _write(outputs, opened, found, located, settings)
+    for path in (trajectory, initialpose, output):
+        if path is not None and located is None:
+            console.warn(f"{path}: not written, there is no answer to put into it")
+    for warning in found.about["warnings"]:
+        console.warn(warning)
+    if found.report is not None and found.report.lossy:
+        console.warn(f"{log.name}: {data_loss.sentence(found.report)}")
+    for damage in left_out:
+        console.warn(f"{where}: damaged and left out: {damage}")
+    if found.answer.status != "located":
+        raise typer.Exit(console.UNSURE)
+    if left_out or (found.report is not None and data_loss.ends_with_3(found.report, strict)):
+        raise typer.Exit(console.LOSSY)
+
+
+def _check_not_swapped(log: Path, database: str) -> None:
+    """Raises NotALog if a database is given in place of the recording."""
+    from pc2grid.errors import NotALog
+    from pc2grid_cli.info import is_database
+
+    if is_database(str(log)):
+        raise NotALog(
+            f"{log}: a submap database, where a recording or a map is expected",
+            hint=f"are they swapped? pc2grid relocalize {database} -d {log}",
+        )
+
+
+def _check_options_for_maps(log: Path, outputs: _Outputs, rerun: str | None) -> None:
+    """Raises ConfigError for options that need a robot, if the query is a map."""
+    from pc2grid.errors import ConfigError
+    from pc2grid.io.nav2_map import is_map_file
+
+    asked = {"--trajectory": outputs.trajectory, "--initialpose": outputs.initialpose, "--rerun": rerun}
+    for option, value in asked.items():
+        if value is not None and is_map_file(log):
+            raise ConfigError(
+                f"{option}: there is no robot in a map", hint="--json and --output have its pose"
+            )
+
+
+def _find(
+    log: Path,
+    database: SubmapDatabase,
+    settings: Config,
+    *,
+    span: TimeSpan,
+    recover: bool,
+    rerun: str | None,
+    terminal: console.Console,
+) -> tuple[Found, Trajectory | None]:
+    """The answer, and the query's poses in the map; both are streamed to `rerun` meanwhile."""
+    from pc2grid.io.nav2_map import is_map_file
+
+    if is_map_file(log):
+        found = find_map(log, database, settings)
+        return found, in_map(found.poses, found.answer)
+    with contextlib.ExitStack() as stack:
         shown = None
         if rerun is not None:
             from pc2grid_cli.rerun_stream import Search, stream_to
 
-            shown = Search(stack.enter_context(stream_to(rerun, log.stem)), opened)
-        if is_map_file(log):
-            found = find_map(log, opened, settings)
-        else:
-            found = find_log(
-                log,
-                opened,
-                settings,
-                start_s=start,
-                duration_s=duration,
-                recover=recover,
-                watch=None if shown is None else shown.watch,
-            )
-        answer = found.answer
-        located = in_map(found.poses, answer)
-        if located is not None:
-            if trajectory is not None:
-                from pc2grid.io.trajectory import write_trajectory
+            shown = Search(stack.enter_context(stream_to(rerun, log.stem)), database)
+        found = find_log(
+            log,
+            database,
+            settings,
+            span=span,
+            recover=recover,
+            observer=terminal.observer(),
+            watch=None if shown is None else shown.watch,
+        )
+        located = in_map(found.poses, found.answer)
+        if shown is not None and located is not None:
+            shown.show(found.answer, located)
+    return found, located
 
-                write_trajectory(trajectory, located)
-            if initialpose is not None:
-                write_initialpose(initialpose, answer)
-            if output is not None:
-                from pc2grid_cli.foxglove import write_answer, write_located_map
 
-                if found.drawn is not None:
-                    write_located_map(output, opened, answer, found.drawn, force)
-                else:
-                    write_answer(output, opened, answer, located, force)
-            if shown is not None:
-                shown.show(answer, located)
-        if plot is not None:
-            from pc2grid_cli.picture import draw_answer
+def _write(
+    outputs: _Outputs,
+    database: SubmapDatabase,
+    found: Found,
+    located: Trajectory | None,
+    settings: Config,
+) -> None:
+    """Write the files; without an answer only the picture and the page."""
+    answer = found.answer
+    if located is not None:
+        if outputs.trajectory is not None:
+            from pc2grid.io.trajectory import write_trajectory
 
-            draw_answer(plot, opened, answer, found.poses)
-        if report is not None:
-            from pc2grid_cli.report import write_report
+            write_trajectory(outputs.trajectory, located)
+        if outputs.initialpose is not None:
+            write_initialpose(outputs.initialpose, answer)
+        if outputs.output is not None:
+            from pc2grid_cli.foxglove import write_answer, write_located_map
 
-            write_report(report, opened, found=found, accept=settings.relocalize.accept)
-    for path in (trajectory, initialpose, output):
-        if path is not None and located is None:
-            console.warn(f"{path}: not written, there is no answer to put into it")
-    if json:
-        about_database = {"path": where, "left_out": left_out}
-        console.print_json(answer.to_json(query=found.about, database=about_database))
+            if found.drawn is not None:
+                write_located_map(outputs.output, database, answer, found.drawn, outputs.force)
+            else:
+                write_answer(outputs.output, database, answer, located, outputs.force)
+    if outputs.plot is not None:
+        from pc2grid_cli.picture import draw_answer
+
+        draw_answer(outputs.plot, database, answer, found.poses)
+    if outputs.report is not None:
+        from pc2grid_cli.report import write_report
+
+        write_report(outputs.report, database, found=found, accept=settings.relocalize.accept)
+
+
+def _print(found: Found, where: str, left_out: list[str], *, as_json: bool) -> None:
+    """The answer on stdout."""
+    if as_json:
+        answer = found.answer.to_json()
+        document: Relocalize = {
+            **answer,
+            "query": found.about,
+            "database": {**answer["database"], "path": where, "left_out": left_out},
+        }
+        console.print_json(document)
     else:
-        print(as_text(answer, is_map=found.drawn is not None))
-    for warning in found.about["warnings"]:
-        console.warn(warning)
-    for damage in left_out:
-        console.warn(f"{where}: damaged and left out: {damage}")
-    if answer.status != "located":
-        raise typer.Exit(console.UNSURE)
-    if found.about["lossy"] or left_out:
-        raise typer.Exit(console.LOSSY)
+        print(as_text(found.answer, is_map=found.drawn is not None), flush=True)
 
 
 def as_text(answer: Answer, *, is_map: bool = False) -> str:
@@ -161,7 +261,7 @@ def as_text(answer: Answer, *, is_map: bool = False) -> str:
         return (
             f"located in {_named(answer, answer.hypotheses[0])}: x {pose.x:.2f} m, y {pose.y:.2f} m,"
             f" yaw {math.degrees(pose.yaw):.1f} deg {of_what},"
-            f" confidence {answer.confidence:.2f}{travel}"
+            f" confidence {probability(answer.confidence)}{travel}"
         )
     lines = [
         {
@@ -176,7 +276,7 @@ def as_text(answer: Answer, *, is_map: bool = False) -> str:
 
 
 def _named(answer: Answer, hypothesis: Hypothesis) -> str:
-    """The session whose map a hypothesis is in, with its building and floor if they were ever told."""
+    """The session whose map a hypothesis is in, with its building and floor if they are known."""
     session = answer.sessions[hypothesis.session_index]
     label = answer.labels[hypothesis.session_index]
     return one_line(f"{session} ({label})" if label.building or label.floor else session)

@@ -16,18 +16,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pc2grid.io.atomic import replace_file
+from pc2grid.model import OCCUPIED_FROM
 
 if TYPE_CHECKING:
-    from pc2grid.geometry import F64
-    from pc2grid.model import Loop, OccupancyGrid, Trajectory
-    from pc2grid_cli.finding import Found
-    from signature.config import Config
+    import networkx as nx
+
+    from pc2grid.arrays import F64
+    from pc2grid.model import Consistency, Loop, OccupancyGrid, Trajectory
+    from pc2grid_cli.locate import Found
     from signature.database import SubmapDatabase
     from signature.similarity import SignatureTable
 
 _LARGEST_PIXELS = 3000
 _STEP_M = 0.05
-"""Poses nearer than this to the last one drawn are left out: nobody sees them."""
+"""Poses nearer than this to the last one drawn are left out: they would not be visible."""
 
 
 def write_report(
@@ -45,7 +47,7 @@ def write_report(
     """
     page = files("pc2grid_cli").joinpath("report.html").read_text(encoding="utf-8")
     document = contents(database, found=found, accept=accept, truth_m=truth_m)
-    # "<" is the only character with which text could leave the script element.
+    # "<" is the only character that could end the script element.
     data = json.dumps(document, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     with replace_file(path) as temporary:
         temporary.write_text(page.replace("/*DATA*/null", data, 1), encoding="utf-8")
@@ -58,7 +60,7 @@ def contents(
     accept: float = 0.9,
     truth_m: F64 | None = None,
 ) -> dict[str, Any]:
-    """What the page shows, plain types only."""
+    """The data of the page as plain types."""
     config, table = database.config(), database.signatures()
     return {
         "title": Path(database.location).name,
@@ -70,8 +72,9 @@ def contents(
                 **_facts(info),
                 "image": _picture(database.grid(info.name)),
                 "submaps": _submaps(table, index),
-                "graph": _graph(database.grid(info.name), config),
+                "graph": _graph(database.graph(info.name)),
                 "path": runs(database.trajectory(info.name)),
+                "contradicted": _contradicted(database.trajectory(info.name), info.consistency),
                 "loops": _loops(database.trajectory(info.name), database.loops(info.name)),
             }
             for index, info in enumerate(database.sessions())
@@ -91,6 +94,8 @@ def _facts(info: Any) -> dict[str, Any]:
         "duration_s": round(info.duration_s, 1),
         "scans": info.scans,
         "lossy": info.lossy,
+        "agreement": None if info.consistency is None else round(1.0 - info.consistency.contradicted, 4),
+        "bent": info.consistency is not None and info.consistency.bent,
         "warnings": list(info.warnings),
     }
 
@@ -108,11 +113,8 @@ def _submaps(table: SignatureTable, session_index: int) -> list[dict[str, Any]]:
     ]
 
 
-def _graph(grid: OccupancyGrid, config: Config) -> dict[str, Any]:
-    """Where ways meet or end (x, y, whether a junction), and which of them are joined."""
-    from pc2grid.partition import junction_graph
-
-    graph = junction_graph(grid, config.partition)
+def _graph(graph: nx.Graph) -> dict[str, Any]:
+    """Nodes of the junction graph (x, y, whether a junction), and the pairs of them that are joined."""
     return {
         "nodes": [
             [*_short(node["center_m"], 2), int(node["kind"] == "junction")] for _, node in graph.nodes.items()
@@ -139,14 +141,27 @@ def runs(poses: Trajectory) -> list[dict[str, Any]]:
 
 
 def _loops(poses: Trajectory, loops: tuple[Loop, ...]) -> list[list[float]]:
-    """Which two places of the path were found to be near each other: x, y, x, y, whether it was accepted."""
+    """The two poses of each loop: x, y, x, y, whether it was accepted."""
     xy = poses.planar()[:, :2]
     return [[*_short(xy[loop.older], 2), *_short(xy[loop.newer], 2), int(loop.accepted)] for loop in loops]
 
 
+def _contradicted(poses: Trajectory, consistency: Consistency | None) -> list[list[float]]:
+    """The parts of a path along which the scans do not agree with the map, as x, y, x, y, ..."""
+    xy, parts = poses.planar()[:, :2], []
+    for stretch in () if consistency is None else consistency.stretches:
+        first, last = np.searchsorted(poses.stamps_ns, (stretch.from_ns, stretch.to_ns))
+        part = xy[first : last + 1]
+        step_m = np.hypot(*np.diff(part, axis=0).T)
+        drawn = np.concatenate(([True], np.diff(np.floor(np.cumsum(step_m) / _STEP_M), prepend=0.0) > 0))
+        drawn[-1] = True
+        parts.append(_short(np.ravel(part[drawn]), 2))
+    return parts
+
+
 def _answer(found: Found, accept: float, truth_m: F64 | None) -> dict[str, Any]:
     answer = found.answer
-    document = answer.to_json(query=found.about)
+    document = answer.to_json()
     pose = document["pose"]
     return {
         "status": answer.status,
@@ -155,7 +170,7 @@ def _answer(found: Found, accept: float, truth_m: F64 | None) -> dict[str, Any]:
         "deviation": None if answer.covariance is None else _short(np.sqrt(np.diag(answer.covariance)), 4),
         "confidence": round(answer.confidence, 4),
         "accept": accept,
-        "query": {**document["query"], "is_map": found.drawn is not None},
+        "query": {**found.about, "is_map": found.drawn is not None},
         "hypotheses": [
             {**shown, "T": [h.fit.T_map_query.x, h.fit.T_map_query.y, h.fit.T_map_query.yaw]}
             for shown, h in zip(document["hypotheses"], answer.hypotheses, strict=True)
@@ -187,7 +202,7 @@ def _picture(grid: OccupancyGrid, tint: tuple[int, int, int] | None = None) -> d
         pixels[..., 3] = np.where(cells < 0, 0, 255)
     else:
         pixels[..., :3] = tint
-        pixels[..., 3] = np.where(cells >= 65, 255, 0)
+        pixels[..., 3] = np.where(cells >= OCCUPIED_FROM, 255, 0)
     # Row 0 of a grid is its lowest, row 0 of a picture its highest.
     data = cv2.imencode(".png", np.ascontiguousarray(pixels[::-1]))[1].tobytes()
     size = grid.resolution_m * n
@@ -201,5 +216,5 @@ def _picture(grid: OccupancyGrid, tint: tuple[int, int, int] | None = None) -> d
 
 
 def _short(values: Any, digits: int) -> list[float]:
-    """Plain numbers with no more digits than anybody can see."""
+    """Plain numbers, rounded to digits that can be seen."""
     return [round(float(v), digits) for v in np.asarray(values, np.float64)]

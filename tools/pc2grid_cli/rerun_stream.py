@@ -1,9 +1,9 @@
-"""Maps, and recordings as they are worked on, in the rerun viewer or as `.rrd` files; needs the extra `viz`.
+"""Maps, and recordings during the work on them, in the rerun viewer or in `.rrd` files; needs the extra viz.
 
 Entities: map/walls, map/submaps, map/ways, map/path, map/loops, map/base. While a recording is converted,
-map/live is what tracking sees of it, before loops are closed; while one is located, query/live is the same
-where the best hypothesis puts it, and query/confidence how sure that is. In the end query/path,
-query/hypotheses and query/base. What moves does so over the timeline `time`, the recording's own.
+map/live holds the scans at their tracked poses, before loops are closed. While a recording is located,
+query/live holds the same at the pose of the best hypothesis, and query/confidence its confidence. At the end
+query/path, query/hypotheses and query/base follow. The timeline `time` has the time of the recording.
 """
 
 from __future__ import annotations
@@ -15,29 +15,34 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pc2grid.io.atomic import replace_file
+from pc2grid.observer import Observer
 from pc2grid_cli import console
 from pc2grid_cli.picture import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, YELLOW
 from pc2grid_cli.rerun_target import VIEWER, require_rerun, url_of
 
 if TYPE_CHECKING:
-    from pc2grid.config import PartitionConfig
-    from pc2grid.geometry import F64, SE2
+    import networkx as nx
+
+    from pc2grid.arrays import F64
+    from pc2grid.geometry import SE2
     from pc2grid.model import Loop, OccupancyGrid, RegisteredScan, SessionMap, Trajectory
-    from signature.answer import Answer, Moment
-    from signature.cluster import Job
     from signature.config import Config
     from signature.database import SubmapDatabase
+    from signature.relocalization.answer import Answer, Moment
 
-_MOST_POINTS = 4000  # of a scan; a viewer far away shall keep up
+_MOST_POINTS = 4000
+"""Points of a scan that are sent at most, so that a remote viewer can keep up; chosen by hand."""
 _KEPT_EVERY_M = 1.0
-_PATIENCE_S = 10.0
+"""A scan stays visible after so much travel; chosen by hand."""
+_FLUSH_S = 10.0
+"""How long to wait for the viewer at the end; chosen by hand."""
 
 
 @contextlib.contextmanager
 def stream_to(target: str, name: str) -> Iterator[Any]:
-    """A recording that a viewer shows as it grows, or that becomes a file when the block ends well."""
+    """A recording that a viewer shows while it grows, or a file if the block ends without an error."""
     url = url_of(target)
-    # A file is named after its content, so that the same data does not open as something new every time.
+    # With an id given by the name, the same data opens as the same recording each time.
     stream = require_rerun().RecordingStream("pc2grid", recording_id=name if url is None else None)
     with contextlib.ExitStack() as stack:
         if url is None:
@@ -51,7 +56,7 @@ def stream_to(target: str, name: str) -> Iterator[Any]:
             yield stream
         finally:
             try:
-                stream.flush(timeout_sec=_PATIENCE_S)
+                stream.flush(timeout_sec=_FLUSH_S)
             except Exception as error:  # its class differs between versions of rerun
                 console.warn(f"rerun: not all of {name} has arrived: {error}")
             stream.disconnect()
@@ -64,25 +69,30 @@ def write_session(target: str, database: SubmapDatabase, session: str) -> None:
         _log_moving(recording, "map/base", database.trajectory(session), BLUE)
 
 
-class Conversions:
-    """Shows recordings as they are converted, and the maps that they become: a rerun recording each."""
+class Conversions(Observer):
+    """Shows recordings as they are converted, and then their maps: one rerun recording for each session."""
 
     def __init__(self, target: str) -> None:
         self._target = target
         self._stack = contextlib.ExitStack()
+        self._session = ""
         self._name: str | None = None
 
-    def watch(self, job: Job, registered: RegisteredScan) -> None:
-        """The next scan of a job's recording."""
-        self._begin(job.name)
+    def on_session(self, name: str) -> None:
+        """The following scans belong to the session of this name."""
+        self._session = name
+
+    def on_scan(self, registered: RegisteredScan) -> None:
+        """The next scan."""
+        self._begin(self._session)
         self._live.add(registered)
 
     def show(self, session: SessionMap, config: Config) -> None:
-        """The map that it became."""
+        """The finished map of a session."""
         self._begin(session.session)
         self._live.end()
         centers = np.array([submap.center_m for submap in session.submaps]).reshape(-1, 2)
-        _log_map(self._recording, session.grid, centers, config.partition, session.trajectory, session.loops)
+        _log_map(self._recording, session.grid, centers, session.graph, session.trajectory, session.loops)
         _log_moving(self._recording, "map/base", session.trajectory, BLUE)
 
     def _begin(self, name: str) -> None:
@@ -100,7 +110,7 @@ class Conversions:
 
 
 class Search:
-    """Shows a recording while it is looked for in a database, and the answer."""
+    """Shows a recording while it is located in a database, and the answer."""
 
     def __init__(self, recording: Any, database: SubmapDatabase) -> None:
         self._recording, self._database = recording, database
@@ -112,7 +122,7 @@ class Search:
             self._show(sessions[0].name)
 
     def watch(self, registered: RegisteredScan, moment: Moment | None) -> None:
-        """The next scan, and what became of it if the database was asked."""
+        """The next scan, and the state of the answer if the database was asked after it."""
         from pc2grid.geometry import SE2
 
         rr = require_rerun()
@@ -121,18 +131,18 @@ class Search:
             self._recording.log("query/confidence", rr.Scalars(moment.confidence))
             if moment.session is not None and moment.pose is not None:
                 self._show(moment.session)
-                self._live.move(moment.pose @ SE2.flatten(registered.T_map_base).inverse())
+                self._live.move(moment.pose @ SE2.from_matrix(registered.T_session_base).inverse())
                 self._placed = True
         if self._placed:
             self._live.add(registered)
 
     def show(self, answer: Answer, located: Trajectory) -> None:
-        """Where it was: `located` are its poses in the map."""
+        """The answer; `located` are the poses of the query in the map."""
         assert answer.session is not None
         rr = require_rerun()
         self._show(answer.session)
         self._live.end()
-        way = rr.LineStrips3D([located.T_map_base[:, :3, 3]], colors=_rgb(VERMILLION))
+        way = rr.LineStrips3D([located.T_session_base[:, :3, 3]], colors=_rgb(VERMILLION))
         self._recording.log("query/path", way, static=True)
         poses = [hypothesis.fit.T_map_query @ answer.T_odom_base for hypothesis in answer.hypotheses]
         here = [answer.sessions[h.session_index] == answer.session for h in answer.hypotheses]
@@ -142,14 +152,14 @@ class Search:
         _log_moving(self._recording, "query/base", located, VERMILLION)
 
     def _show(self, session: str) -> None:
-        """The map of one session at a time: each has a frame of its own."""
+        """Show the map of one session at a time, because each has a frame of its own."""
         if session != self._shown:
             _log_stored(self._recording, self._database, session)
             self._shown = session
 
 
 class _Live:
-    """Scans where tracking puts them: the last one, and of the way so far a scan a metre."""
+    """Scans at their tracked poses: the latest one, and one for each metre of the path."""
 
     def __init__(self, recording: Any, entity: str) -> None:
         self._recording, self._entity = recording, entity
@@ -157,7 +167,7 @@ class _Live:
         self._driven_m, self._kept = 0.0, 0
 
     def move(self, T_map_odom: SE2) -> None:
-        """From now on, everything is there."""
+        """Move all scans to this pose of their frame in the map."""
         from pc2grid.geometry import quat_xyzw_from_pose
 
         T = T_map_odom.lift()
@@ -170,7 +180,7 @@ class _Live:
         from pc2grid.model import Health
 
         rr = require_rerun()
-        scan, T = registered.scan, registered.T_map_base
+        scan, T = registered.scan, registered.T_session_base
         _set_time(self._recording, scan.stamp_ns)
         step = -(-len(scan.points_m) // _MOST_POINTS) or 1
         points = transform_points(T, scan.points_m[::step])
@@ -188,7 +198,7 @@ class _Live:
             self._way, self._driven_m, self._kept = self._way[-1:], 0.0, self._kept + 1
 
     def end(self) -> None:
-        """Take it all away: what it became is there."""
+        """Clear the live entities; the final map replaces them."""
         self._recording.log(self._entity, require_rerun().Clear(recursive=True))
 
 
@@ -197,13 +207,13 @@ def _set_time(recording: Any, stamp_ns: int) -> None:
 
 
 def _log_stored(recording: Any, database: SubmapDatabase, session: str) -> None:
-    """The map of a session as the database has it."""
+    """Show the stored map of a session."""
     table = database.signatures(session)
     _log_map(
         recording,
         database.grid(session),
         table.center_m,
-        database.config().partition,
+        database.graph(session),
         database.trajectory(session),
         database.loops(session),
     )
@@ -213,17 +223,14 @@ def _log_map(
     recording: Any,
     grid: OccupancyGrid,
     centers_m: F64,
-    partition: PartitionConfig,
+    graph: nx.Graph,
     trajectory: Trajectory,
     loops: Sequence[Loop],
 ) -> None:
-    from pc2grid.partition import junction_graph
-
     rr = require_rerun()
     walls = _lift(grid.to_point(np.argwhere(grid.occupied)))
-    graph = junction_graph(grid, partition)
     ways = [_lift(np.array([graph.nodes[n]["center_m"] for n in edge])) for edge in graph.edges]
-    path = trajectory.T_map_base[:, :3, 3]
+    path = trajectory.T_session_base[:, :3, 3]
     closed = [path[[loop.older, loop.newer]] for loop in loops if loop.accepted]
     for entity, shown in (
         ("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
@@ -248,8 +255,8 @@ def _log_moving(recording: Any, entity: str, poses: Trajectory, color: str) -> N
         entity,
         indexes=[rr.TimeColumn("time", timestamp=poses.stamps_ns.astype("datetime64[ns]"))],
         columns=rr.Transform3D.columns(
-            translation=poses.T_map_base[:, :3, 3],
-            quaternion=[quat_xyzw_from_pose(T) for T in poses.T_map_base],
+            translation=poses.T_session_base[:, :3, 3],
+            quaternion=[quat_xyzw_from_pose(T) for T in poses.T_session_base],
         ),
     )
 

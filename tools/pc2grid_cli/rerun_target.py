@@ -12,21 +12,21 @@ from urllib.parse import urlsplit
 from pc2grid.errors import ConfigError, OutputError
 
 VIEWER = "viewer"
-"""Instead of an address or a file: the viewer of this machine, opened if it is not."""
-_PORT = 9876  # where a viewer listens unless told otherwise
+"""In place of an address or a file: the viewer of this machine, which is started if necessary."""
+_PORT = 9876  # the default of the viewer
 
 
 def require_rerun() -> Any:
-    """The rerun module. Raises ConfigError, saying what to install, if it is not there."""
+    """The rerun module. Raises ConfigError if it is not installed."""
     try:
         import rerun
     except ImportError:
-        raise ConfigError("--rerun needs the package rerun-sdk", hint="pip install 'pc2grid[viz]'") from None
+        raise ConfigError("--rerun needs the package rerun-sdk", hint="pip install rerun-sdk") from None
     return rerun
 
 
 def names_target(word: str) -> bool:
-    """Whether a word behind `--rerun` says where to: OUT.rrd, HOST:PORT, or a viewer's URL."""
+    """Whether a word behind `--rerun` is its value: OUT.rrd, HOST:PORT, or the URL of a viewer."""
     return word.endswith(".rrd") or url_of(word) is not None
 
 
@@ -40,16 +40,16 @@ def url_of(target: str) -> str | None:
 
 
 def require_target(target: str, force: bool) -> None:
-    """Refuse, before any work is done, what cannot be streamed to.
+    """Refuse a target that cannot be streamed to, before any work is done.
 
     Raises ConfigError without rerun; OutputError if the file exists, nobody answers, or there is no display.
     """
-    from pc2grid.io.atomic import refuse_existing
+    from pc2grid.io.atomic import require_writable
 
     require_rerun()
     url = url_of(target)
     if url is None:
-        refuse_existing(target, force)
+        require_writable(target, force)
         return
     place = urlsplit(url)
     try:

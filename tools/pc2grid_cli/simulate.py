@@ -1,15 +1,18 @@
-"""`pc2grid simulate`: a recording of a robot that never was, with the truth beside it."""
+"""`pc2grid simulate`: a simulated recording with its ground truth."""
 
 from __future__ import annotations
 
 import enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.settings import AsJson, Force
+from pc2grid_cli.options import AsJson, Force
+
+if TYPE_CHECKING:
+    from pc2grid_cli.json_schemas import Simulate
 
 
 class SensorName(str, enum.Enum):
@@ -21,42 +24,56 @@ class SensorName(str, enum.Enum):
 
 
 def simulate_command(
+    context: typer.Context,
     files: Annotated[
         list[Path],
         typer.Argument(
-            metavar="[MAP.yaml] OUT.mcap", help="floor plan (default: an office), and what to write"
+            metavar="[BUILDING] OUT.mcap",
+            help="MAP.yaml, or a real building as .pcd, .ply, .obj or .stl (default: an office);"
+            " and what to write",
         ),
     ],
     sensor: Annotated[SensorName, typer.Option(help="what the robot carries")],
     length: Annotated[float, typer.Option(min=0.1, metavar="M", help="metres to drive")] = 40.0,
     seed: Annotated[int, typer.Option(min=0, help="route, clutter, noise and odometry")] = 0,
-    clutter: Annotated[int, typer.Option(min=0, help="movable pieces in the way")] = 30,
+    clutter: Annotated[int, typer.Option(min=0, help="movable objects in the way")] = 30,
     walkers: Annotated[int, typer.Option(min=0, help="people who walk about meanwhile")] = 0,
+    change: Annotated[
+        float, typer.Option(min=0, max=1, help="share of doors and furniture that differ from the building")
+    ] = 0.0,
+    relief: Annotated[float, typer.Option(min=0, max=2, help="things on a metre of wall")] = 0.0,
+    glass: Annotated[float, typer.Option(min=0, max=1, help="share of the walls that is glass")] = 0.0,
+    mirrors: Annotated[float, typer.Option(min=0, max=0.5, help="share of the walls that is mirror")] = 0.0,
     start: Annotated[
         tuple[float, float] | None,
         typer.Option(metavar="X Y", help="where to start in the map; default: anywhere"),
     ] = None,
-    building_seed: Annotated[int, typer.Option(min=0, help="which office, when there is no MAP.yaml")] = 0,
+    building_seed: Annotated[int, typer.Option(min=0, help="which office, when no building is given")] = 0,
     no_odometry: Annotated[bool, typer.Option("--no-odometry", help="leave odometry out of the log")] = False,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Drive a robot through a building and record it: OUT.mcap, and OUT.tum with the true poses.
 
+    A cloud or a mesh of a real building is driven through as it is: its floor is found and levelled, and
+    rays hit its surfaces.
+
     Example: pc2grid simulate map.yaml drive.mcap --sensor depth --length 20
     """
     from pydantic import ValidationError
 
     from pc2grid.errors import ConfigError
-    from pc2grid.io.nav2_map import load_map
-    from pc2grid.simulate import SimulationConfig, simulate_session
-    from pc2grid.simulate.config import OdometryConfig
+    from pc2grid.io.atomic import require_writable
+    from pc2grid.simulate import SimulationConfig, load_building, simulate_session
+    from pc2grid.simulate.config import ChangeConfig, OdometryConfig
 
     if len(files) > 2:
-        raise typer.BadParameter(f"expected [MAP.yaml] OUT.mcap, got {len(files)} files")
+        raise typer.BadParameter(f"expected [BUILDING] OUT.mcap, got {len(files)} files")
     if files[-1].suffix != ".mcap":
         raise typer.BadParameter(f"the file to write must end in .mcap: {files[-1]}")
-    grid = load_map(files[0]) if len(files) == 2 else None
+    for path in (files[-1], files[-1].with_suffix(".tum")):
+        require_writable(path, force)
+    grid = load_building(files[0]) if len(files) == 2 else None
     try:
         config = SimulationConfig(
             length_m=length,
@@ -64,31 +81,36 @@ def simulate_command(
             clutter=clutter,
             walkers=walkers,
             start_m=start,
+            change=ChangeConfig(
+                doors=change, furniture=change, relief_per_m=relief, glass=glass, mirrors=mirrors
+            ),
             building_seed=building_seed,
             odometry=OdometryConfig(enabled=not no_odometry),
         )
     except ValidationError as error:
         first = error.errors()[0]
         raise ConfigError(f"{first['loc'][0]}: {first['msg']}, got {first['input']}") from error
-    with console.progress(f"simulate {sensor.value}") as update:
+    with console.of(context).progress(f"simulate {sensor.value}") as update:
         made = simulate_session(
             files[-1], sensor=sensor.value, grid=grid, config=config, progress=update, force=force
         )
     if made.clutter < clutter:
-        console.warn(f"only {made.clutter} of {clutter} pieces of clutter found room")
+        console.warn(f"only {made.clutter} of {clutter} pieces of clutter could be placed")
     if json:
-        console.print_json(
-            {
-                "schema_version": 1,
-                "recording": str(made.path),
-                "truth": str(made.truth_path),
-                "sensor": made.sensor,
-                "scans": made.scans,
-                "duration_s": made.duration_s,
-                "length_m": made.length_m,
-                "clutter": made.clutter,
-            }
-        )
+        document: Simulate = {
+            "schema_version": 1,
+            "recording": str(made.path),
+            "truth": str(made.truth_path),
+            "sensor": made.sensor,
+            "scans": made.scans,
+            "duration_s": made.duration_s,
+            "length_m": made.length_m,
+            "clutter": made.clutter,
+            "change": made.change.counts(),
+        }
+        console.print_json(document)
         return
     print(f"{made.path}: {made.scans} {made.sensor} scans, {made.length_m:.1f} m in {made.duration_s:.1f} s")
+    if change or relief or glass or mirrors:
+        print(f"against the building as drawn: {made.change.describe()}")
     print(f"{made.truth_path}: {made.scans} true poses of base_link in the map frame")

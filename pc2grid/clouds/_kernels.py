@@ -1,0 +1,136 @@
+"""Compiled twins of functions of this folder. The plain forms in the modules are their definitions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pc2grid.arrays import F32, F64
+
+
+@njit(cache=True)
+def planar_normals(
+    away: F64,
+    order: NDArray[np.intp],
+    bearings: F64,
+    reach_m: float,
+    reach_per_m: float,
+    sparse_factor: float,
+    max_flatness: float,
+) -> F32:
+    """Twin of `normals.planar_normals_plain`; `order` sorts the hits `away` from the sensor by bearing.
+
+    Measured: 0.06 ms instead of 16 ms a scan of a planar laser, 0.11 instead of 86 ms of a lidar; all of the
+    tracking of a scan takes 2 ms and 6 ms.
+    """
+    count = len(order)
+    angles = np.empty(count, dtype=np.float32)
+    for place in range(count):
+        i = order[place]
+        x, y = away[i]
+        distance = math.hypot(x, y)
+        towards = math.atan2(-y, -x)
+        angles[i] = towards
+        for factor in (1.0, sparse_factor):
+            reach = factor * (reach_m + reach_per_m * distance)
+            window = reach / max(distance, reach)
+            n = 1.0
+            sx = sy = sxx = sxy = syy = 0.0
+            # Half of the hits on either side at most, so that each neighbour is counted once.
+            for step, farthest in ((-1, (count - 1) // 2), (1, count // 2)):
+                for k in range(1, farthest + 1):
+                    j = order[(place + step * k) % count]
+                    turn = abs(bearings[j] - bearings[i])
+                    if min(turn, 2.0 * math.pi - turn) > window:
+                        break
+                    dx, dy = away[j, 0] - x, away[j, 1] - y
+                    if dx * dx + dy * dy < reach * reach:
+                        n += 1.0
+                        sx += dx
+                        sy += dy
+                        sxx += dx * dx
+                        sxy += dx * dy
+                        syy += dy * dy
+            if n < 3.0:
+                continue
+            mx, my = sx / n, sy / n
+            a, b, d = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
+            spread = math.sqrt(0.25 * (a - d) * (a - d) + b * b)
+            if 0.5 * (a + d) - spread < max_flatness * (0.5 * (a + d) + spread):
+                normal = 0.5 * math.atan2(2.0 * b, a - d) + 0.5 * math.pi
+                if math.cos(normal - towards) < 0.0:
+                    normal += math.pi
+                angles[i] = normal
+            break
+    return angles
+
+
+@njit(cache=True)
+def scan_bearings(
+    points: F32,
+    sensor: F64,
+    plane: F64,
+    band: tuple[float, float],
+    limit: float,
+    depths: tuple[float, float],
+    bearings: int,
+) -> tuple[F64, F64, F64]:
+    """Twin of `planar_scan.scan_bearings_plain`.
+
+    Measured: 0.6 ms instead of 23 ms a scan of a lidar, 0.015 instead of 0.7 ms of a planar laser.
+    """
+    nearest = np.full(bearings, np.inf)
+    reach = np.zeros(bearings)
+    count = points.shape[0]
+    bearing_of = np.full(count, -1, dtype=np.int32)
+    ranges = np.empty(count)
+    starts = np.zeros(bearings + 1, dtype=np.int64)
+    sensor_height = plane[0] * sensor[0] + plane[1] * sensor[1] + plane[2] * sensor[2] + plane[3]
+    for k in range(count):
+        px, py = float(points[k, 0]), float(points[k, 1])
+        x, y = px - sensor[0], py - sensor[1]
+        ranges[k] = distance = math.hypot(x, y)
+        bearing = round(math.atan2(y, x) * (bearings / (2.0 * math.pi))) % bearings
+        height = plane[0] * px + plane[1] * py + plane[2] * points[k, 2] + plane[3]
+        if height < band[0]:
+            reach[bearing] = max(reach[bearing], distance)
+        elif height > band[1]:
+            if sensor_height < band[1]:
+                part = (band[1] - sensor_height) / (height - sensor_height)
+                reach[bearing] = max(reach[bearing], distance * part)
+        else:
+            nearest[bearing] = min(nearest[bearing], distance)
+            if distance <= limit:
+                bearing_of[k] = bearing
+                starts[bearing + 1] += 1
+    starts = np.cumsum(starts)
+    by_bearing = np.empty(starts[-1], dtype=np.int64)
+    filled = starts.copy()
+    for k in range(count):
+        if bearing_of[k] >= 0:
+            by_bearing[filled[bearing_of[k]]] = k
+            filled[bearing_of[k]] += 1
+    surfaces = np.empty((len(by_bearing), 3))
+    found = 0
+    for bearing in range(bearings):
+        first = 0.0
+        for place in range(starts[bearing], starts[bearing + 1]):
+            k = by_bearing[place]
+            before = place  # insertion sort by range: one bearing has a few dozen points
+            while before > starts[bearing] and ranges[by_bearing[before - 1]] > ranges[k]:
+                by_bearing[before] = by_bearing[before - 1]
+                before -= 1
+            by_bearing[before] = k
+        for place in range(starts[bearing], starts[bearing + 1]):
+            k = by_bearing[place]
+            if place == starts[bearing] or ranges[k] - first > depths[0] + depths[1] * ranges[k] * ranges[k]:
+                first = ranges[k]
+                surfaces[found] = 0.0
+                found += 1
+            surfaces[found - 1, 0] += points[k, 0]
+            surfaces[found - 1, 1] += points[k, 1]
+            surfaces[found - 1, 2] += 1.0
+    return nearest, reach, surfaces[:found].copy()

@@ -1,0 +1,131 @@
+"""Which container a path is; its first bytes decide, not its name."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+from pc2grid.config import ReadConfig
+from pc2grid.errors import LogNotFound, LogTruncated, NotALog
+from pc2grid.io.containers import cloud_folder, rosbag2_folder
+from pc2grid.io.message_source import MessageSource
+
+_MCAP = b"\x89MCAP0\r\n"
+_BAG = b"#ROSBAG V2.0\n"
+_SQLITE = b"SQLite format 3\0"
+SUBMAPS_ID = b"pc2g"
+"""The application id in the header of a submap database."""
+_RECORDED = "pc2grid reads recordings in files, not streams: `ros2 bag record` makes one"
+
+
+def open_source(path: Path, config: ReadConfig, *, recover: bool) -> MessageSource:
+    """Open the container at a path.
+
+    recover : read what is whole of a damaged MCAP file, and go on without missing files of a folder.
+
+    Raises LogNotFound, NotALog, LogTruncated, or what the container's reader raises.
+    """
+    try:
+        if path.name == rosbag2_folder.METADATA and path.is_file():
+            path = path.parent
+        if path.is_dir():
+            return _open_folder(path, config, recover)
+        if not path.exists():
+            stream = "://" in str(path) or re.match(r"\w+:/", str(path)) or str(path) == "-"
+            raise LogNotFound(f"{path}: no such file", hint=_RECORDED if stream else "check the path")
+        if not path.is_file():
+            raise LogNotFound(f"{path}: not a regular file", hint=_RECORDED)
+        with path.open("rb") as file:
+            head = file.read(100)
+    except OSError as error:
+        raise LogNotFound(f"{path}: {error.strerror}") from error
+    return _open_file(path, head, config, recover)
+
+
+def is_submap_database(head: bytes) -> bool:
+    """Whether a file is a submap database, by its first 100 bytes."""
+    return head.startswith(_SQLITE) and head[68:72] == SUBMAPS_ID
+
+
+def _open_file(path: Path, head: bytes, config: ReadConfig, recover: bool) -> MessageSource:
+    if not head:
+        raise LogTruncated(f"{path}: empty file", hint="was the recording interrupted?")
+    if head.startswith(_MCAP):
+        if os.path.getsize(path) <= len(_MCAP):  # noqa: PTH202 - the size, not the name, is meant
+            raise LogTruncated(
+                f"{path}: an MCAP that ends after its first 8 bytes", hint="nothing to recover"
+            )
+        from pc2grid.io.containers.mcap import McapSource
+
+        return McapSource(path, config, recover=recover)
+    if _MCAP.startswith(head):
+        raise LogTruncated(f"{path}: an MCAP that ends after {len(head)} bytes", hint="nothing to recover")
+    if head.startswith(_BAG):
+        from pc2grid.io.containers.bag import BagSource
+
+        return BagSource(path, config)
+    if is_submap_database(head):
+        raise NotALog(
+            f"{path}: a submap database, not a recording", hint=f"`pc2grid info {path}` shows what is in it"
+        )
+    if head.startswith(_SQLITE):
+        from pc2grid.io.containers.db3 import Db3Source
+
+        return Db3Source(path, config)
+    raise NotALog(f"{path}: not a recording; looks like {_looks_like(head)}", hint=_advice(head))
+
+
+def _open_folder(path: Path, config: ReadConfig, recover: bool) -> MessageSource:
+    names = sorted(entry.name for entry in path.iterdir() if entry.is_file())
+    if rosbag2_folder.METADATA in names or any(name.endswith(rosbag2_folder.SUFFIXES) for name in names):
+        return rosbag2_folder.open_folder(
+            path,
+            lambda file: open_source(file, config, recover=recover),
+            recover=recover,
+            max_chunk_bytes=config.max_chunk_bytes,
+        )
+    if any(name.lower().endswith(cloud_folder.SUFFIXES) for name in names):
+        return cloud_folder.CloudFolder(path, config)
+    if any(name.endswith(".bag") for name in names):
+        raise LogNotFound(
+            f"{path}: a folder of ROS 1 bags", hint=f"name the files: pc2grid convert {path}/*.bag"
+        )
+    raise LogNotFound(
+        f"{path}: a folder without a recording",
+        hint="it holds neither metadata.yaml, .mcap or .db3 nor .pcd, .ply or .bin",
+    )
+
+
+def _looks_like(head: bytes) -> str:
+    kinds = {
+        b"#ROSBAG V": "a ROS 1 bag of an old format",
+        b"\x89PNG": "a PNG image",
+        b"P5": "a PGM image",
+        b"\x1f\x8b": "a gzip archive",
+        b"PK\x03\x04": "a zip archive",
+        b"\x28\xb5\x2f\xfd": "a zstd-compressed file",
+        b"\x04\x22\x4d\x18": "an lz4-compressed file",
+        b"# .PCD": "a PCD cloud",
+        b"ply": "a PLY cloud",
+    }
+    for mark, name in kinds.items():
+        if head.startswith(mark):
+            return name
+    try:
+        text = head.decode("utf-8")
+    except UnicodeDecodeError:
+        return "binary data of another kind"
+    return "text" if text.isprintable() or "\n" in text else "binary data of another kind"
+
+
+def _advice(head: bytes) -> str:
+    if head.startswith((b"\x1f\x8b", b"PK\x03\x04", b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18")):
+        return "unpack it first"
+    if head.startswith(b"#ROSBAG V"):
+        return "`rosbag migrate` or `rosbag fix` makes it one of format 2.0"
+    if head.startswith((b"\x89PNG", b"P5")):
+        return "of a map, give the .yaml that names this image"
+    if head.startswith((b"ply", b"# .PCD")):
+        return "name the folder of the clouds, one file per scan"
+    return "pc2grid reads MCAP, ROS 1 bags, rosbag2 folders and .db3"

@@ -1,0 +1,74 @@
+"""A recording in several files, one after another, as one message source."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from pc2grid.io.containers.decompress import ZSTD_MAGIC, unpacker
+from pc2grid.io.message_source import LogInfo, MessageSource, RawMessage, Tally, TopicInfo
+
+
+class SplitSource:
+    """The parts of a recording in the order in which they were recorded; they share one tally."""
+
+    def __init__(
+        self, path: Path, parts: Sequence[MessageSource], tally: Tally, max_chunk_bytes: int
+    ) -> None:
+        self._parts = parts
+        self.files: tuple[Path, ...] = tuple(file for part in parts for file in part.files)
+        self.tally = tally
+        for part in parts:
+            tally.bytes_lost += part.tally.bytes_lost
+            tally.topics_lost |= part.tally.topics_lost
+            for sentence in part.tally.warnings:
+                tally.warn(sentence)
+            part.tally = tally
+        self._unpack = unpacker("zstd", max_chunk_bytes)
+        self._topics = _merged([t for part in parts for t in part.info.topics])
+        spans = [part.info for part in parts if part.info.message_count != 0]
+        counts = [part.info.message_count for part in parts]
+        self.info = LogInfo(
+            path=path,
+            format=next((p.info.format for p in parts if p.info.topics), parts[0].info.format),
+            size_bytes=sum(part.info.size_bytes for part in parts),
+            start_ns=min((s.start_ns for s in spans), default=0),
+            end_ns=max((s.end_ns for s in spans), default=0),
+            message_count=None if None in counts else sum(c for c in counts if c is not None),
+            topics=tuple(sorted(set(self._topics.values()), key=lambda t: (t.topic, t.type))),
+            warnings=tuple(tally.warnings),
+        )
+
+    def close(self) -> None:
+        """Close all files."""
+        for part in self._parts:
+            part.close()
+
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """See MessageSource.messages; parts outside of the time range are not read."""
+        for part in self._parts:
+            if start_ns is not None and part.info.end_ns < start_ns:
+                continue
+            if end_ns is not None and part.info.start_ns >= end_ns:
+                continue
+            for channel, log_time_ns, data in part.messages(topics, start_ns, end_ns):
+                # rosbag2 may compress each message on its own; no encoding of messages begins like that.
+                plain = self._unpack(bytes(data)) if bytes(data[:4]) == ZSTD_MAGIC else data
+                yield RawMessage(self._topics[channel], log_time_ns, plain)
+
+
+def _merged(topics: list[TopicInfo]) -> dict[TopicInfo, TopicInfo]:
+    """For each topic of a part, the topic of the whole recording, with all messages counted."""
+    groups: dict[tuple[str, str, str], list[TopicInfo]] = {}
+    for topic in topics:
+        groups.setdefault((topic.topic, topic.type, topic.encoding), []).append(topic)
+    whole: dict[TopicInfo, TopicInfo] = {}
+    for group in groups.values():
+        counts = [t.message_count for t in group]
+        total = None if None in counts else sum(c for c in counts if c is not None)
+        described = next((t for t in group if t.schema), group[0])
+        whole.update(dict.fromkeys(group, replace(described, message_count=total)))
+    return whole

@@ -1,0 +1,1 @@
+"""Results -> files of other programs: MCAP, g2o, GraphML, point clouds."""

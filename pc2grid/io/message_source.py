@@ -1,0 +1,138 @@
+"""The interface of everything that messages come from: topics, times and bytes.
+
+Files of each format implement `MessageSource` (`pc2grid.io.containers`); a live source would, too. A source
+does not decode its messages: `pc2grid.io.recording` turns the bytes of any source into scans.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from pc2grid.model import SensorKind
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TopicInfo:
+    """One topic of one type.
+
+    type : such as `sensor_msgs/PointCloud2`, without the `msg` in the middle.
+    encoding : of the messages: `cdr`, `ros1`, `protobuf`, `json`, or a format of files such as `ply`.
+    schema_encoding, schema : the definition of the type in the log, such as `ros2msg` and its text; empty if
+    there is none.
+    message_count : None if it is unknown unless the log is read in full.
+    """
+
+    topic: str
+    type: str
+    encoding: str
+    schema_encoding: str = ""
+    schema: bytes = field(default=b"", repr=False)
+    message_count: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogInfo:
+    """The facts about a recording that are known without decoding it.
+
+    format : `mcap/ros2`, `mcap/ros1`, `bag/ros1`, `db3/ros2`, `folder/ply`, ...
+    start_ns, end_ns : first and last log time; 0 and 0 if there is no message.
+    message_count : None if unknown.
+    """
+
+    path: Path
+    format: str
+    size_bytes: int
+    start_ns: int
+    end_ns: int
+    message_count: int | None
+    topics: tuple[TopicInfo, ...]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def duration_s(self) -> float:
+        """Time between the first and the last message."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """Which topics a log is read from, and why.
+
+    topic, sensor : of the scans.
+    odometry_topic : None if there is none; a tf topic if the odometry is the transform odom -> base.
+    base_frame : the robot's frame, in which points are expressed.
+    sensor_frame : the frame in the header of the scans; None if it is empty.
+    reason : one sentence for the user.
+    """
+
+    topic: str
+    sensor: SensorKind
+    odometry_topic: str | None
+    base_frame: str
+    sensor_frame: str | None
+    reason: str
+
+
+class RawMessage(NamedTuple):
+    """A message as it stands in the log; data holds its bytes in the encoding of its channel."""
+
+    channel: TopicInfo
+    log_time_ns: int
+    data: memoryview | bytes
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts of what was read and of what could not be read.
+
+    points_dropped : without a finite position. skipped : scans left out, by reason.
+    bytes_lost : of the files, passed over for damage. topics_lost : whether these bytes may have held topics
+    that are not known from elsewhere.
+    warnings : sentences for the user.
+    """
+
+    scans_read: int = 0
+    points_dropped: int = 0
+    bytes_lost: int = 0
+    topics_lost: bool = False
+    skipped: dict[str, int] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    def warn(self, sentence: str) -> None:
+        """Add a sentence for the user, unless it is there already."""
+        if sentence not in self.warnings:
+            self.warnings.append(sentence)
+
+    def skip(self, reason: str) -> None:
+        """Count one more scan left out for `reason`."""
+        self.skipped[reason] = self.skipped.get(reason, 0) + 1
+
+
+class MessageSource(Protocol):
+    """A source of timed messages.
+
+    info : known as soon as the source is open. tally : counts while it is read.
+    files : those that the messages come from.
+    """
+
+    info: LogInfo
+    tally: Tally
+    files: tuple[Path, ...]
+
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """Messages of the topics with start_ns <= log time < end_ns (nanoseconds; None: no bound).
+
+        Sorted by log time, as far as the memory suffices for it. May be called again, for another pass.
+
+        Raises LogError (LogCorrupt, LimitExceeded, ...) when damage is reached.
+        """
+        ...
+
+    def close(self) -> None:
+        """Close the files."""
+        ...

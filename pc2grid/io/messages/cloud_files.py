@@ -1,0 +1,192 @@
+"""One cloud from the bytes of a PCD, PLY or KITTI .bin file, as a PointCloud2.
+
+Only the header is interpreted here. The points stay the bytes of the file; `pointcloud2` finds coordinates
+and times in them, as in every other cloud.
+
+PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html, version 0.7.
+PLY: https://paulbourke.net/dataformats/ply.
+
+Not read by Open3D 0.19, whose readers lose data without an error:
+- PLY: properties of the types char, short, ushort and uint (and their other names but `uint16`) are left out,
+  among them the times of most lidars. A file that ends in the middle is accepted.
+- PCD as text: numbers that are missing, or words in their place, are accepted.
+- PCD: of a field of several values only the first is kept. A file of no points is refused.
+- Both are read from a path only, not from the bytes of a message.
+A binary cloud of 75,000 points takes Open3D 11 ms (PCD) or 4 ms (PLY); here it is a view, 0.1 ms.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+
+from pc2grid.arrays import F64
+from pc2grid.errors import PointCloudError, UnsupportedSchema
+from pc2grid.io.messages.types import Header, PointCloud2
+
+Fields = tuple[tuple[str, int, int, int], ...]  # name, offset, datatype, count
+
+# Limits that keep a damaged header from asking for memory that the file cannot fill.
+_MAX_HEADER_BYTES = 1 << 16
+_MAX_UNPACKED_BYTES = 256 << 20
+_MOST_EXPANDED = 88  # LZF: three bytes stand for 264 at most
+_TEXT_BLOCK_BYTES = 1 << 20
+_LONGEST_NUMBER = 100  # characters of a number as text
+_SIZES = (0, 1, 1, 2, 2, 4, 4, 4, 8, 8, 8)  # bytes of the datatypes of sensor_msgs/PointField; 0: a list
+_PCD_TYPES = {"I1": 1, "U1": 2, "I2": 3, "U2": 4, "I4": 5, "U4": 6, "F4": 7, "F8": 8, "I8": 9, "U8": 10}
+_PLY_TYPES = {
+    "char": 1, "int8": 1, "uchar": 2, "uint8": 2, "short": 3, "int16": 3, "ushort": 4, "uint16": 4,
+    "int": 5, "int32": 5, "uint": 6, "uint32": 6, "float": 7, "float32": 7, "double": 8, "float64": 8,
+}  # fmt: skip
+
+
+def parser(suffix: str) -> Callable[[bytes, Header], PointCloud2]:
+    """The function for files of a suffix: `pcd`, `ply` or `bin`.
+
+    It raises PointCloudError for a file that contradicts itself, UnsupportedSchema for a kind we do not read.
+    """
+    return {"pcd": _pcd, "ply": _ply, "bin": _kitti}[suffix]
+
+
+def _kitti(data: bytes, header: Header) -> PointCloud2:
+    """float32 x y z and reflectance, without any header."""
+    if len(data) % 16:
+        raise PointCloudError(f"{len(data)} bytes are not whole points of 16 bytes")
+    fields = tuple((name, 4 * i, 7, 1) for i, name in enumerate("xyz"))
+    return _cloud(header, fields, 16, len(data) // 16, data)
+
+
+def _pcd(data: bytes, header: Header) -> PointCloud2:
+    match = re.search(rb"^DATA +(\w+)[ \r]*\n", data[:_MAX_HEADER_BYTES], re.MULTILINE)
+    if match is None:
+        raise PointCloudError("a PCD without a DATA line")
+    kind, body = match.group(1).decode(), memoryview(data)[match.end() :]
+    lines = [line.split() for line in data[: match.start()].decode("ascii", "replace").splitlines()]
+    keys = {line[0]: line[1:] for line in lines if line and not line[0].startswith("#")}
+    try:
+        names = keys["FIELDS"]
+        types = [kind_of + size for kind_of, size in zip(keys["TYPE"], keys["SIZE"], strict=True)]
+        counts = [int(n) for n in keys.get("COUNT", ["1"] * len(names))]
+        points = int(keys["WIDTH"][0]) * int(keys["HEIGHT"][0])
+        columns = [(n, _PCD_TYPES[t], c) for n, t, c in zip(names, types, counts, strict=True)]
+    except (KeyError, ValueError, IndexError) as error:
+        raise PointCloudError(f"the header of a PCD makes no sense: {error}") from error
+    if points < 0 or any(count < 0 for count in counts):
+        raise PointCloudError("the header of a PCD makes no sense: a negative count")
+    if kind == "ascii":
+        return _from_text(bytes(body), header, [(n, c) for n, _, c in columns], points)
+    fields, step = _packed(columns)
+    if kind == "binary":
+        return _cloud(header, fields, step, points, body)
+    if kind == "binary_compressed":
+        return _cloud(
+            header, fields, step, points, _transposed(_unpacked(body, step * points), fields, points)
+        )
+    raise UnsupportedSchema(
+        f"a PCD of data {kind!r:.40} is not read", hint="ascii, binary, binary_compressed"
+    )
+
+
+def _unpacked(body: memoryview, size: int) -> bytes:
+    from pc2grid.io.messages import lzf
+
+    stored, expanded = (int.from_bytes(body[i : i + 4], "little") for i in (0, 4))
+    if expanded != size or len(body) < 8 + stored:
+        raise PointCloudError(f"{expanded} bytes of compressed data where {size} are declared")
+    if expanded > min(_MAX_UNPACKED_BYTES, _MOST_EXPANDED * stored):
+        raise PointCloudError(f"a PCD of {stored} bytes that would expand to {expanded}")
+    return lzf.decompress(body[8 : 8 + stored], expanded)
+
+
+def _transposed(data: bytes, fields: Fields, points: int) -> bytes:
+    """Values field by field, as compressed PCD stores them, to values point by point."""
+    parts, at = [], 0
+    for _, _, datatype, count in fields:
+        width = _SIZES[datatype] * count
+        parts.append(np.frombuffer(data, np.uint8, width * points, at).reshape(points, width))
+        at += width * points
+    return np.concatenate(parts, axis=1).tobytes() if parts else b""
+
+
+def _ply(data: bytes, header: Header) -> PointCloud2:
+    end = re.search(rb"^end_header[ \r]*\n", data[:_MAX_HEADER_BYTES], re.MULTILINE)
+    if not data.startswith(b"ply") or end is None:
+        raise PointCloudError("a PLY without a header")
+    kind = ""
+    elements: list[tuple[str, int, list[tuple[str, int, int]]]] = []
+    try:
+        for line in data[: end.start()].decode("ascii", "replace").splitlines():
+            words = line.split()
+            if words[:1] == ["format"]:
+                kind = words[1]
+            elif words[:1] == ["element"]:
+                elements.append((words[1], int(words[2]), []))
+            elif words[:1] == ["property"]:
+                # A list has no fixed size, so the place of what follows it is not known.
+                code = 0 if words[1] == "list" else _PLY_TYPES[words[1]]
+                elements[-1][2].append((words[-1], code, 1))
+    except (KeyError, ValueError, IndexError) as error:
+        raise PointCloudError(f"the header of a PLY makes no sense: {error}") from error
+    body = memoryview(data)[end.end() :]
+    for name, count, columns in elements:
+        if count < 0 or any(code == 0 for _, code, _ in columns):
+            raise PointCloudError(
+                f"element {name} of a PLY stands before the points or in them, and has lists"
+            )
+        fields, step = _packed(columns)
+        if name == "vertex" and kind == "ascii":
+            return _from_text(bytes(body), header, [(n, 1) for n, _, _ in columns], count)
+        if name == "vertex" and kind in ("binary_little_endian", "binary_big_endian"):
+            return _cloud(header, fields, step, count, body, big=kind == "binary_big_endian")
+        skipped = step * count
+        if kind == "ascii":
+            skipped = sum(len(line) for line in bytes(body).splitlines(keepends=True)[:count])
+        body = body[skipped:]
+    raise PointCloudError(f"a PLY without points (format {kind!r:.30})")
+
+
+def _packed(columns: list[tuple[str, int, int]]) -> tuple[Fields, int]:
+    """The fields of columns (name, datatype, count) without gaps, and the bytes of a point."""
+    fields, at = [], 0
+    for name, datatype, count in columns:
+        fields.append((name, at, datatype, count))
+        at += _SIZES[datatype] * count
+    return tuple(fields), at
+
+
+def _from_text(body: bytes, header: Header, columns: list[tuple[str, int]], points: int) -> PointCloud2:
+    """A cloud whose values stand as text, point after point. columns : (name, count of values)."""
+    width = sum(count for _, count in columns)
+    if width * points > len(body):
+        raise PointCloudError(f"{len(body)} bytes of text where {width * points} numbers are declared")
+    values = _numbers(body, width * points)
+    if len(values) < width * points:
+        raise PointCloudError(f"{len(values)} numbers where {width * points} are declared")
+    fields, step = _packed([(name, 8, count) for name, count in columns])
+    return _cloud(header, fields, step, points, values.astype("<f8").tobytes())
+
+
+def _numbers(body: bytes, most: int) -> F64:
+    """The first numbers of a text, at most `most`; in blocks, because each word becomes a Python object."""
+    parts, at = [np.zeros(0)], 0
+    while most > 0 and at < len(body):
+        end = re.compile(rb"\s").search(body, at + _TEXT_BLOCK_BYTES)
+        stop = end.start() if end else len(body)
+        words = body[at:stop].split()[:most]
+        if max(map(len, words), default=0) > _LONGEST_NUMBER:
+            raise PointCloudError(f"a number of more than {_LONGEST_NUMBER} digits")
+        try:
+            parts.append(np.array(words, dtype="S").astype(np.float64) if words else np.zeros(0))
+        except ValueError as error:
+            raise PointCloudError(f"not a number: {error}") from error
+        most -= len(words)
+        at = stop
+    return np.concatenate(parts)
+
+
+def _cloud(
+    header: Header, fields: Fields, step: int, points: int, data: bytes | memoryview, *, big: bool = False
+) -> PointCloud2:
+    return PointCloud2(header, 1, points, fields, big, step, step * points, data)

@@ -1,0 +1,23 @@
+"""The decoder for a topic's messages, by their encoding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from pc2grid.io.message_source import TopicInfo
+from pc2grid.io.messages import cloud_messages, ros
+
+
+def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
+    """A function from a message's bytes to one of the classes of `types`.
+
+    Raises UnsupportedSchema for a type or encoding that is not supported.
+    """
+    if channel.encoding in ("protobuf", "json"):
+        from pc2grid.io.messages import foxglove
+
+        return foxglove.decoder_for(channel)
+    if channel.type.startswith("cloud/"):
+        return cloud_messages.decoder_for(channel)
+    return ros.decoder_for(channel)

@@ -1,0 +1,154 @@
+"""The message types that every encoding is decoded to: ROS 2, ROS 1, Foxglove, and files of clouds.
+
+Large arrays stay views of the log's bytes. Lengths are in metres, angles in radians, times in seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+# No laser has so many beams in one scan; a message that claims more is refused before memory is allocated.
+MOST_BEAMS = 1_000_000
+
+Bytes = memoryview | bytes
+Seven = tuple[float, float, float, float, float, float, float]
+"""A pose as messages hold it: x y z in metres, then the quaternion x y z w."""
+
+# Coordinates beyond this are a mistake: it is twice the circumference of the earth, and floats are far from
+# overflowing.
+FARTHEST_M = 1e8
+# The squared length of a quaternion within which it has a direction; writers do not always normalise it.
+_QUATERNION_SQUARED = (1e-12, 1e12)
+
+
+def valid_pose(pose: Seven) -> bool:
+    """Whether a pose is finite, within `FARTHEST_M`, and its quaternion has a direction."""
+    if not all(map(math.isfinite, pose)) or max(map(abs, pose[:3])) > FARTHEST_M:
+        return False
+    return _QUATERNION_SQUARED[0] < sum(v * v for v in pose[3:]) < _QUATERNION_SQUARED[1]
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """std_msgs/Header."""
+
+    stamp_ns: int
+    frame: str
+
+
+@dataclass(frozen=True, slots=True)
+class PointCloud2:
+    """sensor_msgs/PointCloud2; fields as (name, offset, datatype, count).
+
+    origin : pose of the points' frame in the header's frame; None if they are the same.
+    """
+
+    header: Header
+    height: int
+    width: int
+    fields: tuple[tuple[str, int, int, int], ...]
+    is_bigendian: bool
+    point_step: int
+    row_step: int
+    data: Bytes
+    origin: Seven | None = None
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of memory that the message keeps."""
+        return len(self.data)
+
+
+@dataclass(frozen=True, slots=True)
+class LaserScan:
+    """sensor_msgs/LaserScan without intensities; radians, seconds, metres. origin as in PointCloud2."""
+
+    header: Header
+    angle_min: float
+    angle_max: float
+    angle_increment: float
+    time_increment: float
+    scan_time: float
+    range_min: float
+    range_max: float
+    ranges: NDArray[Any]
+    origin: Seven | None = None
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of memory that the message keeps."""
+        return self.ranges.nbytes
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """sensor_msgs/Image."""
+
+    header: Header
+    height: int
+    width: int
+    encoding: str
+    is_bigendian: bool
+    step: int
+    data: Bytes
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of memory that the message keeps."""
+        return len(self.data)
+
+
+@dataclass(frozen=True, slots=True)
+class CompressedImage:
+    """sensor_msgs/CompressedImage."""
+
+    header: Header
+    format: str
+    data: Bytes
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of memory that the message keeps."""
+        return len(self.data)
+
+
+ScanMessage = PointCloud2 | LaserScan | Image | CompressedImage
+
+
+@dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """sensor_msgs/CameraInfo: distortion d, intrinsics k (9 numbers), projection p (12 numbers)."""
+
+    header: Header
+    height: int
+    width: int
+    distortion_model: str
+    d: tuple[float, ...]
+    k: tuple[float, ...]
+    p: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Transform:
+    """One edge of tf: the pose of `child` in `header.frame`.
+
+    lasting : the pose is valid until a newer one is published, and not only near its stamp.
+    """
+
+    header: Header
+    child: str
+    pose: Seven
+    lasting: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """nav_msgs/Odometry without covariance and twist: the pose of `child` in `header.frame`."""
+
+    header: Header
+    child: str
+    pose: Seven

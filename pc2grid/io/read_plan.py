@@ -1,0 +1,231 @@
+"""What to read of a log and how: the topics, the base frame, and where the odometry comes from."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from pc2grid.config import ReadConfig
+from pc2grid.errors import FrameError, NoScans, PointCloudError
+from pc2grid.io import topics
+from pc2grid.io.frames import FrameTree
+from pc2grid.io.message_source import Choice, MessageSource, TopicInfo
+from pc2grid.io.messages.decoders import decoder_for
+from pc2grid.io.messages.types import Header
+
+_BASE_FRAMES = ("base_link", "base_footprint")  # REP-105 and REP-120
+
+
+@dataclass(frozen=True, slots=True)
+class SearchParameters:
+    """How much of a log is read to find out how to read it; chosen by hand.
+
+    tf_ns : log time behind the first scan within which tf must connect the sensor to the base.
+    odometry_ns : log time behind the first scan within which odometry in tf must begin.
+    scans : number of scans whose headers are read.
+    """
+
+    tf_ns: int = 60_000_000_000
+    odometry_ns: int = 5_000_000_000
+    scans: int = 5
+
+
+SEARCH = SearchParameters()
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What to read and how, decided once per log.
+
+    camera : None unless the scans are depth images. odometry : None if there is none, or if it is in tf.
+    odometry_frame : the parent frame of the odometry in tf; None if it is not there.
+    tf_moves : whether tf must be read along with the scans.
+    sensor_is_base : whether the log has no tf, so that the sensor's frame serves as the base.
+    stampless : whether the first scans have stamps of zero, so that the time of recording is used instead.
+    """
+
+    choice: Choice
+    scans: TopicInfo
+    camera: TopicInfo | None
+    odometry: TopicInfo | None
+    odometry_frame: str | None
+    tf_moves: bool
+    sensor_is_base: bool
+    stampless: bool
+
+
+def make_plan(source: MessageSource, config: ReadConfig, frames: FrameTree) -> Plan:
+    """Decide what to read; fills `frames` with the static transforms and the first of the moving ones.
+
+    Raises TopicError, NoScans, UnsupportedSchema or FrameError.
+    """
+    return _Planner(source, config, frames).plan()
+
+
+def is_static(topic: TopicInfo) -> bool:
+    """Whether a tf topic holds transforms that never change (tf2: `tf_static`)."""
+    return topic.topic.endswith("tf_static")
+
+
+def tolerant(decode: Callable[[Any], Any], data: Any, otherwise: Any) -> Any:
+    """Decode a message that is of use but not needed (tf, odometry); `otherwise` if it cannot be decoded."""
+    try:
+        return decode(data)
+    except PointCloudError:
+        return otherwise
+
+
+class _Planner:
+    def __init__(self, source: MessageSource, config: ReadConfig, frames: FrameTree) -> None:
+        self._source, self._config, self._frames = source, config, frames
+        self._topics = source.info.topics
+
+    def plan(self) -> Plan:
+        config, found_topics, frames = self._config, self._topics, self._frames
+        scans, reason = topics.scan_topic(found_topics, config.topic)
+        sensor = topics.SENSORS[scans.type]
+        camera = topics.camera_info_topic(scans, found_topics) if sensor == "depth" else None
+        odometry, why_odometry = topics.odometry_topic(found_topics, config.odometry)
+        tf_topics = [t for t in found_topics if t.type in topics.TF and t.message_count != 0]
+        self._read_static([t for t in tf_topics if is_static(t)])
+
+        first_ns, headers = self._first_headers(scans)
+        sensor_frame = headers[0].frame if headers else ""  # none can be decoded: the stream counts them
+        child = self._odometry_child(odometry)
+        moving = [t for t in tf_topics if not is_static(t)]
+        in_tf = odometry.type in topics.TF if odometry else config.odometry is None
+        base = self._search_tf(moving, sensor_frame, child, first_ns, odometry_too=in_tf)
+
+        sensor_is_base = base is None
+        if base is None:
+            base = sensor_frame or config.base_frame or "sensor"
+        odometry_frame = self._odometry_frame(base) if in_tf and not sensor_is_base else None
+        if in_tf:
+            odometry = None
+        if odometry_frame is not None:
+            why_odometry = f"odometry from tf, {odometry_frame} -> {base}"
+        moves = odometry_frame is not None or (
+            not sensor_is_base
+            and sensor_frame in frames
+            and frames.connected(base, sensor_frame)
+            and frames.moving(base, sensor_frame)
+        )
+        named = odometry.topic if odometry else (moving[0].topic if odometry_frame and moving else None)
+        choice = Choice(
+            topic=scans.topic,
+            sensor=sensor,
+            odometry_topic=named,
+            base_frame=base,
+            sensor_frame=sensor_frame or None,
+            reason=f"{reason}; {why_odometry}",
+        )
+        stampless = bool(headers) and all(header.stamp_ns == 0 for header in headers)
+        return Plan(choice, scans, camera, odometry, odometry_frame, moves, sensor_is_base, stampless)
+
+    def _first_headers(self, scans: TopicInfo) -> tuple[int, list[Header]]:
+        """The log time of the first scan, and the headers of the first scans that can be decoded.
+
+        Raises NoScans if there is none, UnsupportedSchema.
+        """
+        decode = decoder_for(scans)
+        of_topic = (m for m in self._source.messages({scans.topic}) if m.channel == scans)
+        first = list(itertools.islice(of_topic, SEARCH.scans))
+        if not first:
+            raise NoScans(f"{scans.topic}: no message in the log")
+        found = (tolerant(decode, message.data, None) for message in first)
+        return first[0].log_time_ns, [scan.header for scan in found if scan is not None]
+
+    def _read_static(self, topics: list[TopicInfo]) -> None:
+        decoders = {t: decoder_for(t) for t in topics}
+        for message in self._source.messages({t.topic for t in topics}):
+            if message.channel in decoders:
+                edges = tolerant(decoders[message.channel], message.data, None)
+                self._frames.add_all(edges, static=True)
+
+    def _odometry_child(self, odometry: TopicInfo | None) -> str | None:
+        if odometry is None or odometry.type in topics.TF:
+            return None
+        decode = decoder_for(odometry)
+        for message in self._source.messages({odometry.topic}):
+            found = tolerant(decode, message.data, None)
+            return found.child if found else None
+        return None
+
+    def _search_tf(
+        self, moving: list[TopicInfo], sensor_frame: str, child: str | None, first_ns: int, odometry_too: bool
+    ) -> str | None:
+        """Read tf until it connects the sensor to a base frame (`odometry_too`: and until it holds odometry).
+
+        Returns the base frame; None if the log has no tf. Raises FrameError if tf does not connect them.
+        """
+        frames = self._frames
+        decoders = {t: decoder_for(t) for t in moving}
+        base = self._connected_base(sensor_frame, child)
+        for message in self._source.messages({t.topic for t in moving}, end_ns=first_ns + SEARCH.tf_ns):
+            if base is not None and (
+                not odometry_too
+                or self._odometry_frame(base) is not None
+                or message.log_time_ns > first_ns + SEARCH.odometry_ns
+            ):
+                break
+            if message.channel in decoders:
+                size = len(frames.frames)
+                edges = tolerant(decoders[message.channel], message.data, None)
+                frames.add_all(edges, log_time_ns=message.log_time_ns)
+                if len(frames.frames) > size:
+                    base = self._connected_base(sensor_frame, child)
+        return base if base is not None else self._base_without_tf(sensor_frame, child)
+
+    def _base_without_tf(self, sensor_frame: str, child: str | None) -> str | None:
+        """The base frame where tf does not connect one to the sensor; None: the sensor's frame is the base.
+
+        Raises FrameError unless the log never had tf or the user asks for this.
+        """
+        frames = self._frames
+        base = self._base_frame(child)
+        if base is not None and sensor_frame == base:
+            return base
+        name = sensor_frame or "(empty)"
+        # If the connection may be among what is lost, a guess would shift every scan.
+        tally = self._source.tally
+        lost = tally.topics_lost or (tally.bytes_lost and any(t.type in topics.TF for t in self._topics))
+        lost = lost or bool(frames.warnings)
+        if not frames.frames and self._config.base_frame is None and not lost:
+            self._source.tally.warn(
+                f"the log has no tf: frame {name} of the scans is taken for the robot's base"
+            )
+            return None
+        if self._config.assume_identity:
+            self._source.tally.warn(f"tf does not connect frame {name}: it is taken for the base, as asked")
+            return None
+        if base is None and frames.frames:
+            raise FrameError(
+                f"tf has none of the frames {', '.join(_BASE_FRAMES)}; "
+                f"there is: {', '.join(frames.frames[:12])}",
+                hint="--set read.base_frame=NAME says which is the robot's base",
+            )
+        raise frames.missing(sensor_frame, base or "the base")
+
+    def _connected_base(self, sensor_frame: str, child: str | None) -> str | None:
+        base = self._base_frame(child)
+        if base is None or sensor_frame not in self._frames:
+            return None
+        return base if self._frames.connected(base, sensor_frame) else None
+
+    def _base_frame(self, child: str | None) -> str | None:
+        if self._config.base_frame is not None:
+            return self._config.base_frame.lstrip("/")
+        known = self._frames.frames
+        for name in _BASE_FRAMES:
+            named = [f for f in known if f == name] or [f for f in known if f.endswith("/" + name)]
+            if len(named) == 1:
+                return named[0]
+        return child if child in known else None
+
+    def _odometry_frame(self, base: str) -> str | None:
+        if base not in self._frames:
+            return None
+        above = self._frames.chain(base)[1:]
+        return next((f for f in above if f == "odom" or f.endswith(("/odom", "_odom"))), None)

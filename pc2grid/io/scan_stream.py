@@ -1,0 +1,313 @@
+"""One pass over a part of a log: scans sorted by stamp, each with the sensor's pose and the odometry."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pc2grid.arrays import F64
+from pc2grid.config import ReadConfig
+from pc2grid.errors import (
+    LimitExceeded,
+    LogCorrupt,
+    NoScans,
+    Pc2GridError,
+    PointCloudError,
+    UnsupportedSchema,
+)
+from pc2grid.geometry import invert_pose
+from pc2grid.io import topics
+from pc2grid.io.frames import FrameTree, PoseTrack
+from pc2grid.io.message_source import MessageSource, TopicInfo
+from pc2grid.io.messages.decoders import decoder_for
+from pc2grid.io.messages.types import Odometry, ScanMessage, Transform
+from pc2grid.io.read_plan import Plan, is_static, tolerant
+from pc2grid.io.sensors.depth import T_BODY_OPTICAL
+from pc2grid.io.sensors.scan_decoder import ScanDecoder
+from pc2grid.model import Scan
+
+
+@dataclass(frozen=True, slots=True)
+class StreamParameters:
+    """How scans are sorted, and which stamps are reported or refused; chosen by hand.
+
+    wait_ns : log time for which a scan waits for later odometry and for scans with earlier stamps.
+    max_waiting, max_waiting_bytes : scans that wait at the same time.
+    margin_ns : log time in front of and behind the wanted part, read for tf and odometry.
+    clock_jump_ns : a stamp that runs ahead of the time of recording by more needs a second one near it.
+    gap_ns : a longer time between two scans is reported.
+    patience : number of undecodable scans, with no other before them, at which reading stops.
+    max_bad_share : share of undecodable scans above which the log counts as damaged.
+    """
+
+    wait_ns: int = 500_000_000
+    max_waiting: int = 256
+    max_waiting_bytes: int = 128_000_000
+    margin_ns: int = 1_000_000_000
+    clock_jump_ns: int = 60_000_000_000
+    gap_ns: int = 5_000_000_000
+    patience: int = 10
+    max_bad_share: float = 0.1
+
+
+PARAMETERS = StreamParameters()
+
+
+class _Waiting(NamedTuple):
+    """A scan that waits; scans with equal stamps are sorted by their number in the log."""
+
+    stamp_ns: int
+    number: int
+    log_time_ns: int
+    size_bytes: int
+    message: ScanMessage
+
+
+class Stream:
+    """One pass, to be run once; it counts in the source's tally what is read and what is lost."""
+
+    def __init__(
+        self,
+        source: MessageSource,
+        config: ReadConfig,
+        frames: FrameTree,
+        plan: Plan,
+        start_s: float = 0.0,
+        duration_s: float | None = None,
+    ) -> None:
+        self._source, self._frames, self._plan = source, frames, plan
+        self._tally = source.tally
+        self._start_ns = source.info.start_ns + round(start_s * 1e9)
+        self._end_ns = None if duration_s is None else self._start_ns + round(duration_s * 1e9)
+        self._part = f"from {start_s:g} s" + ("" if duration_s is None else f" for {duration_s:g} s")
+        self._decoder = ScanDecoder(plan.scans.topic, plan.choice.sensor, decoder_for(plan.scans), config)
+        self._track = PoseTrack()
+        self._T_child_base: F64 | None = None
+        self._waiting: list[_Waiting] = []
+        self._waiting_bytes = 0
+        self._count = self._bad = self._good = 0
+        self._last_ns: int | None = None
+        self._last_log_ns: int | None = None
+        self._error: Pc2GridError | None = None
+
+    def run(self) -> Iterator[Scan]:
+        """Yield the scans. Raises as `Log.scans` says."""
+        plan = self._plan
+        on: dict[TopicInfo, Callable[[Any, int], None]] = {plan.scans: self._take_scan}
+        if plan.odometry is not None:
+            on[plan.odometry] = self._take_odometry()
+        if plan.camera is not None:
+            on[plan.camera] = self._take_camera()
+            self._first_camera(plan.camera, on[plan.camera])
+        if plan.tf_moves:
+            for topic in self._source.info.topics:
+                if topic.type in topics.TF and not is_static(topic):
+                    on[topic] = self._take_tf(topic)
+        low = (
+            max(self._start_ns - PARAMETERS.margin_ns, 0)
+            if self._start_ns > self._source.info.start_ns
+            else None
+        )
+        high = None if self._end_ns is None else self._end_ns + PARAMETERS.margin_ns
+        for message in self._source.messages({t.topic for t in on}, low, high):
+            take = on.get(message.channel)
+            if take is not None:
+                take(message.data, message.log_time_ns)
+            while self._waiting and (
+                message.log_time_ns - self._waiting[0].log_time_ns > PARAMETERS.wait_ns
+                or len(self._waiting) > PARAMETERS.max_waiting
+                or self._waiting_bytes > PARAMETERS.max_waiting_bytes
+            ):
+                yield from self._release()
+        while self._waiting:
+            yield from self._release()
+        self._finish()
+
+    # --- decoding messages ----------------------------------------------------------------------------
+
+    def _take_scan(self, data: Any, log_time_ns: int) -> None:
+        if log_time_ns < self._start_ns or (self._end_ns is not None and log_time_ns >= self._end_ns):
+            return
+        self._count += 1
+        try:
+            message = self._decoder.message(data)
+        except Pc2GridError as error:
+            self._skip(error)
+            return
+        stamp_ns = message.header.stamp_ns
+        if self._plan.stampless:
+            self._tally.warn("the stamps of the scans are zero: the time of recording is used instead")
+            stamp_ns = log_time_ns
+        elif stamp_ns <= 0:
+            self._skip(PointCloudError("stamp is zero or negative"))
+            return
+        if stamp_ns >= 1 << 63:
+            self._skip(PointCloudError("stamp is past the year 2262"))
+            return
+        size = max(len(data), message.size_bytes)
+        heapq.heappush(self._waiting, _Waiting(stamp_ns, self._count, log_time_ns, size, message))
+        self._waiting_bytes += size
+
+    def _take_odometry(self) -> Callable[[Any, int], None]:
+        assert self._plan.odometry is not None
+        decode = decoder_for(self._plan.odometry)
+
+        def take(data: Any, log_time_ns: int) -> None:
+            found: Odometry | None = tolerant(decode, data, None)
+            if found is None or not self._track.add(found.header.stamp_ns or log_time_ns, found.pose):
+                self._tally.warn("some odometry messages are unreadable or not finite, and were ignored")
+            elif self._T_child_base is None:
+                self._T_child_base = self._child_to_base(found.child)
+
+        return take
+
+    def _child_to_base(self, child: str) -> F64:
+        """`T_child_base` of the odometry's child frame; identity if it is the base, or if tf is silent."""
+        base, frames = self._plan.choice.base_frame, self._frames
+        if not child or child == base or self._plan.sensor_is_base:
+            return np.eye(4)
+        known = child in frames and base in frames
+        if known and frames.connected(child, base) and not frames.moving(child, base):
+            found = frames.lookup(child, base, 0)
+            return np.eye(4) if found is None else found
+        self._tally.warn(f"the odometry is of frame {child}, which is taken for {base}")
+        return np.eye(4)
+
+    def _take_camera(self) -> Callable[[Any, int], None]:
+        assert self._plan.camera is not None
+        decode = decoder_for(self._plan.camera)
+
+        def take(data: Any, log_time_ns: int) -> None:
+            found = tolerant(decode, data, None)
+            if found is not None:
+                self._decoder.camera = found
+
+        return take
+
+    def _first_camera(self, camera: TopicInfo, take: Callable[[Any, int], None]) -> None:
+        """Take the first CameraInfo of the log: it may have been published only once, at the beginning."""
+        for message in self._source.messages({camera.topic}):
+            if message.channel == camera:
+                take(message.data, message.log_time_ns)
+                return
+        raise NoScans(f"{camera.topic}: no message in the log, but the depth images need it")
+
+    def _take_tf(self, topic: TopicInfo) -> Callable[[Any, int], None]:
+        decode = decoder_for(topic)
+
+        def take(data: Any, log_time_ns: int) -> None:
+            edges: tuple[Transform, ...] | None = tolerant(decode, data, None)
+            self._frames.add_all(edges, log_time_ns=log_time_ns)
+
+        return take
+
+    # --- yielding scans -------------------------------------------------------------------------------
+
+    def _release(self) -> Iterator[Scan]:
+        """Yield the waiting scan with the earliest stamp, unless it is skipped."""
+        stamp_ns, _, log_time_ns, size, message = heapq.heappop(self._waiting)
+        self._waiting_bytes -= size
+        try:
+            self._check_stamp(stamp_ns, log_time_ns)
+            T_base_sensor = self._sensor_pose(message.header.frame, stamp_ns)
+            scan = self._decoder.scan(message, stamp_ns, T_base_sensor, self._odometry_at(stamp_ns))
+            scan = self._with_motion(scan)
+        except (PointCloudError, LimitExceeded) as error:
+            self._skip(error)
+            return
+        except UnsupportedSchema as error:
+            if self._good:
+                self._skip(error)
+                return
+            raise UnsupportedSchema(f"{self._plan.scans.topic}: {error.message}", hint=error.hint) from error
+        self._last_ns, self._last_log_ns = stamp_ns, log_time_ns
+        self._good += 1
+        self._tally.scans_read += 1
+        self._tally.points_dropped += scan.dropped
+        for note in self._decoder.notes:
+            self._tally.warn(note)
+        if not len(scan.points_m):
+            self._tally.warn("some scans hold no returns at all")
+        yield scan
+
+    def _check_stamp(self, stamp_ns: int, log_time_ns: int) -> None:
+        """Compare a stamp with the one before. Raises PointCloudError for a scan to be skipped."""
+        if self._last_ns is None or self._last_log_ns is None:
+            return
+        if stamp_ns == self._last_ns:
+            raise PointCloudError("stamp is a duplicate")
+        if stamp_ns < self._last_ns:
+            raise PointCloudError("stamp goes back in time")
+        ahead_ns = (stamp_ns - self._last_ns) - (log_time_ns - self._last_log_ns)
+        if ahead_ns > PARAMETERS.clock_jump_ns:
+            # If the next scan is near this stamp, too, the clock was set; else this one stamp is wrong.
+            if not any(0 <= entry.stamp_ns - stamp_ns < PARAMETERS.gap_ns for entry in self._waiting):
+                raise PointCloudError("stamp jumps")
+            self._tally.warn("the clock of the scans jumps forward within the log")
+        elif stamp_ns - self._last_ns > PARAMETERS.gap_ns:
+            self._tally.warn("the log has gaps of more than 5 s between scans")
+
+    def _sensor_pose(self, frame: str, stamp_ns: int) -> F64:
+        plan = self._plan
+        if plan.sensor_is_base:
+            # REP-103: images are in optical axes (z forward); without tf they are turned here.
+            optical = plan.choice.sensor == "depth" or frame.endswith("_optical") or "_optical_" in frame
+            return T_BODY_OPTICAL if optical else np.eye(4)
+        base = plan.choice.base_frame
+        if frame != base and frame not in self._frames:
+            raise self._frames.missing(frame, base)
+        found = self._frames.lookup(base, frame, stamp_ns)
+        if found is None:
+            raise PointCloudError("tf is unknown at the stamp")
+        return found
+
+    def _odometry_at(self, stamp_ns: int) -> F64 | None:
+        plan = self._plan
+        if plan.odometry_frame is not None:
+            return self._frames.lookup(plan.odometry_frame, plan.choice.base_frame, stamp_ns)
+        if plan.odometry is None:
+            return None
+        found = self._track.at(stamp_ns)
+        if found is None or self._T_child_base is None:
+            return found
+        return found @ self._T_child_base
+
+    def _with_motion(self, scan: Scan) -> Scan:
+        """The scan with the motion from its first to its last point, if there is odometry at both."""
+        if scan.T_odom_base is None or scan.offsets_s is None or not len(scan.offsets_s):
+            return scan
+        times_s = float(scan.offsets_s.min()), float(scan.offsets_s.max())
+        first, last = (self._odometry_at(scan.stamp_ns + round(time_s * 1e9)) for time_s in times_s)
+        if first is None or last is None:
+            return scan
+        return replace(scan, T_first_last=invert_pose(first) @ last)
+
+    def _skip(self, error: Pc2GridError) -> None:
+        self._bad += 1
+        self._error = self._error or error
+        self._tally.skip(error.message)
+        if self._bad >= PARAMETERS.patience and not self._good:
+            raise self._mostly_bad()
+
+    def _finish(self) -> None:
+        topic = self._plan.scans.topic
+        if self._count == 0:
+            raise NoScans(
+                f"{topic}: no scan {self._part}",
+                hint=f"the log lasts {self._source.info.duration_s:.1f} s",
+            )
+        if self._good == 0 or self._bad > PARAMETERS.max_bad_share * self._count:
+            raise self._mostly_bad()
+
+    def _mostly_bad(self) -> Pc2GridError:
+        assert self._error is not None
+        kind = PointCloudError if self._good == 0 else LogCorrupt
+        return kind(
+            f"{self._plan.scans.topic}: {self._bad} of {self._count} scans are unreadable: "
+            f"{self._error.message}",
+            hint=self._error.hint,
+        )

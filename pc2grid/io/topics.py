@@ -1,0 +1,149 @@
+"""Which topic of a log the scans come from, and which one the odometry."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+
+from pc2grid.errors import NoScans, TopicError, UnsupportedSchema
+from pc2grid.io.message_source import TopicInfo
+from pc2grid.model import SensorKind
+
+SENSORS: dict[str, SensorKind] = {
+    "sensor_msgs/PointCloud2": "lidar",
+    "sensor_msgs/LaserScan": "laser",
+    "sensor_msgs/Image": "depth",
+    "sensor_msgs/CompressedImage": "depth",
+    "foxglove.PointCloud": "lidar",
+    "cloud/pcd": "lidar",
+    "cloud/ply": "lidar",
+    "cloud/bin": "lidar",
+    "foxglove.LaserScan": "laser",
+    "foxglove.RawImage": "depth",
+    "foxglove.CompressedImage": "depth",
+}
+CAMERA_INFOS = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
+ODOMETRY = ("nav_msgs/Odometry", "foxglove.Odometry", "foxglove.PoseInFrame", "cloud/pose")
+TF = ("tf2_msgs/TFMessage", "tf/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
+
+
+def scan_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicInfo, str]:
+    """The topic to read scans from, and a sentence that says why.
+
+    Raises TopicError if `wanted` is missing or if several topics hold scans, NoScans if none does,
+    UnsupportedSchema if `wanted` is of a type that holds no scans.
+    """
+    fitting = [t for t in topics if _fits(t, topics)]
+    if wanted is not None:
+        return _named(topics, fitting, wanted), "named by the user"
+    full = [t for t in fitting if t.message_count != 0]
+    if fitting and not full:
+        raise NoScans(f"{_listed(fitting)}: no message in the log")
+    if not full:
+        there = _listed(topics) if topics else "the log has no topics at all"
+        raise NoScans(
+            f"no topic with scans; there is: {there}",
+            hint="scans are PointCloud2, LaserScan, or a depth Image with a CameraInfo",
+        )
+    # An image and its compressed copy come from the same camera: take the uncompressed one.
+    distinct = [t for t in full if not (_is_compressed(t) and any(_raw_twin(t, other) for other in full))]
+    if len(distinct) > 1:
+        raise TopicError(
+            f"several topics hold scans: {_listed(distinct)}",
+            hint=f"choose one, e.g. --topic {distinct[0].topic}",
+        )
+    return distinct[0], f"the only topic with scans ({distinct[0].type})"
+
+
+def camera_info_topic(image: TopicInfo, topics: Sequence[TopicInfo]) -> TopicInfo:
+    """The CameraInfo that belongs to a depth image: the one with the longest common prefix of names.
+
+    Raises NoScans if there is none.
+    """
+    infos = [t for t in topics if t.type in CAMERA_INFOS]
+    if not infos:
+        raise NoScans(
+            f"{image.topic}: a depth image without a CameraInfo topic",
+            hint="record the camera_info topic next to the image",
+        )
+    return max(infos, key=lambda t: (_shared(image.topic, t.topic), "depth" in t.topic, t.topic))
+
+
+def odometry_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicInfo | None, str]:
+    """The odometry topic or None, and a sentence that says why; odometry in tf is found by `read_plan`.
+
+    Raises TopicError if `wanted` is missing.
+    """
+    if wanted is not None and wanted.lower() == "none":
+        return None, "odometry is ignored as asked"
+    candidates = [t for t in topics if t.type in ODOMETRY]
+    if wanted is not None:
+        found = next((t for t in topics if t.topic == wanted and (t in candidates or t.type in TF)), None)
+        if found is None:
+            raise TopicError(
+                f"no odometry topic {wanted}; there is: {_listed(candidates) or 'none'}",
+                hint="--odometry none goes without",
+            )
+        return found, f"odometry from {wanted} as asked"
+    # A PoseInFrame may also be a goal or a landmark, so its topic must contain `odom`.
+    candidates = [
+        t
+        for t in candidates
+        if t.message_count != 0 and (t.type != "foxglove.PoseInFrame" or "odom" in t.topic.lower())
+    ]
+    if not candidates:
+        return None, "no odometry topic"
+    best = min(candidates, key=lambda t: (t.topic not in ("/odom", "/odometry"), len(t.topic), t.topic))
+    if len(candidates) > 1:
+        rest = ", ".join(t.topic for t in candidates if t is not best)
+        return best, f"odometry from {best.topic} (also there: {rest}; --odometry chooses)"
+    return best, f"odometry from {best.topic}"
+
+
+def _fits(topic: TopicInfo, topics: Sequence[TopicInfo]) -> bool:
+    kind = SENSORS.get(topic.type)
+    if kind != "depth":
+        return kind is not None
+    return "depth" in topic.topic.lower() and any(t.type in CAMERA_INFOS for t in topics)
+
+
+def _named(topics: Sequence[TopicInfo], fitting: Sequence[TopicInfo], wanted: str) -> TopicInfo:
+    same = [t for t in topics if t.topic == wanted]
+    if not same:
+        names = [t.topic for t in topics]
+        close = difflib.get_close_matches(wanted, names, n=1, cutoff=0.5)
+        guess = f"; did you mean {close[0]}?" if close else ""
+        there = _listed(fitting) if fitting else f"none with scans, but {_listed(topics)}"
+        raise TopicError(f"no topic {wanted} in the log{guess}", hint=f"topics with scans: {there}")
+    usable = [t for t in same if t.type in SENSORS]
+    if not usable:
+        raise UnsupportedSchema(
+            f"{wanted}: is of type {same[0].type or 'unknown'}",
+            hint="scans are PointCloud2, LaserScan, or a depth Image with a CameraInfo",
+        )
+    if usable[0].message_count == 0:
+        raise NoScans(f"{wanted}: no message in the log")
+    return usable[0]
+
+
+def _listed(topics: Sequence[TopicInfo]) -> str:
+    shown = [f"{t.topic} ({t.type or 'no type'})" for t in topics[:20]]
+    return ", ".join(shown) + (f" and {len(topics) - 20} more" if len(topics) > 20 else "")
+
+
+def _is_compressed(topic: TopicInfo) -> bool:
+    return topic.type in ("sensor_msgs/CompressedImage", "foxglove.CompressedImage")
+
+
+def _raw_twin(compressed: TopicInfo, other: TopicInfo) -> bool:
+    return not _is_compressed(other) and compressed.topic.startswith(other.topic + "/")
+
+
+def _shared(a: str, b: str) -> int:
+    """The number of leading name parts that two topics have in common."""
+    count = 0
+    for x, y in zip(a.split("/"), b.split("/"), strict=False):
+        if x != y:
+            break
+        count += 1
+    return count

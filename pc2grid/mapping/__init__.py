@@ -1,0 +1,1 @@
+"""Registered scans -> a map: keyframes, local maps, loop closure, pose graph, occupancy grid."""

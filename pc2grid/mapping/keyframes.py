@@ -1,0 +1,108 @@
+"""The planar scans that the map of a session is made of; those of a long session are kept in a file."""
+
+from __future__ import annotations
+
+import struct
+import tempfile
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pc2grid.arrays import F32
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.errors import OutputError
+from pc2grid.geometry import SE2
+
+IN_MEMORY_BYTES = 32 << 20  # chosen by hand: about an hour of a 2D laser
+# index, stamp, restart; T_session_base; origin of the sensor; hits, bearings and unseen_hits
+_HEADER = struct.Struct("<qqq 3d 2d 3q")
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A planar scan that becomes part of the map, because the robot had moved since the one before.
+
+    index : number of its scan in the session. T_session_base : as tracked, before loops are closed.
+    restart : the first keyframe after tracking was lost: its pose relative to those before is a guess.
+    unseen_hits_m : (N, 2) in its frame, hits of the scans up to the next keyframe in cells where this
+        keyframe has none (see `UnseenHits`).
+    """
+
+    index: int
+    planar_scan: PlanarScan
+    T_session_base: SE2
+    restart: bool = False
+    unseen_hits_m: F32 = field(default_factory=lambda: np.empty((0, 2), np.float32))
+
+
+class Keyframes:
+    """The keyframes of a session, a sequence that only grows.
+
+    If they exceed `in_memory_bytes`, they are written to a temporary file without a name: memory does not
+    grow with the length of the session, and a killed process leaves no file behind.
+    """
+
+    def __init__(self, in_memory_bytes: int = IN_MEMORY_BYTES) -> None:
+        self._file = tempfile.SpooledTemporaryFile(max_size=in_memory_bytes)  # noqa: SIM115
+        self._starts = array("q", [0])
+
+    def __len__(self) -> int:
+        return len(self._starts) - 1
+
+    def __iter__(self) -> Iterator[Keyframe]:
+        return (self[k] for k in range(len(self)))
+
+    def __getitem__(self, number: int) -> Keyframe:
+        start, end = self._starts[number], self._starts[number + 1]
+        self._file.seek(start)
+        data = self._file.read(end - start)
+        index, stamp_ns, restart, x, y, yaw, origin_x, origin_y, hits, bearings, unseen_hits = (
+            _HEADER.unpack_from(data)
+        )
+        values = np.frombuffer(data, np.float32, offset=_HEADER.size)
+        hits_m, normal_rad, free_m, unseen_hits_m = np.split(
+            values, (2 * hits, 3 * hits, 3 * hits + bearings)
+        )
+        return Keyframe(
+            index,
+            PlanarScan(
+                stamp_ns=stamp_ns,
+                hits_m=hits_m.reshape(-1, 2),
+                origin_m=np.array([origin_x, origin_y]),
+                normal_rad=normal_rad,
+                free_m=free_m,
+            ),
+            SE2(x, y, yaw),
+            bool(restart),
+            unseen_hits_m.reshape(unseen_hits, 2),
+        )
+
+    def append(self, keyframe: Keyframe) -> None:
+        """Add one. Raises OutputError if the disk is full."""
+        planar_scan, pose = keyframe.planar_scan, keyframe.T_session_base
+        header = _HEADER.pack(
+            keyframe.index,
+            planar_scan.stamp_ns,
+            keyframe.restart,
+            *(pose.x, pose.y, pose.yaw),
+            *planar_scan.origin_m,
+            *(len(planar_scan.hits_m), len(planar_scan.free_m), len(keyframe.unseen_hits_m)),
+        )
+        arrays = (planar_scan.hits_m, planar_scan.normal_rad, planar_scan.free_m, keyframe.unseen_hits_m)
+        data = header + b"".join(np.ascontiguousarray(a, np.float32).tobytes() for a in arrays)
+        try:
+            self._file.seek(self._starts[-1])
+            self._file.write(data)
+            self._file.flush()
+        except OSError as error:
+            raise OutputError(
+                f"{tempfile.gettempdir()}: no room for the scans of the map: {error.strerror}",
+                hint="set TMPDIR to a folder on a larger disk",
+            ) from error
+        self._starts.append(self._starts[-1] + len(data))
+
+    def close(self) -> None:
+        """Delete the file."""
+        self._file.close()

@@ -1,0 +1,198 @@
+"""Local maps of a session: a few metres of travel, drawn as one rigid map that loops are closed on."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.arrays import F64, I64
+from pc2grid.geometry import SE2
+from pc2grid.mapping.keyframes import Keyframe, Keyframes
+from pc2grid.mapping.likelihood_field import LikelihoodField, LikelihoodParameters
+from pc2grid.odometry.point_to_line import Match, PointGrid, best_placements
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocalMapParameters:
+    """How a local map is drawn and matched. Chosen by hand; checked on the relations of fr079 and intel.
+
+    range_m : hits farther from the sensor are left out: they are too sparse to match.
+    cell_m : edge of a cell.
+    margin_m : free border around the points, at least the widest neighbourhood of `radii_cells`.
+    sigma_m : of the likelihood field: wider than that of relocalization (0.10 m), because the coarse search
+        moves in steps of 0.2 m and 2 degrees.
+    wall_m : a point this near an obstacle meets it.
+    radii_cells : neighbourhoods of the refinement, see `PointGrid.match`.
+    every_keyframe : every n-th keyframe is drawn; they are 0.2 m apart, so more of them add no new walls.
+    cached : local maps that stay in memory.
+    """
+
+    range_m: float = 12.0
+    cell_m: float = 0.1
+    margin_m: float = 0.6
+    sigma_m: float = 0.15
+    wall_m: float = 0.25
+    radii_cells: tuple[int, ...] = (3, 2, 2, 1, 1, 1, 1, 1)
+    every_keyframe: int = 2
+    cached: int = 24
+
+
+LOCAL_MAPS = LocalMapParameters()
+
+_FREE, _HIT = 1, 2  # what a local map observed in a cell; 0: nothing
+_SUBPIXEL_BITS = 4  # of cv2's polygon corners
+
+
+def pose_at(poses: F64, index: int) -> SE2:
+    """One of poses (N, 3): x, y, yaw."""
+    x, y, yaw = poses[index]
+    return SE2(float(x), float(y), float(yaw))
+
+
+class LocalMap:
+    """The local map of a run of keyframes, in the frame of its anchor, the keyframe in the middle.
+
+    points_m : (N, 2) obstacle points, thinned to one a cell. normal_rad : (N,) direction of the surface
+        normal at each.
+    """
+
+    def __init__(
+        self,
+        keyframes: Sequence[Keyframe],
+        T_anchor_base: Sequence[SE2],
+        parameters: LocalMapParameters = LOCAL_MAPS,
+    ) -> None:
+        """Draw the keyframes at their poses in the anchor's frame."""
+        hits, normals, outlines = [], [], []
+        for keyframe, pose in zip(keyframes, T_anchor_base, strict=True):
+            scan = keyframe.planar_scan
+            near = ((scan.hits_m - scan.origin_m) ** 2).sum(axis=1) < parameters.range_m**2
+            hits.append(pose.apply(scan.hits_m[near]))
+            normals.append(scan.normal_rad[near] + pose.yaw)
+            outlines.append(pose.apply(scan.free_polygon(parameters.range_m)))
+        points, normal_rad = np.concatenate(hits), np.concatenate(normals)
+        everything = np.concatenate((points, *outlines))
+        self._parameters = parameters
+        self._low_m = everything.min(axis=0) - parameters.margin_m
+        self._grid = PointGrid(self._low_m, everything.max(axis=0) + parameters.margin_m, parameters.cell_m)
+        self._grid.add(points, normal_rad)
+        cells = self._cells(points)
+        field = self._likelihood(cells)
+        self._field = field.values.astype(np.float32) * np.float32(1.0 / 255.0)
+        near_wall = np.exp(-0.5 * (parameters.wall_m / parameters.sigma_m) ** 2)
+        self._seen = np.where(self._field > near_wall, _HIT, self._free(outlines))
+        _, first = np.unique(cells @ (self._grid.shape[1], 1), return_index=True)
+        self.points_m: F64 = points[first]
+        self.normal_rad: F64 = normal_rad[first]
+
+    def _likelihood(self, cells: I64) -> LikelihoodField:
+        """The likelihood field of obstacles in cells (N, 2)."""
+        occupied = np.zeros(self._grid.shape, np.bool_)
+        occupied[cells[:, 0], cells[:, 1]] = True
+        low_x, low_y = self._low_m.tolist()
+        return LikelihoodField.around(
+            occupied,
+            np.ones_like(occupied),
+            self._parameters.cell_m,
+            (low_x, low_y),
+            LikelihoodParameters(sigma_m=self._parameters.sigma_m),
+        )
+
+    def _free(self, outlines: Sequence[F64]) -> NDArray[np.uint8]:
+        """Cells (H, W) inside one of the outlines (B, 2) of free space."""
+        import cv2
+
+        free = np.zeros(self._grid.shape, dtype=np.uint8)
+        for outline in outlines:
+            corners = ((outline - self._low_m) / self._parameters.cell_m - 0.5) * (1 << _SUBPIXEL_BITS)
+            cv2.fillPoly(free, [np.rint(corners).astype(np.int32)], _FREE, shift=_SUBPIXEL_BITS)
+        return free
+
+    def match(self, points_m: F64, normal_rad: NDArray[np.floating], guess: SE2) -> Match:
+        """Refine the pose of points (N, 2) with normals (N,) in this local map, from the points alone."""
+        no_prior = np.zeros((3, 3))
+        return self._grid.match(
+            points_m, normal_rad, guess, guess, no_prior, radii=self._parameters.radii_cells
+        )
+
+    def search(
+        self, points_m: F64, guess: SE2, window_m: float, window_rad: float
+    ) -> list[tuple[float, SE2]]:
+        """The best few poses of points (N, 2) in a window around `guess`, with their scores 0..1."""
+        return best_placements(
+            self._field, self._low_m, self._parameters.cell_m, points_m, guess, window_m, window_rad
+        )
+
+    def agreement(self, points_m: F64, pose: SE2) -> tuple[float, float]:
+        """How well points (N, 2) placed at `pose` fit what this local map observed.
+
+        Returns the share of the points in observed cells, and among those the share in cells at an obstacle
+        (the others lie in free space).
+        """
+        cells = self._cells(pose.apply(points_m))
+        inside = ((cells >= 0) & (cells < self._seen.shape)).all(axis=1)
+        seen = self._seen[cells[inside, 0], cells[inside, 1]]
+        observed = int((seen > 0).sum())
+        return observed / max(len(points_m), 1), float((seen == _HIT).sum()) / max(observed, 1)
+
+    def _cells(self, points: F64) -> I64:
+        """Points (N, 2) as cells (N, 2), row and column; may lie outside."""
+        cells: I64 = np.floor((points - self._low_m) / self._parameters.cell_m)[:, ::-1].astype(np.int64)
+        return cells
+
+
+class LocalMaps:
+    """The local maps of a session, drawn on demand from its keyframes; the last used ones are kept.
+
+    runs : of each local map, the numbers of its keyframes.
+    """
+
+    def __init__(self, keyframes: Keyframes, parameters: LocalMapParameters = LOCAL_MAPS) -> None:
+        self._keyframes = keyframes
+        self._parameters = parameters
+        self.runs: list[range] = []
+        self._settled: F64 | None = None
+        self._drawn: OrderedDict[int, LocalMap] = OrderedDict()
+
+    def append(self, run: range) -> None:
+        """Add the local map of one more run of keyframes."""
+        self.runs.append(run)
+
+    def anchor(self, number: int) -> int:
+        """The keyframe in whose frame a local map is drawn."""
+        run = self.runs[number]
+        return run[len(run) // 2]
+
+    def redraw(self, settled: F64) -> None:
+        """From now on, draw with settled keyframe poses (K, 3), x, y, yaw, in place of the tracked ones."""
+        self._settled = settled
+        self._drawn.clear()
+
+    def __getitem__(self, number: int) -> LocalMap:
+        if number not in self._drawn:
+            run, anchor = self.runs[number], self.anchor(number)
+            every = self._parameters.every_keyframe
+            drawn = run[(anchor - run.start) % every :: every]
+            keyframes, poses = self.keyframes(drawn, anchor)
+            self._drawn[number] = LocalMap(keyframes, poses, self._parameters)
+            if len(self._drawn) > self._parameters.cached:
+                self._drawn.popitem(last=False)
+        self._drawn.move_to_end(number)
+        return self._drawn[number]
+
+    def keyframes(self, numbers: range, anchor: int) -> tuple[list[Keyframe], list[SE2]]:
+        """Keyframes, and their poses T_anchor_base in the frame of the keyframe `anchor`."""
+        keyframes = [self._keyframes[k] for k in numbers]
+        T_anchor_session = self._pose(self._keyframes[anchor], anchor).inverse()
+        poses = [T_anchor_session @ self._pose(f, k) for f, k in zip(keyframes, numbers, strict=True)]
+        return keyframes, poses
+
+    def _pose(self, keyframe: Keyframe, number: int) -> SE2:
+        """T_session_base of a keyframe: settled, or as tracked if loops are not closed yet."""
+        if self._settled is None:
+            return keyframe.T_session_base
+        return pose_at(self._settled, number)

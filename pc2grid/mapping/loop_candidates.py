@@ -1,0 +1,195 @@
+"""Which recognised places are loops: those that agree with the drift of tracking and with each other.
+
+A recognition alone may be wrong with high confidence: buildings repeat themselves, and some look alike when
+they are turned by 180 degrees. Two things that the recognizer does not know tell such a place from the right
+one. Tracking drifts, but only so far. And what is recognised on two stretches must fit together with the
+travel between them (pairwise consistency, Mangelson et al., "Pairwise consistent measurement set
+maximization for robust multi-robot map merging", 2018). A recognition that is not accepted remains a
+candidate, because later ones may support it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pc2grid.arrays import F64, I64
+from pc2grid.geometry import SE2
+from pc2grid.mapping.pose_graph import Edge
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CandidateParameters:
+    """Numbers of the acceptance. Chosen on aces and csail, unless noted.
+
+    The drift that tracking may have over a travel, in standard deviations, generous because a slip of the
+    wheels counts too (measured on right recognitions: 1 to 6 % and up to 0.4 degrees per metre):
+
+    drift_m, drift_per_m : of position, constant and per metre of travel.
+    drift_rad, drift_rad_per_m : of yaw.
+
+    The drift over the short travel between two recognitions that support each other:
+
+    short_m, short_per_m, short_rad, short_rad_per_m : as above.
+    within_m : recognitions farther apart in travel do not support each other: almost all would agree.
+    consistent : largest Mahalanobis distance at which two of them agree; 3 degrees of freedom, 1 %.
+
+    What is required:
+
+    alone : largest Mahalanobis distance from the tracked pose at which a recognition without support is
+        accepted. probability_alone : and its least probability.
+    supported : the same with one other recognition that agrees.
+    possible : the same with two; beyond it a recognition is never accepted. 3 degrees of freedom, 0.3 %.
+    known_way_m : a recognition over a shorter way adds nothing: tracking is more exact. A stretch and a half.
+    rival : log-odds by which a contradicting place of the same stretch must be less likely.
+    pending : candidates that are kept at most, the latest.
+    """
+
+    drift_m: float = 0.3
+    drift_per_m: float = 0.025
+    drift_rad: float = math.radians(1.5)
+    drift_rad_per_m: float = math.radians(0.1)
+    short_m: float = 0.15
+    short_per_m: float = 0.015
+    short_rad: float = math.radians(1.0)
+    short_rad_per_m: float = math.radians(0.1)
+    within_m: float = 60.0
+    consistent: float = 3.37
+    alone: float = 1.0
+    probability_alone: float = 0.95
+    supported: float = 2.5
+    possible: float = 3.8
+    known_way_m: float = 18.0
+    rival: float = 3.0
+    pending: int = 100
+
+
+CANDIDATES = CandidateParameters()
+LOOP_M = 0.1
+"""Travel that the error of a loop is worth: some centimetres."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidate:
+    """A place that was recognised: the pose of a newer local map in an older one.
+
+    recognition : number of the recognition; its candidates show one stretch at several places, at most one
+        of which is right, or at one place that several older stretches saw.
+    older, newer : numbers of the local maps. probability : that it is right, by what the places look like.
+    """
+
+    recognition: int
+    older: int
+    newer: int
+    T_older_newer: SE2
+    probability: float
+
+
+class LoopCandidates:
+    """Recognised places that are not accepted as loops yet."""
+
+    def __init__(self, parameters: CandidateParameters = CANDIDATES) -> None:
+        self._parameters = parameters
+        self._pending: list[Candidate] = []
+
+    def add(self, candidates: Sequence[Candidate]) -> None:
+        """Add what was recognised on the newest stretch."""
+        self._pending = [*self._pending, *candidates][-self._parameters.pending :]
+
+    def remove(self, candidate: Candidate) -> None:
+        """Forget a candidate that was accepted or found to be wrong."""
+        self._pending.remove(candidate)
+
+    def acceptable(self, nodes: F64, travel_m: F64, edges: Sequence[Edge]) -> list[Candidate]:
+        """The candidates that are loops by drift and by each other.
+
+        nodes : (N, 3) settled poses of the local maps. travel_m : (N,) metres of travel at each.
+        edges : the pose graph: tracked steps, and the loops that were accepted.
+        """
+        pending, p = self._pending, self._parameters
+        if not pending:
+            return []
+        older, newer = (np.array([getattr(c, name) for c in pending]) for name in ("older", "newer"))
+        measured = np.array([(c.T_older_newer.x, c.T_older_newer.y, c.T_older_newer.yaw) for c in pending])
+        recognition = np.array([c.recognition for c in pending])
+        same = recognition[:, None] == recognition
+        probability = np.clip([c.probability for c in pending], 1e-6, 1.0 - 1e-6)
+
+        way_m = ways(len(nodes), travel_m, edges, older)[:, newer].diagonal()
+        error = between(measured, between(nodes[older], nodes[newer]))
+        sigma_m, sigma_rad = p.drift_m + p.drift_per_m * way_m, p.drift_rad + p.drift_rad_per_m * way_m
+        off = _mahalanobis(error, sigma_m, sigma_rad)
+        in_reach = off <= p.possible
+
+        between_m = np.abs(travel_m[newer][:, None] - travel_m[newer])
+        between_m += np.abs(travel_m[older][:, None] - travel_m[older])
+        first, second = (k.ravel() for k in np.indices(between_m.shape))
+        there = compose(measured[first], between(nodes[newer[first]], nodes[newer[second]]))
+        again = compose(between(nodes[older[first]], nodes[older[second]]), measured[second])
+        apart = _mahalanobis(
+            between(there, again),
+            p.short_m + p.short_per_m * between_m.ravel(),
+            p.short_rad + p.short_rad_per_m * between_m.ravel(),
+        ).reshape(between_m.shape)
+        agrees = apart <= p.consistent
+        supports = agrees & (between_m <= p.within_m) & ~same & in_reach
+        support = np.array([len(set(recognition[row].tolist())) for row in supports])
+        likely = np.log(probability / (1.0 - probability)) - 0.5 * off**2
+
+        known = way_m <= p.known_way_m
+        accepted = []
+        for k in range(len(pending)):
+            rivals = np.flatnonzero(same[k] & ~agrees[k] & in_reach)
+            near = off[k] <= (p.alone, p.supported, p.possible)[min(support[k], 2)]
+            if near and not known[k] and (support[k] or probability[k] >= p.probability_alone):
+                beaten = (support[rivals] < support[k]) | (
+                    (support[rivals] == support[k]) & (likely[rivals] <= likely[k] - p.rival)
+                )
+                if beaten.all():
+                    accepted.append(pending[k])
+        self._pending = [c for c, kept in zip(pending, in_reach & ~known, strict=True) if kept]
+        return accepted
+
+
+def ways(count: int, travel_m: F64, edges: Sequence[Edge], starts: I64) -> F64:
+    """(C, N) the shortest way from each of the local maps `starts` (C,) to all, metres of travel.
+
+    Drift grows along it: a loop shortens the ways between all that lies before and after it.
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import dijkstra
+
+    ends = np.array([(edge.first, edge.second) for edge in edges])
+    loop = np.array([edge.loop for edge in edges])
+    length_m = np.where(loop, LOOP_M, np.abs(np.diff(travel_m[ends], axis=1)[:, 0]) + LOOP_M)
+    # Of several edges between two local maps the shortest counts; the matrix would add them up.
+    order = np.lexsort((length_m, ends[:, 1], ends[:, 0]))
+    first = np.append(True, np.any(np.diff(ends[order], axis=0) != 0, axis=1))
+    shortest = order[first]
+    graph = csr_array((length_m[shortest], ends[shortest].T), shape=(count, count))
+    different, at = np.unique(starts, return_inverse=True)
+    return np.asarray(dijkstra(graph, directed=False, indices=different)[at])
+
+
+def between(a: F64, b: F64) -> F64:
+    """T_a_b (N, 3) of poses (N, 3) in one frame: x, y, yaw."""
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
+    return np.column_stack((c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2]))
+
+
+def compose(a: F64, b: F64) -> F64:
+    """Poses (N, 3) `b`, given in the frames of poses (N, 3) `a`, in the frame of these."""
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    return np.column_stack(
+        (a[:, 0] + c * b[:, 0] - s * b[:, 1], a[:, 1] + s * b[:, 0] + c * b[:, 1], a[:, 2] + b[:, 2])
+    )
+
+
+def _mahalanobis(error: F64, sigma_m: F64, sigma_rad: F64) -> F64:
+    """(N,) length of errors (N, 3) of x, y, yaw in standard deviations."""
+    yaw = (error[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    return np.asarray(np.sqrt((error[:, 0] ** 2 + error[:, 1] ** 2) / sigma_m**2 + yaw**2 / sigma_rad**2))

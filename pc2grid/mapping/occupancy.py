@@ -1,0 +1,216 @@
+"""Planar scans with poses -> log-odds occupancy grid.
+
+The grid consists of tiles that are created where something was observed, so a long corridor needs no memory
+for the empty rectangle around it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.arrays import F64, I64
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.config import ProjectionConfig
+from pc2grid.errors import LimitExceeded
+from pc2grid.geometry import SE2
+from pc2grid.model import FREE, OCCUPIED, OCCUPIED_FROM, UNKNOWN, OccupancyGrid
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OccupancyParameters:
+    """Numbers of the occupancy grid; chosen by hand, checked by `pc2grid compare maps` on simulated drives.
+
+    hit, miss, limit : log-odds in hundredths, as int16 adds them. One hit makes a cell occupied by nav2's
+        threshold, two misses make it free. A hit weighs two misses, so a thin wall that passing rays graze
+        stays; three misses clear a person who has left.
+    body_m : radius of the robot's body around the origin of the base, where no obstacle can be.
+    wall_window, wall_cells : an unseen hit is drawn if fewer occupied cells than `wall_cells` lie in the
+        square of `wall_window` cells around it. In front of a drawn wall there are more, and the hit is the
+        wall's noise; where a wall has a gap or ends there are fewer.
+    lone_window, lone_cells : a cell that was hit once is noise if at least `lone_cells` cells in the square
+        of `lone_window` around it were hit more often.
+    merged_hits : unseen hits that are collected before each cell is reduced to one entry.
+    """
+
+    hit: int = 150
+    miss: int = -75
+    limit: int = 500
+    body_m: float = 0.15
+    wall_window: int = 5
+    wall_cells: int = 5
+    lone_window: int = 3
+    lone_cells: int = 3
+    merged_hits: int = 200_000
+
+
+OCCUPANCY = OccupancyParameters()
+
+_TILE = 256  # cells along the edge of a tile
+_SUBPIXEL_BITS = 4  # of cv2's polygon corners
+_COLUMN_OFFSET = 1 << 31  # makes column numbers positive, so that row and column fit into one int64
+
+
+class GridBuilder:
+    """Draws planar scans into a growing grid.
+
+    Cells are aligned to multiples of the resolution in the session's frame. A cell that no planar scan
+    observed stays unknown.
+    """
+
+    def __init__(self, config: ProjectionConfig, parameters: OccupancyParameters = OCCUPANCY) -> None:
+        self._config = config
+        self._parameters = parameters
+        self._log_odds: dict[tuple[int, int], NDArray[np.int16]] = {}
+        self._observed: dict[tuple[int, int], NDArray[np.bool_]] = {}
+        self._unseen_hits = np.empty(0, np.int64)  # cells, row and column in one number
+        self._new_unseen_hits: list[I64] = []
+
+    def add(self, planar_scan: PlanarScan, T_grid_base: SE2) -> None:
+        """Draw one planar scan taken at `T_grid_base`.
+
+        Raises LimitExceeded if the map needs more than `max_cells`.
+        """
+        import cv2
+
+        resolution = self._config.resolution_m
+        outline = T_grid_base.apply(planar_scan.free_polygon()) / resolution
+        hits = np.floor(T_grid_base.apply(planar_scan.hits_m) / resolution).astype(np.int64)
+        low = np.floor(outline.min(axis=0)).astype(np.int64) - 1
+        high = np.floor(outline.max(axis=0)).astype(np.int64) + 2
+        here = np.floor(np.array([T_grid_base.x, T_grid_base.y]) / resolution).astype(np.int64)
+        around = math.ceil(self._parameters.body_m / resolution) + 1
+        low, high = np.minimum(low, here - around), np.maximum(high, here + around + 1)
+        if len(hits):
+            low, high = np.minimum(low, hits.min(axis=0)), np.maximum(high, hits.max(axis=0) + 1)
+        update = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.int16)
+        corners = np.rint((outline - low - 0.5) * (1 << _SUBPIXEL_BITS)).astype(np.int32)
+        cv2.fillPoly(update, [corners], self._parameters.miss, shift=_SUBPIXEL_BITS)
+        # The outline runs through cells of obstacles, most of all along a wall that is seen at a small angle:
+        # these cells are not drawn as free.
+        cv2.polylines(update, _rims(corners, planar_scan.free_m), False, 0, shift=_SUBPIXEL_BITS)
+        update[hits[:, 1] - low[1], hits[:, 0] - low[0]] = self._parameters.hit
+        body_cells = round(self._parameters.body_m / resolution)
+        cv2.circle(update, (here - low).tolist(), body_cells, 2 * self._parameters.miss, -1)
+        self._add_window(update, int(low[0]), int(low[1]))
+
+    def add_unseen_hits(self, hits_m: F64) -> None:
+        """Add obstacles (N, 2), metres, that are drawn only in cells that no planar scan observes."""
+        columns, rows = np.floor(hits_m / self._config.resolution_m).astype(np.int64).T
+        self._new_unseen_hits.append((rows << 32) + (columns + _COLUMN_OFFSET))
+        if sum(map(len, self._new_unseen_hits)) > self._parameters.merged_hits:
+            self._merge_unseen_hits()
+
+    def _merge_unseen_hits(self) -> None:
+        """Keep each cell once: memory grows with the mapped area, not with the number of visits."""
+        self._unseen_hits = np.unique(np.concatenate((self._unseen_hits, *self._new_unseen_hits)))
+        self._new_unseen_hits = []
+
+    def grid(self) -> OccupancyGrid:
+        """The map so far: 0..100 where observed, unknown elsewhere, cropped to the observed part."""
+        if not self._log_odds:
+            return OccupancyGrid(
+                cells=np.zeros((0, 0), np.int8), resolution_m=self._config.resolution_m, origin_m=(0.0, 0.0)
+            )
+        rows, columns = zip(*self._log_odds, strict=True)
+        height = (max(rows) - min(rows) + 1) * _TILE
+        width = (max(columns) - min(columns) + 1) * _TILE
+        self._check_size(height * width)
+        cells = np.full((height, width), UNKNOWN, dtype=np.int8)
+        summed = np.zeros((height, width), dtype=np.int16)
+        for (row, column), log_odds in self._log_odds.items():
+            percent = np.rint(_percent(log_odds.astype(np.float32))).astype(np.int8)
+            r, c = (row - min(rows)) * _TILE, (column - min(columns)) * _TILE
+            cells[r : r + _TILE, c : c + _TILE] = np.where(self._observed[row, column], percent, UNKNOWN)
+            summed[r : r + _TILE, c : c + _TILE] = log_odds
+        self._erase_lone_hits(cells, summed)
+        self._draw_unseen_hits(cells, (min(rows) * _TILE, min(columns) * _TILE))
+        known_rows = np.flatnonzero((cells >= FREE).any(axis=1))
+        known_columns = np.flatnonzero((cells >= FREE).any(axis=0))
+        r0, r1 = int(known_rows[0]), int(known_rows[-1]) + 1
+        c0, c1 = int(known_columns[0]), int(known_columns[-1]) + 1
+        resolution = self._config.resolution_m
+        return OccupancyGrid(
+            cells=cells[r0:r1, c0:c1].copy(),
+            resolution_m=resolution,
+            origin_m=((min(columns) * _TILE + c0) * resolution, (min(rows) * _TILE + r0) * resolution),
+        )
+
+    def _draw_unseen_hits(self, cells: NDArray[np.int8], first: tuple[int, int]) -> None:
+        """Draw the unseen hits in unknown cells (H, W); `first` is the cell that is (0, 0) there."""
+        self._merge_unseen_hits()
+        rows = self._unseen_hits >> 32
+        columns = (self._unseen_hits & (2 * _COLUMN_OFFSET - 1)) - _COLUMN_OFFSET
+        at = np.column_stack((rows, columns)) - first
+        row, column = at[((at >= 0) & (at < cells.shape)).all(axis=1)].T
+        walls = _count_around(cells >= OCCUPIED_FROM, self._parameters.wall_window)
+        kept = (cells[row, column] == UNKNOWN) & (walls[row, column] < self._parameters.wall_cells)
+        cells[row[kept], column[kept]] = round(float(_percent(np.float64(self._parameters.hit))))
+
+    def _erase_lone_hits(self, cells: NDArray[np.int8], log_odds: NDArray[np.int16]) -> None:
+        """Make cells (H, W) unknown that were hit once, never observed free, beside cells hit more often.
+
+        Such a hit is a return one cell in front of its wall. No later ray clears it, because the wall stops
+        all of them.
+        """
+        hit = self._parameters.hit
+        often = _count_around(log_odds > hit, self._parameters.lone_window)
+        cells[(log_odds == hit) & (often >= self._parameters.lone_cells)] = UNKNOWN
+
+    def _add_window(self, update: NDArray[np.int16], x0: int, y0: int) -> None:
+        """Add log-odds (h, w), whose first cell is in column `x0` and row `y0`, to the tiles."""
+        height, width = update.shape
+        limit = self._parameters.limit
+        for row in range(y0 // _TILE, (y0 + height - 1) // _TILE + 1):
+            for column in range(x0 // _TILE, (x0 + width - 1) // _TILE + 1):
+                r, c = row * _TILE - y0, column * _TILE - x0
+                part = update[max(r, 0) : max(r + _TILE, 0), max(c, 0) : max(c + _TILE, 0)]
+                touched = part != 0
+                if not touched.any():
+                    continue
+                if (row, column) not in self._log_odds:
+                    self._check_size((len(self._log_odds) + 1) * _TILE * _TILE)
+                    self._log_odds[row, column] = np.zeros((_TILE, _TILE), dtype=np.int16)
+                    self._observed[row, column] = np.zeros((_TILE, _TILE), dtype=np.bool_)
+                where = np.s_[
+                    max(-r, 0) : max(-r, 0) + part.shape[0], max(-c, 0) : max(-c, 0) + part.shape[1]
+                ]
+                tile = self._log_odds[row, column][where]
+                np.clip(tile + part, -limit, limit, out=tile)
+                self._observed[row, column][where] |= touched
+
+    def _check_size(self, cells: int) -> None:
+        if cells > self._config.max_cells:
+            raise LimitExceeded(
+                f"the map needs {cells} cells, more than projection.max_cells = {self._config.max_cells}",
+                hint="raise projection.max_cells, or choose a coarser projection.resolution_m",
+            )
+
+
+def _percent(log_odds: NDArray[np.floating] | np.floating) -> NDArray[np.floating]:
+    """Log-odds in hundredths as a probability in percent."""
+    return np.asarray(OCCUPIED / (1.0 + np.exp(-log_odds / np.float32(100.0))))
+
+
+def _count_around(mask: NDArray[np.bool_], width: int) -> NDArray[np.uint8]:
+    """Number of cells of the mask (H, W) in the square of `width` cells around each cell."""
+    import cv2
+
+    return np.asarray(
+        cv2.boxFilter(
+            mask.astype(np.uint8), -1, (width, width), normalize=False, borderType=cv2.BORDER_CONSTANT
+        ),
+        np.uint8,
+    )
+
+
+def _rims(corners: NDArray[np.int32], free_m: NDArray[np.float32]) -> list[NDArray[np.int32]]:
+    """The parts of an outline (B, 2) at known ranges; elsewhere the outline runs through the sensor."""
+    known = np.flatnonzero(free_m > 0)
+    if len(known) == len(free_m):
+        return [np.concatenate((corners, corners[:1]))]
+    runs = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1)
+    return [corners[run] for run in runs if len(run)]

@@ -1,0 +1,98 @@
+"""What the stages report while they work: one object in place of a callback for each kind of news.
+
+`Observer` is also the null object: all its methods do nothing, so a stage calls them without asking whether
+anybody is interested. A subclass overrides the methods that it needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pc2grid.model import RegisteredScan
+
+
+class Observer:
+    """Gets the news of a piece of work, in the thread that does the work.
+
+    >>> class Shares(Observer):
+    ...     def __init__(self) -> None:
+    ...         self.shares: list[float] = []
+    ...     def on_progress(self, share: float) -> None:
+    ...         self.shares.append(share)
+    >>> import pc2grid
+    >>> observer = Shares()
+    >>> with pc2grid.open_log("monday.mcap") as log:
+    ...     part = pc2grid.TimeSpan(0.0, 1.0)
+    ...     monday = pc2grid.build_map(log, session="monday", span=part, observer=observer)
+    >>> observer.shares == sorted(observer.shares), observer.shares[-1]
+    (True, 1.0)
+    """
+
+    def step(self, what: str, recorded_s: float | None = None) -> AbstractContextManager[None]:
+        """Surrounds a step of the work.
+
+        what : name of the step, for the user. recorded_s : length of the recording that the step works
+        through; None if there is none.
+        """
+        return nullcontext()
+
+    def on_session(self, name: str) -> None:
+        """The work on the session of this name begins."""
+
+    def on_progress(self, share: float) -> None:
+        """The share of the present step that is done: 0..1, never decreasing."""
+
+    def on_scan(self, registered: RegisteredScan) -> None:
+        """The next scan with its tracked pose, before loops are closed."""
+
+    def on_note(self, text: str) -> None:
+        """A sentence about a choice that the program made, for a user who wants details."""
+
+    def on_warning(self, text: str) -> None:
+        """A sentence about something that went wrong and was dealt with."""
+
+
+class Observers(Observer):
+    """Passes all news on to several observers, in their order."""
+
+    def __init__(self, *observers: Observer) -> None:
+        self._observers = observers
+
+    @contextmanager
+    def _all_steps(self, what: str, recorded_s: float | None) -> Iterator[None]:
+        with ExitStack() as stack:
+            for observer in self._observers:
+                stack.enter_context(observer.step(what, recorded_s))
+            yield
+
+    def step(self, what: str, recorded_s: float | None = None) -> AbstractContextManager[None]:
+        """Surrounds the step with those of all observers."""
+        return self._all_steps(what, recorded_s)
+
+    def on_session(self, name: str) -> None:
+        """See `Observer.on_session`."""
+        for observer in self._observers:
+            observer.on_session(name)
+
+    def on_progress(self, share: float) -> None:
+        """See `Observer.on_progress`."""
+        for observer in self._observers:
+            observer.on_progress(share)
+
+    def on_scan(self, registered: RegisteredScan) -> None:
+        """See `Observer.on_scan`."""
+        for observer in self._observers:
+            observer.on_scan(registered)
+
+    def on_note(self, text: str) -> None:
+        """See `Observer.on_note`."""
+        for observer in self._observers:
+            observer.on_note(text)
+
+    def on_warning(self, text: str) -> None:
+        """See `Observer.on_warning`."""
+        for observer in self._observers:
+            observer.on_warning(text)

@@ -1,0 +1,127 @@
+"""Compiled twins of functions of this folder. The plain forms in `point_to_line` are their definitions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pc2grid.arrays import F32, F64
+
+
+@njit(cache=True)
+def _line_at(
+    index: NDArray[np.int32], moments: F64, row: int, column: int, radius: int, sector: int, line: F64
+) -> bool:
+    """Write mean, normal and straightness of the points around a cell; False if they make no line.
+
+    The inner part of `normal_equations`.
+    """
+    sectors = moments.shape[1]
+    n = sx = sy = sxx = sxy = syy = 0.0
+    for r in range(row - radius, row + radius + 1):
+        for c in range(column - radius, column + radius + 1):
+            cell = index[r, c]
+            if cell < 0:
+                continue
+            for beside in (-1, 0, 1):
+                m = moments[cell, (sector + beside) % sectors]
+                n += m[0]
+                sx += m[1]
+                sy += m[2]
+                sxx += m[3]
+                sxy += m[4]
+                syy += m[5]
+    if n < 3.0:
+        return False
+    mx, my = sx / n, sy / n
+    a, b, d = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
+    middle = 0.5 * (a + d)
+    spread = math.sqrt(max(0.25 * (a - d) * (a - d) + b * b, 0.0))
+    large, small = middle + spread, max(middle - spread, 0.0)
+    if large < 1e-4:
+        return False
+    angle = 0.5 * math.atan2(2.0 * b, a - d)  # of the line; its normal is a quarter turn on
+    line[0], line[1] = mx, my
+    line[2], line[3] = -math.sin(angle), math.cos(angle)
+    line[4] = 1.0 - small / large
+    return True
+
+
+@njit(cache=True)
+def normal_equations(
+    index: NDArray[np.int32],
+    moments: F64,
+    points: F64,
+    normal_rad: F64,
+    pose: F64,
+    cell_m: float,
+    radius: int,
+    scale_m: float,
+) -> tuple[F64, F64, int, float]:
+    """Twin of `point_to_line.normal_equations_plain`.
+
+    Measured: 0.09 ms instead of 23 ms for 700 points of a lidar, 0.025 instead of 7 ms for a planar laser; a
+    scan needs seven calls, and all of its tracking 6 ms and 2 ms.
+    """
+    height, width = index.shape
+    sectors = moments.shape[1]
+    H, g, line = np.zeros((3, 3)), np.zeros(3), np.empty(5)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    found = 0
+    distance = 0.0
+    for k in range(points.shape[0]):
+        rx = c * points[k, 0] - s * points[k, 1]
+        ry = s * points[k, 0] + c * points[k, 1]
+        x, y = rx + pose[0], ry + pose[1]
+        column, row = math.floor(x / cell_m), math.floor(y / cell_m)
+        if row < radius or column < radius or row >= height - radius or column >= width - radius:
+            continue
+        sector = round((normal_rad[k] + pose[2]) * (sectors / (2.0 * math.pi))) % sectors
+        if not _line_at(index, moments, row, column, radius, sector, line):
+            continue
+        nx, ny = line[2], line[3]
+        r = nx * (x - line[0]) + ny * (y - line[1])
+        found += 1
+        distance += abs(r)
+        w = line[4] * line[4] / (1.0 + (r / scale_m) ** 2)
+        j2 = ny * rx - nx * ry
+        H[0, 0] += w * nx * nx
+        H[0, 1] += w * nx * ny
+        H[0, 2] += w * nx * j2
+        H[1, 1] += w * ny * ny
+        H[1, 2] += w * ny * j2
+        H[2, 2] += w * j2 * j2
+        g[0] += w * nx * r
+        g[1] += w * ny * r
+        g[2] += w * j2 * r
+    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+    return H, g, found, distance
+
+
+@njit(cache=True)
+def placement_scores(
+    field: F32, points: F64, origin: F64, yaws: F64, first: int, step: int, count: int
+) -> F32:
+    """Twin of `point_to_line.placement_scores_plain`.
+
+    Measured: 6 ms instead of 290 ms for 400 points and 20 000 placements.
+    """
+    height, width = field.shape
+    scores = np.zeros((len(yaws), count, count), dtype=np.float32)
+    for a in range(len(yaws)):
+        cos, sin = math.cos(yaws[a]), math.sin(yaws[a])
+        for k in range(points.shape[0]):
+            column = math.floor(cos * points[k, 0] - sin * points[k, 1] + origin[0]) + first
+            row = math.floor(sin * points[k, 0] + cos * points[k, 1] + origin[1]) + first
+            for r in range(count):
+                at_row = row + r * step
+                if at_row < 0 or at_row >= height:
+                    continue
+                for c in range(count):
+                    at_column = column + c * step
+                    if 0 <= at_column < width:
+                        scores[a, r, c] += field[at_row, at_column]
+    return scores / np.float32(max(points.shape[0], 1))

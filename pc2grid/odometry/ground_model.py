@@ -1,0 +1,107 @@
+"""The floor under a moving sensor: fixed to a robot on wheels, moving against a sensor in the hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pc2grid.arrays import F32, F64
+from pc2grid.clouds.ground import Ground, assumed_ground, find_ground
+from pc2grid.clouds.sampling import random_subset
+from pc2grid.geometry import SE2, invert_pose
+from pc2grid.model import Scan
+from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
+
+
+class GroundModel:
+    """Follows the floor from scan to scan, in the base frame.
+
+    ground : the floor in the base frame; None for a planar laser, which sees none.
+    rolling : whether the base stands on the floor, so that the floor keeps its place in the base frame.
+    """
+
+    def __init__(
+        self, ground: Ground | None, *, rolling: bool, parameters: TrackingParameters = TRACKING_PARAMETERS
+    ) -> None:
+        self.ground = ground
+        self.rolling = rolling
+        self._parameters = parameters
+        self._scans = 0
+
+    @classmethod
+    def start(
+        cls, points_m: F32, scan: Scan, parameters: TrackingParameters = TRACKING_PARAMETERS
+    ) -> GroundModel:
+        """Find the floor in the first scan.
+
+        It is looked for where the mounting of the sensor puts it, then as the lowest level plane; else it
+        is assumed. points_m : (N, 3) points of the scan that are used, base frame.
+        """
+        if scan.sensor == "laser":
+            return cls(None, rolling=True, parameters=parameters)
+        sensor_m = scan.T_base_sensor[:3, 3]
+        assumed = assumed_ground(scan.T_base_sensor)
+        found = find_ground(points_m, sensor_m, assumed) if assumed.offset_m == 0.0 else None
+        ground = found or find_ground(points_m, sensor_m) or assumed
+        return cls(ground, rolling=is_rolling(scan), parameters=parameters)
+
+    def follow(self, points_m: F32, scan: Scan, motion: F64) -> None:
+        """Update the floor by the points (N, 3) of a scan after a motion (4, 4) T_last_now.
+
+        A floor that is fixed to the robot is looked for only in some of the scans.
+        """
+        if self.ground is None:
+            return
+        p = self._parameters
+        expected = self.ground
+        if self.rolling:
+            self._scans += 1
+            if self._scans % p.rolling_every:
+                return
+        else:
+            expected = expected.moved(invert_pose(motion))
+        found = find_ground(points_m, scan.T_base_sensor[:3, 3], expected)
+        gain = p.rolling_gain if self.rolling else p.carried_gain
+        self.ground = expected if found is None else expected.toward(found, gain)
+
+    def remove(self, points_m: F32) -> F32:
+        """Return the points (N, 3) that KISS-ICP is given: a sample, without floor and ceiling.
+
+        A sensor in the hand keeps floor and ceiling: they determine its tilt and height.
+        """
+        if self.ground is None or not len(points_m):
+            return points_m
+        p = self._parameters
+        if not self.rolling:
+            return points_m[random_subset(len(points_m), p.icp_points_carried)]
+        points = points_m[random_subset(len(points_m), p.icp_points)]
+        heights = self.ground.heights(points)
+        slack = p.floor_slack_m + p.floor_slack_per_m * np.hypot(points[:, 0], points[:, 1])
+        keep = heights > slack
+        if self.ground.ceiling_m is not None:
+            keep &= heights < self.ground.ceiling_m - slack
+        return points[keep] if keep.sum() > p.icp_min_points else points
+
+    def start_pose(self) -> F64:
+        """Return T_session_base (4, 4) of the first scan: the session frame is the base, levelled."""
+        return np.eye(4) if self.ground is None else self.ground.leveling()
+
+    def hold(self, pose: F64) -> F64:
+        """Return a pose (4, 4) with tilt and height from the floor, since walls alone let them drift."""
+        if not self.rolling:
+            return pose
+        planar = SE2.from_matrix(pose)
+        if self.ground is None:
+            return planar.lift()
+        held: F64 = planar.lift() @ self.ground.leveling()
+        # Levelling is the smallest rotation, which may change the heading: turn it back.
+        turn = SE2(0.0, 0.0, planar.yaw - SE2.from_matrix(held).yaw).lift()
+        held[:3, :3] = turn[:3, :3] @ held[:3, :3]
+        return held
+
+
+def is_rolling(scan: Scan) -> bool:
+    """Whether the base stays upright: by its odometry, or without odometry by the mounting."""
+    T = scan.T_odom_base
+    if T is None:
+        return float(scan.T_base_sensor[2, 3]) > 0.05
+    return abs(float(T[2, 3])) < 1e-3 and float(T[2, 2]) > 1.0 - 1e-6

@@ -1,0 +1,51 @@
+"""What the pose of a scan is worth, judged by its match with the local map."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pc2grid.model import Health
+from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.odometry.point_to_line import Match
+
+
+class HealthJudge:
+    """Judges each scan, and counts the poor ones in a row.
+
+    rolling : whether the base stands on the floor, so that the plane shows most of what the sensor sees.
+    """
+
+    def __init__(self, *, rolling: bool, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
+        self._parameters = parameters
+        self._min_overlap = parameters.min_overlap if rolling else parameters.min_overlap_carried
+        self._poor_scans = 0
+        self._lost_scans = 0
+
+    def judge(self, match: Match | None, measured: bool) -> Health:
+        """Judge a scan by its match, None if it had too few hits. measured : odometry predicted its pose.
+
+        A scan that shows too little is bridged by odometry for a while (DEGENERATE). A scan that does not
+        fit, without odometry or for too long, is LOST. A scan that fits is DEGENERATE if one direction of
+        its position is not determined, FINE otherwise.
+        """
+        p = self._parameters
+        if match is None or match.overlap < self._min_overlap or match.residual_m > p.max_residual_m:
+            self._poor_scans += 1
+            lost = not measured or self._poor_scans > p.bridged_scans
+            self._lost_scans += lost
+            return Health.LOST if lost else Health.DEGENERATE
+        self._poor_scans = self._lost_scans = 0
+        # Information on x and y with the yaw eliminated (Schur complement).
+        J = match.information
+        across = J[:2, :2] - np.outer(J[:2, 2], J[2, :2]) / max(J[2, 2], 1e-9)
+        weakest = float(np.linalg.eigvalsh(across)[0])
+        return Health.FINE if weakest > p.max_sigma_m**-2 else Health.DEGENERATE
+
+    @property
+    def gives_up(self) -> bool:
+        """Whether so many scans in a row were lost that tracking must start again."""
+        return self._lost_scans > self._parameters.give_up_scans
+
+    def restart(self) -> None:
+        """Start to count again."""
+        self._lost_scans = 0

@@ -1,0 +1,93 @@
+"""The local maps that a scan is matched with: the last metres of travel, as grids of point moments."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pc2grid.arrays import F64
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.geometry import SE2
+from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.odometry.point_to_line import Match, PointGrid, best_placements, evenly
+
+
+class MatchingMaps:
+    """Two overlapping local maps: scans are matched with the older one, and the younger replaces it in time.
+
+    reach_m : range of the hits of a scan.
+    restarts : how often the maps were started again.
+    """
+
+    def __init__(self, reach_m: float, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
+        self._half_m = reach_m + 2.0 * parameters.map_travel_m
+        self._parameters = parameters
+        self._maps: list[tuple[PointGrid, float]] = []  # each with the travel at which it was begun
+        self._last_keyframe: SE2 | None = None
+        self._travel_m = 0.0
+        self.restarts = 0
+
+    def __bool__(self) -> bool:
+        return bool(self._maps)
+
+    def fit(self, planar_scan: PlanarScan, guess: SE2) -> Match:
+        """Match a planar scan from a guess T_session_base, by its hits alone."""
+        return self._match(planar_scan, guess, guess, np.zeros((3, 3)))
+
+    def refine(
+        self, planar_scan: PlanarScan, guesses: list[SE2], prior: SE2, information: F64
+    ) -> Match | None:
+        """Match a planar scan from some guesses and return the better result.
+
+        prior, information : pose T_session_base that the result is held to, and its information (3, 3).
+        Returns None for a scan with too few hits.
+        """
+        if len(planar_scan.hits_m) < self._parameters.min_hits:
+            return None
+        matches = [self._match(planar_scan, guess, prior, information) for guess in guesses]
+        return max(matches, key=self.quality)
+
+    def search(self, planar_scan: PlanarScan, guess: SE2, window_m: float, window_rad: float) -> list[SE2]:
+        """Return the best placements of a planar scan around a guess T_session_base, to be refined."""
+        p, grid = self._parameters, self._maps[0][0]
+        hits = planar_scan.hits_m[evenly(len(planar_scan.hits_m), p.search_hits)].astype(np.float64)
+        field = grid.likelihood(p.search_sigma_m)
+        found = best_placements(field, grid.low_m, grid.cell_m, hits, guess, window_m, window_rad)
+        return [pose for _, pose in found]
+
+    def quality(self, match: Match) -> float:
+        """What placements of one scan are compared by."""
+        return match.overlap - self._parameters.residual_weight_per_m * match.residual_m
+
+    def _match(self, planar_scan: PlanarScan, guess: SE2, prior: SE2, information: F64) -> Match:
+        chosen = evenly(len(planar_scan.hits_m), self._parameters.matched_hits)
+        hits, normals = planar_scan.hits_m[chosen], planar_scan.normal_rad[chosen]
+        return self._maps[0][0].match(hits, normals, guess, prior, information)
+
+    def extend(self, planar_scan: PlanarScan, pose: SE2) -> bool:
+        """Add a planar scan at its final pose T_session_base, if the robot has moved enough since the last.
+
+        Returns whether it was added, as a keyframe: a robot that stands still adds nothing.
+        """
+        p = self._parameters
+        if self._last_keyframe is not None:
+            step = self._last_keyframe.inverse() @ pose
+            distance_m = math.hypot(step.x, step.y)
+            if distance_m < p.keyframe_travel_m and abs(step.yaw) < p.keyframe_turn_rad:
+                return False
+            self._travel_m += distance_m
+        if not self._maps or self._travel_m - self._maps[-1][1] > p.map_travel_m:
+            middle = np.array([pose.x, pose.y])
+            self._maps.append((PointGrid(middle - self._half_m, middle + self._half_m), self._travel_m))
+        if len(self._maps) > 2:
+            del self._maps[0]
+        for grid, _ in self._maps:
+            grid.add(pose.apply(planar_scan.hits_m), planar_scan.normal_rad + pose.yaw)
+        self._last_keyframe = pose
+        return True
+
+    def restart(self) -> None:
+        """Forget the maps: the next keyframe begins new ones."""
+        self._maps, self._last_keyframe = [], None
+        self.restarts += 1

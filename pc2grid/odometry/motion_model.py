@@ -1,0 +1,171 @@
+"""The motion that is expected before a scan is looked at: by odometry, or else as it was before."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pc2grid.arrays import F64
+from pc2grid.geometry import interpolate_pose, invert_pose
+from pc2grid.model import Scan
+from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.odometry.wheel_odometry import OdometryTrust, is_plausible, motion_size
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """The expected motion from the last scan to this one.
+
+    motion : (4, 4) T_last_now. seconds : the time between them.
+    odometry : (4, 4) motion since odometry was last known, as it reports it; None if `motion` rests on the
+        motion before instead.
+    windowed : (4, 4) T_last_now as odometry reports it over the last second: from the pose a second ago. It
+        differs from `motion` if odometry is late, or reports a motion again that the scans have shown before.
+    credible : False if odometry is implausible and the local map confirms neither it nor the motion before.
+    """
+
+    motion: F64
+    seconds: float
+    odometry: F64 | None = None
+    windowed: F64 | None = None
+    credible: bool = True
+
+
+class MotionModel:
+    """Predicts motions from odometry and from the last poses; all use of odometry is here.
+
+    last_pose : (4, 4) T_session_base of the last scan.
+    """
+
+    def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
+        self._parameters = parameters
+        self._trust = OdometryTrust(parameters)
+        self._window: list[tuple[int, F64, F64]] = []  # stamp, T_odom_base, T_session_base of the last second
+        self._intervals_s: list[float] = []  # between the last scans
+        self._recent: list[tuple[int, F64]] = []  # stamp and T_session_base of the last three scans
+        self._measured: tuple[F64, F64] | None = (
+            None  # T_odom_base, T_session_base of the last known odometry
+        )
+        self._last_had_odometry = False
+        self.last_pose: F64 = np.eye(4)
+
+    def predict(self, scan: Scan) -> Prediction:
+        """Predict the motion up to a scan.
+
+        Odometry spans the scans that had none: the poses of those were only predicted. Only for a scan
+        that has no odometry itself is the motion before continued.
+        """
+        seconds = (scan.stamp_ns - self._recent[-1][0]) * 1e-9
+        if scan.T_odom_base is None or self._measured is None:
+            return self.continued(seconds)
+        T_odom_then, T_session_then = self._measured
+        odometry: F64 = invert_pose(T_odom_then) @ scan.T_odom_base
+        motion = odometry
+        if not self._last_had_odometry:
+            motion = invert_pose(self.last_pose) @ T_session_then @ odometry
+        windowed = None
+        if self._window:
+            _, T_odom_then, T_session_then = self._window[0]
+            windowed = (
+                invert_pose(self.last_pose) @ T_session_then @ invert_pose(T_odom_then) @ scan.T_odom_base
+            )
+        return Prediction(motion=motion, seconds=seconds, odometry=odometry, windowed=windowed)
+
+    def continued(self, seconds: float) -> Prediction:
+        """Predict that the last motion continues.
+
+        That motion is taken over two scans where they follow closely. It removes the skew of the next scan,
+        and the error of a single pose, taken for motion, would come back in the next pose with the other
+        sign, and grow.
+        """
+        motion = np.eye(4)
+        now_ns, T_session_now = self._recent[-1]
+        for k, (stamp_ns, T_session_then) in enumerate(self._recent[:-1]):
+            span = (now_ns - stamp_ns) * 1e-9
+            if span < self._parameters.steady_s or k == len(self._recent) - 2:
+                before = invert_pose(T_session_then) @ T_session_now
+                motion = interpolate_pose(np.eye(4), before, min(seconds / span, 1.0))
+                break
+        return Prediction(motion=motion, seconds=seconds)
+
+    def is_plausible(self, prediction: Prediction) -> bool:
+        """Whether the odometry that a prediction rests on, if any, is a motion that a robot can make."""
+        odometry, p = prediction.odometry, self._parameters
+        usual_s = float(np.median(self._intervals_s)) if self._intervals_s else prediction.seconds
+        gap_s = max(p.gap_s, p.gap_intervals * usual_s)
+        return odometry is None or is_plausible(odometry, prediction.seconds, gap_s, p)
+
+    def owed(self, prediction: Prediction) -> tuple[float, float]:
+        """Return by how much (m, rad) odometry over a step and over the last second differ; 0 if by little.
+
+        Then odometry is late, or repeats a motion, and only the scan can tell which of the two is right.
+        """
+        p = self._parameters
+        if prediction.windowed is None:
+            return 0.0, 0.0
+        distance_m, turn_rad = motion_size(invert_pose(prediction.motion) @ prediction.windowed)
+        return (distance_m, turn_rad) if distance_m > p.owed_m or turn_rad > p.owed_rad else (0.0, 0.0)
+
+    def search_window(self, prediction: Prediction) -> tuple[float, float]:
+        """Return how far (m, rad) the robot can be from where it is predicted."""
+        p = self._parameters
+        if prediction.odometry is None:
+            sigma_m, sigma_rad = p.unsteady_mps * prediction.seconds, p.unsteady_radps * prediction.seconds
+        else:
+            variances = np.diag(np.linalg.inv(self.information(prediction)))
+            sigma_m, sigma_rad = math.sqrt(variances[0]), math.sqrt(variances[2])
+        return min(p.search_sigmas * sigma_m, p.search_most_m), min(
+            p.search_sigmas * sigma_rad, p.search_most_rad
+        )
+
+    def forget_window(self) -> None:
+        """Start the window of odometry again, because its frame has changed."""
+        self._window = []
+
+    def within(self, scan: Scan, prediction: Prediction | None) -> tuple[F64, float]:
+        """Return the motion (4, 4) of the base while a scan is taken, and its duration in seconds.
+
+        It is odometry's where that is used (or for the first scan, without a prediction), since a turn
+        begins and ends within a scan; else the predicted motion.
+        """
+        if prediction is None or prediction.odometry is not None:
+            times, motion = scan.offsets_s, scan.T_first_last
+            if motion is not None and times is not None:
+                seconds = float(times.max() - times.min())
+                if is_plausible(motion, seconds, self._parameters.gap_s, self._parameters):
+                    return motion, seconds
+        return (np.eye(4), 0.0) if prediction is None else (prediction.motion, prediction.seconds)
+
+    def information(self, prediction: Prediction) -> F64:
+        """Return the information (3, 3) of a prediction on x, y, yaw."""
+        if prediction.odometry is not None:
+            information = self._trust.information(prediction.odometry)
+            owed_m, owed_rad = self.owed(prediction)
+            owed = np.diag([owed_m**2, owed_m**2, owed_rad**2])
+            return np.linalg.inv(np.linalg.inv(information) + owed) if owed.any() else information
+        p = self._parameters
+        return np.diag([p.steady_sigma_m**-2, p.steady_sigma_m**-2, p.steady_sigma_rad**-2])
+
+    def observe(self, scan: Scan, T_session_base: F64, *, sure: bool) -> None:
+        """Remember the final pose (4, 4) of a scan; `sure`: every direction of it was measured."""
+        p = self._parameters
+        if self._recent:
+            seconds = (scan.stamp_ns - self._recent[-1][0]) * 1e-9
+            self._intervals_s = [*self._intervals_s[-(p.usual_intervals - 1) :], seconds]
+        self._recent = [*self._recent[-2:], (scan.stamp_ns, T_session_base)]
+        self.last_pose = T_session_base
+        self._last_had_odometry = scan.T_odom_base is not None
+        if scan.T_odom_base is not None:
+            self._measured = scan.T_odom_base, T_session_base
+            begin_ns = scan.stamp_ns - p.window_s * 1e9
+            kept = [past for past in self._window if past[0] >= begin_ns]
+            self._window = [*kept, (scan.stamp_ns, scan.T_odom_base, T_session_base)]
+            self._trust.observe(scan.T_odom_base, T_session_base, sure)
+
+
+def not_credible(prediction: Prediction) -> Prediction:
+    """Return the same prediction, marked as confirmed by nothing."""
+    return dataclasses.replace(prediction, credible=False)

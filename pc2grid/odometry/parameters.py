@@ -1,0 +1,200 @@
+"""The numbers of tracking and scan matching. Where no other origin is given, a number was chosen by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatchingParameters:
+    """Point-to-line scan matching.
+
+    cell_m : edge of a cell of moments.
+    sectors : number of directions by which surfaces are distinguished; a point uses its own and the two
+        beside it.
+    point_sigma_m : standard deviation that one point counts with. It is far above the noise of a range,
+        since the errors of neighbours on one wall are not independent.
+    residual_scale_m : scale of the Cauchy weight of a point, times the radius of its neighbourhood in cells.
+    prior_scale : scale of the Cauchy weight of the prior, in standard deviations.
+    radii_cells : half width of the neighbourhood that gives each point its line, one entry an iteration:
+        wide first for a large basin of convergence, then narrow for accuracy.
+    converged : the iterations end when x, y (m) and yaw (rad) change by less than this in sum.
+    """
+
+    cell_m: float = 0.1
+    sectors: int = 8
+    point_sigma_m: float = 0.1
+    residual_scale_m: float = 0.05
+    prior_scale: float = 2.0
+    radii_cells: tuple[int, ...] = (3, 3, 2, 2, 1, 1, 1, 1, 1, 1)
+    converged: float = 1e-4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackingParameters:
+    """Tracking from scan to scan.
+
+    Points:
+
+    max_points : of a scan, chosen at random; a depth image has 300 000.
+    icp_points : of these, those given to KISS-ICP where a refinement follows, floor and ceiling included.
+    icp_points_carried : the same for a carried sensor, whose pose is KISS-ICP's. With all 40 000 points the
+        poses are no better (hall.mcap: 0.023 m both, kitchen.mcap: 0.026 m instead of 0.034 m) and take 1.4
+        times as long.
+    icp_min_points : fewer than this above the floor: the floor is left in.
+    floor_slack_m, floor_slack_per_m : height up to which points count as floor, and its growth with the
+        horizontal range (0.01 is an error of the tilt of 0.6 degrees).
+
+    Ground:
+
+    rolling_gain, carried_gain : share by which the floor moves towards what a scan shows of it.
+    rolling_every : scans from one look at the floor to the next where it is fixed to the robot.
+
+    Motion without odometry:
+
+    steady_s : the motion before is taken over this time, so that an error of one pose does not come back
+        in the next with the other sign.
+    steady_sigma_m, steady_sigma_rad : standard deviations of a pose that KISS-ICP found, as a prior.
+
+    Odometry:
+
+    gap_s, gap_intervals : odometry over a longer time than `gap_s`, and than so many times the interval at
+        which the scans of this log follow, is tested against the local map before it is used.
+    usual_intervals : that interval is the median of so many.
+    fastest_mps, fastest_radps : the same for odometry that claims a faster motion, with an allowance of
+        `jump_m` and `jump_rad` for noise.
+    slip_sigma : share of the distance and of the turn that is the standard deviation of unknown odometry.
+    slip_sigma_m_per_rad : the same of the position, for a turn.
+    odometry_floor_m, odometry_floor_rad : standard deviations of odometry over no motion at all.
+    window_s : odometry that reports a motion late reports it over this time all the same.
+    owed_m, owed_rad : if the motion of a step and that of the window differ by more than this, odometry owes
+        a motion or repeats one, and counts less by the difference.
+    trust_window_m : travel over which odometry is compared with the poses; the difference must stand out
+        from the noise of the poses.
+    trust_windows, trust_min_windows : windows that are remembered, and that an estimate needs.
+    trust_safety : factor on the root mean square of the differences in the windows.
+    trust_best, trust_worst : bounds of the factor that the standard deviations are multiplied by.
+
+    Refinement in the plane:
+
+    min_hits : with fewer hits no refinement is made.
+    matched_hits : hits of a scan that are matched, at most, evenly chosen.
+    residual_weight_per_m : of two placements the one with the larger overlap - weight * residual is taken.
+    disagree_m, disagree_rad : where KISS-ICP and the prediction differ by more, both start a refinement.
+    sure_overlap : least overlap of a placement that alone decides between odometry and the motion before;
+        with less, placements are searched for if the prediction leaves enough open.
+    search_sigmas : half width of that search in standard deviations of the predicted motion.
+    search_above_m, search_above_rad : it is made only if the half width exceeds one of these; a refinement
+        alone converges over less.
+    search_most_m, search_most_rad : largest half width.
+    search_sigma_m : of the likelihood field that is searched; its steps are 0.2 m and 2 degrees.
+    search_hits : hits that are searched with, at most, evenly chosen.
+    unsteady_mps, unsteady_radps : without odometry, the standard deviation of the motion is this times the
+        time since the last scan: a robot indoors starts, stops and turns.
+
+    Local maps and keyframes:
+
+    keyframe_travel_m, keyframe_turn_rad : a scan joins the local maps after this motion.
+    map_travel_m : travel after which a new local map is begun.
+
+    Health:
+
+    min_overlap, min_overlap_carried : least share of the hits that meet a line of the local map. It is
+        smaller for a carried sensor, since the plane shows less of a scene when the sensor tilts.
+    max_residual_m : largest mean distance of the hits from their lines.
+    max_sigma_m : a direction whose standard deviation is larger counts as not measured.
+    bridged_scans : poor scans in a row that odometry may bridge.
+    give_up_scans : lost scans in a row after which tracking starts again.
+
+    KISS-ICP (Vizzo et al. 2023; its defaults are for cars):
+
+    icp_range_factor, icp_range_percentile : its range is this times that percentile of the first ranges,
+        within `icp_range_m`.
+    icp_voxels_per_range : its voxel is the 75th percentile of the first ranges over this, within
+        `icp_voxel_m` (rolling) or `icp_voxel_carried_m`.
+    brisk_mps, icp_max_reach_m : partners of points are looked for no farther than a voxel away, so a voxel
+        spans at least the motion of a person between two scans, up to a limit.
+    icp_* otherwise : a rolling base is refined afterwards, so a coarse and quick solution is enough.
+    """
+
+    max_points: int = 40_000
+    icp_points: int = 6_000
+    icp_points_carried: int = 15_000
+    icp_min_points: int = 100
+    floor_slack_m: float = 0.1
+    floor_slack_per_m: float = 0.01
+
+    rolling_gain: float = 0.36
+    carried_gain: float = 0.3
+    rolling_every: int = 8
+
+    steady_s: float = 0.3
+    steady_sigma_m: float = 0.03
+    steady_sigma_rad: float = 0.01
+
+    gap_s: float = 1.0
+    gap_intervals: float = 5.0
+    usual_intervals: int = 9
+    fastest_mps: float = 4.0
+    fastest_radps: float = 4.0
+    jump_m: float = 0.2
+    jump_rad: float = 0.3
+    slip_sigma: float = 0.1
+    slip_sigma_m_per_rad: float = 0.05
+    odometry_floor_m: float = 0.01
+    odometry_floor_rad: float = 0.01
+    window_s: float = 1.0
+    owed_m: float = 0.1
+    owed_rad: float = 0.1
+    trust_window_m: float = 2.0
+    trust_windows: int = 5
+    trust_min_windows: int = 3
+    trust_safety: float = 2.0
+    trust_best: float = 0.25
+    trust_worst: float = 1.0
+
+    min_hits: int = 10
+    matched_hits: int = 700
+    residual_weight_per_m: float = 5.0
+    disagree_m: float = 0.03
+    disagree_rad: float = 0.02
+    sure_overlap: float = 0.6
+    search_sigmas: float = 3.0
+    search_above_m: float = 0.3
+    search_above_rad: float = 0.2
+    search_most_m: float = 3.0
+    search_most_rad: float = math.radians(60.0)
+    search_sigma_m: float = 0.15
+    search_hits: int = 200
+    unsteady_mps: float = 0.4
+    unsteady_radps: float = 0.4
+
+    keyframe_travel_m: float = 0.2
+    keyframe_turn_rad: float = math.radians(10.0)
+    map_travel_m: float = 5.0
+
+    min_overlap: float = 0.3
+    min_overlap_carried: float = 0.1
+    max_residual_m: float = 0.1
+    max_sigma_m: float = 0.15
+    bridged_scans: int = 30
+    give_up_scans: int = 10
+
+    icp_min_frame: int = 10
+    icp_range_factor: float = 1.5
+    icp_range_percentile: float = 98.0
+    icp_range_m: tuple[float, float] = (10.0, 100.0)
+    icp_voxels_per_range: float = 40.0
+    icp_voxel_m: tuple[float, float] = (0.3, 1.0)
+    icp_voxel_carried_m: tuple[float, float] = (0.05, 1.0)
+    brisk_mps: float = 1.0
+    icp_max_reach_m: float = 0.5
+    icp_points_per_voxel: int = 10
+    icp_iterations: int = 10
+    icp_converged: float = 1e-2
+    icp_initial_threshold_m: float = 1.0
+
+
+MATCHING_PARAMETERS = MatchingParameters()
+TRACKING_PARAMETERS = TrackingParameters()

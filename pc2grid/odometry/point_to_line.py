@@ -1,0 +1,263 @@
+"""Scan matching in the plane: point-to-line Gauss-Newton against a local map, with a prior.
+
+The map is a grid of moments: each cell keeps number, sum and second moments of the points that fell into
+it, separately for each direction of the surface normal, so that the two faces of a wall stay two. The line
+at a place is the principal axis of the cells around it. The accuracy is therefore not bound by the cell
+size, and adding a scan costs one pass over its points.
+
+Point-to-line as in Censi, "An ICP variant using a point-to-line metric" (2008); the moments are those of
+Biber and Strasser's normal distributions transform (2003).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pc2grid.arrays import F32, F64
+from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.odometry.parameters import MATCHING_PARAMETERS, MatchingParameters
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """Placement of a point set on a map.
+
+    pose : T_map_points. information : (3, 3) of x, y, yaw in the map frame, from the points alone.
+    overlap : share of the points that found a line. residual_m : mean distance of those from their lines.
+    """
+
+    pose: SE2
+    information: F64
+    overlap: float
+    residual_m: float
+
+
+class PointGrid:
+    """A map of point moments over the rectangle from `low_m` to `high_m` (each x, y).
+
+    Points outside are ignored, both when adding and when matching.
+    """
+
+    def __init__(
+        self,
+        low_m: ArrayLike,
+        high_m: ArrayLike,
+        cell_m: float | None = None,
+        parameters: MatchingParameters = MATCHING_PARAMETERS,
+    ) -> None:
+        self._parameters = parameters
+        self.cell_m = cell_m or parameters.cell_m
+        self.low_m = np.asarray(low_m, dtype=np.float64)
+        width, height = np.ceil((np.asarray(high_m) - self.low_m) / self.cell_m).astype(int)
+        # Most cells are empty: `_index` gives the row of `_moments` of those that are not, -1 of the others.
+        self._index = np.full((height, width), -1, dtype=np.int32)
+        self._moments = np.zeros((256, parameters.sectors, 6), dtype=np.float64)
+        self._used = 0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows (y) and columns (x)."""
+        return self._index.shape[0], self._index.shape[1]
+
+    def add(self, points_m: NDArray[np.floating], normal_rad: NDArray[np.floating]) -> None:
+        """Add points (N, 2) with the directions (N,) of their surface normals, in the map frame."""
+        local = np.asarray(points_m, dtype=np.float64) - self.low_m
+        column, row = np.floor(local / self.cell_m).astype(np.int64).T
+        inside = (row >= 0) & (row < self.shape[0]) & (column >= 0) & (column < self.shape[1])
+        x, y = local[inside].T
+        cell = row[inside] * self.shape[1] + column[inside]
+        cells = self._index.reshape(-1)
+        fresh = np.unique(cell[cells[cell] < 0])
+        cells[fresh] = self._used + np.arange(len(fresh), dtype=np.int32)
+        self._used += len(fresh)
+        if self._used > len(self._moments):
+            room = np.zeros((max(len(self._moments), len(fresh)), *self._moments.shape[1:]))
+            self._moments = np.concatenate((self._moments, room))
+        sector = sector_of(np.asarray(normal_rad, np.float64)[inside], self._parameters.sectors)
+        slot = cells[cell] * self._parameters.sectors + sector
+        changed, group = np.unique(slot, return_inverse=True)
+        flat = self._moments.reshape(-1, 6)
+        for moment, weights in enumerate((np.ones_like(x), x, y, x * x, x * y, y * y)):
+            flat[changed, moment] += np.bincount(group, weights, len(changed))
+
+    def likelihood(self, sigma_m: float) -> F32:
+        """Return the likelihood field (H, W), 0..1, of the cells that hold points."""
+        import cv2
+
+        empty = (self._index < 0).astype(np.uint8)
+        distance_m = self.cell_m * cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_3)
+        field: F32 = np.exp(np.float32(-0.5 / sigma_m**2) * distance_m**2)
+        return field
+
+    def match(
+        self,
+        points_m: NDArray[np.floating],
+        normal_rad: NDArray[np.floating],
+        guess: SE2,
+        prior: SE2,
+        prior_information: F64,
+        *,
+        radii: tuple[int, ...] | None = None,
+    ) -> Match:
+        """Align points (N, 2) with the directions (N,) of their normals, in the points' frame, to the map.
+
+        The iterations start at `guess` and are held to `prior` by `prior_information` (3, 3) of x, y, yaw.
+        radii : half widths of the neighbourhood, as `MatchingParameters.radii_cells`, its default.
+        """
+        from pc2grid.odometry._kernels import normal_equations
+
+        p, steps = self._parameters, radii or self._parameters.radii_cells
+        points, normals = np.asarray(points_m, np.float64), np.asarray(normal_rad, np.float64)
+        origin = np.array([*self.low_m, 0.0])
+        unit, damping = p.point_sigma_m**-2, 1e-6 * np.eye(3)
+        pose = np.array([guess.x, guess.y, guess.yaw])
+        held = np.array([prior.x, prior.y, prior.yaw])
+        information, found, distance = np.zeros((3, 3)), 0, 0.0
+        for radius in steps:
+            H, g, found, distance = normal_equations(
+                self._index, self._moments, points, normals, pose - origin, self.cell_m,
+                radius, p.residual_scale_m * radius,
+            )  # fmt: skip
+            information = unit * H
+            away = pose - held
+            away[2] = wrap_angle(float(away[2]))
+            # Cauchy weight: wheels slip, so a prior that disagrees with the points counts less.
+            weight = prior_information / (1.0 + (away @ prior_information @ away) / p.prior_scale**2)
+            step = np.linalg.solve(information + weight + damping, -(unit * g + weight @ away))
+            pose = pose + step
+            if radius == steps[-1] and np.abs(step).sum() < p.converged:
+                break
+        return Match(
+            SE2(float(pose[0]), float(pose[1]), wrap_angle(float(pose[2]))),
+            information,
+            found / max(len(points), 1),
+            distance / max(found, 1),
+        )
+
+
+def sector_of(normal_rad: F64, sectors: int) -> NDArray[np.int64]:
+    """Return the number (N,), 0..sectors - 1, of the sector that directions (N,) fall into."""
+    found: NDArray[np.int64] = np.rint(normal_rad * (sectors / (2.0 * np.pi))).astype(np.int64) % sectors
+    return found
+
+
+def normal_equations_plain(
+    index: NDArray[np.int32],
+    moments: F64,
+    points: F64,
+    normal_rad: F64,
+    pose: F64,
+    cell_m: float,
+    radius: int,
+    scale_m: float,
+) -> tuple[F64, F64, int, float]:
+    """Linearise the point-to-line distances at a pose: the definition of the compiled form, in numpy.
+
+    index : (H, W) row of `moments` (K, sectors, 6) for each cell, or -1. points : (N, 2) and normal_rad :
+    (N,) in their frame. pose : (3,) x, y, yaw of that frame from the corner of cell (0, 0).
+    radius : half width in cells of the neighbourhood. scale_m : scale of the Cauchy weight.
+
+    Returns H (3, 3) and g (3,) of the Gauss-Newton step H d = -g for points of unit variance, the number
+    of points that found a line, and the sum of their distances from it.
+    """
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    rotated = points @ np.array([[c, s], [-s, c]])
+    at = rotated + pose[:2]
+    sectors = moments.shape[1]
+    sector = sector_of(normal_rad + pose[2], sectors)
+    H, g, found, distance = np.zeros((3, 3)), np.zeros(3), 0, 0.0
+    for k, (column, row) in enumerate(np.floor(at / cell_m).astype(int)):
+        if not (radius <= row < index.shape[0] - radius and radius <= column < index.shape[1] - radius):
+            continue
+        cells = index[row - radius : row + radius + 1, column - radius : column + radius + 1]
+        beside = (sector[k] + np.array([-1, 0, 1])) % sectors
+        n, sx, sy, sxx, sxy, syy = moments[cells[cells >= 0]][:, beside].sum(axis=(0, 1))
+        if n < 3:
+            continue
+        mean = np.array([sx, sy]) / n
+        (small, large), axes = np.linalg.eigh(np.array([[sxx, sxy], [sxy, syy]]) / n - np.outer(mean, mean))
+        if large < 1e-4:
+            continue
+        normal = axes[:, 0]
+        r = float(normal @ (at[k] - mean))
+        weight = (1.0 - max(small, 0.0) / large) ** 2 / (1.0 + (r / scale_m) ** 2)
+        J = np.array([normal[0], normal[1], normal[1] * rotated[k, 0] - normal[0] * rotated[k, 1]])
+        H += weight * np.outer(J, J)
+        g += weight * r * J
+        found += 1
+        distance += abs(r)
+    return H, g, found, distance
+
+
+def best_placements(
+    field: F32,
+    low_m: F64,
+    cell_m: float,
+    points_m: F64,
+    guess: SE2,
+    window_m: float,
+    window_rad: float,
+    *,
+    step_m: float = 0.2,
+    step_rad: float = math.radians(2.0),
+    count: int = 3,
+) -> list[tuple[float, SE2]]:
+    """Correlative scan matching (Olson 2009), exhaustive: placements of points (N, 2) on a likelihood field.
+
+    field : (H, W) in 0..1, cell (0, 0) at `low_m`. The window around `guess` is searched in equal steps.
+    Returns the best `count` placements no two of which are neighbours, best first, each with the mean
+    likelihood of the points.
+    """
+    from pc2grid.odometry._kernels import placement_scores
+
+    steps = math.ceil(window_m / step_m)
+    across = step_m * np.arange(-steps, steps + 1, dtype=np.float64)
+    turn_steps = math.ceil(window_rad / step_rad)
+    turns = step_rad * np.arange(-turn_steps, turn_steps + 1, dtype=np.float64)
+    points = np.asarray(points_m, dtype=np.float64) / cell_m
+    origin = (np.array([guess.x, guess.y]) - low_m) / cell_m
+    first, step = round(float(across[0]) / cell_m), max(round(step_m / cell_m), 1)
+    scores = placement_scores(field, points, origin, guess.yaw + turns, first, step, len(across))
+    found: list[tuple[float, SE2]] = []
+    while len(found) < count:
+        a, r, c = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        score = float(scores[a, r, c])
+        if score <= 0.0:
+            break
+        found.append(
+            (score, SE2(guess.x + across[c], guess.y + across[r], wrap_angle(guess.yaw + float(turns[a]))))
+        )
+        scores[max(a - 2, 0) : a + 3, max(r - 2, 0) : r + 3, max(c - 2, 0) : c + 3] = 0.0
+    return found
+
+
+def placement_scores_plain(
+    field: F32, points: F64, origin: F64, yaws: F64, first: int, step: int, count: int
+) -> F32:
+    """Score all placements of a window: the definition of the compiled form, in numpy. All in cells.
+
+    points : (N, 2) x, y. origin : (2,) middle of the window. yaws : (A,) radians. Shifts are
+    `first` + `step` * k for k below `count`, in x and in y. Returns the means (A, count (y), count (x)) of
+    the field at the points, 0 outside.
+    """
+    scores = np.zeros((len(yaws), count, count), dtype=np.float32)
+    shifts = first + step * np.arange(count)
+    for a, yaw in enumerate(yaws):
+        c, s = math.cos(yaw), math.sin(yaw)
+        column, row = np.floor(points @ np.array([[c, s], [-s, c]]) + origin).astype(int).T
+        for r, down in enumerate(shifts):
+            for k, right in enumerate(shifts):
+                y, x = row + down, column + right
+                inside = (y >= 0) & (y < field.shape[0]) & (x >= 0) & (x < field.shape[1])
+                scores[a, r, k] = field[y[inside], x[inside]].sum()
+    mean: F32 = scores / np.float32(max(len(points), 1))
+    return mean
+
+
+def evenly(length: int, count: int) -> NDArray[np.intp]:
+    """Return at most `count` of the indices below `length`, evenly spread."""
+    return np.arange(length) if length <= count else np.linspace(0, length - 1, count).astype(np.intp)

@@ -1,0 +1,157 @@
+"""KISS-ICP (Vizzo et al. 2023) per scan. The only file that imports kiss_icp.
+
+`KissRegistration` is composed of the public parts of kiss_icp, in the order of `KissICP.register_frame`.
+Three things differ. The initial guess comes from outside (odometry where the log has it). The local map is
+updated by a call of its own, once the pose of the scan is final. Voxel and range are chosen from the first
+scans, since the defaults are for cars. Floor and ceiling are removed before: the rings of a lidar on the
+floor move with the sensor and pull point-to-point ICP towards standing still.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.arrays import F64
+from pc2grid.config import RegistrationConfig
+from pc2grid.model import Scan
+from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
+
+
+class KissRegistration:
+    """KISS-ICP with a given initial guess, in one thread and hence repeatable.
+
+    carried : the sensor is hand-held: six degrees of freedom, found by ICP alone.
+
+    Voxel and range come from the first scan with returns and the time to the next one, unless `config`
+    fixes them. A hand-held sensor in a room needs voxels of 0.1 m, in a hall or at two scans a second
+    larger ones. A robot on wheels, where a refinement follows, needs only coarse voxels and few iterations.
+    """
+
+    def __init__(
+        self,
+        config: RegistrationConfig,
+        *,
+        carried: bool = False,
+        parameters: TrackingParameters = TRACKING_PARAMETERS,
+    ) -> None:
+        self._config = config
+        self._carried = carried
+        self._parameters = parameters
+        self._first: tuple[F64, F64] | None = None  # points and pose of the first scan
+        self._pending: F64 | None = None  # the last scan, downsampled, until its pose is final
+        self._kiss_config: Any = None
+        self._registration: Any = None
+        self._threshold: Any = None
+        self._map: Any = None
+
+    def register(
+        self, points_m: NDArray[np.floating], T_session_last: F64, predicted_motion: F64, period_s: float
+    ) -> F64:
+        """Align one scan to the local map.
+
+        points_m : (N, 3) deskewed, without floor and ceiling, in the base frame.
+        T_session_last : (4, 4) final pose of the scan before.
+        predicted_motion : (4, 4) T_last_now. period_s : time since that scan.
+
+        Returns T_session_base (4, 4); the prediction for scans without enough points and for the first one.
+        The scan becomes part of the local map only by `update_map`.
+        """
+        self._pending = None
+        guess: F64 = T_session_last @ predicted_motion
+        if len(points_m) < self._parameters.icp_min_frame:
+            return guess
+        points = np.ascontiguousarray(points_m, dtype=np.float64)
+        if self._first is None:
+            self._first = points, guess
+            return guess
+        if self._map is None:
+            self._start(*self._first, period_s)
+        near = np.einsum("ij,ij->i", points, points) < self._kiss_config.data.max_range**2
+        frame = self._downsample(points[near])
+        sigma = self._threshold.get_threshold()
+        pose: F64 = self._registration.align_points_to_map(
+            points=self._downsample(frame, 1.5),
+            voxel_map=self._map,
+            initial_guess=guess,
+            max_correspondance_distance=3.0 * sigma,
+            kernel=sigma,
+        )
+        if not np.isfinite(pose).all():
+            return guess
+        self._threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
+        self._pending = frame
+        return pose
+
+    def update_map(self, T_session_base: F64) -> None:
+        """Add the scan registered last to the local map, at its final pose (4, 4)."""
+        if self._pending is not None:
+            self._map.update(self._pending, T_session_base)
+            self._pending = None
+
+    def _downsample(self, points: F64, voxels: float = 0.5) -> F64:
+        """One point for each cube with an edge of so many voxels of the local map."""
+        from kiss_icp.voxelization import voxel_down_sample
+
+        sampled: F64 = voxel_down_sample(points, voxels * self._kiss_config.mapping.voxel_size)
+        return sampled
+
+    def _start(self, points: F64, pose: F64, period_s: float) -> None:
+        """Choose the configuration from the first scan and begin the local map with it."""
+        from kiss_icp.config import KISSConfig
+        from kiss_icp.mapping import get_voxel_hash_map
+        from kiss_icp.registration import get_registration
+        from kiss_icp.threshold import get_threshold_estimator
+
+        p = self._parameters
+        ranges = np.linalg.norm(points, axis=1)
+        config = KISSConfig()
+        config.data.max_range = self._config.max_range_m or float(
+            np.clip(p.icp_range_factor * np.percentile(ranges, p.icp_range_percentile), *p.icp_range_m)
+        )
+        finest_m = max(
+            float(np.percentile(ranges, 75)) / p.icp_voxels_per_range,
+            min(p.brisk_mps * period_s, p.icp_max_reach_m),
+        )
+        config.mapping.voxel_size = self._config.voxel_m or float(
+            np.clip(finest_m, *(p.icp_voxel_carried_m if self._carried else p.icp_voxel_m))
+        )
+        config.registration.max_num_threads = 1
+        if not self._carried:
+            config.mapping.max_points_per_voxel = p.icp_points_per_voxel
+            config.registration.max_num_iterations = p.icp_iterations
+            config.registration.convergence_criterion = p.icp_converged
+            config.adaptive_threshold.initial_threshold = p.icp_initial_threshold_m
+        self._kiss_config = config
+        self._registration = get_registration(config)
+        self._threshold = get_threshold_estimator(config)
+        self._map = get_voxel_hash_map(config)
+        self._map.update(self._downsample(points), pose)
+
+    @property
+    def voxel_and_range_m(self) -> tuple[float, float] | None:
+        """The voxel and the range that were chosen, or None before the second scan."""
+        if self._kiss_config is None:
+            return None
+        return self._kiss_config.mapping.voxel_size, self._kiss_config.data.max_range
+
+
+class BareKissIcp:
+    """KISS-ICP with its own defaults and all points of each scan, to compare with."""
+
+    def __init__(self) -> None:
+        from kiss_icp.config import load_config
+        from kiss_icp.kiss_icp import KissICP
+
+        config = load_config(None)
+        config.registration.max_num_threads = 1
+        self._kiss: Any = KissICP(config)
+
+    def register(self, scan: Scan) -> F64:
+        """Return T_start_base (4, 4) at the time of the last point of a scan, to which KISS-ICP deskews."""
+        times = np.empty(0) if scan.offsets_s is None else scan.offsets_s.astype(np.float64)
+        if len(scan.points_m):
+            self._kiss.register_frame(scan.points_m.astype(np.float64), times)
+        return np.array(self._kiss.last_pose, dtype=np.float64)

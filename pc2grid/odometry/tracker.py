@@ -1,0 +1,228 @@
+"""Tracking from scan to scan: prediction, KISS-ICP, refinement in the plane, health.
+
+Each source counts by what it measures. Odometry knows the motion to a few percent in every direction. A
+scan knows the pose to millimetres, but only across the walls that it sees. So KISS-ICP brings the scan near,
+and point-to-line Gauss-Newton against the local map, with the odometry as a prior, determines the pose:
+along a corridor by the prior, across it by the walls.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pc2grid.arrays import F32, F64
+from pc2grid.clouds.deskew import deskew
+from pc2grid.clouds.planar_scan import PlanarScan, project_to_plane
+from pc2grid.clouds.sampling import random_subset
+from pc2grid.config import ProjectionConfig, RegistrationConfig
+from pc2grid.geometry import SE2
+from pc2grid.model import Health, RegisteredScan, Scan
+from pc2grid.odometry.ground_model import GroundModel
+from pc2grid.odometry.health import HealthJudge
+from pc2grid.odometry.matching_maps import MatchingMaps
+from pc2grid.odometry.motion_model import MotionModel, Prediction, not_credible
+from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.odometry.point_to_line import Match
+from pc2grid.odometry.registration import KissRegistration
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tracked:
+    """The result of tracking one scan.
+
+    registered : the scan, deskewed, with its pose and health.
+    planar_scan : the scan reduced to the plane.
+    keyframe : whether the robot had moved enough for the scan to become part of the local map.
+    restart : the first keyframe after tracking was lost: its pose relative to those before is unknown.
+    """
+
+    registered: RegisteredScan
+    planar_scan: PlanarScan
+    keyframe: bool
+    restart: bool = False
+
+
+class Tracker:
+    """Turns scans into poses and planar scans, one by one. Its memory is the size of two local maps.
+
+    The session frame is the base at the first scan, levelled: z up.
+    """
+
+    def __init__(
+        self,
+        registration: RegistrationConfig,
+        projection: ProjectionConfig | None = None,
+        parameters: TrackingParameters = TRACKING_PARAMETERS,
+    ) -> None:
+        self._config = registration
+        self._projection = projection or ProjectionConfig()
+        self._parameters = parameters
+        self._started = False
+        self._motion = MotionModel(parameters)
+        self._maps = MatchingMaps(self._projection.max_range_m, parameters)
+        # These three depend on how the sensor is carried; `start` makes them from the first scan.
+        self._ground = GroundModel(None, rolling=True, parameters=parameters)
+        self._health = HealthJudge(rolling=True, parameters=parameters)
+        self.kiss = KissRegistration(registration, parameters=parameters)
+
+    def start(self, scan: Scan) -> Tracked:
+        """Begin with the first scan: find the floor, and put the base at the origin of the session frame."""
+        points = self._deskewed(scan, *self._motion.within(scan, None))
+        self._ground = GroundModel.start(points, scan, self._parameters)
+        self._health = HealthJudge(rolling=self._ground.rolling, parameters=self._parameters)
+        self.kiss = self._new_kiss()
+        self._started = True
+        pose = self._ground.start_pose()
+        self.kiss.register(self._ground.remove(points), pose, np.eye(4), 0.0)
+        planar_scan = self._project(points, scan, _split(pose)[1])
+        return self._finish(scan, points, planar_scan, pose, Health.FINE)
+
+    def track(self, scan: Scan) -> Tracked:
+        """Track the next scan; stamps must increase."""
+        if not self._started:
+            return self.start(scan)
+        # 1. Predict the motion, by odometry or as it was before. Implausible odometry is tested on the map.
+        prediction = self._motion.predict(scan)
+        if self._maps and not self._motion.is_plausible(prediction):
+            prediction = self._examine(scan, prediction)
+            self._motion.forget_window()
+        last_pose = self._motion.last_pose
+        predicted = SE2.from_matrix(last_pose @ prediction.motion)
+        # 2. Undo the motion within the scan.
+        points = self._deskewed(scan, *self._motion.within(scan, prediction))
+        # 3. Follow the floor.
+        self._ground.follow(points, scan, prediction.motion)
+        # 4. Let KISS-ICP bring the scan near, in space.
+        pose = self.kiss.register(
+            self._ground.remove(points), last_pose, prediction.motion, prediction.seconds
+        )
+        planar, T_level_base = _split(self._ground.hold(pose))
+        # 5. Reduce the scan to the plane.
+        planar_scan = self._project(points, scan, T_level_base)
+        # 6. Refine the pose in the plane; a carried sensor, with six degrees of freedom, keeps KISS-ICP's.
+        health = Health.FINE
+        if self._maps:
+            refined, match = self._refine(planar_scan, planar, predicted, prediction)
+            planar = refined if self._ground.rolling else planar
+            # 7. Judge the pose.
+            health = self._health.judge(match, prediction.odometry is not None)
+        if not prediction.credible:
+            health = Health.LOST
+        # 8. Start again if nothing fits any more, else extend the local maps.
+        if not prediction.credible or self._health.gives_up:
+            self._restart()
+        return self._finish(scan, points, planar_scan, planar.lift() @ T_level_base, health)
+
+    def _finish(self, scan: Scan, points: F32, planar_scan: PlanarScan, pose: F64, health: Health) -> Tracked:
+        """Extend the maps by a scan if it is worth it, and remember its final pose."""
+        after_restart = not self._maps and self._maps.restarts > 0
+        keyframe = (
+            health is not Health.LOST
+            and len(planar_scan.hits_m) > 0
+            and self._maps.extend(planar_scan, SE2.from_matrix(pose))
+        )
+        if keyframe:
+            self.kiss.update_map(pose)
+        self._motion.observe(scan, pose, sure=health is Health.FINE)
+        deskewed = dataclasses.replace(scan, points_m=points, offsets_s=None)
+        return Tracked(
+            registered=RegisteredScan(scan=deskewed, T_session_base=pose, health=health),
+            planar_scan=planar_scan,
+            keyframe=keyframe,
+            restart=keyframe and after_restart,
+        )
+
+    def _restart(self) -> None:
+        """Forget the local maps, of the plane and of KISS-ICP; the poses go on from the last one."""
+        self._maps.restart()
+        self._health.restart()
+        self.kiss = self._new_kiss()
+
+    def _new_kiss(self) -> KissRegistration:
+        return KissRegistration(self._config, carried=not self._ground.rolling, parameters=self._parameters)
+
+    def _examine(self, scan: Scan, prediction: Prediction) -> Prediction:
+        """Decide on odometry that a restarted driver may have started again.
+
+        It counts only if the scan fits where it leads, and better than where the motion before leads.
+        """
+        points = self._deskewed(scan, np.eye(4), 0.0)
+        planar_scan = self._project(points, scan, _split(self._motion.last_pose)[1])
+        best, best_quality = not_credible(prediction), -math.inf
+        for candidate in (prediction, self._motion.continued(prediction.seconds)):
+            match = self._maps.fit(planar_scan, SE2.from_matrix(self._motion.last_pose @ candidate.motion))
+            fits = (
+                match.overlap > self._parameters.sure_overlap
+                and match.residual_m < self._parameters.max_residual_m
+            )
+            if fits and self._maps.quality(match) > best_quality:
+                best, best_quality = candidate, self._maps.quality(match)
+        return best
+
+    def _deskewed(self, scan: Scan, motion: F64, motion_s: float) -> F32:
+        """Return the points (N, 3) of a scan that are used, without the motion (4, 4) over `motion_s`."""
+        points, offsets = scan.points_m, scan.offsets_s
+        away = points - scan.T_base_sensor[:3, 3].astype(np.float32)
+        keep = np.flatnonzero(np.einsum("ij,ij->i", away, away) >= self._config.min_range_m**2)
+        keep = keep[random_subset(len(keep), self._parameters.max_points)]
+        if len(keep) < len(points):
+            points, offsets = points[keep], None if offsets is None else offsets[keep]
+        if offsets is not None and self._config.deskew:
+            points = deskew(points, offsets, motion, motion_s)
+        return points
+
+    def _project(self, points: F32, scan: Scan, T_level_base: F64) -> PlanarScan:
+        """Reduce points (N, 3) of the base frame to the plane."""
+        sensor_m, ground = scan.T_base_sensor[:3, 3], self._ground.ground
+        if ground is not None:
+            R = T_level_base.copy()
+            R[:3, 3] = 0.0  # a planar scan keeps the base's own origin; heights are relative to the ground
+            points = points @ R[:3, :3].T.astype(np.float32)
+            sensor_m, ground = R[:3, :3] @ sensor_m, ground.moved(R)
+        return project_to_plane(
+            points,
+            stamp_ns=scan.stamp_ns,
+            sensor_m=sensor_m,
+            ground=ground,
+            config=self._projection,
+            sensor=scan.sensor,
+        )
+
+    def _refine(
+        self, planar_scan: PlanarScan, guess: SE2, predicted: SE2, prediction: Prediction
+    ) -> tuple[SE2, Match | None]:
+        """Match a planar scan with the local map, from KISS-ICP's pose `guess`.
+
+        The prior is the predicted pose if that rests on odometry, else the guess. Where the two disagree
+        both start a refinement, and the better match is taken.
+        """
+        p = self._parameters
+        prior = guess if prediction.odometry is None else predicted
+        guesses = [guess]
+        apart = predicted.inverse() @ guess
+        if math.hypot(apart.x, apart.y) > p.disagree_m or abs(apart.yaw) > p.disagree_rad:
+            guesses.append(predicted)
+        if prediction.windowed is not None and any(self._motion.owed(prediction)):
+            guesses.append(SE2.from_matrix(self._motion.last_pose @ prediction.windowed))
+        information = self._motion.information(prediction)
+        match = self._maps.refine(planar_scan, guesses, prior, information)
+        if match is None:
+            return predicted, None
+        if match.overlap < p.sure_overlap or match.residual_m > p.max_residual_m:
+            window_m, window_rad = self._motion.search_window(prediction)
+            if window_m > p.search_above_m or window_rad > p.search_above_rad:
+                found = self._maps.search(planar_scan, predicted, window_m, window_rad)
+                searched = self._maps.refine(planar_scan, found, prior, information) if found else None
+                if searched is not None and self._maps.quality(searched) > self._maps.quality(match):
+                    match = searched
+        return (match.pose if match.overlap >= p.min_overlap else prior), match
+
+
+def _split(pose: F64) -> tuple[SE2, F64]:
+    """Split a pose (4, 4) T_session_base into its planar part and T_level_base (4, 4), tilt and height."""
+    planar = SE2.from_matrix(pose)
+    return planar, planar.inverse().lift() @ pose

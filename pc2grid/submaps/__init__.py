@@ -1,0 +1,1 @@
+"""Occupancy grid -> submaps (paper III-A): skeleton, junction graph, partition, isovists."""

@@ -1,0 +1,67 @@
+"""Compiled twins of two steps of the description, where compiling pays.
+
+The readable definitions are `boundary.pair_distance_counts` and `freespace.in_sight`; the tests compare both.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.arrays import I64
+
+
+@numba.njit(cache=True)
+def pair_distance_counts(cells: I64, bins_per_cell: float, rounding_bins: float, bins: int) -> I64:
+    """`boundary.pair_distance_counts` is the definition; parameters and result are the same.
+
+    Measured: 0.7 against 4 ms for 1,150 cells; a disc of 8 m is described in 9.5 instead of 12 ms.
+    """
+    counts = np.zeros(bins, np.int64)
+    rows, columns = cells[:, 0] * bins_per_cell, cells[:, 1] * bins_per_cell
+    at = np.empty(len(cells), np.int32)
+    for n in range(len(cells)):
+        row, column, rows_before, columns_before = rows[n], columns[n], rows[:n], columns[:n]
+        # Distances and counts are separate loops: only then the compiler vectorises the first.
+        for m in range(n):
+            down, across = rows_before[m] - row, columns_before[m] - column
+            distance_bins = math.sqrt(down * down + across * across) + rounding_bins
+            at[m] = np.int32(min(distance_bins, bins - 1.0))
+        for m in range(n):
+            counts[at[m]] += 1
+    return counts
+
+
+@numba.njit(cache=True)
+def in_sight(
+    occupied: NDArray[np.bool_], cells: I64, first: NDArray[np.intp], second: NDArray[np.intp]
+) -> NDArray[np.bool_]:
+    """`freespace.in_sight` is the definition; parameters and result are the same.
+
+    Measured: a disc of 8 m is described in 9.5 instead of 75 ms, a view of 5 m in 1.1 instead of 6.4 ms.
+    """
+    width = occupied.shape[1]
+    flat = occupied.reshape(-1)
+    visible = np.ones(len(first), np.bool_)
+    for pair in range(len(first)):
+        r0, c0 = cells[first[pair]]
+        r1, c1 = cells[second[pair]]
+        rows, columns = abs(r1 - r0), abs(c1 - c0)
+        down, across = (width if r1 > r0 else -width), (1 if c1 > c0 else -1)
+        at, end = r0 * width + c0, r1 * width + c1
+        lead = rows - columns
+        while not flat[at] and at != end:
+            if lead == 0:
+                if flat[at + down] and flat[at + across]:
+                    break
+                at += down + across
+                lead += 2 * (rows - columns)
+            else:
+                row = int(lead > 0)
+                at += across + row * (down - across)
+                lead += 2 * (rows - row * (rows + columns))
+        visible[pair] = at == end and not flat[end]
+    return visible

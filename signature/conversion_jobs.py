@@ -1,0 +1,252 @@
+"""Converts many recordings for one database: a job for each, in this process or on a Dask cluster.
+
+Recordings are independent of each other, so each is mapped wherever a worker is free. One process stores the
+results, in the order of the jobs. So the database has the same bytes wherever the jobs ran.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pc2grid
+from pc2grid.errors import ClusterError, DatabaseError
+from pc2grid.observer import Observer
+from pc2grid.time_span import TimeSpan
+from signature.config import Config
+from signature.database.protocol import Entry, Label, Provenance
+from signature.sessions import build_session, describe_all, digest_of, provenance
+
+LOCAL = "local"
+"""In place of the address of a scheduler: start a cluster of processes on this machine."""
+CONNECT_TIMEOUT_S = 10.0
+"""How long a scheduler may take to answer, and to have its first worker; chosen by hand."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """One recording or map to convert: the arguments of `signature.sessions.build_session`.
+
+    stored : provenance of the session of this name that the database holds already and that shall stay; None
+        if there is no such session.
+    version : of the pc2grid that made the job; a worker must have the same.
+    """
+
+    path: Path
+    name: str
+    config: Config
+    span: TimeSpan = TimeSpan()
+    recover: bool = False
+    label: Label = field(default_factory=Label)
+    stored: Provenance | None = None
+    version: str = pc2grid.__version__
+
+    def made_from(self, digest: str) -> Provenance:
+        """The provenance that the session of this job will have if its file has this digest."""
+        from pc2grid.io.nav2_map import is_map_file
+
+        span = TimeSpan() if is_map_file(self.path) else self.span
+        return provenance(self.path, digest, self.config, span=span, label=self.label)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """The result of a job.
+
+    entry : what is to be stored; None if it is stored already, or if the job failed.
+    error : why the job failed; None if it did not.
+    """
+
+    job: Job
+    entry: Entry | None = None
+    error: Exception | None = None
+
+
+def convert(job: Job, observer: Observer = Observer()) -> Entry | None:
+    """Do a job: everything there is to store of it, or None if it is stored already.
+
+    Raises the errors of `build_session`; ClusterError if the job was made by another version of pc2grid;
+    DatabaseError if the stored session was made from another file.
+    """
+    if job.version != pc2grid.__version__:
+        raise ClusterError(
+            f"a worker has pc2grid {pc2grid.__version__}, this is {job.version}",
+            hint="install the same version everywhere",
+        )
+    if job.stored is not None:
+        if digest_of(job.path, job.config) == job.stored.digest:
+            return None
+        raise DatabaseError(
+            f"{job.path}: the database holds a session {job.name!r} made from another file",
+            hint="--force replaces it; --name gives this one another name",
+        )
+    session_map, origin = build_session(
+        job.path,
+        job.name,
+        job.config,
+        span=job.span,
+        recover=job.recover,
+        label=job.label,
+        observer=observer,
+    )
+    with observer.step("describe"):
+        return session_map, describe_all(session_map, job.config, observer), origin
+
+
+def here(jobs: Sequence[Job], observer: Observer = Observer()) -> Generator[Outcome, None, None]:
+    """Do jobs one after the other in this process."""
+    for job in jobs:
+        yield _attempt(job, observer)
+
+
+def on_cluster(
+    jobs: Sequence[Job], address: str, processes: int, observer: Observer = Observer()
+) -> Generator[Outcome, None, None]:
+    """Do jobs on the workers of a Dask scheduler, as many at once as there are workers.
+
+    The outcomes are yielded in the order of the jobs.
+
+    address : of the scheduler, or LOCAL for `processes` processes of this machine with one thread each. The
+        workers read `job.path` themselves. Relative paths are made absolute; a path must name the same file
+        there.
+    observer : gets the progress, and a warning when a worker is lost. Its job starts again on another worker.
+
+    Raises ClusterError if the cluster cannot be reached or goes away; the jobs yielded until then are done.
+    """
+    with _connected(address, processes) as client:
+        names: dict[str, str] = {}
+        futures = []
+        for number, job in enumerate(jobs):
+            key = f"pc2grid-{number:06d}-{job.name}"
+            names[key] = job.name
+            futures.append(client.submit(_attempt, _absolute(job), key=key, pure=False))
+        client.subscribe_topic("all", _LostWorkers(names, observer.on_warning))
+        for done, job in enumerate(jobs, start=1):
+            yield _outcome(job, futures.pop(0))
+            observer.on_progress(done / len(jobs))
+
+
+def _attempt(job: Job, observer: Observer = Observer()) -> Outcome:
+    """Do a job. Its error becomes part of the result, so that a cluster does not try it again."""
+    try:
+        return Outcome(job=job, entry=convert(job, observer))
+    except Exception as error:
+        return Outcome(job=job, error=error)
+
+
+def _absolute(job: Job) -> Job:
+    return replace(job, path=job.path.absolute())
+
+
+def _outcome(job: Job, future: Any) -> Outcome:
+    from distributed import KilledWorker
+    from distributed.client import FutureCancelledError
+
+    try:
+        outcome: Outcome = future.result()
+    except KilledWorker as error:
+        many = f"{error.allowed_failures + 1} workers died on it, one after the other"
+        hint = "if memory ran out: fewer workers at once, or a shorter part of it"
+        return Outcome(job=job, error=ClusterError(f"{job.path}: {many}", hint=hint))
+    except (FutureCancelledError, OSError) as error:
+        raise ClusterError(
+            "the scheduler went away",
+            hint="what was stored is whole; the same command continues from there",
+        ) from error
+    return replace(outcome, job=job)
+
+
+class _LostWorkers:
+    """Handles events of the scheduler: reports workers that were lost while they had one of our jobs.
+
+    names : names of our jobs by their keys on the cluster. report : takes a sentence for each lost job.
+    """
+
+    def __init__(self, names: dict[str, str], report: Callable[[str], None]) -> None:
+        self._names = names
+        self._report = report
+
+    def __call__(self, event: tuple[float, Any]) -> None:
+        message = event[1]
+        if not isinstance(message, dict) or message.get("action") != "remove-worker":
+            return
+        lost = [*message.get("processing-tasks", ()), *message.get("lost-computed-tasks", ())]
+        for key in lost:
+            if key in self._names:
+                self._report(
+                    f"worker {message['worker']} was lost; {self._names[key]} starts over on another"
+                )
+
+
+@contextlib.contextmanager
+def _connected(address: str, processes: int) -> Iterator[Any]:
+    """Connects to a scheduler that has at least one worker."""
+    try:
+        import distributed
+    except ImportError as error:
+        raise ClusterError(
+            f"a cluster needs an extra that is not installed ({error})", hint="pip install dask distributed"
+        ) from None
+
+    class Client(distributed.Client):
+        """A client that closes itself if it cannot connect.
+
+        Otherwise the garbage collector would close the incomplete client at an arbitrary time. If another
+        client starts at that time, each waits for a lock that the other one holds.
+        """
+
+        def __init__(self, address: str) -> None:
+            try:
+                super().__init__(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)  # type: ignore[no-untyped-call]
+            except BaseException:
+                self.close()  # type: ignore[no-untyped-call]
+                raise
+
+    # The library logs many lines for each lost connection; our error is one line.
+    for name in ("distributed", "tornado", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    with contextlib.ExitStack() as stack:
+        if address == LOCAL:
+            address = stack.enter_context(_processes(processes)).scheduler_address
+        problem = "does not answer"
+        try:
+            client = stack.enter_context(Client(address))
+            problem = "has no workers"
+            client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
+        except (OSError, ValueError) as error:
+            raise ClusterError(
+                f"the scheduler {address} {problem}",
+                hint="start one with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`",
+            ) from error
+        yield client
+
+
+def _processes(count: int) -> Any:
+    """A cluster of `count` processes on this machine.
+
+    A terminal sends Ctrl-C to all processes, but only this one may react, because it ends the others. So
+    SIGINT is blocked while the workers are started: they, and the workers that replace them, inherit this.
+    """
+    from multiprocessing import resource_tracker
+
+    import distributed
+
+    # Started later, the resource tracker would unblock the signal.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        make: Any = distributed.LocalCluster  # untyped
+        return make(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+        )
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

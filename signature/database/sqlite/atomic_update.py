@@ -1,0 +1,142 @@
+"""Changing a database as a whole: in a copy that replaces the file when it is complete.
+
+A finished `*.submaps` file is never written to again. A reader keeps the file it opened, complete and
+unlocked, on any file system and any read-only medium; a file opened later has the new content. A writer
+that is killed at any moment leaves the old content. There is one writer at a time: it holds a lock on a file
+beside the database, which the system releases when the process ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+import socket
+import sqlite3
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from pc2grid.errors import DatabaseBusy, OutputError
+from pc2grid.io.atomic import replace_file
+from signature.database import migrations, serialize
+from signature.database.sqlite import schema
+from signature.database.sqlite.connection import BoundedConnection
+from signature.database.sqlite.file import migrate
+
+BUSY_TIMEOUT_S = 30.0
+"""How long a writer waits for another one; chosen by hand."""
+_POLL_S = 0.05
+# SQLite's primary result codes (https://www.sqlite.org/rescode.html) for a medium that does not take writes.
+_READONLY, _IOERR, _FULL, _CANTOPEN = 8, 10, 13, 14
+_CANNOT_WRITE = {_READONLY: "readonly", _IOERR: "disk I/O", _FULL: "is full", _CANTOPEN: "unable to open"}
+
+
+@contextlib.contextmanager
+def rewrite(path: Path, *, keep: bool, timeout_s: float = BUSY_TIMEOUT_S) -> Iterator[sqlite3.Connection]:
+    """Give the body a connection to change; when it ends without an error, `path` holds the result.
+
+    keep : start from the content of `path`; otherwise, or if there is none yet, from an empty database. A
+        file of an older format becomes one of the present format; the old file stays beside it, as
+        `NAME.format1` for format 1.
+
+    Raises DatabaseBusy if another writer does not finish within `timeout_s`, OutputError if the file
+    cannot be written, and NotADatabase, DatabaseVersion or DatabaseCorrupt if the content of `path` cannot
+    be kept.
+    """
+    target = Path(os.path.realpath(path))
+    with hold(target, timeout_s), replace_file(target) as copy:
+        kept = keep and target.exists() and target.stat().st_size > 0
+        if kept:
+            schema.inspect_header(target)
+            shutil.copyfile(target, copy)
+        connection = sqlite3.connect(copy, isolation_level=None, factory=BoundedConnection)
+        try:
+            # Journal and fsync are off: the temporary copy is renamed only when it is complete.
+            connection.execute("PRAGMA journal_mode = OFF")
+            connection.execute("PRAGMA synchronous = OFF")
+            connection.execute("PRAGMA trusted_schema = OFF")
+            if kept:
+                schema.inspect_tables(connection, path)
+            else:
+                schema.initialise(connection)
+            version = schema.version_of(connection)
+            connection.execute("BEGIN")
+            migrate(connection)
+            yield connection
+            connection.execute("COMMIT")
+            if version < migrations.FORMAT:
+                with replace_file(target.with_name(f"{target.name}.format{version}")) as before:
+                    shutil.copyfile(target, before)
+        except schema.DAMAGE as error:
+            raise _explained(error, path, kept) from error
+        finally:
+            connection.close()
+
+
+def _explained(error: Exception, path: Path, kept: bool) -> Exception:
+    """An error of SQLite as one of our own: about the medium, or about the content that was to be kept."""
+    if isinstance(error, sqlite3.OperationalError) and (not kept or _cannot_write(error)):
+        return OutputError(f"{path}: cannot write: {error}", hint="free some space, or write to another disk")
+    if kept:
+        return serialize.corrupt(path, "file", str(error))
+    return error  # what this process wrote itself is not damaged: an error of the program
+
+
+def _cannot_write(error: sqlite3.OperationalError) -> bool:
+    """Whether the medium refused to be written to."""
+    code = getattr(error, "sqlite_errorcode", None)
+    if code is not None:
+        return code & 0xFF in _CANNOT_WRITE
+    # Python 3.10 has no error codes: recognise SQLite's fixed messages.
+    return any(words in str(error) for words in _CANNOT_WRITE.values())
+
+
+@contextlib.contextmanager
+def hold(target: Path, timeout_s: float) -> Iterator[None]:
+    """Be the only writer of `target` while the body runs; wait up to `timeout_s` for another writer.
+
+    Raises DatabaseBusy naming the other writer, OutputError if the folder is not writable.
+    """
+    lock_path = target.with_name(f".{target.name}.lock")
+    deadline = time.monotonic() + timeout_s
+    while True:
+        try:
+            descriptor = os.open(lock_path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            raise OutputError(
+                f"{target}: cannot write: {error.strerror}",
+                hint="choose a folder that exists and you may write to",
+            ) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.pread(descriptor, 200, 0).decode("utf-8", "replace").strip()
+            os.close(descriptor)
+            if time.monotonic() >= deadline:
+                raise DatabaseBusy(
+                    f"{target}: being written by {holder or 'another process'}",
+                    hint="try again when it is done",
+                ) from None
+            time.sleep(_POLL_S)
+            continue
+        if _is_at(descriptor, lock_path):
+            break
+        os.close(descriptor)  # the previous holder removed this file: lock the new one
+    try:
+        with contextlib.suppress(OSError):  # on a full disk the lock holds, but does not name its holder
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+        yield
+    finally:
+        lock_path.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    """Whether `path` still names the open file."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,110 @@
+"""Fits the confidence to answers whose truth is known, and judges it on buildings that were left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.arrays import F64
+from signature.relocalization.confidence import Calibration, Evidence
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Known:
+    """An answer whose truth is known.
+
+    group : the building that it is left out with when the fit is judged, with the sensors if these differ.
+    right : whether the best hypothesis is where the query truly was. session : the drive it belongs to;
+    answers of one drive depend on each other.
+    """
+
+    group: str
+    session: str
+    evidence: Evidence
+    right: bool
+
+
+def fit(answers: Sequence[Known]) -> Calibration:
+    """Coefficients of highest likelihood (logistic regression), those of walls and lead not below 0.
+
+    Raises ValueError unless there are both right and wrong answers.
+    """
+    from scipy.optimize import minimize
+
+    right = np.array([answer.right for answer in answers])
+    if right.all() or not right.any():
+        raise ValueError("a fit needs right and wrong answers")
+    features = np.array(
+        [
+            (1.0, e.hundreds, e.hundreds * e.log_odds, e.log_lead)
+            for e in (answer.evidence for answer in answers)
+        ]
+    )
+    sign = np.where(right, 1.0, -1.0)
+
+    def loss(x: F64) -> tuple[float, F64]:
+        margin = sign * (features @ x)
+        slope = -sign / (1.0 + np.exp(np.clip(margin, -500.0, 500.0)))
+        penalty = _PENALTY * x
+        return (
+            float(np.logaddexp(0.0, -margin).mean() + 0.5 * penalty @ x),
+            slope @ features / len(sign) + penalty,
+        )
+
+    bounds = [(None, None), (None, None), (_LEAST_SHARPNESS, None), (0.0, None)]
+    bias, neutral, sharpness, lead = minimize(
+        loss, np.array([0.0, -1.0, 1.0, 1.0]), jac=True, bounds=bounds, method="L-BFGS-B"
+    ).x.tolist()
+    return Calibration(bias=bias, sharpness=sharpness, neutral=-neutral / sharpness, lead=lead)
+
+
+def left_out(answers: Sequence[Known]) -> F64:
+    """(N,) probability of each answer by the coefficients fitted to all other groups."""
+    groups = np.array([answer.group for answer in answers])
+    probabilities = np.zeros(len(answers))
+    for group in np.unique(groups):
+        model = fit([answer for answer in answers if answer.group != group])
+        for i in np.flatnonzero(groups == group).tolist():
+            probabilities[i] = model.probability(answers[i].evidence)
+    return probabilities
+
+
+def log_loss(answers: Sequence[Known], probabilities: F64) -> float:
+    """Mean of the negative logarithm of the probability of what is true."""
+    right = np.array([answer.right for answer in answers])
+    p = np.clip(np.where(right, probabilities, 1.0 - probabilities), 1e-4, 1.0)
+    return float(-np.log(p).mean())
+
+
+def roc_area(answers: Sequence[Known], probabilities: F64) -> float:
+    """Area under the ROC curve: how often a right answer is surer than a wrong one."""
+    from scipy.stats import rankdata
+
+    right = np.array([answer.right for answer in answers])
+    ranks = rankdata(probabilities)[right]
+    count = len(ranks)
+    return float((ranks.sum() - count * (count + 1) / 2) / (count * (len(answers) - count)))
+
+
+def share_by_session(
+    sessions: Sequence[str], yes: NDArray[np.bool_], *, draws: int = 1000, seed: int = 0
+) -> tuple[float, float, float]:
+    """A share, and its 5th and 95th percentile when whole sessions are drawn anew (bootstrap).
+
+    sessions : of each answer, which need not be independent within one. yes : (N,).
+    """
+    names, number = np.unique(np.asarray(sessions), return_inverse=True)
+    count, hits = np.bincount(number), np.bincount(number, weights=yes)
+    drawn = np.random.default_rng(seed).integers(0, len(names), (draws, len(names)))
+    shares = hits[drawn].sum(axis=1) / count[drawn].sum(axis=1)
+    low, high = np.percentile(shares, (5.0, 95.0)).tolist()
+    return float(np.mean(yes)), low, high
+
+
+_PENALTY = 1e-4
+"""Weight of the squared coefficients in the loss: keeps them finite where the answers can be told apart
+without error."""
+_LEAST_SHARPNESS = 1e-3

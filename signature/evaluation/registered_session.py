@@ -1,0 +1,187 @@
+"""A registered session with its true poses: all that is needed to locate it and to judge the answer.
+
+Registering a session takes far longer than locating it. It is registered once and stored like this, however
+many maps it is located in and however many methods are compared on it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.arrays import F64
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.config import Config
+from pc2grid.geometry import SE2
+from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, SensorKind
+from pc2grid.pipeline import follow
+
+if TYPE_CHECKING:
+    from pc2grid.simulate import Building, SimulationConfig
+
+_FITTED_M = 3.0  # length of the path that the true frame is fitted over; chosen by hand
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegisteredSession:
+    """N scans of one session.
+
+    planar_scans : one for each scan, with its stamp.
+    T_odom_base : (N, 3) registered x, y, yaw, in the frame of the session.
+    lost : (N,) whether registration was lost.
+    T_world_base : (N, 3) true x, y, yaw, in the frame of the floor plan or of the ground truth; NaN where the
+    truth is not known.
+    """
+
+    sensor: SensorKind
+    planar_scans: tuple[PlanarScan, ...]
+    T_odom_base: F64
+    lost: NDArray[np.bool_]
+    T_world_base: F64
+
+    def __len__(self) -> int:
+        return len(self.planar_scans)
+
+    def path_m(self) -> F64:
+        """(N,) metres travelled up to each scan, by the registered poses."""
+        steps = np.hypot(*np.diff(self.T_odom_base[:, :2], axis=0).T)
+        return np.concatenate(([0.0], np.cumsum(steps)))[: len(self)]
+
+    def T_world_odom(self) -> SE2:
+        """The true pose of the session's frame, by the end of the session.
+
+        It is fitted over the scans of the last `_FITTED_M` whose true pose is known, because the heading of a
+        single scan, taken while the robot turns, may be wrong by some degrees.
+        """
+        path_m = self.path_m()
+        known = np.flatnonzero(~np.isnan(self.T_world_base[:, 0]))
+        known = known[path_m[known] >= path_m[known[-1]] - _FITTED_M]
+        ahead = np.array([(0.0, 0.0), (_FITTED_M, 0.0)])
+        return SE2.fit(
+            np.concatenate([_pose(self.T_odom_base[k]).apply(ahead) for k in known]),
+            np.concatenate([_pose(self.T_world_base[k]).apply(ahead) for k in known]),
+        )
+
+    def scans(self) -> Iterator[tuple[RegisteredScan, PlanarScan, SE2]]:
+        """Each scan (without its points), its planar scan and its true pose, in order of time."""
+        no_points = np.empty((0, 3), np.float32)
+        for planar_scan, pose, lost, truth in zip(
+            self.planar_scans, self.T_odom_base, self.lost, self.T_world_base, strict=True
+        ):
+            scan = Scan(
+                stamp_ns=planar_scan.stamp_ns, points_m=no_points, T_base_sensor=np.eye(4), sensor=self.sensor
+            )
+            health = Health.LOST if lost else Health.FINE
+            yield (
+                RegisteredScan(scan=scan, T_session_base=_pose(pose).lift(), health=health),
+                planar_scan,
+                _pose(truth),
+            )
+
+    def save(self, path: Path) -> None:
+        """Write the session to one .npz file, completely or not at all."""
+        from pc2grid.io.atomic import replace_file
+
+        empty = np.empty((0, 2), np.float32)
+        with replace_file(path) as draft, draft.open("wb") as file:
+            np.savez_compressed(
+                file,
+                sensor=np.array(self.sensor),
+                stamps_ns=np.array([s.stamp_ns for s in self.planar_scans], np.int64),
+                T_odom_base=self.T_odom_base,
+                lost=self.lost,
+                T_world_base=self.T_world_base,
+                hit_count=np.array([len(s.hits_m) for s in self.planar_scans], np.int64),
+                hits_m=np.concatenate([empty, *(s.hits_m for s in self.planar_scans)]),
+                origin_m=np.array([s.origin_m for s in self.planar_scans]).reshape(-1, 2),
+                free_m=np.array([s.free_m for s in self.planar_scans], np.float32),
+            )
+
+    @staticmethod
+    def load(path: Path) -> RegisteredSession:
+        """Read a file that `save` has written."""
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        hits = np.split(arrays["hits_m"], np.cumsum(arrays["hit_count"])[:-1])
+        return RegisteredSession(
+            sensor=str(arrays["sensor"]),  # type: ignore[arg-type]
+            planar_scans=tuple(
+                PlanarScan.of_hits(stamp_ns=int(stamp), hits_m=points, origin_m=origin, free_m=free)
+                for stamp, points, origin, free in zip(
+                    arrays["stamps_ns"], hits, arrays["origin_m"], arrays["free_m"], strict=True
+                )
+            ),
+            T_odom_base=arrays["T_odom_base"],
+            lost=arrays["lost"],
+            T_world_base=arrays["T_world_base"],
+        )
+
+
+def register(
+    scans: Iterable[tuple[Scan, SE2 | None]],
+    config: Config,
+    *,
+    sensor: SensorKind,
+    until_m: float = math.inf,
+) -> RegisteredSession:
+    """Register scans with the settings of a user, and stop after `until_m` of travel.
+
+    scans : each with its true pose, None where it is not known; registration does not get it.
+    """
+    truths: list[SE2 | None] = []
+
+    def without_truth() -> Iterator[Scan]:
+        for scan, truth in scans:
+            truths.append(truth)
+            yield scan
+
+    planar_scans: list[PlanarScan] = []
+    poses: list[SE2] = []
+    lost: list[bool] = []
+    travel_m = 0.0
+    for registered, planar_scan in follow(without_truth(), config):
+        pose = SE2.from_matrix(registered.T_session_base)
+        if poses:
+            travel_m += math.hypot(pose.x - poses[-1].x, pose.y - poses[-1].y)
+        planar_scans.append(planar_scan)
+        poses.append(pose)
+        lost.append(registered.health is Health.LOST)
+        if travel_m >= until_m:
+            break
+    return RegisteredSession(
+        sensor=sensor,
+        planar_scans=tuple(planar_scans),
+        T_odom_base=_array(poses),
+        lost=np.array(lost, bool),
+        T_world_base=_array(truths[: len(planar_scans)]),
+    )
+
+
+def simulate_and_register(
+    plan: OccupancyGrid | Building,
+    sensor: SensorKind,
+    simulation: SimulationConfig,
+    config: Config,
+    *,
+    until_m: float = math.inf,
+) -> RegisteredSession:
+    """Simulate a session in a floor plan and register it."""
+    from pc2grid.simulate import iter_session
+
+    scans = iter_session(sensor=sensor, grid=plan, config=simulation)
+    return register(scans, config, sensor=sensor, until_m=until_m)
+
+
+def _pose(row: F64) -> SE2:
+    return SE2(float(row[0]), float(row[1]), float(row[2]))
+
+
+def _array(poses: Sequence[SE2 | None]) -> F64:
+    rows = [(p.x, p.y, p.yaw) if p else (math.nan,) * 3 for p in poses]
+    return np.array(rows, np.float64).reshape(-1, 3)

@@ -1,0 +1,132 @@
+"""The SLAM benchmark's measure of a trajectory, which needs neither a map nor a reference frame.
+
+Kuemmerle et al., "On measuring the accuracy of SLAM algorithms" (2009), section III: the relative poses
+of a trajectory between chosen pairs of times are compared with relative poses that people have verified.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pc2grid.arrays import F64, I64
+from pc2grid.errors import TrajectoryFileError
+from pc2grid.geometry import wrap_angle
+from pc2grid.model import Trajectory
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Relations:
+    """R verified relative poses.
+
+    first_ns, second_ns : (R,) int64, the two times of each relation. T_first_second : (R, 3) x, y, yaw.
+    """
+
+    first_ns: I64
+    second_ns: I64
+    T_first_second: F64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelationError:
+    """Mean and standard deviation of the absolute errors over the relations, metres and degrees.
+
+    used : number of relations, of `total`, for which the trajectory has poses at both times.
+    """
+
+    translation_m: float
+    translation_std_m: float
+    rotation_deg: float
+    rotation_std_deg: float
+    used: int
+    total: int
+
+
+def read_relations(path: Path) -> Relations:
+    """Read a `*.relations` file: `t1 t2 x y z roll pitch yaw` in each line, in seconds, metres, radians.
+
+    Raises TrajectoryFileError if a line has another form.
+    """
+    firsts, seconds, poses = [], [], []
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            t1, t2, x, y, _, _, _, yaw = (float(word) for word in line.split())
+        except ValueError:
+            raise TrajectoryFileError(
+                f"{path}, line {number}: expected 't1 t2 x y z roll pitch yaw'"
+            ) from None
+        firsts.append(round(t1 * 1e9))
+        seconds.append(round(t2 * 1e9))
+        poses.append((x, y, yaw))
+    return Relations(
+        first_ns=np.array(firsts, dtype=np.int64),
+        second_ns=np.array(seconds, dtype=np.int64),
+        T_first_second=np.array(poses, dtype=np.float64).reshape(-1, 3),
+    )
+
+
+def relation_error(
+    trajectory: Trajectory,
+    relations: Relations,
+    *,
+    base_to_reference_m: tuple[float, float] = (0.0, 0.0),
+    tolerance_s: float = 0.005,
+) -> RelationError:
+    """The errors of a trajectory with respect to the relations.
+
+    base_to_reference_m : position on the base of the point that the relations describe (the benchmark's poses
+        are those of the laser, not of the base). tolerance_s : a relation is left out if no pose is this
+        close to one of its times, which may differ by a millisecond from the stamps.
+    """
+    poses = trajectory.planar()
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    dx, dy = base_to_reference_m
+    poses[:, 0] += c * dx - s * dy
+    poses[:, 1] += s * dx + c * dy
+    i, near_i = _nearest(trajectory.stamps_ns, relations.first_ns, tolerance_s)
+    j, near_j = _nearest(trajectory.stamps_ns, relations.second_ns, tolerance_s)
+    used = near_i & near_j
+    total = len(used)
+    if not used.any():
+        nan = float("nan")
+        return RelationError(
+            translation_m=nan,
+            translation_std_m=nan,
+            rotation_deg=nan,
+            rotation_std_deg=nan,
+            used=0,
+            total=total,
+        )
+    measured = _relative(poses[i[used]], poses[j[used]])
+    error = _relative(relations.T_first_second[used], measured)
+    distance = np.hypot(error[:, 0], error[:, 1])
+    angle = np.degrees(np.abs(wrap_angle(error[:, 2])))
+    return RelationError(
+        translation_m=float(distance.mean()),
+        translation_std_m=float(distance.std()),
+        rotation_deg=float(angle.mean()),
+        rotation_std_deg=float(angle.std()),
+        used=int(used.sum()),
+        total=total,
+    )
+
+
+def _nearest(stamps_ns: I64, wanted_ns: I64, tolerance_s: float) -> tuple[I64, np.ndarray]:
+    if not len(stamps_ns):
+        return np.zeros(len(wanted_ns), np.int64), np.zeros(len(wanted_ns), np.bool_)
+    after = np.clip(np.searchsorted(stamps_ns, wanted_ns), 0, len(stamps_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = np.abs(stamps_ns[before] - wanted_ns) < np.abs(stamps_ns[after] - wanted_ns)
+    index = np.where(closer, before, after)
+    return index, np.abs(stamps_ns[index] - wanted_ns) <= tolerance_s * 1e9
+
+
+def _relative(a: F64, b: F64) -> F64:
+    """T_a_b (N, 3) of poses (N, 3) in one frame."""
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
+    return np.column_stack((c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2]))

@@ -1,0 +1,147 @@
+"""The JSON document of an answer: its type, of which the JSON Schema is made, and what fills it.
+
+Metres, radians, int64 nanoseconds.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+# Before Python 3.12 pydantic, which makes the schema, does not take the TypedDict of typing.
+from typing_extensions import TypedDict
+
+if TYPE_CHECKING:
+    from pc2grid.geometry import SE2
+    from signature.relocalization import answer
+
+Status = Literal["located", "ambiguous", "not_found"]
+Version = Literal[1]
+
+
+class Pose(TypedDict):
+    """A planar pose: metres, and radians counterclockwise."""
+
+    x: float
+    y: float
+    yaw: float
+
+
+class StampedPose(Pose):
+    """The base in the map frame at the query's last scan; covariance (3, 3) of x, y, yaw."""
+
+    stamp_ns: int
+    covariance: list[list[float]]
+
+
+class Hypothesis(Pose):
+    """A place that fits. Equal `place`: the same place in the maps of different sessions. submap_id is null
+    if the whole map was searched. score and overlap: shares of what both sides see, 0..1."""
+
+    session: str
+    building: str | None
+    floor: str | None
+    submap_id: int | None
+    place: int
+    score: float
+    overlap: float
+
+
+class Moment(TypedDict):
+    """The answer as it stood after `path_m` of travel, with the best hypothesis if there was any."""
+
+    stamp_ns: int
+    path_m: float
+    status: Status
+    x: float | None
+    y: float | None
+    yaw: float | None
+    confidence: float
+
+
+class Travel(TypedDict):
+    """How far the query travelled, and the stamp of its last scan."""
+
+    path_m: float
+    stamp_ns: int
+
+
+class Sessions(TypedDict):
+    """The sessions of the database."""
+
+    sessions: list[str]
+
+
+class Result(TypedDict):
+    """What is found. T_map_odom puts the query's own frame into the map. confidence: the probability that the
+    best hypothesis is right. hypotheses: best first."""
+
+    schema_version: Version
+    status: Status
+    session: str | None
+    building: str | None
+    floor: str | None
+    pose: StampedPose | None
+    T_map_odom: Pose | None
+    confidence: float
+    hypotheses: list[Hypothesis]
+    history: list[Moment]
+    timing_ms: dict[str, float]
+
+
+class AnswerDocument(Result):
+    """An answer alone; `pc2grid relocalize --json` adds where the query and the database come from."""
+
+    query: Travel
+    database: Sessions
+
+
+def document(answer: answer.Answer) -> AnswerDocument:
+    """An answer as plain types."""
+    pose = answer.T_map_base
+    stamped: StampedPose | None = None
+    if pose is not None and answer.covariance is not None:
+        stamped = {"stamp_ns": answer.stamp_ns, **_pose(pose), "covariance": answer.covariance.tolist()}
+    return {
+        "schema_version": 1,
+        "status": answer.status,
+        "session": answer.session,
+        "building": answer.label.building,
+        "floor": answer.label.floor,
+        "pose": stamped,
+        "T_map_odom": None if answer.T_map_odom is None else _pose(answer.T_map_odom),
+        "confidence": answer.confidence,
+        "hypotheses": [
+            {
+                "session": answer.sessions[h.session_index],
+                "building": answer.labels[h.session_index].building,
+                "floor": answer.labels[h.session_index].floor,
+                "submap_id": submap_id if submap_id >= 0 else None,
+                "place": place,
+                **_pose(h.fit.T_map_query @ answer.T_odom_base),
+                "score": h.fit.score,
+                "overlap": h.fit.overlap,
+            }
+            for h, submap_id, place in zip(answer.hypotheses, answer.submap_ids, answer.places, strict=True)
+        ],
+        "history": [_moment(moment) for moment in answer.history],
+        "query": {"path_m": answer.path_m, "stamp_ns": answer.stamp_ns},
+        "database": {"sessions": list(answer.sessions)},
+        "timing_ms": answer.timing_ms,
+    }
+
+
+def _moment(moment: answer.Moment) -> Moment:
+    pose = moment.pose
+    return {
+        "stamp_ns": moment.stamp_ns,
+        "path_m": moment.path_m,
+        "status": moment.status,
+        "x": None if pose is None else float(pose.x),
+        "y": None if pose is None else float(pose.y),
+        "yaw": None if pose is None else float(pose.yaw),
+        "confidence": moment.confidence,
+    }
+
+
+def _pose(pose: SE2) -> Pose:
+    return {"x": float(pose.x), "y": float(pose.y), "yaw": float(pose.yaw)}

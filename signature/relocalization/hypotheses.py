@@ -1,0 +1,190 @@
+"""Hypotheses: where the query may lie, each verified by aligning its walls on the map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pc2grid.arrays import F32, F64
+from pc2grid.geometry import SE2, wrap_angle
+from signature.config import RelocalizeConfig
+from signature.relocalization.query_map import QueryMap
+from signature.retrieval.viewpoints import Places
+from signature.retrieval.vote import Proposal
+from signature.verification.refinement import refine
+from signature.verification.two_way_score import Fit, score_fit
+from signature.verification.walls import thin_evenly
+from signature.verification.window_search import SearchMap, SearchParameters, search_windows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HypothesisParameters:
+    """How places are verified. All chosen by hand, checked on fr079 and intel.
+
+    half_t_m, half_a_rad : poses are searched so far around a proposal: half a lattice of viewpoints and half
+        a ray of their isovists, with some reserve.
+    square_m : side of the squares of free ground that a whole map is searched in; headings are searched in
+        equal parts of at most 2 `half_a_rad`.
+    few_points : wall points in the coarse search, enough to rank poses.
+    few_spacing_m : they are at least about so far apart.
+    near_m : walls farther from the centre of rotation are left out of the coarse search: a small error of yaw
+        would move them by more than a wall's width.
+    refined : share of `RelocalizeConfig.hypotheses` that is refined; some of these will merge.
+    same_m, same_rad : two hypotheses nearer than this are one.
+    """
+
+    half_t_m: float = 0.4
+    half_a_rad: float = math.radians(8.0)
+    square_m: float = 0.8
+    few_points: int = 128
+    few_spacing_m: float = 0.25
+    near_m: float = 8.0
+    refined: int = 2
+    same_m: float = 0.5
+    same_rad: float = math.radians(10.0)
+
+
+HYPOTHESES = HypothesisParameters()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hypothesis:
+    """The query lies in a session as `fit` says.
+
+    session_index : index into the database's sessions. row : row of the signature table of the place that
+    proposed it, -1 if the whole map was searched.
+    """
+
+    session_index: int
+    row: int
+    fit: Fit
+
+
+def verify(
+    query: QueryMap,
+    proposals: Sequence[Proposal],
+    places: Places,
+    maps: Sequence[SearchMap],
+    config: RelocalizeConfig,
+) -> tuple[Hypothesis, ...]:
+    """Align the query at every proposed place; returns what fits, best first, no two alike.
+
+    maps : prepared map of each session, by session_index.
+    """
+    coarse: list[tuple[float, int, int, SE2]] = []
+    best = 0.0
+    groups: dict[tuple[int, int], list[Proposal]] = {}
+    for proposal in proposals:
+        session = int(places.table.session_index[proposal.row])
+        groups.setdefault((proposal.view, session), []).append(proposal)
+    for (view, session), members in groups.items():
+        center = query.views[view].center_m
+        rows = np.array([p.row for p in members])
+        poses = search_windows(
+            maps[session],
+            coarse_points(query.walls.points_m, center),
+            np.array([(*p.at_m, p.yaw_rad) for p in members]),
+            half_t_m=HYPOTHESES.half_t_m,
+            half_a_rad=HYPOTHESES.half_a_rad,
+            parameters=SearchParameters(
+                floor=max(config.coarse_floor, config.coarse_keep * best),
+                keep=config.coarse_keep,
+                most=config.hypotheses,
+            ),
+        )
+        for x, y, yaw, score in poses.tolist():
+            best = max(best, score)
+            nearest = int(rows[np.argmin(np.hypot(*(places.table.center_m[rows] - (x, y)).T))])
+            coarse.append((score, session, nearest, _about(center, SE2(x, y, yaw))))
+    coarse.sort(key=lambda c: -c[0])
+    found = [
+        fitted(query, session, row, maps[session], T_map_query)
+        for _, session, row, T_map_query in coarse[: HYPOTHESES.refined * config.hypotheses]
+    ]
+    return distinct(found, query.T_odom_base)
+
+
+def search_everywhere(
+    query: QueryMap, session_index: int, target: SearchMap, free_xy_m: F64, config: RelocalizeConfig
+) -> tuple[Hypothesis, ...]:
+    """Align the query on the whole map of a session: slower than at proposals, but nothing is left out.
+
+    free_xy_m : (K, 2) centres of the squares of `HYPOTHESES.square_m` that hold free space; the base is in
+    one of them.
+    """
+    center = (query.T_odom_base.x, query.T_odom_base.y)
+    count = math.ceil(math.pi / HYPOTHESES.half_a_rad)
+    half_a_rad = math.pi / count
+    yaws = np.arange(count) * 2.0 * half_a_rad
+    boxes = np.column_stack((np.repeat(free_xy_m, count, axis=0), np.tile(yaws, len(free_xy_m))))
+    poses = search_windows(
+        target,
+        coarse_points(query.walls.points_m, center),
+        boxes,
+        half_t_m=0.5 * HYPOTHESES.square_m,
+        half_a_rad=half_a_rad,
+        parameters=SearchParameters(
+            floor=config.coarse_floor, keep=config.coarse_keep, most=config.hypotheses
+        ),
+    )
+    found = [
+        fitted(query, session_index, -1, target, _about(center, SE2(x, y, yaw)))
+        for x, y, yaw, _ in poses.tolist()
+    ]
+    return distinct(found, query.T_odom_base)
+
+
+def fitted(query: QueryMap, session_index: int, row: int, target: SearchMap, T_map_query: SE2) -> Hypothesis:
+    """The hypothesis that the query lies at a pose, which is refined first."""
+    pose, covariance = refine(target.field, query.walls.points_m, T_map_query, query.center_m)
+    fit = score_fit(target.walls, query.walls, pose, covariance)
+    return Hypothesis(session_index=session_index, row=row, fit=fit)
+
+
+def distinct(hypotheses: Sequence[Hypothesis], at: SE2) -> tuple[Hypothesis, ...]:
+    """Best first; of those that put the pose `at` (query's frame) at the same place only the best.
+
+    The best one takes over the `row` of the others if it has none.
+    """
+    kept: list[Hypothesis] = []
+    bases: list[SE2] = []
+    for candidate in sorted(hypotheses, key=lambda h: -h.fit.score):
+        base = candidate.fit.T_map_query @ at
+        same = next(
+            (
+                i
+                for i, other in enumerate(bases)
+                if candidate.session_index == kept[i].session_index and same_pose(base, other)
+            ),
+            None,
+        )
+        if same is None:
+            kept.append(candidate)
+            bases.append(base)
+        elif kept[same].row < 0:
+            kept[same] = replace(kept[same], row=candidate.row)
+    return tuple(kept)
+
+
+def same_pose(a: SE2, b: SE2) -> bool:
+    """Whether two poses are so near that hypotheses there are one."""
+    near = math.hypot(a.x - b.x, a.y - b.y) < HYPOTHESES.same_m
+    return near and abs(wrap_angle(a.yaw - b.yaw)) < HYPOTHESES.same_rad
+
+
+def coarse_points(points_m: F32, center_m: tuple[float, float]) -> F32:
+    """(M, 2) float32: a few of the wall points (N, 2), spread evenly around `center_m` and relative to it."""
+    local = points_m - np.asarray(center_m, np.float32)
+    local = local[np.hypot(local[:, 0], local[:, 1]) < HYPOTHESES.near_m]
+    local = local[thin_evenly(local, HYPOTHESES.few_spacing_m)]
+    if len(local) > HYPOTHESES.few_points:
+        local = local[np.linspace(0, len(local) - 1, HYPOTHESES.few_points).astype(int)]
+    return local
+
+
+def _about(center_m: tuple[float, float], pose: SE2) -> SE2:
+    """T_map_query that puts `center_m` of the query's frame at the position of `pose`, turned by its yaw."""
+    return pose @ SE2(-center_m[0], -center_m[1], 0.0)

@@ -1,0 +1,303 @@
+"""The maps and places of a database, prepared to be searched."""
+
+from __future__ import annotations
+
+import math
+from collections import ChainMap
+from collections.abc import Mapping, MutableMapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from pc2grid.arrays import F64, BoolGrid
+from pc2grid.model import UNKNOWN, OccupancyGrid
+from signature.config import Config
+from signature.database.protocol import Label
+from signature.relocalization.answer import Status, Verdict
+from signature.relocalization.confidence import CALIBRATION, PRESENCE, RIVALS, SAME_PLACE, Evidence
+from signature.relocalization.hypotheses import (
+    HYPOTHESES,
+    Hypothesis,
+    distinct,
+    fitted,
+    same_pose,
+    search_everywhere,
+    verify,
+)
+from signature.relocalization.lazy_maps import DatabaseGrids, LazySequence, free_m2
+from signature.relocalization.query_map import QueryMap
+from signature.retrieval.viewpoints import AT_ONCE_M2, Places
+from signature.retrieval.vote import retrieve
+from signature.similarity import SignatureTable
+from signature.verification.refinement import refine
+from signature.verification.two_way_score import Fit, score_fit
+from signature.verification.walls import Walls
+from signature.verification.window_search import SearchMap
+
+if TYPE_CHECKING:
+    from signature.database import SubmapDatabase
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DecisionParameters:
+    """Which hypotheses are kept, and when two of them are one place. Chosen on fr079 and intel.
+
+    keep : hypotheses scoring below this share of the best are dropped.
+    rival_score : a hypothesis whose score is lower than the best by more than this takes no part in the
+        decision.
+    around_m : two maps show the same place if they agree this far around it: farther than a query has seen,
+        so that two equal rooms are distinguished by what lies around them.
+    wall_m : what the query has seen is widened by this, so that the far side of a wall does not count as
+        unseen.
+    in_the_map : least probability that the query lies in the map to answer `ambiguous`, not `not_found`.
+    same, same_labelled : least probability, by what surrounds them, that two places that fit the query are
+        one; the second applies if the labels of their sessions say that they are of one floor.
+    """
+
+    keep: float = 0.6
+    rival_score: float = 0.2
+    around_m: float = 10.0
+    wall_m: float = 0.4
+    in_the_map: float = 0.5
+    same: float = 0.5
+    same_labelled: float = 0.1
+
+
+DECISION = DecisionParameters()
+
+
+class MapIndex:
+    """The maps of a database and their places, prepared to be searched again and again.
+
+    Each map is prepared (in tens of milliseconds) when it first matters to a query, and kept.
+    """
+
+    def __init__(
+        self,
+        grids: Mapping[str, OccupancyGrid],
+        table: SignatureTable,
+        made_with: Config,
+        config: Config,
+        labels: Mapping[str, Label] | None = None,
+        areas_m2: Mapping[str, float] | None = None,
+        *,
+        smaller: MapIndex | None = None,
+    ) -> None:
+        """grids : map of each session, in the order of `table.session_index`.
+
+        made_with : how the places were cut and described; queries are described in the same way.
+        config : its relocalize section says how to search and when to be sure.
+        labels : building and floor of sessions, where known.
+        areas_m2 : free space of each map, for maps that are not to be read before they are needed.
+        smaller : an index of the first of these sessions; what it has prepared is taken over.
+        """
+        self.made_with = made_with
+        self.config, self._settings = config.relocalize, config
+        self.sessions = tuple(grids)
+        self.labels = tuple((labels or {}).get(name, Label()) for name in grids)
+        self._grids_by_name = grids
+        count = len(grids)
+        self.grids: LazySequence[OccupancyGrid] = LazySequence(
+            lambda i: grids[self.sessions[i]], count, None if smaller is None else smaller.grids
+        )
+        self.maps: LazySequence[SearchMap] = LazySequence(
+            lambda i: SearchMap.of(self.grids[i]), count, None if smaller is None else smaller.maps
+        )
+        self._free: LazySequence[F64] = LazySequence(
+            lambda i: free_squares(self.grids[i]), count, None if smaller is None else smaller._free
+        )
+        areas_m2 = areas_m2 or {name: free_m2(grid) for name, grid in grids.items()}
+        self._areas_m2 = tuple(areas_m2[name] for name in self.sessions)
+        self.places: Places = Places(
+            table,
+            self.grids,
+            made_with.partition.radius_m,
+            self._areas_m2,
+            None if smaller is None else smaller.places,
+        )
+
+    @staticmethod
+    def of(database: SubmapDatabase, config: Config) -> MapIndex:
+        """Everything that is in a database.
+
+        If that is more than `signature.retrieval.viewpoints.AT_ONCE_M2` of free floor, maps are read when
+        they first matter, so the database must stay open as long as the index is used.
+        """
+        infos = {info.name: info for info in database.sessions()}
+        areas_m2 = {name: info.area_m2 for name, info in infos.items()}
+        grids: Mapping[str, OccupancyGrid] = DatabaseGrids(database, tuple(infos))
+        if sum(areas_m2.values()) <= AT_ONCE_M2:
+            grids = dict(grids)
+        labels = {name: info.provenance.label for name, info in infos.items()}
+        return MapIndex(grids, database.signatures(), database.config(), config, labels, areas_m2)
+
+    def with_session(
+        self, name: str, grid: OccupancyGrid, places: SignatureTable, label: Label | None = None
+    ) -> MapIndex:
+        """An index with one more session; all that this one has prepared is shared.
+
+        grid : the session's map. places : its places; their `session_index` is not used. Raises ValueError if
+        there is a session of that name.
+        """
+        if name in self.sessions:
+            raise ValueError(f"there is a session {name!r} already")
+        here = replace(places, session_index=np.full(len(places), len(self.sessions), np.int32))
+        labels = {**dict(zip(self.sessions, self.labels, strict=True)), name: label or Label()}
+        areas_m2 = {**dict(zip(self.sessions, self._areas_m2, strict=True)), name: free_m2(grid)}
+        return MapIndex(
+            ChainMap({name: grid}, cast("MutableMapping[str, OccupancyGrid]", self._grids_by_name)),
+            SignatureTable.concatenated((self.places.table, here)),
+            self.made_with,
+            self._settings,
+            labels,
+            areas_m2,
+            smaller=self,
+        )
+
+    def look_up(self, query: QueryMap, carried: tuple[Hypothesis, ...] = ()) -> tuple[Hypothesis, ...]:
+        """Hypotheses for the query, best first: the carried ones, refined, and what retrieval proposes."""
+        old = [
+            fitted(query, h.session_index, h.row, self.maps[h.session_index], h.fit.T_map_query)
+            for h in carried
+        ]
+        base_m = (query.T_odom_base.x, query.T_odom_base.y)
+        proposals = retrieve(
+            query.views, base_m, self.places, signature=self.made_with.signature, config=self.config
+        )
+        new = verify(query, proposals, self.places, self.maps, self.config)
+        return self._worth_keeping((*old, *new), query)
+
+    def look_everywhere(self, query: QueryMap, known: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
+        """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole; in
+        a large database, on those that look most like the query."""
+        found = list(known)
+        for index in self.places.sessions(query.views, self.config.shortlist, self.made_with.signature):
+            if self._areas_m2[index] <= self.config.exhaustive_m2:
+                found.extend(
+                    search_everywhere(query, index, self.maps[index], self._free[index], self.config)
+                )
+        return self._worth_keeping(tuple(found), query)
+
+    def judge(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> Verdict:
+        """What the hypotheses, best first, amount to."""
+        places = self._places(query, hypotheses)
+        rivals = [hypotheses[places.index(k)] for k in range(max(places, default=-1) + 1)]
+        evidence = Evidence.of(rivals, query.walls.weight)
+        confidence = CALIBRATION.probability(evidence)
+        status: Status = "not_found"
+        if confidence >= self.config.accept:
+            status = "located"
+        elif max(confidence, PRESENCE.probability(evidence)) >= DECISION.in_the_map:
+            status = "ambiguous"
+        return Verdict(
+            status=status,
+            confidence=confidence,
+            hypotheses=hypotheses,
+            places=places,
+            evidence=evidence,
+        )
+
+    def decide(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> Verdict:
+        """The final verdict: where the proposals did not settle it, all maps are searched as a whole, so that
+        neither the right place nor a rival is left out."""
+        verdict = self.judge(query, hypotheses)
+        return verdict if verdict.status == "located" else self.judge_everywhere(query, hypotheses)
+
+    def judge_everywhere(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> Verdict:
+        """What the hypotheses amount to, together with all that fits anywhere on the maps."""
+        return self.judge(query, self.look_everywhere(query, hypotheses))
+
+    def _worth_keeping(self, found: tuple[Hypothesis, ...], query: QueryMap) -> tuple[Hypothesis, ...]:
+        kept = distinct(found, query.T_odom_base)
+        floor = DECISION.keep * kept[0].fit.score if kept else 0.0
+        return tuple(h for h in kept if h.fit.score >= floor)[: self.config.hypotheses]
+
+    def _places(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> tuple[int, ...]:
+        """The place of each hypothesis, numbered from 0 in their order; a place has one hypothesis a session.
+
+        All sessions of one floor contain the right place, and must not make each other ambiguous. Hypotheses
+        with a much lower score than the best, or after the first few places, are not compared and count as
+        places of their own: they take no part in the decision.
+        """
+        least = hypotheses[0].fit.score - DECISION.rival_score if hypotheses else 0.0
+        members: list[list[Hypothesis]] = []
+        numbers = []
+        for h in hypotheses:
+            number = next(
+                (
+                    k
+                    for k, place in enumerate(members[:RIVALS])
+                    if h.fit.score >= least
+                    and all(h.session_index != other.session_index for other in place)
+                    and any(self._one_place(query, h, other) for other in place)
+                ),
+                len(members),
+            )
+            if number == len(members):
+                members.append([])
+            members[number].append(h)
+            numbers.append(number)
+        return tuple(numbers)
+
+    def _one_place(self, query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
+        """Whether two hypotheses in two maps are one place.
+
+        They are if the surroundings in one map, placed on the other as the hypotheses say, fit there too.
+        What the query has seen fits in both, so only what lies beyond it counts. Labels that contradict each
+        other rule it out; labels that agree lower the probability that is needed.
+        """
+        label, other = self.labels[a.session_index], self.labels[b.session_index]
+        if label.contradicts(other):
+            return False
+        at = query.T_odom_base
+        there = b.fit.T_map_query @ at
+        beyond = unseen_by(
+            query, self.grids[b.session_index].crop((there.x, there.y), DECISION.around_m), b.fit
+        )
+        around = Walls.of(beyond)
+        target = self.maps[a.session_index]
+        T_a_b = a.fit.T_map_query @ b.fit.T_map_query.inverse()
+        refined, covariance = refine(target.field, around.points_m, T_a_b, (there.x, there.y))
+        if not same_pose(T_a_b @ there, refined @ there):
+            return False
+        fit = score_fit(target.walls, around, refined, covariance)
+        labelled = label.building is not None and label == other
+        if not fit.overlap:  # nothing beyond is in both maps
+            return labelled
+        # Ground that only one of the maps knows does not count here, and neither map may contradict the
+        # other.
+        agreement = min(fit.known_agreement, fit.backward)
+        needed = DECISION.same_labelled if labelled else DECISION.same
+        return SAME_PLACE.probability(agreement, fit.overlap * around.weight) >= needed
+
+
+def unseen_by(query: QueryMap, grid: OccupancyGrid, fit: Fit) -> OccupancyGrid:
+    """A part of a map in which all that the query has seen, placed as `fit` says, is made unknown.
+
+    What it has seen is widened by `DecisionParameters.wall_m`.
+    """
+    import cv2
+
+    known = query.grid.cells != UNKNOWN
+    n = math.ceil(DECISION.wall_m / grid.resolution_m)
+    known = cv2.dilate(known.astype(np.uint8), np.ones((2 * n + 1, 2 * n + 1), np.uint8)).astype(bool)
+    cells = np.argwhere(grid.cells != UNKNOWN)
+    at = query.grid.to_cell(fit.T_map_query.inverse().apply(grid.to_point(cells)))
+    inside: BoolGrid = np.all((at >= 0) & (at < query.grid.cells.shape), axis=1)
+    inside[inside] = known[at[inside, 0], at[inside, 1]]
+    left = grid.cells.copy()
+    left[cells[inside, 0], cells[inside, 1]] = UNKNOWN
+    return replace(grid, cells=left)
+
+
+def free_squares(grid: OccupancyGrid, side_m: float = HYPOTHESES.square_m) -> F64:
+    """Centres (K, 2) of the squares of `side_m` of a grid that hold any free space, map frame."""
+    n = max(1, round(side_m / grid.resolution_m))
+    height, width = grid.cells.shape
+    if not height or not width:
+        return np.empty((0, 2))
+    rows, columns = np.arange(0, height, n), np.arange(0, width, n)
+    free = np.add.reduceat(np.add.reduceat(grid.free.astype(np.int32), rows, axis=0), columns, axis=1)
+    corners = np.argwhere(free > 0)[:, ::-1] * (n * grid.resolution_m)
+    return np.asarray(corners + 0.5 * n * grid.resolution_m + np.asarray(grid.origin_m))

@@ -1,0 +1,199 @@
+"""Recognises places within a session while it is made, for loop closure.
+
+The session is its own database: each stretch of some metres of travel becomes a small map with a few
+described places, and every new stretch is looked up among those before it with the parts of the relocalizer.
+Signatures and isovists propose, the alignment of walls in both directions verifies, and a calibrated
+probability says how sure it is that the two maps show the same place. Which of several such places is the
+right one is decided by loop closure (`pc2grid.mapping.loop_candidates`), which knows the travel between them.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+
+from pc2grid.geometry import SE2
+from pc2grid.mapping.place_recognition import Recognition, Stretch
+from pc2grid.model import OccupancyGrid
+from signature.config import Config
+from signature.relocalization.confidence import SAME_PLACE
+from signature.relocalization.hypotheses import Hypothesis, verify
+from signature.relocalization.query_map import QueryMap, query_of
+from signature.retrieval.viewpoints import Places
+from signature.retrieval.vote import retrieve
+from signature.similarity import SignatureTable
+from signature.verification.window_search import SearchMap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecognitionParameters:
+    """Numbers of place recognition within a session, chosen by the time of `convert` on killian (1.9 km).
+
+    views : places of a stretch that are described. They are both what is asked and what is asked for.
+    all_places : up to so many earlier places are all compared by their isovists.
+    shortlist : of more, so many for each view are, those that are nearest by their signatures.
+    placements : placements that are aligned.
+    maps : prepared maps of earlier stretches that stay in memory, about 4 MB each.
+    least : hypotheses that are less probable are not reported.
+    """
+
+    views: int = 12
+    all_places: int = 500
+    shortlist: int = 100
+    placements: int = 30
+    maps: int = 16
+    least: float = 0.3
+
+
+RECOGNITION = RecognitionParameters()
+
+
+class SessionRecognizer:
+    """The stretches of one session as a database of places that grows: a `PlaceRecognizer`.
+
+    >>> import pc2grid, signature
+    >>> config = signature.Config()
+    >>> with pc2grid.open_log("monday.mcap") as log:
+    ...     monday = pc2grid.build_map(log, config, session="monday", recognizer=SessionRecognizer(config))
+    >>> monday.session
+    'monday'
+    """
+
+    def __init__(self, config: Config, parameters: RecognitionParameters = RECOGNITION) -> None:
+        """config : stretches are described as the places of a database with this configuration."""
+        self._partition, self._signature = config.partition, config.signature
+        self._config = config.relocalize.model_copy(
+            update={
+                "views": parameters.views,
+                "shortlist": parameters.shortlist,
+                "all_places": parameters.all_places,
+                "top_k": parameters.placements,
+            }
+        )
+        self._parameters = parameters
+        self._grids = _StoredGrids()
+        self._maps = _PreparedMaps(self._grids, parameters.maps)
+        self._places: Places | None = None
+
+    def recognize(self, newest: Stretch) -> Sequence[Recognition]:
+        """The earlier stretches that look like the newest one, each place with its own probability."""
+        query = query_of(
+            newest.grid,
+            newest.poses[:, :2],
+            partition=self._partition,
+            signature=self._signature,
+            config=self._config,
+            T_odom_base=SE2(),
+        )
+        found = [] if self._places is None else self._look_up(query, self._places)
+        self._remember(newest.grid, query)
+        return found
+
+    def _look_up(self, query: QueryMap, places: Places) -> list[Recognition]:
+        proposals = retrieve(
+            query.views, query.center_m, places, signature=self._signature, config=self._config
+        )
+        return [
+            Recognition(
+                older=found.session_index,
+                T_older_newest=found.fit.T_map_query,
+                probability=probability,
+            )
+            for found in verify(query, proposals, places, self._maps, self._config)
+            if (probability := probability_of(found, query)) >= self._parameters.least
+        ]
+
+    def _remember(self, grid: OccupancyGrid, query: QueryMap) -> None:
+        """Add the newest stretch to the places that later ones are looked up in."""
+        index = len(self._grids)
+        self._grids.append(grid)
+        table = SignatureTable.of(
+            [view.signature for view in query.views],
+            [view.center_m for view in query.views],
+            session_index=np.full(len(query.views), index),
+        )
+        if not len(table):
+            return
+        known = self._places
+        if known is not None:
+            table = SignatureTable.concatenated((known.table, table))
+        self._places = Places(table, self._grids, self._partition.radius_m, [0.0] * len(self._grids), known)
+
+
+def probability_of(hypothesis: Hypothesis, query: QueryMap) -> float:
+    """How probable it is that a map shows the place of the query at all, rivals left aside, 0..1."""
+    fit = hypothesis.fit
+    return SAME_PLACE.probability(fit.score, fit.overlap * query.walls.weight)
+
+
+def recognizer_for(config: Config) -> SessionRecognizer | None:
+    """A recognizer for one session, or None if the configuration does not want one.
+
+    >>> import signature
+    >>> recognizer_for(signature.Config()) is None
+    False
+    """
+    return SessionRecognizer(config) if config.loops.recognize else None
+
+
+class _StoredGrids(Sequence[OccupancyGrid]):
+    """Grids that are kept compressed: some 10 kB a stretch, so that a long session needs little memory."""
+
+    def __init__(self) -> None:
+        self._stored: list[tuple[bytes, tuple[int, ...], float, tuple[float, float]]] = []
+
+    def append(self, grid: OccupancyGrid) -> None:
+        """Add one."""
+        cells = zlib.compress(np.ascontiguousarray(grid.cells, np.int8).tobytes(), 1)
+        self._stored.append((cells, grid.cells.shape, grid.resolution_m, grid.origin_m))
+
+    def __len__(self) -> int:
+        return len(self._stored)
+
+    @overload
+    def __getitem__(self, index: int) -> OccupancyGrid: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[OccupancyGrid]: ...
+
+    def __getitem__(self, index: int | slice) -> OccupancyGrid | Sequence[OccupancyGrid]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        cells, shape, resolution_m, origin_m = self._stored[index]
+        return OccupancyGrid(
+            cells=np.frombuffer(zlib.decompress(cells), np.int8).reshape(shape),
+            resolution_m=resolution_m,
+            origin_m=origin_m,
+        )
+
+
+class _PreparedMaps(Sequence[SearchMap]):
+    """The maps of stretches, prepared to be searched; the `count` used last are kept."""
+
+    def __init__(self, grids: Sequence[OccupancyGrid], count: int) -> None:
+        self._grids, self._count = grids, count
+        self._prepared: OrderedDict[int, SearchMap] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._grids)
+
+    @overload
+    def __getitem__(self, index: int) -> SearchMap: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[SearchMap]: ...
+
+    def __getitem__(self, index: int | slice) -> SearchMap | Sequence[SearchMap]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        if index not in self._prepared:
+            self._prepared[index] = SearchMap.of(self._grids[index])
+            if len(self._prepared) > self._count:
+                self._prepared.popitem(last=False)
+        self._prepared.move_to_end(index)
+        return self._prepared[index]

@@ -1,0 +1,68 @@
+"""Scores a pose both ways: the query's walls against the map, and the map's walls against the query.
+
+One way alone is not enough. The walls of a small query fit into many places; but at the wrong ones the map
+has walls where the query has seen free space.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pc2grid.arrays import F64
+from pc2grid.geometry import SE2
+from pc2grid.mapping.likelihood_field import LIKELIHOOD, LikelihoodField
+from signature.verification.walls import Walls
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fit:
+    """How well a query agrees with a map at one pose. Means and shares are weighted by `walls.steadiness`.
+
+    T_map_query : pose of the query's frame in the map.
+    forward : 0..1, mean likelihood of the query's walls; neutral where the map is unknown.
+    backward : 0..1, mean likelihood of the map's walls on ground that the query knows.
+    overlap : 0..1, share of the query's walls on ground that the map knows.
+    score : 0..1, geometric mean of forward and backward; hypotheses are ranked by it.
+    covariance : (3, 3) of x, y, yaw from the refinement: wide along a corridor, narrow across it.
+    """
+
+    T_map_query: SE2
+    forward: float
+    backward: float
+    overlap: float
+    score: float
+    covariance: F64
+
+    @property
+    def known_agreement(self) -> float:
+        """0..1, mean likelihood of the query's walls on ground that the map knows; 0 if it knows none."""
+        if not self.overlap:
+            return 0.0
+        known = (self.forward - LIKELIHOOD.neutral * (1.0 - self.overlap)) / self.overlap
+        return min(max(known, 0.0), 1.0)
+
+
+def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) -> Fit:
+    """Score the query at a pose on the map `target`."""
+    seen, likelihood = _agreement(query, target.field, T_map_query)
+    looked_at, returned = _agreement(target, query.field, T_map_query.inverse())
+    weight = query.weight
+    forward = (likelihood + LIKELIHOOD.neutral * (weight - seen)) / weight if weight else 0.0
+    backward = returned / looked_at if looked_at else 0.0
+    return Fit(
+        T_map_query=T_map_query,
+        forward=forward,
+        backward=backward,
+        overlap=seen / weight if weight else 0.0,
+        score=math.sqrt(forward * backward),
+        covariance=covariance,
+    )
+
+
+def _agreement(walls: Walls, field: LikelihoodField, T_field_walls: SE2) -> tuple[float, float]:
+    """The weight of the wall points on known ground, and the weighted sum of their likelihoods, 0..1,
+    there."""
+    likelihood, known = field.at(T_field_walls.apply(walls.points_m))
+    weights = walls.weights[known].astype("f8")
+    return float(weights.sum()), float(weights @ likelihood[known])

@@ -1,0 +1,276 @@
+"""Finds where points fit on a map: correlative scan matching with bounds.
+
+This is the one coarse search. It is used twice:
+
+- around each place that retrieval proposes, in boxes of 0.8 m and 16 degrees (`relocalization.hypotheses`);
+- over a whole map, in such boxes side by side on all free ground, when retrieval did not settle the question.
+
+A box is a set of poses. Three bounds, each of which no pose exceeds, keep most poses from being scored, as in
+branch and bound (Olson 2015, "M3RSM: many-to-many multi-resolution scan matching"; Hess et al. 2016):
+
+1. for a whole box: each point on the maximum of the likelihood field within the distance that the box can
+   move it. What remains is divided by 8 and bounded again; boxes are taken in the order of this bound;
+2. within a box, at each heading: each point on the maximum over a block of 2 x 2 cells. At a fixed heading
+   the points move over rows of neighbouring cells, so all blocks of a box are summed with vector
+   instructions;
+3. the cells of the blocks that remain are scored one by one.
+
+A score is the mean over the points of the highest likelihood within half a cell and half a step of heading,
+so a wall of one cell cannot be missed between two poses.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pc2grid.arrays import F32, F64, I64, U8
+from pc2grid.mapping.likelihood_field import LikelihoodField
+from pc2grid.model import OccupancyGrid
+from signature.verification.walls import Walls
+
+MARGIN_M = 3.0
+"""Unknown cells around a map that is searched. Points farther outside are taken to lie on its edge, which
+scores the same if the margin is wider than the largest of `REACHES_M` and a box together."""
+REACHES_M = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.3, 1.6)
+"""Radii (Chebyshev) of the sliding maxima; the first is the field itself. Each is about a quarter more than
+the one before: a bound is loose by that much at most."""
+MOST_POINTS = 256
+"""So many likelihoods of 8 bits add up in 16 bits."""
+MOST_HALF_T_M, MOST_HALF_A_RAD = 0.5, math.radians(10.0)
+"""Larger boxes are divided first: their bounds would exclude hardly any."""
+FEW_BOXES, SPLIT_ABOVE_M, PROBES = 100, 0.25, 16
+"""Of more boxes than this, with a larger half width, those that remain are divided by 8; before that, so many
+of the most promising are searched for a lower bound of the best score. Chosen by the time of a search of a
+floor."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SearchParameters:
+    """What is reported; scores are 0..1.
+
+    step_rad : headings this far apart are tried. It moves a wall 8 m away by 0.24 m, a little more than the
+        likelihood field is wide; chosen by hand.
+    floor, keep : poses scoring below `floor`, or below `keep` times the best, are not reported.
+    most : poses reported at most.
+    apart_m, apart_rad : two reported poses differ by more than one of these.
+    """
+
+    step_rad: float = math.radians(1.7)
+    floor: float = 0.45
+    keep: float = 0.8
+    most: int = 10
+    apart_m: float = 0.5
+    apart_rad: float = math.radians(10.0)
+
+
+SEARCH = SearchParameters()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SearchMap:
+    """A map prepared to be searched.
+
+    walls : its wall points and likelihood field, with a margin of `MARGIN_M`.
+    levels : (L, H, W) uint8, sliding maxima of the field within each of `REACHES_M`.
+    blocks : (`BLOCK_LEVELS`, H // 2 * W // 2 + LANES) uint8, row by row a value for each block of 2 x 2
+        cells that no cell of the block exceeds, for the first of the radii.
+    """
+
+    walls: Walls
+    levels: U8
+    blocks: U8
+
+    @staticmethod
+    def of(grid: OccupancyGrid) -> SearchMap:
+        """Prepare a map. Everything outside it counts as unknown."""
+        import cv2
+
+        from signature.verification._kernels import BLOCK_LEVELS, LANES
+
+        walls = Walls.of(grid, margin_m=MARGIN_M)
+        field = walls.field.values
+        levels = np.empty((len(REACHES_M), *field.shape), np.uint8)
+        levels[0] = field
+        for level, reach_m in enumerate(REACHES_M[1:], start=1):
+            n = math.ceil(reach_m / grid.resolution_m - 1e-6)
+            square = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * n + 1, 2 * n + 1))
+            levels[level] = cv2.dilate(field, square, borderType=cv2.BORDER_REPLICATE)
+        # The maximum within at least a cell of a block's last cell covers the whole block.
+        halves = levels[:BLOCK_LEVELS, 1::2, 1::2].reshape(BLOCK_LEVELS, -1)
+        return SearchMap(walls=walls, levels=levels, blocks=np.pad(halves, ((0, 0), (0, LANES))))
+
+    @property
+    def field(self) -> LikelihoodField:
+        """The likelihood field of the map."""
+        return self.walls.field
+
+
+def search_windows(
+    target: SearchMap,
+    points_m: F32,
+    boxes: F64,
+    *,
+    half_t_m: float,
+    half_a_rad: float,
+    parameters: SearchParameters = SEARCH,
+) -> F64:
+    """The best distinct poses of a point set in boxes of poses, best first.
+
+    points_m : (M, 2) at most `MOST_POINTS` points, relative to the point that they rotate about.
+    boxes : (B, 3) x, y, yaw of the centres of the boxes, with half widths `half_t_m` and `half_a_rad`.
+
+    Returns (H, 4): x, y, yaw, and the score, which no pose within half a cell and half a step of heading
+    exceeds; one pose a box at most. Raises ValueError for too many points.
+    """
+    if len(points_m) > MOST_POINTS:
+        raise ValueError(f"{len(points_m)} points; at most {MOST_POINTS}")
+    if not len(points_m) or not len(boxes):
+        return np.empty((0, 4))
+    res = target.field.resolution_m
+    origin = np.array([*target.field.origin_m, 0.0])
+    points = np.asarray(points_m, np.float64) / res
+    cells = (np.asarray(boxes, np.float64) - origin) / (res, res, 1.0)
+    cells, half_t, half_a_rad = _split(
+        cells, half_t_m / res, half_a_rad, MOST_HALF_T_M / res, MOST_HALF_A_RAD
+    )
+    keep = parameters.keep if parameters.most > 1 else 1.0
+    least = parameters.floor
+    while True:
+        bounds = _bounds(target, points, cells, half_t, half_a_rad)
+        kept = np.argsort(-bounds, kind="stable")[: np.count_nonzero(bounds >= 255.0 * len(points) * least)]
+        cells, bounds = cells[kept], bounds[kept]
+        if len(cells) <= FEW_BOXES or half_t * res <= SPLIT_ABOVE_M:
+            break
+        # A few boxes give a lower bound of the best score before the others are divided.
+        found = _best(
+            target, points, cells[:PROBES], bounds[:PROBES], half_t, half_a_rad, parameters, least, keep
+        )
+        least = max(least, keep * float(found[:, 3].max()))
+        cells = cells[bounds >= 255.0 * len(points) * least]
+        cells, half_t, half_a_rad = _split(cells, half_t, half_a_rad, 0.5 * half_t, 0.5 * half_a_rad)
+    if not len(cells):
+        return np.empty((0, 4))
+    found = _best(target, points, cells, bounds, half_t, half_a_rad, parameters, least, keep)
+    found = found[np.argsort(-found[:, 3], kind="stable")]
+    found = found[found[:, 3] >= max(least, keep * float(found[0, 3]))]
+    found[:, :2] = found[:, :2] * res + origin[:2]
+    return _distinct(found, parameters)
+
+
+def _bounds(target: SearchMap, points: F64, boxes: F64, half_t: float, half_a_rad: float) -> I64:
+    """(B,) the sum over the points, in units of 1/255, that no pose of a box exceeds; lengths in cells."""
+    from signature.verification._kernels import box_bounds
+
+    reach = 2 * math.ceil(half_t / 2) + np.hypot(points[:, 0], points[:, 1]) * half_a_rad
+    return box_bounds(target.levels, levels_for(reach, target.field.resolution_m), points, boxes)
+
+
+def _best(
+    target: SearchMap,
+    points: F64,
+    boxes: F64,
+    bounds: I64,
+    half_t: float,
+    half_a_rad: float,
+    parameters: SearchParameters,
+    least: float,
+    keep: float,
+) -> F64:
+    """The best pose (B, 4) of each box, see `plain_best_of_boxes`; score -1 if it is left out."""
+    from signature.verification._kernels import best_of_boxes
+
+    res = target.field.resolution_m
+    turns = headings(half_a_rad, parameters.step_rad)
+    reach = 0.5 + np.hypot(points[:, 0], points[:, 1]) * half_a_rad / len(turns)
+    return best_of_boxes(
+        target.levels.reshape(-1),
+        target.blocks.reshape(-1),
+        target.field.values.shape,
+        with_blocks(levels_for(reach, res), res),
+        points,
+        boxes,
+        bounds,
+        2 * max(1, math.ceil(half_t / 2)),
+        turns,
+        least,
+        keep,
+    )
+
+
+def headings(half_a_rad: float, step_rad: float) -> F64:
+    """Headings (T,) at most `step_rad` apart that divide -half_a_rad .. half_a_rad into equal steps."""
+    count = max(1, math.ceil(2.0 * half_a_rad / step_rad))
+    return np.asarray((np.arange(count) - 0.5 * (count - 1)) * (2.0 * half_a_rad / count), np.float64)
+
+
+def levels_for(reach_cells: F64, resolution_m: float) -> I64:
+    """(N,) the first of the sliding maxima that covers each of the reaches (N,), or the last one.
+
+    Half a cell is neglected: it is less than the field is wide, and covering it would blur the smallest
+    boxes.
+    """
+    reaches = np.asarray(REACHES_M) / resolution_m
+    return np.asarray(np.searchsorted(reaches, reach_cells - 0.5).clip(max=len(reaches) - 1), np.int64)
+
+
+def with_blocks(level: I64, resolution_m: float) -> I64:
+    """(N, 2) the sliding maxima `level` (N,), and the first in `SearchMap.blocks` that covers each of them
+    from all cells of a block of 2 x 2; -1 if there is none."""
+    from signature.verification._kernels import BLOCK_LEVELS
+
+    reaches = np.ceil(np.asarray(REACHES_M) / resolution_m - 1e-6)
+    cover = np.searchsorted(reaches, reaches[level] + 1.0)
+    return np.column_stack((level, np.where(cover < BLOCK_LEVELS, cover, -1)))
+
+
+def plain_box_bounds(levels: U8, level: I64, points: F64, boxes: F64) -> I64:
+    """(B,) sum over the points of the sliding maximum `level` (N,) at the centre of each box; in cells."""
+    _, height, width = levels.shape
+    c, s = np.cos(boxes[:, 2:]), np.sin(boxes[:, 2:])
+    j = np.floor(c * points[:, 0] - s * points[:, 1] + boxes[:, :1]).astype(np.int64)
+    i = np.floor(s * points[:, 0] + c * points[:, 1] + boxes[:, 1:2]).astype(np.int64)
+    values = levels[level, i.clip(0, height - 1), j.clip(0, width - 1)]
+    return np.asarray(values.sum(axis=1), np.int64)
+
+
+def plain_best_of_boxes(levels: U8, level: I64, points: F64, boxes: F64, half: int, turns: F64) -> F64:
+    """The best pose (B, 4: x, y, yaw, score) of each box, by scoring all cells at all headings; in cells.
+
+    level : (N,) the sliding maximum that each point is scored by. half : poses lie up to so many cells from
+    the centre of a box. turns : (T,) headings relative to that of the box.
+    """
+    best = np.full((len(boxes), 4), -1.0)
+    for b, (x, y, yaw) in enumerate(boxes):
+        for turn in turns:
+            for down in range(-half, half + 1):
+                for right in range(-half, half + 1):
+                    pose = np.array([[x + right, y + down, yaw + turn]])
+                    score = plain_box_bounds(levels, level, points, pose)[0] / (255.0 * len(points))
+                    if score > best[b, 3]:
+                        best[b] = *pose[0], score
+    return best
+
+
+def _split(
+    boxes: F64, half_t: float, half_a_rad: float, most_t: float, most_a_rad: float
+) -> tuple[F64, float, float]:
+    """Boxes (B, 3) cut into equal ones whose half widths are at most `most_t` and `most_a_rad`, and these."""
+    shift, turn = headings(half_t, 2.0 * most_t), headings(half_a_rad, 2.0 * most_a_rad)
+    parts = np.stack(np.meshgrid(shift, shift, turn, indexing="ij"), axis=-1).reshape(-1, 3)
+    return (boxes[:, None] + parts).reshape(-1, 3), half_t / len(shift), half_a_rad / len(turn)
+
+
+def _distinct(found: F64, parameters: SearchParameters) -> F64:
+    """The first `most` of the poses (N, 4), best first, without those that are near one before them."""
+    kept: list[int] = []
+    for k in range(len(found)):
+        if len(kept) == parameters.most:
+            break
+        near = np.abs(found[kept, :2] - found[k, :2]).max(axis=1) < parameters.apart_m
+        turn = np.abs((found[kept, 2] - found[k, 2] + math.pi) % (2.0 * math.pi) - math.pi)
+        if not (near & (turn < parameters.apart_rad)).any():
+            kept.append(k)
+    return found[kept]

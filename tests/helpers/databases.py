@@ -1,0 +1,192 @@
+"""Databases for tests: sessions with random content, and what must come out of a database again."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import networkx as nx
+import numpy as np
+
+from pc2grid.geometry import SE2
+from pc2grid.model import (
+    Consistency,
+    Contradiction,
+    Health,
+    Loop,
+    OccupancyGrid,
+    ReadReport,
+    SessionMap,
+    Submap,
+    Trajectory,
+)
+from pc2grid.submaps.junction_graph import graph_to_arrays, junction_graph
+from signature.boundary import boundary_bins
+from signature.config import Config
+from signature.database import Provenance, SubmapDatabase, open_database
+from signature.database.protocol import Entry
+from signature.describe import Signature
+from signature.freespace import freespace_bins
+
+
+def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Config | None = None) -> Entry:
+    """A session of random cells and signatures, with a trajectory of seven poses and three loops."""
+    rng = np.random.default_rng(seed)
+    cells = rng.choice(np.array([-1, 0, 100, 37], np.int8), size=(40, 60))
+    grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-1.25, 2.0 / 3.0))
+    poses = np.stack([SE2(0.1 * i, 0.01 * i * i, 0.02 * i).lift() for i in range(7)])
+    trajectory = Trajectory(
+        stamps_ns=np.arange(7, dtype=np.int64) * 100_000_000 + 1_700_000_000_000_000_001,
+        T_session_base=poses,
+        health=(Health.FINE, Health.DEGENERATE, *[Health.FINE] * 4, Health.LOST),
+    )
+    config = config or Config()
+    centers = [(0.1 * i % 1.4 + 1 / 3, 0.2 * i % 1.9 + 0.7) for i in range(submaps)]
+    parts = tuple(
+        Submap(submap_id=i, center_m=center, radius_m=0.4, grid=grid.crop(center, 0.4))
+        for i, center in enumerate(centers)
+    )
+    bins = [f(config.partition.radius_m, config.signature) for f in (boundary_bins, freespace_bins)]
+    signatures = [
+        Signature(
+            boundary=rng.dirichlet(np.ones(bins[0])),
+            freespace=rng.dirichlet(np.ones(bins[1])),
+            symmetry=rng.random(2),
+        )
+        for _ in parts
+    ]
+    session_map = SessionMap(
+        session=name,
+        sensor="lidar",
+        grid=grid,
+        submaps=parts,
+        trajectory=trajectory,
+        loops=tuple(
+            Loop(
+                older=k,
+                newer=6 - k,
+                T_older_newer=SE2(*(rng.random(3) / 3).tolist()),
+                information=np.diag(rng.random(3) * 1e4),
+                accepted=k != 1,
+            )
+            for k in range(3)
+        ),
+        graph=small_graph(seed),
+        consistency=Consistency(
+            hits_on_free=1 / 7,
+            contradicted=0.25,
+            bent=True,
+            stretches=(
+                Contradiction(
+                    from_ns=int(trajectory.stamps_ns[2]),
+                    to_ns=int(trajectory.stamps_ns[4]),
+                    x_m=0.3,
+                    y_m=-0.1,
+                    length_m=2 / 3,
+                    share=0.5,
+                ),
+            ),
+        ),
+        report=ReadReport(scans_read=7, warnings=("no per-point time",)),
+    )
+    digest = hashlib.sha256(f"{name}{seed}".encode()).hexdigest()
+    origin = Provenance(source=f"{name}.mcap", digest=digest, config=config, versions={"pc2grid": "0.1.0"})
+    return session_map, signatures, origin
+
+
+def small_graph(seed: int) -> nx.Graph:
+    """Two junctions and an end, inside the map of `make_entry`."""
+    graph = nx.Graph()
+    for node, kind in enumerate(("junction", "end", "junction")):
+        graph.add_node(node, kind=kind, center_m=(node - 1 / 3, 1.0 + 0.1 * seed % 1.5), pixels=node + 1)
+    for a, b in ((0, 1), (0, 2)):
+        path_m = np.array([graph.nodes[node]["center_m"] for node in (a, a, b)], np.float32)
+        graph.add_edge(a, b, length_m=float(b - a) + 1e-3 * seed, path_m=path_m)
+    return graph
+
+
+def without_loops(entry: Entry) -> Entry:
+    """The entry without its loops, which format 1 could not hold."""
+    session_map, signatures, provenance = entry
+    return replace(session_map, loops=()), signatures, provenance
+
+
+def with_graph_of_grid(entry: Entry) -> Entry:
+    """The entry with the graph that is made anew where none was stored."""
+    session_map, signatures, provenance = entry
+    graph = junction_graph(session_map.grid, provenance.config.partition)
+    return replace(session_map, graph=graph), signatures, provenance
+
+
+def assert_holds(database: SubmapDatabase, entry: Entry) -> None:
+    """The database gives back what was stored."""
+    session_map, signatures, origin = entry
+    name = session_map.session
+    index = [info.name for info in database.sessions()].index(name)
+    info = database.sessions()[index]
+    assert (info.digest, info.provenance.config, info.submaps) == (
+        origin.digest,
+        origin.config,
+        len(signatures),
+    )
+    assert info.warnings == session_map.report.warnings
+    grid = database.grid(name)
+    assert np.array_equal(grid.cells, session_map.grid.cells)
+    assert (grid.resolution_m, grid.origin_m) == (session_map.grid.resolution_m, session_map.grid.origin_m)
+    trajectory = database.trajectory(name)
+    assert np.array_equal(trajectory.stamps_ns, session_map.trajectory.stamps_ns)
+    assert np.array_equal(trajectory.T_session_base, session_map.trajectory.T_session_base)
+    assert trajectory.health == session_map.trajectory.health
+    assert info.consistency == session_map.consistency
+    assert_same_graph(database.graph(name), session_map.graph)
+    for loop, stored_loop in zip(session_map.loops, database.loops(name), strict=True):
+        assert np.array_equal(stored_loop.information, loop.information)
+        assert (stored_loop.older, stored_loop.newer) == (loop.older, loop.newer)
+        assert (stored_loop.T_older_newer, stored_loop.accepted) == (loop.T_older_newer, loop.accepted)
+    for wanted, got in zip(session_map.submaps, database.submaps(name), strict=True):
+        assert (got.submap_id, got.center_m, got.radius_m) == (
+            wanted.submap_id,
+            wanted.center_m,
+            wanted.radius_m,
+        )
+        assert np.array_equal(got.grid.cells, wanted.grid.cells)
+        assert np.array_equal(database.submap(name, wanted.submap_id).grid.cells, wanted.grid.cells)
+    table = database.signatures()
+    mine = table.session_index == index
+    for field in ("boundary", "freespace", "symmetry"):
+        stored = getattr(table, field)[mine]
+        assert np.array_equal(stored, np.array([getattr(s, field) for s in signatures]).reshape(stored.shape))
+    assert [tuple(c) for c in table.center_m[mine]] == [s.center_m for s in session_map.submaps]
+
+
+def assert_same_graph(found: nx.Graph, wanted: nx.Graph) -> None:
+    """Equal nodes and edges, with equal values."""
+    arrays, expected = graph_to_arrays(found), graph_to_arrays(wanted)
+    for field in arrays.__slots__:
+        np.testing.assert_array_equal(getattr(arrays, field), getattr(expected, field))
+
+
+def everything(place: str | Path) -> str:
+    """A digest of all content of a database."""
+    with open_database(place) as database:
+        return digest_of(database)
+
+
+def digest_of(database: SubmapDatabase) -> str:
+    """The same, of an open database."""
+    digest = hashlib.sha256()
+    for info in database.sessions():
+        digest.update(repr(info).encode())
+        digest.update(database.grid(info.name).cells.tobytes())
+        digest.update(database.trajectory(info.name).T_session_base.tobytes())
+        digest.update(repr(database.loops(info.name)).encode())
+        arrays = graph_to_arrays(database.graph(info.name))
+        digest.update(repr([getattr(arrays, field).tolist() for field in arrays.__slots__]).encode())
+        for submap in database.submaps(info.name):
+            digest.update(repr((submap.submap_id, submap.center_m, submap.radius_m)).encode())
+            digest.update(submap.grid.cells.tobytes())
+    table = database.signatures()
+    for field in ("boundary", "freespace", "symmetry", "session_index", "submap_id", "center_m"):
+        digest.update(getattr(table, field).tobytes())
+    return digest.hexdigest()

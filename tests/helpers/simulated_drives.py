@@ -1,0 +1,139 @@
+"""Planar drives through small plans without any 3D simulation: planar scans from isovists, exact poses."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+
+import cv2
+import numpy as np
+
+from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
+from pc2grid.geometry import SE2
+from pc2grid.model import FREE, OCCUPIED, OccupancyGrid, RegisteredScan, Scan
+from pc2grid.submaps.isovist import WALL, isovist
+from pc2grid.submaps.partition import partition
+from signature.config import Config
+from signature.database import Label
+from signature.describe import describe
+from signature.relocalization.relocalizer import MapIndex
+from signature.similarity import SignatureTable
+
+RESOLUTION_M = 0.05
+
+
+def plan(
+    width_m: float, height_m: float, walls: Sequence[tuple[float, float, float, float]]
+) -> OccupancyGrid:
+    """A hall with its lower left corner at (0, 0), and walls in it from (x0, y0) to (x1, y1)."""
+    cells = np.full((round(height_m / RESOLUTION_M), round(width_m / RESOLUTION_M)), FREE, np.int16)
+    outline = [(0, 0, width_m, 0), (width_m, 0, width_m, height_m), (width_m, height_m, 0, height_m)]
+    for x0, y0, x1, y1 in [*outline, (0, height_m, 0, 0), *walls]:
+        ends = [
+            tuple(int(min(v / RESOLUTION_M, n - 1)) for v, n in zip(p, cells.shape[::-1], strict=True))
+            for p in ((x0, y0), (x1, y1))
+        ]
+        cv2.line(cells, *ends, OCCUPIED, thickness=2)
+    return OccupancyGrid(cells=cells.astype(np.int8), resolution_m=RESOLUTION_M, origin_m=(0.0, 0.0))
+
+
+def office() -> OccupancyGrid:
+    """20 x 14 m: a corridor with rooms of different sizes, no two places alike."""
+    walls = [
+        (0, 6, 3, 6),
+        (4, 6, 9, 6),
+        (10, 6, 16, 6),
+        (17, 6, 20, 6),
+        (0, 8, 6, 8),
+        (7, 8, 13, 8),
+        (14, 8, 20, 8),
+        (5, 0, 5, 6),
+        (12, 0, 12, 6),
+        (8, 8, 8, 14),
+        (14.5, 8, 14.5, 14),
+        (2, 2, 3, 2),
+        (3, 2, 3, 4),
+        (7, 1, 7, 3),
+        (15, 3, 18, 3),
+        (16, 1, 16, 3),
+        (2, 11, 5, 11),
+        (10, 10, 10, 12),
+        (17, 10, 17, 14),
+    ]
+    return plan(20, 14, walls)
+
+
+def office_part(center_m: tuple[float, float], half_m: float = 3.0) -> OccupancyGrid:
+    """Part of the office in a frame of its own, whose origin is at `center_m`."""
+    crop = office().crop(center_m, half_m)
+    origin_m = crop.origin_m[0] - center_m[0], crop.origin_m[1] - center_m[1]
+    return OccupancyGrid(cells=crop.cells, resolution_m=crop.resolution_m, origin_m=origin_m)
+
+
+def drive(
+    grid: OccupancyGrid,
+    corners_m: Sequence[tuple[float, float]],
+    *,
+    field_rad: float = 2 * math.pi,
+    reach_m: float = 12.0,
+) -> Iterator[tuple[RegisteredScan, PlanarScan, SE2]]:
+    """Planar scans every 0.2 m along straight lines between corners, with the true pose of each.
+
+    The registered pose is in the frame of the first one, as a robot that starts anywhere would have it.
+    """
+    first: SE2 | None = None
+    stamp_ns = 0
+    for (x0, y0), (x1, y1) in itertools.pairwise(corners_m):
+        yaw = math.atan2(y1 - y0, x1 - x0)
+        steps = max(1, round(math.hypot(x1 - x0, y1 - y0) / 0.2))
+        for k in range(steps):
+            truth = SE2(x0 + (x1 - x0) * k / steps, y0 + (y1 - y0) * k / steps, yaw)
+            first = first or truth
+            stamp_ns += 100_000_000
+            planar_scan = look(grid, truth, stamp_ns, field_rad, reach_m)
+            yield register(first.inverse() @ truth, stamp_ns), planar_scan, truth
+
+
+def register(T_odom_base: SE2, stamp_ns: int) -> RegisteredScan:
+    scan = Scan(stamp_ns=stamp_ns, points_m=np.zeros((0, 3)), T_base_sensor=np.eye(4), sensor="laser")
+    return RegisteredScan(scan=scan, T_session_base=T_odom_base.lift())
+
+
+def look(grid: OccupancyGrid, truth: SE2, stamp_ns: int, field_rad: float, reach_m: float) -> PlanarScan:
+    view = isovist(grid, (truth.x, truth.y), reach_m, bearings=BEARINGS)
+    bearings = 2 * np.pi * np.arange(BEARINGS) / BEARINGS
+    relative = np.remainder(bearings - truth.yaw + np.pi, 2 * np.pi) - np.pi
+    inside = np.abs(relative) <= field_rad / 2
+    hit = inside & (view.ends == WALL)
+    points = view.ranges_m[:, None] * np.column_stack((np.cos(relative), np.sin(relative)))
+    free = np.zeros(BEARINGS, np.float32)
+    bins = np.rint(relative * BEARINGS / (2 * np.pi)).astype(int) % BEARINGS
+    free[bins[inside]] = view.ranges_m[inside]
+    return PlanarScan.of_hits(
+        stamp_ns=stamp_ns, hits_m=points[hit].astype(np.float32), origin_m=np.zeros(2), free_m=free
+    )
+
+
+def building(
+    grids: dict[str, OccupancyGrid],
+    config: Config | None = None,
+    labels: dict[str, Label] | None = None,
+) -> MapIndex:
+    """A database in memory."""
+    config = config or Config()
+    signatures, centers, sessions, ids = [], [], [], []
+    for index, grid in enumerate(grids.values()):
+        for submap in partition(grid, config.partition):
+            signatures.append(describe(submap, config.signature))
+            centers.append(submap.center_m)
+            sessions.append(index)
+            ids.append(submap.submap_id)
+    table = SignatureTable.of(signatures, centers, submap_id=ids, session_index=sessions)
+    return MapIndex(grids, table, config, config, labels)
+
+
+def cut(grid: OccupancyGrid, x0: float, y0: float, x1: float, y1: float) -> OccupancyGrid:
+    """A part of a plan with its own frame at the plan's (x0, y0)."""
+    a, b, c, d = (round(v / RESOLUTION_M) for v in (y0, y1, x0, x1))
+    return OccupancyGrid(cells=grid.cells[a:b, c:d], resolution_m=RESOLUTION_M, origin_m=(0.0, 0.0))

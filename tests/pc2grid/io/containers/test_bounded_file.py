@@ -1,0 +1,37 @@
+"""A file that refuses to read more at once than is allowed, or than there is."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+
+from pc2grid.errors import LimitExceeded, LogCorrupt
+from pc2grid.io.containers.bounded_file import BoundedFile
+from tests.helpers.memory import bounded_memory
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> BoundedFile:
+    path = tmp_path / "a"
+    path.write_bytes(bytes(range(100)))
+    return BoundedFile(io.FileIO(path), most_bytes=40)
+
+
+def test_what_is_allowed_is_read(file: BoundedFile) -> None:
+    assert file.read(40) == bytes(range(40))
+    file.seek(95)
+    assert file.read(10) == bytes(range(95, 100))  # the end, as with every file
+    assert file.read(1) == b""
+
+
+def test_more_than_the_limit_is_refused(file: BoundedFile) -> None:
+    with pytest.raises(LimitExceeded, match=r"a record has 41 bytes; the limit is 40 .*max_record_bytes"):
+        file.read(41)
+
+
+@pytest.mark.parametrize("size", [101, 1 << 62, -1, -5, None])
+def test_more_than_there_is_is_damage(file: BoundedFile, size: int | None) -> None:
+    with bounded_memory(100 << 20), pytest.raises(LogCorrupt, match="where a record should begin"):
+        file.read(size)

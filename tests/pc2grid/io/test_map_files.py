@@ -1,0 +1,169 @@
+"""Maps against a second, independent reading of nav2's rules; trajectories there and back."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from pc2grid.errors import MapFileError, TrajectoryFileError
+from pc2grid.io.nav2_map import is_map_file, load_map, save_map
+from pc2grid.io.trajectory import read_tum, stamp_ns_from_text, stamp_text, write_tum
+from pc2grid.model import OccupancyGrid, Trajectory
+from tests.helpers.nav2_map import oracle
+
+GOOD: dict[str, Any] = {
+    "image": "m.pgm",
+    "resolution": 0.05,
+    "origin": [0, 0, 0],
+    "negate": 0,
+    "occupied_thresh": 0.65,
+    "free_thresh": 0.196,
+}
+
+
+def write_map(folder: Path, keys: dict[str, Any], pixels: bytes = bytes(6)) -> Path:
+    (folder / "m.pgm").write_bytes(b"P5\n# made\n3 2\n255\n" + pixels)
+    path = folder / "m.yaml"
+    path.write_text("".join(f"{k}: {v}\n" for k, v in keys.items()))
+    return path
+
+
+@pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
+@settings(max_examples=60, deadline=None)
+@given(pixels=st.binary(min_size=6, max_size=6), negate=st.sampled_from([0, 1]))
+def test_loading_agrees_with_the_oracle(mode: str, pixels: bytes, negate: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        keys = {**GOOD, "mode": mode, "negate": negate}
+        grid = load_map(write_map(Path(folder), keys, pixels))
+    expected = np.array([oracle(v, keys, mode) for v in pixels]).reshape(2, 3)[::-1]
+    np.testing.assert_array_equal(grid.cells, expected)
+
+
+@pytest.mark.parametrize("image_format", ["pgm", "png"])
+@pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
+@settings(max_examples=40, deadline=None)
+@given(
+    cells=hnp.arrays(np.int8, st.tuples(st.integers(1, 6), st.integers(1, 6)), elements=st.integers(-1, 100)),
+    resolution=st.floats(1e-3, 10),
+    x=st.floats(-1e6, 1e6),
+)
+def test_maps_survive_saving(mode: Any, image_format: Any, cells: Any, resolution: float, x: float) -> None:
+    if mode == "trinary":
+        cells = np.select([cells < 0, cells < 20, cells >= 65], [-1, 0, 100], -1)
+    grid = OccupancyGrid(cells=cells, resolution_m=resolution, origin_m=(x, -x))
+    with tempfile.TemporaryDirectory() as folder:
+        path, _ = save_map(grid, Path(folder) / "a b", mode=mode, image_format=image_format)
+        found = load_map(path)
+    np.testing.assert_array_equal(found.cells, grid.cells)
+    assert (found.resolution_m, found.origin_m) == (resolution, (x, -x))
+
+
+def test_grey_205_is_unknown_and_rows_are_flipped(tmp_path: Path) -> None:
+    grid = load_map(write_map(tmp_path, GOOD, bytes([205, 254, 0, 0, 0, 254])))
+    assert grid.cells.tolist() == [[100, 100, 0], [-1, 0, 100]]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("resolution", 0),
+        ("resolution", ".nan"),
+        ("resolution", "[1]"),
+        ("image", "none.pgm"),
+        ("origin", "[0, 0]"),
+        ("origin", "[0, 0, 0.5]"),
+        ("negate", "maybe"),
+        ("free_thresh", 0.9),
+        ("mode", "odd"),
+        ("image", "!!python/object/apply:os.system ['true']"),
+    ],
+)
+def test_bad_keys_are_named(tmp_path: Path, key: str, value: object) -> None:
+    with pytest.raises(MapFileError, match=r"m\.yaml|none\.pgm"):
+        load_map(write_map(tmp_path, {**GOOD, key: value}))
+
+
+@pytest.mark.parametrize("key", list(GOOD))
+def test_missing_keys_are_named(tmp_path: Path, key: str) -> None:
+    with pytest.raises(MapFileError, match=f"{key}: missing"):
+        load_map(write_map(tmp_path, {k: v for k, v in GOOD.items() if k != key}))
+
+
+def test_exponents_read_as_in_nav2(tmp_path: Path) -> None:
+    assert load_map(write_map(tmp_path, {**GOOD, "resolution": "1e-3"})).resolution_m == 0.001
+
+
+@pytest.mark.parametrize(
+    ("key", "good", "bad"),
+    [
+        ("resolution", [1e-3, 100.0], [0.9e-3, 101]),
+        ("origin", [[1e8, -1e8, 0], [0, 0, 1e-9]], [[1.1e8, 0, 0], [0, 0, 2e-9], [0, 0], [0, 0, 0, 0], "a"]),
+        ("occupied_thresh", [0.196, 1.0], [0.19, 1.01]),
+        ("free_thresh", [0.0, 0.65], [-0.01, 0.66]),
+        ("negate", [0, 1, "0", "1", True, "false"], [2, -1, "", [0], 0.5, 10**30]),
+    ],
+)
+def test_values_up_to_their_limits(tmp_path: Path, key: str, good: list[object], bad: list[object]) -> None:
+    for value in good:
+        load_map(write_map(tmp_path, {**GOOD, key: value}))
+    for value in bad:
+        with pytest.raises(MapFileError, match=r"m\.yaml: (free_thresh|" + key + "): "):
+            load_map(write_map(tmp_path, {**GOOD, key: value}))
+
+
+def test_a_shade_at_a_threshold_is_neither(tmp_path: Path) -> None:
+    keys = {**GOOD, "negate": 1, "occupied_thresh": 0.2, "free_thresh": 0.2}  # 0.2 is shade 51
+    path = write_map(tmp_path, keys, bytes([50, 51, 52, 0, 255, 51]))
+    assert load_map(path).cells.tolist() == [[0, 100, -1], [0, -1, 100]]
+
+
+def test_what_is_a_map_and_what_is_a_recording(tmp_path: Path) -> None:
+    (tmp_path / "folder.yaml").mkdir()
+    names = {"a.yaml": True, "a.yml": True, "a.mcap": False, "metadata.yaml": False, "folder.yaml": False}
+    assert {name: is_map_file(tmp_path / name) for name in names} == names
+
+
+def test_a_map_is_not_saved_in_an_unknown_mode(tmp_path: Path) -> None:
+    grid = OccupancyGrid(cells=np.zeros((2, 3), np.int8), resolution_m=0.1, origin_m=(0.0, 0.0))
+    with pytest.raises(MapFileError, match="mode: 'odd' is not one of"):
+        save_map(grid, tmp_path / "m", mode="odd")  # type: ignore[arg-type]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_short_image_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(MapFileError, match="3 x 2 pixels declared, 5 found"):
+        load_map(write_map(tmp_path, GOOD, bytes(5)))
+
+
+@given(st.integers(-(2**63), 2**63 - 1))
+def test_stamps_survive_exactly(stamp_ns: int) -> None:
+    assert stamp_ns_from_text(stamp_text(stamp_ns)) == stamp_ns
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-1e4, 1e4), min_size=6, max_size=6))
+def test_tum_survives(values: list[float]) -> None:
+    from pc2grid.geometry import pose_from_rotation_vector
+
+    pose = pose_from_rotation_vector(np.array(values[:3]) / 1e4, values[3:])
+    before = Trajectory(stamps_ns=np.array([1, 10**18]), T_session_base=np.stack((np.eye(4), pose)))
+    with tempfile.TemporaryDirectory() as folder:
+        write_tum(Path(folder) / "t.tum", before)
+        after = read_tum(Path(folder) / "t.tum")
+    np.testing.assert_array_equal(after.stamps_ns, before.stamps_ns)
+    np.testing.assert_allclose(after.T_session_base, before.T_session_base, atol=5e-9)
+
+
+@pytest.mark.parametrize("line", ["1 2 3", "x 0 0 0 0 0 0 1", "1 0 0 nan 0 0 0 1", "1 0 0 0 0 0 0 0"])
+def test_bad_lines_are_named(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "t.tum"
+    path.write_text(f"# made\n{line}\n")
+    with pytest.raises(TrajectoryFileError, match="line 2"):
+        read_tum(path)

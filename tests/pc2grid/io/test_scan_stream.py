@@ -1,0 +1,298 @@
+"""Odd but whole recordings: stamps, gaps, empty and short messages, dialects, schemas, checksums."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType
+
+from pc2grid.config import ReadConfig
+from pc2grid.errors import LogCorrupt, PointCloudError, UnsupportedSchema
+from pc2grid.io import open_log, scan_stream
+from tests.helpers.recordings import (
+    STEP,
+    T0,
+    Message,
+    check_drive,
+    drive,
+    raw_log,
+    read,
+    ros,
+    write_mcap,
+)
+
+POINT = [[1.0, 2.0, 3.0]]
+DAY = 86_400_000_000_000
+
+
+def cloud(stamp_ns: int, log_time_ns: int | None = None) -> Message:
+    message = ros().cloud("/points", stamp_ns, POINT)
+    return message._replace(log_time_ns=stamp_ns if log_time_ns is None else log_time_ns)
+
+
+@pytest.mark.parametrize("dialect", ["ros1", "ros2"])
+def test_both_dialects_read_what_an_independent_encoder_wrote(tmp_path: Path, dialect: str) -> None:
+    name = "ros1" if dialect == "ros1" else "ros2"
+    path = write_mcap(tmp_path / "a.mcap", drive(name), name)
+    with open_log(path) as log:
+        assert log.info.format == f"mcap/{dialect}"
+        assert log.choose().odometry_topic == "/odom"
+        check_drive(list(log.scans()))
+        assert not log.report().lossy
+
+
+@pytest.mark.parametrize("dialect", ["ros1", "ros2"])
+def test_a_laser_of_both_dialects(tmp_path: Path, dialect: str) -> None:
+    name = "ros1" if dialect == "ros1" else "ros2"
+    ranges = [1.0, np.inf, 0.05, np.nan, 2.0, 30.0, 0.0]
+    (scan,), _ = read(write_mcap(tmp_path / "a.mcap", [ros(name).laser("/scan", T0, ranges)], name))
+    angles = -np.pi / 2 + 0.01 * np.array([0, 4])
+    expected = np.array([[1.0], [2.0]]) * np.column_stack((np.cos(angles), np.sin(angles), [0, 0]))
+    np.testing.assert_allclose(scan.points_m, expected, atol=1e-6)
+    assert scan.sensor == "laser"
+    assert scan.dropped == 5
+
+
+# --- stamps (33) and gaps (34) ------------------------------------------------------------------------
+
+
+def test_zero_stamps_give_way_to_the_time_of_recording(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", [cloud(0, T0 + i * STEP) for i in range(5)])
+    scans, report = read(path)
+    assert [s.stamp_ns for s in scans] == [T0 + i * STEP for i in range(5)]
+    assert any("time of recording" in w for w in report.warnings)
+    assert not report.lossy
+
+
+def test_one_zero_stamp_among_good_ones_is_skipped_and_counted(tmp_path: Path) -> None:
+    messages = [cloud(T0 + i * STEP if i != 7 else 0, T0 + i * STEP) for i in range(20)]
+    scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
+    assert len(scans) == 19
+    assert report.scans_skipped == {"stamp is zero or negative": 1}
+    assert report.lossy
+
+
+def test_negative_stamps_are_never_used(tmp_path: Path) -> None:
+    messages = [cloud(-5 * STEP if i == 3 else T0 + i * STEP, T0 + i * STEP) for i in range(20)]
+    scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
+    assert min(s.stamp_ns for s in scans) == T0
+    assert sum(report.scans_skipped.values()) == 1
+
+
+def test_duplicated_stamps_are_dropped_and_counted(tmp_path: Path) -> None:
+    messages = [cloud(T0 + i * STEP, T0 + i * STEP + k) for i in range(20) for k in range(2 if i == 4 else 1)]
+    scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
+    assert [s.stamp_ns for s in scans] == [T0 + i * STEP for i in range(20)]
+    assert report.scans_skipped == {"stamp is a duplicate": 1}
+
+
+def test_small_disorder_is_sorted_without_loss(tmp_path: Path) -> None:
+    order = [0, 2, 1, 3, 5, 6, 4, 7, 9, 8]
+    messages = [cloud(T0 + k * STEP, T0 + i * STEP) for i, k in enumerate(order)]
+    scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
+    assert [s.stamp_ns for s in scans] == [T0 + i * STEP for i in range(10)]
+    assert not report.lossy
+
+
+@pytest.mark.parametrize(("limit", "taken"), [(10**9, 20), (300, 4)])
+def test_what_waits_for_its_turn_is_bounded_in_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int, taken: int
+) -> None:
+    """Scans of one moment, however many and large, are not all held in memory."""
+    monkeypatch.setattr(scan_stream, "PARAMETERS", scan_stream.StreamParameters(max_waiting_bytes=limit))
+    seen: list[int] = []
+    take = scan_stream.Stream._take_scan
+    monkeypatch.setattr(
+        scan_stream.Stream,
+        "_take_scan",
+        lambda self, data, time: (seen.append(time), take(self, data, time))[1],
+    )
+    path = write_mcap(tmp_path / "a.mcap", [cloud(T0 + i * 1_000_000) for i in range(20)])
+    with open_log(path) as log:
+        first = next(iter(log.scans()))
+    assert first.stamp_ns == T0
+    assert len(seen) == pytest.approx(taken, abs=1)
+
+
+def test_a_scan_that_comes_far_too_late_is_skipped(tmp_path: Path) -> None:
+    stamps = [T0 + i * STEP for i in range(30)]
+    messages = [cloud(s, s) for s in stamps]
+    messages[25] = cloud(T0 + 3 * STEP + 1, stamps[25])
+    scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
+    assert len(scans) == 29
+    assert report.scans_skipped == {"stamp goes back in time": 1}
+
+
+def test_one_stamp_a_day_ahead_is_skipped(tmp_path: Path) -> None:
+    messages = [cloud(T0 + i * STEP + (DAY if i == 8 else 0), T0 + i * STEP) for i in range(25)]
+    scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
+    assert len(scans) == 24
+    assert report.scans_skipped == {"stamp jumps": 1}
+
+
+def test_a_clock_that_was_set_is_continued_and_reported(tmp_path: Path) -> None:
+    messages = [cloud(T0 + i * STEP + (DAY if i >= 8 else 0), T0 + i * STEP) for i in range(25)]
+    scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
+    assert len(scans) == 25
+    assert any("jumps forward" in w for w in report.warnings)
+
+
+def test_a_gap_is_reported_and_not_bridged_by_odometry(tmp_path: Path) -> None:
+    to = ros()
+    gap = 30 * 10**9
+    stamps = [T0 + i * STEP + (gap if i >= 10 else 0) for i in range(20)]
+    messages = [to.tf(T0, "base_link", "lidar", 0.2, topic="/tf_static")]
+    for i, stamp in enumerate(stamps):
+        messages.append(cloud(stamp))
+        if i not in (9, 10):
+            messages.append(to.odometry("/odom", stamp, 0.1 * i))
+    scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
+    assert len(scans) == 20
+    assert any("gaps of more than 5 s" in w for w in report.warnings)
+    # 0.1 s from the last sample it still counts; it is held, not interpolated towards the far side.
+    for i in (9, 10):
+        pose = scans[i].T_odom_base
+        assert pose is not None
+        assert pose[0, 3] == pytest.approx(0.8 if i == 9 else 1.1)
+
+
+# --- contents (20, 27, 29) ----------------------------------------------------------------------------
+
+
+def test_a_few_short_messages_are_counted_and_more_than_a_tenth_refused(tmp_path: Path) -> None:
+    def log(bad: int) -> Path:
+        messages = [cloud(T0 + i * STEP) for i in range(20)]
+        for i in range(bad):
+            messages[3 + i] = messages[3 + i]._replace(data=messages[3 + i].data[:-15])
+        return write_mcap(tmp_path / f"{bad}.mcap", messages)
+
+    scans, report = read(log(2))
+    assert len(scans) == 18
+    assert report.scans_skipped == {"the message is shorter than its schema": 2}
+    assert report.lossy
+    with pytest.raises(LogCorrupt, match=r"/points: 3 of 20 scans are unreadable: .* than its schema"):
+        read(log(3))
+
+
+def test_an_empty_scan_is_kept(tmp_path: Path) -> None:
+    messages = [
+        ros().cloud("/points", T0 + i * STEP, np.zeros((0, 3)) if i == 2 else POINT) for i in range(5)
+    ]
+    scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
+    assert [len(s.points_m) for s in scans] == [1, 1, 0, 1, 1]
+    assert any("no returns at all" in w for w in report.warnings)
+    assert not report.lossy
+
+
+def test_one_outlier_is_dropped_and_a_global_frame_refused(tmp_path: Path) -> None:
+    far = ros().cloud("/points", T0, [[1, 2, 3], [1e30, 0, 0], [0, -1e7, 0], [0, 900, 0]])
+    (scan,), report = read(write_mcap(tmp_path / "a.mcap", [far]))
+    np.testing.assert_array_equal(scan.points_m, np.float32([[1, 2, 3], [0, 900, 0]]))
+    assert scan.dropped == report.points_dropped == 2
+    utm = [ros().cloud("/points", T0 + i * STEP, [[4.5e5, 5.4e6, 100]]) for i in range(3)]
+    with pytest.raises(PointCloudError, match=r"farther than 1000 m .*UTM"):
+        read(write_mcap(tmp_path / "b.mcap", utm))
+    (scan,), _ = read(tmp_path / "a.mcap", ReadConfig(max_range_m=2e7))
+    assert len(scan.points_m) == 3
+
+
+# --- schemas (17, 19) and checksums (8) ---------------------------------------------------------------
+
+# As rosidl_adapter writes it for a LaserScan, reduced to what a parser has to cope with.
+IDL = b"""================================================================================
+IDL: sensor_msgs/msg/LaserScan
+// generated from rosidl_adapter/resource/msg.idl.em
+#include "std_msgs/msg/Header.idl"
+
+module sensor_msgs {
+  module msg {
+    @verbatim (language="comment", text=
+      "Single scan from a planar laser range-finder" "\\n"
+      "If you have another ranging device; see { other } messages (e.g. a sonar)")
+    struct LaserScan {
+      @verbatim (language="comment", text="timestamp in the header")
+      std_msgs::msg::Header header;
+      @unit (value="rad")
+      float angle_min;
+      float angle_max;
+      float angle_increment;
+      float time_increment;  // comment; with semicolon
+      float scan_time;
+      float range_min;
+      float range_max;
+      sequence<float> ranges;
+      sequence<float> intensities;
+    };
+  };
+};
+================================================================================
+IDL: std_msgs/msg/Header
+#include "builtin_interfaces/msg/Time.idl"
+module std_msgs { module msg { struct Header {
+  builtin_interfaces::msg::Time stamp;
+  string frame_id;
+}; }; };
+================================================================================
+IDL: builtin_interfaces/msg/Time
+module builtin_interfaces { module msg { struct Time { int32 sec; uint32 nanosec; }; }; };
+"""
+
+
+def test_a_schema_in_idl(tmp_path: Path) -> None:
+    payload = ros().laser("/scan", T0, [1.0, 2.0]).data
+    name = "sensor_msgs/msg/LaserScan"
+    (scan,), _ = read(raw_log(tmp_path / "a.mcap", [("/scan", name, "ros2idl", IDL, payload)]))
+    assert len(scan.points_m) == 2
+    wrong = IDL.replace(b"sequence<float> ranges", b"sequence<double> ranges")
+    with pytest.raises(UnsupportedSchema, match=r"differently from ROS: .*float64 ranges\[\]"):
+        read(raw_log(tmp_path / "b.mcap", [("/scan", name, "ros2idl", wrong, payload)]))
+    with pytest.raises(UnsupportedSchema, match="not readable: std_msgs/Header: definition missing"):
+        missing = IDL.split(b"=" * 80)[1]
+        read(raw_log(tmp_path / "c.mcap", [("/scan", name, "ros2idl", missing, payload)]))
+
+
+def test_the_same_type_in_two_schema_records(tmp_path: Path) -> None:
+    schema = ros().schema("sensor_msgs/LaserScan")
+    name = "sensor_msgs/msg/LaserScan"
+    first, second = (ros().laser("/scan", T0 + i * STEP, [1.0, 2.0]).data for i in range(2))
+    both = raw_log(
+        tmp_path / "a.mcap",
+        [("/a", name, "ros2msg", schema, first), ("/b", name, "ros2msg", schema + b"# again", second)],
+    )
+    with open_log(both) as log:
+        assert [t.topic for t in log.info.topics] == ["/a", "/b"]
+    assert len(read(both, ReadConfig(topic="/a"))[0]) == len(read(both, ReadConfig(topic="/b"))[0]) == 1
+    # One topic whose recorder registered the type anew, as after a restart: all messages are found.
+    one = raw_log(
+        tmp_path / "b.mcap",
+        [("/a", name, "ros2msg", schema, first), ("/a", name, "ros2msg", schema + b"# again", second)],
+    )
+    assert len(read(one)[0]) == 2
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+def test_absent_checksums_are_said(tmp_path: Path, chunked: bool) -> None:
+    options = {"enable_crcs": False, "enable_data_crcs": False, "use_chunking": chunked}
+    scans, report = read(write_mcap(tmp_path / "a.mcap", drive(), **options))
+    check_drive(scans)
+    assert any("no checksum: damage would not be seen" in w for w in report.warnings)
+    safe = write_mcap(tmp_path / "b.mcap", drive(), enable_data_crcs=True, use_chunking=chunked)
+    assert not any("checksum" in w for w in read(safe)[1].warnings)
+
+
+def test_a_flip_in_an_unchunked_log_is_seen_by_its_data_checksum(tmp_path: Path) -> None:
+    path = write_mcap(
+        tmp_path / "a.mcap",
+        drive(),
+        use_chunking=False,
+        compression=CompressionType.NONE,
+        enable_data_crcs=True,
+    )
+    content = bytearray(path.read_bytes())
+    at = content.index(drive()[-1].data[-20:])
+    content[at] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(LogCorrupt, match="checksum"):
+        read(path)

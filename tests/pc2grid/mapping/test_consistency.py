@@ -1,0 +1,150 @@
+"""A map that is bent is told from a map that is not, by its own scans."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.config import ProjectionConfig
+from pc2grid.geometry import SE2
+from pc2grid.io import open_log
+from pc2grid.mapping.consistency import consistency_warning, measure_consistency
+from pc2grid.mapping.keyframes import Keyframe
+from pc2grid.mapping.occupancy import GridBuilder
+from pc2grid.model import Consistency, OccupancyGrid, SensorKind, Trajectory
+from pc2grid.pipeline import build_map
+from pc2grid.simulate import SimulationConfig, simulate_session
+
+LENGTH_M, WIDTH_M = 20.0, 2.0
+IN_PLACE = SE2()
+
+
+def scan_of_corridor(at: SE2) -> PlanarScan:
+    """What a sensor sees all around in a corridor along x with a wall on either side, up to 10 m."""
+    bearings = at.yaw + np.arange(1440) * (2 * math.pi / 1440)
+    c, s = np.cos(bearings), np.sin(bearings)
+    with np.errstate(divide="ignore"):
+        to_end = np.where(c >= 0, (LENGTH_M - at.x) / c, -at.x / c)
+        to_side = np.where(s >= 0, (WIDTH_M / 2 - at.y) / s, (-WIDTH_M / 2 - at.y) / s)
+    range_m = np.minimum(to_end, to_side)
+    hit = range_m < 10.0
+    points = at.inverse().apply(np.column_stack((at.x + range_m * c, at.y + range_m * s))[hit])
+    return PlanarScan.of_hits(
+        stamp_ns=0,
+        hits_m=points.astype(np.float32),
+        origin_m=np.zeros(2),
+        free_m=np.minimum(range_m, 10.0).astype(np.float32),
+    )
+
+
+def drive(offset: SE2 = IN_PLACE) -> tuple[list[Keyframe], Trajectory]:
+    """There and back along the corridor; the way back is believed to be moved by `offset`."""
+    x = np.arange(1.0, LENGTH_M - 1.0, 0.25)
+    true = [SE2(float(v), 0.0, 0.0) for v in x] + [SE2(float(v), 0.1, math.pi) for v in x[::-1]]
+    believed = [pose if k < len(x) else offset @ pose for k, pose in enumerate(true)]
+    keyframes = [
+        Keyframe(k, scan_of_corridor(pose), at)
+        for k, (pose, at) in enumerate(zip(true, believed, strict=True))
+    ]
+    return keyframes, Trajectory(
+        stamps_ns=np.arange(len(true)) * 10**9, T_session_base=np.array([pose.lift() for pose in believed])
+    )
+
+
+def draw(keyframes: list[Keyframe]) -> OccupancyGrid:
+    builder = GridBuilder(ProjectionConfig())
+    for keyframe in keyframes:
+        builder.add(keyframe.planar_scan, keyframe.T_session_base)
+    return builder.grid()
+
+
+def measured(keyframes: list[Keyframe], trajectory: Trajectory) -> Consistency:
+    return measure_consistency(keyframes, draw(keyframes), trajectory)
+
+
+def test_a_corridor_driven_twice_agrees_with_its_map() -> None:
+    keyframes, trajectory = drive()
+    assert measured(keyframes, trajectory) == Consistency()
+
+
+@pytest.mark.parametrize(
+    "offset", [SE2(0.0, 0.6, 0.0), SE2(0.0, -0.5, 0.0), SE2(0.0, 0.0, math.radians(5.0))]
+)
+def test_a_way_back_that_is_drawn_aside_is_found_where_it_lies(offset: SE2) -> None:
+    keyframes, trajectory = drive(offset)
+    found = measured(keyframes, trajectory)
+    assert found.bent and found.hits_on_free > 0.05 and found.contradicted > 0.1
+    longest = found.stretches[0]
+    path = trajectory.planar()
+    assert np.hypot(path[:, 0] - longest.x_m, path[:, 1] - longest.y_m).min() < 1e-9
+    assert longest.from_ns < longest.to_ns and longest.length_m > 1.0 and longest.share >= 0.2
+    lengths = [stretch.length_m for stretch in found.stretches]
+    assert lengths == sorted(lengths, reverse=True)
+
+
+def test_the_warning_is_one_line_that_names_place_and_time() -> None:
+    keyframes, trajectory = drive(SE2(0.0, 0.6, 0.0))
+    found = measured(keyframes, trajectory)
+    text = consistency_warning(found, trajectory)
+    assert text is not None and "\n" not in text
+    longest = found.stretches[0]
+    assert f"x {longest.x_m:.1f}, y {longest.y_m:.1f} m" in text
+    assert f"{longest.from_ns / 1e9:.0f} to {longest.to_ns / 1e9:.0f} s" in text and "--start" in text
+    assert consistency_warning(Consistency(), trajectory) is None
+
+
+def test_people_who_pass_do_not_bend_a_map() -> None:
+    keyframes, trajectory = drive()
+    rng = np.random.default_rng(3)
+    crowded = []
+    for keyframe in keyframes:
+        scan = keyframe.planar_scan
+        # Two people of 0.4 m width, somewhere within 3 m of the robot.
+        centres = rng.uniform((-3.0, -0.6), (3.0, 0.6), (2, 2))
+        people = (centres[:, None] + np.linspace((-0.2, 0.0), (0.2, 0.0), 8)).reshape(-1, 2)
+        hits = np.vstack((scan.hits_m, people)).astype(np.float32)
+        crowded.append(
+            replace(keyframe, planar_scan=replace(scan, hits_m=hits, normal_rad=np.zeros(len(hits))))
+        )
+    found = measured(crowded, trajectory)
+    assert found.hits_on_free < 0.02
+    assert not found.bent
+
+
+def test_an_object_that_was_there_on_the_way_out_only_does_not_bend_a_map() -> None:
+    keyframes, trajectory = drive()
+    edge = np.linspace(0.0, 0.6, 25)
+    box = np.vstack([np.column_stack((edge + 9.0, 0 * edge + y)) for y in (0.4, 0.9)])
+    crowded = []
+    for keyframe in keyframes:
+        scan, pose = keyframe.planar_scan, keyframe.T_session_base
+        if keyframe.index < len(keyframes) // 2 and abs(pose.x - 9.3) < 5.0:
+            hits = np.vstack((scan.hits_m, pose.inverse().apply(box))).astype(np.float32)
+            keyframe = replace(
+                keyframe, planar_scan=replace(scan, hits_m=hits, normal_rad=np.zeros(len(hits)))
+            )
+        crowded.append(keyframe)
+    found = measured(crowded, trajectory)
+    assert not found.bent
+
+
+def test_nothing_to_compare() -> None:
+    nowhere = Trajectory(stamps_ns=np.empty(0), T_session_base=np.empty((0, 4, 4)))
+    empty = OccupancyGrid(cells=np.empty((0, 0)), resolution_m=0.05, origin_m=(0.0, 0.0))
+    assert measure_consistency([], empty, nowhere) == Consistency()
+
+
+@pytest.mark.parametrize("sensor", ["laser", "depth"])
+def test_a_simulated_drive_among_people_is_consistent(sensor: SensorKind, tmp_path: Path) -> None:
+    simulation = SimulationConfig(length_m=12.0, seed=4, clutter=20, walkers=5)
+    session = simulate_session(tmp_path / "people.mcap", sensor=sensor, config=simulation)
+    with open_log(session.path) as log:
+        built = build_map(log, session="people")
+    assert built.consistency is not None
+    assert not built.consistency.bent and built.consistency.hits_on_free < 0.05
+    assert not any("contradicts itself" in warning for warning in built.report.warnings)

@@ -1,0 +1,108 @@
+"""Which recognised places become loops."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pc2grid.arrays import F64
+from pc2grid.geometry import SE2
+from pc2grid.mapping.loop_candidates import Candidate, LoopCandidates, between, compose, ways
+from pc2grid.mapping.pose_graph import Edge
+
+STEP_M = 4.0
+
+
+def corridor(count: int) -> tuple[F64, F64, list[Edge]]:
+    """Local maps along a straight corridor that was driven back and forth: poses, travel, tracked steps."""
+    x = STEP_M * np.minimum(np.arange(count), 2 * (count // 2) - np.arange(count))
+    nodes = np.column_stack((x, np.zeros(count), np.where(np.arange(count) < count // 2, 0.0, math.pi)))
+    edges = [
+        Edge(k, k + 1, SE2(*nodes[k]).inverse() @ SE2(*nodes[k + 1]), np.eye(3)) for k in range(count - 1)
+    ]
+    return nodes, STEP_M * np.arange(count), edges
+
+
+def seen(
+    nodes: F64,
+    recognition: int,
+    older: int,
+    newer: int,
+    *,
+    off: SE2 = SE2(0.2, 0.0, 0.0),  # noqa: B008
+    probability: float = 0.99,
+) -> Candidate:
+    """A candidate that is `off` from where tracking puts the newer local map."""
+    T = SE2(*nodes[older]).inverse() @ SE2(*nodes[newer]) @ off
+    return Candidate(
+        recognition=recognition, older=older, newer=newer, T_older_newer=T, probability=probability
+    )
+
+
+def accepted(*batches: list[Candidate]) -> list[Candidate]:
+    candidates = LoopCandidates()
+    for batch in batches:
+        candidates.add(batch)
+    return candidates.acceptable(*corridor(41))
+
+
+NODES = corridor(41)[0]
+
+
+def test_near_the_tracked_pose_one_recognition_is_enough_if_it_is_certain() -> None:
+    assert len(accepted([seen(NODES, 9, 10, 31)])) == 1
+    assert accepted([seen(NODES, 9, 10, 31, probability=0.7)]) == []
+
+
+def test_far_from_the_tracked_pose_others_must_agree() -> None:
+    off = SE2(0.0, 4.0, 0.0)  # of 84 m; 2.4 m are a standard deviation
+    alone = [seen(NODES, 9, 10, 31, off=off)]
+    again = [seen(NODES, 10, 7, 34, off=off)]
+    contrary = [seen(NODES, 10, 7, 34, off=SE2(0.0, -4.0, 0.0))]
+    assert accepted(alone) == [] and accepted(alone, contrary) == []
+    assert accepted(alone, again) == [*alone, *again]
+    same_stretch = [seen(NODES, 9, 13, 31, off=off)]
+    assert accepted([*alone, *same_stretch]) == []
+
+
+def test_a_building_turned_by_half_is_never_accepted() -> None:
+    turned = [[seen(NODES, 9 + k, 10 - 3 * k, 31 + 3 * k, off=SE2(0.0, 0.0, math.pi))] for k in range(3)]
+    assert accepted(*turned) == []
+
+
+def test_of_two_places_for_one_stretch_the_supported_one_is_accepted() -> None:
+    right, wrong = seen(NODES, 9, 10, 31), seen(NODES, 9, 10, 31, off=SE2(2.5, 0.0, 0.0))
+    assert accepted([right, wrong]) == []
+    support = seen(NODES, 10, 7, 34)
+    assert accepted([right, wrong], [support]) == [right, support]
+
+
+def test_what_is_not_accepted_waits_and_what_cannot_be_is_forgotten() -> None:
+    candidates = LoopCandidates()
+    off = SE2(0.0, 4.0, 0.0)
+    first, impossible = seen(NODES, 9, 10, 31, off=off), seen(NODES, 9, 10, 31, off=SE2(0.0, 90.0, 2.0))
+    candidates.add([first, impossible])
+    assert candidates.acceptable(*corridor(41)) == []
+    with pytest.raises(ValueError, match="not in list"):
+        candidates.remove(impossible)
+    second = seen(NODES, 10, 7, 34, off=off)
+    candidates.add([second])
+    assert candidates.acceptable(*corridor(41)) == [first, second]
+
+
+def test_a_loop_shortens_the_ways_around_it() -> None:
+    nodes, travel_m, edges = corridor(41)
+    before = ways(41, travel_m, edges, np.array([10]))[0]
+    loop = Edge(8, 33, SE2(*nodes[8]).inverse() @ SE2(*nodes[33]), np.eye(3), loop=True)
+    after = ways(41, travel_m, [*edges, loop], np.array([10]))[0]
+    assert before[31] == pytest.approx(84.0, rel=0.05) and after[31] == pytest.approx(16.0, rel=0.05)
+    assert after[12] == before[12]
+
+
+def test_poses_are_composed_and_inverted() -> None:
+    a, b = np.array([[1.0, 2.0, 0.5]]), np.array([[-3.0, 0.5, 2.0]])
+    assert between(a, compose(a, b)) == pytest.approx(b)
+    both = SE2(*a[0]) @ SE2(*b[0])
+    assert compose(a, b)[0] == pytest.approx((both.x, both.y, both.yaw))

@@ -1,0 +1,301 @@
+"""The pose graph, and loop closure over it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pc2grid.arrays import F64
+from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
+from pc2grid.geometry import SE2
+from pc2grid.mapping import loop_closure
+from pc2grid.mapping.keyframes import Keyframe, Keyframes
+from pc2grid.mapping.loop_candidates import CandidateParameters
+from pc2grid.mapping.loop_closure import LoopCloser, LoopParameters, SettledKeyframes, spread
+from pc2grid.mapping.place_recognition import Recognition, Stretch
+from pc2grid.mapping.pose_graph import Edge, optimise
+from pc2grid.odometry.point_to_line import Match
+
+Wall = tuple[tuple[float, float], tuple[float, float]]
+"""A segment from one point to another."""
+
+INFORMATION = np.diag([1e4, 1e4, 1e5])
+
+
+def square(count: int = 40, side: float = 10.0) -> list[SE2]:
+    """True poses around a square of corridors."""
+    poses = []
+    for k in range(count):
+        s = 4 * side * k / count
+        edge, along = divmod(s, side)
+        corner = [(0, 0), (side, 0), (side, side), (0, side)][int(edge)]
+        yaw = edge * math.pi / 2
+        poses.append(
+            SE2(
+                corner[0] + along * math.cos(yaw),
+                corner[1] + along * math.sin(yaw),
+                math.remainder(yaw, 2 * math.pi),
+            )
+        )
+    return poses
+
+
+def drifting(truth: list[SE2], veer: float = 0.01) -> tuple[list[SE2], list[Edge]]:
+    poses: list[SE2] = [truth[0]]
+    edges: list[Edge] = []
+    for k in range(1, len(truth)):
+        step = truth[k - 1].inverse() @ truth[k]
+        measured = SE2(step.x * 1.01, step.y, step.yaw + veer)
+        edges.append(Edge(k - 1, k, measured, INFORMATION))
+        poses.append(poses[-1] @ measured)
+    return poses, edges
+
+
+def array(poses: list[SE2]) -> F64:
+    return np.array([(p.x, p.y, p.yaw) for p in poses])
+
+
+def weighted_error(poses: F64, edge: Edge) -> float:
+    """Squared error of an edge, weighted by its information."""
+    first, second = SE2(*poses[edge.first]), SE2(*poses[edge.second])
+    apart = (first @ edge.T_first_second).inverse() @ second
+    error = np.array([apart.x, apart.y, apart.yaw])
+    return float(error @ edge.information @ error)
+
+
+def test_one_loop_takes_the_drift_out_and_a_false_one_is_outvoted() -> None:
+    truth = square()
+    poses, edges = drifting(truth, veer=0.01)
+    before = np.linalg.norm(array(poses)[-1, :2] - array(truth)[-1, :2])
+    loops = [Edge(k, 39 - k, truth[k].inverse() @ truth[39 - k], INFORMATION, loop=True) for k in range(3)]
+    false = Edge(5, 25, SE2(0.5, 0.0, 0.0), INFORMATION, loop=True)
+    solved = optimise(array(poses), [*edges, *loops, false])
+    after = np.linalg.norm(solved.poses[-1, :2] - array(truth)[-1, :2])
+    assert before > 2.0 and after < 0.1
+    assert weighted_error(solved.poses, false) > 100 * weighted_error(solved.poses, loops[-1])
+    assert solved.accepted[:39].all() and solved.accepted[-2:].tolist() == [True, False]
+    assert np.array_equal(solved.poses[0], array(truth)[0])
+
+
+def test_exact_edges_are_solved_exactly_from_a_bad_start() -> None:
+    truth = square(12)
+    edges = [Edge(k, k + 1, truth[k].inverse() @ truth[k + 1], INFORMATION) for k in range(11)]
+    start = array(truth) + np.random.default_rng(0).normal(0, 0.2, (12, 3)) * (np.arange(12) > 0)[:, None]
+    solved = optimise(start, edges).poses
+    assert np.abs(solved[:, :2] - array(truth)[:, :2]).max() < 1e-4
+
+
+def test_no_edges_nothing_moves() -> None:
+    assert np.array_equal(optimise(np.ones((3, 3)), []).poses, np.ones((3, 3)))
+
+
+def test_corrections_pass_smoothly_between_keyframes() -> None:
+    tracked = np.column_stack((np.arange(5.0), np.zeros(5), np.zeros(5)))
+    corrected = np.array([[0.0, 0.0, 0.0], [4.0, 0.4, 0.0]])
+    assert spread(tracked, [0, 4], corrected)[:, 1] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
+    assert spread(tracked, [0, 2], np.array([[0, 0, 0], [2, 1.0, 0]]))[4] == pytest.approx((4, 1, 0))
+
+
+def scan_of(pose: SE2, walls: list[Wall]) -> PlanarScan:
+    """The planar scan of a laser that looks all around, between walls."""
+    bearings = np.arange(BEARINGS) * (2 * np.pi / BEARINGS)
+    directions = np.column_stack((np.cos(bearings + pose.yaw), np.sin(bearings + pose.yaw)))
+    ranges = np.full(BEARINGS, np.inf)
+    for start, end in walls:
+        d, o = np.subtract(end, start), np.subtract(start, (pose.x, pose.y))
+        cross = directions[:, 0] * d[1] - directions[:, 1] * d[0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (o[0] * d[1] - o[1] * d[0]) / cross
+            u = (o[0] * directions[:, 1] - o[1] * directions[:, 0]) / cross
+        ranges = np.where((t > 0) & (u >= 0) & (u <= 1) & (t < ranges), t, ranges)
+    seen = np.isfinite(ranges)
+    hits = np.column_stack((np.cos(bearings), np.sin(bearings)))[seen] * ranges[seen, None]
+    return PlanarScan.of_hits(
+        stamp_ns=0,
+        hits_m=hits.astype(np.float32),
+        origin_m=np.zeros(2),
+        free_m=np.where(seen, ranges, 0).astype(np.float32),
+    )
+
+
+def closed(
+    poses: list[SE2], planar_scans: list[PlanarScan], restart: int | None = None, **options: Any
+) -> tuple[F64, SettledKeyframes]:
+    """Settled poses of all keyframes, and the result of loop closure."""
+    keyframes = Keyframes()
+    closer = LoopCloser(keyframes, **options)
+    for k, (pose, planar_scan) in enumerate(zip(poses, planar_scans, strict=True)):
+        keyframes.append(Keyframe(k, planar_scan, pose, restart=k == restart))
+        closer.extend(keyframes[k])
+    found = closer.finish()
+    return spread(array(poses), found.scans, found.poses), found
+
+
+BLOCK: list[Wall] = [
+    *[((-2, -2), (14, -2)), ((14, -2), (14, 12)), ((14, 12), (-2, 12)), ((-2, 12), (-2, -2))],
+    *[((2, 2), (8, 2)), ((8, 2), (8, 5)), ((8, 5), (5, 8)), ((5, 8), (2, 8)), ((2, 8), (2, 2))],
+]
+"""A block in a hall."""
+
+
+def test_two_laps_around_a_block_with_drift_agree_after_closing() -> None:
+    truth = square(100) * 2
+    poses, _ = drifting(truth, veer=0.003)
+    before = np.linalg.norm(array(poses)[:, :2] - array(truth)[:, :2], axis=1)
+    settled, found = closed(poses, [scan_of(pose, BLOCK) for pose in truth])
+    assert before.max() > 3.0 and len(found.loops) > 3
+    lap = settled[100:, :2] - settled[:100, :2]
+    assert np.linalg.norm(lap, axis=1).max() < 0.04
+    # Half a local map turns by a degree before its anchor: so much may the whole map be turned.
+    T_truth_map = SE2.fit(settled[:, :2], array(truth)[:, :2])
+    assert abs(T_truth_map.yaw) < math.radians(1.0)
+    assert np.linalg.norm(T_truth_map.apply(settled[:, :2]) - array(truth)[:, :2], axis=1).max() < 0.04
+    for loop in found.loops:
+        assert loop.older < loop.newer
+        apart = (truth[loop.older].inverse() @ truth[loop.newer]).inverse() @ loop.T_older_newer
+        assert math.hypot(apart.x, apart.y) < 0.1 and abs(apart.yaw) < 0.03
+        # The information is right about the size of that error: 16 is beyond 0.1 % of what it promises.
+        error = np.array([apart.x, apart.y, apart.yaw])
+        assert error @ loop.information @ error < 16.0 and np.linalg.eigvalsh(loop.information)[0] > 10.0
+    assert sum(loop.accepted for loop in found.loops) > 0.9 * len(found.loops)
+
+
+def test_a_lost_stretch_is_a_guess_and_its_error_stays_in_it() -> None:
+    """After the first lap tracking is lost, and starts again 1 m and 10 degrees beside the truth."""
+    truth = square(100) * 2
+    beside = truth[100] @ SE2(0.8, -0.6, math.radians(10.0)) @ truth[100].inverse()
+    poses = truth[:100] + [beside @ pose for pose in truth[100:]]
+    settled, found = closed(poses, [scan_of(pose, BLOCK) for pose in truth], restart=100)
+    assert {99, 100} <= set(found.scans.tolist())
+    apart = np.linalg.norm(settled[:, :2] - array(truth)[:, :2], axis=1)
+    assert apart.max() < 0.1
+
+
+def test_work_and_loops_grow_with_the_way_and_not_with_its_square(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One more lap does not change how many local maps each one is compared with."""
+    compared: list[int] = []
+    fit = loop_closure._fit
+
+    def counted(*arguments: Any) -> Match | None:
+        compared[-1] += 1
+        return fit(*arguments)
+
+    monkeypatch.setattr(loop_closure, "_fit", counted)
+    for laps in (2, 3, 4):
+        compared.append(0)
+        truth = square(30) * laps
+        planar_scans = [scan_of(pose, BLOCK) for pose in truth[:30]] * laps
+        found = closed(truth, planar_scans)[1]
+        assert found.loops and len(found.loops) <= compared[-1]
+    assert compared[2] - compared[1] <= 1.1 * (compared[1] - compared[0])
+
+
+IDENTITY = SE2()
+
+
+class KnowsTheTruth:
+    """A recognizer that knows the true poses of the keyframes, and so of the stretches."""
+
+    def __init__(self, truth: list[SE2], *, probability: float = 1.0, wrong: SE2 = IDENTITY) -> None:
+        self._truth = truth
+        self._probability = probability
+        self._wrong = wrong
+        self.stretches: list[Stretch] = []
+        self.frames: list[SE2] = []  # true pose of each stretch
+
+    def recognize(self, newest: Stretch) -> list[Recognition]:
+        anchor = int(np.flatnonzero(np.abs(newest.poses).sum(axis=1) < 1e-9)[0])
+        self.stretches.append(newest)
+        self.frames.append(self._truth[newest.scans[anchor]])
+        found = []
+        for older, frame in enumerate(self.frames[:-1]):
+            true = frame.inverse() @ self.frames[-1]
+            if math.hypot(true.x, true.y) < 8.0:
+                found.append(
+                    Recognition(
+                        older=older,
+                        T_older_newest=true @ self._wrong,
+                        probability=self._probability,
+                    )
+                )
+        return found
+
+
+def farthest(settled: F64, truth: list[SE2]) -> float:
+    T_truth_session = SE2.fit(settled[:, :2], array(truth)[:, :2])
+    return float(np.linalg.norm(T_truth_session.apply(settled[:, :2]) - array(truth)[:, :2], axis=1).max())
+
+
+def test_a_recognizer_closes_loops_beyond_the_search_window() -> None:
+    truth = square(100) * 2
+    poses, _ = drifting(truth, veer=0.008)
+    planar_scans = [scan_of(pose, BLOCK) for pose in truth]
+    narrow = LoopParameters(near_m=1.0, max_window_m=0.3, max_window_rad=math.radians(2.0))
+    alone, _ = closed(poses, planar_scans, parameters=narrow)
+    # The drift, 1.1 degrees per metre, is ten times what the default takes for possible.
+    wide = CandidateParameters(
+        **{name: math.radians(1.2) for name in ("drift_rad_per_m", "short_rad_per_m")},
+        drift_per_m=0.1,
+        short_per_m=0.1,
+        known_way_m=0.0,  # the search window is narrow here: short ways drift out of it, too
+    )
+    settled, found = closed(
+        poses,
+        planar_scans,
+        parameters=narrow,
+        candidate_parameters=wide,
+        recognizer=KnowsTheTruth(truth),
+    )
+    assert farthest(alone, truth) > 3.0
+    assert farthest(settled, truth) < 0.5 and sum(loop.accepted for loop in found.loops) > 3
+
+
+def test_a_recognizer_is_given_every_stretch_with_its_grid_and_poses() -> None:
+    truth = square(100) * 2
+    recognizer = KnowsTheTruth(truth)
+    alone = LoopParameters(min_agreement=1.1)  # no overlap that would make a stretch a known one
+    closed(truth, [scan_of(pose, BLOCK) for pose in truth], recognizer=recognizer, parameters=alone)
+    assert [s.index for s in recognizer.stretches] == list(range(len(recognizer.stretches)))
+    assert len(recognizer.stretches) > 4
+    for stretch, frame in zip(recognizer.stretches, recognizer.frames, strict=True):
+        path_m = np.linalg.norm(np.diff(stretch.poses[:, :2], axis=0), axis=1).sum()
+        last = stretch is recognizer.stretches[-1]  # it ends where the session does
+        assert (8.0 if last else 11.0) < path_m < 14.0
+        walls = frame.apply(stretch.grid.to_point(np.argwhere(stretch.grid.occupied)))
+        assert len(walls) > 100
+        distance = []
+        for a, b in BLOCK:
+            along = np.subtract(b, a) / np.linalg.norm(np.subtract(b, a))
+            distance.append(np.abs((walls - a) @ (-along[1], along[0])))
+        assert np.min(distance, axis=0).max() < 0.15
+
+
+def test_improbable_recognitions_are_left_out() -> None:
+    truth = square(100) * 2
+    planar_scans = [scan_of(pose, BLOCK) for pose in truth]
+    _, alone = closed(truth, planar_scans)
+    improbable = KnowsTheTruth(truth, probability=0.5, wrong=SE2(2.0, 0.0, 0.5))
+    settled, found = closed(truth, planar_scans, recognizer=improbable)
+    assert len(improbable.stretches) > 1
+    assert len(found.loops) == len(alone.loops)
+    assert farthest(settled, truth) < 0.05
+
+
+def test_a_stretch_over_known_ground_is_not_asked_for() -> None:
+    truth = square(100) * 3
+    recognizer = KnowsTheTruth(truth)
+    closed(truth, [scan_of(pose, BLOCK) for pose in truth], recognizer=recognizer)
+    assert recognizer.stretches and max(stretch.scans[-1] for stretch in recognizer.stretches) < 130
+
+
+def test_no_stretch_reaches_across_a_lost_part() -> None:
+    truth = square(100)
+    recognizer = KnowsTheTruth(truth)
+    poses = truth[:35] + [SE2(5.0, 5.0, 1.0) @ pose for pose in truth[35:]]
+    closed(poses, [scan_of(pose, BLOCK) for pose in truth], restart=35, recognizer=recognizer)
+    assert recognizer.stretches
+    for stretch in recognizer.stretches:
+        assert np.linalg.norm(np.diff(stretch.poses[:, :2], axis=0), axis=1).max() < 1.0

@@ -1,0 +1,151 @@
+"""Planar scans drawn into a growing grid."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
+from pc2grid.config import ProjectionConfig
+from pc2grid.errors import LimitExceeded
+from pc2grid.geometry import SE2
+from pc2grid.mapping.occupancy import GridBuilder
+from pc2grid.model import OccupancyGrid
+
+
+def disc(radius_m: float, *, hits: bool = True) -> PlanarScan:
+    """A planar scan that looks all around a round room."""
+    bearings = np.arange(BEARINGS) * (2 * np.pi / BEARINGS)
+    rim = radius_m * np.column_stack((np.cos(bearings), np.sin(bearings)))
+    return PlanarScan.of_hits(
+        stamp_ns=0,
+        hits_m=(rim if hits else np.zeros((0, 2))).astype(np.float32),
+        origin_m=np.zeros(2),
+        free_m=np.full(BEARINGS, radius_m, np.float32),
+    )
+
+
+def state(grid: OccupancyGrid, x: float, y: float) -> int:
+    row, column = grid.to_cell(np.array([[x, y]]))[0]
+    return int(grid.cells[row, column])
+
+
+def test_round_room_is_free_inside_occupied_at_its_wall_unknown_outside() -> None:
+    builder = GridBuilder(ProjectionConfig())
+    for _ in range(3):
+        builder.add(disc(2.0), SE2(10.0, -3.0, 0.7))
+    grid = builder.grid()
+    y, x = np.mgrid[: grid.cells.shape[0], : grid.cells.shape[1]]
+    centres = grid.to_point(np.column_stack((y.ravel(), x.ravel())))
+    distance = np.linalg.norm(centres - (10.0, -3.0), axis=1).reshape(grid.cells.shape)
+    assert grid.free[distance < 1.9].all()
+    assert (grid.cells[distance > 2.1] == -1).all()
+    wall = grid.occupied
+    assert wall.sum() > 200 and np.abs(distance[wall] - 2.0).max() < 0.05
+
+
+def test_a_person_who_has_left_is_cleared() -> None:
+    builder = GridBuilder(ProjectionConfig())
+    person = PlanarScan.of_hits(
+        stamp_ns=0,
+        hits_m=np.array([[1.02, 0.02]], np.float32),
+        origin_m=np.zeros(2),
+        free_m=np.where(np.arange(BEARINGS) < 4, 1.0, 0.0).astype(np.float32),
+    )
+    builder.add(person, SE2())
+    assert state(builder.grid(), 1.02, 0.02) >= 65
+    for _ in range(5):
+        builder.add(disc(2.0), SE2())
+    assert 0 <= state(builder.grid(), 1.02, 0.02) < 20
+
+
+def test_a_map_may_span_half_a_kilometre_between_two_rooms() -> None:
+    builder = GridBuilder(ProjectionConfig())
+    builder.add(disc(2.0), SE2(0.0, 0.0, 0.0))
+    builder.add(disc(2.0), SE2(-130.0, 70.0, 0.0))
+    grid = builder.grid()
+    assert state(grid, 0.5, 0.5) < 50 and state(grid, -130.5, 70.5) < 50 and state(grid, -60.0, 30.0) == -1
+
+
+def test_a_map_past_the_limit_is_refused() -> None:
+    builder = GridBuilder(ProjectionConfig(max_cells=600_000))
+    builder.add(disc(2.0), SE2())
+    with pytest.raises(LimitExceeded, match="max_cells"):
+        for k in range(1, 10):
+            builder.add(disc(2.0), SE2(100.0 * k, 0.0, 0.0))
+        builder.grid()
+
+
+def test_memory_goes_with_what_was_visited_not_with_the_rectangle_around_it() -> None:
+    builder = GridBuilder(ProjectionConfig(max_cells=15_000_000))
+    for k in range(200):  # 800 m as the crow flies: a square of 128 million cells
+        builder.add(disc(2.0), SE2(2.83 * k, 2.83 * k, 0.0))
+    with pytest.raises(LimitExceeded, match="max_cells"):
+        builder.grid()
+    corridor = GridBuilder(ProjectionConfig(max_cells=15_000_000))
+    for k in range(200):
+        corridor.add(disc(2.0), SE2(4.0 * k, 0.0, 0.0))
+    grid = corridor.grid()
+    assert grid.cells.shape[1] * grid.resolution_m > 790 and 0 <= state(grid, 796.5, 0.5) < 50
+
+
+def test_unseen_hits_are_drawn_in_unknown_cells_only() -> None:
+    builder = GridBuilder(ProjectionConfig())
+    builder.add(disc(2.0), SE2())
+    before = builder.grid()
+    builder.add_unseen_hits(np.array([[0.52, 0.52], [2.52, 0.02], [900.0, 0.0]]))
+    after = builder.grid()
+    assert state(after, 0.52, 0.52) == state(before, 0.52, 0.52) < 50
+    assert state(after, 2.52, 0.02) >= 65
+
+
+def test_unseen_hit_beside_a_drawn_wall_is_its_noise() -> None:
+    behind, away = (2.02, -0.12), (2.52, 0.02)
+    builder = GridBuilder(ProjectionConfig())
+    builder.add(disc(2.0), SE2())
+    builder.add_unseen_hits(np.array([behind, away]))
+    grid = builder.grid()
+    assert state(grid, *away) >= 65
+    assert state(grid, *behind) == -1
+
+
+def test_lone_hit_beside_a_wall_is_noise_until_it_is_repeated() -> None:
+    strayed, away = (1.92, 0.02), (0.0, 2.5)
+    once = disc(2.0)
+    rays = np.hypot(*(once.hits_m - strayed).T) < 0.12  # their free space ends a cell before the wall
+    bearings = np.arange(len(once.free_m)) * 2 * np.pi / len(once.free_m)
+    free_m = np.where(np.cos(bearings) > 0.99, 1.9, once.free_m).astype(np.float32)
+    hits_m = np.concatenate((once.hits_m[~rays], np.array([strayed, away], np.float32)))
+    stray = dataclasses.replace(once, hits_m=hits_m, free_m=free_m)
+    wall_alone = dataclasses.replace(once, free_m=free_m)
+    for times in (1, 2):
+        builder = GridBuilder(ProjectionConfig())
+        for k in range(3):
+            builder.add(stray if k < times else wall_alone, SE2())
+        grid = builder.grid()
+        assert state(grid, *away) >= 65  # met as seldom, but nothing stands beside it
+        assert state(grid, *strayed) >= 65 if times == 2 else state(grid, *strayed) == -1
+        assert occupied_at(grid, once.hits_m).all()
+
+
+def test_wall_is_continued_by_unseen_hits() -> None:
+    planar_scan = disc(2.0)
+    gap = np.abs(planar_scan.hits_m[:, 1] - 1.0) < 0.15
+    builder = GridBuilder(ProjectionConfig())
+    builder.add(dataclasses.replace(planar_scan, hits_m=planar_scan.hits_m[~gap]), SE2())
+    missing = planar_scan.hits_m[gap & (planar_scan.hits_m[:, 0] > 0)]
+    assert (occupied_at(builder.grid(), missing)).mean() < 0.1
+    builder.add_unseen_hits(missing.astype(np.float64)[::4])
+    assert occupied_at(builder.grid(), missing).mean() > 0.8
+
+
+def occupied_at(grid: OccupancyGrid, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    cells = grid.to_cell(points)
+    return np.asarray(grid.cells[cells[:, 0], cells[:, 1]] >= 65)
+
+
+def test_nothing_seen_gives_an_empty_grid() -> None:
+    assert GridBuilder(ProjectionConfig()).grid().cells.size == 0

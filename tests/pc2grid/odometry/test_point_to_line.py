@@ -1,0 +1,90 @@
+"""Scan matching in the plane: edge cases, and the compiled functions against their plain twins."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pc2grid.geometry import SE2
+from pc2grid.odometry._kernels import normal_equations, placement_scores
+from pc2grid.odometry.point_to_line import (
+    PointGrid,
+    best_placements,
+    normal_equations_plain,
+    placement_scores_plain,
+)
+
+
+def test_points_beside_a_map_are_no_part_of_it_and_a_heap_is_no_line() -> None:
+    wall = np.column_stack((np.linspace(0.5, 3.5, 200), np.full(200, 2.0)))
+    south = np.full(200, -math.pi / 2)
+    grid = PointGrid((0.0, 0.0), (4.0, 4.0))
+    beside = np.array([[-1.0, 2.0], [5.0, 2.0], [2.0, -1.0], [2.0, 5.0]] * 50)
+    grid.add(beside, south)
+    nothing = grid.match(wall, south, SE2(), SE2(), np.eye(3))
+    assert nothing.overlap == 0.0 and nothing.pose == SE2()
+    grid.add(np.full((200, 2), 2.0), south)
+    assert grid.match(wall, south, SE2(), SE2(), np.eye(3)).overlap == 0.0
+    grid.add(wall, south)
+    found = grid.match(wall, south, SE2(0.0, 0.08), SE2(0.0, 0.08), np.eye(3))
+    assert found.overlap > 0.9 and abs(found.pose.y) < 0.01
+
+
+def test_moments_of_points_added_in_parts_are_those_of_all_at_once() -> None:
+    rng = np.random.default_rng(1)
+    points, normals = rng.uniform(-1, 11, (4000, 2)), rng.uniform(-9, 9, 4000)
+    whole, parts = (PointGrid((0.0, 0.0), (10.0, 10.0)) for _ in range(2))
+    whole.add(points, normals)
+    for k in range(0, 4000, 500):
+        parts.add(points[k : k + 500], normals[k : k + 500])
+    inside = ((points >= 0) & (points < 10)).all(axis=1)
+    for grid in (whole, parts):
+        assert grid._moments[..., 0].sum() == inside.sum()
+        assert grid._moments[..., 1:3].sum(axis=(0, 1)) == pytest.approx(points[inside].sum(axis=0))
+    filled = whole._index >= 0
+    assert np.array_equal(filled, parts._index >= 0)
+    assert whole._moments[whole._index[filled]] == pytest.approx(parts._moments[parts._index[filled]])
+
+
+@pytest.mark.parametrize("radius", [1, 2, 3])
+def test_normal_equations_are_those_of_their_definition(radius: int) -> None:
+    rng = np.random.default_rng(radius)
+    along, side = np.linspace(0.5, 7.5, 300), np.full(300, 2.0)
+    wall = np.concatenate((np.column_stack((along, side)), np.column_stack((side, along))))
+    normals = np.repeat((-math.pi / 2, math.pi), 300)
+    grid = PointGrid((0.0, 0.0), (8.0, 8.0))
+    grid.add(wall + rng.normal(0, 0.01, wall.shape), normals)
+    grid.add(rng.uniform(0, 8, (50, 2)), rng.uniform(-3, 3, 50))
+    points = wall[::5] + rng.normal(0, 0.02, wall[::5].shape)
+    pose = np.array([0.05, -0.03, 0.02])
+    arguments = (grid._index, grid._moments, points, normals[::5], pose, grid.cell_m, radius, 0.05 * radius)
+    for found, expected in zip(normal_equations(*arguments), normal_equations_plain(*arguments), strict=True):
+        assert found == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+def test_likelihood_falls_with_the_distance_from_the_points() -> None:
+    grid = PointGrid((0.0, 0.0), (4.0, 4.0))
+    grid.add(np.array([[2.05, 1.05]]), np.zeros(1))
+    field = grid.likelihood(0.2)
+    assert field.shape == grid.shape and field[10, 20] == 1.0
+    assert field[10, 22] == pytest.approx(math.exp(-0.5), abs=0.05) and field[35, 20] < 1e-6
+
+
+def test_placements_are_scored_as_by_their_definition() -> None:
+    rng = np.random.default_rng(4)
+    field, points = rng.random((40, 50), np.float32), rng.uniform(-15, 15, (60, 2))
+    arguments = (field, points, np.array([25.3, 20.1]), np.array([-0.4, 0.0, 0.7]), -6, 2, 7)
+    assert placement_scores(*arguments) == pytest.approx(placement_scores_plain(*arguments), abs=1e-5)
+
+
+def test_the_best_placement_is_where_the_points_lie() -> None:
+    cells = np.argwhere(np.random.default_rng(5).random((60, 60)) < 0.05)
+    field = np.zeros((60, 60), np.float32)
+    field[tuple(cells.T)] = 1.0
+    truth = SE2(0.4, -0.2, math.radians(4.0))
+    points = truth.inverse().apply(0.1 * (cells[:, ::-1] + 0.5))
+    (score, pose), *others = best_placements(field, np.zeros(2), 0.1, points, SE2(), 0.6, math.radians(6.0))
+    assert score > 0.95 and all(other < 0.5 for other, _ in others)
+    assert (pose.x, pose.y, pose.yaw) == pytest.approx((truth.x, truth.y, truth.yaw))

@@ -1,0 +1,290 @@
+"""Following a robot: pose, health, and what it costs to be wrong."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from pc2grid.clouds.deskew import deskew
+from pc2grid.clouds.sampling import random_subset
+from pc2grid.config import ProjectionConfig, RegistrationConfig
+from pc2grid.geometry import SE2, invert_pose, transform_points
+from pc2grid.model import Health, Scan
+from pc2grid.odometry.motion_model import MotionModel
+from pc2grid.odometry.registration import KissRegistration
+from pc2grid.odometry.tracker import Tracker
+from pc2grid.simulate import SimulationConfig, iter_session
+from pc2grid.simulate.config import LidarConfig
+
+
+def session(sensor, *, length_m=6.0, seed=4):
+    return list(iter_session(sensor=sensor, config=SimulationConfig(length_m=length_m, seed=seed)))
+
+
+@pytest.fixture(scope="module")
+def laser():
+    return session("laser", length_m=8.0)
+
+
+def follow(scans):
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    return [tracker.track(scan).registered for scan in scans]
+
+
+def errors(pairs, poses):
+    """Distance of each pose from the truth, both seen from the first scan."""
+    first = pairs[0][1].inverse()
+    truth = np.array([((first @ p).x, (first @ p).y) for _, p in pairs[: len(poses)]])
+    return np.linalg.norm(np.array([T[:2, 3] for T in poses]) - truth, axis=1)
+
+
+def blind(scan):
+    return dataclasses.replace(scan, T_odom_base=None)
+
+
+@pytest.mark.parametrize(("sensor", "limit_m"), [("laser", 0.06), ("lidar", 0.06), ("depth", 0.10)])
+def test_each_sensor_is_followed(sensor, limit_m):
+    pairs = session(sensor)
+    registered = follow(scan for scan, _ in pairs)
+    assert len(registered) == len(pairs)
+    assert errors(pairs, [r.T_session_base for r in registered]).max() < limit_m
+    assert sum(r.health is Health.LOST for r in registered) == 0
+    assert np.array_equal(registered[0].T_session_base, np.eye(4)) or sensor != "laser"
+
+
+def test_odometry_with_the_wrong_sign_is_overruled(laser):
+    wrong = []
+    for k, (scan, pose) in enumerate(laser):
+        odometry = scan.T_odom_base
+        if k:  # every step negated, as a log does whose encoder counts without a sign
+            true_step = invert_pose(laser[k - 1][0].T_odom_base) @ odometry
+            step = true_step.copy()
+            step[:2, 3] *= -1.0
+            odometry = wrong[-1][0].T_odom_base @ step
+        within = scan.T_first_last.copy()
+        within[:2, 3] *= -1.0
+        wrong.append((dataclasses.replace(scan, T_odom_base=odometry, T_first_last=within), pose))
+    poses = [r.T_session_base for r in follow(scan for scan, _ in wrong)]
+    assert errors(laser, poses).max() < 0.15
+
+
+def test_laser_without_odometry_is_followed_or_reported_lost(laser):
+    registered = follow(blind(scan) for scan, _ in laser)
+    lost = [r.health is Health.LOST for r in registered]
+    assert any(lost) or errors(laser, [r.T_session_base for r in registered]).max() < 0.05
+
+
+def test_odometry_bridges_a_scan_without_any_at_the_edge_of_a_gap(laser):
+    gap = [*laser[:31], (blind(laser[31][0]), laser[31][1]), *laser[61:]]
+    unseen = laser[31][1].inverse() @ laser[61][1]
+    assert np.hypot(unseen.x, unseen.y) > 1.0 and abs(unseen.yaw) > 0.3
+    registered = follow(scan for scan, _ in gap)
+    assert not any(r.health is Health.LOST for r in registered)
+    assert errors(gap, [r.T_session_base for r in registered]).max() < 0.06
+
+
+def restarted(pairs, stamp_shift_ns=0):
+    """The same scans from a robot whose odometry starts again with the first of them."""
+    first = invert_pose(pairs[0][0].T_odom_base)
+    return [
+        (
+            dataclasses.replace(
+                scan, T_odom_base=first @ scan.T_odom_base, stamp_ns=scan.stamp_ns + stamp_shift_ns
+            ),
+            pose,
+        )
+        for scan, pose in pairs
+    ]
+
+
+@pytest.mark.parametrize("gap_s", [0.0, 20.0])
+def test_odometry_that_restarts_at_the_same_place_is_detected(laser, gap_s):
+    reset = [*laser[:40], *restarted(laser[40:], int(gap_s * 1e9))]
+    assert np.linalg.norm(laser[40][0].T_odom_base[:2, 3]) > 1.0
+    registered = follow(scan for scan, _ in reset)
+    assert not any(r.health is Health.LOST for r in registered)
+    assert errors(reset, [r.T_session_base for r in registered]).max() < 0.06
+
+
+def test_odometry_that_restarts_in_a_gap_is_not_used(laser):
+    gap_ns = laser[39][0].stamp_ns - laser[0][0].stamp_ns + 5_000_000_000
+    elsewhere = restarted(session("laser", length_m=2.0, seed=11), gap_ns)
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    tracked = [tracker.track(scan) for scan, _ in [*laser[:40], *elsewhere]]
+    health = [t.registered.health for t in tracked]
+    assert health[40] is Health.LOST and Health.LOST not in health[:40] + health[41:]
+    assert [k for k, t in enumerate(tracked) if t.restart] == [41]
+
+
+def test_carried_off_without_odometry_is_noticed_and_restarts(laser):
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    elsewhere = session("laser", length_m=3.0, seed=11)
+    tracked = [tracker.track(blind(scan)) for scan, _ in laser[:40]]
+    end_ns = laser[39][0].stamp_ns
+    for k, (scan, _) in enumerate(elsewhere):
+        moved = dataclasses.replace(blind(scan), stamp_ns=end_ns + (k + 1) * 100_000_000)
+        tracked.append(tracker.track(moved))
+    health = [t.registered.health for t in tracked]
+    assert Health.LOST not in health[:40]
+    assert Health.LOST in health[40:45] or any(t.restart for t in tracked)
+    assert health[-1] is not Health.LOST
+
+
+def late(pairs, first, last):
+    """The same scans, but odometry stands still from scan `first` on and catches up with scan `last`."""
+    return [
+        (dataclasses.replace(scan, T_odom_base=pairs[first][0].T_odom_base), pose)
+        if first < k < last
+        else (scan, pose)
+        for k, (scan, pose) in enumerate(pairs)
+    ]
+
+
+@pytest.mark.parametrize("first", [20, 40, 55])
+def test_odometry_that_is_late_is_not_counted_twice(laser, first):
+    pairs = late(laser, first, first + 8)
+    moved = invert_pose(laser[first][0].T_odom_base) @ laser[first + 8][0].T_odom_base
+    assert np.hypot(*moved[:2, 3]) > 0.25
+    registered = follow(scan for scan, _ in pairs)
+    assert not any(r.health is Health.LOST for r in registered)
+    assert errors(pairs, [r.T_session_base for r in registered]).max() < 0.06
+
+
+def test_what_odometry_owes_is_the_difference_between_a_step_and_a_second():
+    def scan(k, x):
+        return Scan(
+            stamp_ns=k * 10**8,
+            points_m=np.zeros((0, 3), np.float32),
+            T_base_sensor=np.eye(4),
+            sensor="laser",
+            T_odom_base=SE2(x, 0.0, 0.0).lift(),
+        )
+
+    model = MotionModel()
+    for k in range(5):  # the robot moves on by the scans, odometry stands still
+        model.observe(scan(k, 0.0), SE2(0.2 * k, 0.0, 0.0).lift(), sure=True)
+    punctual, late_step = model.predict(scan(5, 0.0)), model.predict(scan(5, 1.0))
+    assert model.owed(late_step) == pytest.approx((0.8, 0.0))
+    assert late_step.windowed is not None and late_step.windowed[0, 3] == pytest.approx(0.2)
+    assert model.information(late_step)[0, 0] < 1.0 / 0.8**2 < model.information(punctual)[2, 2]
+    model.forget_window()
+    assert model.predict(scan(5, 1.0)).windowed is None
+
+
+@pytest.mark.parametrize(("every", "odometry"), [(15, True), (4, False)])
+def test_scans_that_lie_far_apart_are_followed(laser, every, odometry):
+    sparse = [
+        (dataclasses.replace(scan if odometry else blind(scan), stamp_ns=k * 1_500_000_000), pose)
+        for k, (scan, pose) in enumerate(laser[::every])
+    ]
+    steps = [a.inverse() @ b for (_, a), (_, b) in itertools.pairwise(sparse)]
+    assert max(np.hypot(s.x, s.y) for s in steps) > (0.6 if odometry else 0.2)
+    registered = follow(scan for scan, _ in sparse)
+    assert not any(r.health is Health.LOST for r in registered)
+    assert errors(sparse, [r.T_session_base for r in registered]).max() < 0.08
+
+
+def test_a_single_wall_is_degenerate_along_itself():
+    y = np.linspace(-4, 4, 200)
+    wall = np.column_stack((np.full(200, 2.0), y, np.zeros(200)))
+    rng = np.random.default_rng(0)
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    health = []
+    for k in range(8):
+        odometry = SE2(0.0, 0.02 * k, 0.0).lift()
+        points = wall + np.array([0.0, -0.02 * k, 0.0]) + rng.normal(0, 0.005, (200, 1)) * (1, 0, 0)
+        points = points[np.abs(points[:, 1]) < 3]
+        scan = Scan(
+            stamp_ns=k * 100_000_000,
+            points_m=points,
+            T_base_sensor=np.eye(4),
+            sensor="laser",
+            T_odom_base=odometry,
+        )
+        tracked = tracker.track(scan)
+        health.append(tracked.registered.health)
+    assert set(health[2:]) == {Health.DEGENERATE}
+    assert tracked.registered.T_session_base[1, 3] == pytest.approx(0.14, abs=0.03)
+
+
+def test_empty_scans_only_advance_the_time(laser):
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    results = []
+    for k, (scan, _) in enumerate(laser[:30]):
+        if k % 3 == 1:
+            scan = dataclasses.replace(scan, points_m=np.zeros((0, 3), np.float32), offsets_s=None)
+        results.append(tracker.track(scan))
+    assert errors(laser, [t.registered.T_session_base for t in results]).max() < 0.05
+    assert not any(t.keyframe for t in results[1::3])
+    assert all(len(t.planar_scan.hits_m) == 0 for t in results[1::3])
+
+
+def test_standing_still_adds_no_keyframes(laser):
+    scan = laser[0][0]
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    still = (dataclasses.replace(scan, stamp_ns=scan.stamp_ns + k) for k in range(0, 10**9, 10**8))
+    assert sum(tracker.track(s).keyframe for s in still) == 1
+
+
+def test_same_scans_same_bytes(laser):
+    def run():
+        return np.array([r.T_session_base for r in follow(scan for scan, _ in laser[:40])]).tobytes()
+
+    assert run() == run()
+
+
+def test_deskew_puts_points_back_where_they_were():
+    rng = np.random.default_rng(5)
+    world = rng.uniform(-5, 5, (500, 3))
+    offsets = rng.uniform(-0.05, 0.1, 500).astype(np.float32)
+    motion = SE2(0.08, 0.01, 0.09).lift()  # in 0.1 s, from standing at the origin at the stamp
+    seen = np.empty_like(world)
+    for k, t in enumerate(offsets):
+        pose = np.eye(4)
+        yaw = 0.09 * t / 0.1
+        pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+        pose[:2, 3] = 0.08 * t / 0.1, 0.01 * t / 0.1
+        seen[k] = transform_points(invert_pose(pose), world[k : k + 1])[0]
+    assert np.abs(deskew(seen.astype(np.float32), offsets, motion, 0.1) - world).max() < 0.005
+    assert np.abs(seen - world).max() > 0.3
+
+
+def test_a_turn_that_begins_within_a_scan_is_undone_by_odometry():
+    config = SimulationConfig(length_m=6.0, seed=4, lidar=LidarConfig(rate_hz=5.0, columns=450))
+    pairs = list(iter_session(sensor="lidar", config=config))
+    first = pairs[0][1].inverse()
+
+    def worst_heading(scans):
+        found = [SE2.from_matrix(registered.T_session_base) for registered in follow(scans)]
+        return max(
+            abs(((first @ truth).inverse() @ pose).yaw) for pose, (_, truth) in zip(found, pairs, strict=True)
+        )
+
+    aware = worst_heading(scan for scan, _ in pairs)
+    unaware = worst_heading(dataclasses.replace(scan, T_first_last=None) for scan, _ in pairs)
+    assert aware < np.radians(1.0) and aware < 0.6 * unaware
+
+
+def test_absurd_odometry_within_a_scan_is_not_used(laser):
+    """A counter that restarts during a scan would spread its points widely."""
+    far = SE2(3.0, -2.0, 2.0).lift()
+    scans = [
+        scan if scan.T_first_last is None else dataclasses.replace(scan, T_first_last=far)
+        for scan, _ in laser
+    ]
+    assert scans[0].T_first_last is not None
+    registered = follow(scans)
+    assert errors(laser, [r.T_session_base for r in registered]).max() < 0.06
+
+
+def test_a_random_subset_keeps_order_and_repeats():
+    kept = random_subset(1000, 100)
+    assert len(kept) == 100 and (np.diff(kept) > 0).all() and np.array_equal(kept, random_subset(1000, 100))
+    assert len(random_subset(1000, 5000)) == 1000
+
+
+def test_kiss_icp_without_points_returns_the_prediction():
+    kiss = KissRegistration(RegistrationConfig())
+    motion = SE2(0.1, 0.0, 0.05).lift()
+    assert np.allclose(kiss.register(np.zeros((3, 3)), np.eye(4), motion, 0.1), motion)

@@ -1,0 +1,356 @@
+"""What the sensors see, and the recording that is made of it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pc2grid.arrays import F64
+from pc2grid.config import ReadConfig
+from pc2grid.errors import OutputError
+from pc2grid.geometry import transform_points
+from pc2grid.io import open_log
+from pc2grid.io.trajectory import read_tum
+from pc2grid.model import OccupancyGrid, Scan, SensorKind
+from pc2grid.simulate import Session, SimulationConfig, iter_session, prepare_session, simulate_session
+from pc2grid.simulate import session as session_module
+from pc2grid.simulate.config import DepthConfig, DriveConfig, LaserConfig, LidarConfig, OdometryConfig
+from pc2grid.simulate.sensors import depth, laser, lidar
+from pc2grid.simulate.session import EPOCH_NS
+
+SENSORS: tuple[SensorKind, ...] = ("lidar", "laser", "depth")
+DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
+
+
+def brief(**changes: Any) -> SimulationConfig:
+    return SimulationConfig(**{"length_m": 3.0, "clutter": 0, "seed": 5, **changes})
+
+
+def away_from_walls(session: Session, points_m: F64) -> F64:
+    """Distance (N,) of each point in the obstacle band to the nearest occupied cell, metres."""
+    import cv2
+
+    grid = session.grid
+    distance = cv2.distanceTransform((~grid.occupied).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    walls = points_m[(points_m[:, 2] > 0.2) & (points_m[:, 2] < 1.8), :2]
+    cell = grid.to_cell(walls)
+    away: F64 = np.maximum(distance[cell[:, 0], cell[:, 1]] - 0.5, 0) * grid.resolution_m
+    return away
+
+
+def unmoved(session: Session, scan: Scan) -> F64:
+    """Points (N, 3) in the map, each from where the robot truly was when it was taken."""
+    assert scan.offsets_s is not None
+    poses = session.drive.at((scan.stamp_ns - EPOCH_NS) / 1e9 + scan.offsets_s)
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x, y, z = scan.points_m.T
+    return np.column_stack((poses[:, 0] + c * x - s * y, poses[:, 1] + s * x + c * y, z))
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_points_lie_on_the_walls_of_the_plan(sensor: SensorKind) -> None:
+    session = prepare_session(sensor=sensor, config=brief())
+    away = []
+    for scan, T_map_base in session.scans():
+        straight = scan.offsets_s is None
+        points = transform_points(T_map_base.lift(), scan.points_m) if straight else unmoved(session, scan)
+        away.append(away_from_walls(session, points))
+    distances = np.concatenate(away)
+    assert len(distances) > 5000
+    # A cell's half diagonal and two standard deviations; depth noise at 6 m is 5.5 cm.
+    assert np.percentile(distances, 99) < (0.12 if sensor == "depth" else 0.07)
+
+
+@pytest.mark.parametrize("sensor", ["lidar", "laser"])
+def test_motion_distorts_a_scan_and_point_times_undo_it(sensor: SensorKind) -> None:
+    quick = DriveConfig(speed_mps=0.8, yaw_rate_rps=1.0)
+    exact = {"lidar": LidarConfig(noise_m=0), "laser": LaserConfig(noise_m=0)}
+    session = prepare_session(sensor=sensor, config=brief(length_m=8.0, drive=quick, **exact))
+    blurred, sharp = [], []
+    for scan, T_map_base in session.scans():
+        time_s = (scan.stamp_ns - EPOCH_NS) / 1e9
+        turn = np.diff(session.drive.at(np.array([time_s, time_s + 0.1]))[:, 2])[0]
+        if abs(turn) > 0.05:
+            blurred.append(away_from_walls(session, transform_points(T_map_base.lift(), scan.points_m)))
+            sharp.append(away_from_walls(session, unmoved(session, scan)))
+    # Without noise every point is on a wall: within its cell, or on the edge of the next one.
+    assert np.percentile(np.concatenate(sharp), 99.9) < 0.03
+    assert np.mean(np.concatenate(blurred) > 0.05) > 0.03
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_scan_is_as_documented(sensor: SensorKind) -> None:
+    scans = list(iter_session(sensor=sensor, config=brief(length_m=1.0)))
+    stamps = [scan.stamp_ns for scan, _ in scans]
+    assert np.diff(stamps).tolist() == [100_000_000] * (len(scans) - 1)
+    assert stamps[0] == EPOCH_NS
+    scan = scans[-1][0]
+    assert scan.sensor == sensor
+    assert scan.T_odom_base is not None
+    rays = {"lidar": 900 * 16, "laser": 541, "depth": 160 * 120}[sensor]
+    assert len(scan.points_m) + scan.dropped == rays
+    from_sensor = np.linalg.norm(scan.points_m - scan.T_base_sensor[:3, 3], axis=1)
+    low, high, height = {"lidar": (0.4, 60, 0.7), "laser": (0.1, 25, 0.28), "depth": (0.3, 11, 0.6)}[sensor]
+    assert from_sensor.min() > low - 0.01
+    assert from_sensor.max() < high + 0.01
+    assert scan.T_base_sensor[2, 3] == height
+    if sensor == "depth":
+        assert scan.offsets_s is None
+        bearing = np.degrees(np.arctan2(scan.points_m[:, 1], scan.points_m[:, 0] - 0.2))
+        assert np.abs(bearing).max() == pytest.approx(45, abs=1)
+        assert scan.points_m[:, 0].max() < 6.3
+    else:
+        assert scan.offsets_s is not None
+        assert 0 <= scan.offsets_s.min() < scan.offsets_s.max() < 0.1
+    if sensor == "laser":
+        np.testing.assert_allclose(scan.points_m[:, 2], 0.28, atol=1e-6)
+    else:
+        # The floor is seen at its height, nothing below it, and nothing above the ceiling.
+        z = scan.points_m[:, 2]
+        assert np.sum(np.abs(z) < 0.05) > 100
+        assert -0.2 < z.min() < z.max() < 2.7
+
+
+def test_depth_noise_grows_with_the_square_of_depth() -> None:
+    config = DepthConfig(dropout=0.0, edge_dropout=0.0, max_range_m=10)
+    camera = depth(config)
+    rng = np.random.default_rng(0)
+    for true_m in (0.5, 2.0, 5.0):
+        reading = camera.measure(np.full(160 * 120, true_m, np.float32), rng)
+        assert np.std(reading) == pytest.approx(0.001 + 0.0015 * true_m**2, rel=0.05)
+        assert np.mean(reading) == pytest.approx(true_m, abs=0.002)
+        np.testing.assert_allclose(reading * 1000, np.round(reading * 1000), atol=1e-3)
+
+
+def test_depth_is_lost_at_edges_and_out_of_range() -> None:
+    camera = depth(DepthConfig(dropout=0.0, edge_dropout=1.0))
+    scene = np.full((120, 160), 2.0, np.float32)
+    scene[:, 80:] = 4.0
+    scene[0, 0], scene[0, 4], scene[0, 8] = np.inf, 9.0, 0.1
+    reading = camera.measure(scene.ravel(), np.random.default_rng(0)).reshape(scene.shape)
+    assert np.isnan(reading[:, 79:81]).all()
+    assert np.isfinite(reading[2:, :79]).all()
+    assert np.isfinite(reading[2:, 81:]).all()
+    assert np.isnan(reading[0, [0, 4, 8]]).all()
+
+
+@pytest.mark.parametrize("make", [lidar, laser])
+def test_range_noise_dropouts_and_limits(make: Any) -> None:
+    config = LidarConfig(dropout=0.1) if make is lidar else brief().laser.model_copy(update={"dropout": 0.1})
+    sensor = make(config)
+    rng = np.random.default_rng(0)
+    rays = len(sensor.directions)
+    readings = np.concatenate([sensor.measure(np.full(rays, 5.0, np.float32), rng) for _ in range(20)])
+    assert np.nanstd(readings) == pytest.approx(0.02, rel=0.05)
+    assert np.nanmean(readings) == pytest.approx(5.0, abs=0.002)
+    assert np.isnan(readings).mean() == pytest.approx(0.1, abs=0.02)
+    for outside in (np.inf, config.max_range_m + 1, 0.0):
+        assert np.isnan(sensor.measure(np.full(rays, outside, np.float32), rng)).all()
+
+
+def test_sessions_differ_in_clutter_and_route_but_not_in_walls() -> None:
+    one, two = (prepare_session(sensor="laser", config=brief(clutter=20, seed=seed)) for seed in (1, 2))
+    assert np.array_equal(one.grid.cells, two.grid.cells)
+    assert {it.pose for it in one.clutter}.isdisjoint({it.pose for it in two.clutter})
+    assert not np.allclose(one.drive.poses[0], two.drive.poses[0])
+
+
+def test_sensors_of_one_seed_share_drive_and_clutter() -> None:
+    a, b = (prepare_session(sensor=sensor, config=brief(clutter=10)) for sensor in ("lidar", "depth"))
+    assert np.array_equal(a.drive.poses, b.drive.poses)
+    assert [furniture.pose for furniture in a.clutter] == [furniture.pose for furniture in b.clutter]
+
+
+def test_clutter_is_seen() -> None:
+    session = prepare_session(sensor="lidar", config=brief(clutter=120))
+    away = [away_from_walls(session, unmoved(session, scan)) for scan, _ in session.scans()]
+    assert np.mean(np.concatenate(away) > 0.2) > 0.005
+
+
+def test_walkers_are_seen_where_they_walk() -> None:
+    exact = {"lidar": LidarConfig(noise_m=0, dropout=0), "seed": 8}
+    alone = prepare_session(sensor="lidar", config=brief(**exact))
+    among = prepare_session(sensor="lidar", config=brief(**exact, walkers=6))
+    assert np.array_equal(alone.drive.poses, among.drive.poses)
+    seen = 0
+    for a, b in zip(alone.readings(), among.readings(), strict=True):
+        nearer = np.flatnonzero(np.isfinite(b.values_m) & (a.values_m != b.values_m))
+        assert (b.values_m[nearer] < a.values_m[nearer]).all()
+        rays = among.sensor.directions[nearer] * b.values_m[nearer, None]
+        time_s = b.time_s + among.sensor.offsets_s[nearer]
+        T = among.sensor.T_base_sensor
+        points = rays @ T[:3, :3].T + T[:3, 3]
+        pose = among.drive.at(time_s)
+        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        x = pose[:, 0] + c * points[:, 0] - s * points[:, 1]
+        y = pose[:, 1] + s * points[:, 0] + c * points[:, 1]
+        for walker in among.walkers:
+            at = walker.walk.at(time_s)
+            on_it = np.abs(np.hypot(x - at[:, 0], y - at[:, 1]) - walker.radius_m) < 1e-3
+            seen += int(on_it.sum())
+            nearer = nearer[~on_it]
+            x, y, time_s, points = x[~on_it], y[~on_it], time_s[~on_it], points[~on_it]
+        assert len(nearer) == 0
+    assert seen > 500
+
+
+def test_readings_do_not_depend_on_how_rays_are_batched(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = prepare_session(sensor="depth", config=brief(length_m=1.0))
+    together = [reading.values_m for reading in session.readings()]
+    monkeypatch.setattr(session_module, "RAYS_PER_CAST", 1)
+    alone = [reading.values_m for reading in session.readings()]
+    np.testing.assert_array_equal(together, alone)
+
+
+def test_without_odometry_there_is_none() -> None:
+    config = brief(odometry=OdometryConfig(enabled=False))
+    assert all(scan.T_odom_base is None for scan, _ in iter_session(sensor="laser", config=config))
+
+
+# --- recordings ---------------------------------------------------------------------------------------
+
+
+def messages(path: Path) -> list[tuple[str, int, Any]]:
+    """Topic, log time and message, read by the reference decoder."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        return [(channel.topic, m.log_time, ros) for _, channel, m, ros in reader.iter_decoded_messages()]
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_recording_holds_what_the_sensor_measured(tmp_path: Path, sensor: SensorKind) -> None:
+    config = brief(length_m=1.0)
+    shares: list[float] = []
+    made = simulate_session(tmp_path / "out.mcap", sensor=sensor, config=config, progress=shares.append)
+    session = prepare_session(sensor=sensor, config=config)
+    readings = list(session.readings())
+    assert made.scans == len(readings) == len(shares)
+    assert shares[-1] == 1.0
+    log = messages(made.path)
+    topic = {"lidar": "/points", "laser": "/scan", "depth": "/camera/depth/image_rect_raw"}[sensor]
+    recorded = [message for name, _, message in log if name == topic]
+    assert len(recorded) == len(readings)
+    for message, reading in zip(recorded, readings, strict=True):
+        assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == reading.stamp_ns
+        values = reading.values_m
+        if sensor == "laser":
+            np.testing.assert_array_equal(message.ranges, np.where(np.isnan(values), np.inf, values))
+            assert message.angle_max - message.angle_min == pytest.approx(np.radians(270))
+            assert message.time_increment * 720 == pytest.approx(0.1)
+        elif sensor == "depth":
+            image = np.frombuffer(bytes(message.data), "<u2")
+            np.testing.assert_allclose(image / 1000, np.nan_to_num(values), atol=1e-6)
+        else:
+            cloud = np.frombuffer(bytes(message.data), "<f4").reshape(-1, 4)
+            kept = np.isfinite(values)
+            np.testing.assert_allclose(
+                cloud[:, :3], values[kept, None] * session.sensor.directions[kept], atol=1e-5
+            )
+            np.testing.assert_allclose(cloud[:, 3], session.sensor.offsets_s[kept], atol=1e-7)
+    static = [message for name, _, message in log if name == "/tf_static"]
+    assert static[0].transforms[0].child_frame_id == recorded[0].header.frame_id
+    odometry = [time for name, time, _ in log if name == "/odom"]
+    assert np.allclose(np.diff(odometry), 20_000_000)
+    assert odometry[0] <= readings[0].stamp_ns
+    assert odometry[-1] >= readings[-1].stamp_ns
+    truth = read_tum(made.truth_path)
+    assert truth.stamps_ns.tolist() == [reading.stamp_ns for reading in readings]
+    true = session.drive.at(np.array([reading.time_s for reading in readings]))
+    np.testing.assert_allclose(truth.planar()[:, :2], true[:, :2], atol=1e-8)
+    np.testing.assert_allclose(np.cos(truth.planar()[:, 2] - true[:, 2]), 1, atol=1e-8)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_recording_reads_back_as_the_session_in_memory(tmp_path: Path, sensor: SensorKind) -> None:
+    config = brief(length_m=1.0)
+    made = simulate_session(tmp_path / "out.mcap", sensor=sensor, config=config)
+    with open_log(made.path, ReadConfig(depth_stride=1)) as log:
+        read = list(log.scans())
+    memory = [scan for scan, _ in iter_session(sensor=sensor, config=config)]
+    assert [scan.stamp_ns for scan in read] == [scan.stamp_ns for scan in memory]
+    for a, b in zip(read, memory, strict=True):
+        np.testing.assert_allclose(a.points_m, b.points_m, atol=2e-5)
+        np.testing.assert_allclose(a.T_base_sensor, b.T_base_sensor, atol=1e-9)
+        np.testing.assert_allclose(a.T_odom_base, b.T_odom_base, atol=1e-4)
+        assert (a.offsets_s is None) == (b.offsets_s is None)
+        if a.offsets_s is not None:
+            np.testing.assert_allclose(a.offsets_s, b.offsets_s, atol=1e-6)
+            np.testing.assert_allclose(a.T_first_last, b.T_first_last, atol=1e-4)
+
+
+def test_same_seed_same_bytes(tmp_path: Path) -> None:
+    files = {}
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        config = brief(length_m=1.0, clutter=10, seed=seed)
+        made = simulate_session(tmp_path / f"{name}.mcap", sensor="laser", config=config)
+        files[name] = made.path.read_bytes(), made.truth_path.read_bytes()
+    assert files["a"] == files["b"]
+    assert files["a"] != files["c"]
+
+
+def test_recording_without_odometry_has_no_such_topic(tmp_path: Path) -> None:
+    config = brief(length_m=1.0, odometry=OdometryConfig(enabled=False))
+    made = simulate_session(tmp_path / "out.mcap", sensor="laser", config=config)
+    assert {name for name, _, _ in messages(made.path)} == {"/scan", "/tf_static"}
+
+
+def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
+    config = brief(length_m=1.0)
+    (tmp_path / "out.tum").write_text("mine")
+    with pytest.raises(OutputError, match="exists"):
+        simulate_session(tmp_path / "out.mcap", sensor="laser", config=config)
+    assert [path.name for path in tmp_path.iterdir()] == ["out.tum"]
+    made = simulate_session(tmp_path / "out.mcap", sensor="laser", config=config, force=True)
+    assert len(read_tum(made.truth_path)) == made.scans
+
+
+def test_command_line(tmp_path: Path) -> None:
+    import typer
+    from typer.testing import CliRunner
+
+    from pc2grid.io.nav2_map import save_map
+    from pc2grid_cli.simulate import simulate_command
+
+    cells = np.full((120, 160), 100, np.int8)
+    cells[20:100, 20:140] = 0
+    grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-1.0, -2.0))
+    yaml, _ = save_map(grid, tmp_path / "room")
+    app = typer.Typer()
+    app.command()(simulate_command)
+    out = tmp_path / "out.mcap"
+    options = ["--sensor", "laser", "--length", "2", "--clutter", "2", "--start", "1.5", "0.5", "--seed", "4"]
+    ran = CliRunner().invoke(app, [str(yaml), str(out), *options, "--no-odometry"])
+    assert ran.exit_code == 0, ran.output
+    assert "laser scans, 2.0 m" in ran.output
+    x, y, _ = read_tum(tmp_path / "out.tum").planar()[0]
+    assert np.hypot(x - 1.5, y - 0.5) < 0.1
+    assert "/odom" not in {name for name, _, _ in messages(out)}
+    ran = CliRunner().invoke(app, [str(yaml), str(out), *options])
+    assert isinstance(ran.exception, OutputError)
+    assert CliRunner().invoke(app, ["out.txt", *options]).exit_code == 2
+    assert CliRunner().invoke(app, ["a.yaml", "b.yaml", "c.mcap", *options]).exit_code == 2
+    assert CliRunner().invoke(app, [str(out)]).exit_code == 2
+
+
+@pytest.mark.parametrize("name", ["fr079", "intel", "csail", "aces"])
+def test_real_floor_plans_can_be_driven_through(name: str) -> None:
+    from pc2grid.io.nav2_map import load_map
+
+    if not (DATA / "maps" / f"{name}.yaml").exists():
+        pytest.skip(f"no real maps in {DATA}")
+    grid = load_map(DATA / "maps" / f"{name}.yaml")
+    session = prepare_session(sensor="laser", grid=grid, config=brief(length_m=40.0, clutter=30))
+    assert session.drive.length_m == pytest.approx(40, rel=0.02)
+    cell = grid.to_cell(session.drive.poses[:, :2])
+    assert grid.free[cell[:, 0], cell[:, 1]].all()
+    assert len(session.clutter) == 30
+    scan, _ = next(session.scans())
+    assert len(scan.points_m) > 100
+    assert away_from_walls(session, unmoved(session, scan)).mean() < 0.3

@@ -1,0 +1,107 @@
+"""Isovists against hand-made rooms and a slow oracle."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pc2grid.model import UNKNOWN, OccupancyGrid
+from pc2grid.submaps._kernels import cast_rays
+from pc2grid.submaps.isovist import (
+    HIDDEN,
+    OPEN,
+    WALL,
+    cast_rays_plain,
+    isovist,
+    look_around,
+    polygon_mask,
+    visible_submap,
+)
+from tests.helpers.simulated_drives import plan
+
+
+def test_rays_in_a_square_room_end_on_its_walls() -> None:
+    room = plan(6, 6, [])
+    view = isovist(room, (3.0, 3.0), 10.0)
+    assert (view.ends == WALL).all()
+    assert view.ranges_m[0] == view.ranges_m.min() or abs(view.ranges_m[0] - 3.0) < 0.15
+    assert abs(view.ranges_m[45] - 3.0 * math.sqrt(2)) < 0.2
+    assert view.observed == 1.0
+    assert abs(view.area_m2 - 36.0) < 2.5
+
+
+def test_rays_beyond_the_sight_are_open_and_into_the_unknown_hidden() -> None:
+    cells = np.zeros((200, 200), np.int8)
+    cells[:, 150:] = UNKNOWN
+    grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0))
+    view = isovist(grid, (5.0, 5.0), 3.0)
+    assert view.ends[180] == OPEN and abs(view.ranges_m[180] - 3.0) < 0.05
+    assert view.ends[0] == HIDDEN and abs(view.ranges_m[0] - 2.5) < 0.1
+    assert abs(view.observed - (1 - 2 * math.acos(2.5 / 3) / (2 * math.pi))) < 0.03
+
+
+def test_a_few_unobserved_cells_do_not_hide_the_wall_behind_them() -> None:
+    room = plan(6, 6, [])
+    cells = room.cells.copy()
+    cells[:, 80] = UNKNOWN
+    view = isovist(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0)), (3.0, 3.0), 10.0)
+    assert view.ends[0] == WALL and abs(view.ranges_m[0] - 3.0) < 0.15
+
+
+def test_a_visible_submap_hides_the_next_room_and_keeps_the_wall() -> None:
+    rooms = plan(12, 6, [(6, 0, 6, 6)])
+    submap = visible_submap(rooms, isovist(rooms, (3.0, 3.0), 8.0), 7)
+    assert submap.submap_id == 7
+    next_room = submap.grid.to_cell(np.array([[8.0, 3.0], [9.0, 1.0]]))
+    assert (submap.grid.cells[next_room[:, 0], next_room[:, 1]] == UNKNOWN).all()
+    wall = submap.grid.to_cell(np.array([[6.0, 3.0]]))[0]
+    assert submap.grid.occupied[wall[0], wall[1] - 2 : wall[1] + 3].any()
+    assert submap.grid.free.sum() * 0.05**2 > 0.9 * 36 * 0.9
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_what_is_inside_the_polygon_is_seen(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    walls = [(*rng.uniform(0.5, 7.5, 2), *rng.uniform(0.5, 7.5, 2)) for _ in range(4)]
+    room = plan(8, 8, walls)
+    free = room.to_point(np.argwhere(cv2.distanceTransform(room.free.astype(np.uint8), 2, 5) > 6))
+    center = free[rng.integers(len(free))]
+    view = isovist(room, (float(center[0]), float(center[1])), 5.0)
+    inside = np.argwhere(polygon_mask(view, room) & room.free)
+    if not len(inside):
+        return
+    seen = 0
+    sample = inside[rng.integers(len(inside), size=40)]
+    for point in room.to_point(sample):
+        steps = np.linspace(0, 1, 200)[:, None]
+        cells = room.to_cell(center + steps * (point - center))
+        seen += not room.occupied[cells[:, 0], cells[:, 1]].any()
+    assert seen >= 0.9 * len(sample)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000), patience=st.integers(0, 4))
+def test_compiled_rays_are_the_plain_ones(seed: int, patience: int) -> None:
+    rng = np.random.default_rng(seed)
+    cells = rng.choice([UNKNOWN, 0, 100], (80, 120), p=[0.05, 0.94, 0.01]).astype(np.int8)
+    rows, columns = rng.uniform(-2, 82, 30), rng.uniform(-2, 122, 30)
+    compiled = cast_rays(cells, rows, columns, 60.0, 90, patience)
+    plain = cast_rays_plain(cells, rows, columns, 60.0, 90, patience)
+    assert np.array_equal(compiled[0], plain[0]) and np.array_equal(compiled[1], plain[1])
+
+
+def test_looking_around_at_many_points_is_one_isovist_after_the_other() -> None:
+    rng = np.random.default_rng(0)
+    cells = rng.choice([UNKNOWN, 0, 100], (80, 120), p=[0.02, 0.96, 0.02]).astype(np.int8)
+    grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-1.0, 2.0))
+    points = rng.uniform((-1.5, 1.5), (5.5, 6.5), (40, 2))  # some of them beside the grid
+    ranges_m, ends = look_around(grid, points, 3.0, bearings=50)
+    for point, own_ranges_m, own_ends in zip(points.tolist(), ranges_m, ends, strict=True):
+        view = isovist(grid, (point[0], point[1]), 3.0, bearings=50)
+        assert np.array_equal(view.ranges_m, own_ranges_m) and np.array_equal(view.ends, own_ends)
+    assert len(look_around(grid, np.empty((0, 2)), 3.0)[0]) == 0

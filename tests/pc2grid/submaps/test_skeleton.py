@@ -1,0 +1,174 @@
+"""Thinning, clearance, even sampling and the steps along a skeleton (paper III-A)."""
+
+from __future__ import annotations
+
+import networkx as nx
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from pc2grid.submaps.sampling import sample_evenly
+from pc2grid.submaps.skeleton import (
+    _DELETABLE,
+    Thinning,
+    cells_of,
+    clearance_of,
+    junctions_and_ends,
+    pixel_steps,
+    skeleton_of,
+    thin,
+    thin_plain,
+)
+
+EIGHT = np.ones((3, 3))
+
+
+def plain_thinning(mask: np.ndarray, rule: Thinning) -> np.ndarray:
+    """The parallel algorithm as its authors write it: all pixels in every half of every iteration."""
+    image = np.pad(mask, 1).astype(np.uint8)
+    idle, half = 0, 0
+    while idle < 2:
+        ring = [
+            image[:-2, 1:-1], image[:-2, 2:], image[1:-1, 2:], image[2:, 2:],
+            image[2:, 1:-1], image[2:, :-2], image[1:-1, :-2], image[:-2, :-2],
+        ]  # fmt: skip
+        code = sum(pixel.astype(int) << k for k, pixel in enumerate(ring))
+        doomed = (image[1:-1, 1:-1] > 0) & _DELETABLE[rule][half][code]
+        idle = 0 if doomed.any() else idle + 1
+        image[1:-1, 1:-1][doomed] = 0
+        half = 1 - half
+    return np.asarray(image[1:-1, 1:-1] > 0)
+
+
+def blobs(seed: int, size: int = 60) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.asarray(ndimage.gaussian_filter(rng.random((size, size)), rng.uniform(0.3, 3)) > 0.5)
+
+
+@pytest.mark.parametrize("rule", ["guo_hall", "zhang_suen"])
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=15, deadline=None)
+def test_work_lists_give_what_the_parallel_algorithm_gives(rule: Thinning, seed: int) -> None:
+    mask = blobs(seed)
+    expected = plain_thinning(mask, rule)
+    assert np.array_equal(thin(mask, rule), expected)
+    assert np.array_equal(thin_plain(mask, rule), expected)
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=25, deadline=None)
+def test_guo_hall_keeps_components_and_holes(seed: int) -> None:
+    mask = np.pad(blobs(seed), 1)
+    thinned = thin(mask)
+    assert not (thinned & ~mask).any()
+    assert ndimage.label(thinned, EIGHT)[1] == ndimage.label(mask, EIGHT)[1]
+    assert ndimage.label(~thinned)[1] == ndimage.label(~mask)[1]
+
+
+def test_a_thick_line_becomes_its_middle() -> None:
+    mask = np.zeros((21, 60), bool)
+    mask[8:13, 5:55] = True
+    thinned = thin(mask)
+    assert set(np.flatnonzero(thinned.any(axis=1))) == {10}
+    assert thinned.sum() >= 45
+
+
+def test_thinning_of_nothing_and_of_a_single_pixel() -> None:
+    assert not thin(np.zeros((5, 5), bool)).any()
+    single = np.zeros((5, 5), bool)
+    single[0, 4] = True
+    assert np.array_equal(thin(single), single)
+    assert np.array_equal(thin_plain(single), single)
+    assert thin(np.ones((40, 40), bool)).sum() >= 1
+
+
+def test_clearance_is_the_distance_to_the_nearest_cell_that_is_not_free() -> None:
+    free = np.ones((41, 41), bool)
+    free[20, 20] = False
+    clearance = clearance_of(free, 0.05)
+    exact = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * 0.05
+    assert np.abs(clearance - exact).max() <= 0.03 * exact.max()
+
+
+def test_erosion_closes_what_is_narrower_than_twice_the_clearance() -> None:
+    free = np.zeros((41, 81), bool)
+    free[5:36, 3:38] = free[5:36, 43:78] = True
+    free[18:24, 38:43] = True  # a gap of 0.3 m
+    wide = ndimage.label(skeleton_of(free, 0.05, 0.1), EIGHT)[1]
+    narrow = ndimage.label(skeleton_of(free, 0.05, 0.3), EIGHT)[1]
+    assert (wide, narrow) == (1, 2)
+
+
+def junctions(skeleton: np.ndarray) -> np.ndarray:
+    pixels = np.argwhere(skeleton)
+    return pixels[junctions_and_ends(skeleton, pixels)[0]]
+
+
+def ends(skeleton: np.ndarray) -> np.ndarray:
+    pixels = np.argwhere(skeleton)
+    return pixels[junctions_and_ends(skeleton, pixels)[1]]
+
+
+def test_junctions_and_ends_of_a_cross() -> None:
+    cross = np.zeros((31, 31), bool)
+    cross[15, 3:28] = cross[3:28, 15] = True
+    assert [15, 15] in junctions(cross).tolist()
+    assert np.abs(junctions(cross) - 15).max() <= 1
+    assert sorted(ends(cross).tolist()) == [[3, 15], [15, 3], [15, 27], [27, 15]]
+    line = np.zeros((9, 9), bool)
+    np.fill_diagonal(line, True)
+    assert not len(junctions(line))
+
+
+def pixel_graph(skeleton: np.ndarray, resolution_m: float) -> nx.Graph:
+    pixels, steps, lengths = pixel_steps(skeleton)
+    assert np.array_equal(pixels, np.argwhere(skeleton))
+    graph = nx.Graph()
+    for (a, b), length in zip(steps, lengths, strict=True):
+        graph.add_edge(tuple(pixels[a].tolist()), tuple(pixels[b].tolist()), length_m=length * resolution_m)
+    return graph
+
+
+def test_steps_measure_along_the_skeleton() -> None:
+    corner = np.zeros((12, 12), bool)
+    corner[2, 2:9] = corner[2:9, 8] = True
+    graph = pixel_graph(corner, 0.1)
+    # The corner pixel has no short cut across: 6 steps right, 6 down.
+    assert nx.shortest_path_length(graph, (2, 2), (8, 8), "length_m") == pytest.approx(1.2)
+    diagonal = pixel_graph(np.eye(5, dtype=bool), 0.1)
+    assert nx.shortest_path_length(diagonal, (0, 0), (4, 4), "length_m") == pytest.approx(0.4 * 2**0.5)
+
+
+@given(seed=st.integers(0, 10_000), spacing=st.floats(1.0, 12.0))
+@settings(max_examples=25, deadline=None)
+def test_samples_are_apart_and_cover(seed: int, spacing: float) -> None:
+    cells = np.argwhere(np.random.default_rng(seed).random((50, 50)) < 0.1)
+    kept = sample_evenly(cells, spacing)
+    if len(kept) > 1:
+        assert cKDTree(kept).query(kept, k=2)[0][:, 1].min() >= spacing - 1e-6
+    if len(cells):
+        assert cKDTree(kept).query(cells)[0].max() < spacing
+
+
+@given(seed=st.integers(0, 10_000), spacing=st.sampled_from([1.0, 2.0, 3.7, 10.0, 25.0]))
+@settings(max_examples=25, deadline=None)
+def test_sampling_is_greedy_in_the_order_given(seed: int, spacing: float) -> None:
+    cells = np.argwhere(np.random.default_rng(seed).random((60, 60)) < 0.2)
+    kept: list[np.ndarray] = []
+    for cell in cells:
+        if not kept or np.linalg.norm(np.array(kept) - cell, axis=1).min() >= spacing - 1e-9:
+            kept.append(cell)
+    assert np.array_equal(sample_evenly(cells, spacing), kept)
+
+
+def test_sampling_of_nothing() -> None:
+    assert sample_evenly(np.empty((0, 2), np.int64), 2.0).shape == (0, 2)
+
+
+def test_cells_of_is_argwhere() -> None:
+    mask = blobs(3)
+    assert np.array_equal(cells_of(mask), np.argwhere(mask))
+    assert cells_of(np.zeros((4, 0), bool)).shape == (0, 2)

@@ -1,0 +1,139 @@
+"""From a recording to a session map."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pc2grid.config import Config
+from pc2grid.errors import NoScans, TrackingLost
+from pc2grid.geometry import SE2
+from pc2grid.io import open_log
+from pc2grid.io.trajectory import read_tum
+from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, Trajectory
+from pc2grid.observer import Observer
+from pc2grid.pipeline import build_map, check_followed, follow, map_scans
+from pc2grid.simulate import SimulationConfig, prepare_session
+from pc2grid.simulate.session import Session
+from pc2grid.time_span import TimeSpan
+from signature.evaluation.slam_relations import read_relations, relation_error
+
+Mapped = tuple[Session, list[tuple[Scan, SE2]], OccupancyGrid, Trajectory]
+
+DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[2] / ".." / "shared" / "data"))
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="PC2GRID_DATA is not there")
+
+
+class News(Observer):
+    """Keeps all scans and shares of progress."""
+
+    def __init__(self) -> None:
+        self.scans: list[RegisteredScan] = []
+        self.shares: list[float] = []
+
+    def on_scan(self, registered: RegisteredScan) -> None:
+        self.scans.append(registered)
+
+    def on_progress(self, share: float) -> None:
+        self.shares.append(share)
+
+
+def ate_m(positions: np.ndarray, truth: np.ndarray) -> float:
+    """RMS distance (N, D) after the best rigid alignment."""
+    a, b = positions - positions.mean(axis=0), truth - truth.mean(axis=0)
+    U, _, Vt = np.linalg.svd(b.T @ a)
+    fix = np.ones(a.shape[1])
+    fix[-1] = np.sign(np.linalg.det(U @ Vt))
+    return float(np.sqrt((((a @ (U @ np.diag(fix) @ Vt).T) - b) ** 2).sum(axis=1).mean()))
+
+
+def test_a_laser_that_is_lost_too_often_gives_no_map() -> None:
+    def trajectory(lost: int) -> Trajectory:
+        health = [Health.FINE] * (10 - lost) + [Health.LOST] * lost
+        return Trajectory(
+            stamps_ns=np.arange(10) * 10**9,
+            T_session_base=np.tile(np.eye(4), (10, 1, 1)),
+            health=tuple(health),
+        )
+
+    check_followed(trajectory(2), "log")
+    with pytest.raises(TrackingLost, match=r"log: 3 of 10 scans .* first 7\.0 s after .* no odometry"):
+        check_followed(trajectory(3), "log")
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return prepare_session(sensor="laser", config=SimulationConfig(length_m=20.0, seed=6, clutter=10))
+
+
+@pytest.fixture(scope="module")
+def mapped(session: Session) -> Mapped:
+    pairs = list(session.scans())
+    news = News()
+    grid, trajectory, _ = map_scans((scan for scan, _ in pairs), Config(), news)
+    assert [registered.scan.stamp_ns for registered in news.scans] == trajectory.stamps_ns.tolist()
+    return session, pairs, grid, trajectory
+
+
+def test_trajectory_and_grid_agree_with_the_true_plan(mapped: Mapped) -> None:
+    session, pairs, grid, trajectory = mapped
+    truth = np.array([(p.x, p.y) for _, p in pairs])
+    assert ate_m(trajectory.planar()[:, :2], truth) < 0.05
+    first = pairs[0][1]
+    rows, columns = np.nonzero(grid.free)
+    inside = session.grid.to_cell(first.apply(grid.to_point(np.column_stack((rows, columns)))))
+    walls_called_free = session.grid.occupied[inside[:, 0], inside[:, 1]].mean()
+    assert walls_called_free < 0.02
+    assert grid.free.sum() * grid.resolution_m**2 > 20.0
+    assert (grid.cells == -1).any()
+
+
+def test_the_robot_drove_through_free_cells(mapped: Mapped) -> None:
+    _, _, grid, trajectory = mapped
+    cells = grid.to_cell(trajectory.planar()[:, :2])
+    assert grid.free[cells[:, 0], cells[:, 1]].mean() >= 0.99
+
+
+def test_follow_streams_one_planar_scan_a_scan(session: Session) -> None:
+    pairs = [pair for pair, _ in zip(session.scans(), range(5), strict=False)]
+    followed = list(follow((scan for scan, _ in pairs), Config()))
+    assert [planar_scan.stamp_ns for _, planar_scan in followed] == [scan.stamp_ns for scan, _ in pairs]
+    assert all(registered.health is Health.FINE for registered, _ in followed)
+
+
+def test_no_scans_no_trajectory() -> None:
+    grid, trajectory, loops = map_scans(iter(()), Config())
+    assert grid.cells.size == 0 and len(trajectory) == 0 and loops == ()
+
+
+@needs_data
+def test_the_hall_with_its_turns_of_forty_degrees() -> None:
+    with open_log(DATA / "lidar" / "hall.mcap") as log:
+        built = build_map(log, Config(), session="hall")
+    truth = read_tum(DATA / "lidar" / "hall.tum")
+    index = [int(np.argmin(np.abs(built.trajectory.stamps_ns - stamp))) for stamp in truth.stamps_ns]
+    assert ate_m(built.trajectory.T_session_base[index, :3, 3], truth.T_session_base[:, :3, 3]) < 0.03
+    assert built.submaps and not built.report.scans_skipped
+    assert built.consistency is not None and not built.consistency.bent
+
+
+@needs_data
+def test_a_minute_of_fr079_meets_the_benchmark() -> None:
+    with open_log(DATA / "laser" / "fr079.mcap") as log:
+        news = News()
+        built = build_map(log, Config(), session="fr079", span=TimeSpan(0.0, 60.0), observer=news)
+    error = relation_error(
+        built.trajectory, read_relations(DATA / "laser" / "fr079.relations"), base_to_reference_m=(0.04, 0.0)
+    )
+    assert error.used > 20 and error.translation_m < 0.056 and error.rotation_deg < 1.0
+    assert news.shares == sorted(news.shares) and news.shares[-1] == 1.0
+    assert built.trajectory.T_session_base[0] == pytest.approx(np.eye(4), abs=1e-9)
+
+
+@needs_data
+def test_a_part_without_scans_is_an_error() -> None:
+    with open_log(DATA / "laser" / "fr079.mcap") as log, pytest.raises(NoScans):
+        build_map(log, Config(), session="nothing", span=TimeSpan(10_000.0, 5.0))

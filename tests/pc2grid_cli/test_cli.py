@@ -1,0 +1,306 @@
+"""The program as a user meets it: exit codes, one-line errors, nothing left behind, a quick --help."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pc2grid.io.nav2_map import save_map
+from pc2grid.model import OccupancyGrid
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def pc2grid(*arguments: object, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        env={
+            **os.environ,
+            "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}",
+            "PC2GRID_CONFIG": "",
+            "PC2GRID_DEBUG": "",
+            "COLUMNS": "200",
+            **environment,
+        },
+    )
+
+
+@pytest.fixture(scope="module")
+def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the map of a small house and a laser recording made in it."""
+    folder = tmp_path_factory.mktemp("house")
+    cells = np.full((180, 240), 0, np.int8)
+    cells[:3], cells[-3:], cells[:, :3], cells[:, -3:] = 100, 100, 100, 100
+    cells[88:91, :100], cells[88:91, 120:], cells[:60, 150:153], cells[120:, 80:83] = 100, 100, 100, 100
+    cells[30:40, 30:50], cells[140:150, 180:186] = 100, 100
+    save_map(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-2.0, -3.0)), folder / "house")
+    made = pc2grid(
+        "simulate",
+        "house.yaml",
+        "drive.mcap",
+        "--sensor",
+        "laser",
+        "--length",
+        "14",
+        "--seed",
+        "5",
+        "--clutter",
+        "0",
+        cwd=folder,
+    )
+    assert made.returncode == 0, made.stderr
+    return folder
+
+
+def assert_says(result: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
+    """One line of error, perhaps one of advice, nothing on stdout, no traceback."""
+    assert result.returncode == code, result.stderr
+    assert result.stdout == ""
+    lines = [line for line in result.stderr.splitlines() if not line.startswith("pc2grid: warning")]
+    assert lines[0].startswith("pc2grid: error: "), result.stderr
+    assert len(lines) <= 2
+    assert all(line.startswith("hint: ") for line in lines[1:])
+    for word in words:
+        assert word in result.stderr, result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        ("convert none.mcap -o x.submaps", 1, ["none.mcap"]),
+        ("convert text.mcap -o x.submaps", 1, ["text.mcap"]),
+        ("convert empty.mcap -o x.submaps", 1, ["empty.mcap", "empty"]),
+        ("convert . -o x.submaps", 1, ["."]),
+        ("convert none.yaml -o x.submaps", 1, ["none.yaml"]),
+        ("convert bad.yaml -o x.submaps", 1, ["bad.yaml", "image"]),
+        ("convert house.yaml -o missing/x.submaps", 1, ["no folder missing"]),
+        ("convert house.yaml house.yaml -o x.submaps", 2, ["'house'"]),
+        ("convert drive.mcap -o x.submaps --topic /scam", 1, ["/scam", "/scan"]),
+        ("convert drive.mcap -o x.submaps --start 1e6", 1, ["no scan", "the log lasts"]),
+        ("convert drive.mcap -o x.submaps --set partition.radios_m=5", 2, ["partition.radius_m"]),
+        ("convert drive.mcap -o x.submaps --set partition.radius_m=-5", 2, ["partition.radius_m", "greater"]),
+        ("convert drive.mcap -o x.submaps --set radius_m", 2, ["section.key=value"]),
+        ("convert drive.mcap -o x.submaps --config none.toml", 2, ["none.toml", "no such file"]),
+        ("convert drive.mcap -o x.submaps --config text.mcap", 2, ["text.mcap", "not TOML"]),
+        ("convert drive.mcap -o taken.submaps", 1, ["taken.submaps", "exists", "--force"]),
+        ("convert drive.mcap -o house.pgm", 1, ["house.pgm", "house.submaps"]),
+        ("convert", 2, ["--help"]),
+        ("convert drive.mcap", 2, ["output"]),
+        ("nonsense", 2, ["nonsense"]),
+        ("relocalize drive.mcap --database none.submaps", 1, ["none.submaps", "pc2grid convert"]),
+        ("relocalize drive.mcap --database text.mcap", 1, ["text.mcap", "not a pc2grid database"]),
+        ("relocalize drive.mcap --database empty.mcap", 1, ["empty.mcap", "empty file"]),
+        ("relocalize drive.mcap --database mongodb://h/d", 1, ["mongodb://"]),
+        ("export none.submaps --map m", 1, ["none.submaps"]),
+        ("export none.submaps", 2, ["nothing to export"]),
+        ("db check text.mcap", 1, ["not a pc2grid database"]),
+        ("db info .", 1, ["folder"]),
+        ("db merge none.submaps -o y.submaps", 1, ["none.submaps"]),
+        ("db copy none.submaps -o y.submaps", 1, ["none.submaps"]),
+    ],
+)
+def test_wrong_input_is_one_line_and_leaves_nothing(
+    house: Path, arguments: str, code: int, words: list[str]
+) -> None:
+    (house / "text.mcap").write_text("this is not a recording, nor = [ TOML\n")
+    (house / "empty.mcap").write_bytes(b"")
+    (house / "taken.submaps").write_text("something else\n")
+    (house / "bad.yaml").write_text("resolution: 0.05\norigin: [0, 0, 0]\n")
+    before = sorted(house.iterdir())
+    assert_says(pc2grid(*arguments.split(), cwd=house), code, *words)
+    assert sorted(house.iterdir()) == before
+
+
+def test_map_and_recording_become_databases_and_the_recording_is_found(house: Path, tmp_path: Path) -> None:
+    database = tmp_path / "b.submaps"
+    made = pc2grid("convert", house / "house.yaml", "-o", database, "--json", cwd=tmp_path)
+    assert made.returncode == 0, made.stderr
+    document = json.loads(made.stdout)
+    assert document["sessions"][0]["sensor"] == "map"
+    assert document["sessions"][0]["submaps"] > 0
+
+    before = database.read_bytes()
+    found = pc2grid(
+        "relocalize", house / "drive.mcap", "--database", database, "--json",
+        "--trajectory", "q.tum", "--output", "q.mcap", "--plot", "q.png", cwd=tmp_path,
+    )  # fmt: skip
+    assert found.returncode in (0, 4), found.stderr
+    answer = json.loads(found.stdout)
+    assert set(answer) >= {
+        "schema_version", "status", "pose", "T_map_odom", "confidence", "hypotheses", "history",
+        "query", "database", "timing_ms",
+    }  # fmt: skip
+    assert (answer["status"] == "located") == (found.returncode == 0) == (answer["pose"] is not None)
+    assert (tmp_path / "q.png").read_bytes().startswith(b"\x89PNG")
+    truth = np.loadtxt(house / "drive.tum")[-1]
+    best = answer["pose"] or answer["hypotheses"][0]
+    assert np.hypot(best["x"] - truth[1], best["y"] - truth[2]) < 0.5
+    if answer["status"] == "located":
+        poses = np.loadtxt(tmp_path / "q.tum")
+        assert np.hypot(*(poses[-1, 1:3] - [best["x"], best["y"]])) < 1e-6
+        assert (tmp_path / "q.mcap").stat().st_size > 0
+    assert database.read_bytes() == before
+    assert_says(pc2grid("convert", house / "house.yaml", "-o", database, cwd=tmp_path), 1, "--force", "--add")
+    assert database.read_bytes() == before
+
+
+def test_convert_export_add_and_check(house: Path, tmp_path: Path) -> None:
+    made = pc2grid("convert", house / "drive.mcap", "-o", "d.submaps", cwd=tmp_path)
+    assert made.returncode == 0, made.stderr
+    assert "drive: " in made.stdout
+    again = pc2grid("convert", house / "drive.mcap", "-o", "e.submaps", cwd=tmp_path)
+    assert again.returncode == 0
+    assert (tmp_path / "d.submaps").read_bytes() == (tmp_path / "e.submaps").read_bytes()
+
+    assert pc2grid("db", "check", "d.submaps", cwd=tmp_path).stdout == "d.submaps: sound\n"
+    info = json.loads(pc2grid("db", "info", "d.submaps", "--json", cwd=tmp_path).stdout)
+    assert info["sessions"][0]["sensor"] == "laser"
+    out = pc2grid(
+        "export",
+        "d.submaps",
+        "--map",
+        "m",
+        "--trajectory",
+        "t.tum",
+        "--mcap",
+        "o.mcap",
+        "--plot",
+        "p.png",
+        cwd=tmp_path,
+    )
+    assert out.returncode == 0, out.stderr
+    assert {p.name for p in tmp_path.iterdir()} >= {"m.yaml", "m.pgm", "t.tum", "o.mcap", "p.png"}
+    assert len(np.loadtxt(tmp_path / "t.tum")) == info["sessions"][0]["scans"]
+    assert_says(pc2grid("export", "d.submaps", "--map", "m", cwd=tmp_path), 1, "m.yaml", "--force")
+
+    added = pc2grid("convert", tmp_path / "m.yaml", "-o", "d.submaps", "--add", cwd=tmp_path)
+    assert added.returncode == 0, added.stderr
+    assert pc2grid("db", "info", "d.submaps", cwd=tmp_path).stdout.startswith("d.submaps: 2 sessions")
+    assert_says(pc2grid("export", "d.submaps", "--map", "n", cwd=tmp_path), 1, "drive, m", "--session")
+
+    data = bytearray((tmp_path / "e.submaps").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "e.submaps").write_bytes(data)
+    checked = pc2grid("db", "check", "e.submaps", cwd=tmp_path)
+    assert checked.returncode == 1
+    assert "checksum" in checked.stdout or "malformed" in checked.stdout
+
+
+def test_a_map_without_free_space_is_stored_with_a_warning(tmp_path: Path) -> None:
+    cells = np.full((40, 40), 100, np.int8)
+    save_map(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0)), tmp_path / "rock")
+    made = pc2grid("convert", "rock.yaml", "-o", "rock.submaps", cwd=tmp_path)
+    assert made.returncode == 0, made.stderr
+    assert "0 submaps" in made.stdout
+    assert "warning: rock: no free space" in made.stderr
+
+
+def test_truncated_recording_needs_recover_and_gives_exit_3(house: Path, tmp_path: Path) -> None:
+    data = (house / "drive.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: int(len(data) * 0.7)])
+    assert_says(pc2grid("convert", "cut.mcap", "-o", "c.submaps", cwd=tmp_path), 1, "cut.mcap", "--recover")
+    assert [p.name for p in tmp_path.iterdir()] == ["cut.mcap"]
+    saved = pc2grid("convert", "cut.mcap", "-o", "c.submaps", "--recover", cwd=tmp_path)
+    assert saved.returncode == 3, saved.stderr
+    assert "warning" in saved.stderr
+    assert pc2grid("db", "check", "c.submaps", cwd=tmp_path).returncode == 0
+
+
+def test_config_dump_reads_back_and_flags_win(house: Path, tmp_path: Path) -> None:
+    dumped = pc2grid("config", "dump", "--set", "partition.radius_m=5.5", cwd=tmp_path)
+    assert dumped.returncode == 0
+    (tmp_path / "mine.toml").write_text(dumped.stdout)
+    again = pc2grid("config", "dump", "--config", "mine.toml", cwd=tmp_path)
+    assert again.stdout == dumped.stdout
+    assert "radius_m = 5.5" in again.stdout
+    from_environment = pc2grid("config", "dump", cwd=tmp_path, PC2GRID_CONFIG="mine.toml")
+    assert from_environment.stdout == dumped.stdout
+    flags = pc2grid(
+        "config", "dump", "--config", "mine.toml", "--set", "partition.radius_m=6.5", cwd=tmp_path
+    )
+    assert "radius_m = 6.5" in flags.stdout
+
+
+def test_debug_shows_the_traceback(tmp_path: Path) -> None:
+    shown = pc2grid("--debug", "db", "info", "none.submaps", cwd=tmp_path)
+    assert shown.returncode == 1
+    assert "Traceback" in shown.stderr
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interrupted_convert_leaves_nothing(house: Path, tmp_path: Path, number: int, code: int) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from pc2grid_cli.main import main; main()", "convert",
+         str(house / "drive.mcap"), "-o", "x.submaps"],
+        cwd=tmp_path, stderr=subprocess.PIPE, text=True,
+        # A shell that runs the tests in the background lets its children ignore Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"},
+    )  # fmt: skip
+    time.sleep(1.0)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == code, said
+    assert "Traceback" not in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_closed_pipe_is_quiet(tmp_path: Path) -> None:
+    command = f'"{sys.executable}" -c "from pc2grid_cli.main import main; main()" config dump | true'
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}", "PC2GRID_CONFIG": ""}
+    done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, text=True, env=environment)
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["", "demo", "simulate", "info", "convert", "relocalize", "compare", "compare paper", "compare sensors",
+     "export", "db", "db info", "db check", "db merge", "db copy", "config", "config dump"],
+)  # fmt: skip
+def test_every_command_explains_itself(tmp_path: Path, command: str) -> None:
+    shown = pc2grid(*command.split(), "--help", cwd=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    assert f"Usage: pc2grid {command}".rstrip() in shown.stdout
+
+
+def test_help_loads_nothing_heavy(tmp_path: Path) -> None:
+    heavy = ("numpy", "scipy", "cv2", "open3d", "kiss_icp", "matplotlib", "pydantic", "numba", "networkx")
+    code = (
+        f"import sys\nfrom pc2grid_cli import main\nprint([name for name in {heavy} if name in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"},
+    )  # fmt: skip
+    assert done.stdout == "[]\n", done.stdout + done.stderr
+
+
+def test_help_takes_little_longer_than_typer_itself(tmp_path: Path) -> None:
+    """A ratio, because machines differ: against Python that starts and loads typer, interleaved."""
+
+    def seconds(code: str) -> float:
+        begin = time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-c", code, "--help"], capture_output=True, check=True,
+            env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"},
+        )  # fmt: skip
+        return time.perf_counter() - begin
+
+    pairs = [
+        (seconds("from pc2grid_cli.main import main; main()"), seconds("import typer, typer.main"))
+        for _ in range(7)
+    ]
+    assert statistics.median(ours / bare for ours, bare in pairs) < 4.0

@@ -1,0 +1,132 @@
+"""`pc2grid compare paper`: cells, resuming, tables, JSON, pictures."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from pc2grid.errors import ConfigError, MapFileError
+from pc2grid.io.nav2_map import save_map
+from pc2grid_cli import console
+from pc2grid_cli.compare_paper import compare_paper_command
+from pc2grid_cli.json_schemas import schema
+from pc2grid_cli.paper_report import published, verdicts
+from signature.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES
+from signature.evaluation.paper_tables import MAPS, TABLE_3, TABLE_4
+from signature.evaluation.paper_task import load_result, paper_tasks, run_task
+from tests.helpers.rooms import cross, grid_of, l_shape, rectangle
+
+app = typer.Typer()
+app.command()(compare_paper_command)
+runner = CliRunner()
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("maps")
+    save_map(grid_of(np.hstack([cross(6.0, 2.0), rectangle(8.0, 5.0), l_shape()])), folder / "intel")
+    return folder
+
+
+def test_published_tables_are_whole() -> None:
+    assert all(set(row) == set(MAPS) for level in TABLE_3 for row in level.values())
+    assert [len(level) for level in TABLE_3] == [7, 7, 7]
+    # The row for 8 m of Table IV is the proposed method's row at noise level 1 of Table III.
+    assert TABLE_4[8] == TABLE_3[1]["proposed"]
+    assert TABLE_3[2]["sdf"]["killian"] == (0.531, 0.218, 0.456)
+
+
+def test_published_f1_shows_what_recall_is_of() -> None:
+    """With recall of all queries AUC could not exceed the true share, nor F1 fall below it; it does."""
+    cells = [cell for level in TABLE_3 for row in level.values() for cell in row.values()]
+    assert sum(cell.auc > cell.f1 for cell in cells) > len(cells) / 2
+
+
+def test_a_run_writes_its_cells_and_the_next_one_only_reads_them(
+    maps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console, "_LINE_EVERY_S", 0.0)
+    arguments = ["--maps", str(maps), "--out", str(tmp_path), "--queries", "4", "--jobs", "1"]
+    arguments += ["--offset", "0.5", "--methods", "proposed", "--methods", "shape_context"]
+    first = runner.invoke(app, [*arguments, "--json"])
+    assert first.exit_code == 0, first.output
+    assert re.search(r"^pc2grid: \d+ cells of the tables: \d+%", first.stderr, re.MULTILINE)
+    document = json.loads(first.stdout)
+    jsonschema.validate(document, schema("compare-paper"))
+    assert len(document["cells"]) == 8  # 2 methods x 3 levels, and 2 radii
+    assert {cell["paper_auc"] for cell in document["cells"] if cell["radius_m"] == 6.0} == {0.935}
+    assert json.loads((tmp_path / "results.json").read_text()) == document
+    assert len(list(csv.DictReader((tmp_path / "results.csv").open()))) == 8
+    for name in ("figure-9-offset-0.5.png", "figure-10-offset-0.5.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+    written = {path: path.stat().st_mtime_ns for path in (tmp_path / "cells").iterdir()}
+    second = runner.invoke(app, arguments)
+    assert second.exit_code == 0, second.output
+    assert written == {path: path.stat().st_mtime_ns for path in (tmp_path / "cells").iterdir()}
+    assert "Table III, AUC" in second.stdout and "Table IV" in second.stdout
+    assert "AUC within 0.03" in second.stdout
+
+
+def test_a_damaged_or_outdated_cell_is_run_again(maps: Path, tmp_path: Path) -> None:
+    task = next(iter(paper_tasks([maps / "intel.yaml"], methods=["proposed"], queries=2)))
+    run_task(task, tmp_path)
+    result = load_result(task, "proposed", tmp_path)
+    assert result is not None and 0.0 <= result.auc <= 1.0
+    path = task.result_path(tmp_path, "proposed")
+    whole = path.read_text()
+    path.write_text(whole[: len(whole) // 2])
+    assert load_result(task, "proposed", tmp_path) is None
+    run_task(task, tmp_path)
+    again = load_result(task, "proposed", tmp_path)
+    assert again is not None and np.array_equal(again.matches.similarity, result.matches.similarity)
+    path.write_text(whole.replace('"fingerprint": "', '"fingerprint": "0'))
+    assert load_result(task, "proposed", tmp_path) is None
+
+
+def test_open_choices_change_the_proposed_method_only(maps: Path) -> None:
+    tasks = list(paper_tasks([maps / "intel.yaml"], methods=["proposed", "sdf"], open_choices=True))
+    changed = [task for task in tasks if task.overrides]
+    assert changed and all(task.methods == ("proposed",) for task in changed)
+    paths = [task.result_path(Path(), method) for task in tasks for method in task.methods]
+    assert len(set(paths)) == len(paths)
+
+
+def test_verdicts_and_published_cells(maps: Path, tmp_path: Path) -> None:
+    task = next(iter(paper_tasks([maps / "intel.yaml"], methods=["proposed"], queries=2)))
+    run_task(task, tmp_path)
+    result = load_result(task, "proposed", tmp_path)
+    assert result is not None
+    assert published(result) == TABLE_3[0]["proposed"]["intel"]
+    lines = verdicts([result])
+    near = abs(result.auc - 0.965) <= 0.03
+    assert f"on {int(near)} (" in lines[0]
+    assert "intel proposed" in lines[1]
+
+
+@pytest.mark.parametrize(
+    ("options", "kind", "words"),
+    [
+        (["--methods", "orb"], ConfigError, "orb"),
+        (["--offset", "-1"], ConfigError, "above 0"),
+        (["--maps", "."], MapFileError, "none of the paper's maps"),
+    ],
+)
+def test_wrong_arguments_say_what_is_wrong(
+    options: list[str], kind: type[Exception], words: str, maps: Path, tmp_path: Path
+) -> None:
+    error = runner.invoke(app, ["--maps", str(maps), "--out", str(tmp_path), *options]).exception
+    assert isinstance(error, kind) and words in str(error)
+
+
+@pytest.mark.parametrize("method", METHOD_NAMES + EXTRA_METHOD_NAMES)
+def test_every_method_that_can_be_asked_for_is_run(method: str) -> None:
+    tasks = list(paper_tasks([Path("intel.yaml")], methods=[method], offsets_m=[1.0]))
+    assert {m for task in tasks for m in task.methods} == {method}

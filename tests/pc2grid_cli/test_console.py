@@ -1,0 +1,231 @@
+"""What a terminal sees, and what a pipe sees."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import pc2grid
+from pc2grid.io.nav2_map import save_map
+from pc2grid_cli import console, main
+from tests.helpers.simulated_drives import office
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def on_a_terminal(code: str, *arguments: str, **environment: str) -> str:
+    """What a program writes to a terminal that is its stdout and stderr."""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stdin=theirs, stdout=theirs, stderr=theirs,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}", "TERM": "xterm-256color",
+             "COLUMNS": "100", **environment},
+    )  # fmt: skip
+    os.close(theirs)
+    seen = b""
+    while True:
+        try:
+            part = os.read(ours, 65536)
+        except OSError:  # Linux: the other end is closed
+            break
+        if not part:
+            break
+        seen += part
+    assert process.wait(timeout=60) == 0, seen
+    os.close(ours)
+    return seen.decode()
+
+
+PROGRAM = "from pc2grid_cli.main import main; main()"
+WORKING = """
+import time, types
+from pc2grid_cli import console
+begin, real = time.monotonic(), time.monotonic
+console.time = types.SimpleNamespace(monotonic=lambda: 20 * (real() - begin))  # a clock in a hurry
+with console.Console().progress("work", 100.0) as update:
+    for tenth in range(11):
+        time.sleep(0.06)
+        update(tenth / 10)
+"""
+COLOUR = re.compile(r"\x1b\[[0-9;]*(?:3[0-7]|38;|9[0-7])[0-9;]*m")
+
+
+def test_a_terminal_gets_colours_unless_no_color_is_set() -> None:
+    assert "\x1b[" in on_a_terminal(PROGRAM, "--help", NO_COLOR="")
+    assert "\x1b[" not in on_a_terminal(PROGRAM, "--help", NO_COLOR="1")
+
+
+def test_a_terminal_gets_a_bar_with_rate_and_time_left() -> None:
+    seen = on_a_terminal(WORKING, NO_COLOR="")
+    assert COLOUR.search(seen)
+    assert re.search(r"\d+%", seen) and "x real time" in seen and re.search(r"\d s left", seen)
+    plain = on_a_terminal(WORKING, NO_COLOR="1")
+    assert not COLOUR.search(plain) and "x real time" in plain
+
+
+def test_a_pipe_gets_a_line_every_ten_seconds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(console.time, "monotonic", lambda: now)
+    with console.Console().progress("map a.mcap", 300.0) as update:
+        for second in range(26):
+            now = 100.0 + second
+            update(second / 50)
+    assert capsys.readouterr().err.splitlines() == [
+        "pc2grid: map a.mcap: 20%, 6.0x real time, 40 s left",
+        "pc2grid: map a.mcap: 40%, 6.0x real time, 30 s left",
+    ]
+
+
+def said(
+    shares: dict[float, float], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> list[str]:
+    """What a pipe gets to read if at these seconds so much is done."""
+    clock = [0.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
+    with console.Console().progress("map", 300.0) as update:
+        for second, share in shares.items():
+            clock[0] = second
+            update(share)
+    return capsys.readouterr().err.splitlines()
+
+
+def test_nothing_is_said_of_the_time_left_before_it_can_be_known(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither at a few per mille, nor from the start, which includes what has to be made ready first."""
+    assert said({0: 0.0, 10: 0.0007, 20: 0.02, 30: 0.04}, monkeypatch, capsys) == [
+        "pc2grid: map: 0%",
+        "pc2grid: map: 2%",
+        "pc2grid: map: 4%, 0.4x real time, 12 min 0 s left",
+    ]
+    assert said({40: 0.2, 41: 0.21, 50: 0.4}, monkeypatch, capsys) == [
+        "pc2grid: map: 20%",
+        "pc2grid: map: 40%, 6.0x real time, 30 s left",
+    ]
+    # A jump within a second is no pace.
+    assert said({9: 0.0, 10: 0.5}, monkeypatch, capsys) == ["pc2grid: map: 50%"]
+
+
+def test_the_time_left_never_goes_up(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert said({0: 0.0, 10: 0.5, 20: 0.52, 30: 0.9}, monkeypatch, capsys) == [
+        "pc2grid: map: 50%, 15.0x real time, 10 s left",
+        "pc2grid: map: 52%, 7.8x real time, 10 s left",
+        "pc2grid: map: 90%, 9.0x real time, 3 s left",
+    ]
+
+
+def terminal_of(monkeypatch: pytest.MonkeyPatch, *words: str) -> console.Console:
+    """The console of a run of the program with these words."""
+    ran: list[console.Console] = []
+    plain = console.Console.run
+
+    def run(self: console.Console, command: Callable[[], Any]) -> int:
+        ran.append(self)
+        return plain(self, command)
+
+    monkeypatch.setattr(sys, "argv", ["pc2grid", *words])
+    monkeypatch.setattr(console.Console, "run", run)
+    with pytest.raises(SystemExit) as end:
+        main.main()
+    assert end.value.code == 0
+    return ran[-1]
+
+
+@pytest.mark.parametrize(
+    "words", [["-q", "config", "schema"], ["config", "-q", "schema"], ["config", "schema", "--quiet"]]
+)
+def test_global_options_may_stand_behind_the_command(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    terminal = terminal_of(monkeypatch, *words)
+    assert terminal.quiet
+    with terminal.progress("quiet") as update:
+        update(0.5)
+    terminal.note("nothing")
+    assert capsys.readouterr().err == ""
+
+
+def test_global_options_add_up(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    terminal = terminal_of(monkeypatch, "-v", "config", "-vv", "schema", "--verbose", "--debug")
+    assert (terminal.verbose, terminal.quiet, terminal.debug) == (4, False, True)
+    assert terminal_of(monkeypatch, "-vvv", "config", "schema").verbose == 3
+
+
+@pytest.mark.parametrize("name", ["-q", "--debug", "--rerun", "-v"])
+def test_a_value_that_looks_like_an_option_stays_a_value(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_map(office(), tmp_path / "office")
+    monkeypatch.chdir(tmp_path)
+    terminal = terminal_of(monkeypatch, "convert", "office.yaml", "--name", name, "-o", "office.submaps")
+    assert (terminal.verbose, terminal.quiet, terminal.debug) == (0, False, False)
+    assert capsys.readouterr().out.startswith(f"{name}: ")
+
+
+def test_words_behind_two_dashes_are_no_options(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pc2grid", "info", "--", "-q"])
+    with pytest.raises(SystemExit) as end:
+        main.main()
+    assert end.value.code == 1
+    assert "-q: no such file" in capsys.readouterr().err
+
+
+def test_compiling_is_noted_once(capsys: pytest.CaptureFixture[str]) -> None:
+    import numba
+
+    terminal = console.Console()
+    for _ in range(2):
+        with terminal.observer().step("work"):
+            assert numba.njit(lambda x: x + 1)(1) == 2
+            assert numba.njit(lambda x: x + 2)(1) == 3
+    assert capsys.readouterr().err.count("compiling, once") == 1
+
+
+def test_the_version_needs_no_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pc2grid", "--version"])
+    with pytest.raises(SystemExit) as end:
+        main.main()
+    assert end.value.code == 0
+    assert capsys.readouterr() == (f"pc2grid {pc2grid.__version__}\n", "")
+
+
+@pytest.mark.parametrize("words", [[], ["config"], ["db"]])
+def test_a_group_alone_shows_its_help(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pc2grid", *words])
+    with pytest.raises(SystemExit) as end:
+        main.main()
+    assert end.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == "" and "pc2grid: error" not in err
+    assert f"Usage: {' '.join(['pc2grid', *words])} [OPTIONS] COMMAND" in err and "Commands:" in err
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion(shell: str) -> None:
+    environment = {
+        "_PC2GRID_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_ARGS": "pc2grid reloc",
+        "_TYPER_COMPLETE_FISH_ACTION": "get-args", "COMP_WORDS": "pc2grid reloc", "COMP_CWORD": "1",
+    }  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}", **environment},
+    )  # fmt: skip
+    assert "relocalize" in done.stdout

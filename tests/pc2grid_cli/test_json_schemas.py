@@ -1,0 +1,142 @@
+"""What --json prints is what its published schema says, and every command has an example."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from pc2grid.io.nav2_map import save_map
+from pc2grid.settings import dump_settings
+from pc2grid_cli.console import print_json
+from pc2grid_cli.json_schemas import DOCUMENTS, schema
+from pc2grid_cli.main import app
+from signature.config import Config
+from tests.helpers.json_schema import closed
+from tests.helpers.simulated_drives import cut, office
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """office.yaml with its database b.submaps, part.yaml of it, and a laser's metre in the office."""
+    folder = tmp_path_factory.mktemp("documents")
+    save_map(office(), folder / "office")
+    save_map(cut(office(), 4.0, 3.0, 15.0, 12.0), folder / "part")
+    laser = ("--sensor", "laser", "--length", "1.5", "--seed", "4", "--clutter", "0")
+    for arguments in (
+        ("convert", folder / "office.yaml", "-o", folder / "b.submaps"),
+        ("simulate", folder / "office.yaml", folder / "drive.mcap", *laser),
+    ):
+        assert CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False).exit_code == 0
+    data = bytearray((folder / "b.submaps").read_bytes())
+    data[len(data) // 2] ^= 1
+    (folder / "damaged.submaps").write_bytes(data)
+    return folder
+
+
+COMMANDS = [
+    ("info", "info drive.mcap", 0),
+    ("info-map", "info office.yaml", 0),
+    ("db-info", "info b.submaps", 0),
+    ("simulate", "simulate office.yaml out.mcap --sensor laser --length 0.5 --clutter 0", 0),
+    ("convert", "convert office.yaml -o out.submaps", 0),
+    ("convert", "convert drive.mcap -o out.submaps --building B --floor 2", 0),
+    ("relocalize", "relocalize part.yaml -d b.submaps", 0),
+    ("relocalize", "relocalize drive.mcap -d b.submaps --set relocalize.accept=0.9999999", 4),
+    ("export", "export b.submaps --map out --report out.html", 0),
+    ("export", "export b.submaps --report out.html", 0),
+    (
+        "compare-log",
+        "compare log drive.mcap --truth drive.tum --of-base --map 0..2 --queries 1 --length 1",
+        0,
+    ),
+    ("db-info", "db info b.submaps", 0),
+    ("db-check", "db check b.submaps", 0),
+    ("db-check", "db check damaged.submaps", 1),
+    ("db-copy", "db copy b.submaps -o out.submaps", 0),
+    ("db-copy", "db copy --recover damaged.submaps -o out.submaps", 3),
+    ("db-merge", "db merge b.submaps -o out.submaps", 0),
+    ("db-split", "db split b.submaps office -o out.submaps", 0),
+    ("db-rename", "db rename b.submaps office plan", 0),
+    ("db-remove", "db remove b.submaps office", 0),
+]
+
+
+@pytest.mark.parametrize(("name", "command", "code"), COMMANDS)
+def test_documents_are_as_their_schema_says(
+    name: str, command: str, code: int, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(shutil.copytree(folder, tmp_path, dirs_exist_ok=True))
+    done = CliRunner().invoke(app, [*command.split(), "--json"], catch_exceptions=False)
+    assert done.exit_code == code, done.stderr
+    jsonschema.validate(json.loads(done.stdout), closed(schema(name)))
+
+
+def test_every_document_is_validated_by_a_test() -> None:
+    elsewhere = {
+        "compare-paper": "pc2grid_cli/test_compare_paper.py",
+        "compare-maps": "signature/evaluation/test_map_quality.py",
+        "compare-real": "signature/evaluation/test_real_sensors.py",
+        "compare-sensors": "signature/evaluation/test_sensor_matrix.py",
+    }
+    for name, file in elsewhere.items():
+        assert f'schema("{name}")' in (Path(__file__).parents[1] / file).read_text()
+    assert {name for name, _, _ in COMMANDS} | set(elsewhere) == set(DOCUMENTS)
+
+
+@pytest.mark.parametrize("name", ["settings", *DOCUMENTS])
+def test_schemas_are_sound_and_explained(name: str) -> None:
+    done = CliRunner().invoke(app, ["config", "schema", name], catch_exceptions=False)
+    document = json.loads(done.stdout)
+    jsonschema.Draft202012Validator.check_schema(document)
+    assert all(about.get("description") for about in (document, *document.get("$defs", {}).values()))
+
+
+def test_the_schema_of_settings_fits_what_dump_prints() -> None:
+    tomllib = pytest.importorskip("tomllib" if sys.version_info >= (3, 11) else "tomli")
+    settings = tomllib.loads(dump_settings(Config()))
+    jsonschema.validate(settings, schema("settings"))
+    settings["partition"]["radius_m"] = -1.0
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(settings, schema("settings"))
+
+
+def commands(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """All commands with their full names."""
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, (*path, name))
+        else:
+            yield " ".join((*path, name)), command
+
+
+@pytest.mark.parametrize(
+    ("name", "command"), [pytest.param(n, c, id=n) for n, c in commands(get_command(app))]
+)
+def test_every_command_shows_an_example_that_parses(name: str, command: Any) -> None:
+    (example,) = re.findall(r"^Example: pc2grid (.*)$", command.help, re.MULTILINE)
+    assert example.startswith(name)
+    words = example.removeprefix(name).partition(" > ")[0].split()
+    command.make_context(name, words)
+    for option in command.params:
+        assert option.help, f"{name}: {option.name} is not explained"
+
+
+def test_json_is_offered_where_there_is_a_schema_and_only_there() -> None:
+    for name, command in commands(get_command(app)):
+        has_json = any("--json" in option.opts for option in command.params)
+        assert has_json == (name.replace(" ", "-") in DOCUMENTS), name
+
+
+def test_what_is_not_known_is_null(capsys: pytest.CaptureFixture[str]) -> None:
+    print_json({"error_m": float("nan"), "ranges": (1.0, float("inf")), "count": 2})
+    assert json.loads(capsys.readouterr().out) == {"error_m": None, "ranges": [1.0, None], "count": 2}

@@ -1,0 +1,120 @@
+"""Sessions renamed, removed and split off, on every engine; all or nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pc2grid.errors import DatabaseError, NotADatabase, OutputError
+from signature.database import maintenance, open_database
+from signature.database.sqlite import atomic_update
+from tests.helpers import postgresql
+from tests.helpers.databases import assert_holds, everything, make_entry
+
+MONDAY, TUESDAY = make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)
+
+
+@pytest.fixture(params=["sqlite", "postgres"])
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> str | Path:
+    """A database of two sessions, on each engine."""
+    target = tmp_path / "x.submaps" if request.param == "sqlite" else postgresql.new_database()
+    maintenance.store(target, [MONDAY, TUESDAY], keep=False)
+    return target
+
+
+def names(place: str | Path) -> list[str]:
+    with open_database(place) as database:
+        return [info.name for info in database.sessions()]
+
+
+def test_a_renamed_session_is_the_same_in_all_else(place: str | Path) -> None:
+    maintenance.rename(place, "monday", "first floor")
+    assert names(place) == ["first floor", "tuesday"]
+    assert maintenance.check(place) == ()
+    with open_database(place) as database:
+        assert_holds(database, (replace(MONDAY[0], session="first floor"), *MONDAY[1:]))
+        assert_holds(database, TUESDAY)
+    maintenance.rename(place, "first floor", "monday")
+    maintenance.rename(place, "monday", "monday")
+    with open_database(place) as database:
+        assert_holds(database, MONDAY)
+
+
+def test_a_removed_session_is_gone_and_its_name_is_free(place: str | Path) -> None:
+    small = place.stat().st_size if isinstance(place, Path) else 0
+    maintenance.store(place, [make_entry("large", 3, submaps=100)], keep=True)
+    maintenance.remove(place, ["large", "tuesday", "large"])
+    assert names(place) == ["monday"]
+    assert maintenance.check(place) == ()
+    if isinstance(place, Path):
+        assert place.stat().st_size <= small
+    other = make_entry("tuesday", 7)
+    maintenance.store(place, [other], keep=True)
+    with open_database(place) as database:
+        assert_holds(database, MONDAY)
+        assert_holds(database, other)
+    maintenance.remove(place, ["monday", "tuesday"])
+    assert names(place) == []
+
+
+def test_a_session_split_off_is_as_it_was(place: str | Path, tmp_path: Path) -> None:
+    before, alone = everything(place), tmp_path / "tuesday.submaps"
+    assert maintenance.split(place, ["tuesday"], alone) == 1
+    assert names(alone) == ["tuesday"]
+    with open_database(alone) as database:
+        assert_holds(database, TUESDAY)
+    assert everything(place) == before
+    with pytest.raises(OutputError, match="exists already"):
+        maintenance.split(place, ["monday"], alone)
+    assert maintenance.split(place, ["monday", "tuesday"], alone, force=True) == 2
+    assert everything(alone) == before
+
+
+def test_what_is_refused_changes_nothing(place: str | Path, tmp_path: Path) -> None:
+    before = everything(place)
+    with pytest.raises(DatabaseError, match="holds a session 'tuesday' already"):
+        maintenance.rename(place, "monday", "tuesday")
+    with pytest.raises(DatabaseError, match="the name of a session is empty"):
+        maintenance.rename(place, "monday", " ")
+    for act in (
+        lambda: maintenance.rename(place, "friday", "sunday"),
+        lambda: maintenance.remove(place, ["monday", "friday"]),
+        lambda: maintenance.split(place, ["monday", "friday"], tmp_path / "no.submaps"),
+    ):
+        with pytest.raises(DatabaseError, match="no session 'friday'") as caught:
+            act()
+        assert caught.value.hint == "there are: 'monday', 'tuesday'"
+    assert everything(place) == before
+    assert not (tmp_path / "no.submaps").exists()
+
+
+def test_a_file_is_changed_as_a_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "x.submaps"
+    maintenance.store(path, [MONDAY, TUESDAY], keep=False)
+    before = path.read_bytes()
+    with pytest.raises(DatabaseError, match="named twice"):
+        maintenance.split(path, ["monday"], path, force=True)
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(atomic_update, "migrate", killed)
+    for act in (
+        lambda: maintenance.rename(path, "monday", "friday"),
+        lambda: maintenance.remove(path, ["monday"]),
+    ):
+        with pytest.raises(KeyboardInterrupt):
+            act()
+    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("x.submaps", before)]
+
+
+def test_what_is_no_database_is_not_changed(tmp_path: Path) -> None:
+    (tmp_path / "x.submaps").write_text("text")
+    for path in (tmp_path / "x.submaps", tmp_path / "none.submaps"):
+        with pytest.raises(NotADatabase):
+            maintenance.remove(path, ["monday"])
+        with pytest.raises(NotADatabase):
+            maintenance.rename(path, "monday", "friday")
+    assert [file.name for file in tmp_path.iterdir()] == ["x.submaps"]

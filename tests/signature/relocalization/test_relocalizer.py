@@ -1,0 +1,280 @@
+"""The decision: located, ambiguous or not found."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from pc2grid.errors import NoScans
+from pc2grid.geometry import SE2
+from pc2grid.model import FREE, Health, OccupancyGrid, RegisteredScan
+from signature.config import Config
+from signature.database import Label
+from signature.relocalization.answer import Verdict
+from signature.relocalization.confidence import NO_EVIDENCE
+from signature.relocalization.hypotheses import Hypothesis
+from signature.relocalization.query_map import QueryMap, QueryWindow
+from signature.relocalization.relocalizer import Answer, MapIndex, Relocalizer, Search
+from signature.verification.two_way_score import Fit
+from tests.helpers.simulated_drives import building, drive, office, plan
+
+OFFICE = building({"office": office()})
+ROUTE = [(1.5, 7.0), (9.5, 7.0), (9.5, 4.0)]
+
+
+def ask(
+    where: MapIndex, grid: OccupancyGrid, corners: list[tuple[float, float]], **kind: float
+) -> tuple[Answer, SE2]:
+    relocalizer = Relocalizer(where)
+    for registered, planar_scan, truth in drive(grid, corners, **kind):
+        relocalizer.add(registered, planar_scan)
+        end = truth
+    return relocalizer.answer(), end
+
+
+@pytest.mark.parametrize("field_deg", [360.0, 270.0, 90.0])
+def test_a_drive_through_a_known_building_is_located(field_deg: float) -> None:
+    answer, truth = ask(OFFICE, office(), ROUTE, field_rad=math.radians(field_deg))
+    assert answer.status == "located" and answer.session == "office"
+    pose = answer.T_map_base
+    assert pose is not None and math.dist((pose.x, pose.y), (truth.x, truth.y)) < 0.1
+    assert abs(math.remainder(pose.yaw - truth.yaw, 2 * math.pi)) < math.radians(1.5)
+    assert answer.confidence >= 0.9
+    whole = answer.T_map_odom @ answer.T_odom_base if answer.T_map_odom else None
+    assert whole is not None and math.dist((whole.x, whole.y), (pose.x, pose.y)) < 1e-9
+
+
+def test_certainty_grows_with_travel_and_history_tells_it() -> None:
+    answer, _ = ask(OFFICE, office(), ROUTE, field_rad=math.radians(90))
+    travelled = [m.path_m for m in answer.history]
+    assert travelled == sorted(travelled) and len(travelled) >= 8
+    assert answer.history[-1].confidence >= answer.history[0].confidence
+
+
+def test_another_building_is_not_found() -> None:
+    other = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
+    answer, _ = ask(OFFICE, other, [(2, 2), (2, 9), (7, 8)])
+    assert answer.status == "not_found" and answer.T_map_base is None and answer.session is None
+
+
+def test_two_identical_rooms_are_ambiguous_with_both_named() -> None:
+    bent = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]
+    twins = plan(12, 6, [(6, 0, 6, 6), *bent, *[(x0 + 6, y0, x1 + 6, y1) for x0, y0, x1, y1 in bent]])
+    answer, truth = ask(building({"twins": twins}), twins, [(1.0, 1.0), (5.0, 1.0), (5.0, 2.4)])
+    assert answer.status == "ambiguous" and answer.T_map_base is None
+    places = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
+    for expected in (truth, SE2(truth.x + 6, truth.y, truth.yaw)):
+        assert any(math.dist((p.x, p.y), (expected.x, expected.y)) < 0.25 for p in places)
+
+
+def test_a_symmetric_room_reports_both_headings() -> None:
+    room = plan(8, 5, [])
+    answer, truth = ask(building({"room": room}), room, [(2.0, 2.0), (6.0, 2.0)])
+    assert answer.status == "ambiguous"
+    poses = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
+    turned = SE2(8 - truth.x, 5 - truth.y, truth.yaw + math.pi)
+    for expected in (truth, turned):
+        assert any(
+            math.dist((p.x, p.y), (expected.x, expected.y)) < 0.25
+            and abs(math.remainder(p.yaw - expected.yaw, 2 * math.pi)) < 0.1
+            for p in poses
+        )
+
+
+def test_an_empty_database_finds_nothing() -> None:
+    answer, _ = ask(building({}), office(), ROUTE)
+    assert answer.status == "not_found" and answer.hypotheses == () and answer.confidence == 0.0
+
+
+def test_the_session_is_named_and_its_frame_kept() -> None:
+    other = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
+    both = building({"other": other, "office": office()})
+    answer, truth = ask(both, office(), ROUTE)
+    assert answer.session == "office"
+    assert answer.T_map_base is not None
+    assert math.dist((answer.T_map_base.x, answer.T_map_base.y), (truth.x, truth.y)) < 0.1
+
+
+def elsewhere(grid: OccupancyGrid, origin_m: tuple[float, float]) -> OccupancyGrid:
+    return OccupancyGrid(cells=grid.cells, resolution_m=grid.resolution_m, origin_m=origin_m)
+
+
+def test_two_sessions_of_one_floor_do_not_make_each_other_ambiguous() -> None:
+    tidied = office().cells.copy()
+    tidied[20:90, 130:150] = FREE  # between the sessions a wall went
+    second = elsewhere(OccupancyGrid(cells=tidied, resolution_m=0.05, origin_m=(0, 0)), (-30.0, 12.0))
+    answer, truth = ask(building({"monday": office(), "tuesday": second}), office(), ROUTE)
+    assert answer.status == "located" and answer.T_map_base is not None
+    there = [h.session_index for h, place in zip(answer.hypotheses, answer.places, strict=True) if place == 0]
+    assert sorted(there) == [0, 1]
+    moved = {"monday": SE2(), "tuesday": SE2(-30.0, 12.0, 0.0)}[answer.session or ""]
+    expected = moved @ truth
+    assert math.dist((answer.T_map_base.x, answer.T_map_base.y), (expected.x, expected.y)) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("floors", "status"), [(("1", "2"), "ambiguous"), (("1", "1"), "located"), ((None, None), "located")]
+)
+def test_labels_that_differ_keep_two_floors_apart(floors: tuple[str | None, str | None], status: str) -> None:
+    labels = {n: Label(building="hall" if f else None, floor=f) for n, f in zip("ab", floors, strict=True)}
+    twice = building({"a": office(), "b": elsewhere(office(), (5.0, 0.0))}, labels=labels)
+    answer, _ = ask(twice, office(), ROUTE)
+    assert answer.status == status
+    assert answer.label.floor == (floors[0] if status == "located" else None)
+    named = [(h["session"], h["floor"]) for h in answer.to_json()["hypotheses"]]
+    assert {("a", floors[0]), ("b", floors[1])} <= set(named)
+
+
+def test_like_rooms_of_two_buildings_are_told_apart_by_what_lies_around_them() -> None:
+    """The query saw one room only, and no labels state that the sessions are of different buildings."""
+    room = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5), (6, 0, 6, 6)]
+    left = plan(14, 6, [*room, (6, 2, 10, 2), (9, 4, 9, 6)])
+    amid = [(0, 0, 6, 0), (0, 0, 0, 6), (0, 6, 6, 6), *room]
+    around = [(2, 2, 2, 9), (2, 12, 9, 12), (14, 4, 17, 4), (16, 8, 16, 14), (10, 0, 10, 3)]
+    right = plan(20, 15, [*around, *[(x0 + 6, y0 + 5, x1 + 6, y1 + 5) for x0, y0, x1, y1 in amid]])
+    answer, _ = ask(building({"left": left, "right": right}), left, [(1.0, 1.0), (5.0, 1.0), (5.0, 2.4)])
+    assert answer.status == "ambiguous"
+    best = {h.session_index for h in answer.hypotheses[:2]}
+    assert best == {0, 1} and len(set(answer.places[:2])) == 2
+
+
+def test_the_answer_does_not_depend_on_where_the_query_starts() -> None:
+    late = Relocalizer(OFFICE)
+    early = Relocalizer(OFFICE)
+    scans = list(drive(office(), [(18.0, 1.5), (18.0, 2.4), (18.5, 7.0), *ROUTE[1:]]))
+    for k, (registered, planar_scan, truth) in enumerate(scans):
+        early.add(registered, planar_scan)
+        end = truth
+        if k >= 20:
+            late.add(registered, planar_scan)
+    a, b = early.answer(), late.answer()
+    assert a.status == b.status == "located"
+    for answer in (a, b):
+        assert answer.T_map_base is not None
+        assert math.dist((answer.T_map_base.x, answer.T_map_base.y), (end.x, end.y)) < 0.1
+
+
+def test_lost_scans_end_a_part_and_the_last_one_alone_is_a_query() -> None:
+    relocalizer = Relocalizer(OFFICE)
+    for registered, planar_scan, _ in drive(office(), ROUTE[:2]):
+        lost = RegisteredScan(
+            scan=registered.scan, T_session_base=registered.T_session_base, health=Health.LOST
+        )
+        relocalizer.add(lost, planar_scan)
+    assert relocalizer.path_m == 0.0
+    assert relocalizer.answer().path_m == 0.0
+    with pytest.raises(NoScans):
+        Relocalizer(OFFICE).answer()
+
+
+def test_the_json_document_keeps_its_contract() -> None:
+    answer, _ = ask(OFFICE, office(), ROUTE)
+    document = json.loads(json.dumps(answer.to_json()))
+    assert document["schema_version"] == 1 and document["status"] == "located"
+    assert set(document["pose"]) == {"stamp_ns", "x", "y", "yaw", "covariance"}
+    assert np.array(document["pose"]["covariance"]).shape == (3, 3)
+    assert set(document["T_map_odom"]) == {"x", "y", "yaw"}
+    first = document["hypotheses"][0]
+    assert {"session", "submap_id", "x", "y", "yaw", "score", "overlap"} <= set(first)
+    assert {"stamp_ns", "path_m", "status", "x", "y", "yaw", "confidence"} == set(document["history"][0])
+    assert isinstance(document["pose"]["stamp_ns"], int)
+    assert {"query", "database", "timing_ms"} <= set(document)
+
+
+def test_an_index_with_one_more_session_shares_what_was_prepared() -> None:
+    other = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
+    first, office_only = building({"other": other}), building({"office": office()})
+    ask(first, office(), ROUTE)
+    prepared = first.maps[0]
+    both = first.with_session("office", office(), office_only.places.table)
+    assert both.sessions == ("other", "office") and len(first.sessions) == 1
+    assert both.maps[0] is prepared
+    at_once = building({"other": other, "office": office()})
+    answers = [ask(index, office(), ROUTE)[0] for index in (both, at_once)]
+    assert answers[0].session == answers[1].session == "office"
+    assert answers[0].T_map_base == answers[1].T_map_base
+    with pytest.raises(ValueError, match="already"):
+        both.with_session("other", other, first.places.table)
+
+
+class Judged:
+    """An index whose verdict on a query is given by its `path_m`: a confidence."""
+
+    config, sessions, labels = Config().relocalize, ("a",), (Label(),)
+    places = SimpleNamespace(table=SimpleNamespace(submap_id=[0]))
+
+    def look_up(self, query: QueryMap, carried: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
+        fit = Fit(
+            T_map_query=SE2(query.path_m, 0.0, 0.0),
+            forward=1.0,
+            backward=1.0,
+            overlap=1.0,
+            score=1.0,
+            covariance=np.eye(3),
+        )
+        return (Hypothesis(session_index=0, row=0, fit=fit),)
+
+    def judge(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> Verdict:
+        return Verdict(
+            status="located" if query.path_m >= self.config.accept else "ambiguous",
+            confidence=query.path_m,
+            hypotheses=hypotheses,
+            places=(0,),
+            evidence=NO_EVIDENCE,
+        )
+
+    judge_everywhere = decide = judge
+
+
+@pytest.mark.parametrize(
+    ("whole", "shorter", "expected", "asked"),
+    [
+        (0.95, [0.99, 0.99], (0.95, 0.95), 0),
+        (0.5, [0.98, 0.99], (0.98, 0.96), 1),  # the second attempt: an error counts twice
+        (0.5, [0.94, 0.98], (0.98, 0.94), 2),  # 0.94 is not enough for a second attempt
+        (0.5, [0.94, 0.96], (0.5, 0.5), 2),
+        (0.5, [], (0.5, 0.5), 0),
+    ],
+)
+def test_the_last_metres_answer_where_the_whole_query_is_not_sure(
+    whole: float, shorter: list[float], expected: tuple[float, float], asked: int
+) -> None:
+    """The confidence of each stands in `path_m`, here and in the pose of the answer."""
+    made = []
+
+    def last_metres() -> Iterator[QueryMap]:
+        for confidence in shorter:
+            made.append(confidence)
+            yield query_with(confidence)
+
+    answer = Search(cast("MapIndex", Judged())).answer(query_with(whole), last_metres())
+    x, confidence = expected
+    assert answer.hypotheses[0].fit.T_map_query.x == x
+    assert answer.confidence == pytest.approx(confidence)
+    assert (answer.status == "located") == (confidence >= 0.9)
+    assert len(made) == asked
+
+
+def query_with(path_m: float) -> QueryMap:
+    query = QueryWindow(Config().projection, Config().relocalize)
+    for registered, planar_scan, _ in itertools.islice(drive(office(), ROUTE), 1):
+        query.add(planar_scan, SE2.from_matrix(registered.T_session_base))
+    return replace(query.query(Config().partition, Config().signature), path_m=path_m)
+
+
+def test_the_last_metres_are_drawn_from_the_newest_scans_alone() -> None:
+    window = QueryWindow(Config().projection, Config().relocalize)
+    for registered, planar_scan, _ in drive(office(), ROUTE, reach_m=3.0):
+        window.add(planar_scan, SE2.from_matrix(registered.T_session_base))
+    whole = window.query(Config().partition, Config().signature)
+    last = window.query(Config().partition, Config().signature, 2.0)
+    assert last.T_odom_base == whole.T_odom_base and last.path_m == whole.path_m
+    assert 0 < last.walls.weight < 0.7 * whole.walls.weight

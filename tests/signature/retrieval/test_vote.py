@@ -1,0 +1,192 @@
+"""Views, retrieval by signatures and isovists, and the calibration of the probabilities."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pc2grid.geometry import SE2
+from signature.relocalization.query_map import QueryWindow
+from signature.retrieval.vote import (
+    distinct_placements,
+    peaks,
+    plain_rotate_and_compare,
+    retrieve,
+    rotate_and_compare,
+    view_scores,
+)
+from tests.helpers.simulated_drives import building, drive, office
+
+OFFICE = building({"office": office()})
+
+
+def window(corners: list[tuple[float, float]], field_deg: float = 360.0) -> tuple[QueryWindow, SE2]:
+    """The query map of a drive, and its frame in the office."""
+    seen = QueryWindow(OFFICE.made_with.projection, OFFICE.config)
+    first: SE2 | None = None
+    for registered, planar_scan, truth in drive(office(), corners, field_rad=math.radians(field_deg)):
+        first = first or truth
+        seen.add(planar_scan, SE2.from_matrix(registered.T_session_base))
+    assert first is not None
+    return seen, first
+
+
+@pytest.mark.parametrize("field_deg", [360.0, 270.0, 90.0])
+def test_the_right_place_is_among_the_first_twenty(field_deg: float) -> None:
+    seen, T_map_query = window([(1.5, 7.0), (9.5, 7.0)], field_deg)
+    made_with = OFFICE.made_with
+    query = seen.query(made_with.partition, made_with.signature)
+    found = retrieve(
+        query.views,
+        (query.T_odom_base.x, query.T_odom_base.y),
+        OFFICE.places,
+        signature=made_with.signature,
+        config=OFFICE.config,
+        top_k=20,
+    )
+    assert len(found) == 20
+    assert [p.likeness for p in found] == sorted((p.likeness for p in found), reverse=True)
+    right = [
+        p
+        for p in found
+        if math.dist(
+            T_map_query.apply(np.array([query.views[p.view].center_m]))[0],
+            OFFICE.places.table.center_m[p.row],
+        )
+        <= 1.0
+    ]
+    assert right
+    turns = [abs(math.remainder(p.yaw_rad - T_map_query.yaw, 2 * math.pi)) for p in right]
+    assert min(turns) < math.radians(10)
+    bases = [SE2(*p.at_m, p.yaw_rad) @ SE2(*query.views[p.view].center_m).inverse() for p in found]
+    poses = [b @ query.T_odom_base for b in bases]
+    for i, a in enumerate(poses):
+        for b in poses[:i]:
+            turn = abs(math.remainder(a.yaw - b.yaw, 2 * math.pi))
+            assert max(abs(a.x - b.x), abs(a.y - b.y)) > 0.7 or turn > math.radians(14)
+
+
+def test_all_places_are_compared_unless_there_are_too_many() -> None:
+    seen, _ = window([(1.5, 7.0), (9.5, 7.0)])
+    made_with = OFFICE.made_with
+    query = seen.query(made_with.partition, made_with.signature)
+
+    def rows_compared(**changes: float) -> tuple[list[int], float]:
+        config = OFFICE.config.model_copy(update=changes)
+        base_m = (query.T_odom_base.x, query.T_odom_base.y)
+        found = retrieve(query.views, base_m, OFFICE.places, signature=made_with.signature, config=config)
+        assert OFFICE.places._last is not None
+        return OFFICE.places._last[0].tolist(), found[0].likeness
+
+    every = list(range(len(OFFICE.places.table)))
+    few = {"all_places": 10, "shortlist": 5}
+    assert rows_compared(shortlist=5)[0] == every
+    assert rows_compared(shortlist=5) == rows_compared(shortlist=5, signature_weight=0.0)
+    assert 5 <= len(rows_compared(**few)[0]) < len(every)
+    assert rows_compared(**few)[1] != rows_compared(**few, signature_weight=0.0)[1]
+
+
+def test_every_view_has_a_viewpoint_beside_it_that_belongs_to_the_nearest_place() -> None:
+    places, grid = OFFICE.places, office()
+    rows = np.arange(len(places.table))
+    stand = places.around(rows)
+    cells = grid.to_cell(stand.at_m)
+    assert grid.free[cells[:, 0], cells[:, 1]].all()
+    apart = np.hypot(*(stand.at_m[:, None] - places.table.center_m[None]).transpose(2, 0, 1))
+    assert (apart[np.arange(len(apart)), stand.place] <= apart.min(axis=1) + 1e-9).all()
+    rng = np.random.default_rng(0)
+    on_the_way = rng.uniform((0.5, 6.6), (19.5, 7.4), (50, 2))
+    found = stand.beside(on_the_way, np.zeros(50, np.int64))
+    assert (found < len(stand.at_m)).all()
+    assert np.hypot(*(stand.at_m[found] - on_the_way).T).max() < 0.29
+    assert (stand.beside(on_the_way, np.ones(50, np.int64)) == len(stand.at_m)).all()
+
+
+def test_views_lie_apart_and_on_what_was_seen() -> None:
+    seen, _ = window([(1.5, 7.0), (9.5, 7.0)], 90.0)
+    query = seen.query(OFFICE.made_with.partition, OFFICE.made_with.signature)
+    centers = np.array([v.center_m for v in query.views])
+    apart = np.hypot(*(centers[:, None] - centers[None]).transpose(2, 0, 1))
+    assert 2 <= len(centers) <= OFFICE.config.views
+    assert apart[~np.eye(len(centers), dtype=bool)].min() >= OFFICE.config.view_spacing_m
+    cells = query.grid.to_cell(centers)
+    assert (query.grid.cells[cells[:, 0], cells[:, 1]] >= 0).all()
+
+
+def test_a_window_forgets_what_lies_farther_back() -> None:
+    config = OFFICE.config.model_copy(update={"window_m": 3.0})
+    long, short = (
+        QueryWindow(OFFICE.made_with.projection, OFFICE.config),
+        QueryWindow(OFFICE.made_with.projection, config),
+    )
+    for registered, planar_scan, _ in drive(office(), [(1.5, 7.0), (9.5, 7.0)]):
+        for seen in (long, short):
+            seen.add(planar_scan, SE2.from_matrix(registered.T_session_base))
+    assert long.path_m == pytest.approx(short.path_m) == pytest.approx(7.8, abs=0.3)
+    assert len(short) < 20 < len(long)
+
+
+def test_standing_still_adds_nothing() -> None:
+    seen = QueryWindow(OFFICE.made_with.projection, OFFICE.config)
+    registered, planar_scan, _ = next(drive(office(), [(1.5, 7.0), (9.5, 7.0)]))
+    for _ in range(50):
+        seen.add(planar_scan, SE2.from_matrix(registered.T_session_base))
+    assert len(seen) == 1 and seen.path_m == 0.0
+
+
+@pytest.mark.parametrize(("bearings", "longest_m"), [(48, 5.0), (90, 5.0), (48, 80.0)])
+def test_the_compiled_comparison_is_the_plain_one(bearings: int, longest_m: float) -> None:
+    rng = np.random.default_rng(0)
+    ranges, others = (rng.uniform(0, longest_m, (n, bearings)).astype(np.float32) for n in (2, 700))
+    seen, others_seen = rng.random((2, bearings)) < 0.8, rng.random((700, bearings)) < 0.8
+    others[3], others_seen[3] = np.roll(ranges[1], 20), np.roll(seen[1], 20)
+    seen[0, 5:] = False
+    others_seen[600] = False
+    fast = rotate_and_compare(ranges, seen, others, others_seen)
+    assert fast.shape == (2, bearings, 700)
+    plain = plain_rotate_and_compare(ranges, seen, others, others_seen)
+    assert np.abs(fast - plain).max() < 0.002 * max(1.0, longest_m / 20)
+    assert np.unravel_index(np.argmax(fast[1]), fast[1].shape) == (20, 3)
+
+
+def test_a_view_scores_what_it_would_see_or_nothing() -> None:
+    rng = np.random.default_rng(0)
+    likeness = rng.random((3, 48, 10)).astype(np.float32)
+    shift, beside = rng.integers(0, 48, 40), rng.integers(0, 11, (40, 3))
+    scores = view_scores(likeness, shift, beside)
+    for c, u in np.ndindex(scores.shape):
+        near = (
+            [likeness[u, (shift[c] + turn) % 48, beside[c, u]] for turn in (-1, 0, 1)]
+            if beside[c, u] < 10
+            else [-1]
+        )
+        assert scores[c, u] == max(near)
+
+
+def test_peaks_are_found_around_the_circle_and_one_on_each_plateau() -> None:
+    rng = np.random.default_rng(2)
+    likeness = rng.integers(0, 4, (12, 30)).astype(np.float32)
+    likeness[:, 0] = 1.0  # as good everywhere: no peak
+    columns = rng.permutation(30)[:20]
+    columns[0] = 0
+    at, shift = peaks(likeness, columns)
+    expected = [
+        (column, k)
+        for column in columns.tolist()
+        for k in range(12)
+        if likeness[k - 1, column] <= likeness[k, column] > likeness[(k + 1) % 12, column]
+    ]
+    assert list(zip(at.tolist(), shift.tolist(), strict=True)) == expected
+    assert 0 in shift and 11 in shift and 0 not in at
+
+
+def test_placements_beside_a_better_one_are_left_out() -> None:
+    base = np.array([[0.0, 0.0], [0.3, 0.3], [0.3, 0.3], [0.3, 0.3], [0.0, 5.0], [9.0, 0.0]])
+    yaw = np.array([math.pi - 0.01, 0.01 - math.pi, 0.0, 0.01 - math.pi, 0.0, 0.0])
+    session = np.array([0, 0, 0, 1, 0, 0])
+    order = np.array([0, 1, 2, 3, 4, 5])
+    assert distinct_placements(order, base, yaw, session, 10).tolist() == [0, 2, 3, 4, 5]
+    assert distinct_placements(order, base, yaw, session, 3).tolist() == [0, 2, 3]
+    assert distinct_placements(order[::-1].copy(), base, yaw, session, 10).tolist() == [5, 4, 3, 2, 1]

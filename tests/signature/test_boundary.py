@@ -1,0 +1,132 @@
+"""Boundary histogram (paper III-B)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from signature import _kernels
+from signature.boundary import (
+    ROUNDING_BINS,
+    boundary_bins,
+    boundary_edges,
+    boundary_histogram,
+    boundary_points,
+    pair_distance_counts,
+)
+from signature.config import SignatureConfig
+from tests.helpers.rooms import RESOLUTION_M, disc, random_rooms, rectangle, submap_of
+
+CONFIG = SignatureConfig()
+
+
+def histogram(cells: np.ndarray, config: SignatureConfig = CONFIG) -> np.ndarray:
+    points = boundary_points(boundary_edges(submap_of(cells), config), RESOLUTION_M, config)
+    return boundary_histogram(points, 8.0, RESOLUTION_M, config)
+
+
+def brute_force(points: np.ndarray, config: SignatureConfig) -> np.ndarray:
+    """Eq. 1-2 pair by pair, exactly: bin k holds k * bin <= d < (k + 1) * bin, in whole cells squared."""
+    bins = boundary_bins(8.0, config)
+    counts = np.zeros(bins)
+    edge_cells = config.boundary_bin_m / RESOLUTION_M
+    edges2 = np.array([round((k * edge_cells) ** 2, 6) for k in range(1, bins)])
+    for i, (r, c) in enumerate(points):
+        for s, d in points[i + 1 :]:
+            counts[np.searchsorted(edges2, (r - s) ** 2 + (c - d) ** 2, side="right")] += 1
+    return counts / max(counts.sum(), 1)
+
+
+def test_number_of_bins_is_that_of_the_paper() -> None:
+    assert boundary_bins(8.0, CONFIG) == 80
+    assert boundary_bins(8.0, SignatureConfig(boundary_bin_m=0.3)) == 54
+
+
+def test_two_points_fill_one_bin_and_an_edge_goes_up() -> None:
+    # 20 cells of 0.05 m are 1.0 m: the upper of the two bins that meet there, number 5.
+    found = boundary_histogram(np.array([[0, 0], [0, 20]]), 8.0, RESOLUTION_M, CONFIG)
+    assert np.flatnonzero(found).tolist() == [5]
+    assert found[5] == 1.0
+
+
+def test_the_longest_distance_counts_in_the_last_bin() -> None:
+    found = boundary_histogram(np.array([[0, 0], [0, 320]]), 8.0, RESOLUTION_M, CONFIG)
+    assert np.flatnonzero(found).tolist() == [79]
+
+
+def test_three_corners_by_hand() -> None:
+    # 3-4-5 triangle in metres: distances 3, 4 and 5 m, a third each.
+    found = boundary_histogram(np.array([[0, 0], [0, 60], [80, 0]]), 8.0, RESOLUTION_M, CONFIG)
+    assert {k: round(float(found[k]), 6) for k in np.flatnonzero(found)} == {
+        15: 0.333333,
+        20: 0.333333,
+        25: 0.333333,
+    }
+
+
+@given(seed=st.integers(0, 10_000), count=st.integers(0, 60), bin_m=st.sampled_from([0.1, 0.2, 0.3, 0.25]))
+@settings(max_examples=40, deadline=None)
+def test_matches_brute_force(seed: int, count: int, bin_m: float) -> None:
+    config = SignatureConfig(boundary_bin_m=bin_m)
+    points = np.random.default_rng(seed).integers(0, 226, (count, 2))
+    found = boundary_histogram(points, 8.0, RESOLUTION_M, config)
+    assert found == pytest.approx(brute_force(points, config), abs=1e-6)
+
+
+@given(seed=st.integers(0, 10_000), count=st.integers(0, 60), bin_cells=st.sampled_from([2.0, 4.0, 6.0, 5.0]))
+@settings(max_examples=40, deadline=None)
+def test_the_compiled_counts_are_those_of_scipy(seed: int, count: int, bin_cells: float) -> None:
+    cells = np.random.default_rng(seed).integers(0, 226, (count, 2))
+    arguments = (cells, 1.0 / bin_cells, ROUNDING_BINS, 40)
+    assert np.array_equal(_kernels.pair_distance_counts(*arguments), pair_distance_counts(*arguments))
+
+
+def test_a_circle_has_the_arcsine_law_of_chords() -> None:
+    radius = 4.0
+    found = histogram(disc(radius))
+    chords = 0.2 * np.arange(81)
+    # Chord of a uniform angle: P(d <= x) = 2 / pi * asin(x / 2 R).
+    law = np.diff(2 / np.pi * np.arcsin(np.clip(chords / (2 * radius), 0, 1)))
+    assert np.abs(np.cumsum(found) - np.cumsum(law)).max() < 0.03
+    assert found[41:].sum() == 0
+
+
+def test_a_square_by_brute_force_over_its_outline() -> None:
+    found = histogram(rectangle(6.0, 6.0))
+    side = np.linspace(-3, 3, 60, endpoint=False)
+    outline = np.concatenate([[(t, -3), (3, t), (-t, 3), (-3, -t)] for t in side])
+    distances = np.linalg.norm(outline[:, None] - outline[None], axis=2)[np.triu_indices(len(outline), 1)]
+    law = np.histogram(distances, bins=80, range=(0, 16))[0] / len(distances)
+    assert np.abs(np.cumsum(found) - np.cumsum(law)).max() < 0.02
+
+
+def test_a_corridor_peaks_at_its_width() -> None:
+    found = histogram(rectangle(14.0, 2.0))
+    wide = histogram(rectangle(14.0, 4.0))
+    assert found[10] > 1.5 * found[8]  # nothing of the opposite wall is nearer than 2.0 m
+    assert wide[20] > 1.5 * wide[18]
+
+
+def test_translation_changes_nothing_and_turning_little() -> None:
+    cells = rectangle(7.0, 5.0)
+    shifted = np.roll(cells, (17, -9), axis=(0, 1))
+    assert np.abs(np.cumsum(histogram(cells) - histogram(shifted))).max() < 1e-6
+    for quarter in (1, 2, 3):
+        assert np.abs(np.cumsum(histogram(cells) - histogram(np.rot90(cells, quarter).copy()))).max() < 0.02
+
+
+@given(seed=st.integers(0, 500))
+@settings(max_examples=10, deadline=None)
+def test_shares_sum_to_one(seed: int) -> None:
+    found = histogram(random_rooms(seed))
+    assert found.min() >= 0 and found.sum() == pytest.approx(1.0, abs=1e-5)
+
+
+def test_only_clearly_occupied_cells_are_boundary() -> None:
+    cells = rectangle(6.0, 6.0)
+    cells[100:200, 130] = 50  # perhaps a wall
+    assert np.array_equal(histogram(cells), histogram(rectangle(6.0, 6.0)))
+    cells[100:200, 130] = 65
+    assert not np.array_equal(histogram(cells), histogram(rectangle(6.0, 6.0)))

@@ -1,0 +1,191 @@
+"""Free-space histogram (paper III-C)."""
+
+from __future__ import annotations
+
+import itertools
+
+import networkx as nx
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pc2grid.model import FREE, OCCUPIED
+from signature import _kernels
+from signature.config import SignatureConfig
+from signature.freespace import (
+    freespace_bins,
+    freespace_graph,
+    freespace_histogram,
+    freespace_nodes,
+    in_sight,
+    shortest_paths,
+    visibility_graph,
+)
+from tests.helpers.rooms import (
+    RESOLUTION_M,
+    canvas,
+    cross,
+    grid_of,
+    l_shape,
+    random_rooms,
+    rectangle,
+    submap_of,
+)
+
+CONFIG = SignatureConfig()
+
+
+def parts(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    submap = submap_of(cells)
+    lengths = shortest_paths(freespace_graph(submap, CONFIG))
+    return freespace_nodes(submap, CONFIG), lengths, freespace_histogram(lengths, 8.0, CONFIG)
+
+
+def joined(nodes: np.ndarray, occupied: np.ndarray, config: SignatureConfig = CONFIG) -> nx.Graph:
+    """The visibility graph of places of a grid with these walls."""
+    cells = np.where(occupied, OCCUPIED, FREE).astype(np.int8)
+    return visibility_graph(grid_of(cells), nodes, config)
+
+
+def adjacency(nodes: np.ndarray, occupied: np.ndarray, config: SignatureConfig = CONFIG) -> np.ndarray:
+    """The matrix A of III-C 2, in metres; inf where two nodes are not joined."""
+    return nx.to_numpy_array(joined(nodes, occupied, config), weight="length_m", nonedge=np.inf)
+
+
+def test_number_of_bins_is_that_of_the_paper() -> None:
+    assert freespace_bins(8.0, CONFIG) == 80
+
+
+@given(seed=st.integers(0, 500))
+@settings(max_examples=12, deadline=None)
+def test_path_lengths_are_those_of_networkx_dijkstra(seed: int) -> None:
+    submap = submap_of(random_rooms(seed))
+    graph = freespace_graph(submap, CONFIG)
+    nodes = freespace_nodes(submap, CONFIG)
+    lengths = shortest_paths(graph)
+    assert len(graph) == len(nodes)
+    plain = dict(nx.all_pairs_dijkstra_path_length(graph, weight="length_m"))
+    for i, j in itertools.product(range(len(nodes)), repeat=2):
+        assert lengths[i, j] == pytest.approx(plain[i].get(j, np.inf), rel=1e-5)
+
+
+@given(seed=st.integers(0, 500))
+@settings(max_examples=12, deadline=None)
+def test_nodes_are_joined_exactly_when_they_see_each_other(seed: int) -> None:
+    cells = random_rooms(seed)
+    occupied = grid_of(cells).occupied
+    nodes = freespace_nodes(submap_of(cells), CONFIG)[:25]
+    weights = adjacency(nodes, occupied)
+    assert np.array_equal(weights, weights.T)
+    for i, j in itertools.combinations(range(len(nodes)), 2):
+        a, b = nodes[i], nodes[j]
+        # Hundreds of points along the line, none of them on the border of two cells.
+        along = a + (b - a) * np.linspace(0, 1, 4001)[:, None]
+        met = np.rint(along[(np.abs(along % 1.0 - 0.5) > 1e-3).all(axis=1)]).astype(int)
+        blocked = occupied[met[:, 0], met[:, 1]].any()
+        assert np.isinf(weights[i, j]) == blocked
+
+
+@given(seed=st.integers(0, 500), share=st.sampled_from([0.0, 0.02, 0.2]))
+@settings(max_examples=20, deadline=None)
+def test_the_compiled_line_of_sight_is_that_of_numpy(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    occupied, nodes = rng.random((31, 47)) < share, rng.integers(0, (31, 47), (12, 2))
+    first, second = (axis.ravel() for axis in np.indices((12, 12)))
+    expected = in_sight(occupied, nodes, first, second)
+    assert np.array_equal(_kernels.in_sight(occupied, nodes, first, second), expected)
+    assert np.array_equal(expected.reshape(12, 12).diagonal(), ~occupied[nodes[:, 0], nodes[:, 1]])
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_a_line_through_a_corner_is_blocked_by_both_cells_beside_it(turns: int) -> None:
+    for beside, visible in (([], True), ([(3, 4)], True), ([(4, 3)], True), ([(3, 4), (4, 3)], False)):
+        occupied, ends = np.zeros((8, 8), np.bool_), np.zeros((8, 8), np.bool_)
+        ends[2, 2] = ends[5, 5] = True
+        for cell in beside:
+            occupied[cell] = True
+        nodes = np.argwhere(np.rot90(ends, turns))
+        assert joined(nodes, np.rot90(occupied, turns)).has_edge(0, 1) == visible
+
+
+def test_a_slanted_wall_of_single_cells_cannot_be_slipped_through() -> None:
+    occupied = np.eye(41, dtype=bool)
+    nodes = np.array([[10, 30], [30, 10], [5, 20]])
+    weights = adjacency(nodes, occupied)
+    assert np.isinf(weights[0, 1])
+    assert weights[0, 2] == pytest.approx(np.hypot(5, 10) * RESOLUTION_M)
+
+
+def test_unknown_does_not_block_and_reach_does() -> None:
+    nodes = np.array([[10, 10], [10, 70]])
+    nothing = np.zeros((80, 80), bool)
+    assert adjacency(nodes, nothing)[0, 1] == pytest.approx(3.0)
+    short = SignatureConfig(freespace_join_m=2.9)
+    assert np.isinf(adjacency(nodes, nothing, short)[0, 1])
+
+
+def test_lengths_by_hand_in_a_square_with_a_corner() -> None:
+    # Three nodes around a wall's end: the straight way is blocked, the way over the third is 3 + 4 m.
+    occupied = np.zeros((120, 120), bool)
+    occupied[15:61, 40] = True
+    nodes = np.array([[70, 10], [10, 10], [10, 90]])
+    graph = joined(nodes, occupied)
+    assert not graph.has_edge(0, 2)
+    lengths = shortest_paths(graph)
+    assert lengths[0, 2] == pytest.approx(3.0 + 4.0)
+    found = freespace_histogram(lengths, 8.0, CONFIG)
+    # 3, 4 and 7 m in bins of 0.4 m: 7.5 -> 7, 10, 17.5 -> 17.
+    assert np.flatnonzero(found).tolist() == [7, 10, 17]
+
+
+def test_ways_without_end_and_beyond_the_last_bin() -> None:
+    lengths = np.array([[0, np.inf, 1], [np.inf, 0, 100], [1, 100, 0]], np.float32)
+    found = freespace_histogram(lengths, 8.0, CONFIG)
+    assert found[2] == 0.5 and found[79] == 0.5 and found.sum() == 1.0
+
+
+def test_a_corridor_is_a_line_of_nodes() -> None:
+    nodes, lengths, found = parts(rectangle(12.0, 2.0))
+    on_the_middle = np.abs(nodes[:, 0] - 160) <= 4
+    assert on_the_middle.mean() > 0.7
+    # Points evenly on a line of length L: the density of their distance d is 2 (L - d) / L^2.
+    length = lengths[np.isfinite(lengths)].max()
+    at = np.arange(81) * 0.4
+    law = np.diff(1 - np.clip(1 - at / length, 0, 1) ** 2)
+    assert np.abs(np.cumsum(found) - np.cumsum(law)).max() < 0.12
+
+
+def test_around_a_corner_ways_are_longer_than_straight() -> None:
+    nodes, lengths, _ = parts(l_shape())
+    straight = np.linalg.norm(nodes[:, None] - nodes[None], axis=2) * RESOLUTION_M
+    finite = np.isfinite(lengths)
+    assert finite.all()
+    assert (lengths - straight).min() > -1e-4
+    assert (lengths - straight).max() > 0.3
+
+
+def test_rooms_without_a_door_are_not_connected() -> None:
+    cells = rectangle(12.0, 6.0)
+    cells[:, 160] = np.where(cells[:, 160] >= 0, OCCUPIED, cells[:, 160])
+    nodes, lengths, _ = parts(cells)
+    left = nodes[:, 1] < 160
+    assert left.any() and (~left).any()
+    assert np.isinf(lengths[np.ix_(left, ~left)]).all()
+    assert np.isfinite(lengths[np.ix_(left, left)]).all()
+
+
+def test_turning_and_shifting_change_little() -> None:
+    cells = cross(6.0, 2.0)
+    _, _, here = parts(cells)
+    for other in (np.rot90(cells).copy(), np.rot90(cells, 2).copy(), np.roll(cells, (11, 8), axis=(0, 1))):
+        assert np.abs(np.cumsum(here - parts(other)[2])).max() < 0.05
+
+
+def test_graph_carries_places_and_lengths() -> None:
+    graph = freespace_graph(submap_of(rectangle(8.0, 5.0)))
+    for a, b, length in graph.edges(data="length_m"):
+        assert length == pytest.approx(
+            np.hypot(*np.subtract(graph.nodes[a]["center_m"], graph.nodes[b]["center_m"]))
+        )
+    assert len(freespace_graph(submap_of(canvas()))) == 0

@@ -1,0 +1,136 @@
+"""Eq. 6-8 of the paper, and signatures of submaps with nothing in them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from signature.config import SignatureConfig
+from signature.describe import Signature, describe
+from signature.similarity import SignatureTable, distances, histogram_distance, similarity, structural_factor
+from tests.helpers.rooms import cross, degenerate, disc, l_shape, random_rooms, rectangle, submap_of
+
+CONFIG = SignatureConfig()
+
+
+def signature(boundary: list[float], freespace: list[float], symmetry: list[float]) -> Signature:
+    return Signature(boundary=np.array(boundary), freespace=np.array(freespace), symmetry=np.array(symmetry))
+
+
+def table(*signatures: Signature) -> SignatureTable:
+    return SignatureTable.of(signatures, np.zeros((len(signatures), 2)))
+
+
+def test_eq_6_to_8_by_hand() -> None:
+    query = signature([0.5, 0.5, 0.0], [1.0, 0.0], [50.0, 20.0])
+    other = signature([0.5, 0.0, 0.5], [0.64, 0.36], [110.0, 60.0])
+    boundary = math.sqrt(1 - 0.5)  # BC = sqrt(0.25)
+    freespace = math.sqrt(1 - 0.8)  # BC = sqrt(0.64)
+    phi_alpha = 0.08 * math.exp(60**2 / (2 * 120**2))
+    phi_beta = 0.08 * math.exp(40**2 / (2 * 120**2))
+    expected = phi_alpha * phi_beta * (0.9 * boundary + 0.1 * freespace)
+    assert distances(query, table(other), CONFIG)[0] == pytest.approx(expected, rel=1e-6)
+    log = SignatureConfig(histogram_distance="bhattacharyya")
+    expected = phi_alpha * phi_beta * (0.9 * math.log(2) - 0.1 * math.log(0.8))
+    assert distances(query, table(other), log)[0] == pytest.approx(expected, rel=1e-6)
+
+
+def test_eq_8_grows_with_the_difference_of_the_scores() -> None:
+    scores = np.array([[20.0, 30.0]], np.float32)
+    others = np.array([[20.0, 30.0], [50.0, 30.0], [50.0, 90.0], [200.0, 90.0]], np.float32)
+    factors = structural_factor(scores, others, CONFIG)[0]
+    assert factors[0] == pytest.approx(0.08**2)
+    assert (np.diff(factors) > 0).all()
+
+
+def test_alike_submaps_are_nearer_than_others() -> None:
+    rooms = table(
+        *(
+            describe(submap_of(cells))
+            for cells in (l_shape(), disc(4.0), cross(6.0, 2.0), rectangle(8.0, 5.0))
+        )
+    )
+    for i, cells in enumerate((l_shape(), disc(4.0), cross(6.0, 2.0), rectangle(8.0, 5.0))):
+        turned = describe(submap_of(np.rot90(cells).copy()))
+        assert int(np.argmin(distances(turned, rooms))) == i
+
+
+def test_identical_submaps_have_distance_zero_and_infinite_similarity() -> None:
+    room = describe(submap_of(rectangle(8.0, 5.0)))
+    assert distances(room, table(room))[0] == 0.0
+    assert similarity(distances(room, table(room)))[0] == np.inf
+
+
+@given(seed=st.integers(0, 300))
+@settings(max_examples=10, deadline=None)
+def test_all_rows_at_once_are_the_rows_one_by_one(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+
+    def random() -> Signature:
+        return signature(rng.dirichlet(np.ones(80)), rng.dirichlet(np.ones(80)), rng.uniform(0, 34, 2))
+
+    rows, query = [random() for _ in range(7)], random()
+    together = distances(query, table(*rows))
+    assert together == pytest.approx([distances(query, table(row))[0] for row in rows], rel=1e-9)
+    assert together == pytest.approx([distances(row, table(query))[0] for row in rows], rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["hellinger", "bhattacharyya"])
+@pytest.mark.parametrize("name", list(degenerate()))
+def test_degenerate_submaps_are_defined(name: str, kind: str) -> None:
+    config = SignatureConfig(histogram_distance=kind)
+    found = describe(degenerate()[name], config)
+    for histogram in (found.boundary, found.freespace):
+        assert histogram.shape == (80,)
+        assert histogram.sum() == pytest.approx(0.0) or histogram.sum() == pytest.approx(1.0)
+    assert np.isfinite(found.symmetry).all()
+    others = table(
+        found, describe(submap_of(rectangle(8.0, 5.0)), config), describe(degenerate()["unknown"], config)
+    )
+    assert np.isfinite(distances(found, others, config)).all()
+
+
+def test_knowing_nothing_is_like_nothing() -> None:
+    nothing = describe(degenerate()["unknown"])
+    room = describe(submap_of(rectangle(8.0, 5.0)))
+    worst = CONFIG.symmetry_scale**2
+    assert not nothing.boundary.any() and not nothing.freespace.any()
+    assert distances(nothing, table(nothing))[0] == pytest.approx(worst)
+    assert distances(nothing, table(room))[0] >= worst
+    assert distances(room, table(nothing))[0] >= distances(room, table(describe(submap_of(disc(4.0)))))[0]
+
+
+def test_two_walls_that_see_no_free_space() -> None:
+    found = describe(degenerate()["two occupied cells"])
+    assert np.flatnonzero(found.boundary).tolist() == [5]  # 1.0 m apart
+    assert not found.freespace.any()
+
+
+def test_empty_tables_and_wrong_shapes() -> None:
+    room = describe(submap_of(rectangle(8.0, 5.0)))
+    assert distances(room, SignatureTable.of([], np.empty((0, 2)))).shape == (0,)
+    with pytest.raises(ValueError, match="bins"):
+        histogram_distance(np.ones((1, 80), np.float32) / 80, np.ones((1, 60), np.float32) / 60, CONFIG)
+    with pytest.raises(ValueError, match="rows"):
+        SignatureTable(
+            boundary=np.zeros((2, 80), np.float32),
+            freespace=np.zeros((1, 80), np.float32),
+            symmetry=np.zeros((2, 2), np.float32),
+            session_index=np.zeros(2, np.int32),
+            submap_id=np.zeros(2, np.int32),
+            center_m=np.zeros((2, 2)),
+        )
+
+
+@given(seed=st.integers(0, 300))
+@settings(max_examples=6, deadline=None)
+def test_description_repeats_and_ignores_where_the_submap_lies(seed: int) -> None:
+    cells = random_rooms(seed)
+    first, second = describe(submap_of(cells)), describe(submap_of(cells))
+    for name in ("boundary", "freespace", "symmetry"):
+        assert np.array_equal(getattr(first, name), getattr(second, name))
+        assert not getattr(first, name).flags.writeable

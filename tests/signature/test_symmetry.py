@@ -1,0 +1,171 @@
+"""Reflection symmetry scores (paper III-D)."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from signature.boundary import boundary_edges
+from signature.config import SignatureConfig
+from signature.symmetry import blurred, line_segments, reflection_score, symmetry_axes, symmetry_scores
+from tests.helpers.rooms import (
+    RESOLUTION_M,
+    canvas,
+    cross,
+    l_shape,
+    polygon,
+    random_rooms,
+    rectangle,
+    submap_of,
+)
+
+CONFIG = SignatureConfig()
+
+
+def edges_of(cells: np.ndarray) -> np.ndarray:
+    return boundary_edges(submap_of(cells), CONFIG)
+
+
+def scores(cells: np.ndarray) -> np.ndarray:
+    return symmetry_scores(edges_of(cells), RESOLUTION_M, CONFIG)
+
+
+def line(angle_deg: float, length: float = 100.0) -> list[float]:
+    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    return [0.0, 0.0, length * c, length * s]
+
+
+def test_axes_are_the_directions_with_the_most_length() -> None:
+    axes = symmetry_axes(np.array([line(20), line(20), line(110, 150), line(70, 30)]), CONFIG)
+    assert axes is not None
+    assert math.degrees(axes.alpha_rad) == pytest.approx(20, abs=0.5)
+    assert math.degrees(axes.beta_rad) == pytest.approx(110, abs=0.5)
+
+
+def test_directions_are_undirected_and_wrap_around() -> None:
+    axes = symmetry_axes(np.array([line(179.4), line(0.6), line(-180.2)]), CONFIG)
+    assert axes is not None
+    assert abs((math.degrees(axes.alpha_rad) + 90) % 180 - 90) < 0.5
+    assert math.degrees(axes.beta_rad) == pytest.approx(90, abs=1)  # nothing else: the perpendicular
+
+
+def test_axes_need_not_be_perpendicular_but_are_apart() -> None:
+    axes = symmetry_axes(np.array([line(0, 200), line(10, 150), line(60, 50)]), CONFIG)
+    assert axes is not None
+    assert math.degrees(axes.beta_rad) == pytest.approx(60, abs=0.5)
+
+
+def test_short_segments_are_not_lines() -> None:
+    edges = np.zeros((321, 321), bool)
+    edges[100, 100:105] = True  # 0.25 m
+    assert len(line_segments(edges, RESOLUTION_M, CONFIG)) == 0
+    edges[200, 100:140] = True
+    segments = line_segments(edges, RESOLUTION_M, CONFIG)
+    assert len(segments) >= 1
+    assert (np.hypot(*(segments[:, 2:] - segments[:, :2]).T) * RESOLUTION_M >= 0.3 - 1e-6).all()
+
+
+def test_a_straight_line_peaks_at_the_stated_value() -> None:
+    edges = np.zeros((101, 101), bool)
+    edges[50, 10:91] = True
+    assert blurred(edges, RESOLUTION_M, CONFIG)[50, 50] == pytest.approx(CONFIG.symmetry_peak, rel=0.02)
+
+
+def test_eq_5_by_hand() -> None:
+    image = np.zeros((5, 5), np.float32)
+    image[1, 3], image[4, 0] = 10.0, 30.0
+    # Upright axis: columns swap, (1, 1) -> (1, 3) and (4, 4) -> (4, 0), (0, 0) -> (0, 4).
+    cells = np.array([[1, 1], [4, 4], [0, 0]])
+    assert reflection_score(cells, image, math.pi / 2) == pytest.approx(40 / 3)
+    # Level axis: rows swap, (3, 3) -> (1, 3).
+    assert reflection_score(np.array([[3, 3]]), image, 0.0) == pytest.approx(10.0)
+    # Diagonal axis: row and column swap.
+    assert reflection_score(np.array([[3, 1], [0, 4]]), image, math.pi / 4) == pytest.approx((10 + 30) / 2)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (7, 40), (101, 90)])
+@pytest.mark.parametrize("share", [0.0, 0.05, 1.0])
+def test_a_few_cells_are_blurred_as_opencv_blurs_all_of_them(shape: tuple[int, int], share: float) -> None:
+    edges = np.random.default_rng(1).random(shape) < share
+    sigma, peak = CONFIG.symmetry_blur_m / RESOLUTION_M, CONFIG.symmetry_peak
+    plain = cv2.GaussianBlur(
+        edges.astype(np.float32), (2 * math.ceil(3 * sigma) + 1,) * 2, sigma, borderType=cv2.BORDER_CONSTANT
+    )
+    expected = np.minimum(plain * peak * sigma * math.sqrt(2 * math.pi), peak)
+    assert blurred(edges, RESOLUTION_M, CONFIG) == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 1.2, math.pi / 2, 3.0])
+def test_mirror_images_are_read_between_the_cells_and_beyond_the_rim(angle: float) -> None:
+    rng = np.random.default_rng(2)
+    image, cells = rng.random((9, 14), np.float32), rng.integers(0, (9, 14), (200, 2))
+    inside = np.pad(image, 20)  # of zeros, so that nothing is outside
+    mirrored = np.array(
+        [[math.cos(2 * angle), math.sin(2 * angle)], [math.sin(2 * angle), -math.cos(2 * angle)]]
+    )
+    columns, rows = mirrored @ (cells - [4.0, 6.5])[:, ::-1].T + [[26.5], [24.0]]
+    expected = ndimage.map_coordinates(inside, [rows, columns], order=1).mean()
+    assert reflection_score(cells, image, angle) == pytest.approx(float(expected), rel=1e-5)
+
+
+def test_mirroring_the_pixels_is_rotating_and_flipping_the_image() -> None:
+    edges, angle = edges_of(random_rooms(4)), math.radians(30)
+    image = blurred(edges, RESOLUTION_M, CONFIG)
+    middle = (160.0, 160.0)
+    upright = cv2.getRotationMatrix2D(middle, math.degrees(angle) - 90, 1.0)
+    turned_image = cv2.warpAffine(image, upright, (321, 321))
+    flipped = turned_image[:, ::-1]
+    cells = np.argwhere(edges)
+    columns, rows = upright @ np.vstack((cells[:, 1], cells[:, 0], np.ones(len(cells))))
+    expected = cv2.remap(
+        flipped, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR
+    ).mean()
+    assert reflection_score(cells, image, angle) == pytest.approx(float(expected), rel=0.03)
+
+
+def test_a_mirrored_room_scores_higher_than_an_l_shape() -> None:
+    for symmetric in (rectangle(8.0, 6.0), cross(6.0, 2.0)):
+        assert scores(symmetric).min() > 1.5 * scores(l_shape()).max()
+    assert scores(rectangle(8.0, 6.0)).min() > 0.9 * CONFIG.symmetry_peak
+
+
+def test_moving_one_wall_of_a_mirrored_room_costs_one_axis() -> None:
+    room = rectangle(8.0, 6.0)
+    whole = scores(room)
+    off = scores(polygon([(-4, -3), (3, -3), (3, 3), (-4, 3)]))
+    assert off.min() < 0.8 * whole.min()
+    assert off.max() > 0.9 * whole.max()
+
+
+@pytest.mark.parametrize("angle_deg", [10, 33, 45, 90, 137])
+def test_turning_the_room_changes_the_scores_little(angle_deg: float) -> None:
+    def turned(angle: float) -> np.ndarray:
+        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        corners = [(-5, -3), (5, -3), (5, 3), (1, 3), (1, 1), (-5, 1)]
+        return polygon([(c * x - s * y, s * x + c * y) for x, y in corners])
+
+    # A line at 45 degrees has 1 / sqrt(2) of the pixels of a level one of the same length, and so that much
+    # less of a crest; the rest of the tolerance is the axis, which Hough finds to 1.5 degrees.
+    ratio = scores(turned(angle_deg)) / scores(turned(0))
+    assert (ratio > 0.8 / math.sqrt(2)).all() and (ratio < 1.15).all()
+    assert scores(turned(angle_deg)) == pytest.approx(scores(turned(angle_deg + 90)), rel=0.2)
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=10, deadline=None)
+def test_scores_stay_in_range_and_repeat(seed: int) -> None:
+    cells = random_rooms(seed)
+    first = scores(cells)
+    assert (first >= 0).all() and (first <= CONFIG.symmetry_peak).all()
+    assert np.array_equal(first, scores(cells))
+
+
+def test_without_walls_there_is_no_axis() -> None:
+    assert symmetry_axes(np.empty((0, 4)), CONFIG) is None
+    assert scores(canvas()).tolist() == [0.0, 0.0]

@@ -1,0 +1,83 @@
+"""Refinement below the cell size, the compiled step against the plain one, and the covariance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pc2grid.geometry import SE2
+from pc2grid.mapping.likelihood_field import LIKELIHOOD
+from pc2grid.model import OccupancyGrid
+from signature.verification._kernels import normal_equations
+from signature.verification.refinement import (
+    REFINEMENT,
+    RefinementParameters,
+    gauss_newton,
+    plain_normal_equations,
+    refine,
+)
+from signature.verification.walls import WallParameters, Walls
+from signature.verification.window_search import SearchMap
+from tests.helpers.simulated_drives import office, office_part, plan
+
+MAP = SearchMap.of(office())
+FIELD = MAP.field
+ONE_STEP = RefinementParameters(steps=1)
+
+
+@pytest.mark.parametrize("near", [(220.0, 160.0), (65.0, 65.0)])  # the other: walls hang over the map's edge
+def test_the_compiled_normal_equations_are_the_plain_ones(near: tuple[float, float]) -> None:
+    x, y = np.random.default_rng(0).uniform(-120, 120, (2, 400))
+    fast = normal_equations(FIELD.values, x, y, *near, 0.3)
+    plain = plain_normal_equations(FIELD.values, x, y, *near, 0.3)
+    assert fast[3] == plain[3] >= REFINEMENT.least_points
+    for a, b in zip(fast, plain, strict=True):
+        assert np.allclose(a, b, rtol=1e-9, atol=1e-9)
+    pose, _, _ = gauss_newton(FIELD.values, x, y, np.array([*near, 0.3]), ONE_STEP)
+    H, g = plain[:2]
+    step = np.linalg.solve(H + np.diag(0.05 * np.diag(H) + 1e-3), g)
+    size = math.hypot(step[0], step[1])
+    assert size > 0.01
+    assert pose == pytest.approx(np.array([*near, 0.3]) + (step * 2.0 / size if size > 2.0 else step))
+
+
+def test_a_step_of_the_refinement_is_two_cells_at_most() -> None:
+    """Far down the slope of a wall the straight line leads much too far."""
+    field = np.zeros((80, 80), np.uint8)
+    away = np.arange(80) - 40.0
+    sigma = LIKELIHOOD.sigma_m / FIELD.resolution_m
+    field[:] = np.exp(-0.5 * (away / sigma) ** 2) * 255
+    x, y = np.zeros(40), np.linspace(-15, 15, 40)
+    start = np.array([40.5 - 2.2 * sigma, 40.0, 0.0])
+    (tx, ty, _), _, _ = gauss_newton(field, x, y, start, ONE_STEP)
+    assert math.hypot(tx - start[0], ty - 40.0) == pytest.approx(2.0, abs=1e-9)
+    assert tx > start[0]
+    (tx, _, yaw), _, _ = gauss_newton(field, x, y, start, RefinementParameters(steps=30))
+    assert tx == pytest.approx(40.5, abs=0.05) and yaw == pytest.approx(0.0, abs=1e-3)
+
+
+def test_many_points_are_refined_after_a_few_of_them() -> None:
+    walls = Walls.of(office(), WallParameters(spacing_m=0.05))
+    assert len(walls.points_m) > 2000
+    pose, _ = refine(FIELD, walls.points_m, SE2(0.12, -0.08, 0.01), (10.0, 7.0))
+    assert math.hypot(pose.x, pose.y) < 0.01 and abs(pose.yaw) < 1e-3
+
+
+def test_the_pose_found_turns_with_the_query() -> None:
+    walls = Walls.of(office_part((10.5, 7.0)))
+    turned = SE2(1.0, -2.0, 2.1)
+    guess = SE2(10.6, 7.1, 0.03) @ turned.inverse()
+    pose, _ = refine(FIELD, turned.apply(walls.points_m).astype(np.float32), guess, (1.0, -2.0))
+    there = pose @ turned
+    assert math.dist((there.x, there.y), (10.5, 7.0)) < 0.03 and abs(there.yaw) < 0.01
+
+
+def test_a_corridor_is_certain_across_and_uncertain_along() -> None:
+    corridor = plan(30, 2, [])
+    part = OccupancyGrid(cells=corridor.cells[:, 200:300], resolution_m=0.05, origin_m=(-2.5, -1.0))
+    field, points_m = SearchMap.of(corridor).field, Walls.of(part).points_m
+    _, covariance = refine(field, points_m, SE2(12.5, 1.0, 0.0), (0.0, 0.0))
+    along, across = math.sqrt(covariance[0, 0]), math.sqrt(covariance[1, 1])
+    assert across < 0.05 < 0.3 < along

@@ -1,0 +1,237 @@
+"""The coarse search against brute force, its compiled functions against the plain ones."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from pc2grid.geometry import SE2
+from pc2grid.mapping.likelihood_field import LIKELIHOOD
+from signature.verification._kernels import best_of_boxes, box_bounds
+from signature.verification.refinement import refine
+from signature.verification.two_way_score import score_fit
+from signature.verification.walls import Walls
+from signature.verification.window_search import (
+    MARGIN_M,
+    MOST_POINTS,
+    REACHES_M,
+    SearchMap,
+    SearchParameters,
+    headings,
+    levels_for,
+    plain_best_of_boxes,
+    plain_box_bounds,
+    search_windows,
+    with_blocks,
+)
+from tests.helpers.simulated_drives import office, office_part
+
+MAP = SearchMap.of(office())
+FIELD, WALLS_M = MAP.field, MAP.walls.points_m
+STEP = math.radians(2.0)
+ALL = {"floor": 0.0, "keep": 0.0}
+
+
+def score(points: np.ndarray, pose: np.ndarray, level: np.ndarray) -> float:
+    """Mean of sliding maxima `level` (N,) at points (N, 2) m moved by x, y, yaw."""
+    cells = np.array([*(pose[:2] - FIELD.origin_m) / FIELD.resolution_m, pose[2]])
+    total = plain_box_bounds(MAP.levels, level, points.astype(float) / FIELD.resolution_m, cells[None])[0]
+    return float(total / (255.0 * len(points)))
+
+
+def levels_of(points: np.ndarray, step_rad: float) -> np.ndarray:
+    """The sliding maxima for half a cell and half a step of heading."""
+    distance = np.hypot(*points.T) / FIELD.resolution_m
+    return levels_for(0.5 + distance * 0.5 * step_rad, FIELD.resolution_m)
+
+
+def seen_from(truth: np.ndarray, walls: np.ndarray) -> np.ndarray:
+    """Wall points of the map in the frame of a pose."""
+    c, s = math.cos(truth[2]), math.sin(truth[2])
+    return ((walls - truth[:2]) @ np.array([[c, -s], [s, c]])).astype(np.float32)
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 10_000), corner=st.booleans())
+def test_the_best_pose_is_the_best_of_all_in_the_box(seed: int, corner: bool) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-5, 5, (30, 2)).astype(np.float32)
+    # Near a corner of the map, most windows hang over its edge.
+    start = np.array([[*((0.3, 0.3) if corner else rng.uniform(3, 11, 2)), rng.uniform(-3, 3)]])
+    found = search_windows(
+        MAP,
+        points,
+        start,
+        half_t_m=0.2,
+        half_a_rad=3 * STEP / 2,
+        parameters=SearchParameters(step_rad=STEP, **ALL),
+    )
+    steps, turns = FIELD.resolution_m * np.arange(-4, 5), STEP * np.arange(-1, 2)
+    poses = start[0] + np.array([(dx, dy, da) for dx in steps for dy in steps for da in turns])
+    level = levels_of(points, STEP)
+    everywhere = [score(points, pose, level) for pose in poses]
+    # A coordinate on the border of two cells may be rounded either way.
+    assert found[0, 3] == pytest.approx(max(everywhere), abs=0.02)
+    assert score(points, found[0, :3], level) == pytest.approx(found[0, 3], abs=0.02)
+    within = start[0] + rng.uniform(-1, 1, (200, 3)) * (0.2, 0.2, 3 * STEP / 2)
+    exact = np.zeros(len(points), int)
+    assert max(score(points, pose, exact) for pose in within) <= found[0, 3] + 0.02
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000))
+@example(seed=435)
+def test_the_search_misses_nothing_that_brute_force_finds(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-2, 2, (40, 2)).astype(np.float32)
+    start = np.array([[rng.uniform(4, 16), rng.uniform(3, 11), rng.uniform(-3, 3)]])
+    one = SearchParameters(most=1, **ALL)
+    found = search_windows(MAP, points, start, half_t_m=0.4, half_a_rad=0.1, parameters=one)
+    steps = np.linspace(-1, 1, 12)
+    exact = np.zeros(len(points), int)
+    offsets = itertools.product(0.4 * steps, 0.4 * steps, 0.1 * steps)
+    best = max(score(points, start[0] + np.array(offset), exact) for offset in offsets)
+    # Bounds neglect half a cell, which a few of the points may need; no empty promise either.
+    assert best - 0.02 <= found[0, 3] <= best + 0.35
+
+
+@pytest.mark.parametrize("center", [(2.0, 7.0), (10.5, 7.0), (15.0, 4.0), (6.0, 10.0)])
+def test_a_cut_out_of_the_map_is_found_where_it_was_cut(center: tuple[float, float]) -> None:
+    walls = Walls.of(office_part(center))
+    x, y, yaw = np.meshgrid(np.arange(1, 20, 1.0), np.arange(1, 14, 1.0), np.arange(-180, 180, 15.0))
+    everywhere = np.column_stack((x.ravel(), y.ravel(), np.radians(yaw.ravel())))
+    points = walls.points_m[:: -(-len(walls.points_m) // MOST_POINTS)]
+    poses = search_windows(
+        MAP,
+        points,
+        everywhere,
+        half_t_m=0.5,
+        half_a_rad=math.radians(7.5),
+        parameters=SearchParameters(keep=0.9),
+    )
+    pose, _ = refine(FIELD, walls.points_m, SE2(*poses[0, :3]), (0.0, 0.0))
+    assert math.dist((pose.x, pose.y), center) < 0.03
+    assert abs(pose.yaw) < math.radians(0.5)
+    fit = score_fit(MAP.walls, walls, pose, np.eye(3))
+    assert fit.forward > 0.95 and fit.backward > 0.9 and fit.overlap > 0.99
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 90])
+def test_the_right_one_of_several_boxes_wins(count: int) -> None:
+    rng = np.random.default_rng(count)
+    truth = np.array([10.3, 7.1, 0.4])
+    walls = WALLS_M[np.hypot(*(WALLS_M - truth[:2]).T) < 4.0]
+    points = seen_from(truth, walls[rng.choice(len(walls), count, replace=False)])
+    starts = truth + np.array([(0.3, -0.2, 0.05), (-3.0, 2.0, 1.0), (4.0, -3.0, -2.0)])
+    shape = {"half_t_m": 0.5, "half_a_rad": math.radians(5.0)}
+    found = search_windows(MAP, points, starts, parameters=SearchParameters(floor=0.3, keep=0.7), **shape)
+    assert found[0, 3] > 0.95
+    if count == 90:
+        assert math.dist(found[0, :2], truth[:2]) < 0.15 and abs(found[0, 2] - truth[2]) < 0.03
+
+
+def test_reported_poses_lie_apart_and_best_first() -> None:
+    points = np.random.default_rng(0).uniform(-2, 2, (40, 2)).astype(np.float32)
+    starts = np.array([(x, 7.0, yaw) for x in range(4, 16) for yaw in (0.0, 0.1, 2.0)])
+    some = SearchParameters(floor=0.0, keep=0.5, most=12)
+    found = search_windows(MAP, points, starts, half_t_m=0.6, half_a_rad=0.1, parameters=some)
+    assert len(found) > 3 and (np.diff(found[:, 3]) <= 0).all() and found[-1, 3] >= 0.5 * found[0, 3]
+    for i, a in enumerate(found):
+        for b in found[i + 1 :]:
+            turned = abs(math.remainder(a[2] - b[2], 2 * math.pi))
+            assert np.abs(a[:2] - b[:2]).max() >= 0.5 or turned >= math.radians(10)
+
+
+def test_nothing_to_search_and_too_much() -> None:
+    start = np.array([[5.0, 5.0, 0.0]])
+    for points, starts in ((np.zeros((0, 2)), start), (np.zeros((3, 2)), start[:0])):
+        found = search_windows(MAP, points.astype(np.float32), starts, half_t_m=0.5, half_a_rad=0.1)
+        assert found.shape == (0, 4)
+    with pytest.raises(ValueError, match="at most"):
+        points = np.zeros((MOST_POINTS + 1, 2), np.float32)
+        search_windows(MAP, points, start, half_t_m=0.5, half_a_rad=0.1)
+    black = np.zeros((MOST_POINTS, 2), np.float32)
+    on_wall = WALLS_M[:1].astype(np.float64)
+    found = search_windows(MAP, black, np.array([[*on_wall[0], 0.0]]), half_t_m=0.05, half_a_rad=0.01)
+    assert found[0, 3] == pytest.approx(1.0)  # 256 times 255 still fits
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10_000), half_m=st.floats(0.05, 1.5))
+def test_leaving_out_what_would_not_be_reported_changes_nothing(seed: int, half_m: float) -> None:
+    rng = np.random.default_rng(seed)
+    truth = np.array([*rng.uniform((1, 1), (19, 13)), rng.uniform(-3, 3)])
+    points = seen_from(truth, WALLS_M[np.hypot(*(WALLS_M - truth[:2]).T) < 5.0][:200])
+    starts = np.concatenate((truth[None] + 0.02, truth + rng.uniform(-1, 1, (4, 3)) * (3, 3, 3)))
+    shape = {"half_t_m": half_m, "half_a_rad": 2 * STEP}
+    every = SearchParameters(step_rad=STEP, most=100, **ALL)
+    good = SearchParameters(step_rad=STEP, most=100, floor=0.3, keep=0.8)
+    whole = search_windows(MAP, points, starts, parameters=every, **shape)
+    found = search_windows(MAP, points, starts, parameters=good, **shape)
+    assert np.array_equal(found, whole[whole[:, 3] >= max(0.3, 0.8 * whole[0, 3])])
+
+
+def test_points_so_far_away_that_no_maximum_covers_them() -> None:
+    """Half a heading moves them further than any sliding maximum looks, and they may be on a wall."""
+    rng, half_a_rad = np.random.default_rng(5), math.radians(10.0)
+    angles, far = rng.uniform(-math.pi, math.pi, 24), rng.uniform(1, 9, 24)
+    points = np.column_stack((far * np.cos(angles), far * np.sin(angles))).astype(np.float32)
+    starts = np.array([(10.02, 7.03, 0.2 + turn * 2 * half_a_rad) for turn in (-1, 0, 1)])
+    coarse = SearchParameters(step_rad=2 * half_a_rad, **ALL)
+    found = search_windows(MAP, points, starts, half_t_m=0.2, half_a_rad=half_a_rad, parameters=coarse)
+    level = levels_of(points, 2 * half_a_rad)
+    assert level.max() == len(REACHES_M) - 1
+    steps = FIELD.resolution_m * np.arange(-4, 5)
+    poses = [start + np.array((dx, dy, 0.0)) for start in starts for dx in steps for dy in steps]
+    scores = [score(points, pose, level) for pose in poses]
+    # A coordinate on the border of two cells may be rounded either way.
+    assert found[0, 3] == pytest.approx(max(scores), abs=0.02)
+    assert max(scores) - np.median(scores) > 0.05
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10_000), inside=st.booleans())
+def test_the_compiled_functions_are_the_plain_ones(seed: int, inside: bool) -> None:
+    rng = np.random.default_rng(seed)
+    _, height, width = MAP.levels.shape
+    points = rng.uniform(-60, 60, (25, 2))
+    low, high = ((100, 100), (width - 100, height - 100)) if inside else ((-40, -40), (width + 40, 60))
+    boxes = np.column_stack((rng.uniform(low, high, (6, 2)), rng.uniform(-3, 3, 6)))
+    level, half = rng.integers(0, 5, 25), 4
+    bounds = box_bounds(MAP.levels, level, points, boxes)
+    assert np.array_equal(bounds, plain_box_bounds(MAP.levels, level, points, boxes))
+    turns = headings(0.05, 0.03)
+    unbounded = np.full(6, 255 * 25)
+    prepared = MAP.levels.reshape(-1), MAP.blocks.reshape(-1), FIELD.values.shape
+    levels = with_blocks(level, FIELD.resolution_m)
+    fast = best_of_boxes(*prepared, levels, points, boxes, unbounded, half, turns, 0.0, 0.0)
+    slow = plain_best_of_boxes(MAP.levels, level, points, boxes, half, turns)
+    assert fast[:, 3] == pytest.approx(slow[:, 3], abs=1e-12)
+    again = [box_bounds(MAP.levels, level, points, pose[None, :3])[0] for pose in fast]
+    assert np.array(again) / (255.0 * 25) == pytest.approx(slow[:, 3], abs=1e-12)
+
+
+def test_no_pose_of_a_box_exceeds_its_bound() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-120, 120, (50, 2))
+    box = np.array([[250.0, 200.0, 0.4]])
+    half_t, half_a = 8.0, math.radians(8.0)
+    level = levels_for(half_t + np.hypot(*points.T) * half_a, FIELD.resolution_m)
+    bound = box_bounds(MAP.levels, level, points, box)[0]
+    poses = box + rng.uniform(-1, 1, (300, 3)) * (half_t, half_t, half_a)
+    scores = box_bounds(MAP.levels, np.zeros(50, np.int64), points, poses)
+    assert scores.max() <= bound < 255 * 50
+
+
+def test_the_edge_of_the_margin_is_neutral_on_all_levels() -> None:
+    """So that points farther outside may be taken to lie on it, with a window of a box around them."""
+    wide = round((MARGIN_M - REACHES_M[-1] - 0.4) / FIELD.resolution_m)
+    assert wide * FIELD.resolution_m >= 0.9
+    edge = np.ones(MAP.levels.shape[1:], bool)
+    edge[wide:-wide, wide:-wide] = False
+    assert (MAP.levels[:, edge] == LIKELIHOOD.neutral_value).all()

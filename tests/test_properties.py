@@ -1,0 +1,231 @@
+"""Laws that hold for any input: of poses, of settings, of what is written and read back."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from pc2grid.config import Section
+from pc2grid.errors import ConfigError
+from pc2grid.geometry import (
+    SE2,
+    interpolate_pose,
+    invert_pose,
+    pose_from_rotation_vector,
+    pose_from_xyz_quat,
+    quat_xyzw_from_pose,
+    rotation_vector,
+    transform_points,
+    wrap_angle,
+)
+from pc2grid.io.trajectory import read_kitti, write_kitti
+from pc2grid.model import Trajectory
+from pc2grid.settings import dump_settings, load_settings
+from signature.config import Config
+
+METRES = st.floats(-1e4, 1e4)
+ANGLES = st.floats(-10, 10)
+PLANAR = st.builds(SE2, METRES, METRES, ANGLES)
+TURNS = st.lists(st.floats(-math.pi, math.pi), min_size=3, max_size=3).map(np.array)
+
+
+@st.composite
+def spatial(draw: st.DrawFn) -> np.ndarray:
+    rotation = draw(TURNS)
+    norm = float(np.linalg.norm(rotation))
+    scaled = rotation * min(1.0, 3.1 / norm) if norm else rotation
+    return pose_from_rotation_vector(scaled, draw(st.lists(METRES, min_size=3, max_size=3)))
+
+
+def assert_same(a: SE2, b: SE2) -> None:
+    assert a.x == pytest.approx(b.x, abs=1e-7)
+    assert a.y == pytest.approx(b.y, abs=1e-7)
+    assert abs(wrap_angle(a.yaw - b.yaw)) < 1e-9
+
+
+# --- poses --------------------------------------------------------------------------------------------
+
+
+@given(st.floats(-1e6, 1e6))
+def test_an_angle_is_wrapped_to_itself(angle_rad: float) -> None:
+    wrapped = wrap_angle(angle_rad)
+    assert -math.pi < wrapped <= math.pi
+    assert math.cos(wrapped) == pytest.approx(math.cos(angle_rad), abs=1e-9)
+    assert math.sin(wrapped) == pytest.approx(math.sin(angle_rad), abs=1e-9)
+    assert wrap_angle(wrapped) == wrapped
+
+
+def test_half_a_turn_has_one_name() -> None:
+    assert wrap_angle(-math.pi) == wrap_angle(math.pi) == math.pi
+    half_turns = math.pi * np.array([-3.0, -1.0, 1.0, 3.0])
+    assert wrap_angle(half_turns).tolist() == [math.pi] * 4
+
+
+@given(st.lists(st.floats(-1e6, 1e6)))
+def test_an_array_of_angles_is_wrapped_like_each_of_them(angles_rad: list[float]) -> None:
+    wrapped = wrap_angle(np.array(angles_rad))
+    assert wrapped.shape == (len(angles_rad),)
+    for angle_rad, found in zip(angles_rad, wrapped.tolist(), strict=True):
+        assert -math.pi < found <= math.pi
+        assert abs(wrap_angle(found - wrap_angle(angle_rad))) < 1e-9
+
+
+@given(PLANAR, PLANAR, PLANAR)
+def test_planar_poses_are_a_group(a: SE2, b: SE2, c: SE2) -> None:
+    assert_same((a @ b) @ c, a @ (b @ c))
+    assert_same(a @ SE2(), a)
+    assert_same(SE2() @ a, a)
+    assert_same(a @ a.inverse(), SE2())
+    assert_same((a @ b).inverse(), b.inverse() @ a.inverse())
+
+
+@given(PLANAR, PLANAR, st.lists(st.tuples(METRES, METRES), max_size=5))
+def test_planar_poses_act_on_points(a: SE2, b: SE2, points: list[tuple[float, float]]) -> None:
+    xy = np.array(points, float).reshape(-1, 2)
+    np.testing.assert_allclose((a @ b).apply(xy), a.apply(b.apply(xy)), atol=1e-7)
+    np.testing.assert_allclose((a @ b).matrix(), a.matrix() @ b.matrix(), atol=1e-7)
+    homogeneous = np.column_stack((xy, np.ones(len(xy)))) @ a.matrix().T
+    np.testing.assert_allclose(a.apply(xy), homogeneous[:, :2], atol=1e-7)
+    assert_same(SE2.from_matrix(a.lift()), a)
+    moved, kept = a.apply(xy), np.linalg.norm(np.diff(xy, axis=0), axis=1)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(moved, axis=0), axis=1), kept, atol=1e-7)
+
+
+@given(PLANAR, st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=3, max_size=8))
+def test_fitting_finds_the_pose_that_moved_the_points(a: SE2, points: list[tuple[float, float]]) -> None:
+    xy = np.array(points)
+    assume(np.linalg.norm(xy - xy.mean(axis=0), axis=1).max() > 1.0)
+    np.testing.assert_allclose(SE2.fit(xy, a.apply(xy)).apply(xy), a.apply(xy), atol=1e-6)
+
+
+@settings(deadline=None)
+@given(spatial(), spatial())
+def test_spatial_poses(a: np.ndarray, b: np.ndarray) -> None:
+    np.testing.assert_allclose(a @ invert_pose(a), np.eye(4), atol=1e-7)
+    quat = quat_xyzw_from_pose(a)
+    assert np.linalg.norm(quat) == pytest.approx(1.0)
+    assert quat[3] >= 0
+    np.testing.assert_allclose(pose_from_xyz_quat(a[:3, 3], quat), a, atol=1e-9)
+    np.testing.assert_allclose(pose_from_xyz_quat(a[:3, 3], -7 * quat), a, atol=1e-9)
+    np.testing.assert_allclose(pose_from_rotation_vector(rotation_vector(a), a[:3, 3]), a, atol=1e-7)
+    points = np.random.default_rng(0).uniform(-9, 9, (4, 3))
+    moved = transform_points(a @ b, points)
+    np.testing.assert_allclose(moved, transform_points(a, transform_points(b, points)), atol=1e-7)
+
+
+@settings(deadline=None)
+@given(spatial(), spatial(), st.floats(0, 1))
+def test_between_two_poses(a: np.ndarray, b: np.ndarray, fraction: float) -> None:
+    np.testing.assert_allclose(interpolate_pose(a, b, 0.0), a, atol=1e-7)
+    np.testing.assert_allclose(interpolate_pose(a, b, 1.0), b, atol=1e-6)
+    between = interpolate_pose(a, b, fraction)
+    line = (1 - fraction) * a[:3, 3] + fraction * b[:3, 3]
+    np.testing.assert_allclose(between[:3, 3], line, atol=1e-6)
+    np.testing.assert_allclose(between[:3, :3] @ between[:3, :3].T, np.eye(3), atol=1e-9)
+
+
+@pytest.mark.parametrize("turn", [(math.pi, 0, 0), (0, math.pi, 0), (0, 0, math.pi), (2.0, 2.0, 1.0)])
+def test_half_turns_keep_their_digits(turn: tuple[float, float, float]) -> None:
+    """Where a naive quaternion divides by nearly zero."""
+    axis = np.array(turn) / np.linalg.norm(turn)
+    pose = pose_from_rotation_vector(axis * math.pi)
+    quat = quat_xyzw_from_pose(pose)
+    np.testing.assert_allclose(np.abs(quat[:3]), np.abs(axis), atol=1e-12)
+    np.testing.assert_allclose(pose_from_xyz_quat((0, 0, 0), quat), pose, atol=1e-12)
+
+
+@pytest.mark.parametrize("quat", [(0, 0, 0, 0), (0, 0, 0, 1e-10), (0, 0, 0, math.nan), (math.inf, 0, 0, 1)])
+def test_a_quaternion_without_direction(quat: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="no direction"):
+        pose_from_xyz_quat((0, 0, 0), quat)
+
+
+# --- files --------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(spatial(), max_size=4))
+def test_kitti_survives(poses: list[np.ndarray]) -> None:
+    T = np.array(poses).reshape(-1, 4, 4)
+    before = Trajectory(stamps_ns=np.arange(len(T)), T_session_base=T)
+    with tempfile.TemporaryDirectory() as folder:
+        write_kitti(Path(folder) / "p.txt", before)
+        found = read_kitti(Path(folder) / "p.txt")
+    np.testing.assert_allclose(found, T, rtol=1e-8, atol=1e-9)
+
+
+# --- settings -----------------------------------------------------------------------------------------
+
+
+def values(annotation: Any, default: Any) -> st.SearchStrategy[Any]:
+    """Values that a setting may take, by its type; not all of them are within its range."""
+    if get_origin(annotation) is Literal:
+        return st.sampled_from(get_args(annotation))
+    if get_origin(annotation) is not None and type(None) in get_args(annotation):
+        rest = next(a for a in get_args(annotation) if a is not type(None))
+        return st.none() | values(rest, default)
+    if annotation is bool:
+        return st.booleans()
+    if annotation is int:
+        return st.integers(0, 2 * (default or 50))
+    if annotation is float:
+        return st.floats(0, 4 * (default or 1.0)) | st.sampled_from([1e-7, 1e22, 0.1 + 0.2])
+    if annotation is str:
+        return st.text(max_size=12)
+    return st.just(default)
+
+
+SETTINGS = [
+    (name, key, values(info.annotation, info.default))
+    for name, field in Config.model_fields.items()
+    if isinstance(field.annotation, type) and issubclass(field.annotation, Section)
+    for key, info in field.annotation.model_fields.items()
+]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data())
+def test_any_settings_survive_their_dump(data: st.DataObject) -> None:
+    tree: dict[str, dict[str, Any]] = {}
+    for name, key, strategy in data.draw(st.lists(st.sampled_from(SETTINGS), min_size=1, max_size=12)):
+        tree.setdefault(name, {})[key] = data.draw(strategy, label=f"{name}.{key}")
+    try:
+        wanted = Config.model_validate(tree)
+    except ValidationError:
+        assume(False)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "settings.toml"
+        path.write_text(dump_settings(wanted), encoding="utf-8")
+        assert load_settings(Config, path, (), {}) == wanted
+    assert Config.model_validate_json(wanted.model_dump_json()) == wanted
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
+def test_no_file_of_settings_breaks_anything(content: bytes) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "settings.toml"
+        path.write_bytes(content)
+        try:
+            assert load_settings(Config, path, (), {}) == Config()
+        except ConfigError as error:
+            assert str(path) in error.message
+            assert "\n" not in error.message
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.text(max_size=20), st.text(max_size=20))
+def test_no_assignment_breaks_anything(key: str, value: str) -> None:
+    for text in (f"{key}={value}", f"read.topic={value}", f"partition.{key}={value}", key):
+        try:
+            load_settings(Config, None, [text], {})
+        except ConfigError as error:
+            assert error.message

@@ -1,0 +1,126 @@
+"""Statements of the repository are true: README commands exist, versions are pinned, scripts are POSIX."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import pc2grid
+from pc2grid.config import PartitionConfig
+from pc2grid.errors import ConfigError
+from pc2grid.settings import dump_settings, load_settings
+from pc2grid_cli.main import app
+from signature.config import Config
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.mark.parametrize("target", re.findall(r"^make (\w+)", (ROOT / "README.md").read_text(), re.MULTILINE))
+def test_readme_targets_are_real(target: str) -> None:
+    assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+
+
+def test_constraints_are_plain_versions() -> None:
+    line = re.compile(r"^[a-z0-9-]+==[0-9][0-9a-z.]*( ?; python_version [<>]=? '3\.1\d')?$")
+    lines = [text for text in (ROOT / "constraints.txt").read_text().splitlines() if not text.startswith("#")]
+    assert len(lines) > 20
+    assert [text for text in lines if not line.match(text)] == []
+
+
+def test_scripts_are_posix_shell() -> None:
+    for script in ("tools/setup.sh", ".ci/run"):
+        assert (ROOT / script).read_text().startswith("#!/bin/sh\n")
+        assert subprocess.run(["sh", "-n", ROOT / script], check=False).returncode == 0
+
+
+def test_library_neither_prints_nor_exits_nor_imports_upward() -> None:
+    code = (
+        "import sys, pc2grid, pc2grid.model, pc2grid.errors, pc2grid.config, signature.config\n"
+        "print([m for m in ('pc2grid_cli', 'open3d', 'cv2', 'matplotlib') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+def test_dump_reads_back_as_the_same_settings(tmp_path: Path) -> None:
+    changed = load_settings(
+        Config, None, ['read.topic=/scan "x"', "partition.radius_m=4", "read.odometry=none"], {}
+    )
+    for settings in (Config(), changed):
+        file = tmp_path / "settings.toml"
+        file.write_text(dump_settings(settings), encoding="utf-8")
+        assert load_settings(Config, file, (), {}) == settings
+
+
+def test_presets_are_named_and_what_a_file_says_overrides_them(tmp_path: Path) -> None:
+    usual, paper = PartitionConfig(), Config.paper().partition
+    assert usual == PartitionConfig.travelled() == Config().partition == pc2grid.Config().partition
+    assert (usual.view, usual.radius_m, usual.spacing_m) == ("isovist", 5.0, 1.0)
+    assert (paper.view, paper.radius_m, paper.spacing_m) == ("disc", 8.0, None)
+    file = tmp_path / "mine.toml"
+    file.write_text("[partition]\nradius_m = 6.0\n")
+    found = load_settings(Config, file, ["partition.cluster_m=2"], {}, preset=Config.paper())
+    assert found.partition == PartitionConfig(view="disc", radius_m=6.0, spacing_m=None, cluster_m=2.0)
+    file.write_text(dump_settings(Config.paper()), encoding="utf-8")
+    assert load_settings(Config, file, (), {}) == Config.paper()
+    with pytest.raises(ConfigError, match=r"did you mean partition\.radius_m"):
+        load_settings(Config, None, ["partition.radius=3"], {}, preset=Config.paper())
+
+
+def test_the_preset_of_the_paper_on_the_command_line(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(CliRunner().invoke(app, ["config", "dump", "--preset", "paper"]).stdout, encoding="utf-8")
+    assert load_settings(Config, file, (), {}) == Config.paper()
+
+
+def test_every_setting_is_explained() -> None:
+    for name, field in Config.model_fields.items():
+        section = field.annotation
+        assert section is not None
+        unexplained = [key for key, info in section.model_fields.items() if not info.description]
+        assert unexplained == [], f"in section {name}"
+
+
+def test_one_setting_leaves_the_others_of_its_section_alone() -> None:
+    for name, section in Config():
+        for key, value in section:
+            text = "null" if value is None else json.dumps(value)
+            assert load_settings(Config, None, [f"{name}.{key}={text}"], {}) == Config()
+
+
+def test_order_of_precedence(tmp_path: Path) -> None:
+    low, high = tmp_path / "low.toml", tmp_path / "high.toml"
+    low.write_text("[partition]\nradius_m = 3.0\n[relocalize]\ntop_k = 3\n")
+    high.write_text("[partition]\nradius_m = 4.0\n")
+    environment = {"PC2GRID_CONFIG": str(low)}
+    assert load_settings(Config, None, (), environment).partition.radius_m == 3.0
+    assert load_settings(Config, high, (), environment).partition.radius_m == 4.0
+    assert load_settings(Config, high, (), environment).relocalize.top_k == Config().relocalize.top_k
+    assert load_settings(Config, high, ["partition.radius_m=5"], environment).partition.radius_m == 5.0
+    assert load_settings(Config, None, ["read.topic=null"], {}).read.topic is None
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[partitoin]\nradius_m = 1.0\n", "did you mean partition"),
+        ("[partition]\nradius = 1.0\n", r"did you mean partition\.radius_m"),
+        ("[read]\nradius_m = 1.0\n", r"did you mean partition\.radius_m"),
+        ("[partition]\nradius_m = nan\n", r"partition\.radius_m"),
+        ("[partition]\nradius_m = 'big'\n", r"partition\.radius_m"),
+        ("partition = 3\n", "partition"),
+        ("[partition\n", "not TOML"),
+    ],
+)
+def test_wrong_settings_name_the_key(tmp_path: Path, text: str, words: str) -> None:
+    file = tmp_path / "wrong.toml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=words) as caught:
+        load_settings(Config, file, (), {})
+    assert str(file) in caught.value.message

@@ -1,0 +1,58 @@
+"""`pc2grid db info`: the sessions of a database."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pc2grid.errors import one_line
+from pc2grid_cli import console
+from pc2grid_cli.db import count
+from pc2grid_cli.options import AsJson, Database
+
+if TYPE_CHECKING:
+    from pc2grid_cli.json_schemas import DbInfo, Session
+
+
+def db_info_command(database: Database, json: AsJson = False) -> None:
+    """Show the sessions of a database.
+
+    Example: pc2grid db info building.submaps
+    """
+    from pc2grid_cli.json_schemas import consistency_document
+    from signature.database import open_database
+
+    with open_database(database) as opened:
+        sessions, where = opened.sessions(), opened.location
+    if json:
+        documents: list[Session] = [
+            {
+                "name": s.name,
+                "sensor": s.sensor,
+                "building": s.provenance.label.building,
+                "floor": s.provenance.label.floor,
+                "source": s.provenance.source,
+                "digest": s.digest,
+                "submaps": s.submaps,
+                "resolution_m": s.resolution_m,
+                "area_m2": s.area_m2,
+                "path_m": s.path_m,
+                "duration_s": s.duration_s,
+                "scans": s.scans,
+                "lossy": s.lossy,
+                "consistency": consistency_document(s.consistency),
+                "warnings": list(s.warnings),
+                "versions": dict(s.provenance.versions),
+                "config": s.provenance.config.model_dump(mode="json"),
+            }
+            for s in sessions
+        ]
+        document: DbInfo = {"schema_version": 1, "database": where, "sessions": documents}
+        console.print_json(document)
+        return
+    print(f"{where}: {count(len(sessions))}, {sum(s.submaps for s in sessions)} submaps")
+    for s in sessions:
+        travel = f", {s.scans} scans, {s.path_m:.1f} m in {s.duration_s:.0f} s" if s.scans else ""
+        line = f"  {s.name} ({s.sensor}): {s.submaps} submaps, {s.area_m2:.0f} m2 free{travel}"
+        if s.consistency is not None and s.consistency.bent:
+            line += f", bent: contradicts itself along {s.consistency.contradicted:.0%} of the travel"
+        print(one_line(line))

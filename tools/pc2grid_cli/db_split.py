@@ -1,0 +1,32 @@
+"""`pc2grid db split`: some sessions of a database become one of their own."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from pc2grid_cli import console
+from pc2grid_cli.db import count as counted
+from pc2grid_cli.db import written
+from pc2grid_cli.options import AsJson, Database, Force, WrittenDatabase
+
+
+def db_split_command(
+    database: Database,
+    sessions: Annotated[list[str], typer.Argument(metavar="SESSION...", help="which to copy")],
+    output: WrittenDatabase,
+    force: Force = False,
+    json: AsJson = False,
+) -> None:
+    """Copy sessions of a database into a new one; the first stays as it is.
+
+    Example: pc2grid db split building.submaps monday -o monday.submaps
+    """
+    from signature.database.maintenance import shown, split
+
+    count = split(database, sessions, output, force=force)
+    if json:
+        console.print_json(written(output))
+    else:
+        print(f"{shown(output)}: {counted(count)}")

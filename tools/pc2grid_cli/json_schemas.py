@@ -1,0 +1,390 @@
+"""The JSON documents of the commands as types, and their JSON Schemas (draft 2020-12).
+
+The commands fill these types, so that mypy compares what is printed with what the schema says. Metres,
+radians, int64 nanoseconds, unless a name says otherwise. Within a `schema_version` documents only gain keys:
+a reader must ignore keys that it does not know.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+# Before Python 3.12 pydantic, which makes the schemas, does not take the TypedDict of typing.
+from typing_extensions import TypedDict
+
+from signature.evaluation.metrics import ConfidenceError, MatrixCell, QueryCounts
+from signature.evaluation.real_sensors import RealCell
+from signature.evaluation.trial import Trial
+from signature.relocalization.answer_json import Result, Sessions, Travel, Version
+
+if TYPE_CHECKING:
+    from pc2grid import model
+
+
+class Query(Travel):
+    """What was looked for. sensor: lidar, laser, depth, or map. lossy: data was lost while reading."""
+
+    source: str
+    scans: int
+    sensor: str
+    lossy: bool
+    warnings: list[str]
+
+
+class Searched(Sessions):
+    """Where it was looked for. left_out: damage that was not used."""
+
+    path: str
+    left_out: list[str]
+
+
+class Relocalize(Result):
+    """`pc2grid relocalize --json`. T_map_odom puts the query's own frame into the map. confidence: the
+    probability that the best hypothesis is right. hypotheses: best first."""
+
+    query: Query
+    database: Searched
+
+
+class Topic(TypedDict):
+    """A topic of a recording; message_count is null if the file does not say."""
+
+    topic: str
+    type: str
+    encoding: str
+    message_count: int | None
+
+
+class Choice(TypedDict):
+    """What `convert` would use, and why. camera_topic: the calibration of depth images; else null."""
+
+    topic: str
+    sensor: str
+    odometry_topic: str | None
+    camera_topic: str | None
+    base_frame: str
+    sensor_frame: str
+    reason: str
+
+
+class Info(TypedDict):
+    """`pc2grid info --json`. choice is null, and problem says why, if `convert` could not use the log."""
+
+    schema_version: Version
+    path: str
+    format: str
+    size_bytes: int
+    start_ns: int
+    end_ns: int
+    duration_s: float
+    message_count: int | None
+    topics: list[Topic]
+    choice: Choice | None
+    problem: str | None
+    bytes_lost: int
+    warnings: list[str]
+
+
+class InfoMap(TypedDict):
+    """`pc2grid info MAP.yaml --json`. origin_m: x, y of the lower left corner;
+    free_m2, occupied_m2: areas."""
+
+    schema_version: Version
+    path: str
+    format: str
+    width: int
+    height: int
+    resolution_m: float
+    origin_m: list[float]
+    free_m2: float
+    occupied_m2: float
+
+
+class Report(TypedDict):
+    """What was read, and lost on the way; scans_skipped counts by reason."""
+
+    scans_read: int
+    points_dropped: int
+    scans_skipped: dict[str, int]
+    bytes_lost: int
+    warnings: list[str]
+    lossy: bool
+
+
+class Contradiction(TypedDict):
+    """A stretch of the travel whose scans do not agree with the map. x_m, y_m: where they agree least, in the
+    frame of the session. share: of the wall hits there that lie on ground which the map calls free, 0..1."""
+
+    from_ns: int
+    to_ns: int
+    x_m: float
+    y_m: float
+    length_m: float
+    share: float
+
+
+class Consistency(TypedDict):
+    """How well a map agrees with its own scans. Shares 0..1: hits_on_free of all wall hits, contradicted of
+    the travel. bent: parts of the map are probably drawn in the wrong place. stretches: longest first."""
+
+    hits_on_free: float
+    contradicted: float
+    bent: bool
+    stretches: list[Contradiction]
+
+
+class Converted(TypedDict):
+    """What became of one input. digest: sha256 of it, hex. area_m2: free space. consistency: null for an
+    imported map."""
+
+    session: str
+    building: str | None
+    floor: str | None
+    source: str
+    digest: str
+    sensor: str
+    scans: int
+    path_m: float
+    duration_s: float
+    area_m2: float
+    submaps: int
+    consistency: Consistency | None
+    report: Report
+
+
+class Convert(TypedDict):
+    """`pc2grid convert --json`. unchanged: sessions that were stored already; failed: inputs left out."""
+
+    schema_version: Version
+    database: str
+    lossy: bool
+    sessions: list[Converted]
+    unchanged: list[str]
+    failed: list[str]
+
+
+class Session(TypedDict):
+    """A session of a database, with the versions and settings that made it. consistency: null for an imported
+    map, and for a session that was stored before it was measured."""
+
+    name: str
+    sensor: str
+    building: str | None
+    floor: str | None
+    source: str
+    digest: str
+    submaps: int
+    resolution_m: float
+    area_m2: float
+    path_m: float
+    duration_s: float
+    scans: int
+    lossy: bool
+    consistency: Consistency | None
+    warnings: list[str]
+    versions: dict[str, str]
+    config: dict[str, Any]
+
+
+class DbInfo(TypedDict):
+    """`pc2grid db info --json`."""
+
+    schema_version: Version
+    database: str
+    sessions: list[Session]
+
+
+class Damage(TypedDict):
+    """One thing that is wrong."""
+
+    where: str
+    what: str
+
+
+class DbCheck(TypedDict):
+    """`pc2grid db check --json`; no problems: sound."""
+
+    schema_version: Version
+    database: str
+    problems: list[Damage]
+
+
+class DbWrite(TypedDict):
+    """`pc2grid db merge`, `copy`, `split`, `rename` and `remove` with `--json`. sessions: how many are in
+    the database now; left_out: damage that was not copied."""
+
+    schema_version: Version
+    database: str
+    sessions: int
+    left_out: list[Damage]
+
+
+class Export(TypedDict):
+    """`pc2grid export --json`; session is null if only a report was written."""
+
+    schema_version: Version
+    database: str
+    session: str | None
+    written: list[str]
+
+
+class Simulate(TypedDict):
+    """`pc2grid simulate --json`; clutter: objects that could be placed. change: what differs from the
+    building as drawn, counts and metres, and the share of its visible walls."""
+
+    schema_version: Version
+    recording: str
+    truth: str
+    sensor: str
+    scans: int
+    duration_s: float
+    length_m: float
+    clutter: int
+    change: dict[str, float]
+
+
+class CompareLog(TypedDict):
+    """`pc2grid compare log --json`. map_s: from and to, seconds of the recording. tally: counts of the
+    queries."""
+
+    schema_version: Version
+    log: str
+    map_s: list[float]
+    length_s: float
+    without_truth: int
+    tally: QueryCounts
+    trials: list[Trial]
+
+
+class CompareMaps(TypedDict):
+    """`pc2grid compare maps --json`: a row a session, with the errors of its trajectory and of its cells."""
+
+    schema_version: Version
+    rows: list[dict[str, Any]]
+
+
+class ComparePaper(TypedDict):
+    """`pc2grid compare paper --json`: a cell a map, method and noise level, measured beside published."""
+
+    schema_version: Version
+    version: str
+    queries: int
+    seed: int
+    cells: list[dict[str, Any]]
+
+
+class CompareReal(TypedDict):
+    """`pc2grid compare real --json`, and its real.json.
+
+    T_floor_log: x, y, yaw of the log's frame in the 3D scan's, null if no two answers agree. across: answers
+    across the two; agreeing: whose first place agrees with it.
+    """
+
+    schema_version: Version
+    floor: str
+    log: str
+    T_floor_log: list[float] | None
+    agreeing: int
+    across: int
+    setting: dict[str, float]
+    cells: list[RealCell]
+    trials: list[Trial]
+
+
+class Elsewhere(TypedDict):
+    """What was answered to queries from another building."""
+
+    trials: int
+    not_found: int
+    located: int
+
+
+class Apart(TypedDict):
+    """How well distances separate one place seen by two sensors from two places; auc is null if nothing was
+    compared."""
+
+    auc: float | None
+    same: int
+    other: int
+
+
+class Ablation(TypedDict):
+    """Recall after travel_m metres by query sensor, by what is used, and by how many are retrieved."""
+
+    travel_m: float
+    recall: dict[str, dict[str, dict[str, float | None]]]
+
+
+class CompareSensors(TypedDict):
+    """`pc2grid compare sensors --json`, and its matrix.json. outside_the_map: trials where the map has not
+    been. change: by plan, what differs in a session from the plan, mean of some sessions."""
+
+    schema_version: Version
+    plans: list[str]
+    queries: int
+    setting: dict[str, float]
+    change: dict[str, dict[str, float]]
+    cells: list[MatrixCell]
+    confidence: dict[str, ConfidenceError]
+    outside_the_map: int
+    elsewhere: Elsewhere
+    independence: dict[str, Apart]
+    ablation: Ablation
+
+
+def consistency_document(consistency: model.Consistency | None) -> Consistency | None:
+    """How well a map agrees with its own scans, as the documents show it."""
+    if consistency is None:
+        return None
+    return {
+        "hits_on_free": round(consistency.hits_on_free, 4),
+        "contradicted": round(consistency.contradicted, 4),
+        "bent": consistency.bent,
+        "stretches": [
+            {
+                "from_ns": stretch.from_ns,
+                "to_ns": stretch.to_ns,
+                "x_m": round(stretch.x_m, 2),
+                "y_m": round(stretch.y_m, 2),
+                "length_m": round(stretch.length_m, 2),
+                "share": round(stretch.share, 4),
+            }
+            for stretch in consistency.stretches
+        ],
+    }
+
+
+DOCUMENTS: dict[str, type] = {
+    "compare-log": CompareLog,
+    "compare-maps": CompareMaps,
+    "compare-paper": ComparePaper,
+    "compare-real": CompareReal,
+    "compare-sensors": CompareSensors,
+    "convert": Convert,
+    "db-check": DbCheck,
+    "db-copy": DbWrite,
+    "db-info": DbInfo,
+    "db-merge": DbWrite,
+    "db-remove": DbWrite,
+    "db-rename": DbWrite,
+    "db-split": DbWrite,
+    "export": Export,
+    "info": Info,
+    "info-map": InfoMap,
+    "relocalize": Relocalize,
+    "simulate": Simulate,
+}
+"""By command."""
+
+
+def schema(name: str) -> dict[str, Any]:
+    """JSON Schema of a command's document, or of all `settings` as TOML holds them. Raises KeyError."""
+    if name == "settings":
+        from signature.config import Config
+
+        about = Config.model_json_schema()
+    else:
+        from pydantic import TypeAdapter
+
+        about = TypeAdapter(DOCUMENTS[name]).json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **about}

@@ -1,0 +1,91 @@
+"""The options that several commands share, and the configuration they make."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from signature.config import Config
+
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", help="settings, TOML; default: the file PC2GRID_CONFIG names")
+]
+Assignments = Annotated[
+    list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="one setting; repeatable")
+]
+
+
+class PresetName(str, enum.Enum):
+    """Named settings."""
+
+    default = "default"
+    paper = "paper"
+
+
+Preset = Annotated[
+    PresetName,
+    typer.Option("--preset", help="settings to start from; paper: submaps are discs of 8 m at junctions"),
+]
+Topic = Annotated[str | None, typer.Option("--topic", "-t", help="topic of the scans, if several fit")]
+OdometryTopic = Annotated[
+    str | None, typer.Option("--odometry", help='odometry topic; "none": do not use any')
+]
+Start = Annotated[float, typer.Option("--start", min=0.0, metavar="S", help="seconds from the log's start")]
+Duration = Annotated[
+    float | None, typer.Option("--duration", metavar="S", help="seconds to read; default: all")
+]
+Recover = Annotated[bool, typer.Option("--recover", help="use what is whole of a damaged recording")]
+Strict = Annotated[bool, typer.Option("--strict", help="exit code 3 for any lost scan, not only from 1 % on")]
+AssumeIdentity = Annotated[
+    bool, typer.Option("--assume-identity", help="a sensor frame that tf does not connect is the base")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="one JSON document on stdout")]
+Force = Annotated[bool, typer.Option("--force", help="replace existing files")]
+DATABASE = "BUILDING.submaps|postgresql://..."
+Database = Annotated[str, typer.Argument(metavar=DATABASE, help="the database")]
+WrittenDatabase = Annotated[str, typer.Option("--output", "-o", metavar=DATABASE, help="what to write")]
+OUTPUT_FOLDER = ("--output", "-o", "--out")
+"""Names of the option for the folder of results; --out is the one it had first."""
+
+Rerun = Annotated[
+    str | None,
+    typer.Option(
+        "--rerun",
+        metavar="[HOST:PORT|OUT.rrd]",
+        help="watch in the rerun viewer, here or there, or in a file; needs [viz]",
+    ),
+]
+
+
+def make_config(
+    file: Path | None,
+    assignments: list[str] | None,
+    *,
+    topic: str | None = None,
+    odometry: str | None = None,
+    assume_identity: bool = False,
+    top_k: int | None = None,
+    preset: PresetName = PresetName.default,
+) -> Config:
+    """Flags override --set, which overrides the file, which overrides the preset. Raises ConfigError."""
+    from pc2grid.settings import load_settings
+    from signature.config import Config
+
+    base = Config.paper() if preset is PresetName.paper else None
+    config = load_settings(Config, file, assignments or (), preset=base)
+    read = {"topic": topic, "odometry": odometry, "assume_identity": assume_identity or None}
+    return _changed(config, {"read": read, "relocalize": {"top_k": top_k}})
+
+
+def _changed(config: Config, flags: Mapping[str, Mapping[str, object]]) -> Config:
+    """The configuration with the settings of these sections replaced; None leaves a setting as it is."""
+    sections = {}
+    for name, settings in flags.items():
+        given = {key: value for key, value in settings.items() if value is not None}
+        sections[name] = getattr(config, name).model_copy(update=given)
+    return config.model_copy(update=sections)

@@ -1,0 +1,93 @@
+"""The files that options name for writing; they are checked before any work begins."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pc2grid.errors import OutputError
+
+SUFFIXES: dict[str, tuple[str, ...]] = {
+    "trajectory": (".tum", ".kitti", ".txt"),
+    "map": (".yaml", ".yml", ".pgm"),
+    "cloud": (".ply", ".pcd"),
+    "graph": (".graphml", ".json"),
+    "g2o": (".g2o",),
+    "mcap": (".mcap",),
+    "output": (".mcap",),
+    "initialpose": (".json", ".yaml", ".yml"),
+    "plot": (".png",),
+    "report": (".html", ".htm"),
+}
+"""By option: the suffixes of the files that it writes."""
+_OF_OTHERS = {suffix for known in SUFFIXES.values() for suffix in known} | {".bag", ".db3", ".rrd", ".csv"}
+"""Suffixes of formats that a database or the stem of a map must not be named after."""
+
+
+def check_file(option: str, path: Path | None, force: bool, *, any_suffix: bool = False) -> None:
+    """Refuse a file that the option `--{option}` cannot write; None is no file.
+
+    A name without a suffix is taken, unless the suffix selects the format. any_suffix : the format is given
+    by another option.
+
+    Raises OutputError for a suffix of another format, and as `require_writable`.
+    """
+    from pc2grid.io.atomic import require_writable
+
+    if path is None:
+        return
+    known, suffix = SUFFIXES[option], path.suffix.lower()
+    optional = option not in ("cloud", "graph")
+    if not any_suffix and suffix not in known and (suffix or not optional):
+        raise OutputError(
+            f"{path}: --{option} does not write the format {suffix or '(no suffix)'}",
+            hint=f"end its name in {' or '.join(known)}",
+        )
+    require_writable(path, force)
+
+
+def map_stem(path: Path) -> Path:
+    """The stem of a nav2 map: its files are STEM.yaml and STEM.pgm. Either may be named instead of the stem.
+
+    Raises OutputError for the suffix of another format.
+    """
+    suffix = path.suffix.lower()
+    if suffix in SUFFIXES["map"]:
+        return path.with_suffix("")
+    if suffix in _OF_OTHERS:
+        raise OutputError(
+            f"{path}: --map writes STEM.yaml and STEM.pgm, not the format {suffix}",
+            hint=f"give the stem: --map {path.with_suffix('')}",
+        )
+    return path
+
+
+def check_database_name(output: str) -> None:
+    """Raises OutputError if the file of a new database has the suffix of another format."""
+    path = Path(output)
+    if path.suffix.lower() in _OF_OTHERS:
+        raise OutputError(
+            f"{output}: a submap database is not written as {path.suffix}",
+            hint=f"end its name in .submaps: -o {path.with_suffix('.submaps')}",
+        )
+
+
+def check_database(output: str) -> None:
+    """Raises OutputError if the file of a database cannot be written; a server is asked later."""
+    from pc2grid.io.atomic import require_writable
+    from signature.database.postgres.schema import is_url
+
+    if not is_url(output):
+        require_writable(output, force=True)
+
+
+def make_folder(path: Path) -> None:
+    """Make the folder for results. Raises OutputError if it cannot be made or written to."""
+    from pc2grid.io.atomic import require_writable
+
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot make this folder: {error.strerror}", hint="choose another one with --output"
+        ) from error
+    require_writable(path / "results", force=True)
