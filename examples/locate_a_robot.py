@@ -1,4 +1,4 @@
-"""Where in the database is this robot? Asked as it drives, as a node on a robot would.
+"""Locate a robot in a database while it drives, as a node on the robot would.
 
 python examples/locate_a_robot.py tuesday.mcap building.submaps
 """
@@ -13,25 +13,23 @@ import signature
 
 
 def main(recording: str, database: str) -> None:
-    """Feed scans until the answer is `located`, then print it."""
+    """Add scans until the answer is `located`, then print it."""
     with signature.open_database(database) as opened, pc2grid.open_log(recording) as log:
-        # Made once, to be asked again and again; of a large database it reads what it needs when it needs it.
-        # Queries are treated as the maps were.
+        # The index is made once for many queries. It reads the maps of a large database when they are needed.
+        # Queries are processed with the settings that made the maps.
         config = opened.config()
-        relocalizer = signature.Relocalizer(signature.Building.of(opened, config))
-        asked_m = 0.0
-        for registered, sweep in pc2grid.follow(log.scans(), config):
-            relocalizer.add(registered, sweep)
-            if relocalizer.path_m - asked_m < 1.0:
+        relocalizer = signature.Relocalizer(signature.MapIndex.of(opened, config))
+        for registered, planar_scan in pc2grid.follow(log.scans(), config):
+            moment = relocalizer.add(registered, planar_scan)
+            if moment is None:  # the database is asked after every metre of travel
                 continue
-            asked_m = relocalizer.path_m
             answer = relocalizer.answer()
-            print(f"after {asked_m:.1f} m: {answer.status}, confidence {answer.confidence:.3f}")
+            print(f"after {moment.path_m:.1f} m: {answer.status}, confidence {answer.confidence:.3f}")
             if answer.T_map_base is not None:
                 x, y, yaw_deg = answer.T_map_base.x, answer.T_map_base.y, math.degrees(answer.T_map_base.yaw)
                 print(f"in {answer.session} at x {x:.2f} m, y {y:.2f} m, {yaw_deg:.0f} deg")
                 return
-    print("the recording ended before that was clear")
+    print("the recording ended before the robot was located")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Your own descriptor of a submap beside the paper's, on your own floor plan, as in the paper's tables.
+"""Compare your own descriptor of a submap with the paper's, on your own floor plan, as the paper does.
 
-A descriptor is a `Method`: `fit` sees the submaps of a map, what it returns says how alike a query is to
-each. Queries are places near a submap's centre, turned at random, with obstacles that are not in the map.
-`pc2grid compare paper` runs the same experiment on the paper's maps.
+A descriptor is a `Method`: `fit` takes the submaps of a map and returns an object whose `similarities`
+compares a query with each of them. Queries are cut near a submap's centre and turned at random, with
+obstacles that are not in the map. `pc2grid compare paper` runs the same experiment on the paper's maps.
 
 python examples/own_descriptor.py map.yaml
 """
@@ -15,13 +15,14 @@ from collections.abc import Sequence
 import numpy as np
 
 import pc2grid
+from pc2grid.config import PartitionConfig
 from signature.baselines import make_methods
-from signature.evaluation.evaluate import Experiment, evaluate, precision_recall
 from signature.evaluation.noise import NOISE_LEVELS
+from signature.evaluation.paper_experiment import Experiment, evaluate
 
 
 class WallDistances:
-    """How much wall lies how far from the submap's centre: a histogram, the same however the robot turns."""
+    """Histogram of the distances of the walls from the centre; it does not depend on the rotation."""
 
     def fit(self, submaps: Sequence[pc2grid.Submap]) -> WallDistances:
         """Describe every submap."""
@@ -37,21 +38,21 @@ class WallDistances:
         return counts / max(counts.sum(), 1)
 
     def similarities(self, query: pc2grid.Submap) -> np.ndarray:
-        """(N,), larger is more alike."""
+        """(N,), larger is more similar."""
         return -np.abs(self.table - self.describe(query)).sum(axis=1)
 
 
 def main(map_yaml: str, queries: str = "200") -> None:
     """Print the area under the precision-recall curve of three methods at the paper's noise levels."""
     grid = pc2grid.load_map(map_yaml)
-    submaps = pc2grid.submaps_of(grid)
+    submaps = pc2grid.submaps_of(grid, PartitionConfig.paper())
     methods = {**make_methods(["proposed", "shape_context"]), "wall distances": WallDistances()}
     experiment = Experiment(queries=int(queries))
-    print(f"{len(submaps)} submaps, {queries} queries; area under precision and recall, share recognised")
+    print(f"{len(submaps)} submaps, {queries} queries; area under the curve, share recognised")
     for level, noise in enumerate(NOISE_LEVELS):
-        for name, outcome in evaluate(methods, grid, submaps, experiment, noise).items():
-            curve = precision_recall(outcome.similarity, outcome.correct)
-            print(f"noise {level}  {name:16} {curve.auc:.3f}  {outcome.correct.mean():.2f}")
+        for name, matches in evaluate(methods, grid, submaps, experiment, noise).items():
+            curve = matches.curve()
+            print(f"noise {level}  {name:16} {curve.auc:.3f}  {matches.correct.mean():.2f}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""Would it work in your building? A simulated robot maps your floor plan, others are looked for in that map.
+"""Try the program in your building: a simulated robot maps your floor plan, others are located in that map.
 
-The visitors come another day: they start elsewhere, and there is furniture that the map does not have.
+The others start at other places, and among furniture that the map does not contain.
 
 python examples/own_floor_plan.py map.yaml
 """
@@ -17,7 +17,7 @@ import signature
 
 
 def main(map_yaml: str, visitors: str = "5", map_length_m: str = "60", query_length_m: str = "5") -> None:
-    """Map, visit, and say how far off each answer is."""
+    """Map the plan, locate the visitors, and print the error of each answer."""
     plan, config = pc2grid.load_map(map_yaml), signature.Config()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -25,7 +25,7 @@ def main(map_yaml: str, visitors: str = "5", map_length_m: str = "60", query_len
         made = pc2grid.simulate_session(folder / "map.mcap", sensor="laser", grid=plan, config=mapper)
         session, origin = signature.build_session(made.path, "map", config)
         signature.add_session(folder / "map.submaps", session, config, origin)
-        # The map's frame is where its robot started.
+        # The origin of the map is the place where the robot started.
         T_plan_map = next(pc2grid.read_tum(made.truth_path).poses())
 
         with signature.open_database(folder / "map.submaps") as database:

@@ -1,7 +1,8 @@
-"""A sensor that pc2grid does not know: your reader makes Scans, the rest stays as it is.
+"""Map a sensor that pc2grid does not know: your reader makes Scans, the rest does not change.
 
-Here the sensor is a text file with one scan a line: a time in seconds, then distances in metres, equally
-spaced from -135 to 135 degrees, from a scanner 0.2 m in front of the robot's base. `nan` is no return.
+Here the sensor is a text file with one scan in each line: a time in seconds, then distances in metres at
+equally spaced bearings from -135 to 135 degrees, from a scanner 0.2 m in front of the robot's base. `nan`: no
+return.
 
 python examples/own_sensor.py scans.txt own.submaps
 """
@@ -22,7 +23,7 @@ T_BASE_SENSOR = pc2grid.SE2(0.2, 0.0, 0.0).lift()
 
 
 def read_scans(path: Path) -> Iterator[pc2grid.Scan]:
-    """One Scan after the other: points in the base frame (x forward, y left, z up), metres, only finite."""
+    """The scans one by one: finite points in the base frame (x forward, y left, z up), in metres."""
     with path.open() as lines:
         for line in lines:
             seconds, *words = line.split()
@@ -36,13 +37,13 @@ def read_scans(path: Path) -> Iterator[pc2grid.Scan]:
                 stamp_ns=round(float(seconds) * 1e9),
                 points_m=in_base,
                 T_base_sensor=T_BASE_SENSOR,
-                sensor="laser",  # of the three kinds the one that it is most like
+                sensor="laser",  # the most similar of the three kinds
                 dropped=int((~seen).sum()),
             )
 
 
 def main(recording: str, database: str) -> None:
-    """Map what the own reader yields, and store it."""
+    """Map the scans of the reader, and store the map."""
     config = signature.Config()
     path = Path(recording)
     grid, trajectory, loops = pc2grid.map_scans(read_scans(path), config)

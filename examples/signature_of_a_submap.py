@@ -1,4 +1,4 @@
-"""How a submap becomes its three signatures: figures 2 to 6 of the paper for one place, as one picture.
+"""Draw the three signatures of a submap: figures 2 to 6 of the paper in one picture.
 
 python examples/signature_of_a_submap.py path/to/map.yaml            # the submap nearest the map's middle
 python examples/signature_of_a_submap.py path/to/map.yaml --submap 12 --out submap.png
@@ -18,18 +18,13 @@ from matplotlib.figure import Figure
 from pc2grid.config import PartitionConfig
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import OccupancyGrid, Submap
-from pc2grid.partition import junction_graph, map_skeleton, partition
+from pc2grid.submaps.junction_graph import junction_graph, map_skeleton
+from pc2grid.submaps.partition import partition
 from signature.boundary import boundary_edges, boundary_histogram, boundary_points
 from signature.config import SignatureConfig
 from signature.describe import describe
 from signature.evaluation.noise import NOISE_LEVELS, add_noise
-from signature.freespace import (
-    adjacency,
-    freespace_graph,
-    freespace_histogram,
-    freespace_nodes,
-    shortest_paths,
-)
+from signature.freespace import freespace_graph, freespace_histogram, shortest_paths
 from signature.symmetry import blurred, line_segments, symmetry_axes
 
 FREE, WALL, UNSEEN = (1.0, 1.0, 1.0), (0.1, 0.1, 0.1), (0.86, 0.86, 0.86)
@@ -54,8 +49,8 @@ def show(axis: Any, grid: OccupancyGrid, title: str) -> None:
 
 
 def draw_partition(axis: Any, grid: OccupancyGrid, submaps: tuple[Submap, ...], chosen: Submap) -> None:
-    """Figure 2: the map, its skeleton, the junctions and the submap looked at."""
-    config = PartitionConfig()
+    """Figure 2: the map, its skeleton, the junctions and the chosen submap."""
+    config = PartitionConfig.paper()
     show(
         axis,
         grid,
@@ -74,7 +69,7 @@ def draw_partition(axis: Any, grid: OccupancyGrid, submaps: tuple[Submap, ...], 
 
 
 def draw_boundary(axes: Any, submap: Submap, config: SignatureConfig) -> None:
-    """Figure 3: sampled boundary points, and how far they are from each other."""
+    """Figure 3: the sampled boundary points and the histogram of their distances."""
     points = boundary_points(boundary_edges(submap, config), submap.grid.resolution_m, config)
     show(axes[0], submap.grid, f"Boundary: {len(points)} points (III-B)")
     places = submap.grid.to_point(points)
@@ -84,9 +79,9 @@ def draw_boundary(axes: Any, submap: Submap, config: SignatureConfig) -> None:
 
 
 def draw_freespace(axes: Any, submap: Submap, config: SignatureConfig) -> None:
-    """Figures 4 and 5: nodes that see each other, how long the ways are, and what obstacles change."""
+    """Figures 4 and 5: the free-space graph, its path lengths, and the effect of obstacles."""
     graph = freespace_graph(submap, config)
-    show(axes[0], submap.grid, f"Free space: {len(graph)} nodes, joined in sight (III-C)")
+    show(axes[0], submap.grid, f"Free space: {len(graph)} nodes, an edge for each line of sight (III-C)")
     places = {node: data["center_m"] for node, data in graph.nodes(data=True)}
     lines = [(places[a], places[b]) for a, b in graph.edges]
     axes[0].add_collection(LineCollection(lines, colors=GREEN, linewidths=0.4, alpha=0.25))
@@ -97,7 +92,7 @@ def draw_freespace(axes: Any, submap: Submap, config: SignatureConfig) -> None:
         path_histogram(submap, config),
         config.freespace_bin_m,
         GREEN,
-        "Lengths of the shortest ways (Eq. 4)",
+        "Lengths of the shortest paths (Eq. 4)",
     )
     noisy = add_noise(submap, NOISE_LEVELS[1], np.random.default_rng(0))
     changed = path_histogram(noisy, config)
@@ -115,13 +110,11 @@ def draw_freespace(axes: Any, submap: Submap, config: SignatureConfig) -> None:
 
 def path_histogram(submap: Submap, config: SignatureConfig) -> np.ndarray:
     """H^f of a submap."""
-    grid = submap.grid
-    weights = adjacency(freespace_nodes(submap, config), grid.occupied, grid.resolution_m, config)
-    return freespace_histogram(shortest_paths(weights), submap.radius_m, config)
+    return freespace_histogram(shortest_paths(freespace_graph(submap, config)), submap.radius_m, config)
 
 
 def draw_symmetry(axes: Any, submap: Submap, config: SignatureConfig) -> None:
-    """Figure 6: line segments with both axes, and how bright each wall's mirror image is at either axis."""
+    """Figure 6: line segments with both axes, and the blurred walls at the mirrored walls."""
     grid = submap.grid
     edges = boundary_edges(submap, config)
     segments = line_segments(edges, grid.resolution_m, config)
@@ -143,7 +136,7 @@ def draw_symmetry(axes: Any, submap: Submap, config: SignatureConfig) -> None:
         )
     axes[0].legend(fontsize=8, loc="lower right")
     field = blurred(edges, grid.resolution_m, config)
-    # What Eq. 5 averages: the blurred walls, read where the mirror images of the walls at alpha lie.
+    # Eq. 5 averages these values: the blurred image at the walls mirrored at the axis alpha.
     middle = (np.array(edges.shape) - 1) / 2
     rows, columns = (np.argwhere(edges) - middle).T
     c, s = math.cos(2 * found.alpha_rad), math.sin(2 * found.alpha_rad)
@@ -156,7 +149,7 @@ def draw_symmetry(axes: Any, submap: Submap, config: SignatureConfig) -> None:
     axes[1].imshow(field, origin="lower", extent=extent, cmap="Greys", vmax=2 * config.symmetry_peak)
     places = (mirrored[:, ::-1] + 0.5) * grid.resolution_m + grid.origin_m
     dots = axes[1].scatter(*places.T, c=values, s=2, cmap="plasma", vmin=0, vmax=config.symmetry_peak)
-    axes[1].figure.colorbar(dots, ax=axes[1], shrink=0.8, label="brightness met (Eq. 5 is its mean)")
+    axes[1].figure.colorbar(dots, ax=axes[1], shrink=0.8, label="brightness (Eq. 5 is its mean)")
     axes[1].set_title("Walls mirrored at α (dots) over the blurred walls (grey)", fontsize=10, loc="left")
     axes[1].set_xlim(extent[:2])
     axes[1].set_ylim(extent[2:])
@@ -185,9 +178,7 @@ def draw(grid: OccupancyGrid, submaps: tuple[Submap, ...], chosen: Submap, name:
     draw_boundary(axes[:, 0], chosen, config)
     draw_freespace(axes[:, 1], chosen, config)
     draw_symmetry(axes[:, 2], chosen, config)
-    figure.suptitle(
-        f"{name}, submap {chosen.submap_id}: how a place becomes its three signatures", fontsize=14
-    )
+    figure.suptitle(f"{name}, submap {chosen.submap_id}: its three signatures", fontsize=14)
     return figure
 
 
@@ -195,11 +186,11 @@ def main() -> None:
     """Read the arguments and write the picture."""
     parser = argparse.ArgumentParser(description="Draw how a submap becomes its three signatures.")
     parser.add_argument("map", type=Path, help="a nav2 map.yaml")
-    parser.add_argument("--submap", type=int, help="its number; without it the one nearest the map's middle")
+    parser.add_argument("--submap", type=int, help="its number; by default the one nearest the map's middle")
     parser.add_argument("--out", type=Path, default=Path("signature_of_a_submap.png"))
     arguments = parser.parse_args()
     grid = load_map(arguments.map)
-    submaps = partition(grid)
+    submaps = partition(grid, PartitionConfig.paper())
     if not submaps:
         parser.error(f"{arguments.map} has no free space")
     if arguments.submap is not None and not 0 <= arguments.submap < len(submaps):
