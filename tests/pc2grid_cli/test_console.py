@@ -229,3 +229,23 @@ def test_completion(shell: str) -> None:
         env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}", **environment},
     )  # fmt: skip
     assert "relocalize" in done.stdout
+
+
+@pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_signal_during_an_extension_is_no_bug(number: str, code: int) -> None:
+    program = f"""
+import os, signal, sys
+from pc2grid_cli.console import Console
+
+def command():
+    try:
+        os.kill(os.getpid(), signal.{number})
+    except BaseException as stop:
+        raise SystemError("returned a result with an exception set") from stop
+
+sys.exit(Console().run(command))
+"""
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment)
+    assert done.returncode == code, done.stderr
+    assert "internal error" not in done.stderr

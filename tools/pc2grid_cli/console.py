@@ -125,7 +125,7 @@ class Console:
 
     def run(self, command: Callable[[], Any]) -> int:
         """Run a command; its result or error becomes an exit code."""
-        signal.signal(signal.SIGTERM, _terminate)
+        stop = _StopSignal()
         if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may hold undecodable bytes
             sys.stdout.reconfigure(errors="backslashreplace")
         try:
@@ -137,11 +137,16 @@ class Console:
             return INTERRUPTED
         except BrokenPipeError:
             return _pipe_closed()
-        except SystemExit as stop:
-            if isinstance(stop.__context__, BrokenPipeError):  # click turns it into exit code 1
+        except SystemExit as request:
+            if isinstance(request.__context__, BrokenPipeError):  # click turns it into exit code 1
                 return _pipe_closed()
             raise
         except Exception as error:
+            if stop.number == signal.SIGINT:
+                print("pc2grid: interrupted", file=sys.stderr)
+                return INTERRUPTED
+            if stop.number is not None:
+                return 128 + stop.number
             if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of typer's
                 return _report_usage(error)
             return self.report_error(error)
@@ -292,5 +297,23 @@ def _report_usage(error: Any) -> int:
     return USAGE
 
 
-def _terminate(signum: int, frame: FrameType | None) -> None:
-    raise SystemExit(128 + signum)
+class _StopSignal:
+    """Ends the program when SIGINT or SIGTERM arrives, and remembers which one did.
+
+    The exception that the handler raises may arrive as another one: an extension that was running returns a
+    result all the same, and Python then raises SystemError in its place.
+
+    number : the signal that arrived, None before.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        signal.signal(signal.SIGTERM, self._stop)
+        if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # a shell's background job ignores Ctrl-C
+            signal.signal(signal.SIGINT, self._stop)
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        self.number = number
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + number)
