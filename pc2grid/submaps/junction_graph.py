@@ -78,15 +78,20 @@ def graph_of_skeleton(skeleton: BoolGrid, grid: OccupancyGrid, config: Partition
 def clusters(pixels: I64, chosen: I64, radius_cells: float) -> list[tuple[int, I64]]:
     """DBSCAN over some of the pixels (P, 2): `chosen` holds their numbers.
 
-    Every pixel is a core point (`min_samples=1`): a junction seen in one pixel is a junction. Returns for
+    Every pixel is a core point (`min_samples=1`): a junction seen in one pixel is a junction. The clusters of
+    DBSCAN are then the connected components of the pixels that lie at most `radius_cells` apart. Returns for
     each cluster the number of the member nearest to its mean and the numbers of all members. The mean itself
     may lie in a wall; the member nearest to it lies on the skeleton.
     """
     if not len(chosen):
         return []
-    from sklearn.cluster import DBSCAN
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
 
-    labels = DBSCAN(eps=radius_cells, min_samples=1).fit_predict(pixels[chosen])
+    first, second = cKDTree(pixels[chosen]).query_pairs(radius_cells, output_type="ndarray").T
+    near = coo_array((np.ones(len(first), bool), (first, second)), shape=(len(chosen), len(chosen)))
+    labels = connected_components(near, directed=False)[1]
     order = np.argsort(labels, kind="stable")
     found = []
     for members in np.split(chosen[order], np.cumsum(np.bincount(labels))[:-1]):

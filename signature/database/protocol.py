@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pc2grid.errors import DatabaseError
+from pc2grid.io.containers.detect import SUBMAPS_ID
 from pc2grid.model import Consistency, Loop, OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
 
 if TYPE_CHECKING:
@@ -126,6 +127,10 @@ class Neighbour:
     score: float
 
 
+APPLICATION_ID = int.from_bytes(SUBMAPS_ID, "big")
+"""Marks a file, and the lock of a server, as pc2grid's."""
+BUSY_TIMEOUT_S = 30.0
+"""How long a writer waits for another one; chosen by hand."""
 Entry = tuple[SessionMap, "Sequence[Signature]", Provenance]
 """Everything that is stored of one session: the map, the signature of each submap, the provenance."""
 

@@ -16,10 +16,9 @@ T = TypeVar("T")
 class LazySequence(Sequence[T]):
     """A sequence of `count` items, each made when it is first asked for, and kept."""
 
-    def __init__(self, make: Callable[[int], T], count: int, known: LazySequence[T] | None = None) -> None:
-        """known : a sequence with the same first items; those that it has made are taken over."""
+    def __init__(self, make: Callable[[int], T], count: int) -> None:
         self._make, self._count = make, count
-        self._made: dict[int, T] = {} if known is None else dict(known._made)
+        self._made: dict[int, T] = {}
 
     def __len__(self) -> int:
         return self._count

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections import ChainMap
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -81,8 +80,6 @@ class MapIndex:
         config: Config,
         labels: Mapping[str, Label] | None = None,
         areas_m2: Mapping[str, float] | None = None,
-        *,
-        smaller: MapIndex | None = None,
     ) -> None:
         """grids : map of each session, in the order of `table.session_index`.
 
@@ -90,31 +87,22 @@ class MapIndex:
         config : its relocalize section says how to search and when to be sure.
         labels : building and floor of sessions, where known.
         areas_m2 : free space of each map, for maps that are not to be read before they are needed.
-        smaller : an index of the first of these sessions; what it has prepared is taken over.
         """
         self.made_with = made_with
-        self.config, self._settings = config.relocalize, config
+        self.config = config.relocalize
         self.sessions = tuple(grids)
         self.labels = tuple((labels or {}).get(name, Label()) for name in grids)
-        self._grids_by_name = grids
         count = len(grids)
-        self.grids: LazySequence[OccupancyGrid] = LazySequence(
-            lambda i: grids[self.sessions[i]], count, None if smaller is None else smaller.grids
-        )
-        self.maps: LazySequence[SearchMap] = LazySequence(
-            lambda i: SearchMap.of(self.grids[i]), count, None if smaller is None else smaller.maps
-        )
-        self._free: LazySequence[F64] = LazySequence(
-            lambda i: free_squares(self.grids[i]), count, None if smaller is None else smaller._free
-        )
+        self.grids: LazySequence[OccupancyGrid] = LazySequence(lambda i: grids[self.sessions[i]], count)
+        self.maps: LazySequence[SearchMap] = LazySequence(lambda i: SearchMap.of(self.grids[i]), count)
+        self._free: LazySequence[F64] = LazySequence(lambda i: free_squares(self.grids[i]), count)
         areas_m2 = areas_m2 or {name: free_m2(grid) for name, grid in grids.items()}
         self._areas_m2 = tuple(areas_m2[name] for name in self.sessions)
-        self.places: Places = Places(
+        self.places = Places(
             table,
             self.grids,
             made_with.partition.radius_m,
             self._areas_m2,
-            None if smaller is None else smaller.places,
         )
 
     @staticmethod
@@ -131,29 +119,6 @@ class MapIndex:
             grids = dict(grids)
         labels = {name: info.provenance.label for name, info in infos.items()}
         return MapIndex(grids, database.signatures(), database.config(), config, labels, areas_m2)
-
-    def with_session(
-        self, name: str, grid: OccupancyGrid, places: SignatureTable, label: Label | None = None
-    ) -> MapIndex:
-        """An index with one more session; all that this one has prepared is shared.
-
-        grid : the session's map. places : its places; their `session_index` is not used. Raises ValueError if
-        there is a session of that name.
-        """
-        if name in self.sessions:
-            raise ValueError(f"there is a session {name!r} already")
-        here = replace(places, session_index=np.full(len(places), len(self.sessions), np.int32))
-        labels = {**dict(zip(self.sessions, self.labels, strict=True)), name: label or Label()}
-        areas_m2 = {**dict(zip(self.sessions, self._areas_m2, strict=True)), name: free_m2(grid)}
-        return MapIndex(
-            ChainMap({name: grid}, cast("MutableMapping[str, OccupancyGrid]", self._grids_by_name)),
-            SignatureTable.concatenated((self.places.table, here)),
-            self.made_with,
-            self._settings,
-            labels,
-            areas_m2,
-            smaller=self,
-        )
 
     def look_up(self, query: QueryMap, carried: tuple[Hypothesis, ...] = ()) -> tuple[Hypothesis, ...]:
         """Hypotheses for the query, best first: the carried ones, refined, and what retrieval proposes."""

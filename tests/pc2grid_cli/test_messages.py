@@ -13,7 +13,7 @@ from pc2grid.io.nav2_map import save_map
 from pc2grid_cli import console
 from pc2grid_cli.main import app
 from pc2grid_cli.probability import probability
-from signature.database.sqlite import schema
+from signature.database.protocol import APPLICATION_ID
 from signature.database.sqlite.database import store
 from tests.helpers.databases import make_entry
 from tests.helpers.recordings import drive, write_mcap
@@ -68,7 +68,7 @@ def test_the_error_says_what_to_do(
 
 
 def test_the_mark_of_a_database_is_the_one_that_is_written(folder: Path) -> None:
-    assert (folder / "b.submaps").read_bytes()[68:72] == schema.APPLICATION_ID.to_bytes(4, "big") == b"pc2g"
+    assert (folder / "b.submaps").read_bytes()[68:72] == APPLICATION_ID.to_bytes(4, "big") == b"pc2g"
 
 
 def test_another_label_is_named(folder: Path) -> None:

@@ -23,8 +23,7 @@ from pc2grid.errors import (
     Pc2GridError,
 )
 from signature.database.migrations import FORMAT, tables_of
-from signature.database.sqlite.atomic_update import BUSY_TIMEOUT_S
-from signature.database.sqlite.schema import APPLICATION_ID
+from signature.database.protocol import APPLICATION_ID, BUSY_TIMEOUT_S
 
 if TYPE_CHECKING:
     from psycopg import Connection, Error

@@ -21,12 +21,11 @@ from pathlib import Path
 from pc2grid.errors import DatabaseBusy, OutputError
 from pc2grid.io.atomic import replace_file
 from signature.database import migrations, serialize
+from signature.database.protocol import BUSY_TIMEOUT_S
 from signature.database.sqlite import schema
 from signature.database.sqlite.connection import BoundedConnection
 from signature.database.sqlite.file import migrate
 
-BUSY_TIMEOUT_S = 30.0
-"""How long a writer waits for another one; chosen by hand."""
 _POLL_S = 0.05
 # SQLite's primary result codes (https://www.sqlite.org/rescode.html) for a medium that does not take writes.
 _READONLY, _IOERR, _FULL, _CANTOPEN = 8, 10, 13, 14

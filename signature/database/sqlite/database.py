@@ -15,6 +15,7 @@ from pc2grid.io.atomic import refuse_existing
 from pc2grid.model import SessionMap, Submap
 from signature.database import serialize, validation
 from signature.database.protocol import (
+    BUSY_TIMEOUT_S,
     Entry,
     Neighbour,
     Problem,
@@ -25,7 +26,7 @@ from signature.database.protocol import (
 from signature.database.reader import RowReader
 from signature.database.serialize import Row
 from signature.database.sqlite import rows, schema
-from signature.database.sqlite.atomic_update import BUSY_TIMEOUT_S, rewrite
+from signature.database.sqlite.atomic_update import rewrite
 from signature.database.sqlite.file import (
     check,
     connect,

@@ -6,11 +6,10 @@ import sqlite3
 from pathlib import Path
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseVersion, NotADatabase
-from pc2grid.io.containers.detect import SUBMAPS_ID
 from signature.database.migrations import FORMAT, tables_of
+from signature.database.protocol import APPLICATION_ID
 from signature.database.serialize import SALVAGE
 
-APPLICATION_ID = int.from_bytes(SUBMAPS_ID, "big")
 CONVERT = "make one with `pc2grid convert LOG -o BUILDING.submaps`"
 
 DAMAGE = (sqlite3.Error, UnicodeDecodeError)

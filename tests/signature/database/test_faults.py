@@ -39,10 +39,11 @@ from signature.database import Label, maintenance, open_database
 from signature.database.maintenance import check, copy, merge
 from signature.database.postgres import schema
 from signature.database.postgres.schema import is_url
+from signature.database.protocol import APPLICATION_ID
 from signature.database.sqlite import atomic_update, rows
 from signature.database.sqlite.atomic_update import hold, rewrite
 from signature.database.sqlite.database import store
-from signature.database.sqlite.schema import APPLICATION_ID, COLUMNS
+from signature.database.sqlite.schema import COLUMNS
 from signature.sessions import add_session, provenance
 from tests.helpers import postgresql
 from tests.helpers.databases import assert_holds, make_entry

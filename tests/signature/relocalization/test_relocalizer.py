@@ -189,22 +189,6 @@ def test_the_json_document_keeps_its_contract() -> None:
     assert {"query", "database", "timing_ms"} <= set(document)
 
 
-def test_an_index_with_one_more_session_shares_what_was_prepared() -> None:
-    other = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
-    first, office_only = building({"other": other}), building({"office": office()})
-    ask(first, office(), ROUTE)
-    prepared = first.maps[0]
-    both = first.with_session("office", office(), office_only.places.table)
-    assert both.sessions == ("other", "office") and len(first.sessions) == 1
-    assert both.maps[0] is prepared
-    at_once = building({"other": other, "office": office()})
-    answers = [ask(index, office(), ROUTE)[0] for index in (both, at_once)]
-    assert answers[0].session == answers[1].session == "office"
-    assert answers[0].T_map_base == answers[1].T_map_base
-    with pytest.raises(ValueError, match="already"):
-        both.with_session("other", other, first.places.table)
-
-
 class Judged:
     """An index whose verdict on a query is given by its `path_m`: a confidence."""
 
