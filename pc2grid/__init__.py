@@ -22,7 +22,6 @@ from pc2grid.lazy import lazy_names
 # The only list of the public names. A function with the name of its module has another name here, because the
 # module would hide it.
 if TYPE_CHECKING:
-    from pc2grid.config import Config as Config
     from pc2grid.errors import Pc2GridError as Pc2GridError
     from pc2grid.geometry import SE2 as SE2
     from pc2grid.io.nav2_map import load_map as load_map
@@ -48,6 +47,18 @@ if TYPE_CHECKING:
     from pc2grid.simulate import simulate_session as simulate_session
     from pc2grid.submaps.partition import partition as submaps_of  # noqa: F401
     from pc2grid.time_span import TimeSpan as TimeSpan
+
+    # Of the package above this one, so that a user needs one import. `pyproject.toml` allows it here only.
+    from signature.config import Config as Config
+    from signature.database import Label as Label
+    from signature.database import SubmapDatabase as SubmapDatabase
+    from signature.database import open_database as open_database
+    from signature.files import convert as convert
+    from signature.files import relocalize as relocalize
+    from signature.relocalization.answer import Answer as Answer
+    from signature.relocalization.map_index import MapIndex as MapIndex
+    from signature.relocalization.relocalizer import Relocalizer as Relocalizer
+    from signature.relocalization.relocalizer import relocalize as locate  # noqa: F401
 
 __getattr__, _names = lazy_names(__name__, __file__)
 __all__ = ["__version__", *_names]

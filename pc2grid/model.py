@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64, I64, BoolGrid, freeze, hand_over
+from pc2grid.display import html_picture, html_table, map_png, short
 from pc2grid.geometry import SE2
 
 if TYPE_CHECKING:
@@ -71,6 +72,9 @@ class Scan:
         if self.offsets_s is not None:
             freeze(self, "offsets_s", np.float32, (len(self.points_m),))
 
+    def __repr__(self) -> str:
+        return f"Scan({self.sensor}, {len(self.points_m)} points, stamp_ns={self.stamp_ns})"
+
 
 class Health(enum.Enum):
     """How well the pose of a scan is determined."""
@@ -101,6 +105,10 @@ class RegisteredScan:
 
     def __post_init__(self) -> None:
         freeze(self, "T_session_base", np.float64, (4, 4))
+
+    def __repr__(self) -> str:
+        pose = SE2.from_matrix(self.T_session_base)
+        return f"RegisteredScan({self.scan}, {self.health.value}, at x {pose.x:.2f} m, y {pose.y:.2f} m)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,6 +143,9 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    def __repr__(self) -> str:
+        return f"Trajectory({len(self)} poses, {self.length_m:.1f} m in {self.duration_s:.1f} s)"
+
     def planar(self) -> F64:
         """(N, 3): x, y, yaw of the base in the session frame; metres and radians."""
         T = self.T_session_base
@@ -144,6 +155,16 @@ class Trajectory:
         """(N,): planar distance driven up to each pose, metres."""
         steps = np.linalg.norm(np.diff(self.T_session_base[:, :2, 3], axis=0), axis=1)
         return np.concatenate(([0.0], np.cumsum(steps)))[: len(self)]
+
+    @property
+    def length_m(self) -> float:
+        """Planar distance driven, metres; 0 without poses."""
+        return float(self.path_m()[-1]) if len(self) else 0.0
+
+    @property
+    def duration_s(self) -> float:
+        """Time between the first and the last pose, seconds; 0 without poses."""
+        return float(self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9 if len(self) else 0.0
 
     def poses(self) -> Iterator[SE2]:
         """Planar pose of each entry."""
@@ -177,6 +198,17 @@ class OccupancyGrid:
         if not (np.isfinite(self.resolution_m) and self.resolution_m > 0):
             raise ValueError(f"OccupancyGrid.resolution_m: expected > 0, got {self.resolution_m}")
 
+    def __repr__(self) -> str:
+        height, width = self.cells.shape
+        x, y = self.origin_m
+        return (
+            f"OccupancyGrid({width} x {height} cells of {self.resolution_m:g} m, origin ({x:.2f}, {y:.2f}) m,"
+            f" {self.free_m2:.0f} m2 free)"
+        )
+
+    def _repr_png_(self) -> bytes:
+        return map_png(self.cells, self.resolution_m, self.origin_m)
+
     @property
     def occupied(self) -> BoolGrid:
         """(H, W) cells that are occupied: `OCCUPIED_FROM` percent or more."""
@@ -186,6 +218,11 @@ class OccupancyGrid:
     def free(self) -> BoolGrid:
         """(H, W) cells that are known and free: below `FREE_BELOW` percent."""
         return (self.cells >= 0) & (self.cells < FREE_BELOW)
+
+    @property
+    def free_m2(self) -> float:
+        """Area of the free cells, square metres."""
+        return float(np.count_nonzero(self.free)) * self.resolution_m**2
 
     def is_free(self, x_m: float, y_m: float) -> bool:
         """Whether a point of the map frame lies in a free cell of the grid."""
@@ -239,6 +276,13 @@ class Submap:
     center_m: tuple[float, float]
     radius_m: float
     grid: OccupancyGrid
+
+    def __repr__(self) -> str:
+        x, y = self.center_m
+        return f"Submap({self.submap_id} at ({x:.2f}, {y:.2f}) m, radius {self.radius_m:g} m)"
+
+    def _repr_png_(self) -> bytes:
+        return self.grid._repr_png_()
 
 
 MISSING_FILES = "files of the recording that are missing"
@@ -306,6 +350,10 @@ class Loop:
 
     def __post_init__(self) -> None:
         freeze(self, "information", np.float64, (3, 3))
+
+    def __repr__(self) -> str:
+        accepted = "accepted" if self.accepted else "not accepted"
+        return f"Loop({self.older} to {self.newer}, {self.T_older_newer}, {accepted})"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -394,3 +442,30 @@ class SessionMap:
                     f"SessionMap.loops: expected poses of 0..{len(self.trajectory) - 1},"
                     f" got {loop.older} and {loop.newer}"
                 )
+
+    def __repr__(self) -> str:
+        travel = self.trajectory
+        driven = f"{travel.length_m:.1f} m in {travel.duration_s:.0f} s, " if len(travel) else ""
+        counts = f"{len(self.submaps)} submaps, {len(self.loops)} loops"
+        return (
+            f"SessionMap({short(self.session)}, {self.sensor}, {driven}{self.grid.free_m2:.0f} m2, {counts})"
+        )
+
+    def _repr_html_(self) -> str:
+        grid, travel = self.grid, self.trajectory
+        rows = [
+            ("sensor", self.sensor),
+            ("scans", len(travel)),
+            ("driven", f"{travel.length_m:.1f} m in {travel.duration_s:.0f} s"),
+            ("free space", f"{grid.free_m2:.0f} m2"),
+            ("submaps", len(self.submaps)),
+            ("loops closed", sum(loop.accepted for loop in self.loops)),
+        ]
+        if self.consistency is not None and self.consistency.bent:
+            rows.append(("probably bent", f"along {100 * self.consistency.contradicted:.0f} % of the travel"))
+        rows += [("warning", text) for text in self.report.warnings]
+        centers_m = np.array([submap.center_m for submap in self.submaps]).reshape(-1, 2)
+        path_m = travel.planar()[:, :2]
+        png = map_png(grid.cells, grid.resolution_m, grid.origin_m, path_m=path_m, centers_m=centers_m)
+        picture = html_picture(png, "the map, the path of the robot, and the centres of the submaps")
+        return html_table(f"session {self.session}", rows) + picture

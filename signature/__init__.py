@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from signature.database import open_database as open_database
     from signature.describe import Signature as Signature
     from signature.describe import describe as signature_of  # noqa: F401
+    from signature.files import convert as convert
+    from signature.files import relocalize as relocalize
     from signature.relocalization.answer import Answer as Answer
     from signature.relocalization.map_index import MapIndex as MapIndex
     from signature.relocalization.relocalizer import Relocalizer as Relocalizer

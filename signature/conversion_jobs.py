@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import pc2grid
+from pc2grid._version import __version__
 from pc2grid.errors import ClusterError, DatabaseError
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
@@ -44,7 +44,7 @@ class Job:
     recover: bool = False
     label: Label = field(default_factory=Label)
     stored: Provenance | None = None
-    version: str = pc2grid.__version__
+    version: str = __version__
 
     def made_from(self, digest: str) -> Provenance:
         """The provenance that the session of this job will have if its file has this digest."""
@@ -73,9 +73,9 @@ def convert(job: Job, observer: Observer = Observer()) -> Entry | None:
     Raises the errors of `build_session`; ClusterError if the job was made by another version of pc2grid;
     DatabaseError if the stored session was made from another file.
     """
-    if job.version != pc2grid.__version__:
+    if job.version != __version__:
         raise ClusterError(
-            f"a worker has pc2grid {pc2grid.__version__}, this is {job.version}",
+            f"a worker has pc2grid {__version__}, this is {job.version}",
             hint="install the same version everywhere",
         )
     if job.stored is not None:

@@ -33,6 +33,11 @@ class Signature:
         for name in ("boundary", "freespace", "symmetry"):
             freeze(self, name, np.float32, (None,))
 
+    def __repr__(self) -> str:
+        alpha, beta = self.symmetry
+        bins = f"{len(self.boundary)} boundary bins, {len(self.freespace)} free-space bins"
+        return f"Signature({bins}, symmetry {alpha:.1f} and {beta:.1f})"
+
 
 def describe(submap: Submap, config: SignatureConfig = SignatureConfig()) -> Signature:
     """The three signatures of a submap; defined for every submap, never NaN.

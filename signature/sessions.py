@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-import pc2grid
+from pc2grid._version import __version__
 from pc2grid.model import OccupancyGrid, SessionMap, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
@@ -59,7 +59,7 @@ def provenance(
         config=config,
         start_s=span.start_s,
         duration_s=span.duration_s,
-        versions={"pc2grid": pc2grid.__version__, "python": platform.python_version(), **_versions()},
+        versions={"pc2grid": __version__, "python": platform.python_version(), **_versions()},
         label=label or Label(),
     )
 

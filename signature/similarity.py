@@ -53,6 +53,9 @@ class SignatureTable:
     def __len__(self) -> int:
         return len(self.boundary)
 
+    def __repr__(self) -> str:
+        return f"SignatureTable({len(self)} submaps of {len(np.unique(self.session_index))} sessions)"
+
     @staticmethod
     def of(
         signatures: Sequence[Signature],

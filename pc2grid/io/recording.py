@@ -10,6 +10,7 @@ from types import TracebackType
 import numpy as np
 
 from pc2grid.config import ReadConfig
+from pc2grid.display import html_table, short
 from pc2grid.errors import ConfigError
 from pc2grid.io.containers.detect import open_source
 from pc2grid.io.error_translation import guarded, guarded_stream
@@ -54,6 +55,19 @@ class Log:
         self._plan: Plan | None = None
         self._frames = FrameTree()
         self._digest: str | None = None
+
+    def __repr__(self) -> str:
+        info = self.info
+        name, topics = short(info.path.name, 120), len(info.topics)
+        return f"Log({name}, {info.format}, {info.duration_s:.1f} s, {topics} topics)"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (topic.topic, topic.type, "?" if topic.message_count is None else topic.message_count)
+            for topic in self.info.topics
+        ]
+        title = f"{self.info.path.name}: {self.info.format}, {self.info.duration_s:.1f} s"
+        return html_table(title, rows, ("topic", "type", "messages"))
 
     def __enter__(self) -> Log:
         return self

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
+from pc2grid.display import short
 from pc2grid.errors import DatabaseError
 from pc2grid.io.containers.detect import SUBMAPS_ID
 from pc2grid.model import Consistency, Loop, OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
@@ -58,6 +59,9 @@ class Provenance:
     versions: Mapping[str, str] = field(default_factory=dict)
     label: Label = Label()
 
+    def __repr__(self) -> str:
+        return f"Provenance({short(self.source)}, sha256 {self.digest[:12]}, {short(self.label)})"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionInfo:
@@ -87,6 +91,13 @@ class SessionInfo:
     report: ReadReport
     provenance: Provenance
     consistency: Consistency | None = None
+
+    def __repr__(self) -> str:
+        driven = f"{self.path_m:.1f} m in {self.duration_s:.0f} s, " if self.scans else ""
+        return (
+            f"SessionInfo({short(self.name)}, {self.sensor}, {driven}{self.area_m2:.0f} m2,"
+            f" {self.submaps} submaps)"
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from pc2grid.display import html_table, short
 from pc2grid.errors import DatabaseError
 from pc2grid.model import Loop, OccupancyGrid, Submap, Trajectory
 from signature.database import serialize, validation
-from signature.database.protocol import Problem
+from signature.database.protocol import Problem, SessionInfo
 from signature.database.serialize import Row
 
 if TYPE_CHECKING:
@@ -46,6 +47,29 @@ class RowReader(ABC):
     @abstractmethod
     def close(self) -> None:
         """Close the file or connection."""
+
+    @abstractmethod
+    def sessions(self, names: Collection[str] | None = None) -> tuple[SessionInfo, ...]:
+        """All sessions, or those of `names`; see `SubmapDatabase.sessions`."""
+
+    def __repr__(self) -> str:
+        # Without its sessions: the database may be closed, damaged, or on a server that is away.
+        return f"{type(self).__name__}({short(self.location, 120)})"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (
+                info.name,
+                info.provenance.label,
+                info.sensor,
+                f"{info.path_m:.1f}",
+                f"{info.area_m2:.0f}",
+                info.submaps,
+            )
+            for info in self.sessions()
+        ]
+        head = ("session", "label", "sensor", "driven, m", "free, m2", "submaps")
+        return html_table(self.location, rows, head)
 
     def grid(self, session: str) -> OccupancyGrid:
         """Whole occupancy grid of a session."""

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pc2grid import __version__
+from pc2grid._version import __version__
 from pc2grid.config import PartitionConfig
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.nav2_map import load_map

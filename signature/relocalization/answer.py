@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from pc2grid.arrays import F64
+from pc2grid.display import html_table, probability, short
 from pc2grid.geometry import SE2
 from signature.database.protocol import Label
 from signature.relocalization.answer_json import AnswerDocument, document
@@ -77,6 +79,29 @@ class Answer:
     evidence: Evidence
     timing_ms: dict[str, float] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        sure = f"confidence {probability(self.confidence)}, after {self.path_m:.1f} m"
+        if self.T_map_base is None:
+            places = len(set(self.places))
+            return f"Answer({self.status}, {places} {'place' if places == 1 else 'places'}, {sure})"
+        return f"Answer(located in {short(self.session)} at {_pose(self.T_map_base)}, {sure})"
+
+    def _repr_html_(self) -> str:
+        located = self.T_map_base is not None
+        rows = [
+            (
+                place,
+                self.sessions[hypothesis.session_index],
+                _pose(hypothesis.fit.T_map_query @ self.T_odom_base),
+                f"{hypothesis.fit.score:.2f}",
+                "the answer" if located and row == 0 else "",
+            )
+            for row, (place, hypothesis) in enumerate(zip(self.places, self.hypotheses, strict=True))
+        ]
+        status = self.status.replace("_", " ")
+        title = f"{status}, confidence {probability(self.confidence)}, after {self.path_m:.1f} m"
+        return html_table(title, rows[:_SHOWN], ("place", "session", "pose of the robot", "score", ""))
+
     @property
     def label(self) -> Label:
         """Building and floor of the session it was located in, as far as they are known."""
@@ -85,3 +110,11 @@ class Answer:
     def to_json(self) -> AnswerDocument:
         """The answer as plain types: most of what `pc2grid relocalize --json` prints."""
         return document(self)
+
+
+_SHOWN = 6
+"""Hypotheses in the table of a notebook, as many as in the picture of the command line."""
+
+
+def _pose(pose: SE2) -> str:
+    return f"x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {math.degrees(pose.yaw):.1f} deg"

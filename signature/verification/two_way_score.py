@@ -34,6 +34,13 @@ class Fit:
     score: float
     covariance: F64
 
+    def __repr__(self) -> str:
+        pose = self.T_map_query
+        return (
+            f"Fit(x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {math.degrees(pose.yaw):.1f} deg,"
+            f" score {self.score:.2f}, overlap {self.overlap:.2f})"
+        )
+
     @property
     def known_agreement(self) -> float:
         """0..1, mean likelihood of the query's walls on ground that the map knows; 0 if it knows none."""

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from pc2grid.display import probability
 from pc2grid.errors import LogNotFound, MapFileError, NotALog, OutputError, Pc2GridError
 from pc2grid.io.nav2_map import save_map
 from pc2grid_cli import console
 from pc2grid_cli.main import app
-from pc2grid_cli.probability import probability
 from signature.database.protocol import APPLICATION_ID
 from signature.database.sqlite.database import store
 from tests.helpers.databases import make_entry

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pc2grid.display import probability
 from pc2grid_cli import console
 from pc2grid_cli import options as options
-from pc2grid_cli.probability import probability
 
 if TYPE_CHECKING:
     from signature.evaluation.metrics import QueryCounts

@@ -104,19 +104,16 @@ def locate(
 
     watch : called with each scan, and with the state of the answer if the database was asked after it.
 
-    The query is drawn and described with the settings that made the database; the sections `read`,
-    `registration` and `relocalize` are those of `config`.
+    config : see `query_config`.
     """
     import numpy as np
 
     from pc2grid.model import Trajectory
     from pc2grid.pipeline import follow
+    from signature.files import query_config
     from signature.relocalization.relocalizer import relocalize
 
-    made_with = database.config()
-    config = made_with.model_copy(
-        update={"read": config.read, "relocalize": config.relocalize, "registration": config.registration}
-    )
+    config = query_config(database, config)
     seen: list[RegisteredScan] = []
     ends_ns = query.info.start_ns, query.info.end_ns
     with observer.step("locate", span.length_ns(*ends_ns) * 1e-9):

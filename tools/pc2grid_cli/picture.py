@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pc2grid.display import probability
 from pc2grid.io.atomic import replace_file
-from pc2grid_cli.probability import probability
 
 if TYPE_CHECKING:
     from pc2grid.model import OccupancyGrid, Trajectory

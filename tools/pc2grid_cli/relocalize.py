@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pc2grid.display import probability
 from pc2grid.errors import one_line
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
@@ -17,7 +18,6 @@ from pc2grid_cli import options as options
 from pc2grid_cli.locate import Found, find_log, find_map, in_map
 from pc2grid_cli.nav2_pose import write_initialpose
 from pc2grid_cli.output_files import check_file
-from pc2grid_cli.probability import probability
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory

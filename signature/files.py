@@ -1,0 +1,133 @@
+"""From file to file: what `pc2grid convert` and `pc2grid relocalize` do with one recording, as functions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pc2grid.errors import OutputError
+from pc2grid.model import SessionMap
+from pc2grid.observer import Observer
+from pc2grid.time_span import TimeSpan
+from signature.config import Config
+from signature.database import Label
+from signature.sessions import add_sessions, build_session
+
+if TYPE_CHECKING:
+    from signature.database import SubmapDatabase
+    from signature.relocalization.answer import Answer
+
+
+def convert(
+    source: str | Path,
+    database: str | Path,
+    config: Config = Config(),
+    *,
+    name: str | None = None,
+    span: TimeSpan = TimeSpan(),
+    recover: bool = False,
+    label: Label | None = None,
+    add: bool = False,
+    force: bool = False,
+    observer: Observer = Observer(),
+) -> SessionMap:
+    """Make a session of a recording or a nav2 map, and store it in a database.
+
+    source : a recording, or the map.yaml of a nav2 map.
+    database : the file to make, such as `building.submaps`, or a postgresql:// URL.
+    name : of the session; by default that of the file.
+    span, recover, label, observer : as in `signature.build_session`.
+    add : add the session to an existing database. force : replace an existing database or, with `add`, a
+        session of the same name.
+
+    Raises OutputError, before any work, for an existing database without `add` and `force` and for one that
+    cannot be written; else as `signature.build_session` and `signature.add_session`.
+
+    >>> import pc2grid
+    >>> monday = pc2grid.convert("monday.mcap", "new.submaps", span=pc2grid.TimeSpan(0.0, 2.0))
+    >>> monday.session, monday.sensor
+    ('monday', 'laser')
+    """
+    from pc2grid.io.atomic import require_writable
+    from signature.database.maintenance import exists
+    from signature.database.postgres.schema import is_url
+
+    if not (add or force) and exists(database):
+        raise OutputError(f"{database}: exists already", hint="force=True replaces it, add=True adds to it")
+    if not is_url(database):
+        require_writable(Path(database), force=True)
+    session, origin = build_session(
+        source,
+        name or Path(source).stem,
+        config,
+        span=span,
+        recover=recover,
+        label=label,
+        observer=observer,
+    )
+    add_sessions(database, [(session, origin)], config, keep=add, force=force)
+    return session
+
+
+def relocalize(
+    query: str | Path,
+    database: str | Path,
+    config: Config = Config(),
+    *,
+    span: TimeSpan = TimeSpan(),
+    until_located: bool = False,
+    recover: bool = False,
+    observer: Observer = Observer(),
+) -> Answer:
+    """Find where a recording was made, or where a nav2 map lies.
+
+    query : a recording, or the map.yaml of a nav2 map.
+    database : file or postgresql:// URL.
+    config : its sections `read`, `registration` and `relocalize` are used; see `query_config`.
+    span : the part of the recording to use. recover : use what is whole of a damaged recording.
+    until_located : ask after every metre of travel, and stop at the first answer that is `located`; otherwise
+        the recording is read to its end, and the answer is about its last metres.
+    observer : gets the progress, and each scan with its tracked pose.
+
+    Raises the errors of `pc2grid.open_log`, `pc2grid.load_map` and `signature.open_database`; NoScans if no
+    scan can be used.
+
+    >>> import pc2grid
+    >>> answer = pc2grid.relocalize("tuesday.mcap", "building.submaps", until_located=True)
+    >>> answer.status, answer.session, answer.path_m < 4.0
+    ('located', 'monday', True)
+    """
+    from pc2grid.io.nav2_map import is_map_file, load_map
+    from pc2grid.io.recording import open_log
+    from pc2grid.pipeline import follow
+    from signature.database import open_database
+    from signature.relocalization.relocalizer import MapIndex, Relocalizer, locate_map
+
+    with open_database(database) as opened:
+        settings = query_config(opened, config)
+        index = MapIndex.of(opened, settings)
+        if is_map_file(Path(query)):
+            return locate_map(load_map(query), index)
+        relocalizer = Relocalizer(index)
+        with open_log(query, settings.read, recover=recover) as log:
+            start_ns, end_ns = log.info.start_ns, log.info.end_ns
+            with observer.step("locate", span.length_ns(start_ns, end_ns) * 1e-9):
+                for registered, planar_scan in follow(log.scans(span.start_s, span.duration_s), settings):
+                    moment = relocalizer.add(registered, planar_scan)
+                    observer.on_scan(registered)
+                    observer.on_progress(span.share_done(registered.scan.stamp_ns, start_ns, end_ns))
+                    if until_located and moment is not None:
+                        answer = relocalizer.answer()
+                        if answer.status == "located":
+                            return answer
+        return relocalizer.answer()
+
+
+def query_config(database: SubmapDatabase, config: Config) -> Config:
+    """The settings for a query.
+
+    It is drawn and described with those that made the database; how it is read and registered, and how the
+    answer is found, is taken from `config`.
+    """
+    own = {section: getattr(config, section) for section in ("read", "registration", "relocalize")}
+    return database.config().model_copy(update=own)

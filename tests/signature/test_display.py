@@ -1,0 +1,92 @@
+"""Answers, signatures and databases in a notebook: one short line each, and a table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pc2grid.geometry import SE2
+from signature.database import Label, open_database
+from signature.database.sqlite.database import store
+from signature.relocalization.answer import Answer
+from signature.relocalization.confidence import NO_EVIDENCE
+from signature.relocalization.hypotheses import Hypothesis
+from signature.verification.two_way_score import Fit
+from tests.helpers.databases import make_entry
+
+LONGEST_LINE = 200
+
+
+def hypothesis(x: float, session: int, score: float) -> Hypothesis:
+    fit = Fit(
+        T_map_query=SE2(x, 2.0 / 3.0, 0.1),
+        forward=score,
+        backward=score,
+        overlap=0.9,
+        score=score,
+        covariance=np.eye(3),
+    )
+    return Hypothesis(session_index=session, row=-1, fit=fit)
+
+
+def answer(status: str, confidence: float) -> Answer:
+    best, other = hypothesis(4.0, 1, 0.8), hypothesis(9.0, 0, 0.3)
+    located = status == "located"
+    return Answer(
+        status=status,  # type: ignore[arg-type]
+        session="tuesday <x>" if located else None,
+        stamp_ns=0,
+        T_map_base=best.fit.T_map_query @ SE2(1.0, 0.0, 0.0) if located else None,
+        covariance=np.eye(3) if located else None,
+        T_map_odom=best.fit.T_map_query if located else None,
+        confidence=confidence,
+        hypotheses=() if status == "not_found" else (best, other),
+        places=() if status == "not_found" else (0, 1),
+        history=(),
+        T_odom_base=SE2(1.0, 0.0, 0.0),
+        path_m=3.25,
+        sessions=("monday", "tuesday <x>"),
+        labels=(Label(), Label()),
+        submap_ids=() if status == "not_found" else (-1, -1),
+        evidence=NO_EVIDENCE,
+    )
+
+
+@pytest.mark.parametrize(
+    ("status", "confidence", "words"),
+    [
+        ("located", 0.9999, "in 'tuesday <x>' at x 5.00 m, y 0.77 m, yaw 5.7 deg, confidence > 0.99, after"),
+        ("ambiguous", 0.4, "Answer(ambiguous, 2 places, confidence 0.40, after 3.2 m)"),
+        ("not_found", 0.0, "Answer(not_found, 0 places, confidence < 0.01, after 3.2 m)"),
+    ],
+)
+def test_an_answer_is_one_short_line(status: str, confidence: float, words: str) -> None:
+    text = repr(answer(status, confidence))
+    assert words in text and len(text) < LONGEST_LINE and "\n" not in text
+
+
+def test_the_table_of_an_answer_names_the_places_that_fit() -> None:
+    page = answer("located", 0.95)._repr_html_()
+    assert "located, confidence 0.95" in page and page.count("the answer") == 1
+    assert "tuesday &lt;x&gt;" in page and "<x>" not in page
+    assert page.index("x 5.00 m") < page.index("the answer") < page.index("monday")
+    assert "the answer" not in answer("ambiguous", 0.4)._repr_html_()
+    assert answer("not_found", 0.0)._repr_html_().startswith("<table><caption>not found")
+
+
+def test_signatures_and_databases_are_one_short_line(tmp_path: Path) -> None:
+    path = tmp_path / "building.submaps"
+    entry = make_entry("monday")
+    store(path, [entry, make_entry("<b>", seed=1)], keep=False)
+    with open_database(path) as database:
+        table, page = database.signatures(), database._repr_html_()  # type: ignore[attr-defined]
+        infos = database.sessions()
+        for thing in (entry[1][0], table, *infos, infos[0].provenance, database):
+            text = repr(thing)
+            assert text.startswith(f"{type(thing).__name__}(") and len(text) < LONGEST_LINE
+            assert "\n" not in text
+    assert repr(table) == f"SignatureTable({len(table)} submaps of 2 sessions)"
+    assert "monday" in page and "&lt;b&gt;" in page and "building.submaps" in page
+    assert "SqliteDatabase(" in repr(database), "also when it is closed"

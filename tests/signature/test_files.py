@@ -1,0 +1,67 @@
+"""From file to file: what is refused before any work, and what a notebook gets back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import pc2grid
+from pc2grid.config import ReadConfig
+from pc2grid.errors import DatabaseError, OutputError
+from pc2grid.io.nav2_map import save_map
+from signature.config import Config
+from signature.database import Label, open_database
+from signature.files import convert, query_config, relocalize
+from tests.helpers.simulated_drives import cut, office
+
+
+def names(path: Path) -> list[str]:
+    with open_database(path) as database:
+        return [session.name for session in database.sessions()]
+
+
+@pytest.fixture(scope="module")
+def building(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an office plan, a part of it, and the database of the plan."""
+    folder = tmp_path_factory.mktemp("building")
+    save_map(office(), folder / "plan")
+    save_map(cut(office(), 4.0, 3.0, 15.0, 12.0), folder / "part")
+    made = convert(folder / "plan.yaml", folder / "plan.submaps", label=Label(floor="2"))
+    assert (made.session, made.sensor) == ("plan", "map") and len(made.submaps) > 10
+    return folder
+
+
+def test_a_map_is_found_in_a_map(building: Path) -> None:
+    answer = relocalize(building / "part.yaml", building / "plan.submaps")
+    assert answer.status == "located" and answer.label.floor == "2"
+    assert answer.T_map_base is not None
+    assert (round(answer.T_map_base.x, 1), round(answer.T_map_base.y, 1)) == (4.0, 3.0)
+
+
+def test_what_exists_is_kept_unless_one_says_so(building: Path, tmp_path: Path) -> None:
+    plan, target = building / "plan.yaml", tmp_path / "all.submaps"
+    target.write_bytes((building / "plan.submaps").read_bytes())
+    before = target.read_bytes()
+    with pytest.raises(OutputError, match=r"exists already.*force=True"):
+        convert(tmp_path / "never looked at", target)
+    with pytest.raises(DatabaseError, match="plan"):  # another session of that name: it has no label
+        convert(plan, target, add=True)
+    assert target.read_bytes() == before
+    convert(plan, target, name="again", add=True)
+    assert names(target) == ["plan", "again"]
+    convert(plan, target, name="alone", force=True)
+    assert names(target) == ["alone"]
+
+
+def test_a_database_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(OutputError):
+        convert(tmp_path / "never looked at", tmp_path / "missing" / "x.submaps")
+
+
+def test_a_query_is_drawn_as_the_database_and_read_as_one_says(building: Path) -> None:
+    asked = Config(read=ReadConfig(topic="/scan"), partition=pc2grid.Config.paper().partition)
+    with open_database(building / "plan.submaps") as database:
+        settings = query_config(database, asked)
+        assert settings.partition == database.config().partition != asked.partition
+    assert settings.read.topic == "/scan"
