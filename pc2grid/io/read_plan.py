@@ -19,7 +19,7 @@ _BASE_FRAMES = ("base_link", "base_footprint")  # REP-105 and REP-120
 
 
 @dataclass(frozen=True, slots=True)
-class SearchParameters:
+class LookAheadParameters:
     """How much of a log is read to find out how to read it; chosen by hand.
 
     tf_ns : log time behind the first scan within which tf must connect the sensor to the base.
@@ -32,7 +32,7 @@ class SearchParameters:
     scans: int = 5
 
 
-SEARCH = SearchParameters()
+LOOK_AHEAD = LookAheadParameters()
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ class _Planner:
         """
         decode = decoder_for(scans)
         of_topic = (m for m in self._source.messages({scans.topic}) if m.channel == scans)
-        first = list(itertools.islice(of_topic, SEARCH.scans))
+        first = list(itertools.islice(of_topic, LOOK_AHEAD.scans))
         if not first:
             raise NoScans(f"{scans.topic}: no message in the log")
         found = (tolerant(decode, message.data, None) for message in first)
@@ -163,11 +163,11 @@ class _Planner:
         frames = self._frames
         decoders = {t: decoder_for(t) for t in moving}
         base = self._connected_base(sensor_frame, child)
-        for message in self._source.messages({t.topic for t in moving}, end_ns=first_ns + SEARCH.tf_ns):
+        for message in self._source.messages({t.topic for t in moving}, end_ns=first_ns + LOOK_AHEAD.tf_ns):
             if base is not None and (
                 not odometry_too
                 or self._odometry_frame(base) is not None
-                or message.log_time_ns > first_ns + SEARCH.odometry_ns
+                or message.log_time_ns > first_ns + LOOK_AHEAD.odometry_ns
             ):
                 break
             if message.channel in decoders:
