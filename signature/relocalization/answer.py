@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pc2grid.arrays import F64
 from pc2grid.display import html_table, probability, short
 from pc2grid.geometry import SE2
+from pc2grid.model import OccupancyGrid
 from signature.database.protocol import Label
 from signature.relocalization.answer_json import AnswerDocument, document
 from signature.relocalization.answer_json import Status as Status
@@ -58,6 +59,7 @@ class Answer:
     confidence : probability that the best hypothesis is right.
     hypotheses : all that fit, best first. places : the place each of them is at, see `Verdict`.
     history : how the answer came to be. evidence : what the confidence rests on.
+    local_map : what the query has seen, in its odom frame: what the hypotheses were compared with.
     sessions, labels : all of the database, that `Hypothesis.session_index` counts.
     """
 
@@ -77,6 +79,7 @@ class Answer:
     labels: tuple[Label, ...]
     submap_ids: tuple[int, ...]
     evidence: Evidence
+    local_map: OccupancyGrid
     timing_ms: dict[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:

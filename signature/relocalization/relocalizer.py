@@ -379,6 +379,7 @@ def _answer(
         labels=index.labels,
         submap_ids=tuple(int(table.submap_id[h.row]) if h.row >= 0 else -1 for h in verdict.hypotheses),
         evidence=verdict.evidence,
+        local_map=query.grid,
         timing_ms=timing_ms,
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import itertools
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -12,22 +13,28 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import networkx as nx
 import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
 from pc2grid.model import Consistency, Contradiction, OccupancyGrid, Trajectory
+from pc2grid_cli.deviation import deviation
 from pc2grid_cli.locate import Found, find_map
 from pc2grid_cli.nav2_pose import initialpose
 from pc2grid_cli.report import contents, runs, write_report
+from signature.boundary import boundary_histogram
 from signature.config import Config
 from signature.database import SubmapDatabase, open_database
+from signature.describe import Signature
+from signature.freespace import freespace_histogram, shortest_paths
 from signature.sessions import add_sessions, provenance
 from tests.helpers.session_maps import LOOPS, session, way
 from tests.helpers.simulated_drives import cut, office, plan
 
 NASTY = "</script><b>&"
+RADIUS_M = Config().partition.radius_m
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +153,98 @@ def test_the_answer_on_the_page_is_the_answer(database: SubmapDatabase, found: F
     assert shown["query"]["is_map"] and shown["query"]["source"] == "part.yaml"
     assert shown["hypotheses"][0]["T"] == pytest.approx([4.0, 3.0, 0.0], abs=0.05)
     assert len(shown["hypotheses"]) == len(found.answer.hypotheses)
-    assert shown["image"]["w"] == 11.0 and shown["image"]["h"] == 9.0
+
+
+def test_the_walls_of_the_query_are_weighed_at_each_hypothesis(
+    database: SubmapDatabase, found: Found
+) -> None:
+    shown = contents(database, found=found)["answer"]
+    walls_m = np.array(shown["walls"]).reshape(-1, 2)
+    assert len(walls_m) > 100
+    assert found.drawn is not None
+    at = found.drawn.to_cell(walls_m)
+    near = [found.drawn.occupied[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2].any() for r, c in at]
+    assert all(near)
+    for h in shown["hypotheses"]:
+        assert len(h["support"]) == len(walls_m) and set(h["support"]) <= set("012")
+        unknown, fits, contradicted = h["shares"]
+        assert fits + contradicted == pytest.approx(h["overlap"], abs=1e-3)
+        assert unknown + fits + contradicted == pytest.approx(1.0, abs=1e-3)
+    # A part of the very map fits it, and is contradicted nowhere.
+    assert shown["hypotheses"][0]["shares"][1] > 0.99 and shown["hypotheses"][0]["missed"] == []
+
+
+def test_what_a_changed_query_contradicts_is_where_it_was_changed(
+    database: SubmapDatabase, tmp_path: Path
+) -> None:
+    """The query lost a wall that the map has, from (7, 1) to (7, 3), and has a box that the map has not."""
+    cells = cut(office(), 4.0, 0.0, 15.0, 12.0).cells.copy()
+    cells[18:62, 58:63] = 0
+    cells[140:148, 110:118] = 100
+    save_map(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0)), tmp_path / "changed")
+    shown = contents(database, found=find_map(tmp_path / "changed.yaml", database, Config()))["answer"]
+    best = shown["hypotheses"][0]
+    missed_m = np.array(best["missed"]).reshape(-1, 2)
+    assert len(missed_m) > 10
+    assert np.abs(missed_m - (7.0, 2.0)).max(axis=0) == pytest.approx((0.0, 1.0), abs=0.2)
+    against = np.array(shown["walls"]).reshape(-1, 2)[[s == "2" for s in best["support"]]]
+    assert len(against) > 5
+    assert np.abs(against - (5.7, 7.2)).max() < 0.3
+
+
+def test_signatures_are_explained_by_what_they_are_computed_from(database: SubmapDatabase) -> None:
+    """The histograms made again from what the page draws are those that the database has."""
+    signature = Config().signature
+    submaps = contents(database)["sessions"][0]["submaps"]
+    for shown in submaps[::5]:
+        drawn = shown["sources"]
+        points = np.array(drawn["boundary"], np.int64).reshape(-1, 2)[:, ::-1]
+        histogram = boundary_histogram(points, RADIUS_M, drawn["cell_m"], signature)
+        assert np.allclose(histogram, shown["boundary"], atol=1e-4)
+        nodes_m = (np.array(drawn["nodes"]).reshape(-1, 2) + 0.5) * drawn["cell_m"] + drawn["corner"]
+        assert office().free[tuple(office().to_cell(nodes_m).T)].all()
+        first, second = np.triu_indices(len(nodes_m), 1)
+        bits = np.unpackbits(np.frombuffer(base64.b64decode(drawn["edges"]), np.uint8), bitorder="little")
+        graph = nx.empty_graph(len(nodes_m))
+        for a, b in zip(first[bits[: len(first)] == 1], second[bits[: len(first)] == 1], strict=True):
+            graph.add_edge(int(a), int(b), length_m=math.dist(nodes_m[a], nodes_m[b]))
+        paths = freespace_histogram(shortest_paths(graph), RADIUS_M, signature)
+        assert np.allclose(paths, shown["freespace"], atol=1e-4)
+    # The office's walls run along both axes of its map.
+    angles = np.array([shown["sources"]["axes"] for shown in submaps if shown["sources"]["axes"]])
+    along = np.abs((np.degrees(angles) + 45) % 90 - 45)
+    assert np.median(along) < 2.0
+
+
+def test_similar_places_are_the_nearest_in_the_database_but_not_those_around(
+    database: SubmapDatabase,
+) -> None:
+    shown, table = contents(database)["sessions"][0]["submaps"], database.signatures()
+    names = [info.name for info in database.sessions()]
+    for row in np.flatnonzero(table.session_index == 0)[::7]:
+        far_m = np.hypot(*(table.center_m - table.center_m[row]).T)
+        near = {("office", int(k)) for k in table.submap_id[(table.session_index == 0) & (far_m < RADIUS_M)]}
+        query = Signature(
+            boundary=table.boundary[row], freespace=table.freespace[row], symmetry=table.symmetry[row]
+        )
+        ranked = [(n.session, n.submap_id) for n in database.nearest(query, len(table))]
+        assert near <= set(ranked)
+        wanted = [place for place in ranked if place not in near][:5]
+        assert [(names[k], i) for k, i, _ in shown[row]["similar"]] == wanted
+
+
+def test_a_page_about_an_answer_explains_the_maps_of_its_hypotheses(
+    database: SubmapDatabase, found: Found
+) -> None:
+    there = {found.answer.sessions[h.session_index] for h in found.answer.hypotheses}
+    for session_ in contents(database, found=found)["sessions"]:
+        explained = [submap["sources"] is not None for submap in session_["submaps"]]
+        assert set(explained) == {session_["name"] in there}
+
+
+def test_a_deviation_is_not_smaller_than_the_map_can_show() -> None:
+    assert deviation(np.zeros((3, 3)), 0.05, 5.0) == pytest.approx((0.025, 0.025, 0.005), abs=1e-6)
+    assert deviation(np.diag([4.0, 0.25, 0.01]), 0.05, 5.0) == pytest.approx((2.0, 0.5, 0.1))
 
 
 def test_an_initial_pose_is_what_nav2_takes() -> None:
@@ -175,24 +273,79 @@ def test_a_map_of_nothing_still_has_a_page(tmp_path: Path) -> None:
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
+
+
+def looked_at(page: Path, tmp_path: Path, size: str = "1280,900", act: str = "") -> str:
+    """The document after the script ran and a reader acted; fails on any message of the console."""
+    if act:
+        page.write_text(page.read_text("utf-8").replace("</script>", f"\n{act}\n</script>"), "utf-8")
+    assert CHROMIUM is not None
+    done = subprocess.run(
+        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
+         "--enable-logging=stderr", "--virtual-time-budget=3000", f"--window-size={size}", "--dump-dom",
+         f"file://{page}"],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    assert [line for line in done.stderr.splitlines() if "CONSOLE" in line] == []
+    shown = re.sub(r"<script>.*?</script>", "", done.stdout, flags=re.S)
+    assert "NaN" not in shown and "Infinity" not in shown and "undefined" not in shown
+    return shown
+
+
+@needs_chromium
 @pytest.mark.parametrize("size", ["1280,900", "390,844"])
 def test_a_browser_has_nothing_to_complain_about(
     database: SubmapDatabase, found: Found, tmp_path: Path, size: str
 ) -> None:
     write_report(tmp_path / "page.html", database, found=found)
-    assert CHROMIUM is not None
-    done = subprocess.run(
-        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
-         "--enable-logging=stderr", "--virtual-time-budget=3000", f"--window-size={size}", "--dump-dom",
-         f"file://{tmp_path / 'page.html'}"],
-        capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
-    assert [line for line in done.stderr.splitlines() if "CONSOLE" in line] == []
-    shown = re.sub(r"<script>.*?</script>", "", done.stdout, flags=re.S)
-    for words in ("part.yaml in two.submaps", "submap centres", "query: walls as located", "Submap "):
+    shown = looked_at(tmp_path / "page.html", tmp_path, size)
+    for words in ("part.yaml in two.submaps", "submap centres", "query's wall: fits the map", "Submap "):
         assert words in shown
-    # Of the three loops that the first session came back by.
+    assert "of the query's walls 100" in shown
+    # Of the three loops that the first session came back by, off until they are wanted.
     assert re.search(r"<label><input type=\"checkbox\">.*?2 loops closed</label>", shown)
     assert "1 loop doubted</label>" in shown
-    assert "NaN" not in shown and "Infinity" not in shown
+
+
+def points_drawn(shown: str) -> int:
+    return sum(int(n) for n in re.findall(r'class="evidence" data-points="(\d+)"', shown))
+
+
+@needs_chromium
+def test_the_place_that_a_reader_chooses_is_the_one_weighed(database: SubmapDatabase, tmp_path: Path) -> None:
+    """A query of a symmetric room fits it in both headings."""
+    save_map(cut(plan(8, 5, []), 0.0, 0.0, 8.0, 5.0), tmp_path / "room")
+    found = find_map(tmp_path / "room.yaml", database, Config())
+    assert found.answer.status == "ambiguous"
+    write_report(tmp_path / "page.html", database, found=found)
+    data = contents(database, found=found)["answer"]
+    act = 'document.querySelectorAll("#hypotheses tr")[2].click();'
+    shown = looked_at(tmp_path / "page.html", tmp_path, act=act)
+    assert "Place 2: of the query's walls" in shown
+    second = data["hypotheses"][1]
+    assert points_drawn(shown) == len(second["support"]) + len(second["missed"]) // 2
+
+
+@needs_chromium
+def test_the_submap_that_a_reader_chooses_is_explained_with_its_loops(
+    database: SubmapDatabase, tmp_path: Path
+) -> None:
+    write_report(tmp_path / "page.html", database)
+    first = contents(database)["sessions"][0]
+    places_m = np.array([submap["xy"] for submap in first["submaps"]])
+    ends_m = np.array([loop[:4] for loop in first["loops"]]).reshape(-1, 2, 2)
+    nearest = np.linalg.norm(ends_m[:, :, None] - places_m, axis=-1).argmin(axis=-1)
+    chosen = int(nearest[0, 0])
+    own = int((nearest == chosen).any(axis=1).sum())
+    act = f"pick(S.submaps.at({chosen} - 1)); $('next').click();"
+    shown = looked_at(tmp_path / "page.html", tmp_path, act=act)
+    submap = first["submaps"][chosen]
+    assert f">Submap {submap['id']}<" in shown
+    assert f"{own} loop{'s' if own > 1 else ''} from here" in shown and own < len(ends_m)
+    bits = np.unpackbits(np.frombuffer(base64.b64decode(submap["sources"]["edges"]), np.uint8))
+    assert f'id="graph" data-edges="{bits.sum()}"' in shown
+    mark = shown[shown.index('<g id="mark">') :]
+    assert mark.count("h.001") >= len(submap["sources"]["boundary"]) // 2
+    assert "var(--yellow)" in mark[: mark.index("</svg>")]
+    assert "Most similar places elsewhere" in shown

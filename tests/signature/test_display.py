@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2
+from pc2grid.model import OccupancyGrid
 from signature.database import Label, open_database
 from signature.database.sqlite.database import store
 from signature.relocalization.answer import Answer
@@ -17,6 +18,7 @@ from signature.verification.two_way_score import Fit
 from tests.helpers.databases import make_entry
 
 LONGEST_LINE = 200
+SEEN = OccupancyGrid(cells=np.zeros((4, 4), np.int8), resolution_m=0.05, origin_m=(0.0, 0.0))
 
 
 def hypothesis(x: float, session: int, score: float) -> Hypothesis:
@@ -51,6 +53,7 @@ def answer(status: str, confidence: float) -> Answer:
         labels=(Label(), Label()),
         submap_ids=() if status == "not_found" else (-1, -1),
         evidence=NO_EVIDENCE,
+        local_map=SEEN,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,25 +10,98 @@ import numpy as np
 
 from pc2grid.display import probability
 from pc2grid.io.atomic import replace_file
+from pc2grid_cli.evidence import agreements
 
 if TYPE_CHECKING:
+    from pc2grid.arrays import F64, U8
+    from pc2grid.geometry import SE2
     from pc2grid.model import OccupancyGrid, Trajectory
     from signature.database import SubmapDatabase
-    from signature.relocalization.relocalizer import Answer
+    from signature.relocalization.answer import Answer
+    from signature.relocalization.hypotheses import Hypothesis
+    from signature.verification.agreement import Agreement
 
 BLUE, ORANGE, GREEN, VERMILLION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
 YELLOW = "#F0E442"
-_SHADES = {"unknown": 0.87, "free": 1.0, "wall": 0.15}
+GREY = "#777777"
+SUPPORT_COLOURS = {"FITS": GREEN, "CONTRADICTED": VERMILLION, "UNKNOWN": BLUE}
+"""Of the query's wall points, by the name of their `signature.verification.agreement.Support`."""
+MISSED_COLOUR = ORANGE
+"""Of the map's wall points where the query saw free ground."""
+_SUPPORT_LABELS = {
+    "FITS": "query's wall: fits the map",
+    "CONTRADICTED": "query's wall: free in the map",
+    "UNKNOWN": "query's wall: unknown to the map",
+}
+_SHADES = {"unknown": 222, "undecided": 238, "free": 255, "wall": 38}
+_WIDTH_IN, _GAP_IN = 10.0, 0.55
+_MARGIN = 0.03
+"""Around a map, as a share of its longer side; an arrow at its edge must not be cut."""
+_CLOSE_MARGIN_M = 1.0
+_CLOSE_SHARE = 0.5
+"""A close-up is drawn if the query is shorter than this share of the map."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Box:
+    """A part of a map frame, metres."""
+
+    left: float
+    right: float
+    bottom: float
+    top: float
+
+    @staticmethod
+    def around(points_m: F64, margin_m: float = 0.0) -> _Box:
+        """The box of points (N, 2)."""
+        (left, bottom), (right, top) = points_m.min(axis=0) - margin_m, points_m.max(axis=0) + margin_m
+        return _Box(float(left), float(right), float(bottom), float(top))
+
+    @property
+    def width_m(self) -> float:
+        """In x."""
+        return self.right - self.left
+
+    @property
+    def height_m(self) -> float:
+        """In y."""
+        return self.top - self.bottom
+
+    def with_ratio(self, height_by_width: float) -> _Box:
+        """The smallest box around this one with a given ratio of its sides."""
+        x, y = 0.5 * (self.left + self.right), 0.5 * (self.bottom + self.top)
+        half_x = 0.5 * max(self.width_m, self.height_m / height_by_width)
+        half_y = half_x * height_by_width
+        return _Box(x - half_x, x + half_x, y - half_y, y + half_y)
+
+    def united(self, other: _Box) -> _Box:
+        """The smallest box around both."""
+        left, right = min(self.left, other.left), max(self.right, other.right)
+        return _Box(left, right, min(self.bottom, other.bottom), max(self.top, other.top))
+
+    def __contains__(self, pose: SE2) -> bool:
+        return self.left < pose.x < self.right and self.bottom < pose.y < self.top
+
+
+def shades(grid: OccupancyGrid) -> U8:
+    """Grey values (H, W) of a grid: free white, walls dark, undecided and unknown cells light grey."""
+    grey = np.full(grid.cells.shape, _SHADES["undecided"], np.uint8)
+    grey[grid.cells < 0] = _SHADES["unknown"]
+    grey[grid.free] = _SHADES["free"]
+    grey[grid.occupied] = _SHADES["wall"]
+    return grey
 
 
 def draw_session(path: Path, database: SubmapDatabase, session: str) -> None:
     """The map of a session with its submaps and the path of the robot."""
-    figure, axes = _canvas(database.grid(session))
+    grid = database.grid(session)
+    figure, (axes,) = _panels(_known(grid), None)
+    _draw_map(axes, grid)
     _draw_submaps(axes, database, session)
     poses = database.trajectory(session).planar()
     if len(poses):
         axes.plot(poses[:, 0], poses[:, 1], color=BLUE, lw=1.2, label="path of the map's robot")
-    axes.set_title(session)
+    axes.set_title(session, loc="left")
     _finish(figure, axes, path)
 
 
@@ -36,85 +110,234 @@ def draw_answer(
     database: SubmapDatabase,
     answer: Answer,
     poses: Trajectory,
-    truth_m: np.ndarray | None = None,
+    truth_m: F64 | None = None,
 ) -> None:
-    """The map with the answer: the path of the query in it, and the hypotheses.
+    """The map with the best hypothesis: the query's walls, coloured by what the map says about them.
 
-    poses : the query in its own frame. truth_m : (N, 2) its true path in the map frame, if known.
+    In a large map a second panel shows the place from near. Without any hypothesis there is only the map.
+
+    poses : the query in its own frame, empty for a map. truth_m : (N, 2) its true path in the map frame, if
+    known.
     """
-    best = answer.session or (
-        answer.sessions[answer.hypotheses[0].session_index] if answer.hypotheses else None
+    best = answer.hypotheses[0] if answer.hypotheses else None
+    session = answer.sessions[best.session_index if best else 0]
+    grid = database.grid(session)
+    compared = agreements(answer, database)[0] if best else None
+    whole, close = _known(grid), None
+    if best is not None and compared is not None and len(compared.points_m):
+        close = _Box.around(best.fit.T_map_query.apply(compared.points_m), _CLOSE_MARGIN_M)
+        whole = whole.united(close)
+        if max(close.width_m, close.height_m) > _CLOSE_SHARE * max(whole.width_m, whole.height_m):
+            close = None
+    figure, panels = _panels(whole, close)
+    for axes in panels:
+        _draw_map(axes, grid)
+        _draw_way(axes, database, session)
+        if truth_m is not None:
+            axes.plot(truth_m[:, 0], truth_m[:, 1], color="black", lw=3.5, alpha=0.3, label="query: truth")
+        if best is not None and compared is not None:
+            _draw_agreement(axes, best, compared, point_size=2.0 if axes is panels[-1] else 1.0)
+            _draw_robot(axes, best, answer, poses)
+        _draw_rivals(axes, answer, session)
+    if close is not None:
+        _outline(panels[0], panels[1])
+    panels[0].set_title(_title(answer, session, compared), loc="left")
+    _finish(figure, panels[0], path)
+
+
+def _title(answer: Answer, session: str, compared: Agreement | None) -> str:
+    """The answer, and what it rests on."""
+    from signature.verification.agreement import Support
+
+    said = {"located": f"located in {session}", "ambiguous": "ambiguous", "not_found": "not found"}
+    title = f"{said[answer.status]}, confidence {probability(answer.confidence)}"
+    if compared is None:
+        return title
+    what = "" if answer.status == "located" else " at the best hypothesis"
+    fits, against, unknown = (
+        f"{100 * compared.share(kind):.0f} %"
+        for kind in (Support.FITS, Support.CONTRADICTED, Support.UNKNOWN)
     )
-    session = best or answer.sessions[0]
-    figure, axes = _canvas(database.grid(session))
-    _draw_submaps(axes, database, session)
-    way = database.trajectory(session).planar()
-    if len(way):
-        axes.plot(way[:, 0], way[:, 1], color=BLUE, lw=0.9, alpha=0.6, label="path of the map's robot")
-    if truth_m is not None:
-        axes.plot(truth_m[:, 0], truth_m[:, 1], color="black", lw=3.5, alpha=0.35, label="query: truth")
-    if answer.T_map_odom is not None:
-        found = answer.T_map_odom.apply(poses.planar()[:, :2])
-        axes.plot(found[:, 0], found[:, 1], color=VERMILLION, lw=1.6, label="query: as located")
-    rivals = answer.hypotheses[1:6] if answer.status == "located" else answer.hypotheses[:6]
-    places = [
-        h.fit.T_map_query @ answer.T_odom_base for h in rivals if answer.sessions[h.session_index] == session
-    ]
-    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    shown = [(p.x, p.y) for p in places if left < p.x < right and bottom < p.y < top]
-    if shown:
-        label = "other hypotheses" if answer.status == "located" else "hypotheses"
-        axes.plot(*zip(*shown, strict=True), "s", color=PURPLE, ms=6, mfc="none", mew=1.5, label=label)
-    if answer.T_map_base is not None:
-        pose = answer.T_map_base
-        length = 0.035 * max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
-        axes.annotate(
-            "",
-            xy=(pose.x + length * np.cos(pose.yaw), pose.y + length * np.sin(pose.yaw)),
-            xytext=(pose.x, pose.y),
-            arrowprops={"arrowstyle": "-|>", "color": VERMILLION, "lw": 2.5, "mutation_scale": 18},
-            zorder=6,
-        )
-        axes.plot(
-            pose.x, pose.y, "o", color=VERMILLION, mec="white", ms=9, zorder=7, label="robot at the last scan"
-        )
-    axes.set_title(f"{answer.status.replace('_', ' ')}, confidence {probability(answer.confidence)}")
-    _finish(figure, axes, path)
+    return (
+        f"{title}\nquery's walls{what}: {fits} fit the map, {against} on free ground, {unknown} unknown to it"
+    )
 
 
-def _canvas(grid: OccupancyGrid) -> tuple[Any, Any]:
+def _known(grid: OccupancyGrid) -> _Box:
+    """The part of the map that is known, with a margin."""
+    cells = np.argwhere(grid.cells >= 0)
+    if not len(cells):
+        cells = np.array([(0, 0), grid.cells.shape])
+    corners = np.array([cells.min(axis=0), cells.max(axis=0) + 1])[:, ::-1]
+    corners_m = np.asarray(grid.origin_m) + corners * grid.resolution_m
+    return _Box.around(corners_m, _MARGIN * float(np.ptp(corners_m, axis=0).max()))
+
+
+def _panels(whole: _Box, close: _Box | None) -> tuple[Any, list[Any]]:
+    """A figure with a panel for the whole map and, if wanted, one for a close-up beside or below it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    known = np.argwhere(grid.cells >= 0)
-    (r0, c0), (r1, c1) = (
-        (known.min(axis=0), known.max(axis=0) + 1) if len(known) else ((0, 0), grid.cells.shape)
-    )
-    cells, occupied = grid.cells[r0:r1, c0:c1], grid.occupied[r0:r1, c0:c1]
-    grey = np.where(cells < 0, _SHADES["unknown"], np.where(occupied, _SHADES["wall"], _SHADES["free"]))
-    x0, y0 = grid.origin_m[0] + c0 * grid.resolution_m, grid.origin_m[1] + r0 * grid.resolution_m
-    width, height = (c1 - c0) * grid.resolution_m, (r1 - r0) * grid.resolution_m
-    ratio = float(np.clip(height / max(width, 1e-6), 0.35, 1.6))
-    figure = Figure(figsize=(10, 10 * ratio + 1.2), dpi=110, layout="constrained")
+    ratio = float(np.clip(whole.height_m / whole.width_m, 0.1, 2.5))
+    boxes, sizes_in = [whole.with_ratio(ratio)], [(_WIDTH_IN, _WIDTH_IN * ratio)]
+    beside = ratio > 0.8
+    if close is not None:
+        if beside:
+            sizes_in = [(_WIDTH_IN * 0.6, _WIDTH_IN * 0.6 * ratio)] * 2
+        else:
+            sizes_in.append((_WIDTH_IN, _WIDTH_IN * 0.55))
+        boxes.append(close.with_ratio(sizes_in[1][1] / sizes_in[1][0]))
+    step = (1, 0) if beside else (0, 1)
+    total_in = [
+        sum(size[k] for size in sizes_in) + _GAP_IN * (len(boxes) - 1) if step[k] else sizes_in[0][k]
+        for k in (0, 1)
+    ]
+    figure = Figure(figsize=(total_in[0], total_in[1]), dpi=110)
     FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    extent = (x0, x0 + width, y0, y0 + height)
-    axes.imshow(grey, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-    axes.set_xlabel("x, m")
-    axes.set_ylabel("y, m")
-    axes.set_aspect("equal")
-    axes.autoscale(False)
-    return figure, axes
+    panels, left, top = [], 0.0, total_in[1]
+    for box, (width, height) in zip(boxes, sizes_in, strict=True):
+        place = (left / total_in[0], (top - height) / total_in[1], width / total_in[0], height / total_in[1])
+        axes = figure.add_axes(place)
+        axes.set_xlim(box.left, box.right)
+        axes.set_ylim(box.bottom, box.top)
+        axes.set_aspect("equal")
+        axes.set_facecolor(_grey("unknown"))
+        axes.tick_params(labelsize=8, color=GREY, labelcolor="#444444")
+        for spine in axes.spines.values():
+            spine.set_color(GREY)
+        axes.autoscale(False)
+        panels.append(axes)
+        left += step[0] * (width + _GAP_IN)
+        top -= step[1] * (height + _GAP_IN)
+    panels[-1].set_xlabel("x, m", fontsize=9)
+    panels[0].set_ylabel("y, m", fontsize=9)
+    return figure, panels
+
+
+def _grey(name: str) -> str:
+    return f"#{_SHADES[name]:02x}{_SHADES[name]:02x}{_SHADES[name]:02x}"
+
+
+def _draw_map(axes: Any, grid: OccupancyGrid) -> None:
+    (x0, y0), (height, width) = grid.origin_m, np.array(grid.cells.shape) * grid.resolution_m
+    axes.imshow(
+        shades(grid),
+        origin="lower",
+        extent=(x0, x0 + width, y0, y0 + height),
+        cmap="gray",
+        vmin=0,
+        vmax=255,
+        interpolation="nearest",
+    )
 
 
 def _draw_submaps(axes: Any, database: SubmapDatabase, session: str) -> None:
     index = [info.name for info in database.sessions()].index(session)
     table = database.signatures()
     centers = table.center_m[table.session_index == index]
-    axes.plot(centers[:, 0], centers[:, 1], ".", color=GREEN, ms=4, label=f"{len(centers)} submap centres")
+    label = f"{len(centers)} submap centre{'' if len(centers) == 1 else 's'}"
+    axes.plot(centers[:, 0], centers[:, 1], ".", color=GREEN, ms=4, label=label)
+
+
+def _draw_way(axes: Any, database: SubmapDatabase, session: str) -> None:
+    way = database.trajectory(session).planar()
+    if len(way):
+        axes.plot(way[:, 0], way[:, 1], color=GREY, lw=0.7, label="path of the map's robot")
+
+
+def _draw_agreement(axes: Any, best: Hypothesis, compared: Agreement, *, point_size: float) -> None:
+    """The query's walls at a hypothesis, and the map's walls that it should have seen."""
+    from signature.verification.agreement import Support
+
+    points_m = best.fit.T_map_query.apply(compared.points_m)
+    for kind in (Support.FITS, Support.CONTRADICTED, Support.UNKNOWN):
+        chosen = points_m[compared.support == kind]
+        if len(chosen):
+            label = _SUPPORT_LABELS[kind.name]
+            axes.plot(*chosen.T, ".", color=SUPPORT_COLOURS[kind.name], ms=3 * point_size, mew=0, label=label)
+    if len(compared.missed_m):
+        axes.plot(
+            *compared.missed_m.T,
+            "x",
+            color=MISSED_COLOUR,
+            ms=1.8 * point_size,
+            mew=0.6 * point_size,
+            label="map's wall: the query saw free ground",
+        )
+
+
+def _draw_robot(axes: Any, best: Hypothesis, answer: Answer, poses: Trajectory) -> None:
+    """The path of the query at a hypothesis, and an arrow where it ends; of a map, its frame."""
+    if len(poses):
+        path = best.fit.T_map_query.apply(poses.planar()[:, :2])
+        label = (
+            "query: path as located" if answer.status == "located" else "query: path at the best hypothesis"
+        )
+        axes.plot(path[:, 0], path[:, 1], color=PURPLE, lw=1.8, label=label)
+    pose = best.fit.T_map_query @ answer.T_odom_base
+    if pose not in _Box(*axes.get_xlim(), *axes.get_ylim()):
+        return
+    length = 0.035 * max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
+    axes.annotate(
+        "",
+        xy=(pose.x + length * np.cos(pose.yaw), pose.y + length * np.sin(pose.yaw)),
+        xytext=(pose.x, pose.y),
+        arrowprops={"arrowstyle": "-|>", "color": PURPLE, "lw": 2.5, "mutation_scale": 18},
+        zorder=6,
+    )
+    label = "robot at the last scan" if len(poses) else "frame of the query"
+    axes.plot(pose.x, pose.y, "o", color=PURPLE, mec="white", ms=9, zorder=7, label=label)
+
+
+def _draw_rivals(axes: Any, answer: Answer, session: str) -> None:
+    """The next hypotheses in this session, where they lie within the panel."""
+    box = _Box(*axes.get_xlim(), *axes.get_ylim())
+    places = [
+        h.fit.T_map_query @ answer.T_odom_base
+        for h in answer.hypotheses[1:6]
+        if answer.sessions[h.session_index] == session
+    ]
+    shown = [(pose.x, pose.y) for pose in places if pose in box]
+    if shown:
+        label = "other hypotheses"
+        axes.plot(*zip(*shown, strict=True), "s", color=PURPLE, ms=6, mfc="none", mew=1.5, label=label)
+
+
+def _outline(whole: Any, close: Any) -> None:
+    """Mark in the whole map what the close-up shows."""
+    from matplotlib.patches import Rectangle
+
+    (left, right), (bottom, top) = close.get_xlim(), close.get_ylim()
+    frame = Rectangle((left, bottom), right - left, top - bottom, fill=False, ec="black", lw=1.0, ls="--")
+    whole.add_patch(frame)
 
 
 def _finish(figure: Any, axes: Any, path: Path) -> None:
-    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    """Add the legend of what the figure shows, and write it without empty bands."""
+    entries: dict[str, Any] = {}
+    for panel in figure.axes:
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    axes.title.set_fontsize(10)
+    if entries:
+        legend = figure.legend(
+            entries.values(),
+            entries.keys(),
+            loc="upper left",
+            bbox_to_anchor=(0.0, -0.5 / figure.get_figheight()),
+            borderaxespad=0.0,
+            ncols=3,
+            frameon=False,
+            fontsize=9,
+        )
+        for handle in legend.legend_handles:
+            if handle.get_marker() in (".", "x"):  # the dots of the figure are too small to tell colours
+                handle.set_markersize(9 if handle.get_marker() == "." else 6)
     with replace_file(path) as temporary:
-        figure.savefig(temporary, format="png", metadata={"Software": "pc2grid"})
+        figure.savefig(
+            temporary,
+            format="png",
+            bbox_inches="tight",
+            pad_inches=0.12,
+            metadata={"Software": "pc2grid"},
+        )

@@ -9,14 +9,20 @@ from __future__ import annotations
 import base64
 import itertools
 import json
+from datetime import datetime, timezone
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pc2grid._version import __version__
 from pc2grid.io.atomic import replace_file
-from pc2grid.model import OCCUPIED_FROM
+from pc2grid_cli.deviation import deviation
+from pc2grid_cli.evidence import agreements
+from pc2grid_cli.picture import shades
+from pc2grid_cli.submap_sources import similar_places, sources
+from signature.verification.agreement import Support
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -24,10 +30,15 @@ if TYPE_CHECKING:
     from pc2grid.arrays import F64
     from pc2grid.model import Consistency, Loop, OccupancyGrid, Trajectory
     from pc2grid_cli.locate import Found
-    from signature.database import SubmapDatabase
+    from signature.database import SessionInfo, SubmapDatabase
+    from signature.relocalization.answer import Answer
     from signature.similarity import SignatureTable
 
 _LARGEST_PIXELS = 3000
+_MOST_EXPLAINED = 2000
+"""A page of more submaps does not show where signatures come from: it takes 10 ms and 3 kB for each."""
+_CLOCK_FROM_S = 3e8
+"""Stamps below this, 1979, are not read as a date: no robot recorded then, but logs count from 0."""
 _STEP_M = 0.05
 """Poses nearer than this to the last one drawn are left out: they would not be visible."""
 
@@ -61,31 +72,38 @@ def contents(
     truth_m: F64 | None = None,
 ) -> dict[str, Any]:
     """The data of the page as plain types."""
-    config, table = database.config(), database.signatures()
+    config, table, infos = database.config(), database.signatures(), database.sessions()
+    explained = {info.name for info in infos}
+    if found is not None:  # only the maps that the answer is about
+        explained = {found.answer.sessions[h.session_index] for h in found.answer.hypotheses}
+    if sum(info.submaps for info in infos if info.name in explained) > _MOST_EXPLAINED:
+        explained = set()
     return {
         "title": Path(database.location).name,
+        "version": __version__,
         "radius_m": config.partition.radius_m,
         "boundary_bin_m": config.signature.boundary_bin_m,
         "freespace_bin_m": config.signature.freespace_bin_m,
         "sessions": [
             {
-                **_facts(info),
+                **_facts(info, database.trajectory(info.name)),
                 "image": _picture(database.grid(info.name)),
-                "submaps": _submaps(table, index),
+                "submaps": _submaps(database, table, index, info.name, explain=info.name in explained),
                 "graph": _graph(database.graph(info.name)),
                 "path": runs(database.trajectory(info.name)),
                 "contradicted": _contradicted(database.trajectory(info.name), info.consistency),
                 "loops": _loops(database.trajectory(info.name), database.loops(info.name)),
             }
-            for index, info in enumerate(database.sessions())
+            for index, info in enumerate(infos)
         ],
-        "answer": None if found is None else _answer(found, accept, truth_m),
+        "answer": None if found is None else _answer(found, database, accept, truth_m),
     }
 
 
-def _facts(info: Any) -> dict[str, Any]:
+def _facts(info: SessionInfo, poses: Trajectory) -> dict[str, Any]:
     return {
         "name": info.name,
+        "date": _date(poses),
         "source": info.provenance.source,
         "sensor": info.sensor,
         "count": info.submaps,
@@ -100,7 +118,23 @@ def _facts(info: Any) -> dict[str, Any]:
     }
 
 
-def _submaps(table: SignatureTable, session_index: int) -> list[dict[str, Any]]:
+def _date(poses: Trajectory) -> str | None:
+    """The day of the first scan, UTC; None if its stamp is not a time of day but counts from a start."""
+    begin_s = poses.stamps_ns[0] / 1e9 if len(poses) else 0.0
+    return None if begin_s < _CLOCK_FROM_S else f"{datetime.fromtimestamp(begin_s, timezone.utc):%Y-%m-%d}"
+
+
+def _submaps(
+    database: SubmapDatabase, table: SignatureTable, session_index: int, session: str, *, explain: bool
+) -> list[dict[str, Any]]:
+    """The submaps of a session with their signatures and the places that are most similar.
+
+    explain : also where the signatures come from, see `submap_sources`.
+    """
+    config = database.config()
+    rows = np.flatnonzero(table.session_index == session_index).tolist()
+    drawn = {s.submap_id: sources(s, config.signature) for s in database.submaps(session)} if explain else {}
+    alike = similar_places(table, rows, config.partition, config.signature) if explain else [[] for _ in rows]
     return [
         {
             "id": int(table.submap_id[row]),
@@ -108,8 +142,13 @@ def _submaps(table: SignatureTable, session_index: int) -> list[dict[str, Any]]:
             "boundary": _short(table.boundary[row], 4),
             "freespace": _short(table.freespace[row], 4),
             "symmetry": _short(table.symmetry[row], 2),
+            "sources": drawn.get(int(table.submap_id[row])),
+            "similar": [
+                [int(table.session_index[k]), int(table.submap_id[k]), float(f"{score:.3g}")]
+                for k, score in similar
+            ],
         }
-        for row in np.flatnonzero(table.session_index == session_index)
+        for row, similar in zip(rows, alike, strict=True)
     ]
 
 
@@ -159,50 +198,60 @@ def _contradicted(poses: Trajectory, consistency: Consistency | None) -> list[li
     return parts
 
 
-def _answer(found: Found, accept: float, truth_m: F64 | None) -> dict[str, Any]:
+def _answer(found: Found, database: SubmapDatabase, accept: float, truth_m: F64 | None) -> dict[str, Any]:
     answer = found.answer
     document = answer.to_json()
     pose = document["pose"]
+    compared = agreements(answer, database)
+    # The wall points are the same for all hypotheses; only what the map says about them differs.
+    walls_m = compared[0].points_m if compared else np.empty((0, 2))
     return {
         "status": answer.status,
         "session": answer.session,
         "pose": pose and {key: pose[key] for key in ("x", "y", "yaw")},
-        "deviation": None if answer.covariance is None else _short(np.sqrt(np.diag(answer.covariance)), 4),
+        "deviation": None if pose is None else _short(_deviation(answer, database), 4),
         "confidence": round(answer.confidence, 4),
         "accept": accept,
         "query": {**found.about, "is_map": found.drawn is not None},
+        "walls": _short(np.ravel(walls_m), 2),
         "hypotheses": [
-            {**shown, "T": [h.fit.T_map_query.x, h.fit.T_map_query.y, h.fit.T_map_query.yaw]}
-            for shown, h in zip(document["hypotheses"], answer.hypotheses, strict=True)
+            {
+                **shown,
+                "T": [h.fit.T_map_query.x, h.fit.T_map_query.y, h.fit.T_map_query.yaw],
+                "support": "".join(map(str, points.support.tolist())),
+                "shares": _short([points.share(kind) for kind in Support], 4),
+                "missed": _short(np.ravel(points.missed_m), 2),
+            }
+            for shown, h, points in zip(document["hypotheses"], answer.hypotheses, compared, strict=True)
         ],
         "history": document["history"],
         "path": runs(found.poses),
         "truth": [] if truth_m is None else _short(np.ravel(truth_m), 2),
-        "image": None if found.drawn is None else _picture(found.drawn, tint=(0, 94, 213)),
     }
 
 
-def _picture(grid: OccupancyGrid, tint: tuple[int, int, int] | None = None) -> dict[str, Any]:
-    """The known part of a grid as a PNG: free white, walls dark, in between grey, unknown transparent.
+def _deviation(answer: Answer, database: SubmapDatabase) -> tuple[float, float, float]:
+    assert answer.covariance is not None and answer.session is not None
+    (info,) = database.sessions([answer.session])
+    return deviation(answer.covariance, info.resolution_m, database.config().partition.radius_m)
 
-    tint : (blue, green, red) to show walls only, for a map laid over another. Large grids are reduced so
-    that walls stay.
-    """
+
+def _picture(grid: OccupancyGrid) -> dict[str, Any]:
+    """The known part of a grid as a PNG, unknown cells transparent. Large grids are reduced so that walls
+    stay."""
     import cv2
 
+    shade = shades(grid)
     known = np.argwhere(grid.cells >= 0)
     (r0, c0), (r1, c1) = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else ((0, 0), (1, 1))
-    cells = grid.cells[r0:r1, c0:c1] if len(known) else np.full((1, 1), -1, np.int8)
-    n = -(-max(cells.shape) // _LARGEST_PIXELS)
+    shade, unknown = shade[r0:r1, c0:c1], (grid.cells < 0)[r0:r1, c0:c1]
+    n = -(-max(shade.shape) // _LARGEST_PIXELS)
     for axis in (0, 1):
-        cells = np.maximum.reduceat(cells, np.arange(0, cells.shape[axis], n), axis=axis)
-    pixels = np.zeros((*cells.shape, 4), np.uint8)
-    if tint is None:
-        pixels[..., :3] = np.clip(255 - 2.2 * np.maximum(cells, 0.0), 30, 255)[..., None]
-        pixels[..., 3] = np.where(cells < 0, 0, 255)
-    else:
-        pixels[..., :3] = tint
-        pixels[..., 3] = np.where(cells >= OCCUPIED_FROM, 255, 0)
+        blocks = np.arange(0, shade.shape[axis], n)
+        # Unknown cells are the lightest here, so that they do not hide what is known in their block.
+        shade = np.minimum.reduceat(np.where(unknown, 255, shade), blocks, axis=axis)
+        unknown = np.minimum.reduceat(unknown, blocks, axis=axis)
+    pixels = np.dstack((shade, shade, shade, np.where(unknown, 0, 255))).astype(np.uint8)
     # Row 0 of a grid is its lowest, row 0 of a picture its highest.
     data = cv2.imencode(".png", np.ascontiguousarray(pixels[::-1]))[1].tobytes()
     size = grid.resolution_m * n
@@ -210,8 +259,8 @@ def _picture(grid: OccupancyGrid, tint: tuple[int, int, int] | None = None) -> d
         "png": "data:image/png;base64," + base64.b64encode(data).decode(),
         "x": round(float(grid.origin_m[0] + c0 * grid.resolution_m), 4),
         "y": round(float(grid.origin_m[1] + r0 * grid.resolution_m), 4),
-        "w": round(cells.shape[1] * size, 4),
-        "h": round(cells.shape[0] * size, 4),
+        "w": round(shade.shape[1] * size, 4),
+        "h": round(shade.shape[0] * size, 4),
     }
 
 

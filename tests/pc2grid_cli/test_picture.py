@@ -1,0 +1,132 @@
+"""What `--plot` draws: evidence in its colours, nothing in the legend that is not in the picture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from pc2grid.io.nav2_map import save_map
+from pc2grid.model import OccupancyGrid
+from pc2grid_cli.locate import Found, find_map
+from pc2grid_cli.picture import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, draw_answer, draw_session
+from signature.config import Config
+from signature.database import SubmapDatabase, open_database
+from signature.sessions import add_sessions, provenance
+from tests.helpers.session_maps import session, way
+from tests.helpers.simulated_drives import cut, office, plan
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory: pytest.TempPathFactory) -> SubmapDatabase:
+    folder = tmp_path_factory.mktemp("picture")
+    origin = provenance(Path("office.mcap"), "a" * 64, Config())
+    add_sessions(folder / "office.submaps", [(session("office", office(), way()), origin)], Config())
+    return open_database(folder / "office.submaps")
+
+
+def located(grid: OccupancyGrid, database: SubmapDatabase, folder: Path) -> Found:
+    save_map(grid, folder / "query")
+    return find_map(folder / "query.yaml", database, Config())
+
+
+def changed_part() -> OccupancyGrid:
+    """A part of the office: without the wall from (7, 1) to (7, 3), with a box, and larger than the map."""
+    cells = cut(office(), 4.0, 0.0, 15.0, 12.0).cells.copy()
+    cells[18:62, 58:63] = 0
+    cells[140:148, 110:118] = 100
+    # Below y = 0 the map ends, and the query has seen another wall there.
+    beyond = np.zeros((40, cells.shape[1]), np.int8)
+    beyond[0:2] = 100
+    return OccupancyGrid(cells=np.vstack((beyond, cells)), resolution_m=0.05, origin_m=(0.0, 0.0))
+
+
+def pixels_of(path: Path, colour: str) -> int:
+    image = cv2.imread(str(path)).astype(int)
+    wanted = np.array([int(colour[k : k + 2], 16) for k in (5, 3, 1)])
+    return int((np.abs(image - wanted).max(axis=-1) < 12).sum())
+
+
+def labels_of(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The labels of the legend of the next picture."""
+    seen: list[str] = []
+    legend = Figure.legend
+
+    def listening(self: Figure, handles: object, labels: list[str], **kind: object) -> object:
+        seen.extend(labels)
+        return legend(self, handles, labels, **kind)
+
+    monkeypatch.setattr(Figure, "legend", listening)
+    return seen
+
+
+def test_walls_have_the_colour_of_what_the_map_says_about_them(
+    database: SubmapDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = located(changed_part(), database, tmp_path)
+    assert found.answer.status == "located"
+    labels = labels_of(monkeypatch)
+    draw_answer(tmp_path / "a.png", database, found.answer, found.poses)
+    drawn = {colour: pixels_of(tmp_path / "a.png", colour) for colour in (GREEN, VERMILLION, BLUE, ORANGE)}
+    assert min(drawn.values()) > 20
+    assert drawn[GREEN] > 5 * drawn[VERMILLION]
+    assert {
+        "query's wall: fits the map",
+        "query's wall: free in the map",
+        "query's wall: unknown to the map",
+        "map's wall: the query saw free ground",
+    } <= set(labels)
+    assert len(labels) == len(set(labels))
+
+
+def test_a_map_as_the_query_has_no_last_scan_and_no_path(
+    database: SubmapDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = located(cut(office(), 4.0, 3.0, 15.0, 12.0), database, tmp_path)
+    labels = labels_of(monkeypatch)
+    draw_answer(tmp_path / "a.png", database, found.answer, found.poses)
+    assert "frame of the query" in labels
+    assert not [label for label in labels if "last scan" in label or "query: path" in label]
+    # A part of the very map is contradicted nowhere, so the legend does not name this.
+    assert (
+        "query's wall: free in the map" not in labels
+        and "map's wall: the query saw free ground" not in labels
+    )
+
+
+def test_without_a_hypothesis_there_is_only_the_map(
+    database: SubmapDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = located(plan(8, 5, []), database, tmp_path)
+    none = replace(found.answer, status="not_found", hypotheses=(), places=(), submap_ids=())
+    labels = labels_of(monkeypatch)
+    draw_answer(tmp_path / "a.png", database, none, found.poses)
+    assert labels == ["path of the map's robot"]
+    assert pixels_of(tmp_path / "a.png", PURPLE) == 0
+
+
+def test_a_small_query_is_also_shown_from_near(database: SubmapDatabase, tmp_path: Path) -> None:
+    part, whole = cut(office(), 4.0, 3.0, 9.0, 8.5), cut(office(), 0.5, 0.5, 19.0, 13.0)
+    for name, grid in (("near", part), ("far", whole)):
+        found = located(grid, database, tmp_path)
+        draw_answer(tmp_path / f"{name}.png", database, found.answer, found.poses)
+    near, far = (cv2.imread(str(tmp_path / f"{name}.png")).shape for name in ("near", "far"))
+    assert near[0] * near[1] > 1.3 * far[0] * far[1]
+
+
+@pytest.mark.parametrize("name", ["session", "answer"])
+def test_no_band_of_a_picture_is_empty(name: str, database: SubmapDatabase, tmp_path: Path) -> None:
+    if name == "session":
+        draw_session(tmp_path / "a.png", database, "office")
+    else:
+        found = located(changed_part(), database, tmp_path)
+        draw_answer(tmp_path / "a.png", database, found.answer, found.poses)
+    drawn = cv2.imread(str(tmp_path / "a.png")).min(axis=-1) < 250
+    for axis in (0, 1):
+        used = np.flatnonzero(drawn.any(axis=1 - axis))
+        longest = np.diff(np.concatenate(([0], used, [drawn.shape[axis]]))).max()
+        assert longest < 0.06 * max(drawn.shape)

@@ -1,0 +1,24 @@
+"""What an answer rests on, to be drawn: each hypothesis compared with its map, wall point by wall point."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from signature.database import SubmapDatabase
+    from signature.relocalization.answer import Answer
+    from signature.verification.agreement import Agreement
+
+
+def agreements(answer: Answer, database: SubmapDatabase) -> tuple[Agreement, ...]:
+    """For each hypothesis of an answer, best first, what supports and what contradicts it."""
+    from signature.verification.agreement import agreement
+    from signature.verification.walls import Walls
+
+    query = Walls.of(answer.local_map)
+    indices = {hypothesis.session_index for hypothesis in answer.hypotheses}
+    maps = {index: Walls.of(database.grid(answer.sessions[index])) for index in indices}
+    return tuple(
+        agreement(maps[hypothesis.session_index], query, hypothesis.fit.T_map_query)
+        for hypothesis in answer.hypotheses
+    )
