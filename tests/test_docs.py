@@ -11,7 +11,7 @@ import math
 import os
 import re
 import runpy
-import shutil
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
@@ -31,6 +31,7 @@ from typer.testing import CliRunner
 
 import pc2grid
 import signature
+from pc2grid_cli import demo
 from pc2grid_cli.main import app
 from tests.helpers import doc_files
 from tests.helpers.nav2_map import oracle
@@ -96,61 +97,95 @@ def test_importing_a_package_loads_no_library(package: str) -> None:
 
 # --- README and what stands beside it ---------------------------------------------------------------------
 
-DOCUMENTS = ("README.md", "CONTRIBUTING.md", "examples/nav2.md", "examples/fleet.md")
+EXAMPLES = sorted(f"examples/{path.name}" for path in ROOT.glob("examples/*.md"))
+DOCUMENTS = ("README.md", "CONTRIBUTING.md", *EXAMPLES)
+ON_OWN_FILES = ("examples/nav2.md", "examples/fleet.md")
+"""Their commands are run in a folder with the files that they name; those of README make their own."""
 NOT_RUN = {
-    "make": "test_repository.py looks at the Makefile; `make demo` takes minutes",
-    "pc2grid compare paper": "needs the paper's maps, and hours",
-    "pc2grid compare sensors": "needs the paper's maps, and an hour",
-    "pc2grid compare real": "needs a real 3D scan; test_real_sensors.py does a small run",
-    "pc2grid compare log": "needs a long recording with its truth",
-    "pc2grid compare maps": "drives hundreds of metres",
-    "ros2": "needs ROS; test_example_nav2 has one that listens",
+    "make": "test_repository.py looks at the Makefile; `make demo` is `pc2grid demo` after an installation",
     "pip": "the network is not asked in tests",
+    "ros2": "needs ROS; test_example_nav2 has one that listens",
     "createdb": "needs a PostgreSQL server; test_postgres.py brings one",
-    "pc2grid relocalize tuesday.mcap --rerun": "needs a display and the extra viz; see test_rerun.py",
+    "pc2grid relocalize depth.mcap --rerun": "needs a display and the extra viz; see test_rerun.py",
     "pc2grid convert logs": "several processes; test_conversion_jobs.py does it",
 }
 SHORTER = {"--length 20": "--length 1"}
 """What a command says, and what is run in its place so that it takes a second."""
 
 
-def shown_commands() -> list[Any]:
-    """The commands of each block of shell in the documents, in the order in which they stand."""
-    found = []
-    for name in DOCUMENTS:
-        blocks = re.findall(r"^```sh\n(.*?)^```", (ROOT / name).read_text(), re.MULTILINE | re.DOTALL)
-        for number, block in enumerate(blocks, start=1):
-            lines = [line.partition(" #")[0].strip() for line in block.splitlines()]
-            found.append(pytest.param([line for line in lines if line], id=f"{name}-{number}"))
-    return found
+def blocks(name: str, *languages: str) -> list[tuple[str, str]]:
+    """Language and text of each block of code in a document, in order."""
+    kinds = "|".join(languages)
+    return re.findall(rf"^```({kinds})\n(.*?)^```", (ROOT / name).read_text(), re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("commands", shown_commands())
-def test_shown_commands_work(commands: list[str], folder: Path) -> None:
-    """Each block in a user's folder of its own. What cannot be run must at least parse."""
-    shutil.copy("building.submaps", "a.submaps")
-    shutil.copy("plan.submaps", "b.submaps")
-    data = bytearray(Path("building.submaps").read_bytes())
-    data[len(data) // 2] ^= 1
-    Path("damaged.submaps").write_bytes(data)
-    reasons = []
-    for command in commands:
-        reason = next((why for start, why in NOT_RUN.items() if command.startswith(start)), None)
-        if "postgresql://" in command:
-            reason = NOT_RUN["createdb"]
-        if reason is not None:
-            reasons.append(reason)
-            if command.startswith("pc2grid"):
-                parse(command.split()[1:])
+def commands_of(block: str) -> list[str]:
+    lines = [line.partition(" #")[0].strip() for line in block.splitlines()]
+    return [line for line in lines if line]
+
+
+def run_or_parse(command: str) -> str | None:
+    """Run a command of a document here. What cannot be run must at least parse; returns why it is not run."""
+    reason = next((why for start, why in NOT_RUN.items() if command.startswith(start)), None)
+    if "postgresql://" in command:
+        reason = NOT_RUN["createdb"]
+    words = functools.reduce(lambda text, pair: text.replace(*pair), SHORTER.items(), command).split()
+    if reason is not None:
+        if words[0] == "pc2grid":
+            parse(words[1:])
+        return reason
+    assert words[0] == "pc2grid", command
+    done = CliRunner().invoke(app, words[1:], catch_exceptions=False)
+    assert done.exit_code == 0, f"{command}: {done.stderr}"
+    return None
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)  # half a minute of work; on a busy machine many times as long
+def test_the_readme_can_be_pasted_from_top_to_bottom(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one folder, with only what its own commands have made; the demo's drives are short."""
+    monkeypatch.setattr(demo, "MAP_LENGTH_M", 20.0)
+    monkeypatch.setattr(demo, "QUERY_LENGTH_M", 6.0)
+    monkeypatch.chdir(tmp_path)
+    ran = []
+    for language, block in blocks("README.md", "sh", "python"):
+        if language == "python":
+            exec(compile(block, "README.md", "exec"), {})
+            assert capsys.readouterr().out.startswith("located SE2(")
             continue
-        words = functools.reduce(lambda text, pair: text.replace(*pair), SHORTER.items(), command).split()
-        assert words[0] == "pc2grid", command
-        if "-o" in words and "--add" not in words:  # what the folder has already, but a user has not
-            Path(words[words.index("-o") + 1]).unlink(missing_ok=True)
-        done = CliRunner().invoke(app, words[1:], catch_exceptions=False)
-        assert done.exit_code == (3 if "--recover" in words else 0), f"{command}: {done.stderr}"
-    if len(reasons) == len(commands):
-        pytest.skip("; ".join(sorted(set(reasons))))
+        for command in commands_of(block):
+            if command.startswith("cd "):
+                monkeypatch.chdir(command.removeprefix("cd "))
+            elif run_or_parse(command) is None:
+                ran.append(command)
+    assert len(ran) > 15
+    for file in re.findall(r"`(\w+\.(?:mcap|tum|submaps|png))`", (ROOT / "README.md").read_text()):
+        assert Path(file).exists(), f"README names {file}, which its commands do not make"
+
+
+@pytest.mark.parametrize(
+    "commands",
+    [
+        pytest.param(commands_of(block), id=f"{name}-{number}")
+        for name in ON_OWN_FILES
+        for number, (_, block) in enumerate(blocks(name, "sh"), start=1)
+    ],
+)
+def test_shown_commands_work(commands: list[str], folder: Path) -> None:
+    """Each block in a user's folder of its own."""
+    reasons = [run_or_parse(command) for command in commands]
+    if all(reasons):
+        pytest.skip("; ".join(sorted({reason for reason in reasons if reason})))
+
+
+@pytest.mark.parametrize("name", [name for name in DOCUMENTS if name not in ("README.md", *ON_OWN_FILES)])
+def test_commands_that_take_hours_or_other_data_parse(name: str) -> None:
+    for _, block in blocks(name, "sh", ""):
+        for command in commands_of(block.replace("\\\n", " ")):
+            if command.startswith("pc2grid "):
+                parse(shlex.split(command)[1:])
 
 
 def parse(arguments: list[str]) -> None:
@@ -162,12 +197,6 @@ def parse(arguments: list[str]) -> None:
         group = group.get_command(context, name)
         assert group is not None, f"no command {name}"
     group.make_context("pc2grid", arguments, parent=context)
-
-
-def test_the_notebook_of_the_readme(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
-    exec(compile(code, "README.md", "exec"), {})
-    assert capsys.readouterr().out.startswith("located SE2(")
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
