@@ -83,9 +83,10 @@ def test_all_places_are_compared_unless_there_are_too_many() -> None:
     every = list(range(len(OFFICE.places.table)))
     few = {"all_places": 10, "shortlist": 5}
     assert rows_compared(shortlist=5)[0] == every
-    assert rows_compared(shortlist=5) == rows_compared(shortlist=5, signature_weight=0.0)
+    assert rows_compared(shortlist=5) == rows_compared(shortlist=5, signature_weight=0.2)
     assert 5 <= len(rows_compared(**few)[0]) < len(every)
-    assert rows_compared(**few)[1] != rows_compared(**few, signature_weight=0.0)[1]
+    assert rows_compared(**few) == rows_compared(**few, signature_weight=0.0)
+    assert rows_compared(**few)[1] != rows_compared(**few, signature_weight=0.2)[1]
 
 
 def test_every_view_has_a_viewpoint_beside_it_that_belongs_to_the_nearest_place() -> None:
