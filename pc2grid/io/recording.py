@@ -15,6 +15,7 @@ from pc2grid.errors import ConfigError
 from pc2grid.io.containers.detect import open_source
 from pc2grid.io.error_translation import guarded, guarded_stream
 from pc2grid.io.frames import FrameTree
+from pc2grid.io.map_pose import MapPose, last_map_pose
 from pc2grid.io.message_source import Choice, LogInfo, MessageSource
 from pc2grid.io.read_plan import Plan, make_plan
 from pc2grid.io.scan_stream import Stream
@@ -112,6 +113,18 @@ class Log:
         if self._plan is None:
             self._plan = guarded(self.info.path, lambda: make_plan(self._source, self._config, self._frames))
         return self._plan.choice
+
+    def map_pose(self, topic: str, end_s: float | None = None) -> MapPose:
+        """The last pose in a map that localization on the robot published, at most `end_s` seconds after the
+        log's start.
+
+        topic : of a pose, an odometry in the map frame, or tf, of which map -> base is taken.
+
+        Raises TopicError, UnsupportedSchema, FrameError, NoScans if there is no such pose.
+        """
+        base_frame = self.choose().base_frame
+        end_ns = None if end_s is None else self.info.start_ns + round(end_s * 1e9)
+        return guarded(self.info.path, lambda: last_map_pose(self._source, topic, base_frame, end_ns))
 
     def scans(self, start_s: float = 0.0, duration_s: float | None = None) -> Iterator[Scan]:
         """Stream the scans from `start_s` seconds after the log's start on, for `duration_s` seconds.

@@ -24,6 +24,8 @@ SENSORS: dict[str, SensorKind] = {
 }
 CAMERA_INFOS = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
 ODOMETRY = ("nav_msgs/Odometry", "foxglove.Odometry", "foxglove.PoseInFrame", "cloud/pose")
+POSES = ("geometry_msgs/PoseWithCovarianceStamped", "geometry_msgs/PoseStamped")
+"""Of the base in a map, as localization publishes them."""
 TF = ("tf2_msgs/TFMessage", "tf/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
 
 

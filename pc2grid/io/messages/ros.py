@@ -27,6 +27,7 @@ from pc2grid.io.messages.types import (
     LaserScan,
     Odometry,
     PointCloud2,
+    PoseStamped,
     Seven,
     Transform,
 )
@@ -154,6 +155,15 @@ def _odometry(r: Reader) -> Odometry:
     return Odometry(header, child, _seven(r.take("ddddddd")))
 
 
+def _pose_stamped(r: Reader) -> PoseStamped:
+    return PoseStamped(r.header(), _seven(r.take("ddddddd")))
+
+
+def _pose_with_covariance(r: Reader) -> PoseStamped:
+    header, pose = r.header(), _seven(r.take("ddddddd"))
+    return PoseStamped(header, pose, tuple(r.array("f8", 36).tolist()))
+
+
 def _transforms(r: Reader) -> tuple[Transform, ...]:
     count = int(r.number("I"))
     if count > _MOST_TRANSFORMS:
@@ -173,6 +183,8 @@ _PARSERS: dict[str, Callable[[Reader], Any]] = {
     "sensor_msgs/CompressedImage": _compressed_image,
     "sensor_msgs/CameraInfo": _camera_info,
     "nav_msgs/Odometry": _odometry,
+    "geometry_msgs/PoseStamped": _pose_stamped,
+    "geometry_msgs/PoseWithCovarianceStamped": _pose_with_covariance,
     "tf2_msgs/TFMessage": _transforms,
     "tf/tfMessage": _transforms,
 }

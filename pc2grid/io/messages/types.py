@@ -152,3 +152,15 @@ class Odometry:
     header: Header
     child: str
     pose: Seven
+
+
+@dataclass(frozen=True, slots=True)
+class PoseStamped:
+    """geometry_msgs/PoseStamped or PoseWithCovarianceStamped: a pose in `header.frame`.
+
+    covariance : 36 numbers, row-major over x, y, z, roll, pitch, yaw; None if the type has none.
+    """
+
+    header: Header
+    pose: Seven
+    covariance: tuple[float, ...] | None = None
