@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from signature.files import relocalize as relocalize
     from signature.relocalization.answer import Answer as Answer
     from signature.relocalization.map_index import MapIndex as MapIndex
+    from signature.relocalization.pose_check import PoseCheck as PoseCheck
+    from signature.relocalization.pose_check import check_pose as check_pose
+    from signature.relocalization.prior import Prior as Prior
     from signature.relocalization.relocalizer import Relocalizer as Relocalizer
     from signature.relocalization.relocalizer import locate_map as locate_map
     from signature.relocalization.relocalizer import relocalize as locate  # noqa: F401

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 from pc2grid.arrays import F64
 from pc2grid.display import html_table, probability, short
@@ -61,6 +62,9 @@ class Answer:
     history : how the answer came to be. evidence : what the confidence rests on.
     local_map : what the query has seen, in its odom frame: what the hypotheses were compared with.
     sessions, labels : all of the database, that `Hypothesis.session_index` counts.
+    prior : what became of the prior, None if there was none; "lapsed": registration was lost after the time
+    that it is about, so it was not used. excluded : the best place that the prior excludes, if nothing that
+    it allows is certain and this fits better.
     """
 
     status: Status
@@ -81,6 +85,8 @@ class Answer:
     evidence: Evidence
     local_map: OccupancyGrid
     timing_ms: dict[str, float] = field(default_factory=dict)
+    prior: Literal["used", "lapsed"] | None = None
+    excluded: Moment | None = None
 
     def __repr__(self) -> str:
         sure = f"confidence {probability(self.confidence)}, after {self.path_m:.1f} m"

@@ -71,9 +71,28 @@ class Sessions(TypedDict):
     sessions: list[str]
 
 
+class Excluded(TypedDict):
+    """The best place that the prior excludes."""
+
+    session: str | None
+    status: Status
+    x: float | None
+    y: float | None
+    yaw: float | None
+    confidence: float
+
+
+class PriorUse(TypedDict):
+    """What became of the prior. status: used, or lapsed if registration was lost after the time that it is
+    about. excluded: null, unless nothing inside is certain and a place outside fits better."""
+
+    status: Literal["used", "lapsed"]
+    excluded: Excluded | None
+
+
 class Result(TypedDict):
     """What is found. T_map_odom puts the query's own frame into the map. confidence: the probability that the
-    best hypothesis is right. hypotheses: best first."""
+    best hypothesis is right. hypotheses: best first. prior: null if nothing was known beforehand."""
 
     schema_version: Version
     status: Status
@@ -85,6 +104,7 @@ class Result(TypedDict):
     confidence: float
     hypotheses: list[Hypothesis]
     history: list[Moment]
+    prior: PriorUse | None
     timing_ms: dict[str, float]
 
 
@@ -124,10 +144,28 @@ def document(answer: answer.Answer) -> AnswerDocument:
             for h, submap_id, place in zip(answer.hypotheses, answer.submap_ids, answer.places, strict=True)
         ],
         "history": [_moment(moment) for moment in answer.history],
+        "prior": _prior(answer),
         "query": {"path_m": answer.path_m, "stamp_ns": answer.stamp_ns},
         "database": {"sessions": list(answer.sessions)},
         "timing_ms": answer.timing_ms,
     }
+
+
+def _prior(answer: answer.Answer) -> PriorUse | None:
+    if answer.prior is None:
+        return None
+    excluded: Excluded | None = None
+    if answer.excluded is not None:
+        moment = _moment(answer.excluded)
+        excluded = {
+            "session": answer.excluded.session,
+            "status": moment["status"],
+            "x": moment["x"],
+            "y": moment["y"],
+            "yaw": moment["yaw"],
+            "confidence": moment["confidence"],
+        }
+    return {"status": answer.prior, "excluded": excluded}
 
 
 def _moment(moment: answer.Moment) -> Moment:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -10,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pc2grid.arrays import F64, BoolGrid
+from pc2grid.errors import ConfigError
+from pc2grid.geometry import SE2
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from signature.config import Config
 from signature.database.protocol import Label
@@ -25,6 +28,7 @@ from signature.relocalization.hypotheses import (
     verify,
 )
 from signature.relocalization.lazy_maps import DatabaseGrids, LazySequence, free_m2
+from signature.relocalization.prior import PRIOR, Prior
 from signature.relocalization.query_map import QueryMap
 from signature.retrieval.viewpoints import AT_ONCE_M2, Places
 from signature.retrieval.vote import retrieve
@@ -70,7 +74,12 @@ class MapIndex:
     """The maps of a database and their places, prepared to be searched again and again.
 
     Each map is prepared (in tens of milliseconds) when it first matters to a query, and kept.
+
+    prior : what is known of the pose beforehand, see `within`. whole : the index without the prior.
     """
+
+    prior: Prior | None = None
+    whole: MapIndex | None = None
 
     def __init__(
         self,
@@ -120,12 +129,73 @@ class MapIndex:
         labels = {name: info.provenance.label for name, info in infos.items()}
         return MapIndex(grids, database.signatures(), database.config(), config, labels, areas_m2)
 
+    def within(self, prior: Prior) -> MapIndex:
+        """An index of which only places that the prior allows are answers; all that is prepared is shared.
+
+        Raises ConfigError if the prior does not name its session where there are several, or an unknown one.
+        """
+        self._prior_session(prior)
+        restricted = copy.copy(self)
+        restricted.prior, restricted.whole = prior, self.whole or self
+        return restricted
+
+    def _prior_session(self, prior: Prior) -> int:
+        """The session in whose map frame the prior is."""
+        names = ", ".join(self.sessions[:12]) + (", ..." if len(self.sessions) > 12 else "")
+        if prior.session is None and len(self.sessions) > 1:
+            raise ConfigError(
+                f"near: the database holds {len(self.sessions)} sessions, each with a map frame of its own",
+                hint=f"--session NAME says whose frame is meant: {names}",
+            )
+        if prior.session is not None and prior.session not in self.sessions:
+            raise ConfigError(
+                f"near: no session {prior.session!r} where it is looked for", hint=f"there is: {names}"
+            )
+        return 0 if prior.session is None else self.sessions.index(prior.session)
+
+    def prior_applies(self, query: QueryMap) -> bool:
+        """Whether there is a prior, and the motion of the query since its time is known."""
+        return self.prior is not None and self._T_odom_prior(query) is not None
+
+    def _T_odom_prior(self, query: QueryMap) -> SE2 | None:
+        """The base at the time that the prior is about."""
+        assert self.prior is not None
+        return query.T_odom_base if self.prior.stamp_ns is None else query.T_odom_prior
+
+    def allowed(self, found: tuple[Hypothesis, ...], query: QueryMap) -> tuple[Hypothesis, ...]:
+        """The hypotheses that the prior allows."""
+        prior = self.prior
+        if prior is None or (T_odom_prior := self._T_odom_prior(query)) is None:
+            return found
+        session = self._prior_session(prior)
+        return tuple(
+            h
+            for h in found
+            if h.session_index == session
+            and prior.allows(h.fit.T_map_query @ T_odom_prior, query.since_prior_m)
+        )
+
+    def _region(self, query: QueryMap) -> tuple[int, F64] | None:
+        """The session of the prior, and the free squares (K, 2) of its map that may hold the base now; None
+        without a prior."""
+        prior = self.prior
+        if prior is None or (T_odom_prior := self._T_odom_prior(query)) is None or not self.sessions:
+            return None
+        session = self._prior_session(prior)
+        step = T_odom_prior.inverse() @ query.T_odom_base
+        free = self._free[session]
+        moved_m = math.hypot(step.x, step.y)
+        return session, free[prior.may_hold(free, HYPOTHESES.square_m, moved_m, query.since_prior_m)]
+
     def look_up(self, query: QueryMap, carried: tuple[Hypothesis, ...] = ()) -> tuple[Hypothesis, ...]:
         """Hypotheses for the query, best first: the carried ones, refined, and what retrieval proposes."""
         old = [
             fitted(query, h.session_index, h.row, self.maps[h.session_index], h.fit.T_map_query)
             for h in carried
         ]
+        region = self._region(query)
+        if region is not None and len(region[1]) * HYPOTHESES.square_m**2 <= PRIOR.searched_m2:
+            return self.look_everywhere(query, tuple(old))
         base_m = (query.T_odom_base.x, query.T_odom_base.y)
         proposals = retrieve(
             query.views, base_m, self.places, signature=self.made_with.signature, config=self.config
@@ -135,8 +205,14 @@ class MapIndex:
 
     def look_everywhere(self, query: QueryMap, known: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
         """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole; in
-        a large database, on those that look most like the query."""
+        a large database, on those that look most like the query. With a prior: anywhere in its region."""
         found = list(known)
+        region = self._region(query)
+        if region is not None:
+            index, free = region
+            if len(free) * HYPOTHESES.square_m**2 <= self.config.exhaustive_m2:
+                found.extend(search_everywhere(query, index, self.maps[index], free, self.config))
+            return self._worth_keeping(tuple(found), query)
         for index in self.places.sessions(query.views, self.config.shortlist, self.made_with.signature):
             if self._areas_m2[index] <= self.config.exhaustive_m2:
                 found.extend(
@@ -174,7 +250,7 @@ class MapIndex:
         return self.judge(query, self.look_everywhere(query, hypotheses))
 
     def _worth_keeping(self, found: tuple[Hypothesis, ...], query: QueryMap) -> tuple[Hypothesis, ...]:
-        kept = distinct(found, query.T_odom_base)
+        kept = distinct(self.allowed(found, query), query.T_odom_base)
         floor = DECISION.keep * kept[0].fit.score if kept else 0.0
         return tuple(h for h in kept if h.fit.score >= floor)[: self.config.hypotheses]
 

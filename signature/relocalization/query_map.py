@@ -58,6 +58,8 @@ class QueryMap:
     grid : local map in the odom frame. views : best observed first. walls : the local map as verification
     takes it. center_m : (x, y) in the odom frame that poses of the query rotate about.
     part : number of times that registration was lost before; each part has an odom frame of its own.
+    T_odom_prior : the base at the time that a prior is about; None if it is not known in this odom frame.
+    since_prior_m : metres driven since that time.
     """
 
     stamp_ns: int
@@ -68,6 +70,8 @@ class QueryMap:
     walls: Walls
     center_m: tuple[float, float]
     part: int = 0
+    T_odom_prior: SE2 | None = None
+    since_prior_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

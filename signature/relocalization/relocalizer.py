@@ -25,6 +25,7 @@ from signature.config import Config
 from signature.relocalization.answer import Answer, Moment, Verdict
 from signature.relocalization.hypotheses import Hypothesis
 from signature.relocalization.map_index import MapIndex
+from signature.relocalization.prior import Prior
 from signature.relocalization.query_map import QUERY, QueryMap, QueryWindow, query_of
 
 if TYPE_CHECKING:
@@ -39,11 +40,12 @@ Watch = Callable[[RegisteredScan, Moment | None], None]
 class Search:
     """One query in one index: its hypotheses, carried from moment to moment."""
 
-    def __init__(self, index: MapIndex) -> None:
+    def __init__(self, index: MapIndex, hypotheses: tuple[Hypothesis, ...] = ()) -> None:
+        """hypotheses : known beforehand, for the first part of the query."""
         self.index = index
         self._clock = _Clock()
         self._history: list[Moment] = []
-        self._hypotheses: tuple[Hypothesis, ...] = ()
+        self._hypotheses = hypotheses
         self._part = 0
 
     def look(self, query: QueryMap) -> Moment:
@@ -52,15 +54,39 @@ class Search:
         self._history.append(_moment(self.index, query, verdict))
         return self._history[-1]
 
-    def answer(self, query: QueryMap, last_metres: Iterable[QueryMap] = ()) -> Answer:
+    def answer(
+        self, query: QueryMap, last_metres: Iterable[QueryMap] = (), *, look_outside: bool = True
+    ) -> Answer:
         """Where the query is by all that it has seen or, if that does not settle it, by the last metres.
 
         last_metres : the query again, each time with less of its travel; made only when they are needed.
+        look_outside : find the best place that a prior excludes, if none that it allows is certain.
         """
         verdict = self._look_up(query, self.index.decide)
         if verdict.status != "located":
             query, verdict = self._by_last_metres(query, verdict, last_metres)
-        return _answer(self.index, query, verdict, tuple(self._history), dict(self._clock.total_ms))
+        answer = _answer(self.index, query, verdict, tuple(self._history), dict(self._clock.total_ms))
+        return self._with_prior(answer, query, look_outside)
+
+    def _with_prior(self, answer: Answer, query: QueryMap, look_outside: bool) -> Answer:
+        """The answer with what became of the prior. Where nothing that it allows is certain, all places are
+        asked: a query that certainly is elsewhere is not in the region."""
+        index, whole = self.index, self.index.whole
+        if whole is None:
+            return answer
+        if not index.prior_applies(query):
+            return replace(answer, prior="lapsed")
+        answer = replace(answer, prior="used")
+        if answer.status == "located" or not look_outside:
+            return answer
+        verdict = whole.decide(query, whole.look_up(query))
+        if not verdict.hypotheses or index.allowed(verdict.hypotheses[:1], query):
+            return answer
+        excluded = _moment(whole, query, verdict)
+        if excluded.status == "located":
+            last = replace(answer.history[-1], status="not_found")
+            answer = replace(answer, status="not_found", history=(*answer.history[:-1], last))
+        return replace(answer, excluded=excluded)
 
     def _by_last_metres(
         self, query: QueryMap, verdict: Verdict, last_metres: Iterable[QueryMap]
@@ -108,8 +134,12 @@ class Query:
     """
 
     def __init__(self, index: MapIndex) -> None:
-        """index : the query is drawn and described with the settings of its database."""
+        """index : the query is drawn and described with the settings of its database; if it has a prior, the
+        pose at the time of that is remembered."""
         self._made_with, self._config = index.made_with, index.config
+        self._prior_ns = None if index.prior is None else index.prior.stamp_ns
+        self._prior_gap_ns: int | None = None  # from that time to the nearest scan so far
+        self._prior_at: tuple[SE2, float] | None = None  # the base and the path there
         self._clock = _Clock()
         self._part = -1
         self._lost: tuple[PlanarScan, SE2] | None = None  # the last scan, if registration was lost on it
@@ -118,6 +148,7 @@ class Query:
     def _restart(self) -> None:
         self._window = QueryWindow(self._made_with.projection, self._config)
         self._asked_m = 0.0
+        self._prior_at = None  # the motion from there to here is not known
         self._part += 1
 
     @property
@@ -140,10 +171,26 @@ class Query:
             self._lost = (planar_scan, pose) if len(planar_scan.hits_m) else None
             return False
         self._window.add(planar_scan, pose)
+        self._remember_prior(planar_scan.stamp_ns, pose)
         due = self.path_m - self._asked_m >= self._config.step_m
         if due:
             self._asked_m = self.path_m
         return due
+
+    def _remember_prior(self, stamp_ns: int, pose: SE2) -> None:
+        if self._prior_ns is None:
+            return
+        gap_ns = abs(stamp_ns - self._prior_ns)
+        if self._prior_gap_ns is None or gap_ns < self._prior_gap_ns:
+            self._prior_gap_ns, self._prior_at = gap_ns, (pose, self.path_m)
+
+    def _placed(self, query: QueryMap) -> QueryMap:
+        """The query with what the window does not know: its odom frame, and where the prior lies in it."""
+        query = replace(query, part=self._part)
+        if self._prior_at is None:
+            return query
+        T_odom_prior, path_m = self._prior_at
+        return replace(query, T_odom_prior=T_odom_prior, since_prior_m=query.path_m - path_m)
 
     def map(self) -> QueryMap:
         """What has been seen over the last metres, described as the database is.
@@ -159,7 +206,7 @@ class Query:
         self._clock.start()
         query = window.query(self._made_with.partition, self._made_with.signature)
         self._clock.lap("describe")
-        return replace(query, part=self._part)
+        return self._placed(query)
 
     def last_metres(self) -> Iterator[QueryMap]:
         """The query map again, with the last metres only, as long as these are less than the whole."""
@@ -167,7 +214,7 @@ class Query:
         for last_m in QUERY.last_m:
             if last_m < min(self.path_m, self._config.window_m):
                 shorter = self._window.query(made_with.partition, made_with.signature, last_m)
-                yield replace(shorter, part=self._part)
+                yield self._placed(shorter)
 
     def resume(self) -> None:
         """The work on the query map is done; from now on, time counts as registration."""
@@ -188,6 +235,7 @@ class Relocalizer:
     """
 
     def __init__(self, index: MapIndex) -> None:
+        """index : where to look; `MapIndex.within` restricts it to what is known beforehand."""
         self._query, self._search = Query(index), Search(index)
 
     @property
@@ -231,7 +279,7 @@ def localize(
     """Ask where a registered recording was made, in each of several indexes separately.
 
     scans : with their planar scans, from `pc2grid.pipeline.follow`, in any frame of their own.
-    indexes : at least one, of databases made with the same settings.
+    indexes : at least one, of databases made with the same settings; of priors for a time, that of the first.
     after : numbers of scans after which the answers are wanted; by default after the last scan.
     watch : called after each scan, with the state of the answer in the first index.
 
@@ -272,11 +320,14 @@ def relocalize(
     database: SubmapDatabase,
     config: Config,
     watch: Watch | None = None,
+    *,
+    prior: Prior | None = None,
 ) -> Answer:
     """Find where a registered recording was made.
 
     query : scans with their planar scans, from `pc2grid.pipeline.follow`, in any frame of their own.
     watch : called with each scan, and with the state of the answer if the database was asked after it.
+    prior : what is known of the pose beforehand; other places are no answers.
 
     Raises NoScans for a query without a usable scan.
 
@@ -287,7 +338,10 @@ def relocalize(
     >>> answer.status, answer.session, answer.covariance.shape
     ('located', 'monday', (3, 3))
     """
-    (asked,) = localize(query, [MapIndex.of(database, config)], watch=watch)
+    index = MapIndex.of(database, config)
+    if prior is not None:
+        index = index.within(prior)
+    (asked,) = localize(query, [index], watch=watch)
     return asked.answers[0]
 
 

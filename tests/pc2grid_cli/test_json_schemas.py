@@ -52,6 +52,8 @@ COMMANDS = [
     ("convert", "convert drive.mcap -o out.submaps --building B --floor 2", 0),
     ("relocalize", "relocalize part.yaml -d b.submaps", 0),
     ("relocalize", "relocalize drive.mcap -d b.submaps --set relocalize.accept=0.9999999", 4),
+    ("relocalize", "relocalize drive.mcap -d b.submaps --near 99 99 1", 4),
+    ("relocalize-check", "relocalize drive.mcap -d b.submaps --check 99 99 0", 4),
     ("export", "export b.submaps --map out --report out.html", 0),
     ("export", "export b.submaps --report out.html", 0),
     (

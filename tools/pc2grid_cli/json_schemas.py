@@ -7,7 +7,7 @@ a reader must ignore keys that it does not know.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 # Before Python 3.12 pydantic, which makes the schemas, does not take the TypedDict of typing.
 from typing_extensions import TypedDict
@@ -15,10 +15,12 @@ from typing_extensions import TypedDict
 from signature.evaluation.metrics import ConfidenceError, MatrixCell, QueryCounts
 from signature.evaluation.real_sensors import RealCell
 from signature.evaluation.trial import Trial
-from signature.relocalization.answer_json import Result, Sessions, Travel, Version
+from signature.relocalization.answer_json import Pose, Result, Sessions, StampedPose, Travel, Version
 
 if TYPE_CHECKING:
     from pc2grid import model
+
+CheckStatus = Literal["fine", "lost", "unsure"]
 
 
 class Query(Travel):
@@ -44,6 +46,49 @@ class Relocalize(Result):
 
     query: Query
     database: Searched
+
+
+class CheckedPose(Pose):
+    """The pose at the last scan, in the map frame."""
+
+    stamp_ns: int
+
+
+class BetterPlace(TypedDict):
+    """Where the query is instead, with certainty."""
+
+    session: str | None
+    building: str | None
+    floor: str | None
+    pose: StampedPose | None
+    confidence: float
+
+
+class CheckedAgainst(TypedDict):
+    """The database."""
+
+    path: str
+
+
+class RelocalizeCheck(TypedDict):
+    """`pc2grid relocalize --check` and `--check-topic`, with `--json`.
+
+    status: fine, lost, or unsure. probability: that the pose is right; an upper bound unless it is fine.
+    off_m, off_rad: from the pose to the best fit near it, null if nothing fits there. comparable: false if
+    registration was lost after the time of the pose. better: null unless another place is certain.
+    """
+
+    schema_version: Version
+    status: CheckStatus
+    probability: float
+    session: str
+    pose: CheckedPose
+    off_m: float | None
+    off_rad: float | None
+    comparable: bool
+    better: BetterPlace | None
+    query: Query
+    database: CheckedAgainst
 
 
 class Topic(TypedDict):
@@ -372,6 +417,7 @@ DOCUMENTS: dict[str, type] = {
     "info": Info,
     "info-map": InfoMap,
     "relocalize": Relocalize,
+    "relocalize-check": RelocalizeCheck,
     "simulate": Simulate,
 }
 """By command."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
+from pc2grid_cli.known_pose import KnownPose
 
 if TYPE_CHECKING:
     from pc2grid.io import Log
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.relocalization.answer import Moment
+    from signature.relocalization.prior import Prior
     from signature.relocalization.relocalizer import Answer, Watch
 
 
@@ -44,12 +46,16 @@ def find_log(
     recover: bool,
     observer: Observer = Observer(),
     watch: Watch | None = None,
+    known: KnownPose = KnownPose(),
 ) -> Found:
     """Locate a recording, or the part of it that `span` names."""
     from pc2grid.io import open_log
 
     with open_log(path, config.read, recover=recover) as query:
-        answer, poses = locate(query, database, config, span=span, observer=observer, watch=watch)
+        prior = known.prior(query, span)
+        answer, poses = locate(
+            query, database, config, span=span, observer=observer, watch=watch, prior=prior
+        )
         about = about_log(path, query, answer, scans=len(poses))
         return Found(answer=answer, poses=poses, about=about, report=query.report())
 
@@ -99,10 +105,12 @@ def locate(
     span: TimeSpan = TimeSpan(),
     observer: Observer = Observer(),
     watch: Watch | None = None,
+    prior: Prior | None = None,
 ) -> tuple[Answer, Trajectory]:
     """The answer for a recording, and its poses in its own odometry frame.
 
     watch : called with each scan, and with the state of the answer if the database was asked after it.
+    prior : what is known of the pose beforehand.
 
     config : see `query_config`.
     """
@@ -126,13 +134,20 @@ def locate(
                 watch(registered, moment)
 
         scans = follow(query.scans(span.start_s, span.duration_s), config)
-        answer = relocalize(scans, database, config, watch=see)
+        answer = relocalize(scans, database, config, watch=see, prior=prior)
     poses = Trajectory(
         stamps_ns=np.array([s.scan.stamp_ns for s in seen], np.int64),
         T_session_base=np.array([s.T_session_base for s in seen]).reshape(-1, 4, 4),
         health=tuple(s.health for s in seen),
     )
     return answer, poses
+
+
+def query_config(database: SubmapDatabase, config: Config) -> Config:
+    """The settings that made the database, with those sections of `config` that are about the query."""
+    return database.config().model_copy(
+        update={"read": config.read, "relocalize": config.relocalize, "registration": config.registration}
+    )
 
 
 def in_map(poses: Trajectory, answer: Answer) -> Trajectory | None:

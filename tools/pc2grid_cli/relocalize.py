@@ -15,6 +15,7 @@ from pc2grid.errors import one_line
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
 from pc2grid_cli import options as options
+from pc2grid_cli.known_pose import KnownPose
 from pc2grid_cli.locate import Found, find_log, find_map, in_map
 from pc2grid_cli.nav2_pose import write_initialpose
 from pc2grid_cli.output_files import check_file
@@ -44,6 +45,17 @@ class _Outputs:
         for option in ("trajectory", "initialpose", "output", "plot", "report"):
             check_file(option, getattr(self, option), self.force)
 
+    def refuse(self, reason: str, rerun: str | None) -> None:
+        """Raises ConfigError if there is any."""
+        from pc2grid.errors import ConfigError
+
+        files = ("trajectory", "initialpose", "output", "plot", "report")
+        asked = [f"--{option}" for option in files if getattr(self, option) is not None]
+        if rerun is not None:
+            asked.append("--rerun")
+        if asked:
+            raise ConfigError(f"{asked[0]}: {reason}", hint="leave it out, or ask without --check")
+
 
 def relocalize_command(
     context: typer.Context,
@@ -55,6 +67,32 @@ def relocalize_command(
         str | None, typer.Option("--building", metavar="NAME", help="look only in sessions labelled so")
     ] = None,
     floor: Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, of a floor")] = None,
+    near: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            "--near", metavar="X Y RADIUS", help="the robot is within RADIUS metres of X, Y of the map"
+        ),
+    ] = None,
+    near_pose: Annotated[
+        str | None,
+        typer.Option(
+            "--near-pose",
+            metavar="FILE|TOPIC",
+            help="the robot is where this pose with covariance says: /initialpose in the log, or in a file",
+        ),
+    ] = None,
+    check: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--check", metavar="X Y YAW_DEG", help="is this pose at the last scan right?"),
+    ] = None,
+    check_topic: Annotated[
+        str | None,
+        typer.Option("--check-topic", metavar="TOPIC", help="the same, of the last on /amcl_pose or /tf"),
+    ] = None,
+    session: Annotated[
+        str | None,
+        typer.Option("--session", metavar="NAME", help="whose map frame these poses are in, of several"),
+    ] = None,
     topic: options.Topic = None,
     odometry: options.OdometryTopic = None,
     start: options.Start = 0.0,
@@ -88,8 +126,12 @@ def relocalize_command(
 ) -> None:
     """Find where a recording was made. Exit code 4: there is no confident single answer.
 
+    With --near or --near-pose, places elsewhere are no answers. With --check or --check-topic, no place is
+    found, but a pose is judged: fine, lost, or unsure; exit code 4 unless it is fine.
+
     Example: pc2grid relocalize tuesday.mcap --database building.submaps
     """
+    from pc2grid.io.nav2_map import is_map_file
     from signature.database import open_database
 
     outputs = _Outputs(
@@ -100,8 +142,12 @@ def relocalize_command(
         report=report,
         force=force,
     )
+    known = KnownPose(near=near, near_pose=near_pose, check=check, check_topic=check_topic, session=session)
     outputs.check()
     _check_options_for_maps(log, outputs, rerun)
+    known.validate(is_map=is_map_file(log))
+    if known.is_check:
+        outputs.refuse("--check judges a pose and finds none", rerun)
     if rerun is not None:
         from pc2grid_cli.rerun_target import require_target
 
@@ -115,6 +161,19 @@ def relocalize_command(
         if building is not None or floor is not None:
             opened.keep_only(building=building, floor=floor)
         left_out = [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
+        if known.is_check:
+            from pc2grid_cli.check_pose import check_log, report_check
+
+            checked, document = check_log(
+                log,
+                opened,
+                settings,
+                known,
+                span=TimeSpan(start, duration),
+                recover=recover,
+                observer=console.of(context).observer(),
+            )
+            raise typer.Exit(report_check(checked, document, as_json=json))
         found, located = _find(
             log,
             opened,
@@ -123,6 +182,7 @@ def relocalize_command(
             recover=recover,
             rerun=rerun,
             terminal=console.of(context),
+            known=known,
         )
         # Printed first: a file that cannot be written must not cost the answer.
         _print(found, where, left_out, as_json=json)
@@ -132,6 +192,7 @@ def relocalize_command(
             console.warn(f"{path}: not written, there is no answer to put into it")
     for warning in found.about["warnings"]:
         console.warn(warning)
+    _warn_of_prior(found.answer)
     if found.report is not None and found.report.lossy:
         console.warn(f"{log.name}: {data_loss.sentence(found.report)}")
     for damage in left_out:
@@ -176,6 +237,7 @@ def _find(
     recover: bool,
     rerun: str | None,
     terminal: console.Console,
+    known: KnownPose,
 ) -> tuple[Found, Trajectory | None]:
     """The answer, and the query's poses in the map; both are streamed to `rerun` meanwhile."""
     from pc2grid.io.nav2_map import is_map_file
@@ -197,6 +259,7 @@ def _find(
             recover=recover,
             observer=terminal.observer(),
             watch=None if shown is None else shown.watch,
+            known=known,
         )
         located = in_map(found.poses, found.answer)
         if shown is not None and located is not None:
@@ -251,9 +314,25 @@ def _print(found: Found, where: str, left_out: list[str], *, as_json: bool) -> N
         print(as_text(found.answer, is_map=found.drawn is not None), flush=True)
 
 
+def _warn_of_prior(answer: Answer) -> None:
+    """Say what the known pose had to do with the answer, if that is not what the user expects."""
+    if answer.prior == "lapsed":
+        console.warn("registration was lost after the time of --near-pose, so that pose was not used")
+    excluded = answer.excluded
+    if excluded is None or excluded.pose is None:
+        return
+    pose = excluded.pose
+    where = f"{one_line(excluded.session or '')}: x {pose.x:.2f} m, y {pose.y:.2f} m"
+    how = "is certain" if excluded.status == "located" else "fits better"
+    console.warn(
+        f"a place that --near excludes {how}: {where}, confidence {probability(excluded.confidence)}"
+    )
+
+
 def as_text(answer: Answer, *, is_map: bool = False) -> str:
     """The answer in a few lines; of a map as the query, the pose is that of its frame."""
     after = "" if is_map else f" after {answer.path_m:.1f} m"
+    near = " near the given one" if answer.prior == "used" else ""
     if answer.T_map_base is not None:
         pose = answer.T_map_base
         of_what = "for the map's own frame" if is_map else "at the last scan"
@@ -266,7 +345,7 @@ def as_text(answer: Answer, *, is_map: bool = False) -> str:
     lines = [
         {
             "ambiguous": f"ambiguous: {len(set(answer.places))} places fit{after}",
-            "not_found": f"not found: no place fits well enough{after}",
+            "not_found": f"not found: no place{near} fits well enough{after}",
         }[answer.status]
     ]
     for h in answer.hypotheses[:5]:

@@ -1,0 +1,145 @@
+"""What is known of a robot's pose beforehand: a region of the map that it is in.
+
+A prior excludes: a place outside has probability 0, so it is no answer, and as a rival it counts nothing.
+What fits better outside is therefore no reason to doubt; it is reported when nothing inside fits
+(`Answer.excluded`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pc2grid.arrays import F64, BoolGrid
+from pc2grid.errors import ConfigError
+from pc2grid.geometry import SE2, wrap_angle
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PriorParameters:
+    """How a covariance becomes a region, and how the region grows with travel.
+
+    sigmas_squared : the region of a normal distribution holds the positions within this squared Mahalanobis
+        distance, 99 % of them (the quantile of chi-square with two degrees of freedom).
+    yaw_sigmas : and the headings within so many standard deviations, 99 % of them.
+    least_m, least_rad : a region is at least so wide on each side, the distance within which two
+        hypotheses are one. A smaller one would exclude right places that are drawn a little off.
+    drift, drift_rad_m : a region for an earlier time grows by this share of the way since, and turns by this
+        much a metre. Chosen by hand: the error of wheel odometry that is not calibrated well.
+    searched_m2 : the free ground of a smaller region is searched as a whole at every look, and nothing in it
+        can be missed; in a larger one, places are proposed by signatures first. Chosen by the time of a look.
+    """
+
+    sigmas_squared: float = 9.21
+    yaw_sigmas: float = 2.58
+    least_m: float = 0.5
+    least_rad: float = math.radians(10.0)
+    drift: float = 0.03
+    drift_rad_m: float = math.radians(0.3)
+    searched_m2: float = 1000.0
+
+
+PRIOR = PriorParameters()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prior:
+    """The base is in an ellipse around (x, y) of the map frame of a session, with a heading near `yaw`.
+
+    T_map_base : the centre of the region. shape_m2 : (2, 2), positions at d from the centre are inside if
+    d' shape_m2^-1 d <= 1. half_yaw_rad : headings differ by at most this; pi: any.
+    stamp_ns : when; of the scans of a query the nearest one is meant. None: whenever the database is asked.
+    session : whose map frame; None if there is only one session.
+
+    >>> near = Prior.around(3.0, 4.0, radius_m=2.0)
+    >>> near.allows(SE2(4.0, 5.0, 3.0)), near.allows(SE2(6.0, 4.0, 0.0))
+    (True, False)
+    """
+
+    T_map_base: SE2
+    shape_m2: F64
+    half_yaw_rad: float = math.pi
+    stamp_ns: int | None = None
+    session: str | None = None
+
+    @staticmethod
+    def around(
+        x_m: float,
+        y_m: float,
+        radius_m: float,
+        *,
+        yaw_rad: float = 0.0,
+        half_yaw_rad: float = math.pi,
+        session: str | None = None,
+    ) -> Prior:
+        """A disc, and any heading unless `half_yaw_rad` says otherwise.
+
+        Raises ConfigError for numbers that are not finite or a radius that is not positive.
+        """
+        if not all(map(math.isfinite, (x_m, y_m, yaw_rad))) or not 0.0 < radius_m < math.inf:
+            raise ConfigError(
+                f"near: expected x and y in metres and a radius > 0, found {x_m:g} {y_m:g} {radius_m:g}"
+            )
+        radius_m = max(radius_m, PRIOR.least_m)
+        return Prior(
+            T_map_base=SE2(x_m, y_m, yaw_rad),
+            shape_m2=radius_m**2 * np.eye(2),
+            half_yaw_rad=half_yaw_rad,
+            session=session,
+        )
+
+    @staticmethod
+    def of_pose(
+        T_map_base: SE2, covariance: ArrayLike, *, stamp_ns: int | None = None, session: str | None = None
+    ) -> Prior:
+        """The 99 % region of a pose with a covariance (3, 3) of x, y, yaw; m^2, m rad, rad^2.
+
+        Raises ConfigError for a covariance of zeros, which says nothing, and for one that is none.
+        """
+        full = np.asarray(covariance, np.float64)
+        full = 0.5 * (full + full.T)
+        position = full[:2, :2]
+        pose = (T_map_base.x, T_map_base.y, T_map_base.yaw)
+        if not np.isfinite(full).all() or not np.isfinite(pose).all():
+            raise ConfigError("near: the pose or its covariance is not finite")
+        if not position.any() or np.linalg.eigvalsh(position)[0] < 0.0 or full[2, 2] < 0.0:
+            raise ConfigError(
+                "near: the covariance of the pose is zero or not a covariance, so it names no region",
+                hint="--near X Y RADIUS names one",
+            )
+        # Added, not a lower bound of the axes, so that the shape of the ellipse stays.
+        shape = PRIOR.sigmas_squared * position + PRIOR.least_m**2 * np.eye(2)
+        half_yaw = PRIOR.yaw_sigmas * math.sqrt(full[2, 2]) + PRIOR.least_rad
+        return Prior(
+            T_map_base=T_map_base,
+            shape_m2=shape,
+            # A variance of zero beside a position that is uncertain means that the heading is not known.
+            half_yaw_rad=min(half_yaw, math.pi) if full[2, 2] else math.pi,
+            stamp_ns=stamp_ns,
+            session=session,
+        )
+
+    @property
+    def radius_m(self) -> float:
+        """Distance of the farthest position in the region from its centre."""
+        return math.sqrt(float(np.linalg.eigvalsh(self.shape_m2)[1]))
+
+    def allows(self, T_map_base: SE2, since_m: float = 0.0) -> bool:
+        """Whether the base can be there. since_m : way driven since `stamp_ns`, by which the region grows."""
+        grown = self.shape_m2 + (PRIOR.drift * since_m) ** 2 * np.eye(2)
+        off = np.array([T_map_base.x - self.T_map_base.x, T_map_base.y - self.T_map_base.y])
+        turn = abs(wrap_angle(T_map_base.yaw - self.T_map_base.yaw))
+        inside = float(off @ np.linalg.solve(grown, off)) <= 1.0
+        return inside and turn <= self.half_yaw_rad + PRIOR.drift_rad_m * since_m
+
+    def may_hold(self, squares_m: F64, side_m: float, moved_m: float, since_m: float) -> BoolGrid:
+        """(K,) which of the squares of `side_m` around (K, 2) may hold the base now.
+
+        moved_m : distance from where it was at `stamp_ns`, whatever its heading was. since_m : way driven.
+        """
+        reach = self.radius_m + moved_m + PRIOR.drift * since_m + side_m * math.sqrt(0.5)
+        center = (self.T_map_base.x, self.T_map_base.y)
+        return np.asarray(np.hypot(*(squares_m - center).T) <= reach)

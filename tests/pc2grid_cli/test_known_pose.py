@@ -1,0 +1,190 @@
+"""`relocalize --near`, `--near-pose`, `--check` and `--check-topic`, as a user types them."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import Result
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from typer.testing import CliRunner
+
+from pc2grid.geometry import SE2
+from pc2grid.io.nav2_map import save_map
+from pc2grid_cli.console import Console
+from pc2grid_cli.main import app
+from pc2grid_cli.nav2_pose import initialpose, read_pose
+from tests.helpers.recordings import ros
+from tests.helpers.simulated_drives import plan
+
+BENT = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]
+LEFT_ROOM = plan(6, 6, BENT)
+TWINS = plan(12, 6, [(6, 0, 6, 6), *BENT, *[(x0 + 6, y0, x1 + 6, y1) for x0, y0, x1, y1 in BENT]])
+
+
+def pc2grid(*words: object) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words], obj=Console())
+
+
+def quaternion(yaw_rad: float) -> tuple[float, float]:
+    return math.sin(yaw_rad / 2), math.cos(yaw_rad / 2)
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SE2]:
+    """twins.submaps: two rooms that are alike; drive.mcap, a laser in the left one, with what its
+    localization believed on /initialpose (right, at the start) and /amcl_pose (wrong, at the end). And the
+    true pose at the end."""
+    folder = tmp_path_factory.mktemp("rooms")
+    save_map(TWINS, folder / "twins")
+    save_map(LEFT_ROOM, folder / "left")
+    assert pc2grid("convert", folder / "twins.yaml", "-o", folder / "twins.submaps").exit_code == 0
+    laser = ("--sensor", "laser", "--length", 4, "--seed", 3, "--clutter", 0)
+    assert pc2grid("simulate", folder / "left.yaml", folder / "plain.mcap", *laser).exit_code == 0
+    poses = np.loadtxt(folder / "plain.tum")
+    first, last = (SE2(p[1], p[2], 2.0 * math.atan2(p[6], p[7])) for p in (poses[0], poses[-1]))
+    covariance = np.diag([0.25, 0.25, 0, 0, 0, 0.07])
+    believed = [
+        ("/initialpose", round(poses[0][0] * 1e9), first),
+        ("/amcl_pose", round(poses[-1][0] * 1e9), last @ SE2(0.8, 0.0, 0.0)),
+    ]
+    with (folder / "plain.mcap").open("rb") as source, (folder / "drive.mcap").open("wb") as target:
+        writer = Writer(target)
+        writer.start(profile="ros2")
+        channels: dict[int, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages():
+            if channel.id not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data) if schema else 0
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", number)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        kind = "geometry_msgs/PoseWithCovarianceStamped"
+        number = writer.register_schema(
+            "geometry_msgs/msg/PoseWithCovarianceStamped", "ros2msg", ros().schema(kind)
+        )
+        for topic, stamp_ns, pose in believed:
+            z, w = quaternion(pose.yaw)
+            make = ros().make
+            content = make(
+                "geometry_msgs/Pose",
+                make("geometry_msgs/Point", pose.x, pose.y, 0.0),
+                make("geometry_msgs/Quaternion", 0.0, 0.0, z, w),
+            )
+            full = make("geometry_msgs/PoseWithCovariance", content, covariance.reshape(-1))
+            data = ros().message(topic, stamp_ns, make(kind, ros().header(stamp_ns, "map"), full)).data
+            writer.add_message(writer.register_channel(topic, "cdr", number), stamp_ns, data, stamp_ns)
+        writer.finish()
+    return folder, last
+
+
+def relocalize(folder: Path, *words: object) -> Result:
+    return pc2grid("relocalize", folder / "drive.mcap", "-d", folder / "twins.submaps", *words)
+
+
+def test_without_a_word_the_rooms_are_ambiguous(rooms: tuple[Path, SE2]) -> None:
+    done = relocalize(rooms[0], "--json")
+    assert done.exit_code == 4
+    document = json.loads(done.stdout)
+    assert document["status"] == "ambiguous" and document["prior"] is None
+
+
+@pytest.mark.parametrize("room", [0.0, 6.0])
+def test_near_names_the_room(rooms: tuple[Path, SE2], room: float) -> None:
+    folder, truth = rooms
+    done = relocalize(folder, "--near", 3 + room, 3, 3.5, "--json")
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    assert document["prior"] == {"status": "used", "excluded": None}
+    assert math.dist((document["pose"]["x"], document["pose"]["y"]), (truth.x + room, truth.y)) < 0.15
+
+
+def test_a_wrong_word_finds_nothing_and_says_what_it_excludes(rooms: tuple[Path, SE2]) -> None:
+    done = relocalize(rooms[0], "--near", -50, -50, 2)
+    assert done.exit_code == 4
+    assert done.stdout.startswith("not found: no place near the given one")
+    assert "--near excludes" in done.stderr and "twins: x" in done.stderr
+
+
+def test_a_pose_in_the_log_or_in_a_file_is_carried_along(rooms: tuple[Path, SE2], tmp_path: Path) -> None:
+    folder, truth = rooms
+    done = relocalize(folder, "--near-pose", "/initialpose", "--initialpose", tmp_path / "pose.json")
+    assert done.exit_code == 0 and done.stdout.startswith("located in twins"), done.output
+    written = read_pose(tmp_path / "pose.json")
+    assert math.dist((written.T_map_base.x, written.T_map_base.y), (truth.x, truth.y)) < 0.15
+    done = relocalize(folder, "--near-pose", tmp_path / "pose.json", "--json")
+    assert done.exit_code == 0 and json.loads(done.stdout)["status"] == "located"
+
+
+def test_a_right_pose_is_fine_and_a_wrong_one_lost(rooms: tuple[Path, SE2]) -> None:
+    folder, truth = rooms
+    yaw_deg = math.degrees(truth.yaw)
+    done = relocalize(folder, "--check", truth.x, truth.y, yaw_deg)
+    assert done.exit_code == 0 and done.stdout.startswith("fine: x "), done.output
+    done = relocalize(folder, "--check", truth.x, truth.y, yaw_deg + 20.0, "--json")
+    document = json.loads(done.stdout)
+    assert done.exit_code == 4 and document["status"] == "lost" and document["probability"] <= 0.1
+    better = document["better"]["pose"]
+    assert math.dist((better["x"], better["y"]), (truth.x, truth.y)) < 0.15
+    # 0.8 m ahead of the truth.
+    done = relocalize(folder, "--check-topic", "/amcl_pose")
+    assert done.exit_code == 4 and done.stdout.startswith("lost: x "), done.output
+    assert "better, in twins: x" in done.stdout
+    # Right, at the first scan.
+    done = relocalize(folder, "--check-topic", "/initialpose", "--json")
+    document = json.loads(done.stdout)
+    assert done.exit_code == 0 and document["comparable"] and document["better"] is None
+    assert math.dist((document["pose"]["x"], document["pose"]["y"]), (truth.x, truth.y)) < 0.15
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "told"),
+    [
+        ("--near 1 1 0", 2, "radius > 0"),
+        ("--near 1 1 nan", 2, "radius > 0"),
+        ("--near 1 1", 2, "3 arguments"),
+        ("--near 1 1 1 --check 1 1 0", 2, "do not go together"),
+        ("--near 1 1 1 --session attic", 2, "there is: twins"),
+        ("--session twins", 2, "--near X Y RADIUS"),
+        ("--near-pose none.json", 2, "none.json"),
+        ("--near-pose twins.yaml", 2, "not a PoseWithCovarianceStamped"),
+        ("--near-pose /scan", 1, "holds no pose"),
+        ("--near-pose /odom", 1, "frame odom"),
+        ("--check-topic /none", 1, "/amcl_pose"),
+        ("--check 1 nan 0", 2, "--check"),
+        ("--check 1 1 0 --plot out.png", 2, "--plot"),
+    ],
+)
+def test_mistakes_are_named(
+    words: str, code: int, told: str, rooms: tuple[Path, SE2], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(rooms[0])
+    console = Console()
+    arguments = ["relocalize", "drive.mcap", "-d", "twins.submaps", *words.split()]
+    runner = CliRunner()
+    done = runner.invoke(app, arguments, obj=console, standalone_mode=False)
+    assert done.exception is not None and done.stdout == ""
+    assert getattr(done.exception, "exit_code", 1) == code
+    message = getattr(done.exception, "message", str(done.exception))
+    assert told in f"{message} {getattr(done.exception, 'hint', '')}"
+
+
+def test_a_map_has_no_robot(rooms: tuple[Path, SE2], monkeypatch: pytest.MonkeyPatch) -> None:
+    done = pc2grid("relocalize", rooms[0] / "left.yaml", "-d", rooms[0] / "twins.submaps", "--near", 1, 1, 1)
+    assert done.exit_code != 0 and "no robot in a map" in str(done.exception)
+
+
+def test_a_pose_file_is_read_as_it_is_written_and_as_ros2_prints_it(tmp_path: Path) -> None:
+    covariance = np.array([[0.2, 0.1, 0.0], [0.1, 0.3, 0.01], [0.0, 0.01, 0.05]])
+    message = initialpose(12_000_000_345, SE2(1.0, -2.0, 2.5), covariance)
+    (tmp_path / "pose.json").write_text(json.dumps(message))
+    (tmp_path / "pose.yaml").write_text(yaml.safe_dump(message) + "---\n" + yaml.safe_dump(message) + "---\n")
+    for name in ("pose.json", "pose.yaml"):
+        pose = read_pose(tmp_path / name)
+        assert pose.stamp_ns == 12_000_000_345
+        assert (pose.T_map_base.x, pose.T_map_base.y) == (1.0, -2.0)
+        assert pose.T_map_base.yaw == pytest.approx(2.5)
+        assert np.allclose(pose.covariance, covariance)

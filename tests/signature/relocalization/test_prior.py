@@ -1,0 +1,172 @@
+"""What is known of the pose beforehand excludes places, and nothing else."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.errors import ConfigError
+from pc2grid.geometry import SE2
+from pc2grid.model import Health, RegisteredScan
+from signature.config import Config, RelocalizeConfig
+from signature.relocalization.answer import Answer
+from signature.relocalization.map_index import MapIndex
+from signature.relocalization.prior import PRIOR, Prior
+from signature.relocalization.relocalizer import Relocalizer
+from tests.helpers.simulated_drives import building, drive, office, plan
+
+BENT = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]
+TWINS = plan(12, 6, [(6, 0, 6, 6), *BENT, *[(x0 + 6, y0, x1 + 6, y1) for x0, y0, x1, y1 in BENT]])
+"""Two rooms side by side that are alike: (x, y) of the one is (x + 6, y) of the other."""
+IN_ROOM = [(1.0, 1.0), (5.0, 1.0), (5.0, 2.4)]
+AT_ONCE = Config(relocalize=RelocalizeConfig(step_m=100.0))
+"""The database is asked once, at the end: what is tested here does not depend on the looks before."""
+ALIKE = building({"twins": TWINS}, AT_ONCE)
+OFFICE = building({"office": office()}, AT_ONCE)
+ROUTE = [(1.5, 7.0), (9.5, 7.0), (9.5, 4.0)]
+
+
+@functools.cache
+def driven(in_office: bool) -> list[tuple[RegisteredScan, PlanarScan, SE2]]:
+    return list(drive(office(), ROUTE) if in_office else drive(TWINS, IN_ROOM))
+
+
+def ask(index: MapIndex, *, in_office: bool = True) -> tuple[Answer, SE2]:
+    relocalizer = Relocalizer(index)
+    for registered, planar_scan, truth in driven(in_office):
+        relocalizer.add(registered, planar_scan)
+        end = truth
+    return relocalizer.answer(), end
+
+
+def distance(a: SE2 | None, b: SE2) -> float:
+    assert a is not None
+    return math.dist((a.x, a.y), (b.x, b.y))
+
+
+@pytest.mark.parametrize("room", [0.0, 6.0])
+def test_of_two_rooms_that_are_alike_the_prior_names_one(room: float) -> None:
+    """The robot is in the left one; whoever says it is in the right one is believed."""
+    assert ask(ALIKE, in_office=False)[0].status == "ambiguous"
+    answer, truth = ask(ALIKE.within(Prior.around(3.0 + room, 2.0, radius_m=3.0)), in_office=False)
+    assert answer.status == "located" and answer.confidence >= 0.9 and answer.prior == "used"
+    assert distance(answer.T_map_base, SE2(truth.x + room, truth.y, truth.yaw)) < 0.1
+    assert answer.excluded is None
+    inside = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
+    assert all(math.dist((p.x, p.y), (3.0 + room, 2.0)) <= 3.0 for p in inside)
+
+
+def test_where_the_robot_is_not_it_is_not_found_and_the_place_is_named() -> None:
+    answer, truth = ask(OFFICE.within(Prior.around(17.0, 2.0, radius_m=2.0)))
+    assert answer.status == "not_found" and answer.T_map_base is None
+    assert answer.excluded is not None and answer.excluded.status == "located"
+    assert distance(answer.excluded.pose, truth) < 0.1
+    for h in answer.hypotheses:
+        pose = h.fit.T_map_query @ answer.T_odom_base
+        assert distance(pose, SE2(17.0, 2.0)) <= 2.0
+
+
+def test_a_prior_that_holds_changes_no_right_answer() -> None:
+    free, truth = ask(OFFICE)
+    for prior in (Prior.around(9.0, 5.0, radius_m=3.0), Prior.around(9.0, 5.0, radius_m=100.0)):
+        answer, _ = ask(OFFICE.within(prior))
+        assert answer.status == "located" and distance(answer.T_map_base, truth) < 0.1
+        assert answer.confidence >= free.confidence - 1e-9
+
+
+def test_a_large_region_is_searched_through_proposals(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = replace(PRIOR, searched_m2=1.0)
+    monkeypatch.setattr("signature.relocalization.map_index.PRIOR", small)
+    answer, truth = ask(OFFICE.within(Prior.around(9.0, 5.0, radius_m=4.0)))
+    assert answer.status == "located" and distance(answer.T_map_base, truth) < 0.1
+    # Proposals outside are dropped all the same.
+    answer, _ = ask(OFFICE.within(Prior.around(17.0, 2.0, radius_m=2.0)))
+    assert answer.status == "not_found"
+
+
+def test_a_pose_of_the_first_scan_is_carried_along_by_the_travel() -> None:
+    """1 m and 20 degrees off at the start, 11 m before the answer."""
+    covariance = np.diag([0.5, 0.5, 0.1])
+    start = SE2(2.3, 6.5, math.radians(20.0))
+    answer, truth = ask(OFFICE.within(Prior.of_pose(start, covariance, stamp_ns=0)))
+    assert answer.status == "located" and distance(answer.T_map_base, truth) < 0.1
+    # The end of the travel is far outside the region: without its time it would be excluded.
+    answer, _ = ask(OFFICE.within(Prior.of_pose(start, covariance)))
+    assert answer.status == "not_found"
+    turned = Prior.of_pose(SE2(1.5, 7.0, math.pi), covariance, stamp_ns=0)
+    assert ask(OFFICE.within(turned))[0].status == "not_found"
+
+
+def test_a_prior_from_before_registration_was_lost_is_not_used() -> None:
+    relocalizer = Relocalizer(OFFICE.within(Prior.around(17.0, 2.0, 1.0)))
+    timed = replace(Prior.around(17.0, 2.0, 1.0), stamp_ns=0)
+    relocalizers = [relocalizer, Relocalizer(OFFICE.within(timed))]
+    for k, (registered, planar_scan, _) in enumerate(driven(in_office=True)):
+        if k == 10:
+            registered = RegisteredScan(
+                scan=registered.scan, T_session_base=registered.T_session_base, health=Health.LOST
+            )
+        for each in relocalizers:
+            each.add(registered, planar_scan)
+    always, at_start = (each.answer() for each in relocalizers)
+    assert (always.status, always.prior) == ("not_found", "used")
+    assert (at_start.status, at_start.prior) == ("located", "lapsed")
+
+
+def test_the_frame_of_the_prior_is_that_of_one_session() -> None:
+    both = building({"twins": TWINS, "office": office()}, AT_ONCE)
+    with pytest.raises(ConfigError, match="2 sessions") as caught:
+        both.within(Prior.around(1.0, 1.0, 1.0))
+    assert "--session" in (caught.value.hint or "") and "office" in (caught.value.hint or "")
+    with pytest.raises(ConfigError, match="'attic'"):
+        both.within(Prior.around(1.0, 1.0, 1.0, session="attic"))
+    answer, truth = ask(both.within(Prior.around(9.0, 5.0, 3.0, session="office")))
+    assert answer.session == "office" and distance(answer.T_map_base, truth) < 0.1
+    answer, _ = ask(both.within(Prior.around(9.0, 5.0, 3.0, session="twins")))
+    assert answer.status == "not_found"
+    assert answer.excluded is not None and answer.excluded.session == "office"
+
+
+def test_regions() -> None:
+    disc = Prior.around(1.0, 2.0, 3.0)
+    assert disc.allows(SE2(3.9, 2.0, 2.0)) and not disc.allows(SE2(4.1, 2.0, 2.0))
+    assert disc.allows(SE2(4.1, 2.0, 0.0), since_m=40.0)
+    pose = Prior.of_pose(SE2(0, 0, 3.1), np.diag([4.0, 0.01, 0.01]))
+    assert pose.allows(SE2(6.0, 0.0, -3.1)) and not pose.allows(SE2(0.0, 1.0, 3.1))
+    assert not pose.allows(SE2(0.0, 0.0, 2.0)) and pose.radius_m > 6.0
+    assert Prior.of_pose(SE2(), np.diag([1.0, 1.0, 0.0])).allows(SE2(0, 0, 3.0))
+    rng = np.random.default_rng(0)
+    turn = SE2(0, 0, 0.7).matrix()[:2, :2]
+    spread = turn @ np.diag([1.0, 0.2]) @ turn.T
+    draws = rng.multivariate_normal((0, 0), spread, 2000)
+    tilted = Prior.of_pose(SE2(), np.block([[spread, np.zeros((2, 1))], [np.zeros((1, 2)), 0.01]]))
+    inside = np.mean([tilted.allows(SE2(x, y, 0.0)) for x, y in draws])
+    assert 0.985 < inside <= 1.0
+    squares = draws * 3.0
+    kept = tilted.may_hold(squares, 0.8, 0.0, 0.0)
+    assert all(kept[i] for i, (x, y) in enumerate(squares) if tilted.allows(SE2(x, y, 0.0)))
+    assert not kept.all()
+
+
+@pytest.mark.parametrize(
+    ("covariance", "words"),
+    [
+        (np.zeros((3, 3)), "zero"),
+        (np.diag([1.0, -1.0, 1.0]), "not a covariance"),
+        (np.diag([1.0, math.nan, 1.0]), "finite"),
+    ],
+)
+def test_a_covariance_that_names_no_region_is_refused(covariance: np.ndarray, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        Prior.of_pose(SE2(), covariance)
+
+
+@pytest.mark.parametrize("radius_m", [0.0, -1.0, math.nan, math.inf])
+def test_a_radius_that_is_none_is_refused(radius_m: float) -> None:
+    with pytest.raises(ConfigError, match="radius"):
+        Prior.around(0.0, 0.0, radius_m)

@@ -1,0 +1,142 @@
+"""`pc2grid relocalize --check` and `--check-topic`: is the pose that the robot believes in still right?"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pc2grid.display import probability
+from pc2grid.errors import one_line
+from pc2grid.observer import Observer
+from pc2grid.time_span import TimeSpan
+from pc2grid_cli import console
+from pc2grid_cli.known_pose import KnownPose, end_s
+
+if TYPE_CHECKING:
+    from pc2grid.geometry import SE2
+    from pc2grid.io import Log
+    from pc2grid.model import RegisteredScan
+    from pc2grid_cli.json_schemas import RelocalizeCheck
+    from signature.config import Config
+    from signature.database import SubmapDatabase
+    from signature.relocalization.pose_check import PoseCheck
+
+
+def check_log(
+    path: Path,
+    database: SubmapDatabase,
+    config: Config,
+    known: KnownPose,
+    *,
+    span: TimeSpan,
+    recover: bool,
+    observer: Observer = Observer(),
+) -> tuple[PoseCheck, RelocalizeCheck]:
+    """Check the pose at the end of a recording, or of the part of it that `span` names."""
+    from pc2grid.io import open_log
+    from pc2grid.pipeline import follow
+    from pc2grid_cli.locate import query_config
+    from signature.relocalization.map_index import MapIndex
+    from signature.relocalization.pose_check import check_pose
+
+    config = query_config(database, config)
+    with open_log(path, config.read, recover=recover) as log:
+        T_map_base, stamp_ns = _believed(log, known, span)
+        ends_ns = log.info.start_ns, log.info.end_ns
+        scans = 0
+
+        def see(registered: RegisteredScan, moment: object) -> None:
+            nonlocal scans
+            scans += 1
+            observer.on_progress(span.share_done(registered.scan.stamp_ns, *ends_ns))
+
+        with observer.step("check", span.length_ns(*ends_ns) * 1e-9):
+            checked = check_pose(
+                follow(log.scans(span.start_s, span.duration_s), config),
+                MapIndex.of(database, config),
+                T_map_base,
+                stamp_ns=stamp_ns,
+                session=known.session,
+                watch=see,
+            )
+        return checked, _document(checked, log, path, database.location, scans)
+
+
+def _believed(log: Log, known: KnownPose, span: TimeSpan) -> tuple[SE2, int | None]:
+    """The pose to be checked, and its time; None: the last scan."""
+    from pc2grid.geometry import SE2
+
+    if known.check_topic is not None:
+        pose = log.map_pose(known.check_topic, end_s(span))
+        return pose.T_map_base, pose.stamp_ns
+    assert known.check is not None
+    x_m, y_m, yaw_deg = known.check
+    return SE2(x_m, y_m, math.radians(yaw_deg)), None
+
+
+def _document(checked: PoseCheck, log: Log, path: Path, where: str, scans: int) -> RelocalizeCheck:
+    report = log.report()
+    pose = checked.T_map_base
+    better = None if checked.better is None else checked.better.to_json()
+    return {
+        "schema_version": 1,
+        "status": checked.status,
+        "probability": checked.probability,
+        "session": checked.session,
+        "pose": {"x": pose.x, "y": pose.y, "yaw": pose.yaw, "stamp_ns": checked.stamp_ns},
+        "off_m": checked.off_m,
+        "off_rad": checked.off_rad,
+        "comparable": not checked.lapsed,
+        "better": better
+        and {
+            "session": better["session"],
+            "building": better["building"],
+            "floor": better["floor"],
+            "pose": better["pose"],
+            "confidence": better["confidence"],
+        },
+        "query": {
+            "path_m": checked.path_m,
+            "stamp_ns": checked.stamp_ns,
+            "source": path.name,
+            "scans": scans,
+            "sensor": log.choose().sensor,
+            "lossy": report.lossy,
+            "warnings": list(report.warnings),
+        },
+        "database": {"path": where},
+    }
+
+
+def as_text(checked: PoseCheck) -> str:
+    """The judgement in one or two lines."""
+    pose = checked.T_map_base
+    where = f"x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {math.degrees(pose.yaw):.1f} deg"
+    told = f"{checked.status}: {where} in {one_line(checked.session)}"
+    if checked.lapsed:
+        return f"{told}: registration was lost after that pose, so it cannot be compared"
+    at_most = "" if checked.status == "fine" else "at most "
+    told += f", right with probability {at_most}{probability(checked.probability)}"
+    if checked.off_m is not None and checked.off_rad is not None and checked.status == "fine":
+        told += f", {checked.off_m:.2f} m and {math.degrees(checked.off_rad):.1f} deg from the best fit"
+    told += f", after {checked.path_m:.1f} m of travel"
+    better = checked.better
+    if better is not None and better.T_map_base is not None:
+        pose = better.T_map_base
+        told += (
+            f"\n  better, in {one_line(better.session or '')}: x {pose.x:.2f} m, y {pose.y:.2f} m,"
+            f" yaw {math.degrees(pose.yaw):.1f} deg, confidence {probability(better.confidence)}"
+        )
+    return told
+
+
+def report_check(checked: PoseCheck, document: RelocalizeCheck, *, as_json: bool) -> int:
+    """Print the judgement; returns the exit code: 0 if the pose is fine."""
+    if as_json:
+        console.print_json(document)
+    else:
+        print(as_text(checked), flush=True)
+    for warning in document["query"]["warnings"]:
+        console.warn(warning)
+    return console.OK if checked.status == "fine" else console.UNSURE
