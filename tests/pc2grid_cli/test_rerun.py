@@ -148,7 +148,26 @@ def test_a_file_holds_all_that_was_shown(
     assert {*MAP, "map/base", *(f"map/{e}" for e in LIVE)} <= entities(tmp_path / "made.rrd")
     found = entities(tmp_path / "found.rrd")
     assert {*MAP, "query/path", "query/hypotheses", "query/base", "query/confidence"} <= found
+    assert {"query/evidence/1/walls", "query/evidence/1/missed"} <= found
     assert {"query/live", "query/live/base", "query/live/seen/0/way"} <= found
+
+
+@pytest.mark.usefixtures("sdk")
+def test_the_viewer_opens_above_the_map_with_loops_off_and_a_fixed_axis() -> None:
+    from pc2grid_cli.rerun_layout import layout
+
+    world, curve = layout(office(), asked=True, hidden=["query/evidence/2"]).root_container.contents
+    eye = world.properties["EyeControls3D"]
+    position, target, up = (
+        values.as_arrow_array().flatten().to_pylist()
+        for values in (eye.position, eye.look_target, eye.eye_up)
+    )
+    assert position[:2] == target[:2] == [10.0, 7.0]  # the middle of the office
+    assert position[2] > 14.0 and target[2] == 0.0 and up == [0.0, 1.0, 0.0]
+    off = {"map/loops", "map/ways", "query/evidence/2"}
+    assert {entity for entity, how in world.visualizer_overrides.items() if "[False]" in str(how)} == off
+    axis = curve.properties["ScalarAxis"]
+    assert axis.range.as_arrow_array().flatten().to_pylist() == [0.0, 1.0]
 
 
 @pytest.mark.usefixtures("sdk")

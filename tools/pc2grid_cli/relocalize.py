@@ -262,7 +262,7 @@ def _find(
             known=known,
         )
         located = in_map(found.poses, found.answer)
-        if shown is not None and located is not None:
+        if shown is not None:
             shown.show(found.answer, located)
     return found, located
 

@@ -3,7 +3,9 @@
 Entities: map/walls, map/submaps, map/ways, map/path, map/loops, map/base. While a recording is converted,
 map/live holds the scans at their tracked poses, before loops are closed. While a recording is located,
 query/live holds the same at the pose of the best hypothesis, and query/confidence its confidence. At the end
-query/path, query/hypotheses and query/base follow. The timeline `time` has the time of the recording.
+query/path, query/hypotheses and query/base follow, and for each hypothesis query/evidence/1, 2, ... with the
+query's walls, coloured by what the map says about them, and the map's walls where the query saw free ground;
+of these the first is shown. The timeline `time` has the time of the recording.
 """
 
 from __future__ import annotations
@@ -17,13 +19,24 @@ import numpy as np
 from pc2grid.io.atomic import replace_file
 from pc2grid.observer import Observer
 from pc2grid_cli import console
-from pc2grid_cli.picture import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, YELLOW
+from pc2grid_cli.evidence import agreements
+from pc2grid_cli.picture import (
+    BLUE,
+    GREEN,
+    MISSED_COLOUR,
+    ORANGE,
+    PURPLE,
+    SUPPORT_COLOURS,
+    VERMILLION,
+    YELLOW,
+)
+from pc2grid_cli.rerun_layout import CONFIDENCE, GRAPH, LOOPS, layout
 from pc2grid_cli.rerun_target import VIEWER, require_rerun, url_of
 
 if TYPE_CHECKING:
     import networkx as nx
 
-    from pc2grid.arrays import F64
+    from pc2grid.arrays import F32, F64
     from pc2grid.geometry import SE2
     from pc2grid.model import Loop, OccupancyGrid, RegisteredScan, SessionMap, Trajectory
     from signature.config import Config
@@ -34,6 +47,8 @@ _MOST_POINTS = 4000
 """Points of a scan that are sent at most, so that a remote viewer can keep up; chosen by hand."""
 _KEPT_EVERY_M = 1.0
 """A scan stays visible after so much travel; chosen by hand."""
+_EVIDENCE_RADIUS_M, _ABOVE_M = 0.06, 0.1
+"""Of the points of the evidence: half of their distance; from above they cover the walls of the map."""
 _FLUSH_S = 10.0
 """How long to wait for the viewer at the end; chosen by hand."""
 
@@ -65,6 +80,7 @@ def stream_to(target: str, name: str) -> Iterator[Any]:
 def write_session(target: str, database: SubmapDatabase, session: str) -> None:
     """A session's map, submaps, path and loops."""
     with stream_to(target, session) as recording:
+        recording.send_blueprint(layout(database.grid(session)))
         _log_stored(recording, database, session)
         _log_moving(recording, "map/base", database.trajectory(session), BLUE)
 
@@ -91,6 +107,7 @@ class Conversions(Observer):
         """The finished map of a session."""
         self._begin(session.session)
         self._live.end()
+        self._recording.send_blueprint(layout(session.grid))
         centers = np.array([submap.center_m for submap in session.submaps]).reshape(-1, 2)
         _log_map(self._recording, session.grid, centers, session.graph, session.trajectory, session.loops)
         _log_moving(self._recording, "map/base", session.trajectory, BLUE)
@@ -99,6 +116,7 @@ class Conversions(Observer):
         if name != self._name:
             self._stack.close()
             self._recording = self._stack.enter_context(stream_to(self._target, name))
+            self._recording.send_blueprint(layout(None))
             self._live = _Live(self._recording, "map/live")
             self._name = name
 
@@ -128,7 +146,7 @@ class Search:
         rr = require_rerun()
         if moment is not None:
             _set_time(self._recording, moment.stamp_ns)
-            self._recording.log("query/confidence", rr.Scalars(moment.confidence))
+            self._recording.log(CONFIDENCE, rr.Scalars(moment.confidence))
             if moment.session is not None and moment.pose is not None:
                 self._show(moment.session)
                 self._live.move(moment.pose @ SE2.from_matrix(registered.T_session_base).inverse())
@@ -136,24 +154,53 @@ class Search:
         if self._placed:
             self._live.add(registered)
 
-    def show(self, answer: Answer, located: Trajectory) -> None:
-        """The answer; `located` are the poses of the query in the map."""
-        assert answer.session is not None
+    def show(self, answer: Answer, located: Trajectory | None) -> None:
+        """The answer; `located` are the poses of the query in the map, None unless it was located."""
+        if not answer.hypotheses:
+            return
         rr = require_rerun()
-        self._show(answer.session)
+        session = answer.sessions[answer.hypotheses[0].session_index]
+        self._show(session)
         self._live.end()
-        way = rr.LineStrips3D([located.T_session_base[:, :3, 3]], colors=_rgb(VERMILLION))
-        self._recording.log("query/path", way, static=True)
+        self._show_evidence(answer, session)
         poses = [hypothesis.fit.T_map_query @ answer.T_odom_base for hypothesis in answer.hypotheses]
-        here = [answer.sessions[h.session_index] == answer.session for h in answer.hypotheses]
+        here = [answer.sessions[h.session_index] == session for h in answer.hypotheses]
         places = [(pose.x, pose.y, 0.0) for pose, shown in zip(poses, here, strict=True) if shown]
         spots = rr.Points3D(places, colors=_rgb(PURPLE), radii=0.2)
         self._recording.log("query/hypotheses", spots, static=True)
-        _log_moving(self._recording, "query/base", located, VERMILLION)
+        if located is not None:
+            way = rr.LineStrips3D([located.T_session_base[:, :3, 3]], colors=_rgb(PURPLE))
+            self._recording.log("query/path", way, static=True)
+            _log_moving(self._recording, "query/base", located, PURPLE)
+
+    def _show_evidence(self, answer: Answer, session: str) -> None:
+        """Per hypothesis in this session, best first, what supports and what contradicts it."""
+        from signature.verification.agreement import Support
+
+        rr = require_rerun()
+        colours = {int(kind): _rgb(SUPPORT_COLOURS[kind.name])[0] for kind in Support}
+        entities = []
+        for number, (hypothesis, compared) in enumerate(
+            zip(answer.hypotheses, agreements(answer, self._database), strict=True), start=1
+        ):
+            if answer.sessions[hypothesis.session_index] != session:
+                continue
+            entities.append(f"query/evidence/{number}")
+            points = _lift(hypothesis.fit.T_map_query.apply(compared.points_m), _ABOVE_M)
+            said = [colours[kind] for kind in compared.support.tolist()]
+            walls = rr.Points3D(points, colors=said, radii=_EVIDENCE_RADIUS_M)
+            self._recording.log(f"{entities[-1]}/walls", walls, static=True)
+            missed = rr.Points3D(
+                _lift(compared.missed_m, _ABOVE_M), colors=_rgb(MISSED_COLOUR), radii=_EVIDENCE_RADIUS_M
+            )
+            self._recording.log(f"{entities[-1]}/missed", missed, static=True)
+        grid = self._database.grid(session)
+        self._recording.send_blueprint(layout(grid, asked=True, hidden=entities[1:]))
 
     def _show(self, session: str) -> None:
         """Show the map of one session at a time, because each has a frame of its own."""
         if session != self._shown:
+            self._recording.send_blueprint(layout(self._database.grid(session), asked=True))
             _log_stored(self._recording, self._database, session)
             self._shown = session
 
@@ -232,13 +279,14 @@ def _log_map(
     ways = [_lift(np.array([graph.nodes[n]["center_m"] for n in edge])) for edge in graph.edges]
     path = trajectory.T_session_base[:, :3, 3]
     closed = [path[[loop.older, loop.newer]] for loop in loops if loop.accepted]
+    thin = rr.Radius.ui_points(0.75)
     for entity, shown in (
         ("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
-        ("map/walls", rr.Points3D(walls, colors=_rgb("#555555"), radii=grid.resolution_m / 2)),
+        ("map/walls", rr.Points3D(walls, colors=_rgb("#AAAAAA"), radii=grid.resolution_m / 2)),
         ("map/submaps", rr.Points3D(_lift(centers_m), colors=_rgb(GREEN), radii=0.12)),
-        ("map/ways", rr.LineStrips3D(ways, colors=_rgb("#999999"))),
-        ("map/path", rr.LineStrips3D([path], colors=_rgb(BLUE))),
-        ("map/loops", rr.LineStrips3D(closed, colors=_rgb(YELLOW))),
+        (GRAPH, rr.LineStrips3D(ways, colors=_rgb("#999999"), radii=thin)),
+        ("map/path", rr.LineStrips3D([path], colors=_rgb(BLUE), radii=thin)),
+        (LOOPS, rr.LineStrips3D(closed, colors=_rgb(YELLOW), radii=thin)),
     ):
         recording.log(entity, shown, static=True)
 
@@ -261,9 +309,9 @@ def _log_moving(recording: Any, entity: str, poses: Trajectory, color: str) -> N
     )
 
 
-def _lift(points_m: F64) -> F64:
-    """Points (N, 2) as (N, 3) at z = 0."""
-    return np.column_stack((points_m, np.zeros(len(points_m))))
+def _lift(points_m: F32 | F64, z_m: float = 0.0) -> F64:
+    """Points (N, 2) as (N, 3) at one height."""
+    return np.column_stack((points_m, np.full(len(points_m), z_m)))
 
 
 def _rgb(color: str) -> list[tuple[int, ...]]:
