@@ -47,6 +47,8 @@ class ReadConfig(Section):
     max_range_m: float = Field(1000.0, gt=0, description="farther returns of any sensor are ignored")
     max_chunk_bytes: int = Field(256 << 20, gt=0, description="a chunk that expands to more is refused")
     max_record_bytes: int = Field(1 << 30, gt=0, description="a larger record of a log is refused")
+    unit_m: float = Field(1.0, gt=0, le=1e4, description="unit of a cloud or mesh; 0.001: millimetres")
+    up: Literal["x", "y", "z"] = Field("z", description="axis of a cloud or mesh that points up")
     max_points: int = Field(20_000_000, gt=0, description="a scan that claims more points is refused")
 
 

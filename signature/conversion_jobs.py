@@ -48,9 +48,9 @@ class Job:
 
     def made_from(self, digest: str) -> Provenance:
         """The provenance that the session of this job will have if its file has this digest."""
-        from pc2grid.io.nav2_map import is_map_file
+        from pc2grid.mapping.drawn_map import is_drawn_map
 
-        span = TimeSpan() if is_map_file(self.path) else self.span
+        span = TimeSpan() if is_drawn_map(self.path) else self.span
         return provenance(self.path, digest, self.config, span=span, label=self.label)
 
 

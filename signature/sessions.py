@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import platform
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pc2grid._version import __version__
-from pc2grid.model import OccupancyGrid, SessionMap, Trajectory
+from pc2grid.model import ReadReport, SessionMap, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from signature.config import Config
 from signature.database import Label, Provenance
 from signature.describe import Signature, describe
+
+if TYPE_CHECKING:
+    from pc2grid.mapping.drawn_map import DrawnMap
 
 _LIBRARIES = (
     "kiss-icp",
@@ -82,9 +85,10 @@ def build_session(
     label: Label | None = None,
     observer: Observer = Observer(),
 ) -> tuple[SessionMap, Provenance]:
-    """Turn a recording or a nav2 map into a session map, and say what it was made from.
+    """Turn a recording or a map into a session map, and say what it was made from.
 
-    span : the part of the recording to use; a nav2 map is always used as a whole.
+    path : of a recording, or of a nav2 map, point cloud or mesh of a building.
+    span : the part of the recording to use; a map is always used as a whole.
     recover : use what is whole of a damaged recording.
     observer : gets the progress, each scan with its tracked pose, and a note with the topic that was chosen.
 
@@ -95,14 +99,14 @@ def build_session(
     >>> session.sensor, len(session.trajectory), origin.source
     ('map', 0, 'map.yaml')
     """
-    from pc2grid.io.nav2_map import is_map_file, load_map
+    from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 
     path = Path(path)
     observer.on_session(name)
-    if is_map_file(path):
-        grid = load_map(path)
-        origin = provenance(path, _map_digest(path, grid), config, label=label)
-        return _map_session(grid, name, config), origin
+    if is_drawn_map(path):
+        drawn = load_drawn_map(path, config)
+        origin = provenance(path, drawn.digest, config, label=label)
+        return _map_session(drawn, name, config), origin
 
     from pc2grid.io import open_log
     from pc2grid.pipeline import build_map
@@ -127,29 +131,30 @@ def build_session(
 
 def digest_of(path: Path, config: Config) -> str:
     """The sha256 in the provenance of a session that is made from this recording or map."""
-    from pc2grid.io.nav2_map import is_map_file, load_map
+    from pc2grid.mapping.drawn_map import digest_of_map, is_drawn_map
 
-    if is_map_file(path):
-        return _map_digest(path, load_map(path))
+    if is_drawn_map(path):
+        return digest_of_map(path)
     from pc2grid.io import open_log
 
     with open_log(path, config.read) as log:
         return log.digest()
 
 
-def _map_digest(path: Path, grid: OccupancyGrid) -> str:
-    """Of the text and the cells, not of the image file: other image formats can hold the same cells."""
-    return hashlib.sha256(path.read_bytes() + grid.cells.tobytes()).hexdigest()
-
-
-def _map_session(grid: OccupancyGrid, name: str, config: Config) -> SessionMap:
+def _map_session(drawn: DrawnMap, name: str, config: Config) -> SessionMap:
     """A session of a map, in the frame of that map and without a trajectory."""
     from pc2grid.submaps.partition import divide
 
     no_poses = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
-    graph, submaps = divide(grid, config.partition)
+    graph, submaps = divide(drawn.grid, config.partition)
     return SessionMap(
-        session=name, sensor="map", grid=grid, submaps=submaps, trajectory=no_poses, graph=graph
+        session=name,
+        sensor="map",
+        grid=drawn.grid,
+        submaps=submaps,
+        trajectory=no_poses,
+        graph=graph,
+        report=ReadReport(warnings=drawn.warnings),
     )
 
 

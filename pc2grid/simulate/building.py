@@ -9,21 +9,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F64, I64
+from pc2grid.arrays import F64
+from pc2grid.config import ReadConfig
 from pc2grid.errors import MapFileError
 from pc2grid.geometry import transform_points
+from pc2grid.io.building_file import building_points, is_building_file, kind_of, load_mesh, sampled
 from pc2grid.io.nav2_map import is_map_file, load_map
-from pc2grid.mapping.cloud_map import level_cloud, map_cloud
+from pc2grid.mapping.cloud_map import drivable_plan, level_cloud, voxel_cloud
 from pc2grid.model import OccupancyGrid
 from pc2grid.simulate.scene import Mesh, quads
-
-CLOUD_SUFFIXES = (".pcd", ".ply", ".xyz", ".pts")
-MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 
 _VOXEL_M = 0.05  # smallest voxel of a cloud that rays hit
 # A voxel is at least this many median distances between neighbours wide, so that walls have few holes: if n
@@ -31,7 +29,6 @@ _VOXEL_M = 0.05  # smallest voxel of a cloud that rays hit
 _SPACINGS = 4.0
 _LATTICE = 1.01  # the points of a lattice are equally far from their neighbours, within 1 %
 _SPACING_SAMPLE = 2000  # points of which the spacing is measured
-_SAMPLES_PER_M2, _MAX_SAMPLES = 1600.0, 4_000_000  # of the surface of a mesh, for its plan: one every 2.5 cm
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +49,14 @@ class Building:
         T_map_cloud = level_cloud(points)
         # The voxels follow the axes of the cloud, in which they may have been a lattice before.
         shell = _moved(voxel_faces(points, voxel_m(points)), T_map_cloud)
-        return Building(map_cloud(transform_points(T_map_cloud, points)), shell)
+        return Building(drivable_plan(transform_points(T_map_cloud, points)), shell)
 
     @staticmethod
     def of_mesh(mesh: Mesh) -> Building:
         """Of a mesh whose z axis points up. Raises MapFileError if it shows no floor."""
-        points = _sampled(mesh)
+        points = voxel_cloud(sampled(mesh.vertices_m.astype(np.float64), mesh.triangles.astype(np.int64)))
         T_map_mesh = level_cloud(points)
-        return Building(map_cloud(transform_points(T_map_mesh, points)), _moved(mesh, T_map_mesh))
+        return Building(drivable_plan(transform_points(T_map_mesh, points)), _moved(mesh, T_map_mesh))
 
 
 def load_building(path: str | Path) -> OccupancyGrid | Building:
@@ -70,51 +67,15 @@ def load_building(path: str | Path) -> OccupancyGrid | Building:
     path = Path(path)
     if is_map_file(path):
         return load_map(path)
-    suffix = path.suffix.lower()
-    if suffix not in (*CLOUD_SUFFIXES, *MESH_SUFFIXES):
-        known = ", ".join(sorted({".yaml", *CLOUD_SUFFIXES, *MESH_SUFFIXES}))
-        raise MapFileError(f"{path}: not a building that pc2grid reads", hint=f"known are {known}")
-    if not path.is_file():
-        raise MapFileError(f"{path}: no such file")
     try:
-        mesh = _read_mesh(path) if suffix in MESH_SUFFIXES else None
-        if mesh is not None:
-            return Building.of_mesh(mesh)
-        points = _read_points(path) if suffix in CLOUD_SUFFIXES else np.empty((0, 3))
-        if not len(points):
-            raise MapFileError("it holds neither points nor triangles")
-        return Building.of_cloud(points)
+        if is_building_file(path) and kind_of(path) == "mesh":
+            vertices, triangles = load_mesh(path)
+            return Building.of_mesh(Mesh(vertices.astype(np.float32), triangles.astype(np.uint32)))
+        return Building.of_cloud(np.concatenate([np.empty((0, 3)), *building_points(path, ReadConfig())]))
     except MapFileError as error:
+        if str(path) in error.message:
+            raise
         raise MapFileError(f"{path}: {error.message}", hint=error.hint) from error
-
-
-def _read_mesh(path: Path) -> Mesh | None:
-    """The triangles of a file, None if it has none."""
-    import open3d as o3d
-
-    with _quietly():
-        found = o3d.io.read_triangle_mesh(path)
-    if not len(found.triangles):
-        return None
-    vertices_m = np.asarray(found.vertices)
-    if not np.isfinite(vertices_m).all():
-        raise MapFileError("a vertex is not a finite number")
-    return Mesh(vertices_m.astype(np.float32), np.asarray(found.triangles).astype(np.uint32))
-
-
-def _read_points(path: Path) -> F64:
-    import open3d as o3d
-
-    with _quietly():
-        cloud = o3d.io.read_point_cloud(path, remove_nan_points=True, remove_infinite_points=True)
-    return np.array(cloud.points)
-
-
-def _quietly() -> Any:
-    """Open3D prints a warning of its own for each file without triangles."""
-    import open3d as o3d
-
-    return o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
 
 
 def voxel_m(points_m: F64) -> float:
@@ -152,21 +113,3 @@ def voxel_faces(points_m: F64, edge_m: float) -> Mesh:
 
 def _moved(mesh: Mesh, T: F64) -> Mesh:
     return Mesh(transform_points(T, mesh.vertices_m).astype(np.float32), mesh.triangles)
-
-
-def _sampled(mesh: Mesh) -> F64:
-    """Points (N, 3) spread evenly over the triangles, the same in every run."""
-    corners = mesh.vertices_m.astype(np.float64)[mesh.triangles]
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area_m2 = np.linalg.norm(np.cross(a, b), axis=1) / 2
-    total_m2 = float(area_m2.sum())
-    count = int(min(total_m2 * _SAMPLES_PER_M2, _MAX_SAMPLES))
-    if count == 0:
-        raise MapFileError("its triangles have no area")
-    rng = np.random.default_rng(0)
-    chosen: I64 = rng.choice(len(area_m2), count, p=area_m2 / total_m2)
-    u, v = rng.random((2, count, 1))
-    flipped = u + v > 1
-    u, v = np.where(flipped, 1 - u, u), np.where(flipped, 1 - v, v)
-    points: F64 = corners[chosen, 0] + u * a[chosen] + v * b[chosen]
-    return points

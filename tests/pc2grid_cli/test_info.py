@@ -10,10 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from pc2grid.io import open_log
+from pc2grid.io.export.cloud import write_cloud
 from pc2grid.io.nav2_map import save_map
 from pc2grid_cli.info import describe
 from pc2grid_cli.main import app
 from signature.database.sqlite.database import store
+from tests.helpers.building_clouds import room_cloud
 from tests.helpers.databases import make_entry
 from tests.helpers.recordings import STEP, T0, drive, read, ros, write_mcap
 from tests.helpers.simulated_drives import office
@@ -116,3 +118,22 @@ def test_markup_in_a_topic_is_shown_and_not_obeyed(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", [ros().cloud("/[bold]x[/bold]", T0 + STEP, [[1, 2, 3]])])
     assert "/[bold]x[/bold]" in runner.invoke(app, ["info", str(path)]).stdout
     assert len(read(path)[0]) == 1
+
+
+def test_cloud_of_a_building(tmp_path: Path) -> None:
+    path = tmp_path / "room.ply"
+    write_cloud(path, room_cloud(1.7, 1.0))
+    result = runner.invoke(app, ["info", str(path), "--json"])
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found["format"] == "cloud"
+    assert found["floor_z_m"] == pytest.approx(1.7 + 3.0 * np.radians(1.0), abs=0.05)
+    assert found["tilt_deg"] == pytest.approx(1.0, abs=0.1)
+    assert 38 < found["free_m2"] < 48
+    text = runner.invoke(app, ["info", str(path)]).stdout
+    assert "floor at z 1.7" in text and "tilted by 1.0 degrees" in text
+    write_cloud(path, 1000.0 * room_cloud())
+    refused = runner.invoke(app, ["info", str(path)])
+    assert refused.exit_code == 1 and "too high for a building in metres" in str(refused.exception)
+    scaled = runner.invoke(app, ["info", str(path), "--set", "read.unit_m=0.001", "--json"])
+    assert scaled.exit_code == 0 and json.loads(scaled.stdout)["free_m2"] > 38

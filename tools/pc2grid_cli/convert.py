@@ -29,7 +29,10 @@ if TYPE_CHECKING:
 
 def convert_command(
     context: typer.Context,
-    inputs: Annotated[list[Path], typer.Argument(metavar="LOG|MAP.yaml...", help="recordings, or nav2 maps")],
+    inputs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG|MAP...", help="recordings, or maps: .yaml of nav2, .pcd, .ply, a mesh"),
+    ],
     output: options.WrittenDatabase,
     topic: options.Topic = None,
     odometry: options.OdometryTopic = None,

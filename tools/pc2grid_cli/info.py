@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,11 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pc2grid.errors import one_line
-from pc2grid_cli.console import print_json
-from pc2grid_cli.options import AsJson, Recover, Topic
+from pc2grid_cli.console import print_json, warn
+from pc2grid_cli.options import AsJson, Assignments, Recover, Topic, make_config
 
 if TYPE_CHECKING:
     from pc2grid.io.message_source import LogInfo
+    from pc2grid.mapping.drawn_map import DrawnMap
     from pc2grid_cli.json_schemas import Choice, Info, InfoMap
 
 _WIDEST = 1000
@@ -23,29 +25,34 @@ _WIDEST = 1000
 def info_command(
     log: Annotated[
         str,
-        typer.Argument(metavar="LOG|MAP.yaml|DATABASE", help="recording, nav2 map or database to look at"),
+        typer.Argument(
+            metavar="LOG|MAP|DATABASE", help="recording, map (.yaml, .pcd, .ply, mesh) or database"
+        ),
     ],
     topic: Topic = None,
     recover: Recover = False,
+    set_: Assignments = None,
     json: AsJson = False,
 ) -> None:
     """Say what is in a recording, and which topic convert would use and why; or in a map, or a database.
 
     Example: pc2grid info monday.mcap
     """
-    from pc2grid.io.nav2_map import is_map_file
+    from pc2grid.mapping.drawn_map import is_drawn_map
 
     if is_database(log):
         from pc2grid_cli.db_info import db_info_command
 
         db_info_command(log, json)
         return
-    if is_map_file(Path(log)):
-        of_map = describe_map(Path(log))
+    if is_drawn_map(Path(log)):
+        of_map = describe_map(Path(log), set_)
         if json:
             print_json(of_map)
         else:
             print(one_line(_map_as_text(of_map)))
+        for warning in of_map["warnings"]:
+            warn(warning)
         return
     document = describe(Path(log), topic=topic, recover=recover)
     if json:
@@ -68,26 +75,42 @@ def is_database(name: str) -> bool:
         return False
 
 
-def describe_map(path: Path) -> InfoMap:
-    """The document of a nav2 map. Raises MapFileError if it cannot be read."""
+def describe_map(path: Path, assignments: list[str] | None = None) -> InfoMap:
+    """The document of a map. Raises MapFileError if it cannot be read."""
     import numpy as np
 
-    from pc2grid.io.nav2_map import load_map
+    from pc2grid.mapping.drawn_map import load_drawn_map
 
-    grid = load_map(path)
+    drawn = load_drawn_map(path, make_config(None, assignments))
+    grid, R = drawn.grid, drawn.T_map_file[:3, :3]
     height, width = grid.cells.shape
     cell_m2 = grid.resolution_m**2
     return {
         "schema_version": 1,
         "path": str(path),
-        "format": "nav2 map",
+        "format": drawn.kind,
         "width": width,
         "height": height,
         "resolution_m": grid.resolution_m,
         "origin_m": list(grid.origin_m),
         "free_m2": round(float(np.count_nonzero(grid.free)) * cell_m2, 2),
         "occupied_m2": round(float(np.count_nonzero(grid.occupied)) * cell_m2, 2),
+        "voxels": len(drawn.level_points_m),
+        "floor_z_m": round(_floor_z_m(drawn), 3),
+        "tilt_deg": round(math.degrees(math.acos(min(1.0, float(R[2, 2])))), 2),
+        "warnings": list(drawn.warnings),
     }
+
+
+def _floor_z_m(drawn: DrawnMap) -> float:
+    """Height of the floor in the frame of the file, in the middle of the map."""
+    import numpy as np
+
+    from pc2grid.geometry import invert_pose, transform_points
+
+    height, width = drawn.grid.cells.shape
+    middle = drawn.grid.to_point(np.array([(height // 2, width // 2)]))[0]
+    return float(transform_points(invert_pose(drawn.T_map_file), np.array([[*middle, 0.0]]))[0, 2])
 
 
 def _camera_topic(log: LogInfo, images: str) -> str:
@@ -100,10 +123,13 @@ def _camera_topic(log: LogInfo, images: str) -> str:
 
 def _map_as_text(d: InfoMap) -> str:
     x, y = d["origin_m"]
+    of_cloud = ""
+    if d["voxels"]:
+        of_cloud = f", floor at z {d['floor_z_m']:.2f} m, tilted by {d['tilt_deg']:.1f} degrees"
     return (
-        f"{d['path']}: nav2 map, {d['width']} x {d['height']} cells of {d['resolution_m']:g} m"
+        f"{d['path']}: {d['format']}, {d['width']} x {d['height']} cells of {d['resolution_m']:g} m"
         f" ({d['width'] * d['resolution_m']:.1f} x {d['height'] * d['resolution_m']:.1f} m),"
-        f" {d['free_m2']:.0f} m2 free, lower left corner at x {x:.2f} m, y {y:.2f} m"
+        f" {d['free_m2']:.0f} m2 free, lower left corner at x {x:.2f} m, y {y:.2f} m{of_cloud}"
     )
 
 

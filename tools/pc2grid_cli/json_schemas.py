@@ -131,8 +131,9 @@ class Info(TypedDict):
 
 
 class InfoMap(TypedDict):
-    """`pc2grid info MAP.yaml --json`. origin_m: x, y of the lower left corner;
-    free_m2, occupied_m2: areas."""
+    """`pc2grid info MAP --json`. origin_m: x, y of the lower left corner; free_m2, occupied_m2: areas.
+    Of a cloud or mesh, voxels: points of which it was drawn, one a voxel, floor_z_m, tilt_deg: height and
+    tilt of the floor in the file; 0 for a nav2 map."""
 
     schema_version: Version
     path: str
@@ -143,6 +144,10 @@ class InfoMap(TypedDict):
     origin_m: list[float]
     free_m2: float
     occupied_m2: float
+    voxels: int
+    floor_z_m: float
+    tilt_deg: float
+    warnings: list[str]
 
 
 class Report(TypedDict):

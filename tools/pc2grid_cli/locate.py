@@ -1,4 +1,4 @@
-"""Queries as the command line knows them: a recording or a nav2 map, and the answer to it."""
+"""Queries as the command line knows them: a recording or a map, and the answer to it."""
 
 from __future__ import annotations
 
@@ -75,15 +75,16 @@ def about_log(path: Path, query: Log, answer: Answer, *, scans: int) -> Query:
 
 
 def find_map(path: Path, database: SubmapDatabase, config: Config) -> Found:
-    """Locate a nav2 map."""
+    """Locate a map: of nav2, or a cloud or mesh."""
     import numpy as np
 
-    from pc2grid.io.nav2_map import load_map
+    from pc2grid.mapping.drawn_map import load_drawn_map
     from pc2grid.model import Trajectory
     from signature.relocalization.relocalizer import MapIndex, locate_map
 
-    drawn = load_map(path)
-    answer = locate_map(drawn, MapIndex.of(database, config))
+    made_with = database.config().model_copy(update={"read": config.read})
+    drawn = load_drawn_map(path, made_with)
+    answer = locate_map(drawn.grid, MapIndex.of(database, config))
     poses = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
     about: Query = {
         "path_m": answer.path_m,
@@ -92,9 +93,9 @@ def find_map(path: Path, database: SubmapDatabase, config: Config) -> Found:
         "scans": 0,
         "sensor": "map",
         "lossy": False,
-        "warnings": [],
+        "warnings": list(drawn.warnings),
     }
-    return Found(answer=answer, poses=poses, about=about, drawn=drawn)
+    return Found(answer=answer, poses=poses, about=about, drawn=drawn.grid)
 
 
 def locate(

@@ -59,7 +59,10 @@ class _Outputs:
 
 def relocalize_command(
     context: typer.Context,
-    log: Annotated[Path, typer.Argument(metavar="LOG|MAP.yaml", help="the recording or nav2 map to locate")],
+    log: Annotated[
+        Path,
+        typer.Argument(metavar="LOG|MAP", help="the recording or map to locate: .yaml, .pcd, .ply, a mesh"),
+    ],
     database: Annotated[
         str, typer.Option("--database", "-d", metavar=options.DATABASE, help="where to look")
     ],
@@ -218,11 +221,11 @@ def _check_not_swapped(log: Path, database: str) -> None:
 def _check_options_for_maps(log: Path, outputs: _Outputs, rerun: str | None) -> None:
     """Raises ConfigError for options that need a robot, if the query is a map."""
     from pc2grid.errors import ConfigError
-    from pc2grid.io.nav2_map import is_map_file
+    from pc2grid.mapping.drawn_map import is_drawn_map
 
     asked = {"--trajectory": outputs.trajectory, "--initialpose": outputs.initialpose, "--rerun": rerun}
     for option, value in asked.items():
-        if value is not None and is_map_file(log):
+        if value is not None and is_drawn_map(log):
             raise ConfigError(
                 f"{option}: there is no robot in a map", hint="--json and --output have its pose"
             )
@@ -240,9 +243,9 @@ def _find(
     known: KnownPose,
 ) -> tuple[Found, Trajectory | None]:
     """The answer, and the query's poses in the map; both are streamed to `rerun` meanwhile."""
-    from pc2grid.io.nav2_map import is_map_file
+    from pc2grid.mapping.drawn_map import is_drawn_map
 
-    if is_map_file(log):
+    if is_drawn_map(log):
         found = find_map(log, database, settings)
         return found, in_map(found.poses, found.answer)
     with contextlib.ExitStack() as stack:

@@ -24,7 +24,7 @@ import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.errors import PointCloudError, UnsupportedSchema
-from pc2grid.io.messages.types import Header, PointCloud2
+from pc2grid.io.messages.types import Bytes, Header, PointCloud2
 
 Fields = tuple[tuple[str, int, int, int], ...]  # name, offset, datatype, count
 
@@ -42,7 +42,7 @@ _PLY_TYPES = {
 }  # fmt: skip
 
 
-def parser(suffix: str) -> Callable[[bytes, Header], PointCloud2]:
+def parser(suffix: str) -> Callable[[Bytes, Header], PointCloud2]:
     """The function for files of a suffix: `pcd`, `ply` or `bin`.
 
     It raises PointCloudError for a file that contradicts itself, UnsupportedSchema for a kind we do not read.
@@ -50,7 +50,7 @@ def parser(suffix: str) -> Callable[[bytes, Header], PointCloud2]:
     return {"pcd": _pcd, "ply": _ply, "bin": _kitti}[suffix]
 
 
-def _kitti(data: bytes, header: Header) -> PointCloud2:
+def _kitti(data: Bytes, header: Header) -> PointCloud2:
     """float32 x y z and reflectance, without any header."""
     if len(data) % 16:
         raise PointCloudError(f"{len(data)} bytes are not whole points of 16 bytes")
@@ -58,12 +58,12 @@ def _kitti(data: bytes, header: Header) -> PointCloud2:
     return _cloud(header, fields, 16, len(data) // 16, data)
 
 
-def _pcd(data: bytes, header: Header) -> PointCloud2:
+def _pcd(data: Bytes, header: Header) -> PointCloud2:
     match = re.search(rb"^DATA +(\w+)[ \r]*\n", data[:_MAX_HEADER_BYTES], re.MULTILINE)
     if match is None:
         raise PointCloudError("a PCD without a DATA line")
     kind, body = match.group(1).decode(), memoryview(data)[match.end() :]
-    lines = [line.split() for line in data[: match.start()].decode("ascii", "replace").splitlines()]
+    lines = [line.split() for line in bytes(data[: match.start()]).decode("ascii", "replace").splitlines()]
     keys = {line[0]: line[1:] for line in lines if line and not line[0].startswith("#")}
     try:
         names = keys["FIELDS"]
@@ -110,14 +110,14 @@ def _transposed(data: bytes, fields: Fields, points: int) -> bytes:
     return np.concatenate(parts, axis=1).tobytes() if parts else b""
 
 
-def _ply(data: bytes, header: Header) -> PointCloud2:
+def _ply(data: Bytes, header: Header) -> PointCloud2:
     end = re.search(rb"^end_header[ \r]*\n", data[:_MAX_HEADER_BYTES], re.MULTILINE)
-    if not data.startswith(b"ply") or end is None:
+    if bytes(data[:3]) != b"ply" or end is None:
         raise PointCloudError("a PLY without a header")
     kind = ""
     elements: list[tuple[str, int, list[tuple[str, int, int]]]] = []
     try:
-        for line in data[: end.start()].decode("ascii", "replace").splitlines():
+        for line in bytes(data[: end.start()]).decode("ascii", "replace").splitlines():
             words = line.split()
             if words[:1] == ["format"]:
                 kind = words[1]

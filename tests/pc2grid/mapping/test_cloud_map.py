@@ -10,17 +10,23 @@ import pytest
 
 from pc2grid.errors import MapFileError
 from pc2grid.geometry import transform_points
-from pc2grid.mapping.cloud_map import CLOUD_MAP, CloudMapParameters, level_cloud, map_cloud
+from pc2grid.mapping.cloud_map import (
+    CLOUD_MAP,
+    CloudMapParameters,
+    drivable_plan,
+    level_cloud,
+    map_cloud,
+    voxel_cloud,
+)
 from pc2grid.model import OccupancyGrid
-from tests.helpers.building_clouds import room_cloud
+from tests.helpers.building_clouds import ROOM_M, box_surface, room_cloud
 
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
 FLOOR = DATA / "lidar" / "fr079_floor.ply"
 
 
 def cell_at(grid: OccupancyGrid, x_m: float, y_m: float) -> int:
-    row, column = grid.to_cell(np.array([[x_m, y_m]]))[0]
-    return int(grid.cells[row, column])
+    return int(grid.crop((x_m, y_m), 0.0).cells[0, 0])  # unknown past the edge
 
 
 @pytest.mark.parametrize(("height_m", "tilt_deg"), [(0.0, 0.0), (-1.3, 0.0), (4.0, 2.0)])
@@ -33,8 +39,8 @@ def test_floor_is_levelled(height_m: float, tilt_deg: float) -> None:
     assert level[:, 2].max() == pytest.approx(2.5, abs=0.05)
 
 
-def test_floor_is_free_and_what_stands_on_it_is_occupied() -> None:
-    grid = map_cloud(room_cloud())
+def test_plan_is_free_where_floor_is_seen_and_nothing_stands() -> None:
+    grid = drivable_plan(room_cloud())
     assert cell_at(grid, 3.0, 2.0) == 0
     assert cell_at(grid, 5.25, 3.0) == 100  # the pillar
     assert cell_at(grid, 4.0, 0.02) == 100  # a wall
@@ -42,28 +48,100 @@ def test_floor_is_free_and_what_stands_on_it_is_occupied() -> None:
     # Nothing above the floor blocks a lower robot; here the table is one voxel thick.
     assert cell_at(grid, 1.5, 4.4) == 0
     one_is_enough = CloudMapParameters(obstacle_voxels=1)
-    assert cell_at(map_cloud(room_cloud(), one_is_enough), 1.5, 4.4) == 100
+    assert cell_at(drivable_plan(room_cloud(), one_is_enough), 1.5, 4.4) == 100
 
 
-def test_denser_cloud_gives_the_same_grid() -> None:
+def test_map_is_drawn_like_the_scans_of_a_session() -> None:
+    grid = map_cloud(room_cloud())
+    assert cell_at(grid, 3.0, 2.0) < 20
+    assert cell_at(grid, 5.02, 3.2) > 65  # the near side of the pillar
+    assert cell_at(grid, 4.0, 0.02) > 65
+    assert cell_at(grid, -0.3, 3.0) == -1
+    # The whole room but pillar and table, and nothing else.
+    assert 40.0 < grid.free.sum() * grid.resolution_m**2 < 48.0
+
+
+def test_floor_hidden_by_furniture_is_free_up_to_the_wall_and_a_hole_in_it_is_closed() -> None:
+    cloud = room_cloud()
+    hidden = (cloud[:, 2] < 0.1) & (cloud[:, 0] > 0.1) & (cloud[:, 0] < 0.4) & (cloud[:, 1] > 1.0)
+    hole = (cloud[:, 0] > 7.9) & (np.abs(cloud[:, 1] - 2.0) < 0.06)
+    next_room = box_surface((9, 0, 0), (9, 6, 2.5))
+    floor_there = box_surface((8.1, 0, 0), (9, 6, 0))
+    cloud = np.concatenate((cloud[~hidden & ~hole], next_room, floor_there))
+    grid = map_cloud(cloud)
+    assert cell_at(grid, 0.25, 3.0) < 20
+    assert cell_at(drivable_plan(cloud), 0.25, 3.0) == -1
+    assert cell_at(grid, 8.5, 2.0) < 20  # seen from its own floor
+    one_room = CloudMapParameters(floor_m=0.02, spacing_m=20.0, tile_m=40.0)
+    assert cell_at(map_cloud(cloud, parameters=one_room), 8.5, 2.0) == -1
+
+
+def test_ground_far_from_seen_floor_stays_unknown() -> None:
+    cloud = room_cloud()
+    wide = (cloud[:, 2] < 0.1) & (cloud[:, 0] < 3.0)
+    assert cell_at(map_cloud(cloud[~wide]), 1.5, 2.0) == -1
+
+
+def test_tiles_do_not_show() -> None:
+    small = CloudMapParameters(tile_m=8.0)
+    one = map_cloud(room_cloud(), parameters=CloudMapParameters(tile_m=16.0))
+    several = map_cloud(room_cloud() - (4.0, 3.0, 0.0), parameters=small)
+    assert several.free.sum() == pytest.approx(one.free.sum(), rel=0.02)
+
+
+def test_single_scan_is_drawn_from_its_origin() -> None:
+    """Sixteen rings around a sensor 1 m above the floor: on the floor there is no room for a viewpoint."""
+    bearing, elevation = np.meshgrid(np.linspace(-np.pi, np.pi, 1800), np.radians(np.arange(-15, 16, 2)))
+    ray = np.stack(
+        (np.cos(bearing) * np.cos(elevation), np.sin(bearing) * np.cos(elevation), np.sin(elevation)), -1
+    ).reshape(-1, 3)
+    origin = np.array([3.0, 2.0, 1.0])
+    far = np.where(ray > 0, np.array(ROOM_M) - origin, -origin) / np.where(ray == 0, 1e-9, ray)
+    scan = origin + far.min(axis=1)[:, None] * ray
+    with pytest.raises(MapFileError, match="seen nowhere"):
+        map_cloud(scan)
+    grid = map_cloud(scan, origin_m=origin)
+    assert cell_at(grid, 5.0, 4.0) < 20
+    assert max(cell_at(grid, x_m, 2.0) for x_m in (7.98, 8.02)) > 65
+
+
+def test_denser_cloud_gives_the_same_plan() -> None:
     cloud = room_cloud() + 0.02  # away from the edges of cells
     rng = np.random.default_rng(0)
     dense = np.concatenate((cloud, cloud + rng.uniform(-0.01, 0.01, cloud.shape)))
-    assert np.array_equal(map_cloud(cloud).cells, map_cloud(dense).cells)
+    assert np.array_equal(drivable_plan(cloud).cells, drivable_plan(dense).cells)
+
+
+def test_cloud_is_turned_about_its_middle() -> None:
+    """Coordinates of a country are millions of metres: a tilt about their origin would move the building."""
+    country = np.array([4e6, 5e6, 300.0])
+    near, far = (
+        transform_points(level_cloud(c), c) for c in (room_cloud(1.0, 2.0), room_cloud(1.0, 2.0) + country)
+    )
+    assert np.abs(far - near - (4e6, 5e6, 0.0)).max() < 0.01
+
+
+@pytest.mark.parametrize(("scale", "words"), [(1000.0, "too high"), (0.001, "too small")])
+def test_cloud_that_is_not_in_metres_is_refused(scale: float, words: str) -> None:
+    with pytest.raises(MapFileError, match=words):
+        voxel_cloud([room_cloud() * scale])
+    with pytest.raises(MapFileError, match="in metres"):
+        level_cloud(room_cloud() * scale)
+
+
+def test_stray_points_do_not_take_all_memory() -> None:
+    far = np.append(room_cloud(), [[40_000.0, 40_000.0, 0.0]], axis=0)
+    with pytest.raises(MapFileError, match="stray"):
+        drivable_plan(far)
+    assert map_cloud(far).cells.size < 100_000
 
 
 def test_cloud_without_floor_is_refused() -> None:
     rng = np.random.default_rng(1)
     with pytest.raises(MapFileError, match="no floor"):
         level_cloud(rng.uniform(-5, 5, (5000, 3)))
-    with pytest.raises(MapFileError, match="no floor"):
+    with pytest.raises(MapFileError, match="neither points"):
         level_cloud(np.empty((0, 3)))
-
-
-def test_stray_point_does_not_take_all_memory() -> None:
-    far = np.append(room_cloud(), [[90_000.0, 90_000.0, 0.0]], axis=0)
-    with pytest.raises(MapFileError, match="stray"):
-        map_cloud(far)
 
 
 @pytest.mark.skipif(not FLOOR.is_file(), reason="no real cloud: set PC2GRID_DATA")
@@ -72,6 +150,6 @@ def test_real_floor() -> None:
 
     points = np.asarray(o3d.io.read_point_cloud(str(FLOOR)).points)
     level = transform_points(level_cloud(points), points)
-    grid = map_cloud(level)
+    grid = drivable_plan(level)
     # The corridor of 39 x 3 m and what can be seen of the rooms.
     assert 115 < grid.free.sum() * CLOUD_MAP.resolution_m**2 < 140

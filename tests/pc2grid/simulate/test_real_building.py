@@ -95,12 +95,12 @@ def test_same_seed_drives_the_same_way() -> None:
 
 def test_files_that_are_no_building(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(MapFileError, match="known are"):
+    with pytest.raises(MapFileError, match="not a building that pc2grid reads"):
         load_building(tmp_path / "notes.txt")
     with pytest.raises(MapFileError, match="no such file"):
         load_building(tmp_path / "gone.ply")
     (tmp_path / "empty.ply").write_bytes(b"ply\nnonsense")
-    with pytest.raises(MapFileError, match="neither points nor triangles"):
+    with pytest.raises(MapFileError, match="a PLY without a header"):
         load_building(tmp_path / "empty.ply")
     (tmp_path / "empty.obj").write_text("v 0 0 0\n")
     with pytest.raises(MapFileError, match="neither points nor triangles"):

@@ -1,0 +1,206 @@
+"""A building in a file: one point cloud, or a mesh, read as points block by block.
+
+Clouds in PCD and PLY are read by our own reader (`messages.cloud_files`), a block at a time from the mapped
+file, so that a map of many gigabytes needs the memory of a block. Clouds as text and meshes are read by
+Open3D; a mesh is sampled evenly.
+
+The folder of results that KISS-SLAM writes is read, too: `local_maps/plys` in it holds its local maps, all in
+one frame.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from pc2grid.arrays import F64, I64
+from pc2grid.config import ReadConfig
+from pc2grid.errors import LogError, MapFileError
+
+CLOUD_SUFFIXES = (".pcd", ".ply", ".xyz", ".pts")
+MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
+
+_BLOCK_POINTS = 1_000_000  # 24 MB
+_SAMPLES_PER_M2 = 1600.0  # of the surface of a mesh: one every 2.5 cm
+_HEADER_BYTES = 1 << 16
+_DIGEST_BYTES = 1 << 20
+_LOCAL_MAPS = Path("local_maps", "plys")
+# Rotations of the axis that points up to z; the two others keep their order.
+_UP: dict[str, F64] = {
+    "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "z": np.eye(3),
+}
+
+Kind = Literal["cloud", "mesh"]
+
+
+def is_building_file(path: Path) -> bool:
+    """Whether an input is a cloud, a mesh or a folder of KISS-SLAM, rather than a recording."""
+    if path.is_dir():
+        return (path / _LOCAL_MAPS).is_dir()
+    return path.suffix.lower() in (*CLOUD_SUFFIXES, *MESH_SUFFIXES)
+
+
+def kind_of(path: Path) -> Kind:
+    """Whether a file holds points or triangles; a .ply with faces holds triangles.
+
+    Raises MapFileError if there is no such file.
+    """
+    _files(path)
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES or path.is_dir():
+        return "cloud"
+    return "mesh" if suffix not in CLOUD_SUFFIXES or _has_faces(path) else "cloud"
+
+
+def building_points(path: Path, config: ReadConfig) -> Iterator[F64]:
+    """The points (N, 3) of a building, metres, z up, in blocks; those of a mesh are spread evenly over it.
+
+    `config.unit_m` and `config.up` say how the file's numbers are meant.
+
+    Raises MapFileError if there is no such file, or it cannot be read or is damaged.
+
+    >>> from pc2grid.io.export.cloud import write_cloud
+    >>> write_cloud("corner.ply", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    >>> sum(len(block) for block in building_points(Path("corner.ply"), ReadConfig()))
+    2
+    """
+    turn = _UP[config.up] * config.unit_m
+    for file in _files(path):
+        try:
+            blocks = sampled(*load_mesh(file)) if kind_of(file) == "mesh" else _cloud_blocks(file)
+            for block in blocks:
+                yield block if config.up == "z" and config.unit_m == 1.0 else block @ turn.T
+        except LogError as error:  # of the reader of clouds, which also reads recordings
+            raise MapFileError(f"{file}: {error.message}", hint=error.hint) from error
+
+
+def digest_of_building(path: Path) -> str:
+    """sha256 of the content, in hexadecimal digits. Raises MapFileError if it cannot be read."""
+    digest = hashlib.sha256()
+    for file in _files(path):
+        with _opened(file) as content:
+            while block := content.read(_DIGEST_BYTES):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def load_mesh(path: Path) -> tuple[F64, I64]:
+    """Vertices (V, 3) and triangles (T, 3), rows of the vertices, as they stand in a file.
+
+    Raises MapFileError if it holds no triangles or a vertex is not finite.
+    """
+    import open3d as o3d
+
+    with _quietly():
+        found = o3d.io.read_triangle_mesh(path)
+    triangles = np.array(found.triangles, np.int64)
+    if not len(triangles):
+        raise MapFileError(f"{path}: it holds neither points nor triangles")
+    vertices = np.array(found.vertices, np.float64)
+    if not np.isfinite(vertices).all():
+        raise MapFileError(f"{path}: a vertex is not a finite number")
+    return vertices, triangles
+
+
+def _files(path: Path) -> list[Path]:
+    """The files of a building. Raises MapFileError if there are none."""
+    if path.is_dir():
+        found = sorted((path / _LOCAL_MAPS).glob("*.ply"))
+        if not found:
+            raise MapFileError(f"{path / _LOCAL_MAPS}: holds no .ply")
+        return found
+    known = {*CLOUD_SUFFIXES, *MESH_SUFFIXES}
+    if path.suffix.lower() not in known:
+        raise MapFileError(
+            f"{path}: not a building that pc2grid reads",
+            hint=f"known are {', '.join(sorted({'.yaml', *known}))}",
+        )
+    if not path.is_file():
+        raise MapFileError(f"{path}: no such file", hint="check the path")
+    return [path]
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    try:
+        with path.open("rb") as content:
+            yield content
+    except OSError as error:
+        raise MapFileError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _has_faces(path: Path) -> bool:
+    """Whether the header of a .ply announces faces."""
+    with _opened(path) as content:
+        head: bytes = content.read(_HEADER_BYTES).partition(b"end_header")[0]
+    counts = [line.split()[2:3] for line in head.splitlines() if line.startswith(b"element face")]
+    return any(count != [b"0"] for count in counts)
+
+
+def _cloud_blocks(path: Path) -> Iterator[F64]:
+    """The points of a cloud file, in blocks. Raises PointCloudError if it contradicts itself."""
+    if path.suffix.lower() not in (".pcd", ".ply"):
+        yield from _text_blocks(path)
+        return
+    from pc2grid.io.messages.cloud_files import parser
+    from pc2grid.io.messages.types import Header
+    from pc2grid.io.sensors.pointcloud2 import decode
+
+    if not path.stat().st_size:
+        raise MapFileError(f"{path}: empty file")
+    # The file stays mapped as long as there are views of it.
+    mapped = np.memmap(path, np.uint8, mode="r").data
+    cloud = parser(path.suffix.lower()[1:])(mapped, Header(0, ""))
+    step, data = cloud.point_step, memoryview(cloud.data)
+    if len(data) < cloud.width * step:
+        raise MapFileError(
+            f"{path}: ends in the middle: {len(data)} bytes where {cloud.width * step} are declared",
+            hint="copy it again",
+        )
+    for first in range(0, cloud.width, _BLOCK_POINTS):
+        count = min(_BLOCK_POINTS, cloud.width - first)
+        part = data[first * step : (first + count) * step]
+        block = replace(cloud, width=count, row_step=count * step, data=part)
+        yield decode(block, unit="none").xyz_m.astype(np.float64)
+
+
+def _text_blocks(path: Path) -> Iterator[F64]:
+    import open3d as o3d
+
+    with _quietly():
+        cloud = o3d.io.read_point_cloud(path, remove_nan_points=True, remove_infinite_points=True)
+    points: F64 = np.array(cloud.points)
+    for first in range(0, len(points), _BLOCK_POINTS):
+        yield points[first : first + _BLOCK_POINTS]
+
+
+def sampled(vertices: F64, triangles: I64) -> Iterator[F64]:
+    """Blocks of points (N, 3) spread evenly over triangles (T, 3) of vertices (V, 3); never random."""
+    a, b, c = vertices[triangles].transpose(1, 0, 2)
+    area_m2 = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    # Each triangle gets its share of the points, rounded so that the sum stays right.
+    ends = np.floor(np.cumsum(area_m2) * _SAMPLES_PER_M2).astype(np.int64)
+    rng = np.random.default_rng(0)
+    for first in range(0, int(ends[-1]), _BLOCK_POINTS):
+        count = min(_BLOCK_POINTS, int(ends[-1]) - first)
+        chosen = np.searchsorted(ends, np.arange(first, first + count), side="right")
+        u, v = rng.random((2, count, 1))
+        flipped = u + v > 1
+        u, v = np.where(flipped, 1 - u, u), np.where(flipped, 1 - v, v)
+        points: F64 = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
+        yield points
+
+
+def _quietly() -> Any:
+    """Open3D prints a warning of its own for each file without triangles."""
+    import open3d as o3d
+
+    return o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)

@@ -1,0 +1,114 @@
+"""Maps that are no recordings: a nav2 map, a point cloud or a mesh of a building, as an occupancy grid."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from pc2grid.arrays import F64, freeze
+from pc2grid.config import Config
+from pc2grid.errors import MapFileError
+from pc2grid.geometry import transform_points
+from pc2grid.io.building_file import building_points, digest_of_building, is_building_file, kind_of
+from pc2grid.io.nav2_map import is_map_file, load_map
+from pc2grid.mapping.cloud_map import level_cloud, map_cloud, voxel_cloud
+from pc2grid.model import OccupancyGrid
+
+_SPARSE_M = 0.12
+"""Median distance of neighbouring points above which walls have gaps in a grid of 5 cm; chosen by hand."""
+_SPACING_SAMPLE = 2000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DrawnMap:
+    """A map that was read from a file.
+
+    grid : in the map frame. kind : "nav2 map", "cloud" or "mesh".
+    T_map_file : (4, 4), the frame of the file in the map frame, whose floor is level and at z = 0. Of a nav2
+        map the two are the same.
+    level_points_m : (V, 3) in the map frame, one a voxel of the size of a cell; empty for a nav2 map.
+    digest : sha256 of what was read. warnings : sentences for the user.
+    """
+
+    grid: OccupancyGrid
+    kind: str
+    T_map_file: F64
+    level_points_m: F64
+    digest: str
+    warnings: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_map_file", np.float64, (4, 4))
+        freeze(self, "level_points_m", np.float64, (None, 3))
+
+
+def is_drawn_map(path: Path) -> bool:
+    """Whether an input is a map rather than a recording."""
+    return is_map_file(path) or is_building_file(path)
+
+
+def load_drawn_map(path: str | Path, config: Config = Config()) -> DrawnMap:
+    """Read a map. `config.read` says how the numbers of a cloud are meant, `projection` how it is drawn.
+
+    Raises MapFileError if it cannot be read, shows no floor or is not in metres; LimitExceeded if it is too
+    large.
+
+    >>> drawn = load_drawn_map("map.yaml")
+    >>> drawn.kind, drawn.grid.resolution_m
+    ('nav2 map', 0.05)
+    """
+    path = Path(path)
+    if is_map_file(path):
+        grid = load_map(path)
+        return DrawnMap(
+            grid=grid,
+            kind="nav2 map",
+            T_map_file=np.eye(4),
+            level_points_m=np.empty((0, 3)),
+            digest=_digest_of_nav2_map(path, grid),
+        )
+    kind = kind_of(path)
+    try:
+        points = voxel_cloud(building_points(path, config.read), config.projection)
+        T_map_file = level_cloud(points)
+        level = transform_points(T_map_file, points)
+        grid = map_cloud(level, config.projection, origin_m=T_map_file[:3, 3])
+    except MapFileError as error:
+        if str(path) in error.message:
+            raise
+        raise MapFileError(f"{path}: {error.message}", hint=error.hint) from error
+    return DrawnMap(
+        grid=grid,
+        kind=kind,
+        T_map_file=T_map_file,
+        level_points_m=level,
+        digest=digest_of_building(path),
+        warnings=_sparse(path, points),
+    )
+
+
+def digest_of_map(path: Path) -> str:
+    """The sha256 of `DrawnMap.digest`, without drawing the map."""
+    return _digest_of_nav2_map(path, load_map(path)) if is_map_file(path) else digest_of_building(path)
+
+
+def _digest_of_nav2_map(path: Path, grid: OccupancyGrid) -> str:
+    """Of the text and the cells, not of the image file: other image formats can hold the same cells."""
+    return hashlib.sha256(path.read_bytes() + grid.cells.tobytes()).hexdigest()
+
+
+def _sparse(path: Path, points: F64) -> tuple[str, ...]:
+    """A warning if the points (V, 3) are too far from each other to draw walls without gaps."""
+    from scipy.spatial import cKDTree
+
+    sample = points[:: max(len(points) // _SPACING_SAMPLE, 1)]
+    spacing_m = float(np.median(cKDTree(points).query(sample, k=2)[0][:, 1]))
+    if spacing_m <= _SPARSE_M:
+        return ()
+    return (
+        f"{path.name}: its points are {spacing_m:.2f} m apart, so walls have gaps; less than {_SPARSE_M:g} m"
+        " is needed",
+    )

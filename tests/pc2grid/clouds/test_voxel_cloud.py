@@ -1,0 +1,61 @@
+"""Points collected block by block, one a voxel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pc2grid.clouds import voxel_cloud
+from pc2grid.clouds.voxel_cloud import VoxelCloud
+from pc2grid.errors import LimitExceeded
+
+
+def test_blocks_give_what_open3d_gives_for_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    import open3d as o3d
+
+    monkeypatch.setattr(voxel_cloud, "_MERGED_POINTS", 100)
+    points = np.random.default_rng(0).uniform(-1, 1, (5000, 3))
+    cloud = VoxelCloud(0.25)
+    for block in np.array_split(points, 17):
+        cloud.add(block)
+    corner = points[0] - 0.125  # of our first voxel; Open3D puts one at the lowest point less half an edge
+    reference = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    low = corner + 0.25 * np.floor((points.min(axis=0) - corner) / 0.25) - 0.25
+    found, *_ = reference.voxel_down_sample_and_trace(0.25, low, low + 3.0)
+    expected = np.asarray(found.points)
+    ours = cloud.points_m()
+    assert len(cloud) == len(ours) == len(expected)
+    assert np.abs(ours[np.lexsort(ours.T)] - expected[np.lexsort(expected.T)]).max() < 1e-6
+
+
+def test_lattice_keeps_its_points() -> None:
+    lattice = np.mgrid[0:2:0.05, 0:2:0.05, 0:0.1:0.05].reshape(3, -1).T
+    cloud = VoxelCloud(0.05)
+    cloud.add(lattice)
+    assert len(cloud) == len(lattice)
+    assert np.abs(cloud.points_m() - lattice).max() < 1e-6
+
+
+def test_points_far_from_zero_keep_their_place() -> None:
+    far = np.array([[5e6, 4e6, 100.0], [5e6 + 0.01, 4e6, 100.0], [5e6 - 3.0, 4e6, 100.0]])
+    cloud = VoxelCloud(0.05)
+    cloud.add(far)
+    assert cloud.points_m() == pytest.approx(np.array([far[2], far[:2].mean(axis=0)]), abs=1e-6)
+
+
+def test_voxels_of_few_points_can_be_left_out() -> None:
+    cloud = VoxelCloud(0.1)
+    cloud.add(np.array([[0.0, 0, 0], [0.01, 0, 0], [1.0, 0, 0]]))
+    assert len(cloud.points_m(least=2)) == 1
+    assert VoxelCloud(0.1).points_m().shape == (0, 3)
+
+
+def test_what_cannot_be_a_building_is_refused() -> None:
+    cloud = VoxelCloud(0.05)
+    cloud.add(np.zeros((1, 3)))
+    with pytest.raises(LimitExceeded, match="km apart"):
+        cloud.add(np.full((1, 3), 1e5))
+    small = VoxelCloud(0.05, max_voxels=10)
+    small.add(np.arange(60.0).reshape(-1, 3))
+    with pytest.raises(LimitExceeded, match="more than 10 voxels"):
+        len(small)
