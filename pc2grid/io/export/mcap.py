@@ -1,13 +1,8 @@
-"""Recordings and results as standard ROS 2 MCAP (profile `ros2`, `cdr`, `ros2msg`): Foxglove opens them.
-
-Messages are serialised, and their definitions written, by the type store of `rosbags` for ROS 2 Humble. Large
-arrays are handed to it as numpy arrays, which it copies as a whole.
-"""
+"""Recordings and results as standard ROS 2 MCAP (profile `ros2`, `cdr`, `ros2msg`): Foxglove opens them."""
 
 from __future__ import annotations
 
 import contextlib
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from pc2grid._version import __version__
 from pc2grid.arrays import F32, F64
-from pc2grid.geometry import SE2, quat_xyzw_from_pose
+from pc2grid.geometry import SE2
 from pc2grid.io.atomic import refuse_existing, replace_file
+from pc2grid.io.export import ros_messages as ros
 from pc2grid.model import OccupancyGrid, Trajectory
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
-    from rosbags.typesys.store import Typestore
 
 _FLOAT32 = 7  # sensor_msgs/PointField
 _FARTHEST_DEPTH_M = 65.0  # an image of 16UC1 ends at 65.535 m
@@ -107,11 +102,12 @@ class LogWriter:
         if offsets_s is not None:
             columns = np.column_stack((columns, np.asarray(offsets_s, dtype=np.float32)))
         fields = [
-            _new("sensor_msgs/PointField", name, 4 * index, _FLOAT32, 1) for index, name in enumerate(names)
+            ros.new("sensor_msgs/PointField", name, 4 * index, _FLOAT32, 1)
+            for index, name in enumerate(names)
         ]
         count, step = len(columns), 4 * len(names)
         cloud = (1, count, fields, False, step, step * count, _bytes_of(columns, "<f4"), True)
-        self._add(topic, stamp_ns, _new("sensor_msgs/PointCloud2", _header(stamp_ns, frame), *cloud))
+        self._add(topic, stamp_ns, ros.new("sensor_msgs/PointCloud2", ros.header(stamp_ns, frame), *cloud))
 
     def laser_scan(
         self,
@@ -132,7 +128,7 @@ class LogWriter:
         times = (time_increment, time_increment * len(values))
         intensities = np.empty(0, np.float32)
         scan = (*angles, *times, range_min, range_max, values, intensities)
-        self._add(topic, stamp_ns, _new("sensor_msgs/LaserScan", _header(stamp_ns, frame), *scan))
+        self._add(topic, stamp_ns, ros.new("sensor_msgs/LaserScan", ros.header(stamp_ns, frame), *scan))
 
     def depth_image(self, topic: str, stamp_ns: int, frame: str, depth_m: ArrayLike) -> None:
         """sensor_msgs/Image of encoding 16UC1: millimetres, 0 without a return or beyond 65 m."""
@@ -142,16 +138,16 @@ class LogWriter:
         millimetres[good] = np.rint(depth[good] * 1000.0).astype(np.uint16)
         height, width = depth.shape
         image = (height, width, "16UC1", 0, 2 * width, _bytes_of(millimetres, "<u2"))
-        self._add(topic, stamp_ns, _new("sensor_msgs/Image", _header(stamp_ns, frame), *image))
+        self._add(topic, stamp_ns, ros.new("sensor_msgs/Image", ros.header(stamp_ns, frame), *image))
 
     def camera_info(self, topic: str, stamp_ns: int, frame: str, K: ArrayLike, W: int, H: int) -> None:
         """sensor_msgs/CameraInfo of an undistorted camera with intrinsics K (3, 3) and W x H pixels."""
         k = np.asarray(K, dtype=np.float64).reshape(3, 3)
         distortion, rectification = np.zeros(5), np.eye(3).reshape(-1)
         projection = np.column_stack((k, np.zeros(3))).reshape(-1)
-        whole_image = _new("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
+        whole_image = ros.new("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
         camera = (H, W, "plumb_bob", distortion, k.reshape(-1), rectification, projection, 0, 0, whole_image)
-        self._add(topic, stamp_ns, _new("sensor_msgs/CameraInfo", _header(stamp_ns, frame), *camera))
+        self._add(topic, stamp_ns, ros.new("sensor_msgs/CameraInfo", ros.header(stamp_ns, frame), *camera))
 
     # --- poses ----------------------------------------------------------------------------------------
 
@@ -160,11 +156,13 @@ class LogWriter:
     ) -> None:
         """nav_msgs/Odometry with a pose (4, 4); covariance and twist zero (unknown)."""
         unknown = np.zeros(36)
-        pose = _new("geometry_msgs/PoseWithCovariance", _pose(T_odom_base), unknown)
-        zero = _vector(0.0, 0.0, 0.0)
-        twist = _new("geometry_msgs/TwistWithCovariance", _new("geometry_msgs/Twist", zero, zero), unknown)
-        header = _header(stamp_ns, frame)
-        self._add(topic, stamp_ns, _new("nav_msgs/Odometry", header, child, pose, twist))
+        pose = ros.new("geometry_msgs/PoseWithCovariance", ros.pose(T_odom_base), unknown)
+        zero = ros.vector(0.0, 0.0, 0.0)
+        twist = ros.new(
+            "geometry_msgs/TwistWithCovariance", ros.new("geometry_msgs/Twist", zero, zero), unknown
+        )
+        header = ros.header(stamp_ns, frame)
+        self._add(topic, stamp_ns, ros.new("nav_msgs/Odometry", header, child, pose, twist))
 
     def tf(self, stamp_ns: int, parent: str, child: str, T_parent_child: F64) -> None:
         """One transform (4, 4) on /tf."""
@@ -185,46 +183,36 @@ class LogWriter:
             return
         at_ns = int(trajectory.stamps_ns[0]) if stamp_ns is None else stamp_ns
         poses = [
-            _new("geometry_msgs/PoseStamped", _header(int(pose_ns), frame), _pose(T))
+            ros.new("geometry_msgs/PoseStamped", ros.header(int(pose_ns), frame), ros.pose(T))
             for pose_ns, T in zip(trajectory.stamps_ns, trajectory.T_session_base, strict=True)
         ]
-        self._add(topic, at_ns, _new("nav_msgs/Path", _header(at_ns, frame), poses))
+        self._add(topic, at_ns, ros.new("nav_msgs/Path", ros.header(at_ns, frame), poses))
 
     def pose_with_covariance(
         self, topic: str, stamp_ns: int, pose: SE2, covariance: ArrayLike, frame: str = "map"
     ) -> None:
         """geometry_msgs/PoseWithCovarianceStamped of a planar pose; covariance (3, 3) of x, y, yaw."""
-        full = np.zeros((6, 6))
-        full[np.ix_((0, 1, 5), (0, 1, 5))] = np.asarray(covariance, dtype=np.float64).reshape(3, 3)
-        content = _new("geometry_msgs/PoseWithCovariance", _pose(pose.lift()), full.reshape(-1))
-        header = _header(stamp_ns, frame)
-        self._add(topic, stamp_ns, _new("geometry_msgs/PoseWithCovarianceStamped", header, content))
+        self._add(topic, stamp_ns, ros.pose_with_covariance(stamp_ns, pose, covariance, frame))
 
     # --- maps and metadata ----------------------------------------------------------------------------
 
     def occupancy_grid(self, topic: str, stamp_ns: int, grid: OccupancyGrid, frame: str = "map") -> None:
         """nav_msgs/OccupancyGrid; row 0 has the smallest y, as in `OccupancyGrid`."""
-        height, width = grid.cells.shape
-        origin = _pose(SE2(*grid.origin_m).lift())
-        info = _new("nav_msgs/MapMetaData", _time(stamp_ns), grid.resolution_m, width, height, origin)
-        cells = np.ascontiguousarray(grid.cells).reshape(-1)
-        self._add(topic, stamp_ns, _new("nav_msgs/OccupancyGrid", _header(stamp_ns, frame), info, cells))
+        self._add(topic, stamp_ns, ros.occupancy_grid(stamp_ns, grid, frame))
 
     def markers(self, topic: str, stamp_ns: int, markers: Sequence[Marker], frame: str = "map") -> None:
         """visualization_msgs/MarkerArray in the layout since ROS 2 Humble; shown until replaced."""
-        drawn = [_marker(number, marker, _header(stamp_ns, frame)) for number, marker in enumerate(markers)]
-        self._add(topic, stamp_ns, _new("visualization_msgs/MarkerArray", drawn))
+        drawn = [
+            _marker(number, marker, ros.header(stamp_ns, frame)) for number, marker in enumerate(markers)
+        ]
+        self._add(topic, stamp_ns, ros.new("visualization_msgs/MarkerArray", drawn))
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
         """An MCAP metadata record: the configuration, the digest of the input, and the like."""
         self._open().add_metadata(name, values)
 
     def _transforms(self, topic: str, stamp_ns: int, edges: Sequence[tuple[str, str, F64]]) -> None:
-        transforms = [
-            _new("geometry_msgs/TransformStamped", _header(stamp_ns, parent), child, _transform(T))
-            for parent, child, T in edges
-        ]
-        self._add(topic, stamp_ns, _new("tf2_msgs/TFMessage", transforms))
+        self._add(topic, stamp_ns, ros.transforms(stamp_ns, edges))
 
     def _open(self) -> Writer:
         if self._writer is None:
@@ -232,12 +220,11 @@ class LogWriter:
         return self._writer
 
     def _add(self, topic: str, stamp_ns: int, message: Any) -> None:
-        writer, store = self._open(), _typestore()
+        writer = self._open()
         type_name: str = message.__msgtype__
         if type_name not in self._schemas:
-            definition, _ = store.generate_msgdef(type_name, ros_version=2)
             self._schemas[type_name] = writer.register_schema(
-                name=type_name, encoding="ros2msg", data=definition.encode()
+                name=type_name, encoding="ros2msg", data=ros.definition(type_name).encode()
             )
         key = (topic, type_name)
         if key not in self._channels:
@@ -252,51 +239,8 @@ class LogWriter:
             log_time=int(stamp_ns),
             publish_time=int(stamp_ns),
             sequence=sequence,
-            data=bytes(store.serialize_cdr(message, type_name, little_endian=True)),
+            data=ros.serialized(message),
         )
-
-
-# --- parts of messages --------------------------------------------------------------------------------
-
-
-@functools.cache
-def _typestore() -> Typestore:
-    """The message types of ROS 2 Humble; loading them takes 0.1 s, so only a writer does."""
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS2_HUMBLE)
-
-
-def _new(name: str, *fields: Any) -> Any:
-    """A message of type `package/Name` from its fields, in the order of its definition."""
-    return _typestore().types[name.replace("/", "/msg/")](*fields)
-
-
-def _time(stamp_ns: int) -> Any:
-    return _new("builtin_interfaces/Time", *divmod(int(stamp_ns), 1_000_000_000))
-
-
-def _header(stamp_ns: int, frame: str) -> Any:
-    return _new("std_msgs/Header", _time(stamp_ns), frame)
-
-
-def _vector(x: float, y: float, z: float) -> Any:
-    return _new("geometry_msgs/Vector3", float(x), float(y), float(z))
-
-
-def _quaternion(T: F64) -> Any:
-    return _new("geometry_msgs/Quaternion", *(float(v) for v in quat_xyzw_from_pose(T)))
-
-
-def _pose(T: F64) -> Any:
-    """geometry_msgs/Pose of a (4, 4) pose."""
-    point = _new("geometry_msgs/Point", *(float(v) for v in T[:3, 3]))
-    return _new("geometry_msgs/Pose", point, _quaternion(T))
-
-
-def _transform(T: F64) -> Any:
-    """geometry_msgs/Transform of a (4, 4) pose."""
-    return _new("geometry_msgs/Transform", _vector(*T[:3, 3]), _quaternion(T))
 
 
 def _bytes_of(values: NDArray[Any], dtype: str) -> NDArray[np.uint8]:
@@ -307,21 +251,21 @@ def _bytes_of(values: NDArray[Any], dtype: str) -> NDArray[np.uint8]:
 def _marker(number: int, marker: Marker, header: Any) -> Any:
     """visualization_msgs/Marker without lifetime: it is shown until it is replaced."""
     points = np.asarray(marker.points_m, np.float64).reshape(-1, 3).tolist()
-    no_texture = _new("sensor_msgs/CompressedImage", _header(0, ""), "", np.empty(0, np.uint8))
-    no_mesh = _new("visualization_msgs/MeshFile", "", np.empty(0, np.uint8))
-    return _new(
+    no_texture = ros.new("sensor_msgs/CompressedImage", ros.header(0, ""), "", np.empty(0, np.uint8))
+    no_mesh = ros.new("visualization_msgs/MeshFile", "", np.empty(0, np.uint8))
+    return ros.new(
         "visualization_msgs/Marker",
         header,
         marker.name,
         number,
         _MARKER_TYPES[marker.kind],
         0,  # action: add
-        _pose(np.eye(4)),
-        _vector(marker.size_m, marker.size_m, marker.size_m),
-        _new("std_msgs/ColorRGBA", *marker.color),
-        _new("builtin_interfaces/Duration", 0, 0),
+        ros.pose(np.eye(4)),
+        ros.vector(marker.size_m, marker.size_m, marker.size_m),
+        ros.new("std_msgs/ColorRGBA", *marker.color),
+        ros.new("builtin_interfaces/Duration", 0, 0),
         False,
-        [_new("geometry_msgs/Point", *point) for point in points],
+        [ros.new("geometry_msgs/Point", *point) for point in points],
         [],  # colours of single points
         "",
         no_texture,
