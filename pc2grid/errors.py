@@ -83,6 +83,10 @@ class FrameError(LogError):
     """A coordinate frame is unknown, or not connected to the base frame."""
 
 
+class LiveError(LogError):
+    """A running robot cannot be reached, or does not take messages."""
+
+
 # --- maps and trajectories ----------------------------------------------------------------------------
 
 

@@ -60,8 +60,17 @@ class PoseTrack:
             del self._stamps[oldest], self._poses[oldest]
         return True
 
+    def emptied(self) -> PoseTrack:
+        """A track of the same kind without samples."""
+        return PoseTrack(lasting=self._lasting)
+
     def __len__(self) -> int:
         return len(self._stamps)
+
+    @property
+    def newest_ns(self) -> int:
+        """The stamp of the newest sample; 0 if there is none."""
+        return self._stamps[-1] if self._stamps else 0
 
     def at(self, stamp_ns: int) -> F64 | None:
         """Pose (4, 4) at a time: between two samples, or within 0.1 s of the nearest; None elsewhere."""
@@ -102,6 +111,11 @@ class FrameTree:
     def frames(self) -> list[str]:
         """All known frames."""
         return sorted({*self._parent, *self._parent.values()})
+
+    def forget_moving(self) -> None:
+        """Forget the poses that depend on time: the clock was set. The tree stays."""
+        for child, track in self._moving.items():
+            self._moving[child] = track.emptied()
 
     def add_all(
         self, edges: tuple[Transform, ...] | None, *, static: bool = False, log_time_ns: int = 0
@@ -155,6 +169,12 @@ class FrameTree:
     def moving(self, target: str, source: str) -> bool:
         """Whether a transform between two connected frames depends on time."""
         return any(child not in self._static for child in self._path(target, source))
+
+    def newest_ns(self, target: str, source: str) -> int:
+        """The stamp up to which the moving part of the path between two connected frames is known; 0 if it
+        is not known at all, or nothing moves there."""
+        moving = [self._moving[child] for child in self._path(target, source) if child not in self._static]
+        return min((track.newest_ns for track in moving), default=0)
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> F64 | None:
         """`T_target_source` (4, 4) at a time; None if a moving part of it is not known then.

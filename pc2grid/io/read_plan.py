@@ -69,6 +69,11 @@ def is_static(topic: TopicInfo) -> bool:
     return topic.topic.endswith("tf_static")
 
 
+def published_once(topic: TopicInfo) -> bool:
+    """Whether the messages of a topic may be published only once, when the robot starts."""
+    return topic.type in topics.CAMERA_INFOS or (topic.type in topics.TF and is_static(topic))
+
+
 def tolerant(decode: Callable[[Any], Any], data: Any, otherwise: Any) -> Any:
     """Decode a message that is of use but not needed (tf, odometry); `otherwise` if it cannot be decoded."""
     try:

@@ -139,6 +139,10 @@ class Log:
         if duration_s is not None and not duration_s > 0:
             raise ConfigError(f"duration: expected seconds > 0, found {duration_s:g}")
         self.choose()
-        assert self._plan is not None
-        stream = Stream(self._source, self._config, self._frames, self._plan, start_s, duration_s)
+        plan = self._plan
+        assert plan is not None
+        stream = guarded(
+            self.info.path,
+            lambda: Stream(self._source, self._config, self._frames, plan, start_s, duration_s),
+        )
         return guarded_stream(self.info.path, stream.run())

@@ -22,7 +22,7 @@ from pc2grid.errors import (
 from pc2grid.geometry import invert_pose
 from pc2grid.io import topics
 from pc2grid.io.frames import FrameTree, PoseTrack
-from pc2grid.io.message_source import MessageSource, TopicInfo
+from pc2grid.io.message_source import MessageSource, RawMessage, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Odometry, ScanMessage, Transform
 from pc2grid.io.read_plan import Plan, is_static, tolerant
@@ -42,6 +42,9 @@ class StreamParameters:
     gap_ns : a longer time between two scans is reported.
     patience : number of undecodable scans, with no other before them, at which reading stops.
     max_bad_share : share of undecodable scans above which the log counts as damaged.
+    eager : a scan waits no longer than until the odometry for all of its points is known.
+    sweep_ns : time from the stamp of a scan to its last point, as long as no scan has told it; a lidar turns
+    ten times a second.
     """
 
     wait_ns: int = 500_000_000
@@ -52,6 +55,8 @@ class StreamParameters:
     gap_ns: int = 5_000_000_000
     patience: int = 10
     max_bad_share: float = 0.1
+    eager: bool = False
+    sweep_ns: int = 100_000_000
 
 
 PARAMETERS = StreamParameters()
@@ -68,7 +73,10 @@ class _Waiting(NamedTuple):
 
 
 class Stream:
-    """One pass, to be run once; it counts in the source's tally what is read and what is lost."""
+    """One pass, to be run once; it counts in the source's tally what is read and what is lost.
+
+    out_of_time : number of scans in a row that were skipped because their stamps go back or jump.
+    """
 
     def __init__(
         self,
@@ -78,8 +86,11 @@ class Stream:
         plan: Plan,
         start_s: float = 0.0,
         duration_s: float | None = None,
+        parameters: StreamParameters | None = None,
     ) -> None:
         self._source, self._frames, self._plan = source, frames, plan
+        self._parameters = parameters = parameters or PARAMETERS
+        self.out_of_time = 0
         self._tally = source.tally
         self._start_ns = source.info.start_ns + round(start_s * 1e9)
         self._end_ns = None if duration_s is None else self._start_ns + round(duration_s * 1e9)
@@ -93,9 +104,12 @@ class Stream:
         self._last_ns: int | None = None
         self._last_log_ns: int | None = None
         self._error: Pc2GridError | None = None
+        self._sweep_ns = 0 if plan.choice.sensor == "depth" else parameters.sweep_ns
+        self._odometry_frame = plan.odometry_frame
+        self._handlers = self._make_handlers()
 
-    def run(self) -> Iterator[Scan]:
-        """Yield the scans. Raises as `Log.scans` says."""
+    def _make_handlers(self) -> dict[TopicInfo, Callable[[Any, int], None]]:
+        """By topic, what takes in its messages. Reads the first CameraInfo of the source."""
         plan = self._plan
         on: dict[TopicInfo, Callable[[Any, int], None]] = {plan.scans: self._take_scan}
         if plan.odometry is not None:
@@ -107,25 +121,77 @@ class Stream:
             for topic in self._source.info.topics:
                 if topic.type in topics.TF and not is_static(topic):
                     on[topic] = self._take_tf(topic)
-        low = (
-            max(self._start_ns - PARAMETERS.margin_ns, 0)
-            if self._start_ns > self._source.info.start_ns
-            else None
-        )
-        high = None if self._end_ns is None else self._end_ns + PARAMETERS.margin_ns
-        for message in self._source.messages({t.topic for t in on}, low, high):
-            take = on.get(message.channel)
-            if take is not None:
-                take(message.data, message.log_time_ns)
-            while self._waiting and (
-                message.log_time_ns - self._waiting[0].log_time_ns > PARAMETERS.wait_ns
-                or len(self._waiting) > PARAMETERS.max_waiting
-                or self._waiting_bytes > PARAMETERS.max_waiting_bytes
-            ):
-                yield from self._release()
+        return on
+
+    def run(self) -> Iterator[Scan]:
+        """Yield the scans of the source. Raises as `Log.scans` says."""
+        margin_ns = self._parameters.margin_ns
+        low = max(self._start_ns - margin_ns, 0) if self._start_ns > self._source.info.start_ns else None
+        high = None if self._end_ns is None else self._end_ns + margin_ns
+        for message in self._source.messages(self.topics, low, high):
+            yield from self.take(message)
+        yield from self.release_all()
+        self._finish()
+
+    def take(self, message: RawMessage) -> Iterator[Scan]:
+        """Take in one message, and yield the scans that need not wait any longer."""
+        take = self._handlers.get(message.channel)
+        if take is not None:
+            take(message.data, message.log_time_ns)
+        while self._waiting and self._is_due(self._waiting[0], message.log_time_ns):
+            yield from self._release()
+
+    def absorb(self, message: RawMessage) -> None:
+        """Take in a message of odometry or tf before its turn; it may be given to `take` as well."""
+        if message.channel != self._plan.scans and message.channel in self._handlers:
+            self._handlers[message.channel](message.data, message.log_time_ns)
+
+    @property
+    def last_log_ns(self) -> int:
+        """The log time of the last scan that was yielded; 0 before the first one."""
+        return self._last_log_ns or 0
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """The topics whose messages are used."""
+        return frozenset(topic.topic for topic in self._handlers)
+
+    def release_all(self) -> Iterator[Scan]:
+        """Yield the scans that wait: nothing more will come."""
         while self._waiting:
             yield from self._release()
-        self._finish()
+
+    def _is_due(self, first: _Waiting, now_ns: int) -> bool:
+        p = self._parameters
+        return (
+            now_ns - first.log_time_ns > p.wait_ns
+            or len(self._waiting) > p.max_waiting
+            or self._waiting_bytes > p.max_waiting_bytes
+            or (p.eager and self._motion_is_known(first.stamp_ns + self._sweep_ns))
+        )
+
+    def _motion_is_known(self, stamp_ns: int) -> bool:
+        """Whether the odometry has arrived, if there is any, up to a stamp."""
+        newest_ns = self.newest_odometry_ns()
+        return newest_ns is None or newest_ns >= stamp_ns
+
+    def newest_odometry_ns(self) -> int | None:
+        """The stamp up to which odometry is known; 0 if none has arrived, None if there is none at all."""
+        plan = self._plan
+        if plan.odometry_frame is not None:
+            return self._frames.newest_ns(plan.odometry_frame, plan.choice.base_frame)
+        return None if plan.odometry is None else self._track.newest_ns
+
+    def newest_odometry(self) -> tuple[int, F64] | None:
+        """The newest stamp of the odometry and `T_odom_base` (4, 4) there; None if there is none."""
+        newest_ns = self.newest_odometry_ns()
+        pose = self._odometry_at(newest_ns) if newest_ns else None
+        return None if pose is None or newest_ns is None else (newest_ns, pose)
+
+    @property
+    def odometry_frame(self) -> str | None:
+        """The parent frame of the odometry, such as `odom`; None as long as it is not known."""
+        return self._odometry_frame
 
     # --- decoding messages ----------------------------------------------------------------------------
 
@@ -162,6 +228,7 @@ class Stream:
                 self._tally.warn("some odometry messages are unreadable or not finite, and were ignored")
             elif self._T_child_base is None:
                 self._T_child_base = self._child_to_base(found.child)
+                self._odometry_frame = found.header.frame or None
 
         return take
 
@@ -225,6 +292,7 @@ class Stream:
                 return
             raise UnsupportedSchema(f"{self._plan.scans.topic}: {error.message}", hint=error.hint) from error
         self._last_ns, self._last_log_ns = stamp_ns, log_time_ns
+        self.out_of_time = 0
         self._good += 1
         self._tally.scans_read += 1
         self._tally.points_dropped += scan.dropped
@@ -241,14 +309,16 @@ class Stream:
         if stamp_ns == self._last_ns:
             raise PointCloudError("stamp is a duplicate")
         if stamp_ns < self._last_ns:
+            self.out_of_time += 1
             raise PointCloudError("stamp goes back in time")
         ahead_ns = (stamp_ns - self._last_ns) - (log_time_ns - self._last_log_ns)
-        if ahead_ns > PARAMETERS.clock_jump_ns:
+        if ahead_ns > self._parameters.clock_jump_ns:
             # If the next scan is near this stamp, too, the clock was set; else this one stamp is wrong.
-            if not any(0 <= entry.stamp_ns - stamp_ns < PARAMETERS.gap_ns for entry in self._waiting):
+            if not any(0 <= entry.stamp_ns - stamp_ns < self._parameters.gap_ns for entry in self._waiting):
+                self.out_of_time += 1
                 raise PointCloudError("stamp jumps")
             self._tally.warn("the clock of the scans jumps forward within the log")
-        elif stamp_ns - self._last_ns > PARAMETERS.gap_ns:
+        elif stamp_ns - self._last_ns > self._parameters.gap_ns:
             self._tally.warn("the log has gaps of more than 5 s between scans")
 
     def _sensor_pose(self, frame: str, stamp_ns: int) -> F64:
@@ -278,9 +348,13 @@ class Stream:
 
     def _with_motion(self, scan: Scan) -> Scan:
         """The scan with the motion from its first to its last point, if there is odometry at both."""
-        if scan.T_odom_base is None or scan.offsets_s is None or not len(scan.offsets_s):
+        if scan.offsets_s is None or not len(scan.offsets_s):
+            self._sweep_ns = 0
             return scan
         times_s = float(scan.offsets_s.min()), float(scan.offsets_s.max())
+        self._sweep_ns = max(round(times_s[1] * 1e9), 0)
+        if scan.T_odom_base is None:
+            return scan
         first, last = (self._odometry_at(scan.stamp_ns + round(time_s * 1e9)) for time_s in times_s)
         if first is None or last is None:
             return scan
@@ -290,7 +364,7 @@ class Stream:
         self._bad += 1
         self._error = self._error or error
         self._tally.skip(error.message)
-        if self._bad >= PARAMETERS.patience and not self._good:
+        if self._bad >= self._parameters.patience and not self._good:
             raise self._mostly_bad()
 
     def _finish(self) -> None:
@@ -300,7 +374,7 @@ class Stream:
                 f"{topic}: no scan {self._part}",
                 hint=f"the log lasts {self._source.info.duration_s:.1f} s",
             )
-        if self._good == 0 or self._bad > PARAMETERS.max_bad_share * self._count:
+        if self._good == 0 or self._bad > self._parameters.max_bad_share * self._count:
             raise self._mostly_bad()
 
     def _mostly_bad(self) -> Pc2GridError:

@@ -57,6 +57,21 @@ def scan_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicIn
     return distinct[0], f"the only topic with scans ({distinct[0].type})"
 
 
+def usable(topics: Sequence[TopicInfo], wanted: str | None) -> list[TopicInfo]:
+    """The topics that scans may be read from, silent ones among them; of those that `wanted` names only
+    these."""
+    fitting = [t for t in topics if (t.topic == wanted if wanted else _fits(t, topics))]
+    return [t for t in fitting if t.type in SENSORS]
+
+
+def may_be_used(topic: TopicInfo, topics: Sequence[TopicInfo], wanted: str | None) -> bool:
+    """Whether the messages of a topic are of use, as far as one can say before the first message.
+
+    wanted : the topic that scans are to be read from; None: any.
+    """
+    return topic.type in (*TF, *ODOMETRY, *CAMERA_INFOS) or topic in usable(topics, wanted)
+
+
 def camera_info_topic(image: TopicInfo, topics: Sequence[TopicInfo]) -> TopicInfo:
     """The CameraInfo that belongs to a depth image: the one with the longest common prefix of names.
 

@@ -16,7 +16,7 @@ _BAG = b"#ROSBAG V2.0\n"
 _SQLITE = b"SQLite format 3\0"
 SUBMAPS_ID = b"pc2g"
 """The application id in the header of a submap database."""
-_RECORDED = "pc2grid reads recordings in files, not streams: `ros2 bag record` makes one"
+_RECORDED = "of a running robot, or a recording that comes through a pipe: pc2grid watch"
 
 
 def open_source(path: Path, config: ReadConfig, *, recover: bool) -> MessageSource:
@@ -36,11 +36,16 @@ def open_source(path: Path, config: ReadConfig, *, recover: bool) -> MessageSour
             raise LogNotFound(f"{path}: no such file", hint=_RECORDED if stream else "check the path")
         if not path.is_file():
             raise LogNotFound(f"{path}: not a regular file", hint=_RECORDED)
-        with path.open("rb") as file:
-            head = file.read(100)
+        head = first_bytes(path)
     except OSError as error:
         raise LogNotFound(f"{path}: {error.strerror}") from error
     return _open_file(path, head, config, recover)
+
+
+def first_bytes(path: Path) -> bytes:
+    """The first 100 bytes of a file, by which its format is known. Raises OSError."""
+    with path.open("rb") as file:
+        return file.read(100)
 
 
 def is_submap_database(head: bytes) -> bool:

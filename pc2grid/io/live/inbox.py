@@ -1,0 +1,130 @@
+"""Messages between their arrival and their use."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+from pc2grid.io import topics
+from pc2grid.io.live.feed import Arrived, FeedCounts
+from pc2grid.io.message_source import RawMessage
+
+
+@dataclass(frozen=True, slots=True)
+class InboxParameters:
+    """How much may wait; chosen by hand.
+
+    most_lag_s : a scan that has waited longer than this is dropped when a newer one arrives. math.inf: never.
+    most_bytes, most_messages : of all messages that wait; beyond, the oldest are dropped.
+    """
+
+    most_lag_s: float = 0.1
+    most_bytes: int = 256_000_000
+    most_messages: int = 100_000
+
+
+INBOX = InboxParameters()
+
+
+@dataclass(slots=True)
+class _Entry:
+    """A message that waits; None once it is dropped. due_s : the time that its lag is counted from."""
+
+    message: RawMessage | None
+    arrived_s: float
+    due_s: float
+    size: int
+
+
+class Inbox:
+    """A queue that drops scans rather than letting them wait. One thread fills it, another one empties it.
+
+    Transforms and odometry are small and rest on each other, so they are kept.
+    """
+
+    def __init__(
+        self,
+        counts: FeedCounts,
+        parameters: InboxParameters = INBOX,
+        *,
+        by_log_time: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """by_log_time : lag is counted in log time, for recordings, whose messages arrive in blocks."""
+        self._counts, self._parameters, self._by_log_time = counts, parameters, by_log_time
+        self._clock = clock
+        self._entries: deque[_Entry] = deque()
+        self._scans: deque[_Entry] = deque()
+        self._bytes = 0
+        self._changed = threading.Condition()
+        self._strict = False
+
+    def keep_up(self) -> None:
+        """From now on scans that wait too long are dropped."""
+        with self._changed:
+            self._strict = True
+
+    def put(self, message: RawMessage) -> None:
+        """Add a message that has just arrived."""
+        now_s = self._clock()
+        due_s = message.log_time_ns * 1e-9 if self._by_log_time else now_s
+        entry = _Entry(message, now_s, due_s, len(message.data))
+        with self._changed:
+            self._counts.arrived += 1
+            self._entries.append(entry)
+            self._bytes += entry.size
+            if message.channel.type in topics.SENSORS:
+                self._scans.append(entry)
+                limit_s = self._parameters.most_lag_s if self._strict else math.inf
+                while len(self._scans) > 1 and due_s - self._scans[0].due_s > limit_s:
+                    self._drop(self._scans.popleft())
+            while self._bytes > self._parameters.most_bytes and len(self._scans) > 1:
+                self._drop(self._scans.popleft())
+            while len(self._entries) > self._parameters.most_messages:
+                self._forget(self._entries.popleft())
+            self._changed.notify()
+
+    def _drop(self, entry: _Entry) -> None:
+        if entry.message is not None:
+            entry.message = None
+            self._bytes -= entry.size
+            self._counts.dropped += 1
+
+    def _forget(self, entry: _Entry) -> None:
+        if self._scans and self._scans[0] is entry:
+            self._scans.popleft()
+        self._drop(entry)
+
+    def get(self, timeout_s: float) -> Arrived | None:
+        """The oldest message; None if there is none within `timeout_s` seconds."""
+        end_s = self._clock() + timeout_s
+        with self._changed:
+            while True:
+                while self._entries:
+                    entry = self._entries.popleft()
+                    if self._scans and self._scans[0] is entry:
+                        self._scans.popleft()
+                    if entry.message is not None:
+                        self._bytes -= entry.size
+                        return Arrived(entry.message, entry.arrived_s)
+                left_s = end_s - self._clock()
+                if left_s <= 0 or not self._changed.wait(left_s):
+                    return None
+
+    def pending(self, names: Collection[str]) -> list[RawMessage]:
+        """The messages of these topics that wait, oldest first."""
+        with self._changed:
+            waiting = [entry.message for entry in self._entries]
+        return [m for m in waiting if m is not None and m.channel.topic in names]
+
+    def wake(self) -> None:
+        """Let `get` return: nothing more will come."""
+        with self._changed:
+            self._changed.notify_all()
+
+    def __len__(self) -> int:
+        return len(self._entries)

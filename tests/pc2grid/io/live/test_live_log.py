@@ -1,0 +1,156 @@
+"""Clocks that jump, gaps, and lag, without any network."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Sequence
+
+import pytest
+
+from pc2grid.config import ReadConfig
+from pc2grid.errors import NoScans
+from pc2grid.io.live.feed import Arrived, FeedCounts, News
+from pc2grid.io.live.live_log import LiveLog
+from pc2grid.io.message_source import RawMessage, TopicInfo
+from tests.helpers.growing import laser_drive
+from tests.helpers.recordings import Message
+
+
+class Given:
+    """A feed of messages that are all there; the clock says when the last one arrived."""
+
+    name = "given"
+    connected = True
+
+    def __init__(self, messages: Sequence[Message]) -> None:
+        self.counts, self.news = FeedCounts(), News()
+        self.kept_up = False
+        self.now_s = 0.0
+        self.wanted: frozenset[str] | None = None
+        self._topics: dict[str, TopicInfo] = {}
+        self._waiting: deque[RawMessage] = deque()
+        for topic, kind, time_ns, data in messages:
+            known = self._topics.setdefault(topic, TopicInfo(topic=topic, type=kind, encoding="cdr"))
+            self._waiting.append(RawMessage(known, time_ns, data))
+
+    @property
+    def ended(self) -> bool:
+        return not self._waiting
+
+    def topics(self) -> tuple[TopicInfo, ...]:
+        return tuple(self._topics.values())
+
+    def want(self, topics: Collection[str]) -> None:
+        self.wanted = frozenset(topics)
+
+    def receive(self, timeout_s: float) -> Arrived | None:
+        if not self._waiting:
+            self.now_s += timeout_s
+            return None
+        return Arrived(self._waiting.popleft(), self.now_s)
+
+    def pending(self, topics: Collection[str]) -> Sequence[RawMessage]:
+        return [m for m in self._waiting if m.channel.topic in topics]
+
+    def keep_up(self) -> None:
+        self.kept_up = True
+
+    def close(self) -> None:
+        pass
+
+
+def live_log(messages: Sequence[Message]) -> tuple[LiveLog, Given]:
+    feed = Given(messages)
+    return LiveLog(feed, ReadConfig(), clock=lambda: feed.now_s), feed
+
+
+def parts_of(live: LiveLog) -> list[list[int]]:
+    """Stamps of the scans that belong together."""
+    parts = []
+    while not live.ended:
+        parts.append([scan.stamp_ns for scan in live.scans()])
+    return [part for part in parts if part]
+
+
+def test_odometry_that_comes_after_its_scan_is_waited_for() -> None:
+    """But no longer: a scan is used as soon as what it needs is there."""
+    messages = laser_drive(60)
+    live, _ = live_log(messages)
+    scans = live.scans()
+    late = 0
+    for scan in scans:
+        assert scan.T_odom_base is not None
+        number = round((scan.stamp_ns - messages[0].log_time_ns) / 1e8)
+        assert scan.T_odom_base[0, 3] == pytest.approx(0.05 * number)
+        newest = live.newest_odometry()
+        assert newest is not None
+        late += newest[0] < scan.stamp_ns
+    assert late == 0
+
+
+def test_only_what_is_used_is_asked_for() -> None:
+    live, feed = live_log(laser_drive(60))
+    live.choose()
+    assert feed.wanted == {"/scan", "/odom"}
+
+
+@pytest.mark.parametrize("jump_s", [-3600, 3600])
+def test_a_clock_that_is_set_begins_a_new_part(jump_s: int) -> None:
+    messages = laser_drive(120)
+    later = laser_drive(240)[361:]
+    offset_ns = jump_s * 10**9
+    from tests.helpers.recordings import T0, ros
+
+    set_back = [
+        ros().laser("/scan", m.log_time_ns + offset_ns, [1.0] * 30)._replace(log_time_ns=m.log_time_ns)
+        if m.topic == "/scan"
+        else ros().odometry("/odom", m.log_time_ns + offset_ns, 6.0)._replace(log_time_ns=m.log_time_ns)
+        for m in later
+    ]
+    live, feed = live_log([*messages, *set_back])
+    first, second = parts_of(live)
+    assert first[0] == T0
+    assert len(first) >= 119
+    assert len(second) >= 110  # a few tell that it was not one wrong stamp
+    assert second[-1] == later[-2].log_time_ns - 50_000_000 + offset_ns or second == sorted(second)
+    assert any("clock of the scans was set" in sentence for sentence in feed.news.take())
+
+
+def test_a_gap_without_odometry_begins_a_new_part() -> None:
+    messages = [m for m in laser_drive(100) if m.topic != "/odom"]
+    gap = [m for i, m in enumerate(messages) if not 50 <= i < 90]
+    live, feed = live_log(gap)
+    first, second = parts_of(live)
+    assert (len(first), len(second)) == (49, 11)
+    assert any("no scan for 4.1 s" in sentence for sentence in feed.news.take())
+
+
+def test_a_gap_with_odometry_is_bridged() -> None:
+    messages = laser_drive(100)
+    gap = [m for i, m in enumerate(messages) if m.topic != "/scan" or not 150 <= i < 270]
+    live, _ = live_log(gap)
+    (only,) = parts_of(live)
+    assert len(only) == 60
+
+
+def test_no_scan_at_all_is_said() -> None:
+    live, _ = live_log([m for m in laser_drive(50) if m.topic != "/scan"])
+    with pytest.raises(NoScans, match="no topic with scans"):
+        live.choose()
+
+
+def test_lag_is_the_time_from_arrival_to_the_end_of_the_use() -> None:
+    live, feed = live_log(laser_drive(60))
+    for count, _scan in enumerate(live.scans()):
+        feed.now_s += 0.01
+        if count > 40:  # those held back for the plan have waited longer
+            assert live.lag_s < 0.05
+    assert live.lag_s > 0.009
+
+
+def test_scans_may_be_dropped_once_the_preparations_are_over() -> None:
+    live, feed = live_log(laser_drive(60))
+    live.choose()
+    assert not feed.kept_up
+    list(live.scans())
+    assert feed.kept_up
