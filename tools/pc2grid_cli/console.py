@@ -167,6 +167,11 @@ def print_json(document: Any) -> None:
     print(json_text(document), flush=True)
 
 
+def print_json_line(document: Any) -> None:
+    """Print a document of a stream of them to stdout, as one line."""
+    print(json.dumps(_finite(document), ensure_ascii=False, allow_nan=False), flush=True)
+
+
 def json_text(document: Any) -> str:
     """A document as JSON. JSON has no NaN and no infinity: such a value becomes null."""
     return json.dumps(_finite(document), indent=1, ensure_ascii=False, allow_nan=False)

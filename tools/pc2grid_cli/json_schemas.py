@@ -15,7 +15,8 @@ from typing_extensions import TypedDict
 from signature.evaluation.metrics import ConfidenceError, MatrixCell, QueryCounts
 from signature.evaluation.real_sensors import RealCell
 from signature.evaluation.trial import Trial
-from signature.relocalization.answer_json import Pose, Result, Sessions, StampedPose, Travel, Version
+from signature.relocalization.answer_json import Pose, Result, Sessions, StampedPose, Status, Travel, Version
+from signature.relocalization.watcher import State
 
 if TYPE_CHECKING:
     from pc2grid import model
@@ -89,6 +90,41 @@ class RelocalizeCheck(TypedDict):
     better: BetterPlace | None
     query: Query
     database: CheckedAgainst
+
+
+class WatchedMap(TypedDict):
+    """The map that a pose is in: its session, and the sha256 of what the session was made from, hex."""
+
+    database: str
+    session: str
+    building: str | None
+    floor: str | None
+    digest: str
+
+
+class Watch(TypedDict):
+    """A line of `pc2grid watch --json`: what one look at the database said. state: searching (not located
+    yet), located, doubtful (this look does not confirm it), lost, recovered (located again, by two looks that
+    agree). pose: of the base at `stamp_ns`; null unless the status is `located`. T_map_odom: of the robot's
+    own odometry frame. confidence: the probability that the best place is right. published: topics on which
+    it was said. lag_s, elapsed_s: seconds from a scan's arrival to its use, and for this look. scans: used so
+    far, dropped: left out because the computer is too slow, reconnected: lost connections made again."""
+
+    schema_version: Version
+    state: State
+    status: Status
+    stamp_ns: int
+    path_m: float
+    map: WatchedMap | None
+    pose: StampedPose | None
+    T_map_odom: Pose | None
+    confidence: float
+    published: list[str]
+    scans: int
+    dropped: int
+    reconnected: int
+    lag_s: float
+    elapsed_s: float
 
 
 class Topic(TypedDict):
@@ -424,6 +460,7 @@ DOCUMENTS: dict[str, type] = {
     "relocalize": Relocalize,
     "relocalize-check": RelocalizeCheck,
     "simulate": Simulate,
+    "watch": Watch,
 }
 """By command."""
 

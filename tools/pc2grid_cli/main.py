@@ -31,6 +31,7 @@ from pc2grid_cli.export import export_command
 from pc2grid_cli.info import info_command
 from pc2grid_cli.relocalize import relocalize_command
 from pc2grid_cli.simulate import simulate_command
+from pc2grid_cli.watch import watch_command
 
 # Colours and boxes cost a tenth of a second at every --help; they are for terminals that want them.
 _FANCY = sys.stderr.isatty() and sys.stdout.isatty() and not os.environ.get("NO_COLOR")
@@ -77,6 +78,7 @@ app.command("simulate", cls=Command)(simulate_command)
 app.command("info", cls=Command)(info_command)
 app.command("convert", cls=Command)(convert_command)
 app.command("relocalize", cls=Command)(relocalize_command)
+app.command("watch", cls=Command)(watch_command)
 app.command("export", cls=Command)(export_command)
 
 compare = typer.Typer(cls=Group, help="The paper's tables, sensors against sensors.", no_args_is_help=True)

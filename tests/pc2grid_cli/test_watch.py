@@ -1,0 +1,210 @@
+"""`pc2grid watch`: the same robot by every way in gives the same answer."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+from typer.testing import CliRunner
+
+from pc2grid.io.nav2_map import save_map
+from pc2grid.io.trajectory import read_tum
+from pc2grid.simulate import SimulationConfig, simulate_session
+from pc2grid_cli.json_schemas import schema
+from pc2grid_cli.main import app, main
+from tests.helpers.json_schema import closed
+from tests.helpers.robot import Recorded, Robot
+from tests.helpers.simulated_drives import office
+
+START_M = (10.0, 7.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """plan.submaps of the office, and tuesday.mcap of a laser that drives 3 m in it."""
+    folder = tmp_path_factory.mktemp("watch")
+    save_map(office(), folder / "plan")
+    arguments = ["convert", str(folder / "plan.yaml"), "-o", str(folder / "plan.submaps")]
+    assert CliRunner().invoke(app, arguments, catch_exceptions=False).exit_code == 0
+    config = SimulationConfig(length_m=3.0, seed=7, clutter=0, start_m=START_M)
+    simulate_session(folder / "tuesday.mcap", sensor="laser", grid=office(), config=config)
+    return folder
+
+
+@pytest.fixture
+def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def watch(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, list[dict[str, Any]], str]:
+    """Exit code, the documents on stdout, and stderr."""
+    with pytest.raises(SystemExit) as stopped, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["pc2grid", "watch", *words, "-d", "plan.submaps", "--json"])
+        main()
+    out, err = capsys.readouterr()
+    return int(stopped.value.code or 0), [json.loads(line) for line in out.splitlines()], err
+
+
+def truth_at(folder: Path, stamp_ns: int) -> tuple[float, float]:
+    truth = read_tum(folder / "tuesday.tum")
+    pose = truth.T_session_base[int(np.argmin(np.abs(truth.stamps_ns - stamp_ns)))]
+    return float(pose[0, 3]), float(pose[1, 3])
+
+
+def answer_of(looks: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
+    """What must be equal however the bytes came."""
+    return [(k["stamp_ns"], k["path_m"], k["state"], k["pose"], k["confidence"], k["map"]) for k in looks]
+
+
+@pytest.fixture(scope="module")
+def expected(folder: Path) -> list[tuple[Any, ...]]:
+    """The answer for the finished file, in a process of its own."""
+    words = ["watch", "tuesday.mcap", "-d", "plan.submaps", "--json", "--keep"]
+    run = subprocess.run(
+        [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *words],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        check=True,
+    )
+    return answer_of([json.loads(line) for line in run.stdout.splitlines()])
+
+
+def test_a_robot_is_located_where_it_is(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, looks, _ = watch(capsys, "tuesday.mcap")
+    assert code == 0
+    last = looks[-1]
+    for look in looks:
+        jsonschema.validate(look, closed(schema("watch")))
+    assert (last["state"], last["map"]["session"]) == ("located", "plan")
+    x, y = truth_at(here, last["stamp_ns"])
+    assert math.dist((last["pose"]["x"], last["pose"]["y"]), (x, y)) < 0.1
+    assert last["confidence"] >= 0.9
+    assert len(last["map"]["digest"]) == 64
+
+
+def test_relocalize_says_the_same(
+    here: Path, capsys: pytest.CaptureFixture[str], expected: list[tuple[Any, ...]]
+) -> None:
+    """At the end of the recording, with no look in between."""
+    result = CliRunner().invoke(app, ["relocalize", "tuesday.mcap", "-d", "plan.submaps", "--json"])
+    history = {m["stamp_ns"]: m for m in json.loads(result.stdout)["history"]}
+    for stamp_ns, path_m, _, pose, *_ in expected:
+        if stamp_ns in history and pose is not None and path_m > 0.5:
+            moment = history[stamp_ns]
+            assert math.dist((moment["x"], moment["y"]), (pose["x"], pose["y"])) < 0.05
+
+
+def test_standard_input_gives_the_same_answer(here: Path, expected: list[tuple[Any, ...]]) -> None:
+    words = ["watch", "-", "-d", "plan.submaps", "--json", "--keep"]
+    with (here / "tuesday.mcap").open("rb") as stream:
+        run = subprocess.run(
+            [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *words],
+            stdin=stream,
+            stdout=subprocess.PIPE,
+            check=True,
+        )
+    assert answer_of([json.loads(line) for line in run.stdout.splitlines()]) == expected
+
+
+def test_a_websocket_gives_the_same_answer_and_initialpose(
+    here: Path, capsys: pytest.CaptureFixture[str], expected: list[tuple[Any, ...]]
+) -> None:
+    pytest.importorskip("websockets", reason="needs the extra [live]")
+    with Robot(Recorded.read(here / "tuesday.mcap")).running() as robot:
+        code, looks, err = watch(capsys, robot.url, "--publish", "initialpose", "--publish-map")
+        published = list(robot.published)
+    assert code == 0, err
+    assert answer_of(looks) == expected[: len(looks)]
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    decoded = {topic: store.deserialize_cdr(data, kind) for topic, kind, data in published}
+    assert sorted(decoded) == ["/initialpose", "/map"]
+    assert len(published) == 2
+    message = decoded["/initialpose"]
+    stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+    assert stamp_ns >= looks[-1]["stamp_ns"]
+    position = message.pose.pose.position
+    assert math.dist((position.x, position.y), truth_at(here, stamp_ns)) < 0.1
+    assert decoded["/map"].data.size == office().cells.size
+
+
+def test_map_to_odom_is_published_until_the_program_is_stopped(here: Path) -> None:
+    pytest.importorskip("websockets", reason="needs the extra [live]")
+    with Robot(Recorded.read(here / "tuesday.mcap"), speed=4.0).running() as robot:
+        words = ["watch", robot.url, "-d", "plan.submaps", "--publish", "tf", "--json"]
+        program = subprocess.Popen(
+            [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        try:
+            end_s = time.monotonic() + 100.0
+            while len(robot.published) < 10 and time.monotonic() < end_s:
+                time.sleep(0.05)
+            program.send_signal(signal.SIGINT)
+            out, err = program.communicate(timeout=30.0)
+        finally:
+            program.kill()
+        published = list(robot.published)
+    assert program.returncode == 130, err
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    edges = [store.deserialize_cdr(data, kind).transforms[0] for topic, kind, data in published]
+    assert {topic for topic, *_ in published} == {"/tf"}
+    assert {(e.header.frame_id, e.child_frame_id) for e in edges} == {("map", "odom")}
+    looks = [json.loads(line) for line in out.splitlines()]
+    told = [look["T_map_odom"] for look in looks if look["published"] == ["/tf"]]
+    assert told
+    for edge in edges:
+        at = edge.transform.translation
+        assert any(math.dist((at.x, at.y), (T["x"], T["y"])) < 1e-9 for T in told)
+
+
+def test_what_is_not_located_ends_with_4(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, looks, _ = watch(capsys, "tuesday.mcap", "--set", "relocalize.accept=0.9999999999")
+    assert code == 4
+    assert {look["state"] for look in looks} == {"searching"}
+    assert all(look["pose"] is None and look["map"] is None for look in looks)
+
+
+def test_words_for_people(here: Path) -> None:
+    result = CliRunner().invoke(app, ["watch", "tuesday.mcap", "-d", "plan.submaps"])
+    assert result.exit_code == 0
+    assert "located in plan: x " in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["rosbridge://robot"], 1, "is not known"),
+        (["tuesday.mcap", "--publish", "tf"], 2, "takes no messages"),
+        (["tuesday.mcap", "--topic", "/points"], 1, "no topic /points"),
+        (["plan.submaps"], 1, "not a recording that can be followed"),
+    ],
+)
+def test_mistakes(
+    here: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, said: str
+) -> None:
+    found, looks, err = watch(capsys, *words)
+    assert (found, looks) == (code, [])
+    assert said in err
+    assert "hint: " in err
+
+
+def test_a_robot_that_is_silent_is_given_up(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A recording without an end that does not grow."""
+    data = (here / "tuesday.mcap").read_bytes()
+    cut = here / "cut.mcap"
+    cut.write_bytes(data[: len(data) // 20])
+    code, looks, err = watch(capsys, "cut.mcap", "--timeout", "0.5")
+    assert (code, looks) == (1, [])
+    assert "/scan" in err or "no topics" in err or "no topic with scans" in err

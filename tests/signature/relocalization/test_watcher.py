@@ -1,0 +1,154 @@
+"""A robot that is located, carried away, and located again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.geometry import SE2
+from pc2grid.model import Health, OccupancyGrid, RegisteredScan
+from signature.relocalization.watcher import Look, ResetPolicy, Watcher, WatchParameters
+from tests.helpers.simulated_drives import building, drive, office, plan
+
+OFFICE = building({"office": office()})
+FIRST = [(1.5, 7.0), (7.5, 7.0)]
+HERE = SE2()
+SECOND = [(6.5, 12.5), (2.0, 12.5), (1.0, 9.5)]
+Step = tuple[RegisteredScan, PlanarScan, SE2]
+
+
+def stretch(
+    corners: list[tuple[float, float]],
+    start: SE2 = HERE,
+    health: Health = Health.FINE,
+    grid: OccupancyGrid | None = None,
+    field_deg: float = 270.0,
+) -> Iterator[Step]:
+    """A drive whose registered poses begin at `start`, with the same odometry, wrong by a metre and a half
+    turn."""
+    T_odom_session = SE2(1.0, 0.0, 3.0)
+    for registered, planar_scan, truth in drive(
+        office() if grid is None else grid, corners, field_rad=math.radians(field_deg)
+    ):
+        T_session_base = start @ SE2.from_matrix(registered.T_session_base)
+        scan = replace(registered.scan, T_odom_base=(T_odom_session @ T_session_base).lift())
+        moved = RegisteredScan(scan=scan, T_session_base=T_session_base.lift(), health=health)
+        yield moved, planar_scan, truth
+
+
+def looks_of(watcher: Watcher, steps: list[Step]) -> list[tuple[Look, SE2]]:
+    found = []
+    for registered, planar_scan, truth in steps:
+        look = watcher.add(registered, planar_scan)
+        if look is not None:
+            found.append((look, truth))
+    return found
+
+
+def check_poses(looks: list[tuple[Look, SE2]]) -> None:
+    for look, truth in looks:
+        if look.state in ("located", "recovered"):
+            assert look.T_map_base is not None
+            assert math.dist((look.T_map_base.x, look.T_map_base.y), (truth.x, truth.y)) < 0.15
+
+
+def test_a_robot_that_drives_on_stays_located() -> None:
+    looks = looks_of(Watcher(OFFICE), list(stretch(FIRST)))
+    states = [look.state for look, _ in looks]
+    at = states.index("located")
+    assert set(states[:at]) <= {"searching"}
+    assert set(states[at:]) == {"located"}
+    assert len(looks) >= 5
+    check_poses(looks)
+
+
+def test_the_odometry_frame_in_the_map_does_not_change_while_the_robot_drives() -> None:
+    looks = looks_of(Watcher(OFFICE), list(stretch(FIRST)))
+    frames = [look.T_map_odom for look, _ in looks if look.state == "located"]
+    poses = np.array([(f.x, f.y) for f in frames if f is not None])
+    assert len(poses) > 2
+    assert np.ptp(poses, axis=0).max() < 0.2
+    registered, truth = list(stretch(FIRST))[-1][0], list(stretch(FIRST))[-1][2]
+    assert registered.scan.T_odom_base is not None
+    assert frames[-1] is not None
+    now = frames[-1] @ SE2.from_matrix(registered.scan.T_odom_base)
+    assert math.dist((now.x, now.y), (truth.x, truth.y)) < 0.2
+
+
+def test_a_robot_that_is_seen_being_carried_away_is_lost_and_then_recovered_by_two_looks() -> None:
+    steps = list(stretch(FIRST))
+    end = SE2.from_matrix(steps[-1][0].T_session_base)
+    steps += list(stretch([(3.0, 3.5), (10.0, 3.5)], end, Health.LOST))[:25]
+    looks = looks_of(Watcher(OFFICE), [*steps, *stretch(SECOND, end)])
+    states = [look.state for look, _ in looks]
+    at = states.index("lost")
+    assert set(states[:at]) == {"located"}
+    at = states.index("recovered")
+    assert states[at - 1] == "doubtful"  # one answer there is not enough
+    assert set(states[at + 1 :]) <= {"located"}
+    check_poses(looks)
+
+
+def test_a_robot_that_is_carried_away_unseen_is_recovered_all_the_same() -> None:
+    """It was put down before a scan showed anything, so odometry says that it is where it was."""
+    steps = list(stretch([FIRST[0], (3.6, 7.0)]))
+    end = SE2.from_matrix(steps[-1][0].T_session_base)
+    watcher = Watcher(OFFICE, WatchParameters(doubtful_looks=2))
+    looks = looks_of(watcher, [*steps, *stretch(SECOND, end)])
+    states = [look.state for look, _ in looks]
+    assert states.count("recovered") == 1
+    assert states[states.index("recovered") - 1] == "doubtful"
+    assert "located" in states[: states.index("doubtful")]
+    check_poses(looks[states.index("recovered") :])
+
+
+def test_a_robot_elsewhere_is_never_located() -> None:
+    other = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
+    looks = looks_of(Watcher(OFFICE), list(stretch([(2, 2), (2, 4.5)], grid=other)))
+    assert {look.state for look, _ in looks} == {"searching"}
+    assert all(look.T_map_base is None and look.T_map_odom is None for look, _ in looks)
+
+
+def test_a_robot_that_stands_is_looked_for_once() -> None:
+    first = next(stretch([(9.5, 4.0), (9.5, 3.0)], field_deg=360.0))
+    steps = []
+    for number in range(60):
+        scan = replace(first[0].scan, stamp_ns=number * 10**8)
+        steps.append((replace(first[0], scan=scan), first[1], first[2]))
+    looks = looks_of(Watcher(OFFICE), steps)
+    assert len(looks) == 1
+    assert looks[0][0].answer.path_m == 0.0
+    check_poses(looks)
+
+
+def test_after_a_restart_one_look_is_not_enough() -> None:
+    watcher = Watcher(OFFICE)
+    assert looks_of(watcher, list(stretch(FIRST)))[-1][0].state == "located"
+    watcher.restart()
+    assert not watcher.located
+    looks = looks_of(watcher, list(stretch(FIRST, SE2(40.0, 2.0, 1.0))))
+    states = [look.state for look, _ in looks if look.answer.status == "located"]
+    assert states[:3] == ["doubtful", "recovered", "located"]
+    check_poses(looks)
+
+
+def test_the_same_place_in_another_session_is_the_same_place() -> None:
+    """A database of two maps of one floor: the pose stays in the map in which it was found first."""
+    both = building({"monday": office(), "tuesday": office()})
+    looks = looks_of(Watcher(both), list(stretch(FIRST)))
+    sessions = {look.session for look, _ in looks if look.state == "located"}
+    assert len(sessions) == 1
+    assert "doubtful" not in {look.state for look, _ in looks}
+
+
+def test_resets_are_paused_and_bounded() -> None:
+    now_s = 0.0
+    policy = ResetPolicy(pause_s=10.0, most=2, calm_s=60.0, clock=lambda: now_s)
+    allowed = {}
+    for now_s in (0.0, 5.0, 11.0, 22.0, 40.0, 80.0, 85.0):
+        allowed[now_s] = policy.allows()
+    assert [now_s for now_s, may in allowed.items() if may] == [0.0, 11.0, 80.0]

@@ -1,0 +1,305 @@
+"""`pc2grid watch`: where in the database is the robot that is running now?"""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+
+from pc2grid.display import probability
+from pc2grid.errors import ConfigError, one_line
+from pc2grid_cli import console
+from pc2grid_cli import options as options
+
+if TYPE_CHECKING:
+    from pc2grid.geometry import SE2
+    from pc2grid.io.live.live_log import LiveLog
+    from pc2grid.io.live.nav2 import Nav2Publisher, Outlet
+    from pc2grid_cli.json_schemas import Watch
+    from signature.config import Config
+    from signature.database import SubmapDatabase
+    from signature.relocalization.watcher import Look, ResetPolicy
+
+
+class Publish(str, enum.Enum):
+    """What the robot is told."""
+
+    none = "none"
+    initialpose = "initialpose"
+    tf = "tf"
+
+
+def watch_command(
+    context: typer.Context,
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="ws://ROBOT:8765|RECORDING|-",
+            help="a robot with foxglove_bridge; a recording, also a growing one; - for an MCAP on stdin",
+        ),
+    ],
+    database: Annotated[
+        str, typer.Option("--database", "-d", metavar=options.DATABASE, help="where to look")
+    ],
+    building: Annotated[
+        str | None, typer.Option("--building", metavar="NAME", help="look only in sessions labelled so")
+    ] = None,
+    floor: Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, of a floor")] = None,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="go on when it is located, and say when it is somewhere else")
+    ] = False,
+    publish: Annotated[
+        Publish,
+        typer.Option(
+            "--publish",
+            help="tell the robot: /initialpose when it is located; or the transform map -> odom, with --keep",
+        ),
+    ] = Publish.none,
+    publish_map: Annotated[
+        bool, typer.Option("--publish-map", help="also /map, the map in which it is located")
+    ] = False,
+    map_frame: Annotated[
+        str, typer.Option("--map-frame", metavar="FRAME", help="the frame of what is published")
+    ] = "map",
+    last: Annotated[
+        float, typer.Option("--last", min=0.0, metavar="S", help="seconds of a recording to begin with")
+    ] = 30.0,
+    timeout: Annotated[
+        float | None, typer.Option("--timeout", min=0.0, metavar="S", help="give up after so many seconds")
+    ] = None,
+    topic: options.Topic = None,
+    odometry: options.OdometryTopic = None,
+    config: options.ConfigFile = None,
+    set_: options.Assignments = None,
+    assume_identity: options.AssumeIdentity = False,
+    json: Annotated[bool, typer.Option("--json", help="a JSON document on each line, one a look")] = False,
+) -> None:
+    """Find where a running robot is, while it drives. Exit code 4: it was not located.
+
+    Example: pc2grid watch ws://robot:8765 --database building.submaps --publish initialpose
+    """
+    from pc2grid.io.live.targets import open_live
+    from signature.database import open_database
+
+    settings = options.make_config(
+        config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
+    )
+    terminal = console.of(context)
+    end_s = math.inf if timeout is None else time.monotonic() + timeout
+    located = False
+    with open_database(database) as opened, open_live(source, settings.read, last_s=last) as live:
+        if building is not None or floor is not None:
+            opened.keep_only(building=building, floor=floor)
+        for problem in opened.leave_out_damaged():
+            console.warn(f"{opened.location}: damaged and left out: {problem.where}: {problem.what}")
+        live.on_poll = lambda: _tell_news(live) or time.monotonic() > end_s
+        with _Robot.of(live, publish, publish_map, map_frame) as robot:
+            for look in looks(live, opened, settings, terminal):
+                published = robot.tell(look, opened)
+                _print(look, live, opened, published, as_json=json)
+                located = look.state in ("located", "recovered")
+                if located and not keep and publish is not Publish.tf:
+                    break
+        _summarize(live, terminal)
+    if not located:
+        raise typer.Exit(console.UNSURE)
+
+
+def looks(
+    live: LiveLog, database: SubmapDatabase, settings: Config, terminal: console.Console
+) -> Iterator[Look]:
+    """What each look at the database says, for as long as scans arrive."""
+    from pc2grid.pipeline import follow
+    from signature.relocalization.map_index import MapIndex
+    from signature.relocalization.watcher import Watcher
+
+    made_with = database.config()
+    own = {name: getattr(settings, name) for name in ("read", "relocalize", "registration")}
+    config = made_with.model_copy(update=own)
+    watcher = Watcher(MapIndex.of(database, config))
+    choice = live.choose()
+    terminal.note(f"{live.feed.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
+    while not live.ended:
+        for registered, planar_scan in follow(live.scans(), config):
+            look = watcher.add(registered, planar_scan)
+            if look is not None:
+                yield look
+        watcher.restart()
+
+
+@dataclass(kw_only=True)
+class _Robot:
+    """The robot that is told where it is.
+
+    publisher : None if it is not told anything. pose_is_due : whether it is to be told its pose.
+    map_session : the session whose map was published.
+    """
+
+    live: LiveLog
+    publish: Publish
+    publish_map: bool
+    publisher: Nav2Publisher | None
+    resets: ResetPolicy
+    pose_is_due: bool = True
+    map_session: str | None = None
+
+    @staticmethod
+    @contextlib.contextmanager
+    def of(live: LiveLog, publish: Publish, publish_map: bool, map_frame: str) -> Iterator[_Robot]:
+        """Raises ConfigError if the source takes no messages, LiveError if the robot does not."""
+        from signature.relocalization.watcher import ResetPolicy
+
+        robot = _Robot(
+            live=live, publish=publish, publish_map=publish_map, publisher=None, resets=ResetPolicy()
+        )
+        topics = [f"/{publish.value}"] if publish is not Publish.none else []
+        topics += ["/map"] if publish_map else []
+        if not topics:
+            yield robot
+            return
+        from pc2grid.io.live.nav2 import Nav2Publisher
+
+        feed = live.feed
+        if not hasattr(feed, "advertise"):
+            raise ConfigError(f"--publish: {feed.name} takes no messages", hint="ws://ROBOT:8765 does")
+        with Nav2Publisher(cast("Outlet", feed), map_frame) as robot.publisher:
+            robot.publisher.announce(*topics)
+            yield robot
+
+    def tell(self, look: Look, database: SubmapDatabase) -> list[str]:
+        """Publish what follows from a look; returns the topics."""
+        publisher = self.publisher
+        if publisher is None:
+            return []
+        if look.state == "lost":
+            self.pose_is_due = True
+            publisher.stop_tf()
+        if look.state not in ("located", "recovered") or look.session is None:
+            return []
+        told = []
+        if self.publish_map and look.session != self.map_session:
+            self.map_session = look.session
+            publisher.map(look.registered.scan.stamp_ns, database.grid(look.session))
+            told.append("/map")
+        self.pose_is_due = self.pose_is_due or look.state == "recovered"
+        if self.publish is Publish.initialpose and self.pose_is_due and self.resets.allows():
+            self.pose_is_due = False
+            assert look.answer.covariance is not None
+            stamp_ns, T_map_base = self._now(look)
+            publisher.initialpose(stamp_ns, T_map_base, look.answer.covariance)
+            told.append("/initialpose")
+        elif self.publish is Publish.tf:
+            T_map_odom, odom_frame = look.T_map_odom, self.live.odometry_frame
+            if T_map_odom is None or odom_frame is None:
+                console.warn("--publish tf: the robot has no odometry; nothing is published")
+                return told
+            publisher.start_tf(odom_frame, T_map_odom, self.live.now_ns)
+            told.append("/tf")
+        return told
+
+    def _now(self, look: Look) -> tuple[int, SE2]:
+        """The stamp of the newest odometry and the pose of the base there: the look is about an earlier
+        scan."""
+        from pc2grid.geometry import SE2
+
+        T_map_odom, newest = look.T_map_odom, self.live.newest_odometry()
+        if T_map_odom is None or newest is None:
+            assert look.T_map_base is not None
+            return look.registered.scan.stamp_ns, look.T_map_base
+        stamp_ns, T_odom_base = newest
+        return stamp_ns, T_map_odom @ SE2.from_matrix(T_odom_base)
+
+
+def _tell_news(live: LiveLog) -> bool:
+    for sentence in live.feed.news.take():
+        console.warn(sentence)
+    return False
+
+
+def _summarize(live: LiveLog, terminal: console.Console) -> None:
+    """What was left out, at the end."""
+    _tell_news(live)
+    report, counts = live.report(), live.feed.counts
+    for warning in report.warnings:
+        console.warn(warning)
+    skipped = sum(report.scans_skipped.values())
+    if counts.dropped or skipped:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in report.scans_skipped.items())
+        terminal.note(
+            f"{report.scans_read} scans used, {counts.dropped} dropped to keep up, {skipped} unusable"
+            + (f" ({reasons})" if reasons else "")
+        )
+
+
+def _print(
+    look: Look, live: LiveLog, database: SubmapDatabase, published: list[str], *, as_json: bool
+) -> None:
+    """What one look said, on stdout."""
+    if as_json:
+        console.print_json_line(_document(look, live, database, published))
+    else:
+        print(as_text(look, published), flush=True)
+
+
+def as_text(look: Look, published: list[str]) -> str:
+    """A look in one line."""
+    answer = look.answer
+    begin = f"after {answer.path_m:.1f} m: {look.state}"
+    if look.T_map_base is None:
+        places = len(set(answer.places))
+        return f"{begin}, {places} places fit" if answer.status == "ambiguous" else f"{begin}, no place fits"
+    pose = look.T_map_base
+    told = f", published {' and '.join(published)}" if published else ""
+    yaw_deg = math.degrees(pose.yaw)
+    return one_line(
+        f"{begin} in {look.session}: x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {yaw_deg:.1f} deg,"
+        f" confidence {probability(answer.confidence)}{told}"
+    )
+
+
+def _document(look: Look, live: LiveLog, database: SubmapDatabase, published: list[str]) -> Watch:
+    answer, pose, T_map_odom, counts = look.answer, look.T_map_base, look.T_map_odom, live.feed.counts
+    document: Watch = {
+        "schema_version": 1,
+        "state": look.state,
+        "status": answer.status,
+        "stamp_ns": answer.stamp_ns,
+        "path_m": answer.path_m,
+        "map": None,
+        "pose": None,
+        "T_map_odom": None,
+        "confidence": answer.confidence,
+        "published": published,
+        "scans": live.report().scans_read,
+        "dropped": counts.dropped,
+        "reconnected": counts.reconnected,
+        "lag_s": live.lag_s,
+        "elapsed_s": look.elapsed_s,
+    }
+    if look.session is not None and pose is not None and answer.covariance is not None:
+        (info,) = database.sessions([look.session])
+        label = info.provenance.label
+        document["map"] = {
+            "database": database.location,
+            "session": look.session,
+            "building": label.building,
+            "floor": label.floor,
+            "digest": info.digest,
+        }
+        document["pose"] = {
+            "stamp_ns": answer.stamp_ns,
+            "x": float(pose.x),
+            "y": float(pose.y),
+            "yaw": float(pose.yaw),
+            "covariance": answer.covariance.tolist(),
+        }
+    if T_map_odom is not None:
+        x, y, yaw = float(T_map_odom.x), float(T_map_odom.y), float(T_map_odom.yaw)
+        document["T_map_odom"] = {"x": x, "y": y, "yaw": yaw}
+    return document
