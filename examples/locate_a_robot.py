@@ -6,19 +6,19 @@ python examples/locate_a_robot.py tuesday.mcap building.submaps
 from __future__ import annotations
 
 import math
-import sys
+
+import typer
 
 import pc2grid
-import signature
 
 
 def main(recording: str, database: str) -> None:
     """Add scans until the answer is `located`, then print it."""
-    with signature.open_database(database) as opened, pc2grid.open_log(recording) as log:
+    with pc2grid.open_database(database) as opened, pc2grid.open_log(recording) as log:
         # The index is made once for many queries. It reads the maps of a large database when they are needed.
         # Queries are processed with the settings that made the maps.
         config = opened.config()
-        relocalizer = signature.Relocalizer(signature.MapIndex.of(opened, config))
+        relocalizer = pc2grid.Relocalizer(pc2grid.MapIndex.of(opened, config))
         for registered, planar_scan in pc2grid.follow(log.scans(), config):
             moment = relocalizer.add(registered, planar_scan)
             if moment is None:  # the database is asked after every metre of travel
@@ -33,4 +33,4 @@ def main(recording: str, database: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    typer.run(main)

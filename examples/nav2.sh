@@ -5,8 +5,9 @@
 set -eu
 map=$1
 recording=$2
-database=${map%.yaml}.submaps
-pose=${recording%.*}.initialpose.json
+# Both are written here: the folder of the map or of the recording may be shared, or read-only.
+database=$(basename "$map" .yaml).submaps
+pose=$(basename "${recording%.*}").initialpose.json
 
 [ -e "$database" ] || pc2grid convert "$map" -o "$database" # once a map
 rm -f "$pose"

@@ -9,10 +9,10 @@ python examples/own_descriptor.py map.yaml
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 
 import numpy as np
+import typer
 
 import pc2grid
 from pc2grid.config import PartitionConfig
@@ -42,12 +42,12 @@ class WallDistances:
         return -np.abs(self.table - self.describe(query)).sum(axis=1)
 
 
-def main(map_yaml: str, queries: str = "200") -> None:
+def main(map_yaml: str, queries: int = 200) -> None:
     """Print the area under the precision-recall curve of three methods at the paper's noise levels."""
     grid = pc2grid.load_map(map_yaml)
     submaps = pc2grid.submaps_of(grid, PartitionConfig.paper())
     methods = {**make_methods(["proposed", "shape_context"]), "wall distances": WallDistances()}
-    experiment = Experiment(queries=int(queries))
+    experiment = Experiment(queries=queries)
     print(f"{len(submaps)} submaps, {queries} queries; area under the curve, share recognised")
     for level, noise in enumerate(NOISE_LEVELS):
         for name, matches in evaluate(methods, grid, submaps, experiment, noise).items():
@@ -56,4 +56,4 @@ def main(map_yaml: str, queries: str = "200") -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    typer.run(main)

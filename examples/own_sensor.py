@@ -10,11 +10,11 @@ python examples/own_sensor.py scans.txt own.submaps
 from __future__ import annotations
 
 import hashlib
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import typer
 
 import pc2grid
 import signature
@@ -61,4 +61,4 @@ def main(recording: str, database: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    typer.run(main)

@@ -1,17 +1,41 @@
 """Recordings -> registered scans -> occupancy grids -> submaps.
 
 The front of pc2grid: everything that depends on the kind of sensor. `signature`, the back, only gets grids
-and submaps. Importing this package loads no library: each name loads its module when it is first used.
-
-Types: `Scan`, `RegisteredScan`, `Trajectory`, `Loop`, `OccupancyGrid`, `Submap`, `SessionMap`; `SE2` for
-planar poses. Everywhere metres, radians, int64 nanoseconds; `T_target_source` maps coordinates of source into
-target. Errors that are raised on purpose are `Pc2GridError`s, whose `hint` says what to do.
+and submaps; the names of it that most users need are passed on here. Importing this package loads no library:
+each name loads its module when it is first used. `help(pc2grid.convert)` and so on explain them.
 
 >>> import pc2grid
->>> with pc2grid.open_log("monday.mcap") as log:
-...     monday = pc2grid.build_map(log, session="monday")
+>>> monday = pc2grid.convert("monday.mcap", "monday.submaps")
 >>> monday.sensor, monday.grid.resolution_m, len(monday.submaps) > 10
 ('laser', 0.05, True)
+>>> pc2grid.relocalize("tuesday.mcap", "monday.submaps").status
+'located'
+
+From file to file
+    convert             a recording or nav2 map becomes a session in a database
+    relocalize          where in a database a recording was made
+
+Recordings to maps
+    open_log, Log       a recording as a stream of scans
+    follow              each scan with its pose, as they come
+    build_map           a recording becomes a SessionMap; map_scans: scans of your own
+    submaps_of          the submaps of a grid
+    load_map, save_map  nav2 maps; read_tum, write_tum, write_kitti: trajectories
+    simulate_session    a recording of a simulated robot, with SimulationConfig
+
+Databases and answers
+    open_database       a SubmapDatabase; Label: building and floor of a session
+    locate              where registered scans were taken: an Answer
+    Relocalizer         the same while the robot drives, in a MapIndex
+
+Types
+    Scan, RegisteredScan, Health, Trajectory, Loop, OccupancyGrid, Submap, SessionMap
+    SE2                 a planar pose
+    Config, TimeSpan    settings; a part of a recording
+    Observer            is told of progress
+    Pc2GridError        every error that is raised on purpose; its `hint` says what to do
+
+Everywhere metres, radians, int64 nanoseconds; `T_target_source` maps coordinates of source into target.
 """
 
 from typing import TYPE_CHECKING

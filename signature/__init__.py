@@ -2,7 +2,7 @@
 
 The back of pc2grid: one file for each section of the paper (`boundary`, `freespace`, `symmetry`,
 `similarity`), the database behind one protocol, and relocalization. Importing this package loads no library:
-each name loads its module when it is first used.
+each name loads its module when it is first used. `help(signature.locate)` and so on explain them.
 
 >>> import pc2grid, signature
 >>> with signature.open_database("building.submaps") as database, pc2grid.open_log("tuesday.mcap") as log:
@@ -10,6 +10,22 @@ each name loads its module when it is first used.
 ...     answer = signature.locate(pc2grid.follow(log.scans(), config), database, config)
 >>> answer.status, answer.session
 ('located', 'monday')
+
+The paper
+    signature_of        a submap's three signatures: a Signature
+    distances           of a query to the rows of a SignatureTable (Eq. 6)
+
+Databases
+    convert             a recording or nav2 map becomes a session in a database
+    build_session       the same without storing; provenance: what a session was made from
+    add_session         store a session
+    create_database, open_database, SubmapDatabase, Label
+
+Answers
+    relocalize          where in a database a recording was made: an Answer
+    locate              where registered scans were taken; locate_map: where a drawn map lies
+    Relocalizer         the same while the robot drives, in a MapIndex
+    Config              settings
 """
 
 from typing import TYPE_CHECKING

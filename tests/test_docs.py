@@ -83,6 +83,14 @@ def test_every_public_name_is_there_and_explained(package: ModuleType, name: str
         assert all(p.annotation is not p.empty for p in parameters)
 
 
+@pytest.mark.parametrize("package", [pc2grid, signature])
+def test_help_begins_with_every_public_name(package: ModuleType) -> None:
+    """What `help` prints behind it, dozens of modules and the methods of dataclasses, is no way in."""
+    assert package.__doc__
+    listed = set(re.findall(r"\w+", re.sub(r"^>>> .*$", "", package.__doc__, flags=re.MULTILINE)))
+    assert {name for name in package.__all__ if name[0] != "_"} <= listed
+
+
 @pytest.mark.parametrize("package", ["pc2grid", "signature"])
 def test_importing_a_package_loads_no_library(package: str) -> None:
     code = (
@@ -222,7 +230,10 @@ def run(
 
     def run_example(name: str, *arguments: str) -> list[str]:
         monkeypatch.setattr(sys, "argv", [name, *arguments])
-        runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+        try:
+            runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+        except SystemExit as ended:  # typer always ends like this
+            assert not ended.code, capsys.readouterr().err
         return capsys.readouterr().out.splitlines()
 
     return run_example
@@ -231,9 +242,21 @@ def run(
 Run = Callable[..., list[str]]
 
 
+@pytest.mark.parametrize("name", sorted(path.name for path in ROOT.glob("examples/*.py")))
+def test_examples_without_arguments_say_how_to_call_them(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", [name])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+    said = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert "usage:" in said.lower() and name in said and "Traceback" not in said
+
+
 def test_example_convert_a_log(run: Run) -> None:
     said = run("convert_a_log.py", "tuesday.mcap", "new.submaps")
-    assert said[0].startswith("tuesday.mcap: /scan (laser): ") and "4.0 m driven" in said[1]
+    assert said[0].startswith("tuesday.mcap: /scan (laser): ") and "laser, 4.0 m in " in said[1]
     with signature.open_database("new.submaps") as database:
         assert [session.name for session in database.sessions()] == ["tuesday"]
 
@@ -270,7 +293,7 @@ def test_example_own_sensor(run: Run) -> None:
 
 
 def test_example_own_descriptor(run: Run) -> None:
-    said = run("own_descriptor.py", "map.yaml", "12")
+    said = run("own_descriptor.py", "map.yaml", "--queries", "12")
     values = {(int(line[6]), line[9:25].strip()): float(line[26:31]) for line in said[1:]}
     assert len(values) == 9
     for level in range(3):
@@ -279,7 +302,7 @@ def test_example_own_descriptor(run: Run) -> None:
 
 
 def test_example_own_floor_plan(run: Run) -> None:
-    said = run("own_floor_plan.py", "map.yaml", "1", "20", "3")
+    said = run("own_floor_plan.py", "map.yaml", "--visitors=1", "--map-length-m=20", "--query-length-m=3")
     (off_m,) = re.findall(r"visitor 0: located, ([\d.]+) m off", "\n".join(said))
     assert float(off_m) < 0.25
 
@@ -321,7 +344,10 @@ def test_example_nav2(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tools / name).write_text(called + does)
         (tools / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tools}{os.pathsep}{os.environ['PATH']}")
-    subprocess.run(["sh", ROOT / "examples" / "nav2.sh", "map.yaml", "tuesday.mcap"], check=True)
+    before = sorted(folder.iterdir())
+    monkeypatch.chdir(tools)
+    subprocess.run(["sh", ROOT / "examples" / "nav2.sh", "../map.yaml", "../tuesday.mcap"], check=True)
+    assert sorted(folder.iterdir()) == before, "the folder of the map may be shared"
     convert, locate, publish = Path("called").read_text().splitlines()
     assert publish.startswith("topic pub --once /initialpose geometry_msgs/msg/PoseWithCovarianceStamped {}")
     assert Path("heard").read_text() == "{}\n"
@@ -330,14 +356,14 @@ def test_example_nav2(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert CliRunner().invoke(app, command.split(), catch_exceptions=False).exit_code == 0
 
     pose = json.loads(Path("tuesday.initialpose.json").read_text())["pose"]["pose"]
-    truth = list(pc2grid.read_tum("tuesday.tum").poses())[-1]
+    truth = list(pc2grid.read_tum(folder / "tuesday.tum").poses())[-1]
     x, y = pose["position"]["x"], pose["position"]["y"]
     yaw = 2 * math.atan2(pose["orientation"]["z"], pose["orientation"]["w"])
     assert math.hypot(x - truth.x, y - truth.y) < 0.1
     assert abs(math.remainder(yaw - truth.yaw, 2 * math.pi)) < math.radians(2)
     # In the map as nav2 reads it, the last scan ends at walls.
     cells, resolution_m, origin_m = nav2_map(folder / "map.yaml")
-    with pc2grid.open_log("tuesday.mcap") as log:
+    with pc2grid.open_log(folder / "tuesday.mcap") as log:
         *_, scan = log.scans()
     ends = pc2grid.SE2(x, y, yaw).apply(scan.points_m[:, :2])
     column, row = ((ends - origin_m) / resolution_m).astype(int).T
