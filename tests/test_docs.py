@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import doctest
 import functools
 import importlib
@@ -14,12 +15,14 @@ import runpy
 import shlex
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import cv2
+import matplotlib.pyplot
 import numpy as np
 import pytest
 import yaml
@@ -151,16 +154,27 @@ def run_or_parse(command: str) -> str | None:
     return None
 
 
+@pytest.fixture(scope="module")
+def demonstrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which `pc2grid demo` was called, with shorter drives."""
+    folder = tmp_path_factory.mktemp("demonstrated")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo, "MAP_LENGTH_M", 20.0)
+        patch.setattr(demo, "QUERY_LENGTH_M", 6.0)
+        patch.chdir(folder)
+        done = CliRunner().invoke(app, ["demo"], catch_exceptions=False)
+    assert done.exit_code == 0, done.stderr
+    return folder
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # half a minute of work; on a busy machine many times as long
 def test_the_readme_can_be_pasted_from_top_to_bottom(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    demonstrated: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In one folder, with only what its own commands have made; the demo's drives are short."""
-    monkeypatch.setattr(demo, "MAP_LENGTH_M", 20.0)
-    monkeypatch.setattr(demo, "QUERY_LENGTH_M", 6.0)
-    monkeypatch.chdir(tmp_path)
-    ran = []
+    """In one folder, with only what its own commands have made."""
+    monkeypatch.chdir(demonstrated)
+    ran = ["pc2grid demo"]
     for language, block in blocks("README.md", "sh", "python"):
         if language == "python":
             exec(compile(block, "README.md", "exec"), {})
@@ -169,11 +183,42 @@ def test_the_readme_can_be_pasted_from_top_to_bottom(
         for command in commands_of(block):
             if command.startswith("cd "):
                 monkeypatch.chdir(command.removeprefix("cd "))
-            elif run_or_parse(command) is None:
+            elif command not in ran and run_or_parse(command) is None:
                 ran.append(command)
     assert len(ran) > 15
     for file in re.findall(r"`(\w+\.(?:mcap|tum|submaps|png))`", (ROOT / "README.md").read_text()):
         assert Path(file).exists(), f"README names {file}, which its commands do not make"
+
+
+def test_the_cells_of_the_notebook_run(
+    demonstrated: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As plain Python, one after the other; what Jupyter would show of a last line is made as well."""
+    monkeypatch.chdir(demonstrated)
+    monkeypatch.setenv("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # the notebook sets it, for good
+    notebook = json.loads((ROOT / "examples" / "from_log_to_answer.ipynb").read_text())
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    names: dict[str, Any] = {}
+    shown: list[str] = []
+    with matplotlib.rc_context({"backend": "agg"}), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="FigureCanvasAgg is non-interactive")
+        for cell in cells:
+            lines = ast.parse("".join(cell["source"])).body
+            last = lines.pop() if isinstance(lines[-1], ast.Expr) else None
+            exec(compile(ast.Module(lines, []), "notebook", "exec"), names)
+            if last is not None:
+                value = eval(compile(ast.Expression(last.value), "notebook", "eval"), names)
+                for form in ("__repr__", "_repr_html_", "_repr_png_"):
+                    if hasattr(value, form):
+                        getattr(value, form)()
+                shown.append(repr(value))
+        matplotlib.pyplot.close("all")
+    assert any(text.startswith("Answer(located in 'lidar'") for text in shown)
+    (off_m,) = re.findall(r"off by ([\d.]+) m", capsys.readouterr().out)
+    assert float(off_m) < 0.25
+    # It was saved as it ran: in order, without an error.
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    assert all(output["output_type"] != "error" for cell in cells for output in cell["outputs"])
 
 
 @pytest.mark.parametrize(

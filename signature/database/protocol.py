@@ -137,6 +137,11 @@ class Neighbour:
     center_m: tuple[float, float]
     score: float
 
+    def __repr__(self) -> str:
+        x, y = self.center_m
+        where = f"{self.submap_id} of {short(self.session)} at ({x:.2f}, {y:.2f}) m"
+        return f"Neighbour({where}, score {self.score:.4f})"
+
 
 APPLICATION_ID = int.from_bytes(SUBMAPS_ID, "big")
 """Marks a file, and the lock of a server, as pc2grid's."""
