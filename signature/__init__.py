@@ -25,6 +25,8 @@ Answers
     relocalize          where in a database a recording was made: an Answer
     locate              where registered scans were taken; locate_map: where a drawn map lies
     Relocalizer         the same while the robot drives, in a MapIndex
+    Prior               where the robot is known to be, roughly
+    check_pose          whether a pose that is believed agrees with the map: a PoseCheck
     Config              settings
 """
 

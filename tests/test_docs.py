@@ -91,7 +91,8 @@ def test_help_begins_with_every_public_name(package: ModuleType) -> None:
     """What `help` prints behind it, dozens of modules and the methods of dataclasses, is no way in."""
     assert package.__doc__
     listed = set(re.findall(r"\w+", re.sub(r"^>>> .*$", "", package.__doc__, flags=re.MULTILINE)))
-    assert {name for name in package.__all__ if name[0] != "_"} <= listed
+    missing = {name for name in package.__all__ if name[0] != "_"} - listed
+    assert not missing, f"not in the docstring of {package.__name__}/__init__.py: {missing}"
 
 
 @pytest.mark.parametrize("package", ["pc2grid", "signature"])
