@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Literal
 
 from pydantic import Field
+from typing_extensions import Self
 
 import pc2grid.config
-from pc2grid.config import Section
+from pc2grid.config import PartitionConfig, Section
 
 
 class SignatureConfig(Section):
@@ -57,6 +58,10 @@ class SignatureConfig(Section):
         le=15,
         description="Hough's step in angle; the direction of a segment follows from its ends instead",
     )
+    axis_vote: Literal["length", "plain"] = Field(
+        "length",
+        description="segments vote on the axes with their length, blurred and refined; or with one vote each",
+    )
     axis_smoothing_deg: float = Field(
         2.0,
         gt=0,
@@ -74,8 +79,10 @@ class SignatureConfig(Section):
     symmetry_peak: float = Field(
         34.0,
         gt=0,
-        description="value of a straight line after the blur, and the limit of all values, which is not the "
-        "paper's; 34 is what an image of 0 and 255 gives at 0.05 m",
+        description="value of a straight line after the blur; 34: an image of 0 and 255 at 0.05 m",
+    )
+    symmetry_limited: bool = Field(
+        True, description="values above the peak, where lines meet, are cut to it; not so in the paper"
     )
 
     weight_boundary: float = Field(
@@ -89,6 +96,22 @@ class SignatureConfig(Section):
         "hellinger",
         description="sqrt(1 - BC), bounded by 1 where histograms share no bin; or -ln BC, capped at 20",
     )
+
+    @classmethod
+    def paper(cls) -> Self:
+        """The paper to the letter: -ln BC as d of Eq. 6, the thinning of III-A everywhere and at full
+        resolution, no limit in S^G, one vote for each segment. What the paper leaves open stays as it is.
+
+        >>> SignatureConfig.paper().histogram_distance
+        'bhattacharyya'
+        """
+        return cls(
+            histogram_distance="bhattacharyya",
+            thinning="zhang_suen",
+            freespace_cell_m=0.05,
+            symmetry_limited=False,
+            axis_vote="plain",
+        )
 
 
 class LoopsConfig(Section):
@@ -153,3 +176,8 @@ class Config(pc2grid.config.Config):
     signature: SignatureConfig = SignatureConfig()
     loops: LoopsConfig = LoopsConfig()
     relocalize: RelocalizeConfig = RelocalizeConfig()
+
+    @classmethod
+    def paper(cls) -> Self:
+        """The defaults, but with the submaps and signatures of the paper."""
+        return cls(partition=PartitionConfig.paper(), signature=SignatureConfig.paper())

@@ -46,9 +46,13 @@ def line_segments(edges: BoolGrid, resolution_m: float, config: SignatureConfig)
 def symmetry_axes(segments: F64, config: SignatureConfig) -> Axes | None:
     """The two directions with the most votes (III-D 2); None without segments.
 
-    segments : (N, 4) as of `line_segments`. A segment votes for its direction with its length, which is its
-    number of pixels. The votes are blurred around the half circle. Beta is the best direction at least
-    `config.axis_separation_deg` from alpha, or the perpendicular of alpha if no segment has such a direction.
+    segments : (N, 4) as of `line_segments`. Beta is the best direction at least `config.axis_separation_deg`
+    from alpha, or the perpendicular of alpha if no segment has such a direction.
+
+    The paper does not say how the segments vote. By `config.axis_vote`, "length": a segment votes with its
+    length, which is its number of pixels, the votes are blurred around the half circle, and an axis is the
+    mean direction of the segments near its peak; "plain": a segment has one vote, and an axis is a whole
+    degree.
     """
     from scipy.ndimage import gaussian_filter1d
 
@@ -57,14 +61,18 @@ def symmetry_axes(segments: F64, config: SignatureConfig) -> Axes | None:
     if lengths.sum() == 0.0:
         return None
     at = np.round(np.degrees(angles_rad)).astype(np.int64) % _DIRECTIONS
-    votes = np.bincount(at, weights=lengths, minlength=_DIRECTIONS)
-    votes = gaussian_filter1d(votes, config.axis_smoothing_deg, mode="wrap", radius=_DIRECTIONS // 2 - 1)
+    plain = config.axis_vote == "plain"
+    votes = np.bincount(at, weights=None if plain else lengths, minlength=_DIRECTIONS).astype(np.float64)
+    if not plain:
+        votes = gaussian_filter1d(votes, config.axis_smoothing_deg, mode="wrap", radius=_DIRECTIONS // 2 - 1)
     alpha = int(np.argmax(votes))
     apart = np.abs((np.arange(_DIRECTIONS) - alpha + 90) % _DIRECTIONS - 90)
     others = np.where(apart >= config.axis_separation_deg, votes, 0.0)
     beta = int(np.argmax(others))
     if others[beta] <= _LEAST_VOTE * votes[alpha]:
         beta = (alpha + 90) % _DIRECTIONS
+    if plain:
+        return Axes(math.radians(alpha), math.radians(beta))
     return Axes(*(_mean_direction(peak, angles_rad, lengths, config) for peak in (alpha, beta)))
 
 
@@ -84,7 +92,8 @@ def _mean_direction(peak_deg: int, angles_rad: F64, lengths: F64, config: Signat
 def blurred(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F32:
     """S^G (H, W): the edge map under a Gaussian, scaled so that a straight line peaks at `symmetry_peak`.
 
-    Values above the peak, where lines meet, are cut to it. The paper does not do so.
+    With `config.symmetry_limited` values above the peak, where lines meet, are cut to it. The paper does not
+    do so.
     """
     import cv2
 
@@ -92,7 +101,8 @@ def blurred(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F3
     size = 2 * math.ceil(3 * sigma) + 1
     crest = np.float32(config.symmetry_peak * sigma * math.sqrt(2 * math.pi))
     image = cv2.GaussianBlur(edges * crest, (size, size), sigma, borderType=cv2.BORDER_CONSTANT)
-    return np.minimum(image, np.float32(config.symmetry_peak), out=image)
+    most = np.float32(config.symmetry_peak if config.symmetry_limited else np.inf)
+    return np.minimum(image, most, out=image)
 
 
 def reflection_score(cells: I64, image: F32, axis_rad: float) -> float:
@@ -114,7 +124,7 @@ def reflection_score(cells: I64, image: F32, axis_rad: float) -> float:
 
 
 def symmetry_scores(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F32:
-    """Both reflection symmetry scores (s^alpha, s^beta), (2,), 0 .. `symmetry_peak` (III-D 3).
+    """Both reflection symmetry scores (s^alpha, s^beta), (2,), 0 .. `symmetry_peak` if limited (III-D 3).
 
     Without any line segment there is no axis, and both are 0.
     """

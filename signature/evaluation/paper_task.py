@@ -5,10 +5,11 @@ own.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,8 +23,8 @@ from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid.submaps.partition import partition
 from signature.baselines import METHOD_NAMES, Method, make_methods
 from signature.config import SignatureConfig
-from signature.evaluation.noise import NOISE_LEVELS
-from signature.evaluation.paper_experiment import BestMatches, Experiment, evaluate
+from signature.evaluation.noise import NOISE_LEVELS, Noise
+from signature.evaluation.paper_experiment import BestMatches, Experiment, MatchMeasures, evaluate
 from signature.evaluation.paper_tables import MAPS, SIZE_PX
 
 Reading = Literal["paper", "true"]
@@ -43,26 +44,112 @@ TOGETHER = (
 )
 """Methods that share their features and therefore run together."""
 
-OPEN_CHOICES: tuple[tuple[str, Any], ...] = (
-    ("histogram_distance", "bhattacharyya"),
-    ("boundary_spacing_m", 0.05),
-    ("boundary_spacing_m", 0.2),
-    ("freespace_spacing_m", 0.4),
-    ("freespace_spacing_m", 1.0),
-    ("freespace_cell_m", 0.05),
-    ("freespace_clearance_m", 0.3),
-    ("freespace_join_m", 1.5),
-    ("thinning", "zhang_suen"),
-    ("symmetry_peak", 255.0),
-    ("symmetry_sigma", 1e6),
-    ("weight_boundary", 0.7),
-    ("weight_boundary", 1.0),
-)
-"""Other values of the parameters that the paper leaves open (and of two that it gives), to measure their
-effect.
-"""
 
-_FORMAT = 1  # of the result files; a change of the meaning of their numbers changes it too
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """Another setting of the proposed method, to measure what it moves.
+
+    name : in a few words. paper : what the paper says of it. ours : what the default does instead.
+    overrides : fields of SignatureConfig with the other values.
+    """
+
+    name: str
+    paper: str
+    ours: str
+    overrides: tuple[tuple[str, Any], ...]
+
+
+_NO_SYMMETRY = ("symmetry_sigma", 1e6)
+
+ABLATION = (
+    Choice(
+        name="boundary and free space",
+        paper="Eq. 6 with Omega = 1",
+        ours="Eq. 6",
+        overrides=(_NO_SYMMETRY,),
+    ),
+    Choice(
+        name="boundary alone",
+        paper="omega_b = 1, Omega = 1",
+        ours="Eq. 6",
+        overrides=(("weight_boundary", 1.0), _NO_SYMMETRY),
+    ),
+    Choice(
+        name="free space alone",
+        paper="omega_b = 0, Omega = 1",
+        ours="Eq. 6",
+        overrides=(("weight_boundary", 0.0), _NO_SYMMETRY),
+    ),
+    Choice(
+        name="symmetry made to count",
+        paper="sigma = 120",
+        ours="sigma = 120; here 4",
+        overrides=(("symmetry_sigma", 4.0),),
+    ),
+)
+"""What each signature adds."""
+
+OPEN_CHOICES = (
+    Choice(
+        name="to the letter",
+        paper="all of the next five",
+        ours="none of them",
+        overrides=tuple(
+            (key, value) for key, value in SignatureConfig.paper() if value != getattr(SignatureConfig(), key)
+        ),
+    ),
+    Choice(
+        name="-ln BC",
+        paper="Bhattacharyya distance",
+        ours="sqrt(1 - BC), which OpenCV calls so",
+        overrides=(("histogram_distance", "bhattacharyya"),),
+    ),
+    Choice(
+        name="Zhang-Suen thinning",
+        paper="thinning, not which one",
+        ours="Guo-Hall in the signatures",
+        overrides=(("thinning", "zhang_suen"),),
+    ),
+    Choice(
+        name="full resolution",
+        paper="skeleton of the map",
+        ours="free-space skeleton on blocks of 0.1 m",
+        overrides=(("freespace_cell_m", 0.05),),
+    ),
+    Choice(
+        name="no limit in S^G",
+        paper="no limit",
+        ours="cut at 34, the value of a straight line",
+        overrides=(("symmetry_limited", False),),
+    ),
+    Choice(
+        name="plain vote",
+        paper="voting on the angles",
+        ours="by length, blurred, refined",
+        overrides=(("axis_vote", "plain"),),
+    ),
+    Choice(name="boundary points 0.05 m", paper="-", ours="0.1 m", overrides=(("boundary_spacing_m", 0.05),)),
+    Choice(name="boundary points 0.2 m", paper="-", ours="0.1 m", overrides=(("boundary_spacing_m", 0.2),)),
+    Choice(name="nodes 0.4 m apart", paper="-", ours="0.6 m", overrides=(("freespace_spacing_m", 0.4),)),
+    Choice(name="nodes 1.0 m apart", paper="-", ours="0.6 m", overrides=(("freespace_spacing_m", 1.0),)),
+    Choice(
+        name="eroded by 0.3 m",
+        paper="erosion, not how much",
+        ours="0.2 m",
+        overrides=(("freespace_clearance_m", 0.3),),
+    ),
+    Choice(
+        name="nodes joined to 1.5 m",
+        paper="all that see each other",
+        ours="the same",
+        overrides=(("freespace_join_m", 1.5),),
+    ),
+    Choice(name="S^G peaks at 255", paper="-", ours="34", overrides=(("symmetry_peak", 255.0),)),
+    Choice(name="omega_b = 0.7", paper="0.9", ours="0.9", overrides=(("weight_boundary", 0.7),)),
+)
+"""Where the default departs from the paper, and other values of what the paper leaves open."""
+
+_FORMAT = 2  # of the result files; a change of the meaning of their numbers changes it too
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,6 +159,7 @@ class PaperTask:
     reading : the image of killian has 0.10 m a pixel, while the paper says 0.05. "paper" reads it as the
         paper does, half as large; "true" reads it in its true size. For all other maps both are the same.
     overrides : fields of SignatureConfig that differ from their defaults, for the proposed method.
+    speckle_sigma_m : spread of the boundary noise, which the paper leaves open.
     """
 
     map_path: Path
@@ -83,6 +171,12 @@ class PaperTask:
     queries: int
     seed: int
     overrides: tuple[tuple[str, Any], ...] = ()
+    speckle_sigma_m: float = Noise(boundary=0, freespace=0).speckle_sigma_m
+
+    @property
+    def noise(self) -> Noise:
+        """The noise of the level, with the spread of this task."""
+        return replace(NOISE_LEVELS[self.level], speckle_sigma_m=self.speckle_sigma_m)
 
     @property
     def map_name(self) -> str:
@@ -92,6 +186,8 @@ class PaperTask:
     def result_path(self, folder: Path, method: str) -> Path:
         """The file of one method's result."""
         changed = "".join(f".{key}={value}" for key, value in self.overrides)
+        if self.speckle_sigma_m != NOISE_LEVELS[self.level].speckle_sigma_m:
+            changed += f".speckles{self.speckle_sigma_m:g}"
         return folder / (
             f"{self.map_name}-{self.reading}.{method}.noise{self.level}.r{self.radius_m:g}"
             f".offset{self.offset_m:g}.q{self.queries}.seed{self.seed}{changed}.json"
@@ -102,16 +198,17 @@ def paper_tasks(
     maps: Sequence[Path],
     *,
     methods: Sequence[str] = METHOD_NAMES,
-    offsets_m: Sequence[float] = (0.5, 1.0),
+    offsets_m: Sequence[float] = (1.0, 0.5),
     queries: int = 2000,
     seed: int = 1,
-    open_choices: bool = False,
+    choices: Sequence[Choice] = (),
+    speckle_sigma_m: float = NOISE_LEVELS[0].speckle_sigma_m,
 ) -> Iterator[PaperTask]:
-    """Every task of Tables III and IV; with `open_choices` also those that measure `OPEN_CHOICES`.
+    """Every task of Tables III and IV, and those that measure other `choices`.
 
     In its true size killian is given to the proposed method only, because it has five times as many submaps.
     """
-    common = {"queries": queries, "seed": seed}
+    common: dict[str, Any] = {"queries": queries, "seed": seed, "speckle_sigma_m": speckle_sigma_m}
     for offset_m in offsets_m:
         for together in TOGETHER:
             group = tuple(name for name in together if name in methods)
@@ -124,11 +221,9 @@ def paper_tasks(
                 if group == ("proposed",):
                     for radius_m in (r for r in RADII_M if r != 8.0):
                         yield _task(path, "paper", group, 1, radius_m, offset_m, **common)
-                    for choice in OPEN_CHOICES if open_choices else ():
-                        for level in (0, 2):
-                            yield _task(
-                                path, "paper", group, level, 8.0, offset_m, overrides=(choice,), **common
-                            )
+                    for choice, level in itertools.product(choices, (0, 2)):
+                        changed = choice.overrides
+                        yield _task(path, "paper", group, level, 8.0, offset_m, overrides=changed, **common)
 
 
 def _task(
@@ -176,7 +271,10 @@ def halved(grid: OccupancyGrid) -> OccupancyGrid:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperCell:
-    """One cell of a table: the facts of its task, its measures, and the best match of every query."""
+    """One cell of a table: the facts of its task, its measures, and the best match of every query.
+
+    half_widths : half of the interval from 5 to 95 % of each measure, by bootstrap over the queries.
+    """
 
     map_name: str
     reading: Reading
@@ -194,12 +292,17 @@ class PaperCell:
     f1: float
     true_share: float
     matches: BestMatches
+    speckle_sigma_m: float
+    half_widths: MatchMeasures
 
     def summary(self) -> dict[str, Any]:
         """Everything except the single queries, for JSON and CSV."""
-        return {key: getattr(self, key) for key in self.__slots__ if key not in ("matches", "overrides")} | {
-            "overrides": dict(self.overrides)
-        }
+        rest = ("matches", "overrides", "half_widths")
+        return (
+            {key: getattr(self, key) for key in self.__slots__ if key not in rest}
+            | {f"{measure}_half_width": value for measure, value in self.half_widths._asdict().items()}
+            | {"overrides": dict(self.overrides)}
+        )
 
 
 def fingerprint(task: PaperTask, method: str) -> str:
@@ -209,7 +312,7 @@ def fingerprint(task: PaperTask, method: str) -> str:
         "format": _FORMAT,
         "version": __version__,
         "map": hashlib.sha256(task.map_path.read_bytes() + _image_bytes(task.map_path)).hexdigest(),
-        "noise": asdict(NOISE_LEVELS[task.level]),
+        "noise": asdict(task.noise),
         "partition": PartitionConfig.paper(task.radius_m).model_dump(),
         "signature": signature.model_dump() if method == "proposed" else None,
     }
@@ -234,8 +337,9 @@ def load_result(task: PaperTask, method: str, folder: Path) -> PaperCell | None:
             similarity=np.array(stored.pop("similarity"), np.float64),
             correct=np.array(stored.pop("correct"), np.bool_),
         )
+        half_widths = MatchMeasures(*(stored.pop(f"{key}_half_width") for key in MatchMeasures._fields))
         stored["overrides"] = tuple((key, value) for key, value in stored["overrides"].items())
-        return PaperCell(matches=matches, **stored)
+        return PaperCell(matches=matches, half_widths=half_widths, **stored)
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -252,10 +356,11 @@ def run_task(task: PaperTask, folder: Path, progress: Callable[[float], None] | 
     grid = read_map(task.map_path, task.reading)
     submaps = partition(grid, PartitionConfig.paper(task.radius_m))
     experiment = Experiment(queries=task.queries, offset_m=task.offset_m, seed=task.seed)
-    found = evaluate(_methods(missing, task), grid, submaps, experiment, NOISE_LEVELS[task.level], progress)
+    found = evaluate(_methods(missing, task), grid, submaps, experiment, task.noise, progress)
     seconds = round((time.perf_counter() - started) / len(missing), 2)
     for method, matches in found.items():
-        curve = matches.curve()
+        measures = matches.measures()
+        low, high = matches.intervals()
         result = PaperCell(
             map_name=task.map_name,
             reading=task.reading,
@@ -268,11 +373,13 @@ def run_task(task: PaperTask, folder: Path, progress: Callable[[float], None] | 
             overrides=task.overrides,
             submaps=len(submaps),
             seconds=seconds,
-            auc=curve.auc,
-            rp9=curve.recall_at_90,
-            f1=curve.f1,
-            true_share=float(matches.correct.mean()),
+            auc=measures.auc,
+            rp9=measures.rp9,
+            f1=measures.f1,
+            true_share=measures.r_at_1,
             matches=matches,
+            speckle_sigma_m=task.speckle_sigma_m,
+            half_widths=MatchMeasures(*((b - a) / 2 for a, b in zip(low, high, strict=True))),
         )
         document = result.summary() | {
             "fingerprint": fingerprint(task, method),
@@ -292,6 +399,11 @@ def _methods(names: Sequence[str], task: PaperTask) -> dict[str, Method]:
     return methods
 
 
-def known_maps(folder: Path) -> list[Path]:
-    """Paths of the paper's maps (`NAME.yaml`) that are in a folder, in the paper's order."""
-    return [folder / f"{name}.yaml" for name in MAPS if (folder / f"{name}.yaml").is_file()]
+def known_maps(path: Path) -> list[Path]:
+    """The maps that a path names: itself, if it is a file; else those of the paper in the folder, in the
+    paper's order; else every `*.yaml` in it, by name.
+    """
+    if path.is_file():
+        return [path]
+    published = [path / f"{name}.yaml" for name in MAPS if (path / f"{name}.yaml").is_file()]
+    return published or sorted(path.glob("*.yaml"))

@@ -20,8 +20,9 @@ from pc2grid_cli.compare_paper import compare_paper_command
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.paper_report import published, verdicts
 from signature.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES
+from signature.evaluation.paper_experiment import BestMatches
 from signature.evaluation.paper_tables import MAPS, TABLE_3, TABLE_4
-from signature.evaluation.paper_task import load_result, paper_tasks, run_task
+from signature.evaluation.paper_task import ABLATION, OPEN_CHOICES, load_result, paper_tasks, run_task
 from tests.helpers.rooms import cross, grid_of, l_shape, rectangle
 
 app = typer.Typer()
@@ -92,7 +93,8 @@ def test_a_damaged_or_outdated_cell_is_run_again(maps: Path, tmp_path: Path) -> 
 
 
 def test_open_choices_change_the_proposed_method_only(maps: Path) -> None:
-    tasks = list(paper_tasks([maps / "intel.yaml"], methods=["proposed", "sdf"], open_choices=True))
+    choices = (*ABLATION, *OPEN_CHOICES)
+    tasks = list(paper_tasks([maps / "intel.yaml"], methods=["proposed", "sdf"], choices=choices))
     changed = [task for task in tasks if task.overrides]
     assert changed and all(task.methods == ("proposed",) for task in changed)
     paths = [task.result_path(Path(), method) for task in tasks for method in task.methods]
@@ -107,8 +109,48 @@ def test_verdicts_and_published_cells(maps: Path, tmp_path: Path) -> None:
     assert published(result) == TABLE_3[0]["proposed"]["intel"]
     lines = verdicts([result])
     near = abs(result.auc - 0.965) <= 0.03
-    assert f"on {int(near)} (" in lines[0]
-    assert "intel proposed" in lines[1]
+    assert "published F1" in lines[0]
+    assert f"on {int(near)} (" in lines[1]
+    assert "intel proposed" in lines[2]
+
+
+def test_the_ablation_and_any_floor(tmp_path: Path) -> None:
+    """A floor that the paper does not have gets its own column, without published figures."""
+    save_map(grid_of(np.hstack([cross(6.0, 2.0), rectangle(8.0, 5.0), l_shape()])), tmp_path / "depot")
+    arguments = ["--maps", str(tmp_path / "depot.yaml"), "--out", str(tmp_path / "out"), "--queries", "3"]
+    arguments += [
+        "--jobs",
+        "1",
+        "--offset",
+        "1.0",
+        "--methods",
+        "proposed",
+        "--ablation",
+        "--speckles",
+        "0.25",
+    ]
+    run = runner.invoke(app, arguments)
+    assert run.exit_code == 0, run.output
+    assert "depot" in run.stdout and "boundary alone" in run.stdout and "R@1" in run.stdout
+    cells = json.loads((tmp_path / "out" / "results.json").read_text())["cells"]
+    assert {cell["paper_auc"] for cell in cells} == {None}
+    assert {cell["speckle_sigma_m"] for cell in cells} == {0.25}
+    assert len(cells) == 3 + 2 + 2 * len(ABLATION)
+
+
+def test_intervals_hold_the_measure_and_shrink_with_more_queries() -> None:
+    rng = np.random.default_rng(4)
+    widths = []
+    for count in (100, 1600):
+        correct = rng.random(count) < 0.8
+        matches = BestMatches(similarity=rng.normal(correct, 0.7), correct=correct)
+        low, high = matches.intervals()
+        assert low.auc < matches.measures().auc < high.auc
+        assert low.r_at_1 < correct.mean() < high.r_at_1
+        widths.append(high.r_at_1 - low.r_at_1)
+    # A share of n draws has the standard deviation sqrt(p (1 - p) / n): a quarter with 16 times as many.
+    assert 3.0 < widths[0] / widths[1] < 5.3
+    assert abs(widths[0] - 2 * 1.645 * np.sqrt(0.8 * 0.2 / 100)) < 0.04
 
 
 @pytest.mark.parametrize(
@@ -116,7 +158,7 @@ def test_verdicts_and_published_cells(maps: Path, tmp_path: Path) -> None:
     [
         (["--methods", "orb"], ConfigError, "orb"),
         (["--offset", "-1"], ConfigError, "above 0"),
-        (["--maps", "."], MapFileError, "none of the paper's maps"),
+        (["--maps", "."], MapFileError, "no map is here"),
     ],
 )
 def test_wrong_arguments_say_what_is_wrong(

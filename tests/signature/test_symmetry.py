@@ -61,6 +61,25 @@ def test_axes_need_not_be_perpendicular_but_are_apart() -> None:
     assert math.degrees(axes.beta_rad) == pytest.approx(60, abs=0.5)
 
 
+def test_a_plain_vote_counts_segments_not_metres() -> None:
+    segments = np.array([line(20.4, 300), line(80, 10), line(80, 10), line(110, 10)])
+    by_length = symmetry_axes(segments, CONFIG)
+    plain = symmetry_axes(segments, CONFIG.model_copy(update={"axis_vote": "plain"}))
+    assert by_length is not None and plain is not None
+    assert math.degrees(by_length.alpha_rad) == pytest.approx(20.4, abs=0.1)
+    assert math.degrees(plain.alpha_rad) == pytest.approx(80)  # a whole degree
+    assert math.degrees(plain.beta_rad) == pytest.approx(20)
+
+
+def test_without_the_limit_crossing_lines_are_brighter_than_one() -> None:
+    edges = np.zeros((101, 101), bool)
+    edges[50, 10:91] = edges[10:91, 50] = True
+    limited = blurred(edges, RESOLUTION_M, CONFIG)
+    unlimited = blurred(edges, RESOLUTION_M, CONFIG.model_copy(update={"symmetry_limited": False}))
+    assert limited.max() == CONFIG.symmetry_peak < unlimited.max()
+    np.testing.assert_array_equal(limited, np.minimum(unlimited, np.float32(CONFIG.symmetry_peak)))
+
+
 def test_short_segments_are_not_lines() -> None:
     edges = np.zeros((321, 321), bool)
     edges[100, 100:105] = True  # 0.25 m

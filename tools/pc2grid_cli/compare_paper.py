@@ -25,7 +25,11 @@ _COSTS = {"proposed": 1.0, "shape_context": 1.0, "sdf": 14.0, "sift_bow": 8.0, "
 def compare_paper_command(
     context: typer.Context,
     maps: Annotated[
-        Path, typer.Option("--maps", help="Folder with fr079.yaml, intel.yaml, ... of the paper.")
+        Path,
+        typer.Option(
+            "--maps",
+            help="Folder with fr079.yaml, intel.yaml, ... of the paper; or a map, or a folder of maps.",
+        ),
     ],
     out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="Folder for results; run again to go on.")] = Path(
         "paper-tables"
@@ -42,41 +46,48 @@ def compare_paper_command(
     offset: Annotated[
         list[float] | None,
         typer.Option(
-            "--offset", help="Farthest a query lies from a submap centre, m; repeatable. [0.5 and 1.0]"
+            "--offset", help="Farthest a query lies from a submap centre, m; repeatable. [1.0 and 0.5]"
         ),
     ] = None,
     open_choices: Annotated[
         bool,
-        typer.Option("--open-choices", help="Also measure what each parameter the paper leaves open moves."),
+        typer.Option("--open-choices", help="Also what each departure and open parameter moves."),
     ] = False,
+    ablation: Annotated[
+        bool, typer.Option("--ablation", help="Also the proposed method without some of its signatures.")
+    ] = False,
+    speckles: Annotated[
+        float,
+        typer.Option("--speckles", min=0.0, help="Spread of the boundary noise, m; the paper gives none."),
+    ] = 0.1,
     jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="Processes. [one a core]")] = None,
     seed: Annotated[int, typer.Option("--seed", help="Of the queries and their noise.")] = 1,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON document instead of tables.")
     ] = False,
 ) -> None:
-    """Reproduce the paper's tables and figures 9 and 10 on its maps, each number beside the published one.
+    """Reproduce the paper's tables and figures 9 and 10, each number beside the published one.
 
-    Example: pc2grid compare paper --maps maps/ --queries 200
+    Example: pc2grid compare paper --maps maps/ --queries 200 --ablation
     """
     from pc2grid.errors import ConfigError, MapFileError
     from pc2grid_cli import paper_report
     from pc2grid_cli.console import of, print_json
     from signature.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES
-    from signature.evaluation.paper_task import known_maps, paper_tasks
+    from signature.evaluation.paper_task import ABLATION, OPEN_CHOICES, known_maps, paper_tasks
 
     chosen = tuple(methods or METHOD_NAMES)
     known = METHOD_NAMES + EXTRA_METHOD_NAMES
     for name in chosen:
         if name not in known:
             raise ConfigError(f"--methods: no method {name!r}", hint=f"one of {', '.join(known)}")
-    offsets_m = tuple(offset or (0.5, 1.0))
+    offsets_m = tuple(offset or (1.0, 0.5))
     if min(offsets_m) <= 0:
         raise ConfigError("--offset: expected a distance above 0 m")
     map_paths = known_maps(maps)
     if not map_paths:
         raise MapFileError(
-            f"{maps}: none of the paper's maps is here", hint="a folder with intel.yaml, fr079.yaml, ..."
+            f"{maps}: no map is here", hint="a map.yaml, or a folder with intel.yaml, fr079.yaml, ..."
         )
     cells = out / "cells"
     make_folder(out)
@@ -88,7 +99,8 @@ def compare_paper_command(
             offsets_m=offsets_m,
             queries=queries,
             seed=seed,
-            open_choices=open_choices,
+            choices=(*(ABLATION if ablation else ()), *(OPEN_CHOICES if open_choices else ())),
+            speckle_sigma_m=speckles,
         )
     )
     run_tasks(tasks, cells, jobs or os.cpu_count() or 1, of(context))

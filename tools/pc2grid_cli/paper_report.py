@@ -6,13 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
 from pc2grid.io.atomic import replace_file
+from signature.evaluation.paper_experiment import MatchMeasures, largest_right_share
 from signature.evaluation.paper_tables import MAPS, SUBMAPS, TABLE_3, TABLE_4, Measures
-from signature.evaluation.paper_task import RADII_M, PaperCell
+from signature.evaluation.paper_task import ABLATION, OPEN_CHOICES, RADII_M, Choice, PaperCell, Reading
 
 _LEVELS = ("without noise", "noise level 1", "noise level 2")
 
@@ -30,56 +32,80 @@ def published(result: PaperCell) -> Measures | None:
 
 def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
     """Tables I, III and IV on stdout: published, ours and the difference, in thousandths."""
-    console = Console(width=120, highlight=False)
+    console = Console(width=150, highlight=False)
     plain = [r for r in results if not r.overrides]
-    console.print("Of three numbers: paper, ours, difference, in thousandths.")
+    columns = _columns(plain)
+    console.print(
+        "Of three numbers: paper, ours, difference, in thousandths; +-: half of the interval from 5 to 95 %,"
+        " by bootstrap over the queries."
+    )
     _print_submaps(console, plain)
-    for offset_m in sorted({r.offset_m for r in plain}):
+    for offset_m in dict.fromkeys(r.offset_m for r in plain):
         here = [r for r in plain if r.offset_m == offset_m]
         where = f"queries within {offset_m:g} m of a submap centre"
-        for measure in Measures._fields:
-            table = _table(f"Table III, {measure.upper()}, {where}", "noise", "method")
+        for measure in MatchMeasures._fields:
+            title = "R@1" if measure == "r_at_1" else measure.upper()
+            table = _table(f"Table III, {title}, {where}", columns, "noise", "method")
             for level in range(len(_LEVELS)):
                 for i, method in enumerate(methods):
                     row = [r for r in here if (r.method, r.level, r.radius_m) == (method, level, 8.0)]
-                    table.add_row(str(level) if i == 0 else "", method, *_cells(row, measure))
+                    table.add_row(str(level) if i == 0 else "", method, *_cells(row, columns, measure))
                 table.add_section()
             console.print(table)
-        table = _table(f"Table IV (proposed, noise level 1), {where}", "radius", "measure")
+        table = _table(f"Table IV (proposed, noise level 1), {where}", columns, "radius", "measure")
         for radius_m in RADII_M:
             row = [r for r in here if (r.method, r.level, r.radius_m) == ("proposed", 1, radius_m)]
             for measure in Measures._fields:
                 table.add_row(
-                    f"{radius_m:g} m" if measure == "auc" else "", measure.upper(), *_cells(row, measure)
+                    f"{radius_m:g} m" if measure == "auc" else "",
+                    measure.upper(),
+                    *_cells(row, columns, measure),
                 )
         console.print(table)
         for line in verdicts(here):
             console.print(line)
-        _print_open_choices(console, [r for r in results if r.offset_m == offset_m], where)
+        of_offset = [r for r in results if r.offset_m == offset_m]
+        _print_choices(console, of_offset, columns, "What each signature adds", ABLATION, where)
+        _print_choices(console, of_offset, columns, "What other choices move", OPEN_CHOICES, where)
 
 
-def _table(title: str, *heads: str) -> Table:
+Column = tuple[str, Reading]
+"""Name and reading of a map."""
+
+
+def _columns(results: Sequence[PaperCell]) -> list[Column]:
+    """The maps of the results, those of the paper first and in its order."""
+    found = {(r.map_name, r.reading): None for r in results}
+    readings: tuple[Reading, ...] = ("paper", "true")
+    known: list[Column] = [(name, reading) for reading in readings for name in MAPS]
+    return [key for key in known if key in found] + [key for key in found if key not in known]
+
+
+def _table(title: str, columns: Sequence[Column], *heads: str) -> Table:
     """A table with a column for each map; killian* is killian at its true size."""
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    for head in (*heads, *MAPS, "killian*"):
-        table.add_column(head, no_wrap=True, justify="left" if head in heads else "right")
+    for head in heads:
+        table.add_column(head, no_wrap=True)
+    for name, reading in columns:
+        table.add_column(f"{name}*" if reading == "true" else name, no_wrap=True, justify="right")
     return table
 
 
-def _cells(row: Sequence[PaperCell], measure: str) -> list[str]:
-    """A text for each map, and one for killian at its true size."""
+def _cells(row: Sequence[PaperCell], columns: Sequence[Column], measure: str) -> list[str]:
+    """A text for each map."""
     texts = []
-    for name, reading in [*((name, "paper") for name in MAPS), ("killian", "true")]:
-        found = [r for r in row if (r.map_name, r.reading) == (name, reading)]
+    for column in columns:
+        found = [r for r in row if (r.map_name, r.reading) == column]
         if not found:
             texts.append("")
             continue
-        ours, paper = round(1000 * getattr(found[0], measure)), published(found[0])
-        if paper is None:
-            texts.append(str(ours))
+        ours, paper = round(1000 * getattr(found[0].matches.measures(), measure)), published(found[0])
+        spread = f" +-{round(1000 * getattr(found[0].half_widths, measure)):<2d}"
+        if paper is None or measure not in Measures._fields:
+            texts.append(f"{ours}{spread}")
         else:
             there = round(1000 * getattr(paper, measure))
-            texts.append(f"{there:3d} {ours:4d} {ours - there:+4d}")
+            texts.append(f"{there:3d} {ours:4d} {ours - there:+4d}{spread}")
     return texts
 
 
@@ -88,16 +114,18 @@ def _print_submaps(console: Console, results: Sequence[PaperCell]) -> None:
     for head in ("map", "paper", "ours", "difference"):
         table.add_column(head, justify="right")
     counts = {(r.map_name, r.reading): r.submaps for r in results if r.radius_m == 8.0}
-    for (name, reading), ours in sorted(
-        counts.items(), key=lambda item: (MAPS.index(item[0][0]), item[0][1])
-    ):
-        paper = SUBMAPS[name]
+    for name, reading in _columns(results):
+        ours, paper = counts[name, reading], SUBMAPS.get(name)
         label = f"{name}*" if reading == "true" else name
-        table.add_row(label, str(paper), str(ours), f"{100 * (ours / paper - 1):+.0f} %")
+        if paper is None:
+            table.add_row(label, "", str(ours), "")
+        else:
+            table.add_row(label, str(paper), str(ours), f"{100 * (ours / paper - 1):+.0f} %")
     console.print(table)
-    console.print(
-        "killian: its image as the paper reads it, 0.05 m a pixel; killian*: at its true 0.10 m a pixel"
-    )
+    if any(reading == "true" for _, reading in counts):
+        console.print(
+            "killian: its image as the paper reads it, 0.05 m a pixel; killian*: at its true 0.10 m a pixel"
+        )
 
 
 def verdicts(results: Sequence[PaperCell]) -> list[str]:
@@ -108,6 +136,20 @@ def verdicts(results: Sequence[PaperCell]) -> list[str]:
         if r.radius_m == 8.0 and r.reading == "paper" and not r.overrides
     }
     lines = []
+    shares = {
+        r.map_name: r.true_share
+        for r in results
+        if (r.method, r.level, r.radius_m, r.reading, r.overrides) == ("proposed", 0, 8.0, "paper", ())
+    }
+    possible = [
+        name
+        for name in MAPS
+        if name in shares and shares[name] <= largest_right_share(TABLE_3[0]["proposed"][name].f1)
+    ]
+    lines.append(
+        "proposed, without noise: R@1 is possible with the published F1, p <= F1 / (2 - F1), on"
+        f" {len(possible)} ({', '.join(possible) or 'none'})"
+    )
     near = [
         name
         for name in MAPS
@@ -126,22 +168,46 @@ def verdicts(results: Sequence[PaperCell]) -> list[str]:
     return lines
 
 
-def _print_open_choices(console: Console, results: Sequence[PaperCell], where: str) -> None:
-    changed = [r for r in results if r.overrides]
-    if not changed:
+def _print_choices(
+    console: Console,
+    results: Sequence[PaperCell],
+    columns: Sequence[Column],
+    title: str,
+    choices: Sequence[Choice],
+    where: str,
+) -> None:
+    """A table of some choices: what the paper says, what the default does, and what the choice moves."""
+    if not any(r.overrides == choice.overrides for r in results for choice in choices):
         return
-    base = {(r.map_name, r.level): r.auc for r in results if _is_base(r)}
-    table = Table(title=f"What open choices move, AUC x 1000, {where}", title_justify="left", box=SIMPLE_HEAD)
-    for head in ("choice", "noise", *MAPS):
-        table.add_column(head, justify="left" if head == "choice" else "right")
-    for choice in dict.fromkeys(r.overrides for r in changed):
+    maps = [name for name, reading in columns if reading == "paper"]
+    base = {(r.map_name, r.level): r.matches.measures() for r in results if _is_base(r)}
+    table = Table(
+        title=f"{title}: AUC x 1000, {where}", title_justify="left", box=SIMPLE_HEAD, pad_edge=False
+    )
+    for head in ("choice", "the paper says", "we do", "noise", *maps, "mean", "mean R@1"):
+        table.add_column(head, justify="right" if head in maps or head.startswith("mean") else "left")
+    for level in (0, 2):
+        here = [base[name, level] for name in maps if (name, level) in base]
+        if here:
+            means = [float(np.mean(values)) for values in ([m.auc for m in here], [m.r_at_1 for m in here])]
+            cells = [f"{1000 * value:.0f}" for value in [m.auc for m in here] + means]
+            table.add_row("all three", "", "Eq. 6", str(level), *cells)
+    for choice in choices:
         for level in (0, 2):
-            cells = {r.map_name: r.auc for r in changed if r.overrides == choice and r.level == level}
-            shifts = [
-                f"{1000 * (cells[m] - base[m, level]):+.0f}" if m in cells and (m, level) in base else ""
-                for m in MAPS
-            ]
-            table.add_row(" ".join(f"{k} = {v}" for k, v in choice), str(level), *shifts)
+            moved = {
+                r.map_name: r.matches.measures()
+                for r in results
+                if r.overrides == choice.overrides and r.level == level and (r.map_name, level) in base
+            }
+            if not moved:
+                continue
+            auc = {name: 1000 * (moved[name].auc - base[name, level].auc) for name in moved}
+            right = [1000 * (moved[name].r_at_1 - base[name, level].r_at_1) for name in moved]
+            shifts = [f"{auc[name]:+.0f}" if name in auc else "" for name in maps]
+            words = (choice.name, choice.paper, choice.ours) if level == 0 else ("", "", "")
+            table.add_row(
+                *words, str(level), *shifts, f"{np.mean(list(auc.values())):+.0f}", f"{np.mean(right):+.0f}"
+            )
     console.print(table)
 
 
@@ -163,7 +229,7 @@ def draw_figures(results: Sequence[PaperCell], out: Path) -> list[Path]:
 
     paths = []
     plain = [r for r in results if not r.overrides and r.reading == "paper"]
-    names = [name for name in MAPS if any(r.map_name == name for r in plain)]
+    names = [name for name, _ in _columns(plain)]
     for offset_m in sorted({r.offset_m for r in plain}):
         here = [r for r in plain if r.offset_m == offset_m]
         figure = Figure(figsize=(3.2 * len(names), 8.4), layout="constrained")
