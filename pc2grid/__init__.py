@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from pc2grid.model import Trajectory as Trajectory
     from pc2grid.observer import Observer as Observer
     from pc2grid.pipeline import build_map as build_map
+    from pc2grid.pipeline import build_maps as build_maps
     from pc2grid.pipeline import follow as follow
     from pc2grid.pipeline import map_scans as map_scans
     from pc2grid.simulate import SimulationConfig as SimulationConfig

@@ -469,3 +469,22 @@ class SessionMap:
         png = map_png(grid.cells, grid.resolution_m, grid.origin_m, path_m=path_m, centers_m=centers_m)
         picture = html_picture(png, "the map, the path of the robot, and the centres of the submaps")
         return html_table(f"session {self.session}", rows) + picture
+
+
+def part_name(session: str, number: int) -> str:
+    """The name of part `number`, from 0, of a recording that does not hang together.
+
+    >>> part_name("monday", 0), part_name("monday", 1)
+    ('monday', 'monday#2')
+    """
+    return f"{session}#{number + 1}" if number else session
+
+
+def is_part_of(name: str, session: str) -> bool:
+    """Whether `name` is that of another part of the recording whose first part is `session`.
+
+    >>> is_part_of("monday#2", "monday"), is_part_of("monday", "monday"), is_part_of("monday#b", "monday")
+    (True, False, False)
+    """
+    head, mark, number = name.rpartition("#")
+    return mark == "#" and head == session and number.isdecimal()

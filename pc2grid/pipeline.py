@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pc2grid.arrays import F64
+from pc2grid.arrays import F64, I64
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import Config, ProjectionConfig
 from pc2grid.errors import NoScans, TrackingLost
@@ -26,6 +26,7 @@ from pc2grid.model import (
     Scan,
     SessionMap,
     Trajectory,
+    part_name,
 )
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
@@ -33,6 +34,7 @@ from pc2grid.time_span import TimeSpan
 if TYPE_CHECKING:
     from pc2grid.io import Log
     from pc2grid.mapping.keyframes import Keyframe, Keyframes
+    from pc2grid.mapping.loop_closure import SettledKeyframes
     from pc2grid.mapping.place_recognition import PlaceRecognizer
     from pc2grid.odometry.tracker import Tracked
 
@@ -77,6 +79,8 @@ def build_map(
 
     observer : gets the progress, and each scan with its tracked pose.
     recognizer : finds loops that are farther off than the search near the tracked pose reaches.
+    Of a recording that does not hang together (see `build_maps`), the part with the longest travel is
+    returned, and its report says what is left out.
     Raises NoScans if there is nothing to make a map from, TrackingLost if the scans of a laser without
     odometry cannot be followed.
 
@@ -85,6 +89,34 @@ def build_map(
     ...     monday = build_map(log, session="monday", span=pc2grid.TimeSpan(0.0, 2.0))
     >>> monday.sensor, len(monday.trajectory) > 10, monday.trajectory.planar()[0].tolist()
     ('laser', True, [0.0, 0.0, 0.0])
+    """
+    return longest_of(
+        build_maps(log, config, session=session, span=span, observer=observer, recognizer=recognizer)
+    )
+
+
+def build_maps(
+    log: Log,
+    config: Config = Config(),
+    *,
+    session: str,
+    span: TimeSpan = TimeSpan(),
+    observer: Observer = Observer(),
+    recognizer: PlaceRecognizer | None = None,
+) -> tuple[SessionMap, ...]:
+    """Turn a recording into a map, or into several if its parts cannot be placed to each other.
+
+    That is so where tracking was lost, or where the map of the whole would contradict itself, and no loop
+    joins what lies before and after (`pc2grid.mapping.parts`). The first map has the name `session`, the
+    others `session#2`, `session#3`, ...; each has its own frame, the base at its first scan. What the report
+    of the reader says of the whole recording stands in the first one's.
+
+    Parameters and errors are those of `build_map`.
+
+    >>> import pc2grid
+    >>> with pc2grid.open_log("monday.mcap") as log:
+    ...     [part.session for part in build_maps(log, session="monday", span=pc2grid.TimeSpan(0.0, 2.0))]
+    ['monday']
     """
     from pc2grid.submaps.partition import divide
 
@@ -99,26 +131,56 @@ def build_map(
             yield scan
             observer.on_progress(_SHARE_BEFORE_LOOPS * span.share_done(scan.stamp_ns, start_ns, end_ns))
 
-    mapped = _map(reported(), config, observer, recognizer)
-    grid, trajectory = mapped.grid, mapped.trajectory
-    if not len(trajectory):
-        raise NoScans(f"{log.info.path}: no scans in the part asked for", hint="check --start and --duration")
+    parts = _map(reported(), config, observer, recognizer)
     sensor = log.choose().sensor
+    if not any(len(part.trajectory) for part in parts):
+        raise NoScans(f"{log.info.path}: no scans in the part asked for", hint="check --start and --duration")
     if sensor == "laser" and not has_odometry:
-        check_followed(trajectory, str(log.info.path))
-    graph, submaps = divide(grid, config.partition)
+        check_followed(_in_order([part.trajectory for part in parts]), str(log.info.path))
+    kept = _of_use(parts)
+    reports = _reports(log.report(), session, parts, kept)
+    maps = []
+    for number, (part, report) in enumerate(zip(kept, reports, strict=True)):
+        graph, submaps = divide(part.grid, config.partition)
+        maps.append(
+            SessionMap(
+                session=part_name(session, number),
+                sensor=sensor,
+                grid=part.grid,
+                submaps=submaps,
+                trajectory=part.trajectory,
+                loops=part.loops,
+                graph=graph,
+                consistency=part.consistency,
+                report=report,
+            )
+        )
     observer.on_progress(1.0)
-    return SessionMap(
-        session=session,
-        sensor=sensor,
-        grid=grid,
-        submaps=submaps,
-        trajectory=trajectory,
-        loops=mapped.loops,
-        graph=graph,
-        consistency=mapped.consistency,
-        report=_with_warnings(log.report(), trajectory, mapped.consistency),
+    return tuple(maps)
+
+
+def longest_of(maps: Sequence[SessionMap]) -> SessionMap:
+    """The map with the longest travel of those of a recording, under the name of the recording.
+
+    Its report is that of the whole recording, and says which maps are left out.
+    """
+    longest = max(maps, key=lambda part: _travel_m(part.trajectory))
+    if len(maps) == 1:
+        return longest
+    others = ", ".join(part.session for part in maps if part is not longest)
+    report = dataclasses.replace(
+        maps[0].report,
+        warnings=(*maps[0].report.warnings, f"only {longest.session} is used here, without {others}"),
     )
+    return dataclasses.replace(longest, session=maps[0].session, report=report)
+
+
+def _of_use(parts: Sequence[_Mapped]) -> list[_Mapped]:
+    """The parts that are long enough to be recognised, or the longest one if none is."""
+    from pc2grid.mapping.parts import PARTS
+
+    kept = [part for part in parts if _travel_m(part.trajectory) >= PARTS.least_travel_m]
+    return kept or [max(parts, key=lambda part: _travel_m(part.trajectory))]
 
 
 def check_followed(trajectory: Trajectory, name: str) -> None:
@@ -141,7 +203,7 @@ def map_scans(
     observer: Observer = Observer(),
     recognizer: PlaceRecognizer | None = None,
 ) -> tuple[OccupancyGrid, Trajectory, tuple[Loop, ...]]:
-    """Grid and trajectory of scans, and the loops that were found.
+    """Grid and trajectory of scans, and the loops that were found; never divided as by `build_maps`.
 
     observer : gets each scan with its tracked pose, before loops are closed.
     recognizer : finds loops that are farther off than the search near the tracked pose reaches.
@@ -156,13 +218,13 @@ def map_scans(
     >>> grid.resolution_m, bool(grid.occupied.any())
     (0.05, True)
     """
-    mapped = _map(scans, config, observer, recognizer)
+    (mapped,) = _map(scans, config, observer, recognizer, whole=True)
     return mapped.grid, mapped.trajectory, mapped.loops
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Mapped:
-    """What becomes of the scans of a session."""
+    """What becomes of the scans of a part of a session."""
 
     grid: OccupancyGrid
     trajectory: Trajectory
@@ -171,12 +233,19 @@ class _Mapped:
 
 
 def _map(
-    scans: Iterable[Scan], config: Config, observer: Observer, recognizer: PlaceRecognizer | None
-) -> _Mapped:
-    """Track the scans, close the loops, draw the map, and compare it with the scans; see `map_scans`."""
-    from pc2grid.mapping.consistency import measure_consistency
+    scans: Iterable[Scan],
+    config: Config,
+    observer: Observer,
+    recognizer: PlaceRecognizer | None,
+    *,
+    whole: bool = False,
+) -> list[_Mapped]:
+    """Track the scans, close the loops, and draw a map of each part; see `build_maps`.
+
+    A part whose map contradicts itself is divided, and drawn again. whole : all scans are one part.
+    """
     from pc2grid.mapping.keyframes import Keyframes
-    from pc2grid.mapping.loop_closure import spread
+    from pc2grid.mapping.parts import PARTS
     from pc2grid.odometry.tracker import Tracker
 
     tracker = Tracker(config.registration, config.projection)
@@ -192,18 +261,108 @@ def _map(
             health.append(tracked.registered.health)
             observer.on_scan(tracked.registered)
         selection.finish()
-        T_session_base = np.frombuffer(poses).reshape(-1, 4, 4)
-        closed = selection.closer.finish()
-        if closed.loops:
-            tracked_poses = np.array([(p.x, p.y, p.yaw) for p in map(SE2.from_matrix, T_session_base)])
-            settled_poses = spread(tracked_poses, closed.scans, closed.poses)
-            T_session_base = _moved_in_plane(T_session_base, tracked_poses, settled_poses)
         trajectory = Trajectory(
-            stamps_ns=np.array(stamps, dtype=np.int64), T_session_base=T_session_base, health=tuple(health)
+            stamps_ns=np.array(stamps, dtype=np.int64),
+            T_session_base=np.frombuffer(poses).reshape(-1, 4, 4),
+            health=tuple(health),
         )
-        grid = _draw(keyframes, T_session_base, config.projection)
-        consistency = measure_consistency(keyframes, grid, trajectory)
-    return _Mapped(grid, trajectory, closed.loops, consistency)
+        closed = selection.closer.finish()
+        if whole:
+            closed = closed.undivided()
+        drawn = _draw_parts(keyframes, trajectory, closed, config.projection)
+        for _ in range(0 if whole else PARTS.rounds):
+            divided = selection.closer.divide([run for part in drawn for run in _doubtful(part, trajectory)])
+            if divided is None:
+                break
+            drawn = _draw_parts(keyframes, trajectory, divided, config.projection)
+    return drawn
+
+
+def _draw_parts(
+    keyframes: Keyframes, tracked: Trajectory, closed: SettledKeyframes, projection: ProjectionConfig
+) -> list[_Mapped]:
+    """The map of each part of a session in a frame of its own, compared with its scans.
+
+    tracked : the poses of all scans before loops were closed.
+    """
+    from pc2grid.mapping.consistency import measure_consistency
+
+    part, T_part_base = _settled(tracked, closed)
+    everywhere = dataclasses.replace(tracked, T_session_base=T_part_base)
+    drawn = []
+    for number in range(int(part.max(initial=0)) + 1):
+        scans = np.flatnonzero(part == number)
+        own = [k for k, other in enumerate(closed.parts.tolist()) if other == number]
+        grid = _draw((keyframes[k] for k in own), T_part_base, projection)
+        drawn.append(
+            _Mapped(
+                grid=grid,
+                trajectory=_chosen(everywhere, scans),
+                loops=_loops_within(closed.loops, scans),
+                consistency=measure_consistency((keyframes[k] for k in own), grid, everywhere),
+            )
+        )
+    return drawn
+
+
+def _settled(tracked: Trajectory, closed: SettledKeyframes) -> tuple[I64, F64]:
+    """The part (N,) of each scan, and its pose (N, 4, 4) in the frame of the part after loop closure.
+
+    A scan belongs to the keyframe before it. Scans before the first keyframe belong to that. The frame of the
+    first part is that of the session; that of another is the base at its first scan, levelled.
+    """
+    from pc2grid.mapping.loop_closure import spread
+
+    T_session_base = tracked.T_session_base.copy()
+    if not len(closed.scans):
+        return np.zeros(len(tracked), np.int64), T_session_base
+    before = np.searchsorted(closed.scans, np.arange(len(tracked)), side="right") - 1
+    keyframe = np.maximum(before, 0)
+    if closed.loops:
+        planar = np.array([(p.x, p.y, p.yaw) for p in map(SE2.from_matrix, T_session_base)])
+        for segment in np.unique(closed.segments):
+            scans = np.flatnonzero(closed.segments[keyframe] == segment)
+            known = closed.segments == segment
+            poses = spread(planar[scans], closed.scans[known] - scans[0], closed.poses[known])
+            T_session_base[scans] = _moved_in_plane(T_session_base[scans], planar[scans], poses)
+    part: I64 = closed.parts[keyframe]
+    for number in range(1, int(part.max()) + 1):
+        scans = np.flatnonzero(part == number)
+        first = SE2.from_matrix(T_session_base[scans[0]])
+        T_session_base[scans] = first.inverse().lift() @ T_session_base[scans]
+    return part, T_session_base
+
+
+def _chosen(trajectory: Trajectory, scans: I64) -> Trajectory:
+    """Some scans of a trajectory."""
+    return Trajectory(
+        stamps_ns=trajectory.stamps_ns[scans],
+        T_session_base=trajectory.T_session_base[scans],
+        health=tuple(trajectory.health[k] for k in scans.tolist()),
+    )
+
+
+def _loops_within(loops: Iterable[Loop], scans: I64) -> tuple[Loop, ...]:
+    """The loops between two of the scans, numbered within these."""
+    number = {scan: k for k, scan in enumerate(scans.tolist())}
+    return tuple(
+        dataclasses.replace(loop, older=number[loop.older], newer=number[loop.newer])
+        for loop in loops
+        if loop.older in number and loop.newer in number
+    )
+
+
+def _doubtful(part: _Mapped, tracked: Trajectory) -> list[range]:
+    """The scans of the session in the stretches that contradict the map of a part, if it is bent."""
+    if not part.consistency.bent:
+        return []
+    return [
+        range(
+            int(np.searchsorted(tracked.stamps_ns, stretch.from_ns)),
+            int(np.searchsorted(tracked.stamps_ns, stretch.to_ns)) + 1,
+        )
+        for stretch in part.consistency.stretches
+    ]
 
 
 class _KeyframeSelection:
@@ -244,8 +403,8 @@ class _KeyframeSelection:
             self.closer.extend(self._latest)
 
 
-def _draw(keyframes: Keyframes, T_session_base: F64, projection: ProjectionConfig) -> OccupancyGrid:
-    """The occupancy grid of all keyframes, each at the pose (N, 4, 4) of its scan."""
+def _draw(keyframes: Iterable[Keyframe], T_session_base: F64, projection: ProjectionConfig) -> OccupancyGrid:
+    """The occupancy grid of keyframes, each at the pose (N, 4, 4) of its scan."""
     builder = GridBuilder(projection)
     for keyframe in keyframes:
         pose = SE2.from_matrix(T_session_base[keyframe.index])
@@ -254,10 +413,74 @@ def _draw(keyframes: Keyframes, T_session_base: F64, projection: ProjectionConfi
     return builder.grid()
 
 
-def _with_warnings(report: ReadReport, trajectory: Trajectory, consistency: Consistency) -> ReadReport:
-    """The report of the reader with the warnings of registration and of the map added."""
+def _reports(
+    report: ReadReport, session: str, parts: Sequence[_Mapped], kept: Sequence[_Mapped]
+) -> list[ReadReport]:
+    """The report of each part that is kept, with the warnings of registration and of its map.
+
+    report : of the reader. It becomes that of the first part; the scans of the others are counted in theirs.
+    """
+    elsewhere = sum(len(part.trajectory) for part in kept[1:])
+    warnings, skipped = list(report.warnings), dict(report.scans_skipped)
+    if len(parts) > 1:
+        warnings.append(_division_warning(session, parts, kept))
+    left_out = sum(len(part.trajectory) for part in parts) - elsewhere - len(kept[0].trajectory)
+    if left_out:
+        skipped["in a part too short to be of use"] = left_out
+    first = dataclasses.replace(
+        report,
+        scans_read=report.scans_read - elsewhere,
+        scans_skipped=skipped,
+        warnings=tuple(warnings),
+    )
+    others = [ReadReport(scans_read=len(part.trajectory)) for part in kept[1:]]
+    return [_with_warnings(r, part) for r, part in zip([first, *others], kept, strict=True)]
+
+
+def _division_warning(session: str, parts: Sequence[_Mapped], kept: Sequence[_Mapped]) -> str:
+    """One sentence that says into what a recording was divided, where, and what to do."""
+    from pc2grid.mapping.parts import PARTS
+
+    start_ns = min(int(part.trajectory.stamps_ns[0]) for part in parts)
+
+    def begin_s(part: _Mapped) -> float:
+        return (int(part.trajectory.stamps_ns[0]) - start_ns) * 1e-9
+
+    named = ", ".join(
+        f"{part_name(session, k)} from {begin_s(part):.0f} s ({_travel_m(part.trajectory):.0f} m)"
+        for k, part in enumerate(kept)
+    )
+    short = len(parts) - len(kept)
+    dropped = f"; {short} shorter than {PARTS.least_travel_m:.0f} m left out" if short else ""
+    return (
+        f"the recording falls into {len(parts)} parts whose places relative to each other are not known, "
+        f"because tracking was lost or the map would contradict itself: {named}{dropped}; record with "
+        "odometry, or come back to known places more often, to keep them together"
+    )
+
+
+def _travel_m(trajectory: Trajectory) -> float:
+    """Planar distance driven, metres."""
+    return float(trajectory.path_m()[-1]) if len(trajectory) else 0.0
+
+
+def _in_order(parts: Sequence[Trajectory]) -> Trajectory:
+    """The scans of all parts in the order of time."""
+    stamps_ns = np.concatenate([part.stamps_ns for part in parts])
+    health = [state for part in parts for state in part.health]
+    order = np.argsort(stamps_ns, kind="stable")
+    return Trajectory(
+        stamps_ns=stamps_ns[order],
+        T_session_base=np.concatenate([part.T_session_base for part in parts])[order],
+        health=tuple(health[k] for k in order.tolist()),
+    )
+
+
+def _with_warnings(report: ReadReport, part: _Mapped) -> ReadReport:
+    """The report of a part with the warnings of registration and of the map added."""
     from pc2grid.mapping.consistency import consistency_warning
 
+    trajectory = part.trajectory
     lost = sum(h is Health.LOST for h in trajectory.health)
     weak = sum(h is Health.DEGENERATE for h in trajectory.health)
     total, skipped, warnings = len(trajectory), dict(report.scans_skipped), list(report.warnings)
@@ -274,7 +497,7 @@ def _with_warnings(report: ReadReport, trajectory: Trajectory, consistency: Cons
             f"{weak} of {total} scans did not fix the pose in every direction: there it rests on odometry "
             "or on the motion before"
         )
-    bent = consistency_warning(consistency, trajectory)
+    bent = consistency_warning(part.consistency, trajectory)
     if bent is not None:
         warnings.append(bent)
     return dataclasses.replace(report, scans_skipped=skipped, warnings=tuple(warnings))

@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from signature.relocalization.relocalizer import relocalize as locate  # noqa: F401
     from signature.sessions import add_session as add_session
     from signature.sessions import build_session as build_session
+    from signature.sessions import build_sessions as build_sessions
     from signature.sessions import provenance as provenance
     from signature.similarity import SignatureTable as SignatureTable
     from signature.similarity import distances as distances

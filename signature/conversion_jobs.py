@@ -20,7 +20,7 @@ from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from signature.config import Config
 from signature.database.protocol import Entry, Label, Provenance
-from signature.sessions import build_session, describe_all, digest_of, provenance
+from signature.sessions import build_sessions, describe_all, digest_of, provenance
 
 LOCAL = "local"
 """In place of the address of a scheduler: start a cluster of processes on this machine."""
@@ -30,7 +30,7 @@ CONNECT_TIMEOUT_S = 10.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """One recording or map to convert: the arguments of `signature.sessions.build_session`.
+    """One recording or map to convert: the arguments of `signature.sessions.build_sessions`.
 
     stored : provenance of the session of this name that the database holds already and that shall stay; None
         if there is no such session.
@@ -58,19 +58,20 @@ class Job:
 class Outcome:
     """The result of a job.
 
-    entry : what is to be stored; None if it is stored already, or if the job failed.
+    entries : what is to be stored, a session for each part of the recording that hangs together; empty if it
+        is stored already, or if the job failed.
     error : why the job failed; None if it did not.
     """
 
     job: Job
-    entry: Entry | None = None
+    entries: tuple[Entry, ...] = ()
     error: Exception | None = None
 
 
-def convert(job: Job, observer: Observer = Observer()) -> Entry | None:
-    """Do a job: everything there is to store of it, or None if it is stored already.
+def convert(job: Job, observer: Observer = Observer()) -> tuple[Entry, ...]:
+    """Do a job: everything there is to store of it, nothing if it is stored already.
 
-    Raises the errors of `build_session`; ClusterError if the job was made by another version of pc2grid;
+    Raises the errors of `build_sessions`; ClusterError if the job was made by another version of pc2grid;
     DatabaseError if the stored session was made from another file.
     """
     if job.version != __version__:
@@ -80,12 +81,12 @@ def convert(job: Job, observer: Observer = Observer()) -> Entry | None:
         )
     if job.stored is not None:
         if digest_of(job.path, job.config) == job.stored.digest:
-            return None
+            return ()
         raise DatabaseError(
             f"{job.path}: the database holds a session {job.name!r} made from another file",
             hint="--force replaces it; --name gives this one another name",
         )
-    session_map, origin = build_session(
+    maps, origin = build_sessions(
         job.path,
         job.name,
         job.config,
@@ -95,7 +96,7 @@ def convert(job: Job, observer: Observer = Observer()) -> Entry | None:
         observer=observer,
     )
     with observer.step("describe"):
-        return session_map, describe_all(session_map, job.config, observer), origin
+        return tuple((part, describe_all(part, job.config, observer), origin) for part in maps)
 
 
 def here(jobs: Sequence[Job], observer: Observer = Observer()) -> Generator[Outcome, None, None]:
@@ -134,7 +135,7 @@ def on_cluster(
 def _attempt(job: Job, observer: Observer = Observer()) -> Outcome:
     """Do a job. Its error becomes part of the result, so that a cluster does not try it again."""
     try:
-        return Outcome(job=job, entry=convert(job, observer))
+        return Outcome(job=job, entries=convert(job, observer))
     except Exception as error:
         return Outcome(job=job, error=error)
 

@@ -91,6 +91,8 @@ def build_session(
     span : the part of the recording to use; a map is always used as a whole.
     recover : use what is whole of a damaged recording.
     observer : gets the progress, each scan with its tracked pose, and a note with the topic that was chosen.
+    Of a recording that does not hang together the part with the longest travel is returned;
+    `build_sessions` returns all.
 
     Raises LogError and its subclasses, NoScans, MapFileError.
 
@@ -99,6 +101,28 @@ def build_session(
     >>> session.sensor, len(session.trajectory), origin.source
     ('map', 0, 'map.yaml')
     """
+    from pc2grid.pipeline import longest_of
+
+    maps, origin = build_sessions(
+        path, name, config, span=span, recover=recover, label=label, observer=observer
+    )
+    return longest_of(maps), origin
+
+
+def build_sessions(
+    path: str | Path,
+    name: str,
+    config: Config,
+    *,
+    span: TimeSpan = TimeSpan(),
+    recover: bool = False,
+    label: Label | None = None,
+    observer: Observer = Observer(),
+) -> tuple[tuple[SessionMap, ...], Provenance]:
+    """Turn a recording into one session map, or into several if it does not hang together.
+
+    See `pc2grid.build_maps`, which names them. Parameters and errors are those of `build_session`.
+    """
     from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 
     path = Path(path)
@@ -106,10 +130,10 @@ def build_session(
     if is_drawn_map(path):
         drawn = load_drawn_map(path, config)
         origin = provenance(path, drawn.digest, config, label=label)
-        return _map_session(drawn, name, config), origin
+        return (_map_session(drawn, name, config),), origin
 
     from pc2grid.io import open_log
-    from pc2grid.pipeline import build_map
+    from pc2grid.pipeline import build_maps
     from signature.relocalization.place_recognition import recognizer_for
 
     with open_log(path, config.read, recover=recover) as log:
@@ -117,7 +141,7 @@ def build_session(
         observer.on_note(f"{path}: {choice.topic} ({choice.sensor}): {choice.reason}")
         length_s = span.length_ns(log.info.start_ns, log.info.end_ns) * 1e-9
         with observer.step(f"map {path.name}", length_s):
-            session_map = build_map(
+            maps = build_maps(
                 log,
                 config,
                 session=name,
@@ -126,7 +150,7 @@ def build_session(
                 recognizer=recognizer_for(config),
             )
         origin = provenance(path, log.digest(), config, span=span, label=label)
-    return session_map, origin
+    return maps, origin
 
 
 def digest_of(path: Path, config: Config) -> str:

@@ -27,6 +27,7 @@ from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.local_maps import LOCAL_MAPS, LocalMap, LocalMapParameters, LocalMaps, pose_at
 from pc2grid.mapping.loop_candidates import CANDIDATES, Candidate, CandidateParameters, LoopCandidates
 from pc2grid.mapping.occupancy import GridBuilder
+from pc2grid.mapping.parts import PARTS, PartParameters, conflicts_of, connected, cuts_for
 from pc2grid.mapping.place_recognition import PlaceRecognizer, Stretch
 from pc2grid.mapping.pose_graph import Edge, Solution, optimise
 from pc2grid.model import Loop
@@ -147,11 +148,21 @@ class SettledKeyframes:
 
     scans : (K,) number of each keyframe's scan. poses : (K, 3) x, y, yaw of each in the session's frame.
     loops : between the scans at the anchors of local maps that overlap.
+    segments : (K,) number of the segment of each; a new one begins where the pose relative to the keyframe
+        before is unknown. parts : (K,) number of the part of each: segments that loops join. Poses of
+        different parts have nothing to do with each other; see `pc2grid.mapping.parts`.
     """
 
     scans: I64
     poses: F64
     loops: tuple[Loop, ...]
+    segments: I64
+    parts: I64
+
+    def undivided(self) -> SettledKeyframes:
+        """The same, as if nothing in it were unknown."""
+        together = np.zeros(len(self.scans), np.int64)
+        return replace(self, segments=together, parts=together)
 
 
 class LoopCloser:
@@ -171,8 +182,10 @@ class LoopCloser:
         parameters: LoopParameters = LOOPS,
         local_map_parameters: LocalMapParameters = LOCAL_MAPS,
         candidate_parameters: CandidateParameters = CANDIDATES,
+        part_parameters: PartParameters = PARTS,
     ) -> None:
         self._parameters = parameters
+        self._part_parameters = part_parameters
         self._local_maps = LocalMaps(keyframes, local_map_parameters)
         self._recognizer = recognizer
         self._projection = projection or ProjectionConfig()
@@ -184,7 +197,7 @@ class LoopCloser:
         self._poses = array("d")  # as tracked: x, y, yaw of one keyframe after the other
         self._begin = 0  # first keyframe of the local map that is not complete yet
         self._travel_m = 0.0
-        self._restarts: set[int] = set()
+        self._restarts: set[int] = set()  # first keyframes after tracking was lost, or after a cut
         self._nodes = np.empty((0, 3))  # settled poses of the anchors of the local maps
         self._edges: list[Edge] = []
         self._drift_m = 0.0  # travel since the pose was last certain
@@ -207,13 +220,78 @@ class LoopCloser:
     def finish(self) -> SettledKeyframes:
         """The settled poses; without a loop they are the tracked ones."""
         if not self._scans:
-            return SettledKeyframes(np.empty(0, np.int64), np.empty((0, 3)), ())
+            none = np.empty(0, np.int64)
+            return SettledKeyframes(none, np.empty((0, 3)), (), segments=none, parts=none)
         self._complete_local_map()
         if self._recognizer is not None and self._stretch_begin < len(self._nodes):
             # The last local maps make a stretch that may overlap the one before.
             begin = max(len(self._nodes) - self._parameters.stretch_maps, 0)
             if not all(self._known_places[begin:]):
                 self._recognize(range(begin, len(self._nodes)))
+        return self._settled_keyframes()
+
+    def divide(self, doubtful: Sequence[range]) -> SettledKeyframes | None:
+        """After `finish`: cut the session where its local maps contradict each other, and settle it again.
+
+        doubtful : scans of the stretches that contradict the map of their part.
+        A cut leaves open how its two sides lie to each other, as a restart of tracking does, so that loops
+        which the tracked poses ruled out may join them again. Loops between segments that contradict each
+        other are removed. Returns None if there is nothing to change.
+        """
+        scans, runs = np.array(self._scans), self._local_maps.runs
+        suspect = np.array(
+            [
+                any(scans[run[0]] < stretch.stop and scans[run[-1]] >= stretch.start for stretch in doubtful)
+                for run in runs
+            ]
+        )
+        segment = self._segments()
+        part = self._parts(optimise(self._nodes, self._edges))
+        conflicts = list(conflicts_of(self._local_maps, self._nodes, part, suspect, self._part_parameters))
+        cuts = set(cuts_for(conflicts, segment))
+        between = [(segment[c.older], segment[c.newer]) for c in conflicts if c.mutual]
+        apart = {(first, second) for first, second in between if first != second}
+        kept = [e for e in self._edges if not e.loop or (segment[e.first], segment[e.second]) not in apart]
+        if not cuts and len(kept) == len(self._edges):
+            return None
+        self._edges = kept
+        parameters = self._parameters
+        for k, edge in enumerate(self._edges):
+            if not edge.loop and edge.second in cuts:
+                self._edges[k] = replace(edge, information=parameters.tracked_information(0.0, restart=True))
+        lost_m = parameters.lost_m * np.cumsum([number in cuts for number in range(len(runs))])
+        self._travelled_m = array("d", np.array(self._travelled_m) + lost_m)
+        self._restarts |= {runs[cut].start for cut in cuts}
+        self._close_candidates()
+        known = {(edge.first, edge.second) for edge in self._edges}
+        for cut in sorted(cuts):
+            self._drift_m = parameters.lost_m
+            self._close(
+                [
+                    edge
+                    for number in range(cut, min(cut + parameters.stretch_maps, len(runs)))
+                    for edge in self._overlaps(number)
+                    if (edge.first, edge.second) not in known
+                ]
+            )
+        return self._settled_keyframes()
+
+    def _segments(self) -> I64:
+        """(N,) number of the segment of each local map; a new one begins at each restart or cut."""
+        begins = [
+            number > 0 and run.start in self._restarts for number, run in enumerate(self._local_maps.runs)
+        ]
+        return np.cumsum(begins, dtype=np.int64)
+
+    def _parts(self, solution: Solution) -> I64:
+        """(N,) number of the part of each local map."""
+        accepted = [
+            edge for edge, kept in zip(self._edges, solution.accepted, strict=True) if edge.loop and kept
+        ]
+        return connected(self._segments(), accepted, self._part_parameters)
+
+    def _settled_keyframes(self) -> SettledKeyframes:
+        """Solve the pose graph; the poses, loops and parts that this gives."""
         solution = self._settle()
         loops = tuple(
             Loop(
@@ -227,7 +305,15 @@ class LoopCloser:
             if edge.loop
         )
         poses = self._settled() if loops else self._tracked()
-        return SettledKeyframes(np.array(self._scans, dtype=np.int64), poses, loops)
+        part = self._parts(solution)
+        lengths = [len(run) for run in self._local_maps.runs]
+        return SettledKeyframes(
+            scans=np.array(self._scans, dtype=np.int64),
+            poses=poses,
+            loops=loops,
+            segments=np.repeat(self._segments(), lengths),
+            parts=np.repeat(part, lengths),
+        )
 
     # --- during the session -------------------------------------------------------------------------------
 
@@ -336,6 +422,10 @@ class LoopCloser:
                 if found.probability >= self._parameters.min_probability
             ]
         )
+        self._close_candidates()
+
+    def _close_candidates(self) -> None:
+        """Close the loops among the recognised places that drift allows and that agree with each other."""
         known = [edge for edge in self._edges if not edge.loop or self._confirms(edge)]
         accepted = self._candidates.acceptable(self._nodes, np.array(self._travelled_m), known)
         loops: list[Edge] = []
@@ -345,8 +435,9 @@ class LoopCloser:
         before = self._nodes
         self._close(loops)
         if self._nodes is not before:
-            # The stretch lies where it belongs now: what the search near the tracked pose missed is near.
-            self._close([edge for number in numbers for edge in self._overlaps(number)])
+            # The newest stretch lies where it belongs now: what the search near the tracked pose missed is
+            # near.
+            self._close([edge for number in self._stretches[-1] for edge in self._overlaps(number)])
 
     def _confirmed(self, candidate: Candidate) -> list[Edge]:
         """Loops between the local maps of two stretches: those that match near where one was recognised."""

@@ -7,12 +7,12 @@ The engine follows from the path or URL; `check`, `copy`, `merge` and `split` us
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError, OutputError
-from pc2grid.model import SessionMap
+from pc2grid.model import SessionMap, is_part_of, part_name
 from signature.database import open_database, serialize
 from signature.database.postgres.schema import is_url
 from signature.database.protocol import Entry, Problem, SessionInfo, SubmapDatabase
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 Place = str | Path
 """Path of a `*.submaps` file, or URL of a PostgreSQL database."""
+_MOST_PARTS = 100
+"""Parts of one recording that are looked for; a recording of 1.9 km without loops falls into 9."""
 
 
 def store(target: Place, entries: Iterable[Entry], *, keep: bool, force: bool = False) -> None:
@@ -30,18 +32,33 @@ def store(target: Place, entries: Iterable[Entry], *, keep: bool, force: bool = 
 
     entries : may be iterated over more than once.
     keep : add them to the sessions of the database; otherwise they become its whole content.
-    force : replace a session of the same name instead of refusing the new one.
+    force : replace a session of the same name instead of refusing the new one, and with it the other parts of
+        the recording that it was made from.
 
     Raises as `SubmapDatabase.add`.
     """
+    names = [session_map.session for session_map, _, _ in entries] if keep and force else []
+    drop = _other_parts(target, names) if names and exists(target) else []
     if is_url(target):
         from signature.database.postgres.database import store as store_rows
 
-        store_rows(str(target), entries, keep=keep, force=force)
+        store_rows(str(target), entries, keep=keep, force=force, drop=drop)
     else:
         from signature.database.sqlite.database import store as store_file
 
-        store_file(Path(target), entries, keep=keep, force=force)
+        store_file(Path(target), entries, keep=keep, force=force, drop=drop)
+
+
+def _other_parts(target: Place, names: Collection[str]) -> list[str]:
+    """The stored sessions that are other parts of the recordings which these sessions were made from."""
+    with open_database(target) as database:
+        asked = [part_name(name, k) for name in names for k in range(_MOST_PARTS)]
+        known = {info.name: info.provenance.digest for info in database.sessions(asked)}
+    return [
+        part
+        for part, digest in known.items()
+        if any(is_part_of(part, name) and digest == known.get(name) for name in names)
+    ]
 
 
 def remove(target: Place, names: Sequence[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,8 @@ from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, Trajectory
 from pc2grid.observer import Observer
-from pc2grid.pipeline import build_map, check_followed, follow, map_scans
-from pc2grid.simulate import SimulationConfig, prepare_session
+from pc2grid.pipeline import build_map, build_maps, check_followed, follow, map_scans
+from pc2grid.simulate import SimulationConfig, prepare_session, simulate_session
 from pc2grid.simulate.session import Session
 from pc2grid.time_span import TimeSpan
 from signature.evaluation.slam_relations import read_relations, relation_error
@@ -102,6 +103,40 @@ def test_follow_streams_one_planar_scan_a_scan(session: Session) -> None:
     followed = list(follow((scan for scan, _ in pairs), Config()))
     assert [planar_scan.stamp_ns for _, planar_scan in followed] == [scan.stamp_ns for scan, _ in pairs]
     assert all(registered.health is Health.FINE for registered, _ in followed)
+
+
+def test_a_robot_that_was_carried_elsewhere_makes_two_maps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its driver started again there, on another floor, five minutes later."""
+    floors = [
+        simulate_session(
+            tmp_path / f"{floor}.mcap",
+            sensor="laser",
+            config=SimulationConfig(length_m=10.0, seed=floor, building_seed=floor),
+        )
+        for floor in (1, 2)
+    ]
+    with open_log(floors[0].path) as first, open_log(floors[1].path) as second:
+        alone = build_map(second, session="alone")
+        upstairs = list(second.scans())
+        begin_ns = first.info.end_ns + 300 * 10**9
+        later = [replace(scan, stamp_ns=scan.stamp_ns - upstairs[0].stamp_ns + begin_ns) for scan in upstairs]
+        scans = [*first.scans(), *later]
+        monkeypatch.setattr(first, "scans", lambda *_: iter(scans))
+        maps = build_maps(first, session="robot")
+        longest = build_map(first, session="robot")
+    assert [made.session for made in maps] == ["robot", "robot#2"]
+    assert sum(len(made.trajectory) for made in maps) == len(scans)
+    # The first scan there is lost, and belongs to what was before.
+    assert 0 < maps[1].trajectory.stamps_ns[0] - begin_ns < 10**9
+    assert np.allclose(maps[1].trajectory.planar()[0], 0.0)
+    # Found without odometry at the first scan in both cases, so the maps are equal but for some cells.
+    apart = alone.trajectory.planar()[-1] - maps[1].trajectory.planar()[-1]
+    assert np.hypot(*apart[:2]) < 0.1
+    (said, *_) = [w for w in maps[0].report.warnings if "falls into 2 parts" in w]
+    assert "robot#2 from 3" in said and "record with odometry" in said
+    assert longest.session == "robot" and "is used here, without" in longest.report.warnings[-1]
 
 
 def test_no_scans_no_trajectory() -> None:

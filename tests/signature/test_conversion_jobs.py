@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +21,14 @@ import pytest
 
 from pc2grid.errors import ClusterError
 from pc2grid.io.nav2_map import save_map
-from pc2grid.model import OccupancyGrid
+from pc2grid.model import OccupancyGrid, part_name
 from pc2grid.observer import Observer
 from pc2grid_cli.main import app
 from signature import conversion_jobs
 from signature.config import Config
 from signature.conversion_jobs import Job, Outcome, on_cluster
 from signature.database import maintenance, open_database
-from signature.sessions import build_session
+from signature.sessions import build_sessions
 from tests.helpers import postgresql
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
@@ -103,9 +104,9 @@ def test_what_is_stored_is_not_done_again(
 
     def noted(path: Path, *rest: Any, **more: Any) -> Any:
         built.append(path.stem)
-        return build_session(path, *rest, **more)
+        return build_sessions(path, *rest, **more)
 
-    monkeypatch.setattr(conversion_jobs, "build_session", noted)
+    monkeypatch.setattr(conversion_jobs, "build_sessions", noted)
     capsys.readouterr()
     assert run("convert", *inputs(folder, *NAMES), "-o", database, "--json") == 0
     out, err = capsys.readouterr()
@@ -113,6 +114,30 @@ def test_what_is_stored_is_not_done_again(
     assert json.loads(out)["unchanged"] == list(NAMES[:2])
     assert "kitchen: stored already" in err
     assert database.read_bytes() == whole.read_bytes()
+
+
+def test_the_parts_of_a_recording_are_stored_together(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A session for each part of a recording; all are known again by the name of the first."""
+
+    def divided(path: Path, name: str, config: Config, **more: Any) -> Any:
+        (whole,), origin = build_sessions(path, name, config, **more)
+        return tuple(replace(whole, session=part_name(name, k)) for k in range(2)), origin
+
+    monkeypatch.setattr(conversion_jobs, "build_sessions", divided)
+    database = tmp_path / "x.submaps"
+    assert run("convert", *inputs(folder, *NAMES[:2]), "-o", database) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in lines[:4]] == ["kitchen", "kitchen#2", "hall", "hall#2"]
+    before = database.read_bytes()
+    assert run("convert", *inputs(folder, *NAMES[:2]), "-o", database, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["unchanged"] == list(NAMES[:2])
+    assert database.read_bytes() == before
+    monkeypatch.undo()
+    assert run("convert", *inputs(folder, NAMES[0]), "-o", database, "--add", "--force") == 0
+    with open_database(database) as opened:
+        assert sorted(info.name for info in opened.sessions()) == ["hall", "hall#2", "kitchen"]
 
 
 @pytest.mark.parametrize(
@@ -191,9 +216,9 @@ def test_a_killed_worker_costs_only_what_it_had_in_hand(folder: Path, processes:
     assert [outcome.job.name for outcome in outcomes] == list(NAMES)
     for outcome in outcomes:
         assert outcome.error is None
-        assert outcome.entry is not None
-        assert outcome.entry[0].session == outcome.job.name
-        assert len(outcome.entry[1]) == len(outcome.entry[0].submaps) > 0
+        (entry,) = outcome.entries
+        assert entry[0].session == outcome.job.name
+        assert len(entry[1]) == len(entry[0].submaps) > 0
     assert said
     assert all("was lost" in line and "starts over" in line for line in said)
     assert {line.split("; ")[1].split()[0] for line in said} < set(NAMES)

@@ -214,13 +214,14 @@ def _convert_all(
         stack.enter_context(contextlib.closing(outcomes))
         for outcome in outcomes:
             error = outcome.error
-            if outcome.entry is not None:
+            if outcome.entries:
                 try:
-                    maintenance.store(output, [outcome.entry], keep=keep, force=force)
+                    maintenance.store(output, outcome.entries, keep=keep, force=force)
                     keep = True
-                    _tell(done, outcome.entry, quiet=quiet, strict=strict)
-                    if shown is not None:
-                        shown.show(outcome.entry[0], outcome.job.config)
+                    for entry in outcome.entries:
+                        _tell(done, entry, quiet=quiet, strict=strict)
+                        if shown is not None:
+                            shown.show(entry[0], outcome.job.config)
                 except DatabaseError as refusal:
                     if type(refusal) is not DatabaseError:  # a subclass: the database itself cannot be used
                         raise
@@ -231,7 +232,7 @@ def _convert_all(
                 terminal.report_error(error)
                 done.failed.append(str(outcome.job.path))
                 done.lossy = done.severe = True
-            elif outcome.entry is None:
+            elif not outcome.entries:
                 terminal.note(f"{outcome.job.name}: stored already")
                 done.unchanged.append(outcome.job.name)
     return done
@@ -249,7 +250,7 @@ def _note_stored(terminal: console.Console, done: _Done, count: int) -> Iterator
 
 
 def _tell(done: _Done, entry: Entry, *, quiet: bool, strict: bool) -> None:
-    """Keep and print the result of one input."""
+    """Keep and print a session made of one input."""
     session, _, origin = entry
     document = summary(session, origin)
     done.sessions.append(document)
@@ -270,6 +271,7 @@ def _stored(output: str, jobs: list[Job], *, add: bool, force: bool) -> dict[str
     Raises OutputError if a database exists that the inputs must not be written to.
     """
     from pc2grid.errors import OutputError
+    from pc2grid.model import is_part_of
     from signature.database import maintenance, open_database
     from signature.database.postgres.schema import is_url
 
@@ -296,7 +298,9 @@ def _stored(output: str, jobs: list[Job], *, add: bool, force: bool) -> dict[str
             f"{where}: holds the session{difference}",
             hint="--force replaces it; --name gives this one another name",
         )
-    others = present.keys() - {job.name for job in jobs}
+    others = {
+        name for name in present if not any(name == job.name or is_part_of(name, job.name) for job in jobs)
+    }
     if not add and (difference or others or len(jobs) == 1):
         if others:
             difference = f" and holds {', '.join(map(repr, sorted(present)))}"

@@ -83,7 +83,9 @@ _NEAREST_FILTERS = {
 """Conditions of _NEAREST: value -> SQL."""
 
 
-def store(url: str, entries: Iterable[Entry], *, keep: bool, force: bool = False) -> None:
+def store(
+    url: str, entries: Iterable[Entry], *, keep: bool, force: bool = False, drop: Collection[str] = ()
+) -> None:
     """Write sessions in one transaction, all or none; see `signature.database.maintenance.store`.
 
     Any number of processes may write at once; they wait for each other only if they store sessions of one
@@ -100,6 +102,8 @@ def store(url: str, entries: Iterable[Entry], *, keep: bool, force: bool = False
         for attempt in range(1, _ATTEMPTS + 1):
             try:
                 with served(where), connection.transaction():
+                    if drop:
+                        connection.execute("DELETE FROM pc2grid.session WHERE name = ANY(%s)", [list(drop)])
                     _store(connection, where, entries, keep=keep, force=force)
                 return
             except DatabaseError as error:

@@ -48,18 +48,22 @@ def store(
     *,
     keep: bool,
     force: bool = False,
+    drop: Collection[str] = (),
     timeout_s: float = BUSY_TIMEOUT_S,
 ) -> None:
     """Write sessions to a file, all or none.
 
     keep : add them to the sessions of the file; otherwise they become its whole content.
     force : replace a session of the same name instead of refusing the new one.
+    drop : names of sessions that are removed before.
 
     Raises DatabaseError for a session of that name with other content, or with signatures that cannot be
     compared with those of the other sessions; DatabaseBusy; OutputError.
     """
     with rewrite(path, keep=keep, timeout_s=timeout_s) as connection:
         present = {info.name: (number, info) for number, info in iter_sessions(connection, path)}
+        for name in drop:
+            _remove(connection, present.pop(name)[0])
         for session_map, signatures, provenance in map(serialize.storable, entries):
             name, resolution_m = session_map.session, session_map.grid.resolution_m
             other = next((info for _, info in present.values() if info.name != name), None)

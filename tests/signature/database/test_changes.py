@@ -118,3 +118,14 @@ def test_what_is_no_database_is_not_changed(tmp_path: Path) -> None:
         with pytest.raises(NotADatabase):
             maintenance.rename(path, "monday", "friday")
     assert [file.name for file in tmp_path.iterdir()] == ["x.submaps"]
+
+
+def test_a_recording_that_is_replaced_takes_its_other_parts_along(place: str | Path) -> None:
+    """Only those that were made from the same recording; a session that merely has such a name stays."""
+    parts = [(replace(MONDAY[0], session=f"monday#{k}"), *MONDAY[1:]) for k in (2, 3)]
+    unrelated = (replace(TUESDAY[0], session="monday#4"), *TUESDAY[1:])
+    maintenance.store(place, [*parts, unrelated], keep=True)
+    assert names(place) == ["monday", "tuesday", "monday#2", "monday#3", "monday#4"]
+    maintenance.store(place, [make_entry("monday", 5), parts[0]], keep=True, force=True)
+    assert sorted(names(place)) == ["monday", "monday#2", "monday#4", "tuesday"]
+    assert maintenance.check(place) == ()

@@ -1,0 +1,174 @@
+"""A session whose parts cannot be placed to each other is divided; loops join what they can."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.config import ProjectionConfig
+from pc2grid.geometry import SE2
+from pc2grid.mapping.keyframes import Keyframe, Keyframes
+from pc2grid.mapping.loop_closure import LoopCloser, LoopParameters, SettledKeyframes
+from pc2grid.mapping.parts import Conflict, connected, cuts_for
+from pc2grid.mapping.pose_graph import Edge
+from pc2grid.model import Consistency, Health, ReadReport, RegisteredScan, Trajectory
+from pc2grid.pipeline import _doubtful, _draw_parts, _Mapped, _of_use, _reports
+from tests.helpers.simulated_drives import drive, office
+
+LAP_M = [(2.0, 7.0), (11.0, 7.0), (11.0, 3.0), (9.5, 5.0), (9.5, 7.0), (18.5, 7.0), (16.5, 4.0), (16.5, 7.0)]
+"""Along the corridor of the office, and into two of its rooms."""
+WITHOUT_LOOPS = LoopParameters(compared=0)
+
+
+def keyframes_of(
+    blunder: SE2 | None = None, *, lost: bool = False
+) -> tuple[Keyframes, Trajectory, list[SE2]]:
+    """Keyframes of laps through the office, with the true poses.
+
+    blunder : the tracked pose of the second lap is wrong by this from its first scan on. lost : tracking says
+        so, because it started again there.
+    """
+    keyframes, stamps, poses, truths = Keyframes(), [], [], []
+    wrong, middle = SE2(), begin_of_second_lap()
+    for registered, planar_scan, truth in two_laps():
+        begins = len(poses) == middle
+        true_pose = SE2.from_matrix(registered.T_session_base)
+        if begins:
+            wrong = true_pose @ (blunder or SE2()) @ true_pose.inverse()
+        pose = wrong @ true_pose
+        keyframes.append(Keyframe(len(poses), planar_scan, pose, restart=lost and begins))
+        stamps.append(planar_scan.stamp_ns)
+        poses.append(pose.lift())
+        truths.append(truth)
+    trajectory = Trajectory(
+        stamps_ns=np.array(stamps), T_session_base=np.array(poses), health=(Health.FINE,) * len(poses)
+    )
+    return keyframes, trajectory, truths
+
+
+@functools.cache
+def two_laps() -> list[tuple[RegisteredScan, PlanarScan, SE2]]:
+    return list(drive(office(), [*LAP_M, *LAP_M[::-1]]))
+
+
+@functools.cache
+def begin_of_second_lap() -> int:
+    return len(list(drive(office(), LAP_M)))
+
+
+def mapped(
+    keyframes: Keyframes, trajectory: Trajectory, parameters: LoopParameters
+) -> tuple[LoopCloser, SettledKeyframes, list[_Mapped]]:
+    closer = LoopCloser(keyframes, parameters=parameters)
+    # The closer compares with older keyframes, so all may be there from the beginning.
+    for keyframe in keyframes:
+        closer.extend(keyframe)
+    closed = closer.finish()
+    return closer, closed, _draw_parts(keyframes, trajectory, closed, ProjectionConfig())
+
+
+def wrong_m(part: _Mapped, truths: list[SE2], first: int = 0) -> float:
+    """Largest distance of the positions of a part, whose first scan is `first`, from the true ones."""
+    T_part_map = truths[first].inverse()
+    true_m = np.array([(T_part_map @ pose).apply(np.zeros((1, 2)))[0] for pose in truths])
+    found_m = part.trajectory.planar()[:, :2]
+    return float(np.hypot(*(found_m - true_m[first : first + len(found_m)]).T).max())
+
+
+def test_a_restart_that_no_loop_joins_gives_two_parts_each_in_its_own_frame() -> None:
+    keyframes, trajectory, truths = keyframes_of(SE2(3.0, -2.0, 1.0), lost=True)
+    _, closed, parts = mapped(keyframes, trajectory, WITHOUT_LOOPS)
+    middle = begin_of_second_lap()
+    assert closed.parts.tolist() == [0] * middle + [1] * (len(truths) - middle)
+    assert [len(part.trajectory) for part in parts] == [middle, len(truths) - middle]
+    assert wrong_m(parts[0], truths) < 1e-6 and wrong_m(parts[1], truths, middle) < 1e-6
+    assert not any(part.consistency.bent for part in parts)
+    assert parts[1].grid.occupied.any()
+
+
+def test_a_restart_that_loops_join_gives_one_part() -> None:
+    keyframes, trajectory, truths = keyframes_of(SE2(0.8, -0.6, 0.15), lost=True)
+    _, closed, (part,) = mapped(keyframes, trajectory, LoopParameters())
+    assert closed.segments.max() == 1 and not closed.parts.any()
+    assert any(loop.accepted for loop in part.loops)
+    assert wrong_m(part, truths) < 0.1
+
+
+def test_a_map_that_contradicts_itself_is_divided_into_parts_that_do_not() -> None:
+    keyframes, trajectory, _ = keyframes_of(SE2(0.9, 0.5, 0.3))
+    closer, closed, (whole,) = mapped(keyframes, trajectory, WITHOUT_LOOPS)
+    assert whole.consistency.bent and closed.segments.max() == 0
+    divided = closer.divide(_doubtful(whole, trajectory))
+    assert divided is not None
+    parts = _draw_parts(keyframes, trajectory, divided, ProjectionConfig())
+    assert len(parts) == 2 and not any(part.consistency.bent for part in parts)
+    # The place of the cut is not known better than to a local map.
+    assert abs(len(parts[0].trajectory) - begin_of_second_lap()) < 30
+    assert closer.divide([run for part in parts for run in _doubtful(part, trajectory)]) is None
+
+
+def test_loops_may_join_what_was_divided() -> None:
+    """The blunder of tracking is larger than what is searched for loops where no restart is known."""
+    keyframes, trajectory, truths = keyframes_of(SE2(1.6, 0.3, 0.25))
+    closer, _, (whole,) = mapped(keyframes, trajectory, WITHOUT_LOOPS)
+    closer._parameters = LoopParameters()
+    divided = closer.divide(_doubtful(whole, trajectory))
+    assert divided is not None and not divided.parts.any() and divided.segments.max() >= 1
+    (part,) = _draw_parts(keyframes, trajectory, divided, ProjectionConfig())
+    assert wrong_m(part, truths) < 0.4 < wrong_m(whole, truths)
+    assert not part.consistency.bent
+
+
+def test_a_good_map_is_not_divided_even_if_asked() -> None:
+    keyframes, trajectory, _ = keyframes_of()
+    closer, _, (whole,) = mapped(keyframes, trajectory, LoopParameters())
+    assert not _doubtful(whole, trajectory)
+    assert closer.divide([range(len(trajectory))]) is None
+
+
+@pytest.mark.parametrize(
+    ("segments", "loops", "parts"),
+    [
+        ([0] * 6, (), [0] * 6),
+        ([0, 0, 1, 1, 2, 2], (), [0, 0, 1, 1, 2, 2]),
+        ([0, 0, 1, 1, 2, 2], ((0, 5), (1, 4)), [0, 0, 1, 1, 0, 0]),
+        ([0, 0, 1, 1, 2, 2], ((0, 5), (0, 4)), [0, 0, 1, 1, 2, 2]),  # a single room may look like others
+        ([0, 0, 1, 1, 2, 2], ((0, 1), (0, 1), (2, 4), (3, 5)), [0, 0, 1, 1, 1, 1]),
+    ],
+)
+def test_loops_join_segments(
+    segments: list[int], loops: tuple[tuple[int, int], ...], parts: list[int]
+) -> None:
+    edges = [Edge(first, second, SE2(), np.eye(3), loop=True) for first, second in loops]
+    assert connected(np.array(segments), edges).tolist() == parts
+
+
+def test_a_segment_is_cut_where_it_contradicts_itself_mutually() -> None:
+    segment = np.array([0, 0, 0, 0, 0, 1, 1, 1])
+    once = [Conflict(0, 2, False), Conflict(5, 7, False), Conflict(1, 7, True)]
+    assert cuts_for(once, segment) == []
+    mutual = [Conflict(0, 2, False), Conflict(1, 3, True), Conflict(2, 4, True)]
+    assert cuts_for(mutual, segment) == [2, 4]
+
+
+def part_of(length_m: float, begin_ns: int) -> _Mapped:
+    count = round(length_m / 0.2) + 1
+    poses = np.array([SE2(0.2 * k, 0.0, 0.0).lift() for k in range(count)])
+    stamps_ns, health = begin_ns + np.arange(count) * 10**8, (Health.FINE,) * count
+    way = Trajectory(stamps_ns=stamps_ns, T_session_base=poses, health=health)
+    return _Mapped(grid=office(), trajectory=way, loops=(), consistency=Consistency())
+
+
+def test_a_part_too_short_to_be_of_use_is_left_out_and_counted() -> None:
+    long, short, other = part_of(20.0, 0), part_of(3.0, 30 * 10**9), part_of(12.0, 60 * 10**9)
+    kept = _of_use([long, short, other])
+    assert kept == [long, other]
+    first, second = _reports(ReadReport(scans_read=300, bytes_lost=7), "log", [long, short, other], kept)
+    assert first.scans_skipped == {"in a part too short to be of use": len(short.trajectory)}
+    assert first.scans_read + second.scans_read == 300 and first.bytes_lost == 7 and not second.lossy
+    (warning,) = first.warnings
+    assert "log from 0 s (20 m), log#2 from 60 s (12 m); 1 shorter than 8 m left out" in warning
+    assert _of_use([short]) == [short]
