@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import socket
 import struct
 import threading
 import time
@@ -196,3 +197,117 @@ class Robot:
                     with contextlib.suppress(ConnectionClosed, OSError):
                         client.send(struct.pack("<BIQ", 1, number, time_ns) + data)
         self.finished.set()
+
+
+class ZenohRobot:
+    """The same recording through a zenoh router, with the keys, tokens and attachments of rmw_zenoh.
+
+    `published` is what clients sent to the topics of `listens`: (topic, type, CDR).
+    """
+
+    def __init__(
+        self, recorded: Recorded, *, speed: float = 1.0, hash_name: str = "RIHS01_" + "0" * 64
+    ) -> None:
+        self.recorded, self.speed, self._hash = recorded, speed, hash_name
+        self.published: list[tuple[str, str, bytes]] = []
+        self.attachments: list[bytes] = []
+        self.finished = threading.Event()
+        self.port = 0
+        self._stop = threading.Event()
+
+    @property
+    def url(self) -> str:
+        return f"zenoh://127.0.0.1:{self.port}"
+
+    @contextlib.contextmanager
+    def running(self, listens: tuple[tuple[str, str], ...] = (), nodes: int = 1) -> Iterator[ZenohRobot]:
+        """A router on a free port. listens : topic and type, such as `nav_msgs/msg/OccupancyGrid`, of nodes
+        that subscribe. nodes : how many announce that they publish."""
+        import zenoh
+        from zenoh.ext import CacheConfig, declare_advanced_publisher
+
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        config = zenoh.Config()
+        config.insert_json5("mode", '"router"')
+        config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{self.port}"]')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        # A router hands out what late subscribers need only with timestamps.
+        config.insert_json5("timestamping/enabled", "true")
+        with zenoh.open(config) as session:
+            zid, kept = session.info.zid(), []
+            publishers: dict[Channel, Any] = {}
+            for number, channel in enumerate(self.recorded.channels):
+                kind = mangled(channel.type)
+                key = f"0{channel.topic}/{kind}/{self._hash}"
+                publishers[channel] = (
+                    declare_advanced_publisher(session, key, cache=CacheConfig(10), publisher_detection=True)
+                    if channel.latched
+                    else session.declare_publisher(key)
+                )
+                topic = channel.topic.replace("/", "%")
+                for node in range(nodes):
+                    token = (
+                        f"@ros2_lv/0/{zid}/{node}/{number}/MP/%/%/driver{node}/{topic}/{kind}/{self._hash}"
+                    )
+                    kept.append(session.liveliness().declare_token(f"{token}/::,10:,:,:,,"))
+            for number, (topic, type_name) in enumerate(listens, start=50):
+                kind = mangled(type_name)
+                token = (
+                    f"@ros2_lv/0/{zid}/9/{number}/MS/%/%/nav2/{topic.replace('/', '%')}/{kind}/{self._hash}"
+                )
+                kept.append(session.liveliness().declare_token(f"{token}/::,10:,:,:,,"))
+
+                def heard(sample: Any, topic: str = topic, type_name: str = type_name) -> None:
+                    self.published.append((topic, type_name, sample.payload.to_bytes()))
+                    self.attachments.append(sample.attachment.to_bytes())
+
+                kept.append(session.declare_subscriber(f"0{topic}/{kind}/{self._hash}", heard))
+            thread = threading.Thread(target=self._replay, args=(publishers,), daemon=True)
+            thread.start()
+            try:
+                yield self
+            finally:
+                self._stop.set()
+                thread.join(10.0)
+
+    def _replay(self, publishers: dict[Channel, Any]) -> None:
+        for channel, time_ns, data in self.recorded.messages:
+            if channel.latched:
+                publishers[channel].put(data, attachment=attachment(time_ns))
+        scans = next(
+            p for c, p in publishers.items() if c.type.endswith(("LaserScan", "PointCloud2", "Image"))
+        )
+        while not scans.matching_status.matching:
+            if self._stop.wait(0.01):
+                return
+        self._stop.wait(0.3)  # for the subscriptions to the other topics
+        begin_s, first_ns = time.monotonic(), self.recorded.messages[0][1]
+        for channel, time_ns, data in self.recorded.messages:
+            wait_s = begin_s + (time_ns - first_ns) * 1e-9 / self.speed - time.monotonic()
+            if wait_s > 0 and self._stop.wait(wait_s):
+                return
+            if not channel.latched:
+                publishers[channel].put(data, attachment=attachment(time_ns))
+        self.finished.set()
+
+
+def mangled(type_name: str) -> str:
+    package, _, kind = type_name.partition("/msg/")
+    return f"{package}::msg::dds_::{kind}_"
+
+
+def attachment(stamp_ns: int) -> bytes:
+    """As rmw_zenoh serialises it."""
+    from zenoh.ext import Int64, z_serialize
+
+    parts: tuple[Any, ...] = (
+        "sequence_number",
+        Int64(1),
+        "source_timestamp",
+        Int64(stamp_ns),
+        "source_gid",
+        bytes(16),
+    )
+    return b"".join(z_serialize(part).to_bytes() for part in parts)

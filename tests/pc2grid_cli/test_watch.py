@@ -23,7 +23,7 @@ from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app, main
 from tests.helpers.json_schema import closed
-from tests.helpers.robot import Recorded, Robot
+from tests.helpers.robot import Recorded, Robot, ZenohRobot
 from tests.helpers.simulated_drives import office
 
 START_M = (10.0, 7.0)
@@ -136,6 +136,26 @@ def test_a_websocket_gives_the_same_answer_and_initialpose(
     position = message.pose.pose.position
     assert math.dist((position.x, position.y), truth_at(here, stamp_ns)) < 0.1
     assert decoded["/map"].data.size == office().cells.size
+
+
+def test_zenoh_gives_the_same_answer_and_initialpose(
+    here: Path, capsys: pytest.CaptureFixture[str], expected: list[tuple[Any, ...]]
+) -> None:
+    pytest.importorskip("zenoh", reason="needs the extra [zenoh]")
+    kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
+    with ZenohRobot(Recorded.read(here / "tuesday.mcap")).running(listens=(("/initialpose", kind),)) as robot:
+        code, looks, err = watch(capsys, robot.url, "--publish", "initialpose")
+        end_s = time.monotonic() + 20.0
+        while not robot.published and time.monotonic() < end_s:
+            time.sleep(0.01)
+        published = list(robot.published)
+    assert code == 0, err
+    assert answer_of(looks) == expected[: len(looks)]
+    ((_, _, data),) = published
+    message = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, kind)
+    stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+    position = message.pose.pose.position
+    assert math.dist((position.x, position.y), truth_at(here, stamp_ns)) < 0.1
 
 
 def test_map_to_odom_is_published_until_the_program_is_stopped(here: Path) -> None:

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
 LOOPS, GRAPH, CONFIDENCE = "map/loops", "map/ways", "query/confidence"
 _HEIGHT, _LEAST_RATIO = 1.1, 1.2
-"""The eye is so many times the height of the map (+y) above it, or its width by the ratio of a window, to have
-the whole map in sight. Tried in the viewer, whose eye sees as much as it is high."""
+"""The eye is so many times the height of the map (+y) above it, or its width by the ratio of a window, to
+have the whole map in sight. Tried in the viewer, whose eye sees as much as it is high."""
 _START_HEIGHT_M = 40.0
 """As long as there is no map yet: above the start of the robot; chosen by hand."""
 _MAP_SHARE = 5

@@ -40,8 +40,8 @@ def watch_command(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="ws://ROBOT:8765|RECORDING|-",
-            help="a robot with foxglove_bridge; a recording, also a growing one; - for an MCAP on stdin",
+            metavar="ws://ROBOT:8765|zenoh://ROBOT:7447|RECORDING|-",
+            help="a robot with foxglove_bridge or rmw_zenoh; a recording, also a growing one; - for an MCAP on stdin",
         ),
     ],
     database: Annotated[

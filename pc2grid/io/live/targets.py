@@ -42,6 +42,10 @@ def open_feed(target: str, config: ReadConfig, last_s: float) -> Feed:
         from pc2grid.io.live.foxglove_websocket import FoxgloveWebsocket
 
         return FoxgloveWebsocket(target, config)
+    if scheme == "zenoh":
+        from pc2grid.io.live.zenoh_session import ZenohSession
+
+        return ZenohSession(target, config)
     raise LogNotFound(f"{target}: {scheme}:// is not known", hint=f"expected {_ADDRESSES}")
 
 
