@@ -10,6 +10,9 @@ from typing_extensions import Self
 import pc2grid.config
 from pc2grid.config import PartitionConfig, Section
 
+SelectBy = Literal["seen", "paper"]
+"""Signatures of what was seen, or those of the paper."""
+
 
 class SignatureConfig(Section):
     """Submap -> three signatures and their distance (paper III-B to III-E).
@@ -140,6 +143,9 @@ class RelocalizeConfig(Section):
         400,
         gt=0,
         description="in a larger one, the places that the signatures select for this, for each view",
+    )
+    select_by: SelectBy = Field(
+        "seen", description="signatures of what was seen, hidden rays left out; paper: Eq. 6"
     )
     signature_weight: float = Field(
         0.0,

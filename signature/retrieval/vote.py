@@ -2,7 +2,7 @@
 
 Three steps, each slower and better than the one before:
 
-1. in a large database, the three signatures (Eq. 6) make a shortlist of places for each view. Signatures
+1. in a large database, the three signatures of what was seen make a shortlist of places for each view. They
    contain no direction and no order, so they are compared fast, but many places are alike;
 2. at these places the ranges of the isovists are compared at every rotation, from many viewpoints; rays that
    either side has not observed are left out;
@@ -94,7 +94,7 @@ def retrieve(
     if places.may_all_be_compared(config.all_places):
         rows = np.arange(len(places.table))
     else:
-        shortlists = places.shortlists(views, config.shortlist, signature)
+        shortlists = places.shortlists(views, config.shortlist, signature, config.select_by)
         rows = np.unique(np.concatenate([s.rows for s in shortlists]))
     stand = places.around(rows)
     ranges = np.stack([v.profile.ranges_m for v in views])

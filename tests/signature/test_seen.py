@@ -1,0 +1,145 @@
+"""The signatures of what was seen: what they are, and what does not change them."""
+
+from __future__ import annotations
+
+import math
+
+import networkx as nx
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pc2grid.arrays import F32
+from pc2grid.submaps.isovist import HIDDEN, OPEN, WALL
+from signature.seen import (
+    SEEN,
+    boundary_seen,
+    freespace_seen,
+    parts,
+    path_lengths,
+    seen_graph,
+    seen_signatures,
+    symmetry_seen,
+)
+
+SIGHT_M, BEARINGS = 5.0, 48
+Ends = NDArray[np.int8]
+
+
+def room(width_m: float = 4.0, height_m: float = 3.0, x: float = 0.3, y: float = -0.2) -> tuple[F32, Ends]:
+    """The isovist (1, B) of a point of a rectangular room, x and y from its middle."""
+    angles = 2 * math.pi * np.arange(BEARINGS) / BEARINGS
+    c, s = np.cos(angles), np.sin(angles)
+    with np.errstate(divide="ignore"):
+        across = np.where(c > 0, width_m / 2 - x, width_m / 2 + x) / np.abs(c)
+        along = np.where(s > 0, height_m / 2 - y, height_m / 2 + y) / np.abs(s)
+    return np.minimum(across, along)[None].astype(np.float32), np.full((1, BEARINGS), WALL, np.int8)
+
+
+def random_views(count: int = 6) -> tuple[F32, Ends]:
+    """Isovists with walls near and far, some rays without a wall and some hidden."""
+    rng = np.random.default_rng(0)
+    steps = rng.uniform(0.5, SIGHT_M, (count, BEARINGS // 4))
+    ends = rng.choice([WALL, WALL, WALL, OPEN, HIDDEN], (count, BEARINGS // 4)).astype(np.int8)
+    ranges_m = (np.repeat(steps, 4, axis=1) - rng.uniform(0, 0.2, (count, BEARINGS))).astype(np.float32)
+    ends = np.repeat(ends, 4, axis=1)
+    ranges_m[ends == OPEN] = SIGHT_M
+    return ranges_m, ends
+
+
+def test_turning_a_view_changes_nothing() -> None:
+    ranges_m, ends = random_views()
+    turned = [np.roll(values, 2 * 5, axis=1) for values in (ranges_m, ends)]
+    # A turn by whole steps of the free-space nodes, up to rounding at the edge of a bin.
+    before, after = seen_signatures(ranges_m, ends, SIGHT_M), seen_signatures(*turned, SIGHT_M)
+    np.testing.assert_allclose(before, after, atol=0.05)
+    assert np.abs(before - after).mean() < 1e-3
+
+
+def test_each_histogram_is_a_share_of_what_was_seen() -> None:
+    found = seen_signatures(*random_views(), SIGHT_M)
+    columns = parts()
+    assert found.shape[1] == columns["symmetry"].stop + 1
+    squares = found.astype(np.float64) ** 2
+    ranges = SEEN.range_bins + 1
+    pairs = ranges + SEEN.pair_bins + 2
+    for part in (slice(0, ranges), slice(ranges, pairs), slice(pairs, columns["boundary"].stop)):
+        np.testing.assert_allclose(squares[:, part].sum(axis=1), 1.0, atol=1e-5)
+    paths = squares[:, columns["freespace"]]
+    np.testing.assert_allclose(paths[:, : SEEN.path_bins].sum(axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(paths[:, SEEN.path_bins :].sum(axis=1), 1.0, atol=1e-5)
+    assert (found[:, columns["symmetry"]] >= 0).all() and (found[:, columns["symmetry"]] <= 1).all()
+    np.testing.assert_allclose(found[:, -1], (random_views()[1] != HIDDEN).mean(axis=1))
+
+
+def test_pair_distances_are_those_of_all_pairs_of_wall_points() -> None:
+    ranges_m, ends = random_views(1)
+    angles = 2 * math.pi * np.arange(BEARINGS) / BEARINGS
+    counts = np.zeros(SEEN.pair_bins + 2)
+    for i in range(BEARINGS):
+        for j in range(i):
+            pair = ends[0, i], ends[0, j]
+            if HIDDEN in pair:
+                continue
+            a, b = (
+                complex(r * math.cos(t), r * math.sin(t))
+                for r, t in zip(ranges_m[0, [i, j]], angles[[i, j]], strict=True)
+            )
+            at = min(int(abs(a - b) / (2 * SIGHT_M) * SEEN.pair_bins), SEEN.pair_bins - 1)
+            counts[SEEN.pair_bins + pair.count(OPEN) - 1 if OPEN in pair else at] += 1
+    found = boundary_seen(ranges_m, ends, SIGHT_M)[0, SEEN.range_bins + 1 :][: SEEN.pair_bins + 2]
+    np.testing.assert_allclose(found**2, counts / counts.sum(), atol=0.01)
+
+
+def test_path_lengths_are_those_of_the_free_space_graph() -> None:
+    ranges_m, ends = random_views()
+    lengths_m, straight_m = path_lengths(ranges_m, ends)
+    longer = 0
+    for n in range(len(ranges_m)):
+        graph = seen_graph(ranges_m[n], ends[n])
+        expected = dict(nx.all_pairs_dijkstra_path_length(graph, weight="length_m"))
+        for a in graph:
+            for b in graph:
+                if a != b:
+                    assert lengths_m[n, a, b] == pytest.approx(expected[a][b], abs=1e-6)
+                    assert lengths_m[n, a, b] >= straight_m[n, a, b] - 1e-6
+                    longer += lengths_m[n, a, b] > straight_m[n, a, b] + 0.1
+    assert longer  # some lie around a corner
+
+
+def test_in_a_convex_room_every_path_is_straight_and_in_two_rooms_it_is_not() -> None:
+    convex = freespace_seen(*room(), SIGHT_M)[0, SEEN.path_bins :]
+    np.testing.assert_allclose(convex[0], 1.0, atol=1e-3)
+    ranges_m, ends = room()
+    ranges_m[0, ::4] = 0.5  # pillars all around
+    assert freespace_seen(ranges_m, ends, SIGHT_M)[0, SEEN.path_bins] < 0.95
+
+
+def test_the_middle_of_a_room_is_symmetric_and_a_corner_is_not() -> None:
+    middle, corner = (symmetry_seen(*room(x=x, y=y))[0] for x, y in ((0.0, 0.0), (1.7, 1.2)))
+    full = 1.0 / (1.0 + SEEN.few)
+    assert middle[0] == pytest.approx(full, abs=0.01)  # at the best axis
+    assert middle[1] == pytest.approx(full, abs=0.01)  # at the one across it
+    assert middle[-1] == pytest.approx(full, abs=0.01)  # after half a turn
+    assert corner[1] < 0.7 and corner[-1] < 0.7
+
+
+def test_a_part_has_about_the_histograms_of_the_whole_and_a_part_taken_for_a_whole_has_not() -> None:
+    rng = np.random.default_rng(1)
+    ranges_m = (2.5 + 1.5 * np.sin(np.arange(BEARINGS) * 0.9) + rng.uniform(0, 0.2, BEARINGS)).astype(
+        np.float32
+    )[None]
+    ends = np.full((1, BEARINGS), WALL, np.int8)
+    hidden = ends.copy()
+    hidden[0, :24] = HIDDEN
+    whole, part = (boundary_seen(ranges_m, e, SIGHT_M)[0, :21] for e in (ends, hidden))
+    short = np.where(hidden == HIDDEN, np.float32(0.1), ranges_m)
+    mistaken = boundary_seen(short, ends, SIGHT_M)[0, :21]
+    assert np.sum((whole - part) ** 2) < 0.3 * np.sum((whole - mistaken) ** 2)
+
+
+def test_a_view_that_has_seen_nothing_has_empty_histograms() -> None:
+    ranges_m, ends = np.zeros((1, BEARINGS), np.float32), np.full((1, BEARINGS), HIDDEN, np.int8)
+    found = seen_signatures(ranges_m, ends, SIGHT_M)
+    assert np.isfinite(found).all() and not found.any()
+    assert seen_signatures(ranges_m[:0], ends[:0], SIGHT_M).shape == (0, found.shape[1])

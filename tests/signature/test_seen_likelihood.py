@@ -1,0 +1,90 @@
+"""The weights of the bins, and how much a distance says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pc2grid.arrays import F32
+from signature.seen import parts
+from signature.seen_likelihood import (
+    DIMENSIONS,
+    SPREAD,
+    Pairs,
+    SeenStatistics,
+    SeenWeights,
+    Spread,
+    seen_weights,
+)
+
+COLUMNS = parts()["symmetry"].stop
+
+
+def made_up_pairs(count: int = 3000) -> Pairs:
+    """Places that differ in the first ten columns, and descriptions of one that differ in the others."""
+    rng = np.random.default_rng(0)
+
+    def described(places: F32) -> F32:
+        noise = rng.normal(0, 1, (len(places), COLUMNS))
+        noise[:, :10] *= 0.1
+        noise[:, :10] += places
+        return np.column_stack((noise, np.ones(len(places)))).astype(np.float32)
+
+    places = rng.normal(0, 1, (count, 10)).astype(np.float32)
+    others = rng.normal(0, 1, (count, 10)).astype(np.float32)
+    return Pairs(described(places), described(places), described(others))
+
+
+def test_bins_that_tell_places_apart_weigh_more_than_those_that_differ_by_the_sensor() -> None:
+    pairs = made_up_pairs()
+    weights = SeenWeights.of(SeenStatistics.of(pairs))
+    first = weights.matrix[:, :10]
+    assert np.abs(first[:10]).max() > 10 * np.abs(first[10:]).max()
+    queries, same = weights.of_queries(pairs.queries), weights.of_places(pairs.same)
+    # The difference at one place has unit variance along each direction.
+    assert np.var((queries - same)[:, :10], axis=0) == pytest.approx(np.ones(10), rel=0.15)
+    # The right one of 3,000 is the nearest.
+    nearest = ((queries[:100, None] - same[None]) ** 2).sum(axis=2).argmin(axis=1)
+    assert np.mean(nearest == np.arange(100)) > 0.9
+
+
+def test_statistics_come_back_from_their_file(tmp_path: Path) -> None:
+    statistics = SeenStatistics.of(made_up_pairs(200))
+    statistics.save(tmp_path / "statistics.npz")
+    again = SeenStatistics.load(tmp_path / "statistics.npz")
+    np.testing.assert_allclose(again.within, statistics.within, rtol=1e-5, atol=1e-6)
+
+
+def test_each_signature_has_weights_of_its_own() -> None:
+    assert seen_weights().matrix.shape == (COLUMNS, DIMENSIONS)
+    for name, part in parts().items():
+        alone = seen_weights(name).matrix
+        assert alone[part].any() and not np.delete(alone, np.r_[part], axis=0).any()
+
+
+def test_the_less_was_seen_the_less_a_distance_says() -> None:
+    near, far = np.full(5, 8.0), np.full(5, 150.0)
+    hidden = np.array([0.0, 0.4, 0.8, 1.2, 1.6])
+    for_one, against = SPREAD.log_ratio(near, hidden), SPREAD.log_ratio(far, hidden)
+    assert (for_one > 0).all() and (against[:3] < 0).all()
+    assert (np.diff(against) > 0).all()
+    distances = SPREAD.log_ratio(np.linspace(15, 400, 50), np.zeros(50))
+    assert (np.diff(distances) < 0).all()
+
+
+def test_the_spread_is_found_again() -> None:
+    rng = np.random.default_rng(0)
+    hidden = rng.uniform(0, 1.5, 20_000)
+
+    def drawn(coefficients: tuple[float, ...], shape: float) -> np.ndarray:
+        mean = np.exp(np.polynomial.polynomial.polyval(hidden, coefficients) + 0.5 / shape)
+        return rng.gamma(shape, mean / shape)
+
+    found = Spread.of(
+        drawn(SPREAD.one_place, SPREAD.one_shape), hidden, drawn(SPREAD.two_places, SPREAD.two_shape), hidden
+    )
+    assert found.one_place == pytest.approx(SPREAD.one_place, abs=0.1)
+    assert found.two_places == pytest.approx(SPREAD.two_places, abs=0.05)
+    assert found.one_shape == pytest.approx(SPREAD.one_shape, rel=0.1)
