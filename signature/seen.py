@@ -7,10 +7,11 @@ counts neither for nor against. A part then has about the histogram of the whole
 
 All three are invariant to rotation, as in the paper. They are:
 
-- boundary: the distances of wall points from the viewpoint (range), of all pairs of them from each other
-  (Eq. 1-2), and of neighbouring ones (step: openings, corners and edges that hide what is behind);
+- boundary: the distances of wall points from the viewpoint (range), and of all pairs of them from each other
+  (Eq. 1-2);
 - free space: the lengths of the shortest paths between the viewpoint and the ends of every second ray, inside
-  of what is seen (Eq. 3-4), and how much longer than the straight line they are (detour);
+  of what is seen (Eq. 3-4), how much longer than the straight line they are (detour), and the openings
+  through which it goes on, which are steps between the ranges of neighbouring rays;
 - symmetry: how well the ranges agree with their mirror image (Eq. 5), at the best axis, at axes beside it,
   and over all axes, and with themselves turned by half a circle.
 """
@@ -76,8 +77,8 @@ def parts() -> dict[str, slice]:
     """Which columns of `seen_signatures` belong to which of the three signatures."""
     p = SEEN
     sizes = {
-        "boundary": p.range_bins + 1 + p.pair_bins + 2 + len(p.steps_m) + 1,
-        "freespace": p.path_bins + p.detours,
+        "boundary": p.range_bins + 1 + p.pair_bins + 2,
+        "freespace": p.path_bins + p.detours + len(p.steps_m) + 1,
         "symmetry": len(_AXES) + 2 + len(_QUANTILES) + 1,
     }
     ends = np.cumsum(list(sizes.values())).tolist()
@@ -113,7 +114,7 @@ def seen_signatures(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F3
 
 
 def boundary_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64:
-    """(N, Kb) square roots of the shares of ranges, of pair distances and of steps.
+    """(N, Kb) square roots of the shares of ranges and of pair distances.
 
     A ray without a wall within sight has no distance, but says that there is none: such rays, pairs with one
     and pairs of two have bins of their own.
@@ -134,15 +135,12 @@ def boundary_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64:
         at = np.minimum(distance_bins.astype(np.int64), SEEN.pair_bins - 1)
         at = np.where(open_end | other_open, SEEN.pair_bins + (open_end & other_open), at)
         pairs += _counts(at[:, :count], (seen & other_seen)[:, :count], SEEN.pair_bins + 2)
-    step_m = np.abs(ranges_m - np.roll(ranges_m, -1, axis=1))
-    at = np.searchsorted(np.array(SEEN.steps_m), step_m)
-    steps = _shares(at, seen & np.roll(seen, -1, axis=1), len(SEEN.steps_m) + 1)
-    return np.sqrt(np.concatenate((ranges, _as_shares(pairs), steps), axis=1))
+    return np.sqrt(np.concatenate((ranges, _as_shares(pairs)), axis=1))
 
 
 def freespace_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64:
-    """(N, Kf) square roots of the shares of path lengths, and of detours, between all nodes of
-    `seen_graph`."""
+    """(N, Kf) square roots of the shares of path lengths and of detours between all nodes of `seen_graph`,
+    and of steps."""
     lengths_m, straight_m = path_lengths(ranges_m, ends)
     first, second = np.triu_indices(lengths_m.shape[1], 1)
     lengths, straight = lengths_m[:, first, second], straight_m[:, first, second]
@@ -153,7 +151,11 @@ def freespace_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64
     detour = (lengths - straight) / np.maximum(lengths, 1e-6) * ((SEEN.detours - 1) / SEEN.largest_detour)
     at = np.minimum(detour, SEEN.detours - 1).astype(np.int64)
     detours = _shares(at, known & (first > 0), SEEN.detours)
-    return np.sqrt(np.concatenate((paths, detours), axis=1))
+    seen = ends != HIDDEN
+    step_m = np.abs(ranges_m - np.roll(ranges_m, -1, axis=1))
+    at = np.searchsorted(np.array(SEEN.steps_m), step_m)
+    steps = _shares(at, seen & np.roll(seen, -1, axis=1), len(SEEN.steps_m) + 1)
+    return np.sqrt(np.concatenate((paths, detours, steps), axis=1))
 
 
 def seen_graph(ranges_m: F32, ends: NDArray[np.int8]) -> nx.Graph:

@@ -17,8 +17,9 @@ densities is the evidence for one place. It goes to 0 where little was seen.
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,6 +36,10 @@ _RIDGE = 1e-3
 finite."""
 _LEAST_SEEN = 0.5
 """The weights are learned from pairs of which both sides have seen at least this share of the rays."""
+_TOO_LITTLE = 0.15
+"""Share of the rays; a view that has seen less is not used to learn how much a distance says."""
+COMBINATIONS = tuple(c for n in (1, 2, 3) for c in itertools.combinations(parts(), n))
+"""The names of all combinations of the signatures; the last one is all three."""
 _FILE = Path(__file__).with_name("seen_statistics.npz")
 
 
@@ -52,34 +57,46 @@ class SeenStatistics:
     """What the weights are made of, for the C columns of `signature.seen.signature_columns`.
 
     query_mean, place_mean (C,) : means over queries and over places of maps. within, between (C, C) :
-    covariances, see above.
+    covariances, see above. spreads (7, 7) : the numbers of a `Spread` for each of `COMBINATIONS`.
     """
 
     query_mean: F64
     place_mean: F64
     within: F64
     between: F64
+    spreads: F64
 
     def __post_init__(self) -> None:
         freeze(self, "query_mean", np.float64, (None,))
         freeze(self, "place_mean", np.float64, (len(self.query_mean),))
         for name in ("within", "between"):
             freeze(self, name, np.float64, (len(self.query_mean), len(self.query_mean)))
+        freeze(self, "spreads", np.float64, (len(COMBINATIONS), 7))
 
     @staticmethod
-    def of(pairs: Pairs) -> SeenStatistics:
-        """From pairs of which enough was seen."""
+    def of(pairs: Pairs, *, seed: int = 0) -> SeenStatistics:
+        """The weights from pairs of which enough was seen, how much a distance says from all."""
         enough = (pairs.queries[:, -1] >= _LEAST_SEEN) & (pairs.same[:, -1] >= _LEAST_SEEN)
         queries, same = (rows[enough][:, signature_columns()].astype(np.float64) for rows in pairs[:2])
         apart = (queries - queries.mean(axis=0)) - (same - same.mean(axis=0))
         places = np.concatenate((pairs.other[:, signature_columns()], same)).astype(np.float64)
         every = places - places.mean(axis=0)
-        return SeenStatistics(
+        statistics = SeenStatistics(
             query_mean=queries.mean(axis=0),
             place_mean=places.mean(axis=0),
             within=apart.T @ apart / len(apart),
             between=every.T @ every / len(every),
+            spreads=np.zeros((len(COMBINATIONS), 7)),
         )
+        rng = np.random.default_rng(seed)
+        spreads = [Spread.of_pairs(pairs, SeenWeights.of(statistics, names), rng) for names in COMBINATIONS]
+        return replace(statistics, spreads=np.array([spread.numbers() for spread in spreads]))
+
+    def spread(self, names: Sequence[str] = ()) -> Spread:
+        """How much the distance by some of the signatures says."""
+        chosen = tuple(name for name in parts() if not names or name in names)
+        a, b, c, d, e, one, two = self.spreads[COMBINATIONS.index(chosen)].tolist()
+        return Spread(one_place=(a, b, c), two_places=(d, e), one_shape=one, two_shape=two)
 
     def save(self, path: Path) -> None:
         """Write the statistics to a .npz file."""
@@ -91,7 +108,12 @@ class SeenStatistics:
 
     @staticmethod
     def load(path: Path = _FILE) -> SeenStatistics:
-        """Read what `save` has written; by default the statistics that come with the program (`SPREAD`)."""
+        """Read what `save` has written; by default the statistics that come with the program.
+
+        These are from simulated sessions in office 1, office 2 and fr079: 18 each by lidar, laser and depth
+        camera, after 1, 3 and 8 m of travel, in the maps of these sensors, with 30 pieces of clutter and a
+        fifth of the doors and of the furniture changed in each session.
+        """
         with np.load(path, allow_pickle=False) as file:
             return SeenStatistics(**{name: file[name].astype(np.float64) for name in file.files})
 
@@ -172,6 +194,30 @@ class Spread:
             two_shape=float(1.0 / rest[1].var() + 0.5),
         )
 
+    @staticmethod
+    def of_pairs(pairs: Pairs, weights: SeenWeights, rng: np.random.Generator) -> Spread:
+        """From pairs at one place, and as many at two: with a place of another building, and of another pair.
+
+        Pairs of which one side has seen less than `_TOO_LITTLE` are left out.
+        """
+        kept = (pairs.queries[:, -1] > _TOO_LITTLE) & (pairs.same[:, -1] > _TOO_LITTLE)
+        queries, same = pairs.queries[kept], pairs.same[kept]
+        other = pairs.other[rng.integers(0, len(pairs.other), len(queries))]
+        shuffled = same[rng.permutation(len(same))]
+        at = weights.of_queries(queries)
+        squared, hidden = zip(
+            *(
+                (((at - weights.of_places(rows)) ** 2).sum(axis=1), 2.0 - queries[:, -1] - rows[:, -1])
+                for rows in (same, other, shuffled)
+            ),
+            strict=True,
+        )
+        return Spread.of(squared[0], hidden[0], np.concatenate(squared[1:]), np.concatenate(hidden[1:]))
+
+    def numbers(self) -> tuple[float, ...]:
+        """All seven, in the order of the fields."""
+        return (*self.one_place, *self.two_places, self.one_shape, self.two_shape)
+
     def log_ratio(self, squared: F64, hidden: F64) -> F64:
         """Natural logarithm of the ratio of the likelihoods of one place and of two, elementwise.
 
@@ -188,10 +234,3 @@ class Spread:
         same = one * (np.log(one) - mean_one) - gammaln(one) + one * (x - np.exp(x - mean_one))
         different = two * (np.log(two) - mean_two) - gammaln(two) + two * (x - np.exp(x - mean_two))
         return np.asarray(same - different)
-
-
-SPREAD = Spread(one_place=(2.882, 1.447, 0.464), two_places=(4.218, 0.598), one_shape=4.490, two_shape=5.398)
-"""Of the vectors that all three signatures give. Like the statistics, from simulated sessions of lidar,
-laser and depth camera, 18 each in office 1, office 2 and fr079, located after 1, 3 and 8 m in maps by lidar
-(in office 1 by all three): 3,205 pairs; 30 pieces of clutter, a fifth of the doors and of the furniture
-changed by session."""

@@ -11,7 +11,6 @@ from pc2grid.arrays import F32
 from signature.seen import parts
 from signature.seen_likelihood import (
     DIMENSIONS,
-    SPREAD,
     Pairs,
     SeenStatistics,
     SeenWeights,
@@ -19,6 +18,7 @@ from signature.seen_likelihood import (
     seen_weights,
 )
 
+SPREAD = SeenStatistics.load().spread()
 COLUMNS = parts()["symmetry"].stop
 
 
@@ -55,6 +55,7 @@ def test_statistics_come_back_from_their_file(tmp_path: Path) -> None:
     statistics.save(tmp_path / "statistics.npz")
     again = SeenStatistics.load(tmp_path / "statistics.npz")
     np.testing.assert_allclose(again.within, statistics.within, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(again.spreads, statistics.spreads, rtol=1e-5)
 
 
 def test_each_signature_has_weights_of_its_own() -> None:
