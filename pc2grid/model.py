@@ -394,6 +394,37 @@ class Consistency:
     stretches: tuple[Contradiction, ...] = ()
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Overruled:
+    """A stretch of time in which the scans showed another motion than odometry.
+
+    from_ns, to_ns : stamps of its first and last scan. distance_m, turn_rad : the largest difference between
+        the two motions from one scan to the next.
+    """
+
+    from_ns: int
+    to_ns: int
+    distance_m: float
+    turn_rad: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryCheck:
+    """What the scans of a session say of its odometry (`pc2grid.odometry.overruled`).
+
+    compared : scans that were tracked and have odometry. overruled : of these, scans that fit the map where
+        odometry does not lead.
+    stretches : where that was so, the largest difference first; of very many the largest only.
+
+    >>> OdometryCheck().compared
+    0
+    """
+
+    compared: int = 0
+    overruled: int = 0
+    stretches: tuple[Overruled, ...] = ()
+
+
 def _empty_graph() -> nx.Graph:
     import networkx as nx
 
@@ -413,6 +444,7 @@ class SessionMap:
     graph : the junction graph of the free space (`pc2grid.submaps.junction_graph`), which the submaps were
         made from; empty if none was made.
     consistency : how well the map agrees with its own scans; None if that is not known.
+    odometry : how well odometry agrees with the scans; None if that is not known.
 
     >>> import numpy as np
     >>> import pc2grid
@@ -433,6 +465,7 @@ class SessionMap:
     loops: tuple[Loop, ...] = ()
     graph: nx.Graph = field(default_factory=_empty_graph)
     consistency: Consistency | None = None
+    odometry: OdometryCheck | None = None
     report: ReadReport = field(default_factory=ReadReport)
 
     def __post_init__(self) -> None:

@@ -21,6 +21,7 @@ from pc2grid.model import (
     Health,
     Loop,
     OccupancyGrid,
+    OdometryCheck,
     ReadReport,
     RegisteredScan,
     Scan,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from pc2grid.mapping.keyframes import Keyframe, Keyframes
     from pc2grid.mapping.loop_closure import SettledKeyframes
     from pc2grid.mapping.place_recognition import PlaceRecognizer
+    from pc2grid.odometry.overruled import Disagreement
     from pc2grid.odometry.tracker import Tracked
 
 _SHARE_BEFORE_LOOPS = 0.8
@@ -152,6 +154,7 @@ def build_maps(
                 loops=part.loops,
                 graph=graph,
                 consistency=part.consistency,
+                odometry=part.odometry,
                 report=report,
             )
         )
@@ -230,6 +233,7 @@ class _Mapped:
     trajectory: Trajectory
     loops: tuple[Loop, ...]
     consistency: Consistency
+    odometry: OdometryCheck
 
 
 def _map(
@@ -251,6 +255,7 @@ def _map(
     tracker = Tracker(config.registration, config.projection)
     stamps, poses = array("q"), array("d")
     health: list[Health] = []
+    disagreements: list[Disagreement | None] = []
     with closing(Keyframes()) as keyframes:
         selection = _KeyframeSelection(keyframes, config.projection, recognizer)
         for scan in scans:
@@ -259,6 +264,7 @@ def _map(
             stamps.append(scan.stamp_ns)
             poses.extend(tracked.registered.T_session_base.ravel())
             health.append(tracked.registered.health)
+            disagreements.append(tracked.disagreement)
             observer.on_scan(tracked.registered)
         selection.finish()
         trajectory = Trajectory(
@@ -269,23 +275,28 @@ def _map(
         closed = selection.closer.finish()
         if whole:
             closed = closed.undivided()
-        drawn = _draw_parts(keyframes, trajectory, closed, config.projection)
+        drawn = _draw_parts(keyframes, trajectory, disagreements, closed, config.projection)
         for _ in range(0 if whole else PARTS.rounds):
             divided = selection.closer.divide([run for part in drawn for run in _doubtful(part, trajectory)])
             if divided is None:
                 break
-            drawn = _draw_parts(keyframes, trajectory, divided, config.projection)
+            drawn = _draw_parts(keyframes, trajectory, disagreements, divided, config.projection)
     return drawn
 
 
 def _draw_parts(
-    keyframes: Keyframes, tracked: Trajectory, closed: SettledKeyframes, projection: ProjectionConfig
+    keyframes: Keyframes,
+    tracked: Trajectory,
+    disagreements: Sequence[Disagreement | None],
+    closed: SettledKeyframes,
+    projection: ProjectionConfig,
 ) -> list[_Mapped]:
     """The map of each part of a session in a frame of its own, compared with its scans.
 
-    tracked : the poses of all scans before loops were closed.
+    tracked : the poses of all scans before loops were closed. disagreements : of odometry, at each scan.
     """
     from pc2grid.mapping.consistency import measure_consistency
+    from pc2grid.odometry.overruled import check_odometry
 
     part, T_part_base = _settled(tracked, closed)
     everywhere = dataclasses.replace(tracked, T_session_base=T_part_base)
@@ -300,6 +311,9 @@ def _draw_parts(
                 trajectory=_chosen(everywhere, scans),
                 loops=_loops_within(closed.loops, scans),
                 consistency=measure_consistency((keyframes[k] for k in own), grid, everywhere),
+                odometry=check_odometry(
+                    tracked.stamps_ns[scans].tolist(), [disagreements[k] for k in scans.tolist()]
+                ),
             )
         )
     return drawn

@@ -11,6 +11,7 @@ import numpy as np
 from pc2grid.arrays import F64
 from pc2grid.geometry import interpolate_pose, invert_pose
 from pc2grid.model import Scan
+from pc2grid.odometry.overruled import Disagreement
 from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.odometry.wheel_odometry import OdometryTrust, is_plausible, motion_size
 
@@ -108,6 +109,23 @@ class MotionModel:
             return 0.0, 0.0
         distance_m, turn_rad = motion_size(invert_pose(prediction.motion) @ prediction.windowed)
         return (distance_m, turn_rad) if distance_m > p.owed_m or turn_rad > p.owed_rad else (0.0, 0.0)
+
+    def disagreement(self, prediction: Prediction, T_session_base: F64) -> Disagreement | None:
+        """Return by how much odometry differs from the motion to the final pose (4, 4) of a scan.
+
+        None if the prediction does not rest on odometry. To be called before `observe`. Unknown odometry may
+        be wrong by `slip_sigma` of the motion, and by `owed_m` and `owed_rad` on top of it.
+        """
+        if prediction.odometry is None or self._measured is None:
+            return None
+        p = self._parameters
+        moved = invert_pose(self._measured[1]) @ T_session_base
+        distance_m, turn_rad = motion_size(invert_pose(prediction.odometry) @ moved)
+        (reported_m, reported_rad), (moved_m, moved_rad) = map(motion_size, (prediction.odometry, moved))
+        overrules = distance_m > p.owed_m + p.slip_sigma * max(
+            reported_m, moved_m
+        ) or turn_rad > p.owed_rad + p.slip_sigma * max(reported_rad, moved_rad)
+        return Disagreement(distance_m, turn_rad, overrules)
 
     def search_window(self, prediction: Prediction) -> tuple[float, float]:
         """Return how far (m, rad) the robot can be from where it is predicted."""

@@ -25,6 +25,7 @@ from pc2grid.odometry.ground_model import GroundModel
 from pc2grid.odometry.health import HealthJudge
 from pc2grid.odometry.matching_maps import MatchingMaps
 from pc2grid.odometry.motion_model import MotionModel, Prediction, not_credible
+from pc2grid.odometry.overruled import Disagreement
 from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.odometry.point_to_line import Match
 from pc2grid.odometry.registration import KissRegistration
@@ -38,12 +39,14 @@ class Tracked:
     planar_scan : the scan reduced to the plane.
     keyframe : whether the robot had moved enough for the scan to become part of the local map.
     restart : the first keyframe after tracking was lost: its pose relative to those before is unknown.
+    disagreement : of odometry with the pose; None for a lost scan, and where there is nothing to compare.
     """
 
     registered: RegisteredScan
     planar_scan: PlanarScan
     keyframe: bool
     restart: bool = False
+    disagreement: Disagreement | None = None
 
 
 class Tracker:
@@ -115,9 +118,17 @@ class Tracker:
         # 8. Start again if nothing fits any more, else extend the local maps.
         if not prediction.credible or self._health.gives_up:
             self._restart()
-        return self._finish(scan, points, planar_scan, planar.lift() @ T_level_base, health)
+        return self._finish(scan, points, planar_scan, planar.lift() @ T_level_base, health, prediction)
 
-    def _finish(self, scan: Scan, points: F32, planar_scan: PlanarScan, pose: F64, health: Health) -> Tracked:
+    def _finish(
+        self,
+        scan: Scan,
+        points: F32,
+        planar_scan: PlanarScan,
+        pose: F64,
+        health: Health,
+        prediction: Prediction | None = None,
+    ) -> Tracked:
         """Extend the maps by a scan if it is worth it, and remember its final pose."""
         after_restart = not self._maps and self._maps.restarts > 0
         keyframe = (
@@ -127,6 +138,9 @@ class Tracker:
         )
         if keyframe:
             self.kiss.update_map(pose)
+        disagreement = None
+        if prediction is not None and health is not Health.LOST:
+            disagreement = self._motion.disagreement(prediction, pose)
         self._motion.observe(scan, pose, sure=health is Health.FINE)
         deskewed = dataclasses.replace(scan, points_m=points, offsets_s=None)
         return Tracked(
@@ -134,6 +148,7 @@ class Tracker:
             planar_scan=planar_scan,
             keyframe=keyframe,
             restart=keyframe and after_restart,
+            disagreement=disagreement,
         )
 
     def _restart(self) -> None:

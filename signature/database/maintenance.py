@@ -236,6 +236,7 @@ def _entry(database: SubmapDatabase, info: SessionInfo, recover: bool) -> Entry:
         loops=database.loops(info.name),
         graph=_graph(database, info.name, recover),
         consistency=info.consistency,
+        odometry=info.odometry,
         report=info.report,
     )
     signatures = [

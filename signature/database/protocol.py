@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any, Protocol
 from pc2grid.display import short
 from pc2grid.errors import DatabaseError
 from pc2grid.io.containers.detect import SUBMAPS_ID
-from pc2grid.model import Consistency, Loop, OccupancyGrid, ReadReport, SessionMap, Submap, Trajectory
+from pc2grid.model import (
+    Consistency,
+    Loop,
+    OccupancyGrid,
+    OdometryCheck,
+    ReadReport,
+    SessionMap,
+    Submap,
+    Trajectory,
+)
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -77,6 +86,7 @@ class SessionInfo:
     report : what was read, and what was lost while reading.
     consistency : how well its map agrees with its own scans; None for an imported map, and for a session that
         was stored before this was measured.
+    odometry : how well odometry agrees with its scans; None likewise.
     """
 
     name: str
@@ -91,6 +101,7 @@ class SessionInfo:
     report: ReadReport
     provenance: Provenance
     consistency: Consistency | None = None
+    odometry: OdometryCheck | None = None
 
     def __repr__(self) -> str:
         driven = f"{self.path_m:.1f} m in {self.duration_s:.0f} s, " if self.scans else ""

@@ -31,6 +31,8 @@ from pc2grid.model import (
     Health,
     Loop,
     OccupancyGrid,
+    OdometryCheck,
+    Overruled,
     ReadReport,
     SessionMap,
     Submap,
@@ -274,6 +276,8 @@ def document(session_map: SessionMap, provenance: Provenance) -> str:
     }
     if session_map.consistency is not None:
         content["consistency"] = asdict(session_map.consistency)
+    if session_map.odometry is not None:
+        content["odometry"] = asdict(session_map.odometry)
     return json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
 
 
@@ -337,6 +341,26 @@ def read_info(row: Row, resolution_m: float, scans: int, location: Path | str) -
             label=Label(building=text_or_none("building"), floor=text_or_none("floor")),
         ),
         consistency=_consistency(content.get("consistency")),
+        odometry=_odometry(content.get("odometry")),
+    )
+
+
+def _odometry(content: Any) -> OdometryCheck | None:
+    """The check of odometry in a session's document; None for a session that has none."""
+    if content is None:
+        return None
+    return OdometryCheck(
+        compared=validation.count(content["compared"], "compared"),
+        overruled=validation.count(content["overruled"], "overruled"),
+        stretches=tuple(
+            Overruled(
+                from_ns=validation.stamp(stretch["from_ns"], "from_ns"),
+                to_ns=validation.stamp(stretch["to_ns"], "to_ns"),
+                distance_m=validation.number(stretch["distance_m"], "distance_m", 0.0),
+                turn_rad=validation.number(stretch["turn_rad"], "turn_rad", 0.0),
+            )
+            for stretch in content["stretches"]
+        ),
     )
 
 

@@ -16,6 +16,8 @@ from pc2grid.model import (
     Health,
     Loop,
     OccupancyGrid,
+    OdometryCheck,
+    Overruled,
     ReadReport,
     SessionMap,
     Submap,
@@ -73,6 +75,11 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
             for k in range(3)
         ),
         graph=small_graph(seed),
+        odometry=OdometryCheck(
+            compared=9,
+            overruled=2,
+            stretches=(Overruled(from_ns=10**9, to_ns=2 * 10**9, distance_m=0.3, turn_rad=0.5),),
+        ),
         consistency=Consistency(
             hits_on_free=1 / 7,
             contradicted=0.25,
@@ -139,6 +146,7 @@ def assert_holds(database: SubmapDatabase, entry: Entry) -> None:
     assert np.array_equal(trajectory.T_session_base, session_map.trajectory.T_session_base)
     assert trajectory.health == session_map.trajectory.health
     assert info.consistency == session_map.consistency
+    assert info.odometry == session_map.odometry
     assert_same_graph(database.graph(name), session_map.graph)
     for loop, stored_loop in zip(session_map.loops, database.loops(name), strict=True):
         assert np.array_equal(stored_loop.information, loop.information)

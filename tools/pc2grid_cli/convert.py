@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -220,6 +221,7 @@ def _convert_all(
                     keep = True
                     for entry in outcome.entries:
                         _tell(done, entry, quiet=quiet, strict=strict)
+                        terminal.note(_odometry_as_text(entry[0]), level=1)
                         if shown is not None:
                             shown.show(entry[0], outcome.job.config)
                 except DatabaseError as refusal:
@@ -263,6 +265,22 @@ def _tell(done: _Done, entry: Entry, *, quiet: bool, strict: bool) -> None:
         done.warnings.append(f"{session.session}: {data_loss.sentence(session.report)}")
         done.lossy = True
         done.severe = done.severe or data_loss.ends_with_3(session.report, strict)
+
+
+def _odometry_as_text(session: SessionMap) -> str:
+    """One line on how well the odometry of a session agrees with its scans."""
+    check, trajectory = session.odometry, session.trajectory
+    if check is None or not check.compared:
+        return f"{session.session}: no odometry to compare with the scans"
+    text = f"{session.session}: the scans overruled odometry in {check.overruled} of {check.compared} scans"
+    if not check.stretches:
+        return text
+    worst, start_ns = check.stretches[0], int(trajectory.stamps_ns[0])
+    from_s, to_s = ((stamp - start_ns) * 1e-9 for stamp in (worst.from_ns, worst.to_ns))
+    return (
+        f"{text}, most {from_s:.1f} to {to_s:.1f} s after the first scan: by up to {worst.distance_m:.2f} m "
+        f"and {math.degrees(worst.turn_rad):.0f} degrees from one scan to the next"
+    )
 
 
 def _stored(output: str, jobs: list[Job], *, add: bool, force: bool) -> dict[str, Provenance]:
@@ -317,7 +335,7 @@ def summary(session: SessionMap, origin: Provenance) -> Converted:
     """The session made of one input, as the JSON document describes it."""
     import numpy as np
 
-    from pc2grid_cli.json_schemas import consistency_document
+    from pc2grid_cli.json_schemas import consistency_document, odometry_document
 
     path_m = session.trajectory.path_m()
     grid = session.grid
@@ -336,6 +354,7 @@ def summary(session: SessionMap, origin: Provenance) -> Converted:
         "area_m2": round(float(np.count_nonzero(grid.free)) * grid.resolution_m**2, 1),
         "submaps": len(session.submaps),
         "consistency": consistency_document(session.consistency),
+        "odometry": odometry_document(session.odometry),
         "report": {
             "scans_read": report.scans_read,
             "points_dropped": report.points_dropped,

@@ -18,7 +18,7 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
 
     Example: pc2grid db info building.submaps
     """
-    from pc2grid_cli.json_schemas import consistency_document
+    from pc2grid_cli.json_schemas import consistency_document, odometry_document
     from signature.database import open_database
 
     with open_database(database) as opened:
@@ -40,6 +40,7 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
                 "scans": s.scans,
                 "lossy": s.lossy,
                 "consistency": consistency_document(s.consistency),
+                "odometry": odometry_document(s.odometry),
                 "warnings": list(s.warnings),
                 "versions": dict(s.provenance.versions),
                 "config": s.provenance.config.model_dump(mode="json"),

@@ -219,9 +219,28 @@ class Consistency(TypedDict):
     stretches: list[Contradiction]
 
 
+class Overruled(TypedDict):
+    """A stretch of time in which the scans showed another motion than odometry. distance_m, turn_rad: the
+    largest difference from one scan to the next."""
+
+    from_ns: int
+    to_ns: int
+    distance_m: float
+    turn_rad: float
+
+
+class OdometryCheck(TypedDict):
+    """How well odometry agrees with the scans. compared: scans with odometry that were tracked. overruled: of
+    these, scans that fit the map where odometry does not lead. stretches: the largest difference first."""
+
+    compared: int
+    overruled: int
+    stretches: list[Overruled]
+
+
 class Converted(TypedDict):
-    """What became of one input. digest: sha256 of it, hex. area_m2: free space. consistency: null for an
-    imported map."""
+    """What became of one input. digest: sha256 of it, hex. area_m2: free space. consistency, odometry: null
+    for an imported map."""
 
     session: str
     building: str | None
@@ -235,6 +254,7 @@ class Converted(TypedDict):
     area_m2: float
     submaps: int
     consistency: Consistency | None
+    odometry: OdometryCheck | None
     report: Report
 
 
@@ -267,6 +287,7 @@ class Session(TypedDict):
     scans: int
     lossy: bool
     consistency: Consistency | None
+    odometry: OdometryCheck | None
     warnings: list[str]
     versions: dict[str, str]
     config: dict[str, Any]
@@ -436,6 +457,25 @@ def consistency_document(consistency: model.Consistency | None) -> Consistency |
                 "share": round(stretch.share, 4),
             }
             for stretch in consistency.stretches
+        ],
+    }
+
+
+def odometry_document(check: model.OdometryCheck | None) -> OdometryCheck | None:
+    """How well odometry agrees with the scans, as the documents show it."""
+    if check is None:
+        return None
+    return {
+        "compared": check.compared,
+        "overruled": check.overruled,
+        "stretches": [
+            {
+                "from_ns": stretch.from_ns,
+                "to_ns": stretch.to_ns,
+                "distance_m": round(stretch.distance_m, 3),
+                "turn_rad": round(stretch.turn_rad, 4),
+            }
+            for stretch in check.stretches
         ],
     }
 

@@ -14,7 +14,7 @@ from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.loop_closure import LoopCloser, LoopParameters, SettledKeyframes
 from pc2grid.mapping.parts import Conflict, connected, cuts_for
 from pc2grid.mapping.pose_graph import Edge
-from pc2grid.model import Consistency, Health, ReadReport, RegisteredScan, Trajectory
+from pc2grid.model import Consistency, Health, OdometryCheck, ReadReport, RegisteredScan, Trajectory
 from pc2grid.pipeline import _doubtful, _draw_parts, _Mapped, _of_use, _reports
 from tests.helpers.simulated_drives import drive, office
 
@@ -67,7 +67,11 @@ def mapped(
     for keyframe in keyframes:
         closer.extend(keyframe)
     closed = closer.finish()
-    return closer, closed, _draw_parts(keyframes, trajectory, closed, ProjectionConfig())
+    return (
+        closer,
+        closed,
+        _draw_parts(keyframes, trajectory, [None] * len(trajectory), closed, ProjectionConfig()),
+    )
 
 
 def wrong_m(part: _Mapped, truths: list[SE2], first: int = 0) -> float:
@@ -103,7 +107,7 @@ def test_a_map_that_contradicts_itself_is_divided_into_parts_that_do_not() -> No
     assert whole.consistency.bent and closed.segments.max() == 0
     divided = closer.divide(_doubtful(whole, trajectory))
     assert divided is not None
-    parts = _draw_parts(keyframes, trajectory, divided, ProjectionConfig())
+    parts = _draw_parts(keyframes, trajectory, [None] * len(trajectory), divided, ProjectionConfig())
     assert len(parts) == 2 and not any(part.consistency.bent for part in parts)
     # The place of the cut is not known better than to a local map.
     assert abs(len(parts[0].trajectory) - begin_of_second_lap()) < 30
@@ -117,7 +121,7 @@ def test_loops_may_join_what_was_divided() -> None:
     closer._parameters = LoopParameters()
     divided = closer.divide(_doubtful(whole, trajectory))
     assert divided is not None and not divided.parts.any() and divided.segments.max() >= 1
-    (part,) = _draw_parts(keyframes, trajectory, divided, ProjectionConfig())
+    (part,) = _draw_parts(keyframes, trajectory, [None] * len(trajectory), divided, ProjectionConfig())
     assert wrong_m(part, truths) < 0.4 < wrong_m(whole, truths)
     assert not part.consistency.bent
 
@@ -159,7 +163,9 @@ def part_of(length_m: float, begin_ns: int) -> _Mapped:
     poses = np.array([SE2(0.2 * k, 0.0, 0.0).lift() for k in range(count)])
     stamps_ns, health = begin_ns + np.arange(count) * 10**8, (Health.FINE,) * count
     way = Trajectory(stamps_ns=stamps_ns, T_session_base=poses, health=health)
-    return _Mapped(grid=office(), trajectory=way, loops=(), consistency=Consistency())
+    return _Mapped(
+        grid=office(), trajectory=way, loops=(), consistency=Consistency(), odometry=OdometryCheck()
+    )
 
 
 def test_a_part_too_short_to_be_of_use_is_left_out_and_counted() -> None:
