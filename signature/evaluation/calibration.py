@@ -28,7 +28,7 @@ class Known:
 
 
 def fit(answers: Sequence[Known]) -> Calibration:
-    """Coefficients of highest likelihood (logistic regression), those of walls and lead not below 0.
+    """Coefficients of highest likelihood (logistic regression), none of them but the bias below 0.
 
     Raises ValueError unless there are both right and wrong answers.
     """
@@ -37,28 +37,22 @@ def fit(answers: Sequence[Known]) -> Calibration:
     right = np.array([answer.right for answer in answers])
     if right.all() or not right.any():
         raise ValueError("a fit needs right and wrong answers")
-    features = np.array(
-        [
-            (1.0, e.hundreds, e.hundreds * e.log_odds, e.log_lead)
-            for e in (answer.evidence for answer in answers)
-        ]
-    )
+    terms = np.array([answer.evidence.terms for answer in answers])
     sign = np.where(right, 1.0, -1.0)
 
     def loss(x: F64) -> tuple[float, F64]:
-        margin = sign * (features @ x)
+        margin = sign * (terms @ x)
         slope = -sign / (1.0 + np.exp(np.clip(margin, -500.0, 500.0)))
         penalty = _PENALTY * x
         return (
             float(np.logaddexp(0.0, -margin).mean() + 0.5 * penalty @ x),
-            slope @ features / len(sign) + penalty,
+            slope @ terms / len(sign) + penalty,
         )
 
-    bounds = [(None, None), (None, None), (_LEAST_SHARPNESS, None), (0.0, None)]
-    bias, neutral, sharpness, lead = minimize(
-        loss, np.array([0.0, -1.0, 1.0, 1.0]), jac=True, bounds=bounds, method="L-BFGS-B"
-    ).x.tolist()
-    return Calibration(bias=bias, sharpness=sharpness, neutral=-neutral / sharpness, lead=lead)
+    bounds = [(None, None), (0.0, None), (0.0, None), (0.0, None)]
+    found = minimize(loss, np.array([0.0, 1.0, 1.0, 1.0]), jac=True, bounds=bounds, method="L-BFGS-B")
+    bias, better, worse, clearance = found.x.tolist()
+    return Calibration(bias=bias, better=better, worse=worse, clearance=clearance)
 
 
 def left_out(answers: Sequence[Known]) -> F64:
@@ -107,4 +101,3 @@ def share_by_session(
 _PENALTY = 1e-4
 """Weight of the squared coefficients in the loss: keeps them finite where the answers can be told apart
 without error."""
-_LEAST_SHARPNESS = 1e-3

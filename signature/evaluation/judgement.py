@@ -68,6 +68,9 @@ def judge(
         walls=answer.evidence.walls,
         lead=answer.evidence.lead,
         look_up_ms=look_up_ms,
+        forward=answer.evidence.forward,
+        backward=answer.evidence.backward,
+        looked_at=answer.evidence.looked_at,
     )
 
 

@@ -38,8 +38,10 @@ class Trial:
     share of the query's walls, placed as they truly are, that lie on ground that the map knows, 0..1. status,
     confidence, error_m, error_rad: of the best hypothesis; the errors are null if there is none. right: the
     error of the best hypothesis is small enough. rank: of the first right place among those retrieved, -1 if
-    there is none; alone: the same by each combination of signatures, without isovists. agreement, walls,
-    lead: the evidence of the decision.
+    there is none; alone: the same by each combination of signatures, without isovists. forward, walls,
+    backward, looked_at, lead: the evidence of the decision, see `signature.relocalization.confidence`;
+    agreement: the better one of forward and backward. In the results of earlier versions, forward, backward
+    and looked_at are null.
     """
 
     building: str
@@ -60,6 +62,9 @@ class Trial:
     walls: float
     lead: float
     look_up_ms: float
+    forward: float | None = None
+    backward: float | None = None
+    looked_at: float | None = None
 
     @property
     def in_map(self) -> bool:

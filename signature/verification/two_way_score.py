@@ -23,6 +23,7 @@ class Fit:
     forward : 0..1, mean likelihood of the query's walls; neutral where the map is unknown.
     backward : 0..1, mean likelihood of the map's walls on ground that the query knows.
     overlap : 0..1, share of the query's walls on ground that the map knows.
+    looked_at : number of the map's wall points on ground that the query knows, by weight.
     score : 0..1, geometric mean of forward and backward; hypotheses are ranked by it.
     covariance : (3, 3) of x, y, yaw from the refinement: wide along a corridor, narrow across it.
     """
@@ -31,6 +32,7 @@ class Fit:
     forward: float
     backward: float
     overlap: float
+    looked_at: float
     score: float
     covariance: F64
 
@@ -62,6 +64,7 @@ def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) ->
         forward=forward,
         backward=backward,
         overlap=seen / weight if weight else 0.0,
+        looked_at=looked_at,
         score=math.sqrt(forward * backward),
         covariance=covariance,
     )

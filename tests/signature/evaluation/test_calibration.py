@@ -6,7 +6,7 @@ import pytest
 from signature.evaluation.calibration import Known, fit, left_out, log_loss, roc_area, share_by_session
 from signature.relocalization.confidence import Calibration, Evidence
 
-TRUTH = Calibration(bias=1.5, sharpness=3.0, neutral=0.7, lead=2.0)
+TRUTH = Calibration(bias=-5.0, better=4.0, worse=2.0, clearance=1.5)
 
 
 def answers(count: int) -> list[Known]:
@@ -14,9 +14,11 @@ def answers(count: int) -> list[Known]:
     made = []
     for i in range(count):
         evidence = Evidence(
-            agreement=float(rng.uniform(0.5, 0.98)),
+            forward=float(rng.uniform(0.3, 0.98)),
             walls=float(rng.uniform(30, 300)),
-            lead=float(rng.uniform(0.0, 0.3)),
+            backward=float(rng.uniform(0.3, 0.98)),
+            looked_at=float(rng.uniform(30, 300)),
+            lead=float(rng.uniform(0.05, 0.3)),  # so long that the places are not equal
         )
         right = bool(rng.random() < TRUTH.probability(evidence))
         made.append(Known(group="abc"[i % 3], session=str(i // 4), evidence=evidence, right=right))
@@ -25,10 +27,10 @@ def answers(count: int) -> list[Known]:
 
 def test_the_fit_recovers_the_model_that_made_the_answers() -> None:
     found = fit(answers(6000))
-    assert found.bias == pytest.approx(TRUTH.bias, abs=0.3)
-    assert found.sharpness == pytest.approx(TRUTH.sharpness, rel=0.15)
-    assert found.neutral == pytest.approx(TRUTH.neutral, abs=0.1)
-    assert found.lead == pytest.approx(TRUTH.lead, rel=0.15)
+    assert found.bias == pytest.approx(TRUTH.bias, abs=0.5)
+    assert found.better == pytest.approx(TRUTH.better, rel=0.15)
+    assert found.worse == pytest.approx(TRUTH.worse, rel=0.15)
+    assert found.clearance == pytest.approx(TRUTH.clearance, rel=0.15)
 
 
 def test_answers_are_judged_by_a_fit_without_their_group() -> None:

@@ -1,6 +1,7 @@
 """The confidence is a monotone function of the evidence."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,46 +12,73 @@ from signature.relocalization.confidence import (
     NO_EVIDENCE,
     PRESENCE,
     SAME_PLACE,
+    Calibration,
     Evidence,
+    Presence,
 )
 
-AGREEMENTS = np.linspace(0.0, 1.0, 21).tolist()
-WALLS = [0.0, 5.0, 30.0, 100.0, 300.0, 2000.0]
-LEADS = [0.0, 0.01, 0.05, 0.2, LIMITS.longest_lead, 1.0]
+AGREEMENTS = np.linspace(0.0, 1.0, 11).tolist()
+WALLS = [5.0, 30.0, 100.0, 300.0, 2000.0]
+LEADS = [0.0, 0.01, 0.05, 0.1, LIMITS.longest_lead, 1.0]
+USUAL = Evidence(forward=0.8, walls=200.0, backward=0.9, looked_at=150.0, lead=0.1)
 
 
-def p(agreement: float, walls: float, lead: float) -> float:
-    return CALIBRATION.probability(Evidence(agreement=agreement, walls=walls, lead=lead))
-
-
-def test_more_agreement_or_a_longer_lead_never_lowers_it() -> None:
-    for walls, lead in itertools.product(WALLS, LEADS):
-        along = [p(a, walls, lead) for a in AGREEMENTS]
-        assert along == sorted(along)
-    for agreement, walls in itertools.product(AGREEMENTS, WALLS):
-        along = [p(agreement, walls, lead) for lead in LEADS]
-        assert along == sorted(along)
+@pytest.mark.parametrize("model", [CALIBRATION, PRESENCE])
+@pytest.mark.parametrize(
+    ("field", "values"), [("forward", AGREEMENTS), ("backward", AGREEMENTS), ("lead", LEADS)]
+)
+def test_more_agreement_or_a_longer_lead_never_lowers_it(
+    model: Calibration | Presence, field: str, values: list[float]
+) -> None:
+    for agreement, walls, lead in itertools.product(AGREEMENTS[::2], WALLS, LEADS[::2]):
+        other = Evidence(forward=agreement, backward=agreement, walls=walls, looked_at=walls, lead=lead)
+        along = [model.probability(replace(other, **{field: value})) for value in values]
+        assert along == sorted(along) and along[-1] > along[0]
 
 
 def test_more_walls_make_surer_either_way() -> None:
-    good = [p(0.97, walls, 0.1) for walls in WALLS]
-    poor = [p(0.5, walls, 0.2) for walls in WALLS[2:]]
-    assert good == sorted(good) and good[-1] > 0.99
-    assert poor == sorted(poor, reverse=True) and poor[-1] < 0.01
+    good = [CALIBRATION.probability(replace(USUAL, walls=n, looked_at=n)) for n in WALLS]
+    poor = replace(USUAL, forward=0.4, backward=0.4, lead=0.0)
+    poorer = [PRESENCE.log_odds(replace(poor, walls=n, looked_at=n)) for n in WALLS]
+    assert good == sorted(good) and good[0] < 0.1 and good[-1] > 0.95
+    assert poorer == sorted(poorer, reverse=True) and poorer[-1] < poorer[0]
 
 
-def test_few_walls_locate_nothing_however_well_they_fit() -> None:
-    assert p(1.0, 0.0, 1.0) == 0.0
-    assert p(1.0, 5.0, 1.0) < 0.5
+def test_an_agreement_counts_by_the_points_that_it_rests_on() -> None:
+    """A single scan contradicts hardly any wall of a map, wherever it is placed."""
+    alone = replace(USUAL, forward=0.5, backward=1.0, lead=0.05)
+    on_few, on_many = (CALIBRATION.probability(replace(alone, looked_at=n)) for n in (20.0, 300.0))
+    assert on_few < on_many
+    assert CALIBRATION.probability(replace(USUAL, backward=1.0, looked_at=0.0)) == pytest.approx(
+        CALIBRATION.probability(replace(USUAL, backward=0.0, looked_at=0.0))
+    )
+
+
+def test_a_changed_hall_is_located_by_its_lead() -> None:
+    """Figures of a real scanner in a real hall that has been changed: no other place fits nearly as well."""
+    changed = Evidence(forward=0.75, walls=450.0, backward=0.71, looked_at=436.0, lead=LIMITS.longest_lead)
+    assert CALIBRATION.probability(changed) > 0.9
+    assert CALIBRATION.probability(replace(changed, lead=0.02)) < 0.3
+
+
+def test_a_lead_on_few_walls_is_chance() -> None:
+    """Figures of a standing scanner asked in another building: a long lead, on 32 wall points."""
+    elsewhere = Evidence(forward=0.89, walls=32.0, backward=0.62, looked_at=45.0, lead=0.17)
+    assert CALIBRATION.probability(elsewhere) < 0.7
+    assert CALIBRATION.probability(replace(elsewhere, walls=300.0, looked_at=300.0)) > 0.9
+
+
+def test_without_walls_there_is_no_answer() -> None:
+    assert CALIBRATION.probability(replace(USUAL, walls=0.0)) == 0.0
     assert CALIBRATION.probability(NO_EVIDENCE) == PRESENCE.probability(NO_EVIDENCE) == 0.0
 
 
 def test_two_equal_places_lie_in_the_map_but_which_one_is_open() -> None:
-    tie = Evidence(agreement=0.97, walls=200.0, lead=0.0)
-    assert CALIBRATION.probability(tie) < 0.9 and PRESENCE.probability(tie) > 0.5
-    perfect = Evidence(agreement=1.0, walls=1e6, lead=0.0)
+    tie = replace(USUAL, forward=0.97, backward=0.97, lead=0.0)
+    assert CALIBRATION.probability(tie) <= 0.5 and PRESENCE.probability(tie) > 0.5
+    perfect = replace(tie, forward=1.0, backward=1.0, walls=1e6, looked_at=1e6)
     assert CALIBRATION.probability(perfect) <= 0.5
-    poor = Evidence(agreement=0.7, walls=200.0, lead=0.0)
+    poor = replace(tie, forward=0.6, backward=0.6)
     assert CALIBRATION.probability(poor) < 0.01 and PRESENCE.probability(poor) < 0.1
 
 

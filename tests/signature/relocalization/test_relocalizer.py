@@ -201,6 +201,7 @@ class Judged:
             forward=1.0,
             backward=1.0,
             overlap=1.0,
+            looked_at=100.0,
             score=1.0,
             covariance=np.eye(3),
         )
