@@ -1,6 +1,7 @@
-"""Counts the answers to real laser logs in maps of their own earlier part.
+"""Counts the answers to real laser logs in maps of their own earlier part, or of other buildings.
 
     python tools/bench/real_answers.py DATA FOLDER [--logs fr079,intel] [--queries 24]
+    python tools/bench/real_answers.py DATA FOLDER --elsewhere [--logs fr079,intel] [--queries 24]
 
 The experiment of `tools/bench/real_queries.py`, but asked as a user asks: standing (six scans), after 3 m and
 after 10 m. A query is covered if half of its last scan lies within 0.2 m of a wall of the map at its true
@@ -26,6 +27,7 @@ from signature.relocalization.map_index import MapIndex
 from signature.relocalization.relocalizer import localize
 
 TRAVEL_M = (0.0, 3.0, 10.0)
+ELSEWHERE_M = (1.0, 3.0, 5.0, 8.0)
 RIGHT_M, RIGHT_RAD = 0.3, math.radians(5.0)
 NEAR_M = 0.2
 
@@ -38,15 +40,18 @@ def covered(grid: OccupancyGrid, driven: RegisteredSession, scan: int, T_world_b
     return bool(len(hits)) and float(np.mean(distance_m <= NEAR_M)) >= 0.5
 
 
+def scans_after(driven: RegisteredSession, travel_m: tuple[float, ...]) -> list[int]:
+    """The numbers of scans after which the query has driven so far, as far as it goes."""
+    path_m = driven.path_m()
+    return [max(int(np.searchsorted(path_m, m)) + 1, STANDING_SCANS) for m in travel_m if m <= path_m[-1]]
+
+
 def count(name: str, grid: OccupancyGrid, queries: list[RegisteredSession], index: MapIndex) -> None:
     """Print the answer to each query, and how many are right."""
     counts: dict[float, Counter[str]] = {travel_m: Counter() for travel_m in TRAVEL_M}
     for number, driven in enumerate(queries):
         spent_ms = 0.0
-        path_m = driven.path_m()
-        after = [
-            max(int(np.searchsorted(path_m, m)) + 1, STANDING_SCANS) for m in TRAVEL_M if m <= path_m[-1]
-        ]
+        after = scans_after(driven, TRAVEL_M)
         scans = ((registered, planar_scan) for registered, planar_scan, _ in driven.scans())
         for travel_m, asked in zip(TRAVEL_M, localize(scans, [index], after=set(after)), strict=False):
             (answer,) = asked.answers
@@ -84,6 +89,23 @@ def count(name: str, grid: OccupancyGrid, queries: list[RegisteredSession], inde
         print(name, f"{travel_m:g} m:", dict(sorted(counted.items())), flush=True)
 
 
+def count_elsewhere(name: str, queries: list[RegisteredSession], others: dict[str, MapIndex]) -> None:
+    """Print how many answers in maps of other buildings are located, and by how many of the queries."""
+    answers: Counter[float] = Counter()
+    located: list[tuple[int, str, float, float]] = []
+    for number, driven in enumerate(queries):
+        scans = ((registered, planar_scan) for registered, planar_scan, _ in driven.scans())
+        after = set(scans_after(driven, ELSEWHERE_M))
+        for travel_m, asked in zip(
+            ELSEWHERE_M, localize(scans, list(others.values()), after=after), strict=False
+        ):
+            for other, answer in zip(others, asked.answers, strict=True):
+                answers[travel_m] += 1
+                if answer.status == "located":
+                    located.append((number, other, travel_m, answer.confidence))
+        print(name, number, dict(answers), located, flush=True)
+
+
 def main() -> None:
     """Ask and count."""
     parser = argparse.ArgumentParser(
@@ -93,13 +115,19 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--logs", default="fr079,intel")
     parser.add_argument("--queries", type=int, default=24)
+    parser.add_argument("--elsewhere", action="store_true", help="ask in maps of other buildings only")
     options = parser.parse_args()
     config = Config()
     kept = options.folder / "drives"
     kept.mkdir(parents=True, exist_ok=True)
-    for name in options.logs.split(","):
-        grid, driven = read(options.data, name, options.queries, kept, config)
-        count(name, grid, driven, index_of(name, grid, config))
+    logs = {name: read(options.data, name, options.queries, kept, config) for name in options.logs.split(",")}
+    indexes = {name: index_of(name, grid, config) for name, (grid, _) in logs.items()}
+    for name, (grid, driven) in logs.items():
+        if options.elsewhere:
+            others = {other: index for other, index in indexes.items() if other != name}
+            count_elsewhere(name, driven, others)
+        else:
+            count(name, grid, driven, indexes[name])
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ the decision is measured, not mapping. Later parts of every log, registered as a
     python tools/bench/real_queries.py DATA OUT.json [--logs fr079,intel] [--queries 24]
 
 DATA holds `laser/NAME.mcap` and `laser/NAME_corrected.tum`; the registered queries are kept beside OUT.
-`tools/bench/real_answers.py` counts what is answered, `signature.evaluation.calibration` fits the confidence.
+`tools/bench/real_answers.py` counts what is answered, `tools/bench/fit_confidence.py` fits the confidence.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import argparse
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from signature.config import Config
 from signature.describe import describe
 from signature.evaluation.registered_session import RegisteredSession, register
 from signature.evaluation.replay import Replay
+from signature.relocalization.confidence import Evidence
 from signature.relocalization.map_index import MapIndex
 from signature.relocalization.query_map import QueryMap, QueryWindow
 from signature.similarity import SignatureTable
@@ -121,36 +123,43 @@ def moments(
 def evidence_rows(
     name: str, start: int, driven: RegisteredSession, indexes: dict[str, MapIndex], config: Config
 ) -> Iterator[dict[str, Any]]:
-    """All hypotheses of one query in each map, after each distance and for each window, with their errors."""
+    """The evidence for one query in each map, after each distance and for each window, and all errors.
+
+    As in `MapIndex.decide`, there are two answers: by what is proposed, and by a search of the whole map.
+    """
     for travel_m, maps, truth in moments(driven, config):
         for map_name, index in indexes.items():
             own = map_name == name
             for window_m, query in maps.items():
-                found = index.look_everywhere(query, index.look_up(query))
                 covered = 0.0
                 if own and truth is not None:
                     T = truth @ query.T_odom_base.inverse()
                     covered = score_fit(index.maps[0].walls, query.walls, T, np.eye(3)).overlap
-                errors = []
-                for h in found:
-                    e = SE2(99.0, 99.0, 3.0)
-                    if own and truth is not None:
-                        e = truth.inverse() @ h.fit.T_map_query @ query.T_odom_base
-                    errors.append((math.hypot(e.x, e.y), abs(wrap_angle(e.yaw))))
-                yield {
-                    "log": name,
-                    "map": map_name,
-                    "start": start,
-                    "travel_m": travel_m,
-                    "window_m": window_m,
-                    "walls": query.walls.weight,
-                    "covered": covered,
-                    "fits": [(h.fit.forward, h.fit.backward, h.fit.overlap, h.fit.score) for h in found],
-                    "poses": [
-                        (lambda p: (p.x, p.y, p.yaw))(h.fit.T_map_query @ query.T_odom_base) for h in found
-                    ],
-                    "errors": errors,
-                }
+                proposed = index.look_up(query)
+                for stage, found in (
+                    ("proposed", proposed),
+                    ("everywhere", index.look_everywhere(query, proposed)),
+                ):
+                    poses = [h.fit.T_map_query @ query.T_odom_base for h in found]
+                    yield {
+                        "log": name,
+                        "map": map_name,
+                        "start": start,
+                        "travel_m": travel_m,
+                        "window_m": window_m,
+                        "stage": stage,
+                        "covered": covered,
+                        "evidence": asdict(Evidence.of(found, query.walls.weight)),
+                        "errors": [_error(pose, truth if own else None) for pose in poses],
+                    }
+
+
+def _error(pose: SE2, truth: SE2 | None) -> tuple[float, float]:
+    """Metres and radians from the true pose; without one, as in another building, nothing is near it."""
+    if truth is None:
+        return math.inf, math.pi
+    e = truth.inverse() @ pose
+    return math.hypot(e.x, e.y), abs(wrap_angle(e.yaw))
 
 
 def main() -> None:
