@@ -9,7 +9,7 @@ ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 
-.PHONY: help demo test check bench fuzz picture clean
+.PHONY: help demo test check bench fuzz picture docs clean
 .DEFAULT_GOAL = help
 
 help:
@@ -19,6 +19,7 @@ help:
 	@echo 'make bench   measure against the goals and the peers (BENCH_ARGS="--only convert --quick" for some of it)'
 	@echo 'make fuzz    20,000 mutations of every kind of input; then kill -9 and crowds, 200 times and a minute'
 	@echo 'make picture draw the modules and what they import: examples/architecture.svg'
+	@echo 'make docs    the documentation site: site/index.html'
 	@echo 'make clean   remove .venv and everything that was made'
 	@echo 'All of them work from a fresh clone. PYTHON=/path/to/python3 chooses the interpreter for .venv.'
 
@@ -53,5 +54,9 @@ fuzz: $(READY)
 picture: $(READY)
 	PYTHONPATH=tools $(BIN)/python tools/architecture.py examples/architecture.svg
 
+docs: $(READY)
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[docs]'
+	$(BIN)/python -m mkdocs build
+
 clean:
-	rm -rf .venv demo_out dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf .venv demo_out dist build site .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -110,7 +110,7 @@ def test_importing_a_package_loads_no_library(package: str) -> None:
 # --- README and what stands beside it ---------------------------------------------------------------------
 
 EXAMPLES = sorted(f"examples/{path.name}" for path in ROOT.glob("examples/*.md"))
-DOCUMENTS = ("README.md", "CONTRIBUTING.md", *EXAMPLES)
+DOCUMENTS = ("README.md", "CONTRIBUTING.md", "docs/method.md", *EXAMPLES)
 ON_OWN_FILES = ("examples/nav2.md", "examples/fleet.md")
 """Their commands are run in a folder with the files that they name; those of README make their own."""
 NOT_RUN = {

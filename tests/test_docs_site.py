@@ -1,0 +1,87 @@
+"""The documentation site is built without a warning, and says what the program says."""
+
+from __future__ import annotations
+
+import html
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+import pc2grid
+import signature
+from pc2grid_cli.main import app
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("material", reason="needs the extra docs (mkdocs-material)")
+    pytest.importorskip("mkdocstrings", reason="needs the extra docs (mkdocstrings)")
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", folder],
+        cwd=ROOT, capture_output=True, text=True, check=False, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" not in done.stderr, done.stderr
+    return folder
+
+
+def text_of(page: Path) -> str:
+    return html.unescape(re.sub(r"<[^>]+>", "", page.read_text("utf-8")))
+
+
+@pytest.mark.parametrize("command", ["", "convert", "relocalize", "db merge", "compare sensors"])
+def test_commands_are_described_as_by_help(site: Path, command: str) -> None:
+    said = CliRunner().invoke(app, [*command.split(), "--help"], prog_name="pc2grid").stdout
+    assert said.strip() in text_of(site / "reference" / "commands.html")
+
+
+def test_every_setting_and_every_public_name_has_its_place(site: Path) -> None:
+    settings = text_of(site / "reference" / "settings.html")
+    assert "radius_m = 5.0" in settings and "[relocalize]" in settings
+    for package in (pc2grid, signature):
+        page = (site / "reference" / f"{package.__name__}.html").read_text("utf-8")
+        for name in package.__all__:
+            thing = getattr(package, name)
+            if name[0] != "_":
+                assert f"{thing.__module__}.{thing.__qualname__}" in page, name
+
+
+def test_docstrings_are_set_as_text_lists_and_code(site: Path) -> None:
+    page = text_of(site / "reference" / "pc2grid.html")
+    assert "stamp_ns: when the scan was taken" in page and "stamp_ns : when" not in page
+    assert ">>> monday = pc2grid.convert(" in page
+    raw = (site / "reference" / "pc2grid.html").read_text("utf-8")
+    assert "&gt;&gt;&gt; " not in re.sub(r"<pre.*?</pre>", "", raw, flags=re.DOTALL)
+
+
+def test_the_notebook_and_the_pictures_are_there(site: Path) -> None:
+    notebook = (site / "examples" / "from_log_to_answer.html").read_text("utf-8")
+    assert notebook.count("data:image/png;base64,") > 4 and "session lidar" in notebook
+    assert (site / "docs" / "signatures.png").is_file() and (site / "examples" / "demo.png").is_file()
+
+
+def test_nothing_is_loaded_from_elsewhere(site: Path) -> None:
+    for page in site.rglob("*.html"):
+        tags = re.findall(r"<(?:script|link|img)\b[^>]*>", page.read_text("utf-8"))
+        assert [tag for tag in tags if re.search(r"(?:src|href)=\"?https?:", tag)] == [], page.name
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    navigation = (ROOT / "mkdocs.yml").read_text("utf-8")
+    missing = [path.name for path in ROOT.glob("examples/*.md") if f"examples/{path.name}" not in navigation]
+    assert not missing, f"not in the nav of mkdocs.yml: {missing}"
+
+
+def test_how_to_cite() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert citation["cff-version"] == "1.2.0"
+    assert {"message", "title", "authors"} <= citation.keys()  # what the format demands

@@ -1,0 +1,178 @@
+"""The pages of the documentation site that are made from README, examples/ and the code: a hook of mkdocs.
+
+The site keeps the paths of the repository, so that the links of README and of the pages in examples/ work
+in both. Commands and settings are what the program itself prints; the reference of Python is made by
+mkdocstrings from the docstrings, which `Docstrings` rewrites as Markdown.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import griffe
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
+NOTEBOOK = "examples/from_log_to_answer"
+LINKED = ("LICENSE", "CITATION.cff")
+"""Files beside README that pages link to."""
+
+
+def on_files(files: Files, *, config: MkDocsConfig) -> Files:
+    """Add the pages and pictures that are not in docs/, and those that are under the paths they have here."""
+    sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
+    os.environ["NO_COLOR"] = "1"  # the texts of --help without the boxes of a terminal
+
+    def add(path: str, text: str) -> None:
+        files.append(File.generated(config, path, content=text))
+
+    for file in list(files):
+        if file.src_dir == config.docs_dir:
+            files.remove(file)
+            files.append(File.generated(config, f"docs/{file.src_uri}", abs_src_path=file.abs_src_path))
+    for path in PAGES:
+        add(path, (ROOT / path).read_text("utf-8").replace(f"{NOTEBOOK}.ipynb", f"{NOTEBOOK}.md"))
+    for source in sorted((ROOT / "examples").rglob("*")):
+        if source.is_file():
+            path = source.relative_to(ROOT).as_posix()
+            files.append(File.generated(config, path, abs_src_path=str(source)))
+    for path in LINKED:
+        files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
+    add(f"{NOTEBOOK}.md", notebook_page(ROOT / f"{NOTEBOOK}.ipynb"))
+    add("reference/commands.md", commands_page())
+    add("reference/settings.md", settings_page())
+    for package in ("pc2grid", "signature"):
+        add(f"reference/{package}.md", python_page(package))
+    return files
+
+
+def commands_page() -> str:
+    """What `--help` prints, of every command."""
+    from typer.main import get_command
+
+    from pc2grid_cli.main import app
+
+    parts = ["# Commands", "What `--help` prints of each.", *helps(get_command(app), "pc2grid", None)]
+    return "\n\n".join(parts) + "\n"
+
+
+def helps(command: Any, name: str, parent: Any) -> Iterator[str]:
+    """A heading and the help of a command, then those of the commands in it."""
+    word = name.split()[-1]
+    # The width of --help where no terminal says another one.
+    context = command.make_context(word, [], parent=parent, resilient_parsing=True, terminal_width=80)
+    yield f"## {name}"
+    yield f"```text\n{command.get_help(context)}\n```"
+    for inner in command.list_commands(context) if hasattr(command, "list_commands") else ():
+        yield from helps(command.get_command(context, inner), f"{name} {inner}", context)
+
+
+def settings_page() -> str:
+    """What `pc2grid config dump` prints."""
+    from pc2grid.settings import dump_settings
+    from signature.config import Config
+
+    about = (
+        "Every setting with its default, as `pc2grid config dump` prints them. `--set section.key=value` sets"
+        " one, `--config FILE` takes a file like this one, and so does the environment variable"
+        " `PC2GRID_CONFIG`."
+    )
+    return f"# Settings\n\n{about}\n\n```toml\n{dump_settings(Config())}\n```\n"
+
+
+def python_page(package: str) -> str:
+    """The docstring of a package, and its public names for mkdocstrings to fill in."""
+    module = import_module(package)
+    names = [name for name in module.__all__ if not name.startswith("_")]
+    homes = {name: getattr(module, name) for name in names}
+    passed_on = [name for name, thing in homes.items() if thing.__module__.split(".")[0] != package]
+    parts = [f"# {package}", as_markdown(module.__doc__ or "")]
+    if passed_on:
+        links = ", ".join(
+            f"[`{name}`][{thing.__module__}.{thing.__qualname__}]"
+            for name, thing in homes.items()
+            if name in passed_on
+        )
+        parts.append(f"Passed on from `signature`: {links}.")
+    for name, thing in homes.items():
+        if name not in passed_on:
+            path = f"{thing.__module__}.{thing.__qualname__}"
+            parts.append(
+                f"::: {path}\n    options:\n      heading: {package}.{name}\n      toc_label: {name}"
+            )
+    return "\n\n".join(parts) + "\n"
+
+
+def notebook_page(path: Path) -> str:
+    """A notebook with what its cells have shown."""
+    parts = []
+    for cell in json.loads(path.read_text("utf-8"))["cells"]:
+        text = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            parts.append(text)
+            continue
+        parts.append(f"```python\n{text}\n```")
+        parts += [shown for output in cell["outputs"] if (shown := _shown(output))]
+    return "\n\n".join(parts) + "\n"
+
+
+def _shown(output: dict[str, Any]) -> str:
+    """The richest form of what a cell has shown."""
+    data = output.get("data", {"text/plain": output.get("text", [])})
+    if "text/html" in data:
+        return "".join(data["text/html"])
+    if "image/png" in data:
+        return f'<img alt="" src="data:image/png;base64,{"".join(data["image/png"]).strip()}">'
+    return "```text\n" + "".join(data["text/plain"]).strip() + "\n```"
+
+
+_PARAMETER = re.compile(r"^((?:\w+(?: \([^)]*\))?)(?:, \w+(?: \([^)]*\))?)*) : (.*)$")
+"""A line such as `stamp_ns : when the scan was taken`."""
+
+
+def as_markdown(docstring: str) -> str:
+    """A docstring of this project as Markdown: its examples as code, its parameters as a list."""
+    out: list[str] = []
+    state = "text"
+    for line in docstring.splitlines():
+        parameter = _PARAMETER.match(line)
+        if state == "example" and not line.strip():
+            out.append("```")
+            state = "text"
+        elif state != "example" and line.startswith(">>> "):
+            out += ["", "```pycon"]
+            state = "example"
+        elif state != "example" and parameter:
+            if state == "text":
+                out.append("")
+            out.append(f"- `{parameter[1]}`: {parameter[2]}")
+            state = "list"
+            continue
+        elif state == "list" and not line.startswith("    "):
+            out.append("")
+            state = "text"
+        elif re.fullmatch(r"-{3,}", line):  # under the title of a section
+            out[-1] = f"**{out[-1]}**"
+            continue
+        elif state == "text" and line.startswith("    ") and out and out[-1].strip() and out[-1][0] != " ":
+            out.append("")  # what is indented is set as it stands
+        out.append(line)
+    return "\n".join((*out, "```")) if state == "example" else "\n".join(out)
+
+
+class Docstrings(griffe.Extension):
+    """Rewrites the docstrings that mkdocstrings shows."""
+
+    def on_instance(self, *, obj: griffe.Object, **_: Any) -> None:
+        """Of every class, function and attribute."""
+        if obj.docstring is not None:
+            obj.docstring.value = as_markdown(obj.docstring.value)
