@@ -11,7 +11,7 @@ from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from signature.config import Config
 from signature.database import Label
-from signature.sessions import add_sessions, build_session
+from signature.sessions import add_sessions, build_sessions
 
 if TYPE_CHECKING:
     from signature.database import SubmapDatabase
@@ -31,9 +31,12 @@ def convert(
     force: bool = False,
     observer: Observer = Observer(),
 ) -> SessionMap:
-    """Make a session of a recording or a nav2 map, and store it in a database.
+    """Make a session of a recording or a map, and store it in a database.
 
-    source : a recording, or the map.yaml of a nav2 map.
+    Of a recording that does not hang together every part becomes a session, and the one with the longest
+    travel is returned.
+
+    source : a recording, the map.yaml of a nav2 map, or a point cloud or mesh of a building.
     database : the file to make, such as `building.submaps`, or a postgresql:// URL.
     name : of the session; by default that of the file.
     span, recover, label, observer : as in `signature.build_session`.
@@ -56,7 +59,7 @@ def convert(
         raise OutputError(f"{database}: exists already", hint="force=True replaces it, add=True adds to it")
     if not is_url(database):
         require_writable(Path(database), force=True)
-    session, origin = build_session(
+    maps, origin = build_sessions(
         source,
         name or Path(source).stem,
         config,
@@ -65,8 +68,8 @@ def convert(
         label=label,
         observer=observer,
     )
-    add_sessions(database, [(session, origin)], config, keep=add, force=force)
-    return session
+    add_sessions(database, [(part, origin) for part in maps], config, keep=add, force=force)
+    return max(maps, key=lambda part: part.trajectory.length_m)
 
 
 def relocalize(
@@ -79,9 +82,9 @@ def relocalize(
     recover: bool = False,
     observer: Observer = Observer(),
 ) -> Answer:
-    """Find where a recording was made, or where a nav2 map lies.
+    """Find where a recording was made, or where a map lies.
 
-    query : a recording, or the map.yaml of a nav2 map.
+    query : a recording, or a map as in `convert`.
     database : file or postgresql:// URL.
     config : its sections `read`, `registration` and `relocalize` are used; see `query_config`.
     span : the part of the recording to use. recover : use what is whole of a damaged recording.
@@ -89,16 +92,16 @@ def relocalize(
         the recording is read to its end, and the answer is about its last metres.
     observer : gets the progress, and each scan with its tracked pose.
 
-    Raises the errors of `pc2grid.open_log`, `pc2grid.load_map` and `signature.open_database`; NoScans if no
-    scan can be used.
+    Raises the errors of `pc2grid.open_log` and `signature.open_database`, MapFileError for a map, and NoScans
+    if no scan can be used.
 
     >>> import pc2grid
     >>> answer = pc2grid.relocalize("tuesday.mcap", "building.submaps", until_located=True)
     >>> answer.status, answer.session, answer.path_m < 4.0
     ('located', 'monday', True)
     """
-    from pc2grid.io.nav2_map import is_map_file, load_map
     from pc2grid.io.recording import open_log
+    from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
     from pc2grid.pipeline import follow
     from signature.database import open_database
     from signature.relocalization.relocalizer import MapIndex, Relocalizer, locate_map
@@ -106,8 +109,8 @@ def relocalize(
     with open_database(database) as opened:
         settings = query_config(opened, config)
         index = MapIndex.of(opened, settings)
-        if is_map_file(Path(query)):
-            return locate_map(load_map(query), index)
+        if is_drawn_map(Path(query)):
+            return locate_map(load_drawn_map(query, settings).grid, index)
         relocalizer = Relocalizer(index)
         with open_log(query, settings.read, recover=recover) as log:
             start_ns, end_ns = log.info.start_ns, log.info.end_ns
