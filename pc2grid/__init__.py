@@ -19,6 +19,7 @@ Recordings to maps
     open_log, Log       a recording as a stream of scans
     follow              each scan with its pose, as they come
     build_map           a recording becomes a SessionMap; map_scans: scans of your own
+    build_maps          the same; several, if its parts cannot be placed to each other
     submaps_of          the submaps of a grid
     load_map, save_map  nav2 maps; read_tum, write_tum, write_kitti: trajectories
     simulate_session    a recording of a simulated robot, with SimulationConfig

@@ -18,6 +18,7 @@ The paper
 Databases
     convert             a recording or nav2 map becomes a session in a database
     build_session       the same without storing; provenance: what a session was made from
+    build_sessions      the same; several, if the recording does not hang together
     add_session         store a session
     create_database, open_database, SubmapDatabase, Label
 

@@ -122,6 +122,11 @@ def build_sessions(
     """Turn a recording into one session map, or into several if it does not hang together.
 
     See `pc2grid.build_maps`, which names them. Parameters and errors are those of `build_session`.
+
+    >>> import signature
+    >>> sessions, origin = build_sessions("map.yaml", "plan", signature.Config())
+    >>> [session.session for session in sessions]
+    ['plan']
     """
     from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 
