@@ -11,6 +11,7 @@ robot that wants to know its place while it drives uses a `Relocalizer`.
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -40,11 +41,18 @@ Watch = Callable[[RegisteredScan, Moment | None], None]
 class Search:
     """One query in one index: its hypotheses, carried from moment to moment."""
 
-    def __init__(self, index: MapIndex, hypotheses: tuple[Hypothesis, ...] = ()) -> None:
-        """hypotheses : known beforehand, for the first part of the query."""
+    def __init__(
+        self,
+        index: MapIndex,
+        hypotheses: tuple[Hypothesis, ...] = (),
+        *,
+        most_moments: int | None = None,
+    ) -> None:
+        """hypotheses : known beforehand, for the first part of the query. most_moments : how many of the
+        latest moments are kept; None: all."""
         self.index = index
         self._clock = _Clock()
-        self._history: list[Moment] = []
+        self._history: deque[Moment] = deque(maxlen=most_moments)
         self._hypotheses = hypotheses
         self._part = 0
 
@@ -234,9 +242,12 @@ class Relocalizer:
     'located'
     """
 
-    def __init__(self, index: MapIndex) -> None:
-        """index : where to look; `MapIndex.within` restricts it to what is known beforehand."""
-        self._query, self._search = Query(index), Search(index)
+    def __init__(self, index: MapIndex, most_moments: int | None = None) -> None:
+        """index : where to look; `MapIndex.within` restricts it to what is known beforehand.
+
+        most_moments : how many of the latest moments an answer tells, for a robot that runs for hours.
+        """
+        self._query, self._search = Query(index), Search(index, most_moments=most_moments)
 
     @property
     def path_m(self) -> float:
@@ -246,8 +257,14 @@ class Relocalizer:
     def add(self, registered: RegisteredScan, planar_scan: PlanarScan) -> Moment | None:
         """Take in the next scan. After every `relocalize.step_m` of travel the database is asked, and the
         present state of the answer is returned."""
-        if not self._query.add(registered, planar_scan):
-            return None
+        return self.look() if self.take(registered, planar_scan) else None
+
+    def take(self, registered: RegisteredScan, planar_scan: PlanarScan) -> bool:
+        """Take in the next scan, and leave it to the caller to `look`; returns whether it is time to."""
+        return self._query.add(registered, planar_scan)
+
+    def look(self) -> Moment:
+        """Ask the database now. Raises NoScans if no scan could be used."""
         moment = self._search.look(self._query.map())
         self._query.resume()
         return moment

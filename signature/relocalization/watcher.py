@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, RegisteredScan
 from signature.relocalization.answer import Answer
@@ -47,6 +48,8 @@ class WatchParameters:
 
 
 WATCH = WatchParameters()
+_MOMENTS = 100
+"""How many moments an answer tells; chosen by hand. Memory must not grow while a robot runs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,14 +101,14 @@ class Watcher:
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self._index, self._parameters, self._clock = index, parameters, clock
-        self._relocalizer = Relocalizer(index)
+        self._relocalizer = Relocalizer(index, _MOMENTS)
         self._place: _Place | None = None
         self._candidate: _Place | None = None
         self._was_located = False
         self._doubtful = self._lost_scans = 0
         self._driven_m = self._path_m = 0.0
         self._first_ns: int | None = None
-        self._stood = False
+        self._stood = self._due = False
 
     @property
     def located(self) -> bool:
@@ -114,19 +117,24 @@ class Watcher:
 
     def restart(self) -> None:
         """The scans do not go on from those before: what comes next is a search of its own."""
-        self._relocalizer = Relocalizer(self._index)
+        self._relocalizer = Relocalizer(self._index, _MOMENTS)
         self._place = self._candidate = None
         self._doubtful = self._lost_scans = 0
         self._path_m = 0.0
-        self._first_ns, self._stood = None, False
+        self._first_ns, self._stood, self._due = None, False, False
 
-    def add(self, registered: RegisteredScan, planar_scan: PlanarScan) -> Look | None:
-        """Take in the next scan; returns what a look said if there was one after it."""
+    def add(
+        self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_look: bool = True
+    ) -> Look | None:
+        """Take in the next scan; returns what a look said if there was one after it.
+
+        may_look : if not, a look that is due is put off until it is true.
+        """
         p = self._parameters
         lost = registered.health is Health.LOST
         self._lost_scans = self._lost_scans + 1 if lost else 0
         begin = self._clock()
-        moment = self._relocalizer.add(registered, planar_scan)
+        self._due = self._relocalizer.take(registered, planar_scan) or (self._due and not lost)
         path_m = self._relocalizer.path_m
         self._driven_m += max(path_m - self._path_m, 0.0)
         self._path_m = path_m
@@ -134,12 +142,18 @@ class Watcher:
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         gives_up = self._place is not None and self._lost_scans == p.lost_scans
         stands = not self._stood and not lost and stamp_ns - self._first_ns > p.standing_s * 1e9
-        if stands:
+        if stands and may_look:
             self._stood = True
             stands = path_m < p.standing_m
-        if moment is None and not gives_up and not stands:
+        if not gives_up and not (may_look and (self._due or stands)):
             return None
-        answer = self._relocalizer.answer()
+        try:
+            if self._due:
+                self._relocalizer.look()
+            answer = self._relocalizer.answer()
+        except NoScans:  # the scans since the start, or since registration was lost, show nothing
+            return None
+        self._due = False
         found = self._place_of(answer, registered)
         state = self._state(found, gives_up)
         return Look(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import enum
 import math
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from pc2grid_cli.json_schemas import Watch
     from signature.config import Config
     from signature.database import SubmapDatabase
+    from signature.database.protocol import SessionInfo
     from signature.relocalization.watcher import Look, ResetPolicy
 
 
@@ -41,7 +43,7 @@ def watch_command(
         str,
         typer.Argument(
             metavar="ws://ROBOT:8765|zenoh://ROBOT:7447|RECORDING|-",
-            help="a robot with foxglove_bridge or rmw_zenoh; a recording, also a growing one; - for an MCAP on stdin",
+            help="a robot with foxglove_bridge or rmw_zenoh; a recording, also a growing one; - for stdin",
         ),
     ],
     database: Annotated[
@@ -92,30 +94,37 @@ def watch_command(
     )
     terminal = console.of(context)
     end_s = math.inf if timeout is None else time.monotonic() + timeout
-    located = False
     with open_database(database) as opened, open_live(source, settings.read, last_s=last) as live:
         if building is not None or floor is not None:
             opened.keep_only(building=building, floor=floor)
         for problem in opened.leave_out_damaged():
             console.warn(f"{opened.location}: damaged and left out: {problem.where}: {problem.what}")
-        live.on_poll = lambda: _tell_news(live) or time.monotonic() > end_s
-        with _Robot.of(live, publish, publish_map, map_frame) as robot:
-            for look in looks(live, opened, settings, terminal):
-                published = robot.tell(look, opened)
-                _print(look, live, opened, published, as_json=json)
-                located = look.state in ("located", "recovered")
-                if located and not keep and publish is not Publish.tf:
-                    break
+        with _Robot.of(live, opened, publish, publish_map, map_frame) as robot:
+            forever = keep or publish is Publish.tf
+            located = _watch(live, opened, settings, robot, end_s, forever, as_json=json, terminal=terminal)
         _summarize(live, terminal)
     if not located:
         raise typer.Exit(console.UNSURE)
 
 
-def looks(
-    live: LiveLog, database: SubmapDatabase, settings: Config, terminal: console.Console
-) -> Iterator[Look]:
-    """What each look at the database says, for as long as scans arrive."""
+def _watch(
+    live: LiveLog,
+    database: SubmapDatabase,
+    settings: Config,
+    robot: _Robot,
+    end_s: float,
+    forever: bool,
+    *,
+    as_json: bool,
+    terminal: console.Console,
+) -> bool:
+    """Follow the robot until it is located, or until nothing comes any more or `end_s`; whether it is
+    located.
+
+    forever : go on when it is located.
+    """
     from pc2grid.pipeline import follow
+    from signature.relocalization.looking import Looking
     from signature.relocalization.map_index import MapIndex
     from signature.relocalization.watcher import Watcher
 
@@ -123,14 +132,34 @@ def looks(
     own = {name: getattr(settings, name) for name in ("read", "relocalize", "registration")}
     config = made_with.model_copy(update=own)
     watcher = Watcher(MapIndex.of(database, config))
-    choice = live.choose()
-    terminal.note(f"{live.feed.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
-    while not live.ended:
-        for registered, planar_scan in follow(live.scans(), config):
-            look = watcher.add(registered, planar_scan)
-            if look is not None:
-                yield look
-        watcher.restart()
+    located = over = False
+    with Looking(watcher, beside=live.feed.realtime, step_m=config.relocalize.step_m) as looking:
+
+        def poll() -> bool:
+            nonlocal located, over
+            _tell_news(live)
+            for look in looking.take():
+                if over:
+                    break
+                _print(look, live, robot, robot.tell(look, looking.lock), as_json=as_json)
+                located = look.state in ("located", "recovered")
+                over = located and not forever
+            over = over or time.monotonic() > end_s
+            return over
+
+        live.on_poll = poll
+        choice = live.choose()
+        terminal.note(f"{live.feed.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
+        while not live.ended and not over:
+            for registered, planar_scan in follow(live.scans(), config):
+                looking.add(registered, planar_scan)
+                if poll():
+                    break
+            looking.restart()
+        if not over:
+            looking.finish()
+            poll()
+    return located
 
 
 @dataclass(kw_only=True)
@@ -138,10 +167,12 @@ class _Robot:
     """The robot that is told where it is.
 
     publisher : None if it is not told anything. pose_is_due : whether it is to be told its pose.
-    map_session : the session whose map was published.
+    map_session : the session whose map was published. sessions : of the database, by name.
     """
 
     live: LiveLog
+    database: SubmapDatabase
+    sessions: dict[str, SessionInfo]
     publish: Publish
     publish_map: bool
     publisher: Nav2Publisher | None
@@ -151,12 +182,20 @@ class _Robot:
 
     @staticmethod
     @contextlib.contextmanager
-    def of(live: LiveLog, publish: Publish, publish_map: bool, map_frame: str) -> Iterator[_Robot]:
+    def of(
+        live: LiveLog, database: SubmapDatabase, publish: Publish, publish_map: bool, map_frame: str
+    ) -> Iterator[_Robot]:
         """Raises ConfigError if the source takes no messages, LiveError if the robot does not."""
         from signature.relocalization.watcher import ResetPolicy
 
         robot = _Robot(
-            live=live, publish=publish, publish_map=publish_map, publisher=None, resets=ResetPolicy()
+            live=live,
+            database=database,
+            sessions={info.name: info for info in database.sessions()},
+            publish=publish,
+            publish_map=publish_map,
+            publisher=None,
+            resets=ResetPolicy(),
         )
         topics = [f"/{publish.value}"] if publish is not Publish.none else []
         topics += ["/map"] if publish_map else []
@@ -172,8 +211,8 @@ class _Robot:
             robot.publisher.announce(*topics)
             yield robot
 
-    def tell(self, look: Look, database: SubmapDatabase) -> list[str]:
-        """Publish what follows from a look; returns the topics."""
+    def tell(self, look: Look, lock: threading.Lock) -> list[str]:
+        """Publish what follows from a look; returns the topics. lock : is held to read the database."""
         publisher = self.publisher
         if publisher is None:
             return []
@@ -185,7 +224,9 @@ class _Robot:
         told = []
         if self.publish_map and look.session != self.map_session:
             self.map_session = look.session
-            publisher.map(look.registered.scan.stamp_ns, database.grid(look.session))
+            with lock:
+                grid = self.database.grid(look.session)
+            publisher.map(look.registered.scan.stamp_ns, grid)
             told.append("/map")
         self.pose_is_due = self.pose_is_due or look.state == "recovered"
         if self.publish is Publish.initialpose and self.pose_is_due and self.resets.allows():
@@ -237,12 +278,10 @@ def _summarize(live: LiveLog, terminal: console.Console) -> None:
         )
 
 
-def _print(
-    look: Look, live: LiveLog, database: SubmapDatabase, published: list[str], *, as_json: bool
-) -> None:
+def _print(look: Look, live: LiveLog, robot: _Robot, published: list[str], *, as_json: bool) -> None:
     """What one look said, on stdout."""
     if as_json:
-        console.print_json_line(_document(look, live, database, published))
+        console.print_json_line(_document(look, live, robot, published))
     else:
         print(as_text(look, published), flush=True)
 
@@ -263,7 +302,7 @@ def as_text(look: Look, published: list[str]) -> str:
     )
 
 
-def _document(look: Look, live: LiveLog, database: SubmapDatabase, published: list[str]) -> Watch:
+def _document(look: Look, live: LiveLog, robot: _Robot, published: list[str]) -> Watch:
     answer, pose, T_map_odom, counts = look.answer, look.T_map_base, look.T_map_odom, live.feed.counts
     document: Watch = {
         "schema_version": 1,
@@ -283,10 +322,10 @@ def _document(look: Look, live: LiveLog, database: SubmapDatabase, published: li
         "elapsed_s": look.elapsed_s,
     }
     if look.session is not None and pose is not None and answer.covariance is not None:
-        (info,) = database.sessions([look.session])
+        info = robot.sessions[look.session]
         label = info.provenance.label
         document["map"] = {
-            "database": database.location,
+            "database": robot.database.location,
             "session": look.session,
             "building": label.building,
             "floor": label.floor,

@@ -51,11 +51,13 @@ class News:
 class Feed(Protocol):
     """Where messages arrive from.
 
-    name : for the user. counts, news : of what happened. connected : whether messages can arrive now.
-    ended : whether no message will arrive any more; those that have arrived can still be received.
+    name : for the user. realtime : whether messages are lost that are not received in time. counts, news : of
+    what happened. connected : whether messages can arrive now. ended : whether no message will arrive any
+    more; those that have arrived can still be received.
     """
 
     name: str
+    realtime: bool
     counts: FeedCounts
     news: News
 

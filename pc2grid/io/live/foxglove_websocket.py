@@ -56,6 +56,8 @@ CONNECTION = ConnectionParameters()
 class FoxgloveWebsocket:
     """The topics of a robot, over a connection that is made again whenever it is lost."""
 
+    realtime = True
+
     def __init__(
         self,
         url: str,
@@ -79,6 +81,7 @@ class FoxgloveWebsocket:
         self._offered: dict[str, tuple[int, str, str]] = {}
         self._last: dict[str, bytes] = {}
         self._may_publish = False
+        self._introduced = threading.Event()
         self._closing = threading.Event()
         self._connect_first()
         self._thread = threading.Thread(target=self._run, name="foxglove websocket", daemon=True)
@@ -143,6 +146,7 @@ class FoxgloveWebsocket:
 
         Raises LiveError if the robot does not take messages from clients.
         """
+        self._introduced.wait(self._parameters.open_s)
         if not self._may_publish:
             raise LiveError(
                 f"{self.name}: does not take messages from clients",
@@ -305,6 +309,7 @@ class FoxgloveWebsocket:
                 self._forget_channels(document["channelIds"])
             elif operation == "serverInfo":
                 self._may_publish = "clientPublish" in document.get("capabilities", [])
+                self._introduced.set()
             elif operation == "status" and document.get("level", 0) >= 1:
                 self.news.tell(f"{self.name} says: {str(document.get('message', ''))[:500]}")
         except (ValueError, KeyError, TypeError, AttributeError) as error:

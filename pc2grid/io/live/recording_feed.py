@@ -67,6 +67,8 @@ class Growing(Protocol):
 class RecordingFeed:
     """A file, or the files of a rosbag2 folder one after another; a next file may appear at any time."""
 
+    realtime = False
+
     def __init__(self, path: Path, config: ReadConfig, last_s: float) -> None:
         """last_s : seconds before the newest message with which to begin.
 

@@ -25,6 +25,7 @@ class StandardInput:
     """The MCAP that arrives at a file descriptor, by default standard input."""
 
     name = "standard input"
+    realtime = False
 
     def __init__(self, config: ReadConfig, descriptor: int = 0) -> None:
         self.counts, self.news = FeedCounts(), News()

@@ -74,6 +74,8 @@ class Token:
 class ZenohSession:
     """The topics of a robot in one ROS domain."""
 
+    realtime = True
+
     def __init__(self, url: str, config: ReadConfig, inbox: InboxParameters = INBOX) -> None:
         """url : `zenoh://ROBOT:7447`, or `zenoh://ROBOT:7447/DOMAIN` for another ROS_DOMAIN_ID than 0.
 

@@ -101,8 +101,6 @@ def test_what_is_published_is_what_an_independent_decoder_reads(recorded: Record
     grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-1.0, 2.0))
     with Robot(recorded, speed=30.0).running() as robot:
         feed = FoxgloveWebsocket(robot.url, ReadConfig(), QUICK)
-        while not feed.topics():
-            time.sleep(0.01)
         with Nav2Publisher(feed) as publisher:
             publisher.initialpose(1_500_000_000, SE2(1.0, 2.0, 0.5), np.diag([0.01, 0.02, 0.03]))
             publisher.map(7, grid)

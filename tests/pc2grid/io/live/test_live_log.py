@@ -21,6 +21,7 @@ class Given:
 
     name = "given"
     connected = True
+    realtime = False
 
     def __init__(self, messages: Sequence[Message]) -> None:
         self.counts, self.news = FeedCounts(), News()
