@@ -80,6 +80,7 @@ class LiveLog:
     """Scans from a feed. Use as a context manager.
 
     feed : where the messages arrive. lag_s : time from the arrival of the last scan to the end of its use.
+    keeps_up : whether the scans that were held back for the plan are used up, so that late ones are dropped.
     on_poll : called several times a second while scans are awaited and with each scan; if it returns true, no
     more scans are given.
     """
@@ -104,7 +105,7 @@ class LiveLog:
         self._topic_of: dict[tuple[str, str], TopicInfo] = {}
         self._begin_s = clock()
         self._planned_s = self._heard_s = self._begin_s
-        self._keeps_up = False
+        self.keeps_up = False
         self._newest = (0, self._begin_s)
         self._arrived_s: dict[int, float] = {}
 
@@ -296,8 +297,8 @@ class LiveLog:
         return Arrived(self._named(arrived.message), arrived.arrived_s)
 
     def _keep_up(self) -> None:
-        if not self._keeps_up:
-            self._keeps_up = True
+        if not self.keeps_up:
+            self.keeps_up = True
             self.feed.keep_up()
 
     # --- odometry, now --------------------------------------------------------------------------------
@@ -347,4 +348,6 @@ class LiveLog:
             listed = ", ".join(f"{t.topic} ({t.type})" for t in there[:12])
             return f"{self.feed.name}: no topic with scans yet; there is: {listed}"
         silent = ", ".join(t.topic for t in scans if t.topic not in heard)
+        if not silent:
+            return f"{', '.join(t.topic for t in scans)}: too few messages so far"
         return f"{silent}: no message yet (is the sensor's driver running? does its QoS fit?)"
