@@ -30,7 +30,9 @@ class Section(BaseModel):
 class ReadConfig(Section):
     """How a recording is read."""
 
-    topic: str | None = Field(None, description="topic of the scans; null: the only one that fits")
+    topic: str | None = Field(
+        None, description="topic of the scans, or several, /a,/b, of one kind; null: the only one that fits"
+    )
     odometry: str | None = Field(None, description='odometry topic; null: found in the log; "none": ignored')
     base_frame: str | None = Field(
         None, description="null: base_link, base_footprint, or the sensor if no tf"

@@ -43,7 +43,9 @@ class Plan:
     odometry_frame : the parent frame of the odometry in tf; None if it is not there.
     tf_moves : whether tf must be read along with the scans.
     sensor_is_base : whether the log has no tf, so that the sensor's frame serves as the base.
-    stampless : whether the first scans have stamps of zero, so that the time of recording is used instead.
+    further : topics of more sensors of the same kind, with the calibration of each, whose scans are put
+    together with those of the first. stampless : whether the first scans have stamps of zero, so that the
+    time of recording is used instead.
     """
 
     choice: Choice
@@ -54,6 +56,7 @@ class Plan:
     tf_moves: bool
     sensor_is_base: bool
     stampless: bool
+    further: tuple[tuple[TopicInfo, TopicInfo | None], ...] = ()
 
 
 def make_plan(source: MessageSource, config: ReadConfig, frames: FrameTree) -> Plan:
@@ -91,7 +94,12 @@ class _Planner:
         config, found_topics, frames = self._config, self._topics, self._frames
         scans, reason = topics.scan_topic(found_topics, config.topic)
         sensor = topics.SENSORS[scans.type]
-        camera = topics.camera_info_topic(scans, found_topics) if sensor == "depth" else None
+        more = topics.further_scan_topics(found_topics, config.topic)
+        if more:
+            reason += f", with {', '.join(t.topic for t in more)}"
+        cameras = [
+            topics.camera_info_topic(t, found_topics) if sensor == "depth" else None for t in (scans, *more)
+        ]
         odometry, why_odometry = topics.odometry_topic(found_topics, config.odometry)
         tf_topics = [t for t in found_topics if t.type in topics.TF and t.message_count != 0]
         self._read_static([t for t in tf_topics if is_static(t)])
@@ -103,6 +111,11 @@ class _Planner:
         in_tf = odometry.type in topics.TF if odometry else config.odometry is None
         base = self._search_tf(moving, sensor_frame, child, first_ns, odometry_too=in_tf)
 
+        if more and base is None:
+            raise FrameError(
+                f"{scans.topic}, {more[0].topic}: without tf their places on the robot are not known",
+                hint=f"record /tf_static too, or choose one: --topic {scans.topic}",
+            )
         sensor_is_base = base is None
         if base is None:
             base = sensor_frame or config.base_frame or "sensor"
@@ -127,7 +140,10 @@ class _Planner:
             reason=f"{reason}; {why_odometry}",
         )
         stampless = bool(headers) and all(header.stamp_ns == 0 for header in headers)
-        return Plan(choice, scans, camera, odometry, odometry_frame, moves, sensor_is_base, stampless)
+        further = tuple(zip(more, cameras[1:], strict=True))
+        return Plan(
+            choice, scans, cameras[0], odometry, odometry_frame, moves, sensor_is_base, stampless, further
+        )
 
     def _first_headers(self, scans: TopicInfo) -> tuple[int, list[Header]]:
         """The log time of the first scan, and the headers of the first scans that can be decoded.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import heapq
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from pc2grid.errors import (
 from pc2grid.geometry import invert_pose
 from pc2grid.io import topics
 from pc2grid.io.frames import FrameTree, PoseTrack
+from pc2grid.io.further_scans import FurtherScans, together
 from pc2grid.io.message_source import MessageSource, RawMessage, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Odometry, ScanMessage, Transform
@@ -96,6 +98,10 @@ class Stream:
         self._end_ns = None if duration_s is None else self._start_ns + round(duration_s * 1e9)
         self._part = f"from {start_s:g} s" + ("" if duration_s is None else f" for {duration_s:g} s")
         self._decoder = ScanDecoder(plan.scans.topic, plan.choice.sensor, decoder_for(plan.scans), config)
+        self._further = [
+            FurtherScans(t, camera, ScanDecoder(t.topic, plan.choice.sensor, decoder_for(t), config))
+            for t, camera in plan.further
+        ]
         self._track = PoseTrack()
         self._T_child_base: F64 | None = None
         self._waiting: list[_Waiting] = []
@@ -115,8 +121,13 @@ class Stream:
         if plan.odometry is not None:
             on[plan.odometry] = self._take_odometry()
         if plan.camera is not None:
-            on[plan.camera] = self._take_camera()
+            on[plan.camera] = self._take_camera(plan.camera, self._decoder)
             self._first_camera(plan.camera, on[plan.camera])
+        for further in self._further:
+            on[further.topic] = functools.partial(self._take_further, further)
+            if further.camera is not None and further.camera not in on:
+                on[further.camera] = self._take_camera(further.camera, further.decoder)
+                self._first_camera(further.camera, on[further.camera])
         if plan.tf_moves:
             for topic in self._source.info.topics:
                 if topic.type in topics.TF and not is_static(topic):
@@ -143,7 +154,8 @@ class Stream:
 
     def absorb(self, message: RawMessage) -> None:
         """Take in a message of odometry or tf before its turn; it may be given to `take` as well."""
-        if message.channel != self._plan.scans and message.channel in self._handlers:
+        scans = (self._plan.scans, *(further.topic for further in self._further))
+        if message.channel not in scans and message.channel in self._handlers:
             self._handlers[message.channel](message.data, message.log_time_ns)
 
     @property
@@ -167,13 +179,17 @@ class Stream:
             now_ns - first.log_time_ns > p.wait_ns
             or len(self._waiting) > p.max_waiting
             or self._waiting_bytes > p.max_waiting_bytes
-            or (p.eager and self._motion_is_known(first.stamp_ns + self._sweep_ns))
+            or (p.eager and self._all_is_there(first.stamp_ns))
         )
 
-    def _motion_is_known(self, stamp_ns: int) -> bool:
-        """Whether the odometry has arrived, if there is any, up to a stamp."""
+    def _all_is_there(self, stamp_ns: int) -> bool:
+        """Whether what belongs to a scan has arrived: those of further sensors, and odometry if there is
+        any."""
+        if any(further.newest_ns < stamp_ns for further in self._further):
+            return False
         newest_ns = self.newest_odometry_ns()
-        return newest_ns is None or newest_ns >= stamp_ns
+        needed_ns = [stamp_ns + self._sweep_ns, *(f.nearest_ns(stamp_ns) for f in self._further)]
+        return newest_ns is None or newest_ns >= max(needed_ns)
 
     def newest_odometry_ns(self) -> int | None:
         """The stamp up to which odometry is known; 0 if none has arrived, None if there is none at all."""
@@ -244,14 +260,19 @@ class Stream:
         self._tally.warn(f"the odometry is of frame {child}, which is taken for {base}")
         return np.eye(4)
 
-    def _take_camera(self) -> Callable[[Any, int], None]:
-        assert self._plan.camera is not None
-        decode = decoder_for(self._plan.camera)
+    def _take_further(self, further: FurtherScans, data: Any, log_time_ns: int) -> None:
+        try:
+            further.take(data)
+        except Pc2GridError as error:
+            self._tally.skip(f"{further.topic.topic}: {error.message}")
+
+    def _take_camera(self, camera: TopicInfo, decoder: ScanDecoder) -> Callable[[Any, int], None]:
+        decode = decoder_for(camera)
 
         def take(data: Any, log_time_ns: int) -> None:
             found = tolerant(decode, data, None)
             if found is not None:
-                self._decoder.camera = found
+                decoder.camera = found
 
         return take
 
@@ -282,7 +303,7 @@ class Stream:
             self._check_stamp(stamp_ns, log_time_ns)
             T_base_sensor = self._sensor_pose(message.header.frame, stamp_ns)
             scan = self._decoder.scan(message, stamp_ns, T_base_sensor, self._odometry_at(stamp_ns))
-            scan = self._with_motion(scan)
+            scan = self._with_motion(self._with_further(scan))
         except (PointCloudError, LimitExceeded) as error:
             self._skip(error)
             return
@@ -301,6 +322,21 @@ class Stream:
         if not len(scan.points_m):
             self._tally.warn("some scans hold no returns at all")
         yield scan
+
+    def _with_further(self, scan: Scan) -> Scan:
+        """The scan together with those of the further sensors that are near in time."""
+        found = []
+        for further in self._further:
+            try:
+                near = further.near(scan.stamp_ns, self._sensor_pose, self._odometry_at)
+            except (PointCloudError, LimitExceeded) as error:
+                self._tally.skip(f"{further.topic.topic}: {error.message}")
+                continue
+            if near is None:
+                self._tally.skip(f"{further.topic.topic}: no scan near the first sensor's")
+            else:
+                found.append(near)
+        return together(scan, found) if found else scan
 
     def _check_stamp(self, stamp_ns: int, log_time_ns: int) -> None:
         """Compare a stamp with the one before. Raises PointCloudError for a scan to be skipped."""

@@ -37,7 +37,7 @@ def scan_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicIn
     """
     fitting = [t for t in topics if _fits(t, topics)]
     if wanted is not None:
-        return _named(topics, fitting, wanted), "named by the user"
+        return _named(topics, fitting, names_in(wanted)[0]), "named by the user"
     full = [t for t in fitting if t.message_count != 0]
     if fitting and not full:
         raise NoScans(f"{_listed(fitting)}: no message in the log")
@@ -50,17 +50,42 @@ def scan_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicIn
     # An image and its compressed copy come from the same camera: take the uncompressed one.
     distinct = [t for t in full if not (_is_compressed(t) and any(_raw_twin(t, other) for other in full))]
     if len(distinct) > 1:
+        alike = [t.topic for t in distinct if t.type == distinct[0].type]
+        both = f", or all of one kind: --topic {','.join(alike[:4])}" if len(alike) > 1 else ""
         raise TopicError(
             f"several topics hold scans: {_listed(distinct)}",
-            hint=f"choose one, e.g. --topic {distinct[0].topic}",
+            hint=f"choose one, e.g. --topic {distinct[0].topic}{both}",
         )
     return distinct[0], f"the only topic with scans ({distinct[0].type})"
+
+
+def further_scan_topics(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicInfo, ...]:
+    """The topics whose scans are put together with those of the first one that `wanted` names.
+
+    Raises TopicError if one is missing or of another kind of sensor, UnsupportedSchema, NoScans.
+    """
+    fitting = [t for t in topics if _fits(t, topics)]
+    found = [_named(topics, fitting, name) for name in names_in(wanted)]
+    for other in found[1:]:
+        kinds = SENSORS[found[0].type], SENSORS[other.type]
+        if kinds[0] != kinds[1]:
+            raise TopicError(
+                f"{found[0].topic} ({kinds[0]}) and {other.topic} ({kinds[1]}) cannot be put together",
+                hint=f"choose one, e.g. --topic {found[0].topic}",
+            )
+    return tuple(found[1:])
+
+
+def names_in(wanted: str | None) -> list[str]:
+    """The topics of a list such as `/front,/rear`; no topic of ROS has a comma in its name."""
+    return list(dict.fromkeys(name.strip() for name in (wanted or "").split(",") if name.strip()))
 
 
 def usable(topics: Sequence[TopicInfo], wanted: str | None) -> list[TopicInfo]:
     """The topics that scans may be read from, silent ones among them; of those that `wanted` names only
     these."""
-    fitting = [t for t in topics if (t.topic == wanted if wanted else _fits(t, topics))]
+    names = names_in(wanted)
+    fitting = [t for t in topics if (t.topic in names if names else _fits(t, topics))]
     return [t for t in fitting if t.type in SENSORS]
 
 

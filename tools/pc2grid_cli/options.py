@@ -31,7 +31,10 @@ Preset = Annotated[
     PresetName,
     typer.Option("--preset", help="settings to start from; paper: submaps are discs of 8 m at junctions"),
 ]
-Topic = Annotated[str | None, typer.Option("--topic", "-t", help="topic of the scans, if several fit")]
+Topic = Annotated[
+    str | None,
+    typer.Option("--topic", "-t", help="topic of the scans, if several fit; /a,/b: of two sensors together"),
+]
 OdometryTopic = Annotated[
     str | None, typer.Option("--odometry", help='odometry topic; "none": do not use any')
 ]
