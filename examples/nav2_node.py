@@ -1,0 +1,172 @@
+"""A ROS 2 node that tells nav2 where the robot is, for those who have rclpy and want no bridge.
+
+    pip install pc2grid                                       # into the Python of the sourced ROS 2
+    python3 nav2_node.py building.submaps                     # publishes /initialpose once
+    python3 nav2_node.py building.submaps --topic /scan_front
+
+Messages are taken as their bytes (raw=True) and decoded by pc2grid, so no message package is needed for
+sensors. Without rclpy, `pc2grid watch ws://robot:8765` and `zenoh://robot:7447` do the same from another
+computer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import threading
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import rclpy
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+import pc2grid
+from pc2grid.config import ReadConfig
+from pc2grid.io import topics
+from pc2grid.io.live.feed import Arrived, FeedCounts, News
+from pc2grid.io.live.inbox import Inbox
+from pc2grid.io.live.live_log import LiveLog
+from pc2grid.io.live.nav2 import Nav2Publisher
+from pc2grid.io.message_source import RawMessage, TopicInfo
+from signature.database import open_database
+from signature.relocalization.looking import Looking
+from signature.relocalization.map_index import MapIndex
+from signature.relocalization.watcher import Look, Watcher
+
+
+class RclpyFeed:
+    """The topics of the node's ROS graph as a feed (pc2grid.io.live.feed), and where messages are
+    published."""
+
+    realtime = True
+    connected = True
+    ended = False
+
+    def __init__(self, node: Any, topic: str | None) -> None:
+        self.name = "this robot"
+        self.counts, self.news = FeedCounts(), News()
+        self._node, self._topic = node, topic
+        self._inbox = Inbox(self.counts)
+        self._topics: dict[str, TopicInfo] = {}
+        self._subscriptions: dict[str, Any] = {}
+        self._publishers: dict[str, Any] = {}
+        node.create_timer(0.5, self._discover)
+
+    def _discover(self) -> None:
+        for name, types in self._node.get_topic_names_and_types():
+            kind = types[0].replace("/msg/", "/")
+            self._topics.setdefault(name, TopicInfo(topic=name, type=kind, encoding="cdr"))
+        there = self.topics()
+        for info in there:
+            if info.topic not in self._subscriptions and topics.may_be_used(info, there, self._topic):
+                self._subscribe(info)
+
+    def _subscribe(self, info: TopicInfo) -> None:
+        # Best effort takes from every publisher; static transforms are published once and kept for those who
+        # ask.
+        latched = info.topic.endswith("tf_static")
+        qos = QoSProfile(
+            depth=100,
+            reliability=ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=lambda event: self.news.tell(f"{info.topic}: QoS does not fit: {event}")
+        )
+
+        def take(data: bytes) -> None:
+            now_ns = self._node.get_clock().now().nanoseconds
+            self._inbox.put(RawMessage(info, now_ns, bytes(data)))
+
+        self._subscriptions[info.topic] = self._node.create_subscription(
+            _type(info.type), info.topic, take, qos, raw=True, event_callbacks=events
+        )
+
+    def topics(self) -> tuple[TopicInfo, ...]:
+        """The topics that are known so far."""
+        return tuple(self._topics.values())
+
+    def want(self, topics: Collection[str]) -> None:
+        """Only these topics are needed from now on."""
+        for name in [name for name in self._subscriptions if name not in topics]:
+            self._node.destroy_subscription(self._subscriptions[name])
+
+    def keep_up(self) -> None:
+        """From now on scans may be dropped."""
+        self._inbox.keep_up()
+
+    def pending(self, topics: Collection[str]) -> Sequence[RawMessage]:
+        """Messages that wait."""
+        return self._inbox.pending(topics)
+
+    def receive(self, timeout_s: float) -> Arrived | None:
+        """The next message."""
+        return self._inbox.get(timeout_s)
+
+    def close(self) -> None:
+        """Let `receive` return."""
+        self._inbox.wake()
+
+    def advertise(self, topic: str, type_name: str, definition: str, *, keep_last: bool) -> None:
+        """Make a publisher."""
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if keep_last else DurabilityPolicy.VOLATILE
+        qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+        self._publishers[topic] = self._node.create_publisher(_type(type_name), topic, qos)
+
+    def publish(self, topic: str, message: bytes) -> None:
+        """Publish a message in CDR."""
+        self._publishers[topic].publish(message)
+
+
+def _type(name: str) -> Any:
+    """The Python class of a message type such as `sensor_msgs/LaserScan`."""
+    package, _, kind = name.replace("/msg/", "/").partition("/")
+    return getattr(importlib.import_module(f"{package}.msg"), kind)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Follow the robot until it is located, and publish /initialpose."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("database")
+    parser.add_argument("--topic", help="of the scans, if several fit")
+    options = parser.parse_args(arguments)
+    rclpy.init()
+    node = rclpy.create_node("pc2grid")
+    spin = threading.Thread(target=rclpy.spin, args=(node,), daemon=True)
+    feed = RclpyFeed(node, options.topic)
+    spin.start()
+    with open_database(options.database) as database, LiveLog(feed, ReadConfig(topic=options.topic)) as live:
+        config = database.config()
+        watcher = Watcher(MapIndex.of(database, config))
+        with Nav2Publisher(feed) as publisher, Looking(watcher, beside=True) as looking:
+            publisher.announce("/initialpose")
+            # Called several times a second; true ends the stream of scans.
+            live.on_poll = lambda: tell(node, live, publisher, looking.take())
+            while not live.ended:
+                for registered, planar_scan in pc2grid.follow(live.scans(), config):
+                    looking.add(registered, planar_scan)
+                looking.restart()
+
+
+def tell(node: Any, live: LiveLog, publisher: Nav2Publisher, looks: Sequence[Look]) -> bool:
+    """Log what there is to say; publish the pose and return true once the robot is located."""
+    for sentence in live.feed.news.take():
+        node.get_logger().warning(sentence)
+    for look in looks:
+        node.get_logger().info(f"{look.state} after {look.answer.path_m:.1f} m")
+        if look.T_map_base is None or look.answer.covariance is None:
+            continue
+        # The look is about a scan some tenths of a second ago: apply it to the newest odometry.
+        stamp_ns, pose = look.registered.scan.stamp_ns, look.T_map_base
+        newest = live.newest_odometry()
+        if newest is not None and look.T_map_odom is not None:
+            stamp_ns, pose = newest[0], look.T_map_odom @ pc2grid.SE2.from_matrix(newest[1])
+        publisher.initialpose(stamp_ns, pose, look.answer.covariance)
+        node.get_logger().info(f"in {look.session} at {pose}")
+        return True
+    return False
+
+
+if __name__ == "__main__":
+    main()
