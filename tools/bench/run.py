@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import large_database
+import live
 import locating
 import peers
 import reading
@@ -48,6 +49,8 @@ MEASURES: dict[str, Measure] = {
     "open": large_database.open_time,
     "floors": large_database.floors_time,
     "relocalize": locating.relocalize_time,
+    "live": live.lag,
+    "hour": live.memory,
     "peers": peers.compare,
     "fleet": fleet_search,
 }
