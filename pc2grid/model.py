@@ -431,6 +431,53 @@ def _empty_graph() -> nx.Graph:
     return nx.Graph()
 
 
+POINT_STEPS = 64
+"""Steps along the edge of a voxel in which a `PointMap` keeps a point: 0.8 mm of 5 cm."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointMap:
+    """The registered points of a session in space, one for each voxel that holds any: their mean.
+
+    voxel_m : edge of a voxel. origin_m : (3,) in the map frame, lowest corner of all voxels.
+    steps : (V, 3) int32 from there, in steps of voxel_m / POINT_STEPS; by increasing x, y, z of the voxels.
+
+    >>> points = PointMap.of(np.array([[0.0, 0.0, 0.02], [1.0, 0.0, 2.0]]), 0.05)
+    >>> len(points), points.points_m().round(2).tolist()
+    (2, [[0.0, 0.0, 0.02], [1.0, 0.0, 2.0]])
+    """
+
+    voxel_m: float
+    origin_m: F64
+    steps: NDArray[np.int32]
+
+    def __post_init__(self) -> None:
+        freeze(self, "origin_m", np.float64, (3,))
+        freeze(self, "steps", np.int32, (None, 3))
+
+    @staticmethod
+    def of(points_m: NDArray[np.floating], voxel_m: float, corner_m: F64 | None = None) -> PointMap:
+        """Of points (N, 3) in the map frame; of several in a voxel the first is kept.
+
+        corner_m : (3,) a corner of any voxel; by default the lowest coordinates.
+        """
+        points = np.asarray(points_m, np.float64).reshape(-1, 3)
+        origin_m = points.min(axis=0) if len(points) else np.zeros(3)
+        if corner_m is not None:
+            origin_m = corner_m + np.floor((origin_m - corner_m) / voxel_m) * voxel_m
+        steps = np.floor((points - origin_m) * (POINT_STEPS / voxel_m)).astype(np.int32)
+        x, y, z = (steps // POINT_STEPS).astype(np.int64).T
+        _, first = np.unique((x << 42) + (y << 21) + z, return_index=True)
+        return PointMap(voxel_m=voxel_m, origin_m=origin_m, steps=hand_over(steps[first]))
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def points_m(self) -> F64:
+        """The points (V, 3) in the map frame."""
+        return (self.steps + 0.5) * (self.voxel_m / POINT_STEPS) + self.origin_m
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionMap:
     """The map made of one recording: the result of the point-cloud half of pc2grid.
@@ -445,6 +492,7 @@ class SessionMap:
         made from; empty if none was made.
     consistency : how well the map agrees with its own scans; None if that is not known.
     odometry : how well odometry agrees with the scans; None if that is not known.
+    points : the points of the recording in space; None if they were not asked for, or there are none.
 
     >>> import numpy as np
     >>> import pc2grid
@@ -466,6 +514,7 @@ class SessionMap:
     graph: nx.Graph = field(default_factory=_empty_graph)
     consistency: Consistency | None = None
     odometry: OdometryCheck | None = None
+    points: PointMap | None = None
     report: ReadReport = field(default_factory=ReadReport)
 
     def __post_init__(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +22,7 @@ from pc2grid.model import (
     Loop,
     OccupancyGrid,
     OdometryCheck,
+    PointMap,
     ReadReport,
     RegisteredScan,
     Scan,
@@ -140,7 +141,11 @@ def build_maps(
     if sensor == "laser" and not has_odometry:
         check_followed(_in_order([part.trajectory for part in parts]), str(log.info.path))
     kept = _of_use(parts)
-    reports = _reports(log.report(), session, parts, kept)
+    read = log.report()
+    if config.projection.points_voxel_m is not None and sensor == "laser":
+        no_points = "a 2D laser shows no points in space, so none are kept"
+        read = dataclasses.replace(read, warnings=(*read.warnings, no_points))
+    reports = _reports(read, session, parts, kept)
     maps = []
     for number, (part, report) in enumerate(zip(kept, reports, strict=True)):
         graph, submaps = divide(part.grid, config.partition)
@@ -155,6 +160,7 @@ def build_maps(
                 graph=graph,
                 consistency=part.consistency,
                 odometry=part.odometry,
+                points=part.points,
                 report=report,
             )
         )
@@ -234,6 +240,7 @@ class _Mapped:
     loops: tuple[Loop, ...]
     consistency: Consistency
     odometry: OdometryCheck
+    points: PointMap | None = None
 
 
 def _map(
@@ -248,6 +255,7 @@ def _map(
 
     A part whose map contradicts itself is divided, and drawn again. whole : all scans are one part.
     """
+    from pc2grid.mapping.keyframe_points import KeyframePoints
     from pc2grid.mapping.keyframes import Keyframes
     from pc2grid.mapping.parts import PARTS
     from pc2grid.odometry.tracker import Tracker
@@ -256,11 +264,18 @@ def _map(
     stamps, poses = array("q"), array("d")
     health: list[Health] = []
     disagreements: list[Disagreement | None] = []
-    with closing(Keyframes()) as keyframes:
+    voxel_m = config.projection.points_voxel_m
+    with ExitStack() as stack:
+        keyframes = stack.enter_context(closing(Keyframes()))
+        kept = None
+        if voxel_m is not None:
+            kept = stack.enter_context(closing(KeyframePoints(voxel_m, config.projection.max_range_m)))
         selection = _KeyframeSelection(keyframes, config.projection, recognizer)
         for scan in scans:
             tracked = tracker.track(scan)
             selection.add(tracked, index=len(stamps))
+            if kept is not None and tracked.keyframe and scan.sensor != "laser":
+                kept.append(len(stamps), tracked.registered.scan)
             stamps.append(scan.stamp_ns)
             poses.extend(tracked.registered.T_session_base.ravel())
             health.append(tracked.registered.health)
@@ -280,7 +295,14 @@ def _map(
             divided = selection.closer.divide([run for part in drawn for run in _doubtful(part, trajectory)])
             if divided is None:
                 break
-            drawn = _draw_parts(keyframes, trajectory, disagreements, divided, config.projection)
+            closed = divided
+            drawn = _draw_parts(keyframes, trajectory, disagreements, closed, config.projection)
+        if kept is not None:
+            part, T_part_base = _settled(trajectory, closed)
+            drawn = [
+                dataclasses.replace(mapped, points=kept.registered(T_part_base, part == number))
+                for number, mapped in enumerate(drawn)
+            ]
     return drawn
 
 

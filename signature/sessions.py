@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pc2grid._version import __version__
-from pc2grid.model import ReadReport, SessionMap, Trajectory
+from pc2grid.model import PointMap, ReadReport, SessionMap, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from signature.config import Config
@@ -183,8 +183,21 @@ def _map_session(drawn: DrawnMap, name: str, config: Config) -> SessionMap:
         submaps=submaps,
         trajectory=no_poses,
         graph=graph,
+        points=_points(drawn, config),
         report=ReadReport(warnings=drawn.warnings),
     )
+
+
+def _points(drawn: DrawnMap, config: Config) -> PointMap | None:
+    """The points of a cloud or mesh in space, if they are to be kept; never finer than the map."""
+    from pc2grid.clouds.voxel_cloud import VoxelCloud
+
+    voxel_m = config.projection.points_voxel_m
+    if voxel_m is None or not len(drawn.level_points_m):
+        return None
+    cloud = VoxelCloud(max(voxel_m, config.projection.resolution_m))
+    cloud.add(drawn.level_points_m)
+    return PointMap.of(cloud.points_m(), cloud.edge_m, cloud.corner_m)
 
 
 def describe_all(session_map: SessionMap, config: Config, observer: Observer = Observer()) -> list[Signature]:

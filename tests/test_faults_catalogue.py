@@ -638,7 +638,7 @@ for _command in (*USES, CONVERT + " --add"):
         database(lambda d: bytes(reversed(d)), _command)
     )
     fault(43, 1, errors.NotADatabase, "another program's SQLite file")(database(header(68, 0), _command))
-    fault(44, 1, errors.DatabaseVersion, "database format 4; this pc2grid reads up to 3", "a newer pc2grid")(
+    fault(44, 1, errors.DatabaseVersion, "database format 5; this pc2grid reads up to 4", "a newer pc2grid")(
         database(header(60, 4), _command)
     )
 for _command in USES:

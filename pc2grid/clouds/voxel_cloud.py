@@ -85,6 +85,11 @@ class VoxelCloud:
         self._merge()
         return len(self._merged.code)
 
+    @property
+    def corner_m(self) -> F64:
+        """A corner (3,) of a voxel."""
+        return np.zeros(3) if self._corner_m is None else self._corner_m
+
     def points_m(self, least: int = 1) -> F64:
         """The mean (V, 3) of each voxel that holds at least `least` points, by increasing x, then y, then z
         of the voxels."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError, OutputError
-from pc2grid.model import SessionMap, is_part_of, part_name
+from pc2grid.model import PointMap, SessionMap, is_part_of, part_name
 from signature.database import open_database, serialize
 from signature.database.postgres.schema import is_url
 from signature.database.protocol import Entry, Problem, SessionInfo, SubmapDatabase
@@ -127,9 +127,9 @@ def check(source: Place) -> tuple[Problem, ...]:
 def copy(source: Place, target: Place, *, recover: bool = False, force: bool = False) -> tuple[Problem, ...]:
     """Write a compact copy, on the same or another engine.
 
-    With `recover`, damaged submaps, and sessions of which another part is damaged, are left out; a damaged
-    junction graph is made again. Returns all damage. Raises DatabaseCorrupt for damage without `recover`,
-    OutputError if `target` exists without `force`.
+    With `recover`, damaged submaps, damaged points, and sessions of which another part is damaged, are left
+    out; a damaged junction graph is made again. Returns all damage. Raises DatabaseCorrupt for damage without
+    `recover`, OutputError if `target` exists without `force`.
     """
     _refuse_existing(target, force)
     problems = check(source)
@@ -237,6 +237,7 @@ def _entry(database: SubmapDatabase, info: SessionInfo, recover: bool) -> Entry:
         graph=_graph(database, info.name, recover),
         consistency=info.consistency,
         odometry=info.odometry,
+        points=_points(database, info.name, recover),
         report=info.report,
     )
     signatures = [
@@ -256,6 +257,12 @@ def _graph(database: SubmapDatabase, session: str, recover: bool) -> nx.Graph:
         if not recover:
             raise
         return junction_graph(database.grid(session), database.config().partition)
+
+
+def _points(database: SubmapDatabase, session: str, recover: bool) -> PointMap | None:
+    with contextlib.suppress(*([DatabaseCorrupt] if recover else [])):
+        return database.points(session)
+    return None
 
 
 def _refuse_existing(target: Place, force: bool) -> None:

@@ -14,6 +14,7 @@ from pc2grid.model import (
     Loop,
     OccupancyGrid,
     OdometryCheck,
+    PointMap,
     ReadReport,
     SessionMap,
     Submap,
@@ -217,6 +218,10 @@ class SubmapDatabase(Protocol):
 
         Made again from the grid if none was stored, as in databases of formats 1 and 2.
         """
+        ...
+
+    def points(self, session: str) -> PointMap | None:
+        """The points of a session in space; None if none were stored."""
         ...
 
     def submap(self, session: str, submap_id: int) -> Submap:

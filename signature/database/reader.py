@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pc2grid.display import html_table, short
 from pc2grid.errors import DatabaseError
-from pc2grid.model import Loop, OccupancyGrid, Submap, Trajectory
+from pc2grid.model import Loop, OccupancyGrid, PointMap, Submap, Trajectory
 from signature.database import serialize, validation
 from signature.database.protocol import Problem, SessionInfo
 from signature.database.serialize import Row
@@ -89,6 +89,10 @@ class RowReader(ABC):
 
         stored = self._read("graph", session, serialize.read_graph)
         return stored if len(stored) else junction_graph(self.grid(session), self.config().partition)
+
+    def points(self, session: str) -> PointMap | None:
+        """The points of a session in space; see `SubmapDatabase.points`."""
+        return self._read("points", session, lambda row, _: serialize.read_points(row))
 
     def submap(self, session: str, submap_id: int) -> Submap:
         """One submap. Raises DatabaseError if the session has none of that number."""

@@ -23,9 +23,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pc2grid.arrays import hand_over
 from pc2grid.errors import DatabaseCorrupt, DatabaseError, DatabaseVersion
 from pc2grid.geometry import SE2
 from pc2grid.model import (
+    POINT_STEPS,
     Consistency,
     Contradiction,
     Health,
@@ -33,6 +35,7 @@ from pc2grid.model import (
     OccupancyGrid,
     OdometryCheck,
     Overruled,
+    PointMap,
     ReadReport,
     SessionMap,
     Submap,
@@ -55,6 +58,8 @@ MAX_CELLS = 100_000_000
 """Cells of the largest grid that is read: 500 m x 500 m at 0.05 m."""
 MAX_POINTS = 10_000_000
 """Points of the largest junction graph that is read; 260 times that of the map killian, 250 m x 200 m."""
+MAX_POINTS_IN_SPACE = 100_000_000
+"""Points of the largest cloud that is read: 50,000 m2 at 5 cm."""
 _ZLIB_LEVEL = 6
 """zlib's own default; a part of the format only in that equal sessions give equal bytes."""
 _HEALTH = tuple(Health)
@@ -218,14 +223,18 @@ def rows_of(session_map: SessionMap, provenance: Provenance) -> dict[str, list[R
         "trajectory": [trajectory_row(session_map.trajectory)],
         "loop": [loop_row(session_map.loops)],
         "graph": [graph_row(session_map.graph)],
+        "points": [points_row(session_map.points)],
         "submap": [submap_row(submap) for submap in session_map.submaps],
     }
 
 
 def row_of_older_format(table: str) -> Row:
-    """The row of a table for a session that was stored before the table existed: no loops, an empty graph."""
+    """The row of a table for a session that was stored before the table existed: no loops, an empty graph,
+    no points."""
     import networkx as nx
 
+    if table == "points":
+        return points_row(None)
     return loop_row(()) if table == "loop" else graph_row(nx.Graph())
 
 
@@ -244,6 +253,8 @@ def decode(table: str, row: Row, sizes: validation.Sizes | None) -> object:
         return read_loops(row, sizes)
     if table == "graph":
         return read_graph(row, sizes)
+    if table == "points":
+        return read_points(row)
     assert table == "submap", table
     return read_submap(row, sizes)
 
@@ -520,6 +531,40 @@ def read_graph(row: Row, sizes: validation.Sizes | None) -> nx.Graph:
     arrays = GraphArrays(**columns)
     validation.check_graph(arrays, sizes)
     return graph_from_arrays(arrays)
+
+
+def points_row(points: PointMap | None) -> Row:
+    """The inverse of `read_points`."""
+    if points is None:
+        points = PointMap(voxel_m=1.0, origin_m=np.zeros(3), steps=np.empty((0, 3), np.int32))
+    if len(points) > MAX_POINTS_IN_SPACE:
+        raise ValueError(f"{len(points)} points, more than {MAX_POINTS_IN_SPACE}")
+    voxels = points.steps // POINT_STEPS
+    return {
+        "count": len(points),
+        "voxel_m": float(points.voxel_m),
+        **{f"origin_{axis}_m": float(v) for axis, v in zip("xyz", points.origin_m, strict=True)},
+        # The voxels are in order, so most steps from one to the next are 0 or 1 and compress well.
+        "voxels": zlib.compress(pack_array(np.diff(voxels, axis=0, prepend=0).T, "<i4"), _ZLIB_LEVEL),
+        "within": zlib.compress(pack_array((points.steps % POINT_STEPS).T, "u1"), _ZLIB_LEVEL),
+    }
+
+
+def read_points(row: Row) -> PointMap | None:
+    """The points of a session in space; None if it has none. Raises ValueError for implausible numbers."""
+    n = validation.count(row["count"], "count")
+    if n > MAX_POINTS_IN_SPACE:
+        raise ValueError(f"{n} points")
+    voxels: Any = unpack_array(_inflate(row["voxels"], 12 * n), "<i4", (3, n))
+    within: Any = unpack_array(_inflate(row["within"], 3 * n), "u1", (3, n))
+    origin_m = np.array([validation.number(row[f"origin_{axis}_m"], "origin_m") for axis in "xyz"])
+    voxel_m = validation.number(row["voxel_m"], "voxel_m", *validation.VOXEL_M)
+    indices = np.cumsum(voxels, axis=1, dtype=np.int64)
+    validation.check_voxels(indices, within, voxel_m)
+    steps = (indices * POINT_STEPS + within).T
+    return (
+        PointMap(voxel_m=voxel_m, origin_m=origin_m, steps=hand_over(steps.astype(np.int32))) if n else None
+    )
 
 
 def submap_row(submap: Submap) -> Row:

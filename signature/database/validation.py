@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pc2grid.arrays import F32, F64, I64
-from pc2grid.model import OccupancyGrid, Submap
+from pc2grid.arrays import F32, F64, I64, U8
+from pc2grid.model import POINT_STEPS, OccupancyGrid, Submap
 
 if TYPE_CHECKING:
     from pc2grid.submaps.junction_graph import GraphArrays
@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 # All chosen by hand: wide enough for every real session.
 RESOLUTION_M = (1e-3, 100.0)
 """Smallest and largest edge of a cell."""
+MOST_VOXELS = 1 << 21
+"""Voxels along an axis; 104 km of 5 cm."""
+VOXEL_M = (1e-3, 10.0)
+"""Smallest and largest edge of a voxel."""
 FARTHEST_M = 1e8
 """Largest coordinate: two and a half times around the earth."""
 MAX_RADIUS_M = 1e4
@@ -206,6 +210,20 @@ def check_graph(graph: GraphArrays, sizes: Sizes | None) -> None:
         outside = ((points_m < low_m) | (points_m > high_m)).any(axis=1)
         if outside.any():
             raise ValueError(f"{name} {int(outside.argmax())} lies outside its map")
+
+
+def check_voxels(indices: I64, within: U8, voxel_m: float) -> None:
+    """Voxels (3, V) increase by x, then y, then z, none twice; points (3, V) lie within them."""
+    if not indices.size:
+        return
+    if indices.min() < 0 or indices.max() >= MOST_VOXELS:
+        raise ValueError(f"a voxel outside 0..{MOST_VOXELS}")
+    code = (indices[0] << 42) + (indices[1] << 21) + indices[2]
+    back = code[1:] <= code[:-1]
+    if back.any():
+        raise ValueError(f"voxel {int(back.argmax()) + 1} is not after the one before")
+    if within.max() >= POINT_STEPS:
+        raise ValueError("a point outside its voxel")
 
 
 def check_histograms(histograms: F32, what: str) -> None:

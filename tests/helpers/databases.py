@@ -18,6 +18,7 @@ from pc2grid.model import (
     OccupancyGrid,
     OdometryCheck,
     Overruled,
+    PointMap,
     ReadReport,
     SessionMap,
     Submap,
@@ -95,6 +96,7 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
                 ),
             ),
         ),
+        points=PointMap.of(rng.uniform(-1.0, 1.0, (40, 3)), 0.1),
         report=ReadReport(scans_read=7, warnings=("no per-point time",)),
     )
     digest = hashlib.sha256(f"{name}{seed}".encode()).hexdigest()
@@ -117,6 +119,12 @@ def without_loops(entry: Entry) -> Entry:
     """The entry without its loops, which format 1 could not hold."""
     session_map, signatures, provenance = entry
     return replace(session_map, loops=()), signatures, provenance
+
+
+def without_points(entry: Entry) -> Entry:
+    """The entry without its points in space, which formats before 4 could not hold."""
+    session_map, signatures, provenance = entry
+    return replace(session_map, points=None), signatures, provenance
 
 
 def with_graph_of_grid(entry: Entry) -> Entry:
@@ -148,6 +156,12 @@ def assert_holds(database: SubmapDatabase, entry: Entry) -> None:
     assert info.consistency == session_map.consistency
     assert info.odometry == session_map.odometry
     assert_same_graph(database.graph(name), session_map.graph)
+    points, wanted_points = database.points(name), session_map.points
+    assert (points is None) == (wanted_points is None)
+    if points is not None and wanted_points is not None:
+        assert points.voxel_m == wanted_points.voxel_m
+        assert np.array_equal(points.origin_m, wanted_points.origin_m)
+        assert np.array_equal(points.steps, wanted_points.steps)
     for loop, stored_loop in zip(session_map.loops, database.loops(name), strict=True):
         assert np.array_equal(stored_loop.information, loop.information)
         assert (stored_loop.older, stored_loop.newer) == (loop.older, loop.newer)
@@ -191,6 +205,8 @@ def digest_of(database: SubmapDatabase) -> str:
         digest.update(repr(database.loops(info.name)).encode())
         arrays = graph_to_arrays(database.graph(info.name))
         digest.update(repr([getattr(arrays, field).tolist() for field in arrays.__slots__]).encode())
+        points = database.points(info.name)
+        digest.update(b"" if points is None else points.points_m().tobytes())
         for submap in database.submaps(info.name):
             digest.update(repr((submap.submap_id, submap.center_m, submap.radius_m)).encode())
             digest.update(submap.grid.cells.tobytes())

@@ -10,9 +10,12 @@ from pathlib import Path
 import networkx as nx
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from typer.testing import CliRunner
 
+from pc2grid.config import ReadConfig
 from pc2grid.errors import OutputError, Pc2GridError
+from pc2grid.io.building_file import building_points
 from pc2grid.io.export.cloud import write_cloud
 from pc2grid.io.export.graphml import write_graph
 from pc2grid.io.trajectory import read_kitti, read_tum
@@ -21,6 +24,7 @@ from pc2grid.submaps.junction_graph import junction_graph
 from pc2grid_cli.main import app
 from signature.config import Config
 from signature.sessions import add_sessions, provenance
+from tests.helpers.building_clouds import room_cloud
 from tests.helpers.session_maps import LOOPS, session, way
 from tests.helpers.simulated_drives import office
 
@@ -32,6 +36,25 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     entry = (session("office", office(), way(), LOOPS), provenance(Path("office.mcap"), "a" * 64, config))
     add_sessions(path, [entry], config, keep=False)
     return path
+
+
+def test_points_of_a_session_are_exported_instead_of_its_walls(tmp_path: Path) -> None:
+    cloud, stored = tmp_path / "room.ply", tmp_path / "room.submaps"
+    write_cloud(cloud, room_cloud(1.7))
+    for options in ((), ("--points", "0.1")):
+        made = ["convert", str(cloud), "-o", str(stored), "--force", *options]
+        assert CliRunner().invoke(app, made, catch_exceptions=False).exit_code == 0
+        said = export(stored, "--cloud", tmp_path / "out.ply", "--mcap", tmp_path / "out.mcap", "--force")
+        (found,) = building_points(tmp_path / "out.ply", ReadConfig())
+        with (tmp_path / "out.mcap").open("rb") as file:
+            topics = {c.topic for c in make_reader(file).get_summary().channels.values()}
+        assert ("/points" in topics) == bool(options)
+        if options:
+            assert "one a voxel of 0.1 m" in said
+            assert 4000 < len(found) < 20_000
+            assert np.quantile(found[:, 2], (0.01, 0.99)) == pytest.approx([0.0, 2.5], abs=0.05)
+        else:
+            assert "convert --points" in said and not found[:, 2].any()
 
 
 def export(database: Path, *options: object) -> str:
@@ -67,7 +90,7 @@ def test_walls_as_points(database: Path, tmp_path: Path, suffix: str) -> None:
 
     path = tmp_path / f"walls.{suffix}"
     said = export(database, "--cloud", path)
-    assert "no 3D points" in said
+    assert "--points 0.05" in said
     points = np.asarray(open3d.io.read_point_cloud(str(path)).points)
     grid = office()
     assert np.allclose(points[:, :2], grid.to_point(np.argwhere(grid.occupied)), atol=1e-5)

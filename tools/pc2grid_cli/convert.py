@@ -46,6 +46,12 @@ def convert_command(
         str | None, typer.Option("--building", metavar="NAME", help="where it was recorded; answers name it")
     ] = None,
     floor: Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, within it")] = None,
+    points: Annotated[
+        float | None,
+        typer.Option(
+            "--points", metavar="VOXEL_M", min=0.01, max=1.0, help="keep the 3D points too, one a voxel"
+        ),
+    ] = None,
     add: Annotated[bool, typer.Option("--add", help="add to an existing database")] = False,
     dask: Annotated[
         str | None,
@@ -74,7 +80,13 @@ def convert_command(
     from signature.database import Label, maintenance
 
     settings = options.make_config(
-        config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity, preset=preset
+        config,
+        set_,
+        topic=topic,
+        odometry=odometry,
+        assume_identity=assume_identity,
+        points_voxel_m=points,
+        preset=preset,
     )
     if rerun is not None:
         _check_rerun(

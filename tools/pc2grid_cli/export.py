@@ -47,7 +47,11 @@ def export_command(
     ] = None,
     cloud: Annotated[
         Path | None,
-        typer.Option("--cloud", metavar="OUT.ply|.pcd", help="the map's walls as points at z = 0"),
+        typer.Option(
+            "--cloud",
+            metavar="OUT.ply|.pcd",
+            help="the 3D points that convert --points kept, else the walls at z = 0",
+        ),
     ] = None,
     graph: Annotated[
         Path | None,
@@ -233,12 +237,17 @@ def _poses(database: SubmapDatabase, session: str) -> Trajectory:
 
 
 def _write_cloud(path: Path, database: SubmapDatabase, session: str, terminal: console.Console) -> None:
-    """One point for each occupied cell: a database keeps the map, not the points of the recording."""
+    """The points in space if the session has them, else one point for each occupied cell."""
     import numpy as np
 
     from pc2grid.io.export.cloud import write_cloud
 
+    points = database.points(session)
+    if points is not None:
+        write_cloud(path, points.points_m())
+        terminal.note(f"{path}: {len(points)} points, one a voxel of {points.voxel_m:g} m")
+        return
     grid = database.grid(session)
     walls = grid.to_point(np.argwhere(grid.occupied))
     write_cloud(path, np.column_stack((walls, np.zeros(len(walls)))))
-    terminal.note(f"{path}: {len(walls)} occupied cells at z = 0; a database holds no 3D points")
+    terminal.note(f"{path}: {len(walls)} occupied cells at z = 0; `convert --points 0.05` keeps 3D points")

@@ -1,7 +1,8 @@
 """Databases and answers as MCAP for Foxglove: `examples/foxglove.json` is a layout that shows them.
 
-Topics: /map, /path, /submaps; for an answer /query_path, /hypotheses, /pose and /initialpose too, and
-map -> odom -> base_link over time. For a map located in another one /query_map.
+Topics: /map, /points (if the session has them), /path, /submaps; for an answer /query_path, /hypotheses,
+/pose and /initialpose too, and map -> odom -> base_link over time. For a map located in another one
+/query_map.
 """
 
 from __future__ import annotations
@@ -76,6 +77,9 @@ def write_located_map(
 def _write_map(writer: LogWriter, database: SubmapDatabase, session: str, stamp_ns: int) -> None:
     grid = database.grid(session)
     writer.occupancy_grid("/map", stamp_ns, grid)
+    points = database.points(session)
+    if points is not None:
+        writer.point_cloud("/points", stamp_ns, "map", points.points_m().astype(np.float32))
     table = database.signatures()
     index = [info.name for info in database.sessions()].index(session)
     graph = database.graph(session)

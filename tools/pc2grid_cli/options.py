@@ -73,6 +73,7 @@ def make_config(
     odometry: str | None = None,
     assume_identity: bool = False,
     top_k: int | None = None,
+    points_voxel_m: float | None = None,
     preset: PresetName = PresetName.default,
 ) -> Config:
     """Flags override --set, which overrides the file, which overrides the preset. Raises ConfigError."""
@@ -82,7 +83,8 @@ def make_config(
     base = Config.paper() if preset is PresetName.paper else None
     config = load_settings(Config, file, assignments or (), preset=base)
     read = {"topic": topic, "odometry": odometry, "assume_identity": assume_identity or None}
-    return _changed(config, {"read": read, "relocalize": {"top_k": top_k}})
+    kept = {"points_voxel_m": points_voxel_m}
+    return _changed(config, {"read": read, "relocalize": {"top_k": top_k}, "projection": kept})
 
 
 def _changed(config: Config, flags: Mapping[str, Mapping[str, object]]) -> Config:

@@ -1,11 +1,12 @@
 """Maps, and recordings during the work on them, in the rerun viewer or in `.rrd` files; needs the extra viz.
 
-Entities: map/walls, map/submaps, map/ways, map/path, map/loops, map/base. While a recording is converted,
-map/live holds the scans at their tracked poses, before loops are closed. While a recording is located,
-query/live holds the same at the pose of the best hypothesis, and query/confidence its confidence. At the end
-query/path, query/hypotheses and query/base follow, and for each hypothesis query/evidence/1, 2, ... with the
-query's walls, coloured by what the map says about them, and the map's walls where the query saw free ground;
-of these the first is shown. The timeline `time` has the time of the recording.
+Entities: map/walls, map/points (if the session has them), map/submaps, map/ways, map/path, map/loops,
+map/base. While a recording is converted, map/live holds the scans at their tracked poses, before loops are
+closed. While a recording is located, query/live holds the same at the pose of the best hypothesis, and
+query/confidence its confidence. At the end query/path, query/hypotheses and query/base follow, and for each
+hypothesis query/evidence/1, 2, ... with the query's walls, coloured by what the map says about them, and the
+map's walls where the query saw free ground; of these the first is shown. The timeline `time` has the time of
+the recording.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
     from pc2grid.arrays import F32, F64
     from pc2grid.geometry import SE2
-    from pc2grid.model import Loop, OccupancyGrid, RegisteredScan, SessionMap, Trajectory
+    from pc2grid.model import Loop, OccupancyGrid, PointMap, RegisteredScan, SessionMap, Trajectory
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.relocalization.answer import Answer, Moment
@@ -110,6 +111,7 @@ class Conversions(Observer):
         self._recording.send_blueprint(layout(session.grid))
         centers = np.array([submap.center_m for submap in session.submaps]).reshape(-1, 2)
         _log_map(self._recording, session.grid, centers, session.graph, session.trajectory, session.loops)
+        _log_points(self._recording, session.points)
         _log_moving(self._recording, "map/base", session.trajectory, BLUE)
 
     def _begin(self, name: str) -> None:
@@ -264,6 +266,21 @@ def _log_stored(recording: Any, database: SubmapDatabase, session: str) -> None:
         database.trajectory(session),
         database.loops(session),
     )
+    _log_points(recording, database.points(session))
+
+
+def _log_points(recording: Any, points: PointMap | None) -> None:
+    """Show the points in space, if a session has them, coloured by height."""
+    rr = require_rerun()
+    if points is None:
+        recording.log("map/points", rr.Clear(recursive=True), static=True)
+        return
+    at = points.points_m()
+    low, high = np.quantile(at[:, 2], (0.02, 0.98))
+    share = np.clip((at[:, 2] - low) / max(high - low, 1e-3), 0.0, 1.0)
+    colors = np.column_stack((80 + 150 * share, 120 + 60 * share, 200 - 120 * share)).astype(np.uint8)
+    shown = rr.Points3D(at.astype(np.float32), colors=colors, radii=points.voxel_m / 2)
+    recording.log("map/points", shown, static=True)
 
 
 def _log_map(

@@ -33,6 +33,10 @@ TABLES = {
     " edges INTEGER NOT NULL, points INTEGER NOT NULL, center_m BLOB NOT NULL, kind BLOB NOT NULL,"
     " pixels BLOB NOT NULL, ends BLOB NOT NULL, length_m BLOB NOT NULL, path_start BLOB NOT NULL,"
     " path_m BLOB NOT NULL, crc32 INTEGER NOT NULL",
+    # The points in space (`pc2grid.model.PointMap`); a session without any has a row of none.
+    "points": "session_id INTEGER PRIMARY KEY REFERENCES session(id), count INTEGER NOT NULL,"
+    " voxel_m REAL NOT NULL, origin_x_m REAL NOT NULL, origin_y_m REAL NOT NULL, origin_z_m REAL NOT NULL,"
+    " voxels BLOB NOT NULL, within BLOB NOT NULL, crc32 INTEGER NOT NULL",
     "submap": "id INTEGER PRIMARY KEY, session_id INTEGER NOT NULL REFERENCES session(id),"
     " submap_id INTEGER NOT NULL, center_x_m REAL NOT NULL, center_y_m REAL NOT NULL, radius_m REAL NOT NULL,"
     " height INTEGER NOT NULL, width INTEGER NOT NULL, resolution_m REAL NOT NULL,"
@@ -44,7 +48,7 @@ TABLES = {
     " center_m BLOB NOT NULL, boundary BLOB NOT NULL, freespace BLOB NOT NULL, symmetry BLOB NOT NULL,"
     " crc32 INTEGER NOT NULL",
 }
-ONE_EACH = ("grid", "trajectory", "loop", "graph", "signature")
+ONE_EACH = ("grid", "trajectory", "loop", "graph", "points", "signature")
 """The tables in which every session has exactly one row."""
 
 # What the checksum covers: all columns except itself and the row's own number.

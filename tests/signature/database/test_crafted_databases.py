@@ -86,6 +86,17 @@ def way(number: int, value: float) -> Change:
     return change
 
 
+def voxel(number: int, value: int) -> Change:
+    """One of the steps from voxel to voxel: all along x, then y, then z."""
+
+    def change(row: dict[str, Any]) -> dict[str, Any]:
+        steps = np.frombuffer(serialize.zlib.decompress(row["voxels"]), "<i4").copy()
+        steps[number] = value
+        return {**row, "voxels": serialize.zlib.compress(steps.tobytes())}
+
+    return change
+
+
 def document(**values: Any) -> Change:
     """Entries of a session's document; those of its report as report__name."""
 
@@ -120,6 +131,7 @@ READ: dict[str, Callable[[Any], object]] = {
     "trajectory": lambda database: database.trajectory("monday"),
     "loop": lambda database: database.loops("monday"),
     "graph": lambda database: database.graph("monday"),
+    "points": lambda database: database.points("monday"),
     "submap": lambda database: list(database.submaps("monday")),
     "signature": lambda database: database.signatures(),
 }
@@ -164,6 +176,14 @@ CASES: list[tuple[str, Change, str]] = [
     ("graph", way(9, INF), "not finite"),
     ("graph", put(points=7), "does not hold the 56 bytes"),
     ("graph", put(points=2**30), "a graph of 1073741824 points"),
+    ("points", voxel(3, -20), "a voxel outside 0"),
+    ("points", voxel(0, 2**21), "a voxel outside 0"),
+    ("points", lambda row: {**row, "within": serialize.zlib.compress(b"\x40" * 120)}, "outside its voxel"),
+    ("points", lambda row: {**row, "voxels": serialize.zlib.compress(bytes(480))}, "voxel 1 is not after"),
+    ("points", put(count=41), "does not hold the 492 bytes"),
+    ("points", put(count=2**30), "1073741824 points"),
+    ("points", put(voxel_m=0.0), "voxel_m is 0"),
+    ("points", put(origin_z_m=INF), "origin_m is inf"),
     ("graph", put(nodes=4), "needs 64"),
     ("graph", put(nodes=-1), "nodes is -1 instead of a count"),
     ("graph", put(edges=3), "needs 24"),
@@ -264,7 +284,7 @@ def test_what_cannot_be_true_is_refused_by_row(place: Any, table: str, change: C
     problems = maintenance.check(place)
     assert any(problem.where.startswith(table) for problem in problems), problems
     assert all("1" in problem.where or "monday" in problem.where for problem in problems), problems
-    if table in ("loop", "graph", "submap"):  # the others are what a search rests on
+    if table in ("loop", "graph", "points", "submap"):  # the others are what a search rests on
         with open_database(place) as database:
             assert len(database.signatures()) == 8
 

@@ -348,7 +348,7 @@ def test_newer_format_is_refused_by_number(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[60:64] = (99).to_bytes(4, "big")
     path.write_bytes(data)
-    with pytest.raises(DatabaseVersion, match="format 99; this pc2grid reads up to 3"):
+    with pytest.raises(DatabaseVersion, match="format 99; this pc2grid reads up to 4"):
         open_database(path)
 
 
@@ -376,6 +376,7 @@ def test_strangers_trigger_is_refused(path: Path) -> None:
         ("trajectory", "poses"),
         ("loop", "measured"),
         ("graph", "path_m"),
+        ("points", "within"),
         ("submap", "cells"),
         ("signature", "boundary"),
         ("signature", "center_m"),
@@ -403,6 +404,7 @@ def test_flipped_bit_in_any_blob_is_found_where_integrity_check_is_blind(path: P
             database.trajectory(info.name)
             database.loops(info.name)
             database.graph(info.name)
+            database.points(info.name)
             list(database.submaps(info.name))
         database.signatures()
     assert "db check" in str(caught.value)

@@ -57,6 +57,7 @@ BLOBS = {
     "trajectory": ["stamps_ns", "poses", "health"],
     "loop": ["pairs", "measured", "information", "accepted"],
     "graph": ["center_m", "kind", "pixels", "ends", "length_m", "path_start", "path_m"],
+    "points": ["voxels", "within"],
     "submap": ["cells"],
     "signature": ["submap_id", "center_m", "boundary", "freespace", "symmetry"],
 }
@@ -93,6 +94,8 @@ def read_all(file: maintenance.Place) -> dict[str, str]:
             digest.update(repr(trajectory.health).encode())
             digest.update(repr(database.loops(info.name)).encode())
             digest.update(repr(database.graph(info.name).edges(data=True)).encode())
+            points = database.points(info.name)
+            digest.update(b"" if points is None else points.points_m().tobytes())
             for submap in database.submaps(info.name):
                 digest.update(repr((submap.submap_id, submap.center_m, submap.radius_m)).encode())
                 digest.update(submap.grid.cells.tobytes())
@@ -124,9 +127,13 @@ def set_header(offset: int, value: int) -> Callable[[bytes], bytes]:
         (lambda data: data[:100] + bytes(len(data) - 100), DatabaseCorrupt, "x.submaps"),
         (lambda data: bytes(range(256)) * 64, NotADatabase, "not a pc2grid database"),
         (set_header(68, 0), NotADatabase, "another program's SQLite file (application id 0x0)"),
-        (set_header(60, 4), DatabaseVersion, "database format 4; this pc2grid reads up to 3"),
-        (set_header(60, 1), DatabaseCorrupt, "its tables are not those of format 1 ('graph', 'loop')"),
-        (set_header(60, 2), DatabaseCorrupt, "its tables are not those of format 2 ('graph')"),
+        (set_header(60, 5), DatabaseVersion, "database format 5; this pc2grid reads up to 4"),
+        (
+            set_header(60, 1),
+            DatabaseCorrupt,
+            "its tables are not those of format 1 ('graph', 'loop', 'points')",
+        ),
+        (set_header(60, 2), DatabaseCorrupt, "its tables are not those of format 2 ('graph', 'points')"),
         (set_header(60, 2**31 - 1), DatabaseVersion, "database format 2147483647"),
         (set_header(60, 0), DatabaseCorrupt, "database format 0 never existed"),
     ],
@@ -181,7 +188,7 @@ def test_command_line_refuses_a_newer_format_in_one_line(path: Path) -> None:
     done = pc2grid("db", "info", path.name, cwd=path.parent)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.splitlines() == [
-        "pc2grid: error: x.submaps: database format 7; this pc2grid reads up to 3",
+        "pc2grid: error: x.submaps: database format 7; this pc2grid reads up to 4",
         "hint: use a newer pc2grid",
     ]
 
@@ -484,7 +491,7 @@ def change(path: Path, *statements: str) -> None:
         connection.commit()
 
 
-@pytest.mark.parametrize("table", ["grid", "trajectory", "loop", "graph", "signature"])
+@pytest.mark.parametrize("table", ["grid", "trajectory", "loop", "graph", "points", "signature"])
 def test_a_row_that_is_gone_is_missed_by_name(path: Path, tmp_path: Path, table: str) -> None:
     change(path, f"DELETE FROM {table} WHERE session_id = 1")
     assert check(path) != ()
@@ -493,6 +500,7 @@ def test_a_row_that_is_gone_is_missed_by_name(path: Path, tmp_path: Path, table:
         "trajectory": lambda database: database.trajectory("monday"),
         "loop": lambda database: database.loops("monday"),
         "graph": lambda database: database.graph("monday"),
+        "points": lambda database: database.points("monday"),
         "signature": lambda database: list(database.submaps("monday")),
     }
     words = rf"session 1: has no {table}" if table in ("grid", "trajectory") else "missing"
@@ -504,7 +512,7 @@ def test_a_row_that_is_gone_is_missed_by_name(path: Path, tmp_path: Path, table:
     assert check(good) == ()
     with open_database(good) as database:
         names = [info.name for info in database.sessions()]
-        assert names == (["monday", "tuesday"] if table == "graph" else ["tuesday"])
+        assert names == (["monday", "tuesday"] if table in ("graph", "points") else ["tuesday"])
 
 
 def test_a_submap_too_many_or_too_few_is_found(path: Path) -> None:
@@ -516,7 +524,7 @@ def test_a_submap_too_many_or_too_few_is_found(path: Path) -> None:
         list(database.submaps("tuesday"))
 
 
-@pytest.mark.parametrize("table", ["session", "submap", "loop", "graph"])
+@pytest.mark.parametrize("table", ["session", "submap", "loop", "graph", "points"])
 def test_merging_takes_nothing_from_a_damaged_file(path: Path, tmp_path: Path, table: str) -> None:
     other, target = tmp_path / "other.submaps", tmp_path / "target.submaps"
     store(other, [make_entry("friday", 5)], keep=False)
@@ -549,8 +557,8 @@ def test_checking_what_is_no_database_of_ours(path: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("statement", "words"),
     [
-        ("CREATE VIEW more AS SELECT * FROM grid", "its tables are not those of format 3 ('more')"),
-        ("CREATE TRIGGER t AFTER DELETE ON grid BEGIN DELETE FROM loop; END", "format 3 ('t')"),
+        ("CREATE VIEW more AS SELECT * FROM grid", "its tables are not those of format 4 ('more')"),
+        ("CREATE TRIGGER t AFTER DELETE ON grid BEGIN DELETE FROM loop; END", "format 4 ('t')"),
         ("DELETE FROM session WHERE id = 2", "belongs to no session"),
     ],
 )

@@ -21,8 +21,16 @@ from signature.database.maintenance import check, copy, merge
 from signature.database.protocol import Entry
 from signature.database.sqlite import schema
 from signature.database.sqlite.database import store
-from tests.helpers.databases import assert_holds, everything, make_entry, with_graph_of_grid, without_loops
+from tests.helpers.databases import (
+    assert_holds,
+    everything,
+    make_entry,
+    with_graph_of_grid,
+    without_loops,
+    without_points,
+)
 
+TABLES_OF_4 = "426a35821938db4a"
 TABLES_OF_3 = "3cd6744c04d08d3b"
 TABLES_OF_2 = "8636326504420fd1"
 TABLES_OF_1 = """
@@ -37,7 +45,7 @@ TABLE_OF_2 = (
     " pairs BLOB NOT NULL, measured BLOB NOT NULL, information BLOB NOT NULL, accepted BLOB NOT NULL,"
     " crc32 INTEGER NOT NULL)"
 )
-LATEST = 3
+LATEST = 4
 
 
 def entries(version: int) -> list[Entry]:
@@ -45,10 +53,10 @@ def entries(version: int) -> list[Entry]:
     made = [make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)]
     if version < 2:
         made = [without_loops(entry) for entry in made]
-    return [with_graph_of_grid(entry) for entry in made]
+    return [without_points(with_graph_of_grid(entry)) for entry in made]
 
 
-@pytest.fixture(params=[1, 2])
+@pytest.fixture(params=[1, 2, 3])
 def version(request: pytest.FixtureRequest) -> int:
     """An older format."""
     return int(request.param)
@@ -63,7 +71,8 @@ def old(version: int, tmp_path: Path) -> Path:
     connection.execute("PRAGMA application_id = 0x70633267")
     connection.execute(f"PRAGMA user_version = {version}")
     connection.execute("ATTACH ? AS today", (str(today),))
-    statements = TABLES_OF_1.strip().splitlines() + [TABLE_OF_2] * (version == 2)
+    statements = TABLES_OF_1.strip().splitlines() + [TABLE_OF_2] * (version >= 2)
+    statements += [schema.statements(3)["graph"]] * (version >= 3)
     for statement in statements:
         connection.execute(statement)
         table = statement.split()[2]
@@ -81,7 +90,8 @@ def test_the_tables_are_unchanged() -> None:
         tables = migrations.tables_of(version, schema.TABLES)
         return hashlib.sha256(json.dumps(tables, sort_keys=True).encode()).hexdigest()[:16]
 
-    assert (migrations.FORMAT, digest(3), digest(2)) == (LATEST, TABLES_OF_3, TABLES_OF_2)
+    assert (migrations.FORMAT, digest(4)) == (LATEST, TABLES_OF_4)
+    assert (digest(3), digest(2)) == (TABLES_OF_3, TABLES_OF_2)
     assert list(schema.statements(1).values()) == TABLES_OF_1.strip().splitlines()
     assert schema.statements(2)["loop"] == TABLE_OF_2
 

@@ -30,7 +30,14 @@ from signature.database.maintenance import store
 from signature.database.nearest_rows import embedding
 from signature.database.postgres import schema
 from tests.helpers import postgresql
-from tests.helpers.databases import assert_holds, everything, make_entry, with_graph_of_grid, without_loops
+from tests.helpers.databases import (
+    assert_holds,
+    everything,
+    make_entry,
+    with_graph_of_grid,
+    without_loops,
+    without_points,
+)
 from tests.helpers.postgresql import with_user
 
 
@@ -133,7 +140,7 @@ def test_server_without_pgvector(url: str, monkeypatch) -> None:
 @pytest.mark.parametrize(
     ("number", "error", "words"),
     [
-        (99, DatabaseVersion, r"format 99; this pc2grid reads up to 3 \(use a newer"),
+        (99, DatabaseVersion, r"format 99; this pc2grid reads up to 4 \(use a newer"),
         (0, DatabaseCorrupt, "never existed"),
     ],
 )
@@ -146,11 +153,16 @@ def test_schema_of_another_version(filled: str, number: int, error: type[Databas
 
 
 @pytest.mark.fault(44)
-@pytest.mark.parametrize(("version", "since"), [(1, ["loop", "graph"]), (2, ["graph"])])
+@pytest.mark.parametrize(
+    ("version", "since"), [(1, ["loop", "graph", "points"]), (2, ["graph", "points"]), (3, ["points"])]
+)
 def test_a_database_of_an_older_format_is_read_as_it_is_and_migrated_when_written(
     url: str, version: int, since: list[str]
 ) -> None:
-    plain = [with_graph_of_grid(make_entry(name, seed)) for seed, name in enumerate(("monday", "tuesday"))]
+    plain = [
+        without_points(with_graph_of_grid(make_entry(name, seed)))
+        for seed, name in enumerate(("monday", "tuesday"))
+    ]
     if "loop" in since:
         plain = [without_loops(entry) for entry in plain]
     store(url, plain, keep=False)
@@ -166,7 +178,7 @@ def test_a_database_of_an_older_format_is_read_as_it_is_and_migrated_when_writte
         assert len(early.loops("monday")) == len(plain[0][0].loops)
         assert early.check() == ()
     with open_database(url) as late, postgresql.connect(url) as connection:
-        assert connection.execute("SELECT format FROM pc2grid.about").fetchone() == (3,)
+        assert connection.execute("SELECT format FROM pc2grid.about").fetchone() == (4,)
         for entry in (*plain, make_entry("friday", 5)):
             assert_holds(late, entry)
         assert late.check() == ()
@@ -288,6 +300,7 @@ def test_writer_that_waits_too_long_is_told(filled: str, monkeypatch) -> None:
         ("trajectory", "poses", "set_byte(poses, 9, 1)"),
         ("loop", "measured", "set_byte(measured, 9, 1)"),
         ("graph", "length_m", "set_byte(length_m, 9, 1)"),
+        ("points", "within", "set_byte(within, 9, 1)"),
         ("submap", "center_x_m", "center_x_m + 1"),
         ("signature", "boundary", "set_byte(boundary, 9, 1)"),
         ("signature", "embedding", "embedding + embedding"),
@@ -308,6 +321,7 @@ def test_changed_rows_are_found(filled: str, table: str, column: str, value: str
             database.trajectory(info.name)
             database.loops(info.name)
             database.graph(info.name)
+            database.points(info.name)
             list(database.submaps(info.name))
         database.signatures()
 

@@ -36,7 +36,7 @@ def change(url: str, *statements: str) -> None:
             connection.execute(statement)
 
 
-@pytest.mark.parametrize("table", ["grid", "trajectory", "loop", "graph", "signature"])
+@pytest.mark.parametrize("table", ["grid", "trajectory", "loop", "graph", "points", "signature"])
 def test_a_row_that_is_gone_is_missed_by_name(url: str, tmp_path: Path, table: str) -> None:
     change(url, f"DELETE FROM pc2grid.{table} WHERE session_id = 1")
     uses: dict[str, Callable[[Any], object]] = {
@@ -44,6 +44,7 @@ def test_a_row_that_is_gone_is_missed_by_name(url: str, tmp_path: Path, table: s
         "trajectory": lambda database: database.sessions(),
         "loop": lambda database: database.loops("monday"),
         "graph": lambda database: database.graph("monday"),
+        "points": lambda database: database.points("monday"),
         "signature": lambda database: database.grid("monday"),
     }
     reads: dict[str, Callable[[Any], object]] = {
@@ -51,6 +52,7 @@ def test_a_row_that_is_gone_is_missed_by_name(url: str, tmp_path: Path, table: s
         "trajectory": lambda database: database.trajectory("monday"),
         "loop": lambda database: database.loops("monday"),
         "graph": lambda database: database.graph("monday"),
+        "points": lambda database: database.points("monday"),
         "signature": lambda database: list(database.submaps("monday")),
     }
     words = f"session 1: has no {table}" if table in ("grid", "trajectory") else f"{table} .*missing"
@@ -90,7 +92,7 @@ def test_merging_takes_nothing_from_a_damaged_database(url: str, tmp_path: Path)
 
 def test_tables_that_are_not_ours(url: str) -> None:
     change(url, "ALTER TABLE pc2grid.loop RENAME COLUMN accepted TO believed")
-    with open_database(url) as database, pytest.raises(DatabaseCorrupt, match="not those of format 3"):
+    with open_database(url) as database, pytest.raises(DatabaseCorrupt, match="not those of format 4"):
         database.loops("monday")
     change(url, "DELETE FROM pc2grid.about")
     with pytest.raises(DatabaseCorrupt, match=r"pc2grid\.about has 0 rows instead of one"):
