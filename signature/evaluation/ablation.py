@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pc2grid.arrays import F64
+from pc2grid.arrays import F32, F64
 from pc2grid.geometry import SE2
+from pc2grid.model import OccupancyGrid
+from pc2grid.submaps.isovist import look_around
 from pc2grid.submaps.partition import view_at
 from signature.config import SignatureConfig
 from signature.describe import Signature, describe
@@ -22,7 +25,11 @@ from signature.evaluation.metrics import recall
 from signature.evaluation.sensor_map import SensorMap
 from signature.evaluation.trial import Trial
 from signature.relocalization.query_map import QueryMap
+from signature.retrieval.view import PROFILE_BEARINGS
 from signature.retrieval.viewpoints import Places
+from signature.seen import seen_signatures
+from signature.seen_likelihood import COMBINATIONS as SEEN_COMBINATIONS
+from signature.seen_likelihood import SeenStatistics, seen_weights
 from signature.similarity import SignatureTable, histogram_distance, structural_factor
 
 PARTS = ("boundary", "freespace", "symmetry")
@@ -151,6 +158,77 @@ def independence(maps: Sequence[SensorMap]) -> tuple[Independence, ...]:
     )
 
 
+def seen_independence(
+    buildings: Sequence[Sequence[SensorMap]], *, draws: int = 100, seed: int = 0
+) -> dict[str, tuple[float, float, float, int, int]]:
+    """As `independence`, by the signatures of what was seen: for each combination of them.
+
+    The area under the curve, its 5th and 95th percentile when pairs are drawn anew (bootstrap; by place,
+    since all pairs of a place depend on each other), and the numbers of pairs at one place and at two.
+    """
+    same, other = _seen_pairs(buildings)
+    rng = np.random.default_rng(seed)
+    statistics = SeenStatistics.load()
+    found = {}
+    for names in reversed(SEEN_COMBINATIONS):
+        weights, spread = seen_weights(*names), statistics.spread(names)
+        one, two = (
+            -spread.log_ratio(
+                ((weights.of_places(a) - weights.of_places(b)) ** 2).sum(axis=1), 2.0 - a[:, -1] - b[:, -1]
+            )
+            for a, b, _ in (same, other)
+        )
+        measured = Independence(combination="+".join(names), same=one, other=two)
+        places, first = np.unique(same[2], return_inverse=True)
+        order = np.argsort(first, kind="stable")
+        starts = np.searchsorted(first[order], np.arange(len(places) + 1))
+        drawn = []
+        few = two[rng.integers(0, len(two), min(len(two), 20_000))] if len(two) else two
+        for _ in range(draws if len(places) else 0):
+            chosen = rng.integers(0, len(places), len(places))
+            rows = np.concatenate([order[starts[k] : starts[k + 1]] for k in chosen])
+            drawn.append(replace(measured, same=one[rows], other=few).auc)
+        low, high = np.percentile(drawn, (5.0, 95.0)).tolist() if drawn else (float("nan"),) * 2
+        found[measured.combination] = (measured.auc, low, high, len(one), len(two))
+    return found
+
+
+Rows = tuple[F32, F32, NDArray[np.int64]]
+"""Pairs of descriptions (P, K), and the number of the place of each pair (P,)."""
+
+
+def _seen_pairs(buildings: Sequence[Sequence[SensorMap]]) -> tuple[Rows, Rows]:
+    """What was seen of one place by two sensors, and of two places of one map that are far apart."""
+    same: list[Rows] = []
+    other: list[Rows] = []
+    first = 0
+    for maps in buildings:
+        for one in maps:
+            places = one.index.places
+            mine, centers = places.described(), places.table.center_m
+            a, b = np.nonzero(np.hypot(*(centers[:, None] - centers[None]).transpose(2, 0, 1)) >= FAR_M)
+            other.append((mine[a], mine[b], first + a))
+            for two in maps:
+                if two is one:
+                    continue
+                T_two_one = two.T_plan_map.inverse() @ one.T_plan_map
+                there = T_two_one.apply(centers)
+                free = np.array([_is_free(two.index.grids[0], point) for point in there], bool)
+                seen = look_around(two.index.grids[0], there[free], places.sight_m, bearings=PROFILE_BEARINGS)
+                theirs = seen_signatures(*seen, places.sight_m)
+                same.append((mine[free], theirs, first + np.flatnonzero(free)))
+            first += len(centers)
+    return tuple(
+        tuple(np.concatenate(column) for column in zip(*rows, strict=True)) for rows in (same, other)
+    )  # type: ignore[return-value]
+
+
+def _is_free(grid: OccupancyGrid, point_m: F64) -> bool:
+    row, column = grid.to_cell(point_m[None])[0]
+    height, width = grid.cells.shape
+    return bool(0 <= row < height and 0 <= column < width and grid.free[row, column])
+
+
 def _row(table: SignatureTable, i: int) -> Signature:
     return Signature(boundary=table.boundary[i], freespace=table.freespace[i], symmetry=table.symmetry[i])
 
@@ -159,9 +237,7 @@ def _signature_at(sensor_map: SensorMap, center: F64) -> Signature | None:
     """The signature of a map at a point; None if the point is not free in it."""
     index = sensor_map.index
     grid = index.grids[0]
-    row, column = grid.to_cell(center[None])[0]
-    height, width = grid.cells.shape
-    if not (0 <= row < height and 0 <= column < width and grid.free[row, column]):
+    if not _is_free(grid, center):
         return None
     made_with = index.made_with
     view = view_at(grid, (float(center[0]), float(center[1])), made_with.partition)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pc2grid.arrays import F64, BoolGrid
+from pc2grid.arrays import F64, I64, BoolGrid
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2
 from pc2grid.model import UNKNOWN, OccupancyGrid
@@ -187,8 +187,13 @@ class MapIndex:
         moved_m = math.hypot(step.x, step.y)
         return session, free[prior.may_hold(free, HYPOTHESES.square_m, moved_m, query.since_prior_m)]
 
-    def look_up(self, query: QueryMap, carried: tuple[Hypothesis, ...] = ()) -> tuple[Hypothesis, ...]:
-        """Hypotheses for the query, best first: the carried ones, refined, and what retrieval proposes."""
+    def look_up(
+        self, query: QueryMap, carried: tuple[Hypothesis, ...] = (), *, rows: I64 | None = None
+    ) -> tuple[Hypothesis, ...]:
+        """Hypotheses for the query, best first: the carried ones, refined, and what retrieval proposes.
+
+        rows : places that retrieval compares, instead of those it selects.
+        """
         old = [
             fitted(query, h.session_index, h.row, self.maps[h.session_index], h.fit.T_map_query)
             for h in carried
@@ -198,7 +203,12 @@ class MapIndex:
             return self.look_everywhere(query, tuple(old))
         base_m = (query.T_odom_base.x, query.T_odom_base.y)
         proposals = retrieve(
-            query.views, base_m, self.places, signature=self.made_with.signature, config=self.config
+            query.views,
+            base_m,
+            self.places,
+            signature=self.made_with.signature,
+            config=self.config,
+            rows=rows,
         )
         new = verify(query, proposals, self.places, self.maps, self.config)
         return self._worth_keeping((*old, *new), query)

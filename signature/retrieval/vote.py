@@ -80,18 +80,22 @@ def retrieve(
     signature: SignatureConfig,
     config: RelocalizeConfig,
     top_k: int | None = None,
+    rows: I64 | None = None,
 ) -> tuple[Proposal, ...]:
     """The `top_k` (default `config.top_k`) most promising placements of the query, no two alike.
 
     views : of the query. base_m : (x, y) in the query's frame; placements are alike if they put this point
-    and the heading at the same place.
+    and the heading at the same place. rows : places to compare, instead of all or of those that the
+    signatures select.
 
     Ties are broken by order, so equal inputs give equal answers.
     """
-    if not views or not len(places.table):
+    if not views or not len(places.table) or (rows is not None and not len(rows)):
         return ()
     shortlists: Sequence[Nearest] = ()
-    if places.may_all_be_compared(config.all_places):
+    if rows is not None:
+        pass
+    elif places.may_all_be_compared(config.all_places):
         rows = np.arange(len(places.table))
     else:
         shortlists = places.shortlists(views, config.shortlist, signature, config.select_by)

@@ -77,7 +77,7 @@ def test_relations_are_not_taken_for_poses(log: Path) -> None:
 
 def test_all_nine_cells_of_the_matrix_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = Console(width=140, record=True, quiet=False)
-    monkeypatch.setattr(matrix_report, "_wide", lambda: shown)
+    monkeypatch.setattr(matrix_report, "wide_console", lambda: shown)
     matrix_report.tables([], [])
     rows = [line for line in shown.export_text().splitlines() if line.startswith("│")]
     assert len(rows) == 9

@@ -89,6 +89,7 @@ def test_every_document_is_validated_by_a_test() -> None:
         "compare-maps": "signature/evaluation/test_map_quality.py",
         "compare-real": "signature/evaluation/test_real_sensors.py",
         "compare-sensors": "signature/evaluation/test_sensor_matrix.py",
+        "compare-signatures": "signature/evaluation/test_selection.py",
         "watch": "pc2grid_cli/test_watch.py",
     }
     for name, file in elsewhere.items():

@@ -422,6 +422,49 @@ class Ablation(TypedDict):
     recall: dict[str, dict[str, dict[str, float | None]]]
 
 
+class SelectionRow(TypedDict):
+    """One way to select places, in one building or a city of many, after travel_m metres.
+
+    found, right: share of the queries whose place is selected, and that are located rightly, each with its
+    5th and 95th percentile by session; right and wrong, the share located wrongly, are null if not tried.
+    places, looked_at: how many there are and how many are selected; processor_ms: median processor time
+    of the selection and the comparison of isovists.
+    """
+
+    scope: str
+    selector: str
+    travel_m: float
+    queries: int
+    sessions: int
+    places: int
+    looked_at: int
+    found: list[float]
+    right: list[float] | None
+    wrong: float | None
+    processor_ms: float
+
+
+class SeenApart(TypedDict):
+    """How well signatures of what was seen separate one place seen by two sensors from two places: area under
+    the curve, its 5th and 95th percentile, and pairs compared."""
+
+    auc: float
+    low: float
+    high: float
+    same: int
+    other: int
+
+
+class CompareSignatures(TypedDict):
+    """`pc2grid compare signatures --json`, and its signatures.json."""
+
+    schema_version: Version
+    plans: list[str]
+    setting: dict[str, float]
+    rows: list[SelectionRow]
+    independence: dict[str, SeenApart]
+
+
 class CompareSensors(TypedDict):
     """`pc2grid compare sensors --json`, and its matrix.json. outside_the_map: trials where the map has not
     been. change: by plan, what differs in a session from the plan, mean of some sessions."""
@@ -486,6 +529,7 @@ DOCUMENTS: dict[str, type] = {
     "compare-paper": ComparePaper,
     "compare-real": CompareReal,
     "compare-sensors": CompareSensors,
+    "compare-signatures": CompareSignatures,
     "convert": Convert,
     "db-check": DbCheck,
     "db-copy": DbWrite,

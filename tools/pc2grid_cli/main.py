@@ -16,6 +16,7 @@ from pc2grid_cli.compare_maps import compare_maps_command
 from pc2grid_cli.compare_paper import compare_paper_command
 from pc2grid_cli.compare_real import compare_real_command
 from pc2grid_cli.compare_sensors import compare_sensors_command
+from pc2grid_cli.compare_signatures import compare_signatures_command
 from pc2grid_cli.config_dump import config_dump_command
 from pc2grid_cli.config_schema import config_schema_command
 from pc2grid_cli.convert import convert_command
@@ -84,6 +85,7 @@ app.command("export", cls=Command)(export_command)
 compare = typer.Typer(cls=Group, help="The paper's tables, sensors against sensors.", no_args_is_help=True)
 compare.command("paper", cls=Command)(compare_paper_command)
 compare.command("sensors", cls=Command)(compare_sensors_command)
+compare.command("signatures", cls=Command)(compare_signatures_command)
 compare.command("log", cls=Command)(compare_log_command)
 compare.command("maps", cls=Command)(compare_maps_command)
 compare.command("real", cls=Command)(compare_real_command)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _SENSORS = ("lidar", "laser", "depth")
 
 
-def _wide() -> Console:
+def wide_console() -> Console:
     """A console as wide as the terminal; for a file, wide enough for all columns."""
     from rich.console import Console
 
@@ -28,7 +28,7 @@ def tables(cells: Sequence[MatrixCell], elsewhere: Sequence[Trial]) -> None:
     """Print the share located and right by metres driven, and the other figures of each cell."""
     from rich.table import Table
 
-    console = _wide()
+    console = wide_console()
     distances = sorted({cell.travel_m for cell in cells})
     shares = Table(title="located and right, by metres driven")
     for heading in ("map", "query", *(f"{d:g} m" for d in distances), "n"):
@@ -139,7 +139,7 @@ def contribution_table(independent: Mapping[str, Independence], recalls: Recalls
         auc = f"{independent[name].auc:.3f}" if name in independent else ""
         shares = (_recall(row[name]) for row in recalls.values())
         table.add_row(name, auc, *shares)
-    _wide().print(table)
+    wide_console().print(table)
 
 
 def draw_signatures(path: Path, independent: Mapping[str, Independence], recalls: Recalls) -> None:

@@ -1,0 +1,114 @@
+"""Table and picture of what the signatures are worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pc2grid_cli.matrix_report import wide_console
+
+_SCOPES = ("building", "city")
+
+
+def _interval(values: Sequence[float] | None) -> str:
+    if values is None:
+        return ""
+    share, low, high = values
+    return f"{share:.2f}\n{low:.2f}-{high:.2f}"
+
+
+def _cells(document: Mapping[str, Any]) -> dict[tuple[str, str, float], Mapping[str, Any]]:
+    return {(row["scope"], row["selector"], row["travel_m"]): row for row in document["rows"]}
+
+
+def table(document: Mapping[str, Any], selectors: Sequence[str]) -> None:
+    """Print, for building and city, how often the right place is selected and the query located rightly."""
+    from rich.table import Table
+
+    console, cells = wide_console(), _cells(document)
+    travels_m = sorted({travel_m for _, _, travel_m in cells})
+    for scope in _SCOPES:
+        rows = [row for row in document["rows"] if row["scope"] == scope]
+        if not rows:
+            continue
+        some = rows[0]
+        shown = Table(
+            title=f"{scope}: {some['places']} places, {some['queries']} queries of {some['sessions']} "
+            "sessions (below: 5 % to 95 %, by session); processor time without alignment"
+        )
+        shown.add_column("selected by", no_wrap=True)
+        shown.add_column("places", justify="right")
+        for travel_m in travels_m:
+            shown.add_column(f"selected\n{travel_m:g} m", justify="right")
+        for travel_m in travels_m:
+            shown.add_column(f"right\n{travel_m:g} m", justify="right")
+        shown.add_column("ms", justify="right")
+        for selector in selectors:
+            row = [cells.get((scope, selector, travel_m)) for travel_m in travels_m]
+            if not any(row):
+                continue
+            last = next(cell for cell in reversed(row) if cell)
+            shown.add_row(
+                selector,
+                str(last["looked_at"]),
+                *(_interval(cell["found"]) if cell else "" for cell in row),
+                *(_interval(cell["right"]) if cell else "" for cell in row),
+                f"{last['processor_ms']:.0f}" if last["right"] is not None else "",
+            )
+        console.print(shown)
+    one = Table(title="one place by two sensors against two places by one: area under the curve")
+    for heading in ("signatures", "AUC", "5 % to 95 %", "pairs"):
+        one.add_column(heading, justify="left" if heading == "signatures" else "right")
+    for name, measured in document["independence"].items():
+        one.add_row(
+            name,
+            f"{measured['auc']:.3f}",
+            f"{measured['low']:.3f}-{measured['high']:.3f}",
+            f"{measured['same']:,} / {measured['other']:,}",
+        )
+    console.print(one)
+
+
+def draw(path: Path, document: Mapping[str, Any], selectors: Sequence[str]) -> None:
+    """One picture: share of the queries whose place is selected, and that are located rightly."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    import numpy as np
+
+    from pc2grid.io.atomic import replace_file
+    from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
+
+    cells = _cells(document)
+    travels_m = sorted({travel_m for _, _, travel_m in cells})
+    figure, axes = plt.subplots(1, 3, figsize=(15, 4.6), constrained_layout=True, sharey=False)
+    panels = ((axes[0], "building", "found"), (axes[1], "city", "found"), (axes[2], "city", "right"))
+    for ax, scope, what in panels:
+        named = [s for s in selectors if any(cells.get((scope, s, t), {}).get(what) for t in travels_m)]
+        at, height = np.arange(len(named)), 0.8 / max(len(travels_m), 1)
+        for number, (travel_m, colour) in enumerate(zip(travels_m, (VERMILLION, ORANGE, BLUE), strict=False)):
+            values = [cells.get((scope, s, travel_m), {}).get(what) or (0.0, 0.0, 0.0) for s in named]
+            share, low, high = np.array(values).reshape(-1, 3).T
+            ax.barh(
+                at + (number - (len(travels_m) - 1) / 2) * height,
+                share,
+                height,
+                xerr=(np.maximum(share - low, 0), np.maximum(high - share, 0)),
+                color=colour,
+                ecolor="0.4",
+                label=f"after {travel_m:g} m",
+            )
+        ax.set_yticks(at, named)
+        ax.invert_yaxis()
+        ax.set(xlim=(0, 1.02))
+        ax.grid(axis="x", alpha=0.3)
+        places = next((row["places"] for row in document["rows"] if row["scope"] == scope), 0)
+        percent = 100 * document["setting"]["share"]
+        title = "right place selected" if what == "found" else "located and right"
+        ax.set_title(f"{scope}, {places} places, {percent:g} % selected: {title}", fontsize=10)
+    axes[2].legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3)
+    with replace_file(path) as draft:
+        figure.savefig(draft, format="png", dpi=110)
+    plt.close(figure)
