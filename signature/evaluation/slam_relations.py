@@ -82,16 +82,11 @@ def relation_error(
         are those of the laser, not of the base). tolerance_s : a relation is left out if no pose is this
         close to one of its times, which may differ by a millisecond from the stamps.
     """
-    poses = trajectory.planar()
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    dx, dy = base_to_reference_m
-    poses[:, 0] += c * dx - s * dy
-    poses[:, 1] += s * dx + c * dy
-    i, near_i = _nearest(trajectory.stamps_ns, relations.first_ns, tolerance_s)
-    j, near_j = _nearest(trajectory.stamps_ns, relations.second_ns, tolerance_s)
-    used = near_i & near_j
-    total = len(used)
-    if not used.any():
+    _, _, wanted, measured = compared_poses(
+        trajectory, relations, base_to_reference_m=base_to_reference_m, tolerance_s=tolerance_s
+    )
+    total = len(relations.first_ns)
+    if not len(measured):
         nan = float("nan")
         return RelationError(
             translation_m=nan,
@@ -101,8 +96,7 @@ def relation_error(
             used=0,
             total=total,
         )
-    measured = _relative(poses[i[used]], poses[j[used]])
-    error = _relative(relations.T_first_second[used], measured)
+    error = _relative(wanted, measured)
     distance = np.hypot(error[:, 0], error[:, 1])
     angle = np.degrees(np.abs(wrap_angle(error[:, 2])))
     return RelationError(
@@ -110,9 +104,33 @@ def relation_error(
         translation_std_m=float(distance.std()),
         rotation_deg=float(angle.mean()),
         rotation_std_deg=float(angle.std()),
-        used=int(used.sum()),
+        used=len(measured),
         total=total,
     )
+
+
+def compared_poses(
+    trajectory: Trajectory,
+    relations: Relations,
+    *,
+    base_to_reference_m: tuple[float, float] = (0.0, 0.0),
+    tolerance_s: float = 0.005,
+) -> tuple[I64, I64, F64, F64]:
+    """The relations for which the trajectory has poses at both times; the parameters are those above.
+
+    Returns the numbers of the two poses (U,) each, and the relative pose (U, 3) x, y, yaw by the relation and
+    by the trajectory.
+    """
+    poses = trajectory.planar()
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    dx, dy = base_to_reference_m
+    poses[:, 0] += c * dx - s * dy
+    poses[:, 1] += s * dx + c * dy
+    i, near_i = _nearest(trajectory.stamps_ns, relations.first_ns, tolerance_s)
+    j, near_j = _nearest(trajectory.stamps_ns, relations.second_ns, tolerance_s)
+    used = near_i & near_j
+    i, j = i[used], j[used]
+    return i, j, relations.T_first_second[used], _relative(poses[i], poses[j])
 
 
 def _nearest(stamps_ns: I64, wanted_ns: I64, tolerance_s: float) -> tuple[I64, np.ndarray]:

@@ -162,6 +162,7 @@ def _of_log(task: dict[str, Any]) -> Row:
     from pc2grid.io.trajectory import read_tum
     from signature.config import Config
     from signature.evaluation.map_quality import map_beside_bare
+    from signature.evaluation.relation_fit import relation_fit
     from signature.evaluation.slam_relations import read_relations, relation_error
     from signature.evaluation.trajectory_error import trajectory_error
 
@@ -179,10 +180,13 @@ def _of_log(task: dict[str, Any]) -> Row:
         }
     relations = read_relations(truth)
     x, y = (float(v) for v in run.T_base_sensor[:2, 3])
+    with open_log(Path(task["log"]), config.read) as log:
+        fit = relation_fit(log.scans(), run.trajectory, relations, base_to_reference_m=(x, y))
     return {
         **row,
         "ours": asdict(relation_error(run.trajectory, relations, base_to_reference_m=(x, y))),
         "bare": asdict(relation_error(run.bare, relations, base_to_reference_m=(x, y))),
+        "fit": asdict(fit),
     }
 
 
@@ -214,6 +218,14 @@ def _errors(row: Row, who: str) -> str:
     return f"{_metres(found['translation_m'])} m, {found['rotation_deg']:.2f} deg"
 
 
+def _fits(row: Row) -> str:
+    """How well the raw scans of a pair fit, placed by the relations and by our trajectory."""
+    fit = row.get("fit")
+    if fit is None:
+        return "-"
+    return f"{fit['relations_m']:.4f} / {fit['trajectory_m']:.4f} (ours better in {fit['better']:.0%})"
+
+
 _COMMON: list[tuple[str, Callable[[Row], str]]] = [
     ("lost, %", lambda r: _percent(r["lost"])),
     ("degenerate, %", lambda r: _percent(r["degenerate"])),
@@ -240,6 +252,7 @@ _RECORDED: list[tuple[str, Callable[[Row], str]]] = [
     ("truth", lambda r: Path(r["truth"]).name),
     ("error", lambda r: _errors(r, "ours")),
     ("error of bare KISS-ICP", lambda r: _errors(r, "bare")),
+    ("scans fit: truth / ours, m", lambda r: _fits(r)),
     *_COMMON,
 ]
 
