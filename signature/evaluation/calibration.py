@@ -49,10 +49,10 @@ def fit(answers: Sequence[Known]) -> Calibration:
             slope @ terms / len(sign) + penalty,
         )
 
-    bounds = [(None, None), (0.0, None), (0.0, None), (0.0, None)]
-    found = minimize(loss, np.array([0.0, 1.0, 1.0, 1.0]), jac=True, bounds=bounds, method="L-BFGS-B")
-    bias, better, worse, clearance = found.x.tolist()
-    return Calibration(bias=bias, better=better, worse=worse, clearance=clearance)
+    bounds = [(None, None), (0.0, None), (0.0, None)]
+    found = minimize(loss, np.array([0.0, 1.0, 1.0]), jac=True, bounds=bounds, method="L-BFGS-B")
+    bias, support, clearance = found.x.tolist()
+    return Calibration(bias=bias, support=support, clearance=clearance)
 
 
 def left_out(answers: Sequence[Known]) -> F64:

@@ -6,7 +6,7 @@ import pytest
 from signature.evaluation.calibration import Known, fit, left_out, log_loss, roc_area, share_by_session
 from signature.relocalization.confidence import Calibration, Evidence
 
-TRUTH = Calibration(bias=-5.0, better=4.0, worse=2.0, clearance=1.5)
+TRUTH = Calibration(bias=-5.0, support=4.0, clearance=1.5)
 
 
 def answers(count: int) -> list[Known]:
@@ -28,8 +28,7 @@ def answers(count: int) -> list[Known]:
 def test_the_fit_recovers_the_model_that_made_the_answers() -> None:
     found = fit(answers(6000))
     assert found.bias == pytest.approx(TRUTH.bias, abs=0.5)
-    assert found.better == pytest.approx(TRUTH.better, rel=0.15)
-    assert found.worse == pytest.approx(TRUTH.worse, rel=0.15)
+    assert found.support == pytest.approx(TRUTH.support, rel=0.15)
     assert found.clearance == pytest.approx(TRUTH.clearance, rel=0.15)
 
 
