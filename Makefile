@@ -55,7 +55,6 @@ picture: $(READY)
 	PYTHONPATH=tools $(BIN)/python tools/architecture.py examples/architecture.svg
 
 docs: $(READY)
-	$(BIN)/python -m pip install -q -c constraints.txt -e '.[docs]'
 	$(BIN)/python -m mkdocs build
 
 clean:

@@ -28,6 +28,7 @@ Databases and answers
     open_database       a SubmapDatabase; Label: building and floor of a session
     locate              where registered scans were taken: an Answer
     Relocalizer         the same while the robot drives, in a MapIndex
+    Prior               where the robot is known to be, roughly
 
 Types
     Scan, RegisteredScan, Health, Trajectory, Loop, OccupancyGrid, Submap, SessionMap
@@ -83,6 +84,7 @@ if TYPE_CHECKING:
     from signature.files import relocalize as relocalize
     from signature.relocalization.answer import Answer as Answer
     from signature.relocalization.map_index import MapIndex as MapIndex
+    from signature.relocalization.prior import Prior as Prior
     from signature.relocalization.relocalizer import Relocalizer as Relocalizer
     from signature.relocalization.relocalizer import relocalize as locate  # noqa: F401
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pc2grid.errors import OutputError
+from pc2grid.errors import ConfigError, OutputError
 from pc2grid.model import SessionMap
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
@@ -16,6 +16,7 @@ from signature.sessions import add_sessions, build_sessions
 if TYPE_CHECKING:
     from signature.database import SubmapDatabase
     from signature.relocalization.answer import Answer
+    from signature.relocalization.prior import Prior
 
 
 def convert(
@@ -78,6 +79,7 @@ def relocalize(
     config: Config = Config(),
     *,
     span: TimeSpan = TimeSpan(),
+    prior: Prior | None = None,
     until_located: bool = False,
     recover: bool = False,
     observer: Observer = Observer(),
@@ -88,6 +90,7 @@ def relocalize(
     database : file or postgresql:// URL.
     config : its sections `read`, `registration` and `relocalize` are used; see `query_config`.
     span : the part of the recording to use. recover : use what is whole of a damaged recording.
+    prior : what is known of the robot's pose beforehand; other places are no answers.
     until_located : ask after every metre of travel, and stop at the first answer that is `located`; otherwise
         the recording is read to its end, and the answer is about its last metres.
     observer : gets the progress, and each scan with its tracked pose.
@@ -99,6 +102,9 @@ def relocalize(
     >>> answer = pc2grid.relocalize("tuesday.mcap", "building.submaps", until_located=True)
     >>> answer.status, answer.session, answer.path_m < 4.0
     ('located', 'monday', True)
+    >>> elsewhere = pc2grid.Prior.around(50.0, 50.0, radius_m=1.0)
+    >>> pc2grid.relocalize("tuesday.mcap", "building.submaps", prior=elsewhere).status
+    'not_found'
     """
     from pc2grid.io.recording import open_log
     from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
@@ -110,7 +116,11 @@ def relocalize(
         settings = query_config(opened, config)
         index = MapIndex.of(opened, settings)
         if is_drawn_map(Path(query)):
+            if prior is not None:
+                raise ConfigError("prior: there is no robot in a map")
             return locate_map(load_drawn_map(query, settings).grid, index)
+        if prior is not None:
+            index = index.within(prior)
         relocalizer = Relocalizer(index)
         with open_log(query, settings.read, recover=recover) as log:
             start_ns, end_ns = log.info.start_ns, log.info.end_ns

@@ -8,7 +8,7 @@ import pytest
 
 import pc2grid
 from pc2grid.config import ReadConfig
-from pc2grid.errors import DatabaseError, OutputError
+from pc2grid.errors import ConfigError, DatabaseError, OutputError
 from pc2grid.io.nav2_map import save_map
 from signature.config import Config
 from signature.database import Label, open_database
@@ -37,6 +37,12 @@ def test_a_map_is_found_in_a_map(building: Path) -> None:
     assert answer.status == "located" and answer.label.floor == "2"
     assert answer.T_map_base is not None
     assert (round(answer.T_map_base.x, 1), round(answer.T_map_base.y, 1)) == (4.0, 3.0)
+
+
+def test_a_map_has_no_robot_whose_pose_could_be_known(building: Path) -> None:
+    near = pc2grid.Prior.around(4.0, 3.0, radius_m=2.0)
+    with pytest.raises(ConfigError, match="no robot in a map"):
+        relocalize(building / "part.yaml", building / "plan.submaps", prior=near)
 
 
 def test_what_exists_is_kept_unless_one_says_so(building: Path, tmp_path: Path) -> None:
