@@ -44,6 +44,7 @@ class LiveParameters:
     poll_s: float = 0.2
     silent_s: float = 5.0
     catch_up_s: float = 10.0
+    caught_up_s: float = 0.1
     clock_scans: int = 5
     gap_s: float = 2.0
 
@@ -277,6 +278,8 @@ class LiveLog:
             yield scan
             if arrived_s is not None:
                 self.lag_s = self._clock() - arrived_s
+                if self.lag_s < self._parameters.caught_up_s:
+                    self._keep_up()
 
     def _next(self) -> Arrived | None:
         """The next message: of those held back, then of those that arrive."""
