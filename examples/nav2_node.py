@@ -17,10 +17,6 @@ import threading
 from collections.abc import Collection, Sequence
 from typing import Any
 
-import rclpy
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-
 import pc2grid
 from pc2grid.config import ReadConfig
 from pc2grid.io import topics
@@ -33,6 +29,13 @@ from signature.database import open_database
 from signature.relocalization.looking import Looking
 from signature.relocalization.map_index import MapIndex
 from signature.relocalization.watcher import Look, Watcher
+
+try:
+    import rclpy
+    from rclpy.event_handler import SubscriptionEventCallbacks
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+except ModuleNotFoundError:
+    rclpy = None
 
 
 class RclpyFeed:
@@ -131,6 +134,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("database")
     parser.add_argument("--topic", help="of the scans, if several fit")
     options = parser.parse_args(arguments)
+    if rclpy is None:
+        parser.error("there is no rclpy here: source ROS 2, or use `pc2grid watch ws://...`")
     rclpy.init()
     node = rclpy.create_node("pc2grid")
     spin = threading.Thread(target=rclpy.spin, args=(node,), daemon=True)
