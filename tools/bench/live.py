@@ -19,7 +19,7 @@ import numpy as np
 from measure import ROOT, Row
 
 if TYPE_CHECKING:
-    from pc2grid.io.live.feed import FeedCounts
+    from pc2grid.io.live.live_log import LiveLog
 
 _ROBOT = (
     "import sys, pathlib\n"
@@ -81,7 +81,8 @@ def lag(folder: Path, quick: bool) -> Iterator[Row]:
         ("lidar", "lidar, 10 Hz"),
         ("depth", "depth 640x480, 15 Hz"),
     ):
-        path, topic = simulated(folder, kind, 3.0 if quick else 8.0)
+        path, topic = simulated(folder, kind, 5.0 if quick else 10.0)
+        warm_up(path, database)
         robot = subprocess.Popen(
             [sys.executable, "-c", _ROBOT, str(path), topic],
             cwd=ROOT,
@@ -92,11 +93,10 @@ def lag(folder: Path, quick: bool) -> Iterator[Row]:
         assert robot.stdout is not None
         url = robot.stdout.readline().strip()
         lags: list[float] = []
-        located_m: float | None = None
         cpu_s = time.process_time()
         with open_database(database) as opened, open_live(url, ReadConfig()) as live:
             watcher = Watcher(MapIndex.of(opened, opened.config()))
-            live.on_poll = Stopped(live.feed.counts)
+            live.on_poll = Stopped(live)
             live.choose()
             count = 0
             with Looking(watcher, beside=True) as looking:
@@ -106,9 +106,9 @@ def lag(folder: Path, quick: bool) -> Iterator[Row]:
                         lags.append(live.lag_s)
                     count += 1
                     looking.add(registered, planar_scan)
-                    for look in looking.take():
-                        if look.state == "located" and located_m is None:
-                            located_m = look.answer.path_m
+                looking.finish()
+                at_m = [look.answer.path_m for look in looking.take() if look.state == "located"]
+                located_m = min(at_m, default=None)
             dropped = live.feed.counts.dropped
         cpu_s = time.process_time() - cpu_s
         robot.communicate()
@@ -121,6 +121,17 @@ def lag(folder: Path, quick: bool) -> Iterator[Row]:
             note=f"median {np.median(lags) if lags else 0:.3f} s, {count} scans used, {dropped} dropped,"
             f" {located}, cpu {1000 * cpu_s / max(count, 1):.0f} ms a scan with looks",
         )
+
+
+def warm_up(path: Path, database: Path) -> None:
+    """Use each function once: the first use compiles it."""
+    from pc2grid.io import open_log
+    from pc2grid.pipeline import follow
+    from signature.database import open_database
+    from signature.relocalization.relocalizer import relocalize
+
+    with open_database(database) as opened, open_log(path) as log:
+        relocalize(follow(log.scans(0.0, 2.0), opened.config()), opened, opened.config())
 
 
 def memory(folder: Path, quick: bool) -> Iterator[Row]:
@@ -161,15 +172,16 @@ def memory(folder: Path, quick: bool) -> Iterator[Row]:
 
 
 class Stopped:
-    """Whether the robot has sent nothing for some seconds."""
+    """Whether the robot has sent nothing, and nothing was used, for some seconds."""
 
-    def __init__(self, counts: FeedCounts) -> None:
-        self._counts, self._arrived, self._last_s = counts, -1, 0.0
+    def __init__(self, live: LiveLog) -> None:
+        self._live, self._before, self._last_s = live, (-1, -1), 0.0
 
     def __call__(self) -> bool:
         """Whether it has stopped."""
-        if self._counts.arrived != self._arrived:
-            self._arrived, self._last_s = self._counts.arrived, time.monotonic()
+        now = self._live.feed.counts.arrived, self._live.report().scans_read
+        if now != self._before:
+            self._before, self._last_s = now, time.monotonic()
         return time.monotonic() - self._last_s > 5.0
 
 
