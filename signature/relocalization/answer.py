@@ -15,6 +15,7 @@ from signature.relocalization.answer_json import AnswerDocument, document
 from signature.relocalization.answer_json import Status as Status
 from signature.relocalization.confidence import Evidence
 from signature.relocalization.hypotheses import Hypothesis
+from signature.relocalization.pose_in_space import PoseInSpace
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,6 +66,8 @@ class Answer:
     prior : what became of the prior, None if there was none; "lapsed": registration was lost after the time
     that it is about, so it was not used. excluded : the best place that the prior excludes, if nothing that
     it allows is certain and this fits better.
+    in_space : the pose with six degrees of freedom, and whether the points agree; None if either side has
+    none. Of a place that was turned down because they contradict it, the pose there.
     """
 
     status: Status
@@ -87,6 +90,7 @@ class Answer:
     timing_ms: dict[str, float] = field(default_factory=dict)
     prior: Literal["used", "lapsed"] | None = None
     excluded: Moment | None = None
+    in_space: PoseInSpace | None = None
 
     def __repr__(self) -> str:
         sure = f"confidence {probability(self.confidence)}, after {self.path_m:.1f} m"

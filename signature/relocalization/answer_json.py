@@ -90,9 +90,31 @@ class PriorUse(TypedDict):
     excluded: Excluded | None
 
 
+class PoseInSpace(TypedDict):
+    """The base in space at the query's last scan: metres, radians; roll, pitch, yaw about the fixed axes
+    (REP-103). covariance (6, 6) of x, y, z and of the rotation about the axes of the map. status: whether
+    the points agree with the map. rays were compared; on, through, before: shares of them that end on a
+    surface of the map, behind one, and before one where the map has none."""
+
+    status: Literal["agrees", "unsure", "contradicts"]
+    x: float
+    y: float
+    z: float
+    roll: float
+    pitch: float
+    yaw: float
+    covariance: list[list[float]]
+    rmse_m: float
+    rays: int
+    on: float
+    through: float
+    before: float
+
+
 class Result(TypedDict):
     """What is found. T_map_odom puts the query's own frame into the map. confidence: the probability that the
-    best hypothesis is right. hypotheses: best first. prior: null if nothing was known beforehand."""
+    best hypothesis is right. hypotheses: best first. prior: null if nothing was known beforehand.
+    in_space: null if the map or the query has no points."""
 
     schema_version: Version
     status: Status
@@ -105,6 +127,7 @@ class Result(TypedDict):
     hypotheses: list[Hypothesis]
     history: list[Moment]
     prior: PriorUse | None
+    in_space: PoseInSpace | None
     timing_ms: dict[str, float]
 
 
@@ -145,6 +168,7 @@ def document(answer: answer.Answer) -> AnswerDocument:
         ],
         "history": [_moment(moment) for moment in answer.history],
         "prior": _prior(answer),
+        "in_space": _in_space(answer),
         "query": {"path_m": answer.path_m, "stamp_ns": answer.stamp_ns},
         "database": {"sessions": list(answer.sessions)},
         "timing_ms": answer.timing_ms,
@@ -166,6 +190,29 @@ def _prior(answer: answer.Answer) -> PriorUse | None:
             "confidence": moment["confidence"],
         }
     return {"status": answer.prior, "excluded": excluded}
+
+
+def _in_space(answer: answer.Answer) -> PoseInSpace | None:
+    pose = answer.in_space
+    if pose is None:
+        return None
+    x, y, z = pose.T_map_base[:3, 3].tolist()
+    roll, pitch, yaw = pose.rpy_rad
+    return {
+        "status": pose.status,
+        "x": x,
+        "y": y,
+        "z": z,
+        "roll": roll,
+        "pitch": pitch,
+        "yaw": yaw,
+        "covariance": pose.covariance.tolist(),
+        "rmse_m": pose.rmse_m,
+        "rays": pose.rays,
+        "on": pose.on,
+        "through": pose.through,
+        "before": pose.before,
+    }
 
 
 def _moment(moment: answer.Moment) -> Moment:

@@ -346,6 +346,9 @@ def relocalize(
     watch : called with each scan, and with the state of the answer if the database was asked after it.
     prior : what is known of the pose beforehand; other places are no answers.
 
+    Where the database keeps points (`convert --points`) and the query is of a lidar or depth camera, the pose
+    is refined and checked in space (`Answer.in_space`).
+
     Raises NoScans for a query without a usable scan.
 
     >>> import pc2grid, signature
@@ -358,8 +361,23 @@ def relocalize(
     index = MapIndex.of(database, config)
     if prior is not None:
         index = index.within(prior)
-    (asked,) = localize(query, [index], watch=watch)
-    return asked.answers[0]
+    if not any(info.provenance.config.projection.points_voxel_m for info in database.sessions()):
+        (asked,) = localize(query, [index], watch=watch)
+        return asked.answers[0]
+    from signature.relocalization.in_space import QueryInSpace, settle_in_space
+
+    in_space = QueryInSpace()
+
+    def see(registered: RegisteredScan, moment: Moment | None) -> None:
+        in_space.add(registered)
+        if watch is not None:
+            watch(registered, moment)
+
+    (asked,) = localize(query, [index], watch=see)
+    begin = time.perf_counter()
+    answer = settle_in_space(asked.answers[0], in_space, database.points, config.relocalize.accept)
+    elapsed_ms = 1000.0 * (time.perf_counter() - begin)
+    return replace(answer, timing_ms={**answer.timing_ms, "in_space": elapsed_ms})
 
 
 def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:

@@ -343,7 +343,7 @@ def as_text(answer: Answer, *, is_map: bool = False) -> str:
         return (
             f"located in {_named(answer, answer.hypotheses[0])}: x {pose.x:.2f} m, y {pose.y:.2f} m,"
             f" yaw {math.degrees(pose.yaw):.1f} deg {of_what},"
-            f" confidence {probability(answer.confidence)}{travel}"
+            f" confidence {probability(answer.confidence)}{travel}" + _in_space(answer)
         )
     lines = [
         {
@@ -354,7 +354,23 @@ def as_text(answer: Answer, *, is_map: bool = False) -> str:
     for h in answer.hypotheses[:5]:
         pose = h.fit.T_map_query @ answer.T_odom_base
         lines.append(f"  {_named(answer, h)}: x {pose.x:.2f} m, y {pose.y:.2f} m, score {h.fit.score:.2f}")
-    return "\n".join(lines)
+    return "\n".join(lines) + _in_space(answer)
+
+
+def _in_space(answer: Answer) -> str:
+    """A line about the pose in space, if both sides have points; else nothing."""
+    pose = answer.in_space
+    if pose is None:
+        return ""
+    shares = f"{pose.on:.0%} of {pose.rays} rays end on surfaces of the map"
+    if answer.T_map_base is None:
+        return f"\n  a place that fits in the plane was turned down in space: {shares}"
+    roll, pitch, _ = (math.degrees(angle) for angle in pose.rpy_rad)
+    sigma_m = float(max(pose.covariance[k, k] for k in range(3))) ** 0.5
+    return (
+        f"\n  in space: z {pose.T_map_base[2, 3]:.2f} m, roll {roll:.1f} deg, pitch {pitch:.1f} deg,"
+        f" standard deviation {100.0 * sigma_m:.1f} cm; {shares}"
+    )
 
 
 def _named(answer: Answer, hypothesis: Hypothesis) -> str:

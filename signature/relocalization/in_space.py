@@ -1,0 +1,211 @@
+"""The answer in space: where map and query both have points, the planar answer is refined and checked.
+
+The check is independent of the occupancy grids. A located place whose surfaces the rays of the query do not
+meet is turned down. Of several places that look alike in the plane, the one is taken that alone agrees in
+space, for example of two rooms that differ in height only.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pc2grid.arrays import F64
+from pc2grid.clouds.voxel_cloud import VoxelCloud
+from pc2grid.geometry import SE2, transform_points
+from pc2grid.model import Health, PointMap, RegisteredScan
+from signature.relocalization.answer import Answer
+from signature.relocalization.hypotheses import Hypothesis
+from signature.relocalization.pose_in_space import PoseInSpace, SpaceStatus
+from signature.verification.registration import RAYS, SpatialFit, SpatialView, register_in_space
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpaceParameters:
+    """When an answer is compared in space, and what follows from it. Chosen by hand; in a simulated drive
+    through a real 3D scan right places have 0.90 to 0.97 of the rays on surfaces, random ones 0.17 to 0.78.
+
+    last_m : metres of travel whose scans are used. every_m : travel between two of them.
+    voxel_m : edge of the voxels that a scan is reduced to.
+    agrees, contradicts : from the first share of rays on surfaces a place agrees, below the second it
+        contradicts.
+    sure : of several places one is chosen only from this share on.
+    equal : spread of this share between equal places. A place elsewhere is as likely as exp(-lead / equal).
+    places : with more places than this, none is chosen.
+    """
+
+    last_m: float = 5.0
+    every_m: float = 0.2
+    voxel_m: float = 0.05
+    agrees: float = 0.75
+    contradicts: float = 0.55
+    sure: float = 0.85
+    equal: float = 0.02
+    places: int = 5
+
+
+SPACE = SpaceParameters()
+
+
+class QueryInSpace:
+    """The scans of the last metres of a query, in its odom frame. Memory is bounded by the metres."""
+
+    def __init__(self) -> None:
+        self._views: deque[tuple[float, SpatialView]] = deque()
+        self._path_m = 0.0
+        self._last: F64 | None = None
+        self.T_odom_base: F64 | None = None
+
+    def add(self, registered: RegisteredScan) -> None:
+        """Take in the next scan. One that registration was lost on begins anew."""
+        scan, T = registered.scan, registered.T_session_base
+        if scan.sensor == "laser":
+            return
+        if registered.health is Health.LOST:
+            self.__init__()  # type: ignore[misc]
+            return
+        self.T_odom_base = T
+        if self._last is not None:
+            step_m = float(np.linalg.norm(T[:3, 3] - self._last[:3, 3]))
+            if step_m < SPACE.every_m:
+                return
+            self._path_m += step_m
+        self._last = T
+        cloud = VoxelCloud(SPACE.voxel_m)
+        cloud.add(scan.points_m)
+        sensor_m = (T @ scan.T_base_sensor)[:3, 3]
+        view = SpatialView(sensor_m=sensor_m, points_m=transform_points(T, cloud.points_m()))
+        self._views.append((self._path_m, view))
+        while self._path_m - self._views[0][0] > SPACE.last_m:
+            self._views.popleft()
+
+    @property
+    def views(self) -> tuple[SpatialView, ...]:
+        """The scans, oldest first."""
+        return tuple(view for _, view in self._views)
+
+
+def settle_in_space(
+    answer: Answer, query: QueryInSpace, points_of: Callable[[str], PointMap | None], accept: float
+) -> Answer:
+    """The answer, refined and checked in space; as it was where the query or the map has no points.
+
+    points_of : the points of a session. accept : least confidence to be located.
+    """
+    views, T_odom_base = query.views, query.T_odom_base
+    if not views or T_odom_base is None or not answer.hypotheses or answer.status == "not_found":
+        return answer
+    fits = _fits(answer, views, points_of)
+    if answer.status == "located":
+        best = fits[0]
+        if best is None:
+            return answer
+        in_space = _pose(best, T_odom_base)
+        if in_space.status == "contradicts":
+            return _refused(answer, in_space)
+        return _located(answer, 0, best, T_odom_base, answer.confidence)
+    # Ambiguous: one place must agree, and every other place must have been compared and agree less.
+    compared = [fit for fit in fits if fit is not None]
+    if len(compared) < max(2, len(fits)):
+        return answer
+    shares = np.array([fit.on for fit in compared])
+    first = int(shares.argmax())
+    confidence = float(1.0 / np.exp((shares - shares[first]) / SPACE.equal).sum())
+    if shares[first] < SPACE.sure or confidence < accept:
+        return answer
+    return _located(answer, first, compared[first], T_odom_base, confidence)
+
+
+def _fits(
+    answer: Answer, views: tuple[SpatialView, ...], points_of: Callable[[str], PointMap | None]
+) -> list[SpatialFit | None]:
+    """A fit for the best hypothesis of each place; of a located answer, of the first place only."""
+    wanted = _best_of_places(answer)
+    if answer.status == "located":
+        wanted = wanted[:1]
+    elif len(wanted) > SPACE.places:
+        return [None]
+    compared: list[SpatialFit | None] = []
+    maps: dict[str, PointMap | None] = {}
+    for hypothesis in wanted:
+        session = answer.sessions[hypothesis.session_index]
+        if session not in maps:
+            maps[session] = points_of(session)
+        points = maps[session]
+        fit = None if points is None else register_in_space(views, points, hypothesis.fit.T_map_query)
+        compared.append(fit if fit is not None and fit.rays >= RAYS.least else None)
+    return compared
+
+
+def _best_of_places(answer: Answer) -> list[Hypothesis]:
+    """The best hypothesis of each place, best first."""
+    first: dict[int, Hypothesis] = {}
+    for hypothesis, place in zip(answer.hypotheses, answer.places, strict=True):
+        first.setdefault(place, hypothesis)
+    return list(first.values())
+
+
+def _pose(fit: SpatialFit, T_odom_base: F64) -> PoseInSpace:
+    status: SpaceStatus = "unsure"
+    if fit.on >= SPACE.agrees:
+        status = "agrees"
+    elif fit.on < SPACE.contradicts:
+        status = "contradicts"
+    return PoseInSpace(
+        status=status,
+        T_map_base=fit.T_map_query @ T_odom_base,
+        covariance=fit.covariance_at(T_odom_base),
+        rmse_m=fit.rmse_m,
+        rays=fit.rays,
+        on=fit.on,
+        through=fit.through,
+        before=fit.before,
+    )
+
+
+def _refused(answer: Answer, in_space: PoseInSpace) -> Answer:
+    """A located answer that the points contradict: nothing was found."""
+    return replace(
+        answer,
+        status="not_found",
+        session=None,
+        T_map_base=None,
+        covariance=None,
+        T_map_odom=None,
+        confidence=min(answer.confidence, in_space.on),
+        in_space=in_space,
+    )
+
+
+def _located(answer: Answer, place: int, fit: SpatialFit, T_odom_base: F64, confidence: float) -> Answer:
+    """The answer at the best hypothesis of a place, with the pose that its points give."""
+    in_space = _pose(fit, T_odom_base)
+    hypothesis = _best_of_places(answer)[place]
+    T_map_base = SE2.from_matrix(in_space.T_map_base)
+    T_map_odom = T_map_base @ answer.T_odom_base.inverse()
+    planar = np.ix_((0, 1, 5), (0, 1, 5))
+    refined = replace(
+        hypothesis,
+        fit=replace(hypothesis.fit, T_map_query=T_map_odom, covariance=in_space.covariance[planar]),
+    )
+    row = next(k for k, other in enumerate(answer.hypotheses) if other is hypothesis)
+    order = [row, *(k for k in range(len(answer.hypotheses)) if k != row)]
+    places = [answer.places[k] for k in order]
+    numbers = {known: number for number, known in enumerate(dict.fromkeys(places))}
+    hypotheses = tuple(refined if k == row else answer.hypotheses[k] for k in order)
+    return replace(
+        answer,
+        status="located",
+        session=answer.sessions[hypothesis.session_index],
+        T_map_base=T_map_base,
+        covariance=in_space.covariance[planar],
+        T_map_odom=T_map_odom,
+        confidence=confidence,
+        hypotheses=hypotheses,
+        places=tuple(numbers[known] for known in places),
+        submap_ids=tuple(answer.submap_ids[k] for k in order),
+        in_space=in_space,
+    )

@@ -1,0 +1,301 @@
+"""A planar pose refined in space, and checked there: points on points, where both sides have them.
+
+1. The heights of the two floors say how high the query lies in the map.
+2. ICP, point to plane (Open3D), brings the points of the query on those of the map, in all six degrees of
+   freedom, with ever smaller distances and Tukey's loss, so that what has changed does not pull.
+3. Each ray of the query is compared with the map: it ends on a surface of the map, or passes through one, or
+   ends before it. This does not use the occupancy grids, so it is a second opinion on a planar answer: a
+   shelf that stands like a wall, or a room that is higher.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.arrays import F64, freeze
+from pc2grid.clouds.ground import find_ground
+from pc2grid.clouds.sampling import random_subset
+from pc2grid.clouds.voxel_cloud import VoxelCloud
+from pc2grid.geometry import SE2, invert_pose, rotation_vector, transform_points
+from pc2grid.model import PointMap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegistrationParameters:
+    """How points are registered and compared. All chosen by hand, tried in simulation.
+
+    voxel_m : edge of the voxels that the query is reduced to.
+    margin_m : of the part of the map that is used, around the query.
+    normal_radius_m, normal_neighbours : neighbourhood in which the normals of the map are estimated.
+    rounds_m : largest distance of corresponding points, round by round.
+    iterations : of each round.
+    tukey : constant of Tukey's loss, as a share of the distance of the round.
+    farthest_m, farthest_rad, tilt_rad : ICP must not move or tilt the planar pose more than this.
+    patch_m : errors of points nearer than this to each other are taken to be the same, in the covariance. In
+        simulation the normalised squared errors are then about 6, as they should for 6 numbers.
+    noise_m : least standard deviation of a distance; of voxels and of maps.
+    """
+
+    voxel_m: float = 0.1
+    margin_m: float = 1.0
+    normal_radius_m: float = 0.25
+    normal_neighbours: int = 30
+    rounds_m: tuple[float, ...] = (0.6, 0.3, 0.15)
+    iterations: int = 30
+    tukey: float = 0.5
+    farthest_m: float = 0.6
+    farthest_rad: float = math.radians(10.0)
+    tilt_rad: float = math.radians(8.0)
+    patch_m: float = 2.0
+    noise_m: float = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RayParameters:
+    """How rays are compared with a map. All chosen by hand, tried in simulation.
+
+    views, rays : at most so many scans are compared, evenly spread, and of each so many rays.
+    bin_rad : size of the bins of directions in which surfaces hide each other.
+    near_m : a point so near to the map lies on it.
+    gap_m : a surface is passed, or not reached, if it is at least so far off along the ray.
+    floor_m : points this near to the floor say nothing: it is the same everywhere.
+    least : fewer rays than this say nothing.
+    """
+
+    views: int = 5
+    rays: int = 4000
+    bin_rad: float = math.radians(1.5)
+    near_m: float = 0.15
+    gap_m: float = 0.4
+    floor_m: float = 0.15
+    least: int = 100
+
+
+REGISTRATION = RegistrationParameters()
+RAYS = RayParameters()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpatialView:
+    """A scan of the query. sensor_m : (3,), points_m : (N, 3), both in the query's odom frame."""
+
+    sensor_m: F64
+    points_m: F64
+
+    def __post_init__(self) -> None:
+        freeze(self, "sensor_m", np.float64, (3,))
+        freeze(self, "points_m", np.float64, (None, 3))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpatialFit:
+    """A query in space on a map.
+
+    T_map_query : (4, 4). information : (6, 6) inverse covariance of a small motion at `center_m` (3,), map
+        frame: along x, y, z, then about x, y, z.
+    rmse_m : of the distances of corresponding points from the surfaces of the map.
+    rays : how many rays were compared. on, through, before : shares of them that end on a surface of the map,
+        behind one that should have stopped them, and before one where the map shows no other; their sum is 1.
+    """
+
+    T_map_query: F64
+    information: F64
+    center_m: F64
+    rmse_m: float
+    rays: int
+    on: float
+    through: float
+    before: float
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_map_query", np.float64, (4, 4))
+        freeze(self, "information", np.float64, (6, 6))
+        freeze(self, "center_m", np.float64, (3,))
+
+    def covariance_at(self, T_query_base: F64) -> F64:
+        """Covariance (6, 6) of the pose of a base (4, 4) in the query.
+
+        Of x, y, z of its origin in the map frame, then of the rotation about the axes of the map, as in
+        geometry_msgs/PoseWithCovariance.
+        """
+        away = (self.T_map_query @ T_query_base)[:3, 3] - self.center_m
+        motion = np.eye(6)
+        motion[:3, 3:] = -_cross(away)
+        values, axes = np.linalg.eigh(self.information)
+        covariance = axes @ np.diag(1.0 / np.maximum(values, 1e-6)) @ axes.T
+        moved: F64 = motion @ covariance @ motion.T
+        return moved
+
+
+def register_in_space(
+    views: Sequence[SpatialView],
+    points: PointMap,
+    T_map_query: SE2,
+    parameters: RegistrationParameters = REGISTRATION,
+    rays: RayParameters = RAYS,
+) -> SpatialFit | None:
+    """Register the scans of a query with the points of a map, from a planar pose of its odom frame.
+
+    None if the map has no points there, the floors are not found on both sides, or ICP leaves the
+    neighbourhood of the planar pose.
+    """
+    p = parameters
+    cloud = VoxelCloud(p.voxel_m)
+    for view in views:
+        cloud.add(view.points_m)
+    query = cloud.points_m()
+    if not len(query):
+        return None
+    lifted = T_map_query.lift()
+    target = _around(points.points_m(), transform_points(lifted, query), p.margin_m)
+    sensor_m = transform_points(lifted, views[-1].sensor_m[None])[0]
+    height_m = _height(target, query, lifted, sensor_m)
+    if height_m is None:
+        return None
+    start = lifted.copy()
+    start[2, 3] += height_m
+    found = _icp(query, target, start, p)
+    if found is None:
+        return None
+    T, information, center_m, rmse_m = found
+    turn_rad = rotation_vector(invert_pose(start) @ T)
+    before_m, after_m = (transform_points(pose, query.mean(axis=0)[None])[0] for pose in (start, T))
+    if (
+        math.hypot(*(after_m - before_m)[:2]) > p.farthest_m
+        or abs(turn_rad[2]) > p.farthest_rad
+        or math.hypot(turn_rad[0], turn_rad[1]) > p.tilt_rad
+    ):
+        return None
+    on, through, before = compare_rays(views, target, T, rays)
+    count = on + through + before
+    return SpatialFit(
+        T_map_query=T,
+        information=information,
+        center_m=center_m,
+        rmse_m=rmse_m,
+        rays=count,
+        on=on / max(count, 1),
+        through=through / max(count, 1),
+        before=before / max(count, 1),
+    )
+
+
+def _around(points: F64, query: F64, margin_m: float) -> F64:
+    """The points of a map (V, 3) within the horizontal extent of a query (N, 3) in the map."""
+    low, high = query[:, :2].min(axis=0) - margin_m, query[:, :2].max(axis=0) + margin_m
+    inside = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
+    around: F64 = points[inside]
+    return around
+
+
+def _height(target: F64, query: F64, lifted: F64, sensor_m: F64) -> float | None:
+    """How far the floor of the map lies above that of the query, at the sensor; None if one is not seen."""
+    placed = transform_points(lifted, query)
+    heights = []
+    for points in (target, placed):
+        near = points[np.linalg.norm(points[:, :2] - sensor_m[:2], axis=1) < 8.0]
+        if not len(near):
+            return None
+        middle = np.array([sensor_m[0], sensor_m[1], float(np.median(near[:, 2]))])
+        ground = find_ground(near - middle, np.zeros(3))
+        if ground is None:
+            return None
+        heights.append(middle[2] - ground.offset_m / ground.normal[2])
+    return float(heights[0] - heights[1])
+
+
+def _icp(
+    query: F64, target: F64, start: F64, p: RegistrationParameters
+) -> tuple[F64, F64, F64, float] | None:
+    """The pose (4, 4), its information (6, 6) at a point (3,), and the rmse, m; None without overlap."""
+    import open3d as o3d
+
+    def cloud_of(points: F64) -> Any:
+        return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+
+    source, surface = cloud_of(query), cloud_of(target)
+    surface.estimate_normals(
+        o3d.geometry.KDTreeSearchParamHybrid(radius=p.normal_radius_m, max_nn=p.normal_neighbours)
+    )
+    steps = o3d.pipelines.registration
+    T = start
+    for distance_m in p.rounds_m:
+        estimate = steps.TransformationEstimationPointToPlane(steps.TukeyLoss(k=p.tukey * distance_m))
+        criteria = steps.ICPConvergenceCriteria(1e-7, 1e-7, p.iterations)
+        result = steps.registration_icp(source, surface, distance_m, T, estimate, criteria)
+        T = np.array(result.transformation)
+        if len(result.correspondence_set) < 100:
+            return None
+    pairs = np.asarray(result.correspondence_set)
+    placed = transform_points(T, query)[pairs[:, 0]]
+    normals = np.asarray(surface.normals)[pairs[:, 1]]
+    away_m = np.einsum("ij,ij->i", placed - target[pairs[:, 1]], normals)
+    near = np.abs(away_m) < p.tukey * p.rounds_m[-1]
+    placed, normals, away_m = placed[near], normals[near], away_m[near]
+    center_m = placed.mean(axis=0)
+    J = np.column_stack((normals, np.cross(placed - center_m, normals)))
+    rmse_m = float(np.sqrt(np.mean(away_m**2)))
+    # Neighbouring points share the error of their voxels and of the map: as many count as there are patches.
+    independent = min(1.0, (p.voxel_m / p.patch_m) ** 2)
+    information = J.T @ J * (independent / max(rmse_m, p.noise_m) ** 2)
+    return T, information, center_m, rmse_m
+
+
+def compare_rays(
+    views: Sequence[SpatialView], target: F64, T_map_query: F64, parameters: RayParameters = RAYS
+) -> tuple[int, int, int]:
+    """How many rays of the views end on a surface of the map (V, 3), behind one, and before one.
+
+    Rays to where the map shows nothing along the way are not counted, nor are those to the floor.
+    """
+    from scipy.spatial import cKDTree
+
+    p = parameters
+    if not len(target):
+        return 0, 0, 0
+    tree = cKDTree(target)
+    every = max(1, math.ceil(len(views) / p.views))
+    counts = np.zeros(3, np.int64)
+    for view in views[::-1][::every]:
+        chosen = random_subset(len(view.points_m), p.rays)
+        placed = transform_points(T_map_query, view.points_m[chosen])
+        origin = transform_points(T_map_query, view.sensor_m[None])[0]
+        ground = find_ground(placed - origin, np.zeros(3))
+        if ground is not None:
+            placed = placed[np.abs(ground.heights(placed - origin)) > p.floor_m]
+        if not len(placed):
+            continue
+        on = tree.query(placed, distance_upper_bound=p.near_m)[0] < p.near_m
+        ray_bin, range_m = _directions(placed - origin, p.bin_rad)
+        map_bin, map_m = _directions(target - origin, p.bin_rad)
+        size = int(max(ray_bin.max(), map_bin.max())) + 1
+        first, last = np.full(size, np.inf), np.full(size, -np.inf)
+        np.minimum.at(first, map_bin, map_m)
+        np.maximum.at(last, map_bin, map_m)
+        through = ~on & (first[ray_bin] < range_m - p.gap_m)
+        before = ~on & ~through & (last[ray_bin] > range_m + p.gap_m)
+        counts += np.count_nonzero(on), np.count_nonzero(through), np.count_nonzero(before)
+    on_, through_, before_ = counts.tolist()
+    return on_, through_, before_
+
+
+def _directions(away: F64, bin_rad: float) -> tuple[NDArray[np.int64], F64]:
+    """The bin of directions (N,) and the range (N,) of points (N, 3) around the origin."""
+    range_m: F64 = np.linalg.norm(away, axis=1)
+    azimuth = np.arctan2(away[:, 1], away[:, 0]) + math.pi
+    elevation = np.arcsin(np.clip(away[:, 2] / np.maximum(range_m, 1e-9), -1.0, 1.0)) + math.pi / 2
+    width = math.ceil(2 * math.pi / bin_rad) + 1
+    bins = (elevation / bin_rad).astype(np.int64) * width + (azimuth / bin_rad).astype(np.int64)
+    return bins, range_m
+
+
+def _cross(vector: F64) -> F64:
+    """The matrix (3, 3) that takes the cross product with a vector (3,) from the left."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

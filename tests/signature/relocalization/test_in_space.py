@@ -1,0 +1,139 @@
+"""What the points of a map and a query change in an answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pc2grid.geometry import SE2, invert_pose
+from pc2grid.model import Health, OccupancyGrid, PointMap
+from signature.database import Label
+from signature.relocalization.answer import Answer
+from signature.relocalization.confidence import NO_EVIDENCE
+from signature.relocalization.hypotheses import Hypothesis
+from signature.relocalization.in_space import QueryInSpace, settle_in_space
+from signature.verification.two_way_score import Fit
+from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, twin_map
+
+
+@pytest.fixture(scope="module")
+def points() -> PointMap:
+    return twin_map()
+
+
+def ask(height_m: float, *rooms_x_m: float) -> tuple[QueryInSpace, Answer]:
+    """A query, and the planar answer that it lies in the rooms that begin at these x."""
+    query, scans = QueryInSpace(), drive(height_m)
+    for registered, _ in scans:
+        query.add(registered)
+    last, T_room_base = scans[-1]
+    T_room_odom = SE2.from_matrix(T_room_base @ invert_pose(last.T_session_base))
+    hypotheses = tuple(
+        Hypothesis(
+            session_index=0,
+            row=-1,
+            fit=Fit(
+                T_map_query=SE2(x_m, 0.0, 0.0) @ T_room_odom,
+                forward=0.9,
+                backward=0.9,
+                overlap=0.9,
+                score=0.9,
+                looked_at=100.0,
+                covariance=np.eye(3) * 1e-4,
+            ),
+        )
+        for x_m in rooms_x_m
+    )
+    T_odom_base = SE2.from_matrix(last.T_session_base)
+    alone = len(rooms_x_m) == 1
+    answer = Answer(
+        status="located" if alone else "ambiguous",
+        session="floor" if alone else None,
+        stamp_ns=5,
+        T_map_base=hypotheses[0].fit.T_map_query @ T_odom_base if alone else None,
+        covariance=np.eye(3) * 1e-4 if alone else None,
+        T_map_odom=hypotheses[0].fit.T_map_query if alone else None,
+        confidence=0.95 if alone else 0.5,
+        hypotheses=hypotheses,
+        places=tuple(range(len(hypotheses))),
+        history=(),
+        T_odom_base=T_odom_base,
+        path_m=1.0,
+        sessions=("floor",),
+        labels=(Label(),),
+        submap_ids=(-1,) * len(hypotheses),
+        evidence=NO_EVIDENCE,
+        local_map=OccupancyGrid(cells=np.zeros((1, 1)), resolution_m=0.05, origin_m=(0.0, 0.0)),
+    )
+    return query, answer
+
+
+@pytest.mark.parametrize(("height_m", "x_m"), [(HEIGHTS_M[0], 0.0), (HEIGHTS_M[1], APART_M)])
+def test_twins_in_the_plane_are_told_apart_by_their_height(
+    height_m: float, x_m: float, points: PointMap
+) -> None:
+    query, answer = ask(height_m, 0.0, APART_M)
+    settled = settle_in_space(answer, query, lambda _: points, accept=0.9)
+    assert settled.status == "located" and settled.session == "floor" and settled.confidence > 0.9
+    assert settled.T_map_base is not None and settled.in_space is not None
+    assert abs(settled.T_map_base.x - x_m - 3.3) < 1.5
+    assert settled.in_space.status == "agrees"
+    assert settled.places == (0, 1)
+    # The planar pose is that of space; the floor is at z = 0, and the base on it.
+    assert settled.T_map_base.x == pytest.approx(settled.in_space.T_map_base[0, 3])
+    assert settled.in_space.T_map_base[2, 3] == pytest.approx(0.0, abs=0.02)
+    document = settled.to_json()["in_space"]
+    assert document is not None and document["z"] == settled.in_space.T_map_base[2, 3]
+
+
+def test_equal_twins_stay_ambiguous(points: PointMap) -> None:
+    """Both hypotheses in the same room, which is taken for two places."""
+    query, answer = ask(HEIGHTS_M[0], 0.0, 0.0)
+    settled = settle_in_space(answer, query, lambda _: points, accept=0.9)
+    assert settled is answer
+
+
+def test_a_located_pose_is_refined_and_keeps_its_confidence(points: PointMap) -> None:
+    query, answer = ask(HEIGHTS_M[0], 0.0)
+    off = answer.hypotheses[0].fit.T_map_query @ SE2(0.1, -0.05, 0.03)
+    moved = replace(answer.hypotheses[0], fit=replace(answer.hypotheses[0].fit, T_map_query=off))
+    settled = settle_in_space(replace(answer, hypotheses=(moved,)), query, lambda _: points, accept=0.9)
+    assert settled.status == "located" and settled.confidence == 0.95
+    assert settled.T_map_base is not None and answer.T_map_base is not None
+    error = answer.T_map_base.inverse() @ settled.T_map_base
+    assert np.hypot(error.x, error.y) < 0.02
+    assert settled.T_map_odom is not None
+    assert settled.T_map_odom == settled.hypotheses[0].fit.T_map_query
+
+
+def test_a_place_that_the_points_contradict_is_turned_down() -> None:
+    """The map has the floor there, and walls that stand elsewhere."""
+    from tests.helpers.building_clouds import box_surface
+
+    query, answer = ask(HEIGHTS_M[0], 0.0)
+    other = [box_surface((-5, -5, 0), (10, 10, 0)), box_surface((4.0, -5, 0), (4.0, 10, 4.0))]
+    other += [box_surface((-5, 1.0, 0), (10, 1.0, 4.0)), box_surface((-5, -5, 4.0), (10, 10, 4.0))]
+    wrong = PointMap.of(np.concatenate(other), 0.05)
+    settled = settle_in_space(answer, query, lambda _: wrong, accept=0.9)
+    assert settled.status == "not_found" and settled.T_map_base is None and settled.session is None
+    assert settled.in_space is not None and settled.in_space.status == "contradicts"
+    assert settled.confidence < 0.9
+
+
+def test_without_points_on_a_side_nothing_changes(points: PointMap) -> None:
+    query, answer = ask(HEIGHTS_M[0], 0.0)
+    assert settle_in_space(answer, query, lambda _: None, accept=0.9) is answer
+    assert settle_in_space(answer, QueryInSpace(), lambda _: points, accept=0.9) is answer
+
+
+def test_what_was_seen_before_tracking_was_lost_is_forgotten() -> None:
+    query, scans = QueryInSpace(), drive(HEIGHTS_M[0])
+    for registered, _ in scans[:3]:
+        query.add(registered)
+    assert len(query.views) == 3
+    query.add(replace(scans[3][0], health=Health.LOST))
+    assert query.views == () and query.T_odom_base is None
+    query.add(replace(scans[4][0], scan=replace(scans[4][0].scan, sensor="laser")))
+    assert query.views == ()

@@ -1,0 +1,91 @@
+"""A planar pose refined in space, and rays that agree with a map or pass through it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pc2grid.arrays import F64
+from pc2grid.geometry import SE2, invert_pose, rotation_vector
+from pc2grid.model import PointMap
+from signature.relocalization.in_space import QueryInSpace
+from signature.verification.registration import SpatialView, register_in_space
+from tests.helpers.building_clouds import box_surface
+from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, twin_map
+
+OFF = SE2(0.08, -0.06, math.radians(2.0))
+
+
+def asked(height_m: float) -> tuple[QueryInSpace, SE2, F64, F64]:
+    """A query, the planar pose of its odom frame in the room, the last true pose, and the same in odom."""
+    query, scans = QueryInSpace(), drive(height_m)
+    for registered, _ in scans:
+        query.add(registered)
+    last, T_room_base = scans[-1]
+    T_room_odom = T_room_base @ invert_pose(last.T_session_base)
+    return query, SE2.from_matrix(T_room_odom), T_room_base, last.T_session_base
+
+
+@pytest.mark.parametrize(("height_m", "x_m"), [(HEIGHTS_M[0], 0.0), (HEIGHTS_M[1], APART_M)])
+def test_pose_in_space_is_exact_to_a_centimetre(height_m: float, x_m: float) -> None:
+    query, T_room_odom, T_room_base, T_odom_base = asked(height_m)
+    fit = register_in_space(query.views, twin_map(), SE2(x_m, 0.0, 0.0) @ T_room_odom @ OFF)
+    assert fit is not None
+    true = T_room_base.copy()
+    true[0, 3] += x_m
+    error = invert_pose(true) @ fit.T_map_query @ T_odom_base
+    assert np.linalg.norm(error[:3, 3]) < 0.02
+    assert np.linalg.norm(rotation_vector(error)) < math.radians(0.3)
+    assert fit.on > 0.97 and fit.through < 0.02 and fit.rmse_m < 0.03
+    sigma = np.sqrt(np.diag(fit.covariance_at(T_odom_base)))
+    assert (sigma[:3] > 1e-3).all() and (sigma[:3] < 0.05).all() and (sigma[3:] < math.radians(1.0)).all()
+
+
+def test_twin_rooms_of_other_height_are_told_apart() -> None:
+    """A query in the lower room ends before the ceiling of the higher one; the other way round it passes."""
+    for height_m, own_m, other_m, share in (
+        (HEIGHTS_M[0], 0.0, APART_M, "before"),
+        (HEIGHTS_M[1], APART_M, 0.0, "through"),
+    ):
+        query, T_room_odom, *_ = asked(height_m)
+        own, other = (
+            register_in_space(query.views, twin_map(), SE2(x_m, 0.0, 0.0) @ T_room_odom)
+            for x_m in (own_m, other_m)
+        )
+        assert own is not None and other is not None
+        assert own.on > other.on + 0.1
+        assert getattr(other, share) > 0.1 > getattr(own, share)
+
+
+def test_a_shelf_is_no_wall() -> None:
+    """Up to 1.8 m both look alike; above the shelf the rays go on to the wall behind it."""
+    floor, sides = box_surface((0, 0, 0), (5, 4, 0)), box_surface((0, 0, 0), (0, 4, 2.8))
+    walls = [floor, sides, box_surface((0, 0, 0), (5, 0, 2.8)), box_surface((0, 4, 0), (5, 4, 2.8))]
+    with_wall = np.concatenate([*walls, box_surface((4, 0, 0), (4, 4, 2.8))])
+    shelf = [box_surface((4, 0, 0), (4, 4, 1.8)), box_surface((5, 0, 1.8), (5, 4, 2.8))]
+    view = SpatialView(sensor_m=np.array([2.0, 2.0, 1.2]), points_m=np.concatenate([*walls, *shelf]))
+    through = register_in_space([view], PointMap.of(with_wall, 0.05), SE2())
+    right = register_in_space([view], PointMap.of(view.points_m, 0.05), SE2())
+    assert through is not None and right is not None
+    assert through.through > 0.05 and right.through == 0.0
+    assert right.on > through.on + 0.05
+
+
+def test_one_free_direction_is_uncertain() -> None:
+    """A corridor without ends: along it nothing fixes the pose."""
+    walls = [box_surface((0, y, 0), (20, y, 2.5)) for y in (0.0, 2.0)]
+    cloud = np.concatenate([*walls, box_surface((0, 0, 0), (20, 2, 0))])
+    seen = cloud[np.abs(cloud[:, 0] - 10.0) < 4.0]
+    view = SpatialView(sensor_m=np.array([10.0, 1.0, 1.0]), points_m=seen)
+    fit = register_in_space([view], PointMap.of(cloud, 0.05), SE2())
+    assert fit is not None
+    sigma = np.sqrt(np.diag(fit.covariance_at(np.eye(4))))
+    assert sigma[0] > 10.0 * max(sigma[1:3])
+
+
+def test_nothing_is_said_where_there_is_no_map() -> None:
+    query, T_room_odom, *_ = asked(HEIGHTS_M[0])
+    assert register_in_space(query.views, twin_map(), SE2(100.0, 0.0, 0.0) @ T_room_odom) is None
+    assert register_in_space([], twin_map(), T_room_odom) is None
