@@ -9,15 +9,15 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pc2grid.arrays import F32, F64, I64
+from pc2grid.arrays import F32, I64
 from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.model import OCCUPIED, OccupancyGrid, SessionMap, Trajectory
+from pc2grid.model import OCCUPIED, OccupancyGrid, SensorKind, SessionMap, Trajectory
 from signature.config import Config
 from signature.evaluation.registered_session import RegisteredSession
 from signature.evaluation.sensor_map import SensorMap
@@ -215,37 +215,106 @@ class Selection:
         return np.unique(np.concatenate([near.rows for near in found]))
 
 
-def recall_at_scale(
-    sessions: Sequence[tuple[QueryMap, SE2]],
-    own: F32,
-    own_m: F64,
-    others: F32,
-    shares: Sequence[float],
-) -> list[tuple[dict[float, bool], float]]:
-    """Whether the right place is among the nearest of a share of very many places, and milliseconds.
+SHARES = (0.05, 0.01, 0.002)
+"""Of very many places, the shares that are selected."""
 
-    sessions : queries with T_map_query. own (M, K), own_m (M, 2) : signatures of what was seen and centres of
-    the places of the map. others (N, K) : signatures of other places. Queries from where the map has no place
-    are left out.
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recalled:
+    """A query among very many places.
+
+    plan, query_sensor, seed, travel_m : the query. places : how many there are. share : of them, selected.
+    found : whether the right one is among those. processor_ms : of the selection.
     """
-    index = SeenIndex.of(np.concatenate((own, others)))
-    found = []
-    for query, T_map_query in sessions:
-        views_m = T_map_query.apply(np.array([view.center_m for view in query.views]).reshape(-1, 2))
-        apart = np.hypot(*(views_m[:, None] - own_m[None]).transpose(2, 0, 1))
+
+    plan: str
+    query_sensor: str
+    seed: int
+    travel_m: float
+    places: int
+    share: float
+    found: bool
+    processor_ms: float
+
+
+Asked = tuple[SensorKind, int, float, QueryMap, SE2]
+"""A query: sensor and seed of its session, metres of travel, what has been seen, its true frame in the
+plan."""
+
+
+def recall_at_scale(own: SensorMap, others: F32, queries: Iterable[Asked]) -> Iterator[Recalled]:
+    """Whether the right places of queries are selected among those of the map and `others`, by what was seen.
+
+    others (N, K) : signatures of what was seen from other places. Queries from where the map has no place are
+    left out.
+    """
+    places = own.index.places
+    index = SeenIndex.of(np.concatenate((places.described(), others)))
+    for sensor, seed, travel_m, query, T_plan_query in queries:
+        views_m = (own.T_plan_map.inverse() @ T_plan_query).apply(
+            np.array([view.center_m for view in query.views]).reshape(-1, 2)
+        )
+        apart = np.hypot(*(views_m[:, None] - places.table.center_m[None]).transpose(2, 0, 1))
         right = np.flatnonzero((apart <= JUDGEMENT.retrieved_m).any(axis=0))
         if not len(right):
             continue
         profiles = [view.profile for view in query.views]
-        hits, processor_ms = {}, 0.0
-        for share in shares:
+        for share in SHARES:
             each = max(1, round(share * len(index.vectors)) // len(profiles))
             begin = time.process_time()
             near = index.nearest_to_each(profiles, each)
             processor_ms = 1000.0 * (time.process_time() - begin)
-            hits[share] = bool(np.isin(np.concatenate([n.rows for n in near]), right).any())
-        found.append((hits, processor_ms))
-    return found
+            yield Recalled(
+                plan=own.name,
+                query_sensor=sensor,
+                seed=seed,
+                travel_m=travel_m,
+                places=len(index.vectors),
+                share=share,
+                found=bool(np.isin(np.concatenate([n.rows for n in near]), right).any()),
+                processor_ms=processor_ms,
+            )
+
+
+def described_floor(seed: int, config: Config) -> F32:
+    """The signatures of what is seen from the places of `office_floor`, (N, K)."""
+    from pc2grid.submaps.isovist import look_around
+    from pc2grid.submaps.partition import submap_centers
+    from signature.retrieval.view import PROFILE_BEARINGS
+    from signature.seen import seen_signatures
+
+    grid, sight_m = office_floor(seed), config.partition.radius_m
+    centers_m = submap_centers(grid, config.partition)
+    return seen_signatures(*look_around(grid, centers_m, sight_m, bearings=PROFILE_BEARINGS), sight_m)
+
+
+def tally_at_scale(trials: Sequence[Recalled], *, draws: int = 1000) -> list[Mapping[str, object]]:
+    """By number of places, share, travel and sensor (and "all"): share found with its 5th and 95th percentile
+    over sessions drawn anew (bootstrap), and median time."""
+    from signature.evaluation.calibration import share_by_session
+
+    groups: dict[tuple[int, float, float, str], list[Recalled]] = {}
+    for trial in trials:
+        for sensor in ("all", trial.query_sensor):
+            # Maps differ in size; the other places do not.
+            places = round(trial.places, -3)
+            groups.setdefault((places, trial.share, trial.travel_m, sensor), []).append(trial)
+    return [
+        {
+            "places": places,
+            "share": share,
+            "travel_m": travel_m,
+            "query_sensor": sensor,
+            "queries": len(members),
+            "found": share_by_session(
+                [f"{m.plan}.{m.query_sensor}.{m.seed}" for m in members],
+                np.array([m.found for m in members]),
+                draws=draws,
+            ),
+            "processor_ms": float(np.median([m.processor_ms for m in members])),
+        }
+        for (places, share, travel_m, sensor), members in sorted(groups.items())
+    ]
 
 
 def tally(trials: Sequence[Selected], *, draws: int = 1000) -> list[Mapping[str, object]]:

@@ -14,12 +14,13 @@ from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
 
 if TYPE_CHECKING:
+    from pc2grid.arrays import F32
     from pc2grid.geometry import SE2
     from pc2grid.model import OccupancyGrid, SensorKind
     from pc2grid.simulate import SimulationConfig
     from signature.config import Config
     from signature.evaluation.registered_session import RegisteredSession
-    from signature.evaluation.selection import Selected
+    from signature.evaluation.selection import Recalled, Selected
     from signature.evaluation.sensor_map import SensorMap
     from signature.relocalization.map_index import MapIndex
     from signature.relocalization.query_map import QueryMap
@@ -29,6 +30,8 @@ MAP_SEED = 1000
 _OFFICE = "office:"
 _FIRST_FLOOR = 20_000
 """Seed of the first of the other buildings' floors."""
+_FIRST_FLOOR_OF_SCALE, _FLOORS_AT_ONCE = 10_000, 50
+"""Floors of the very many places; about 500 places each."""
 _FIRST_FLOOR_OF_FIT, _FLOORS_OF_FIT = 30_000, 30
 """Floors that the weights are learned from, as places of other buildings."""
 
@@ -58,6 +61,10 @@ def compare_signatures_command(
     ] = 0.2,
     rate: Annotated[float, typer.Option("--rate", help="Scans a second, of every sensor.")] = 4.0,
     seed: Annotated[int, typer.Option("--seed", help="Of the first query session.")] = 1,
+    scale: Annotated[
+        list[int] | None,
+        typer.Option("--scale", min=1000, help="Also select among so many places; may be repeated."),
+    ] = None,
     fit: Annotated[
         Path | None,
         typer.Option("--fit", metavar="FILE.npz", help="Learn the weights from these plans, and store them."),
@@ -78,7 +85,7 @@ def compare_signatures_command(
     from pc2grid_cli.signature_report import draw, table
     from signature.config import Config
     from signature.evaluation.ablation import seen_independence
-    from signature.evaluation.selection import SELECTORS, with_floors
+    from signature.evaluation.selection import SELECTORS, queries_of, recall_at_scale, with_floors
     from signature.evaluation.sensor_matrix import SENSORS
 
     for folder in ("", "maps", "drives", "selected"):
@@ -117,7 +124,20 @@ def compare_signatures_command(
                 trials += _read(path)
                 advance((done := done + 1) / steps)
     independent = seen_independence([maps[name] for name in drawn])
-    document = _document(trials, independent, list(drawn), setting, share, seed)
+    recalled: list[Recalled] = []
+    if scale:
+        with of(context).progress("scale") as advance:
+            others = _described(out, max(scale), config, advance)
+            for name, plan in drawn.items():
+                asked = [
+                    (sensor, number, *query)
+                    for sensor in SENSORS
+                    for number in range(seed, seed + queries)
+                    for query in queries_of(_drive(out, name, plan, sensor, number, setting, config), config)
+                ]
+                for count in scale:
+                    recalled += recall_at_scale(maps[name][0], others[:count], asked)
+    document = _document(trials, independent, recalled, list(drawn), setting, share, seed)
     with replace_file(out / "signatures.json") as draft:
         draft.write_text(json_text(document) + "\n", encoding="utf-8")
     draw(out / "signatures.png", document, SELECTORS)
@@ -168,12 +188,13 @@ def _fit(
 def _document(
     trials: Sequence[Selected],
     independent: dict[str, tuple[float, float, float, int, int]],
+    recalled: Sequence[Recalled],
     plans: list[str],
     setting: dict[str, float],
     share: float,
     seed: int,
 ) -> dict[str, Any]:
-    from signature.evaluation.selection import tally
+    from signature.evaluation.selection import tally, tally_at_scale
 
     names = ("auc", "low", "high", "same", "other")
     return {
@@ -181,6 +202,7 @@ def _document(
         "plans": plans,
         "setting": {**setting, "seed": seed, "share": share},
         "rows": tally(trials),
+        "scale": tally_at_scale(recalled),
         "independence": {name: dict(zip(names, values, strict=True)) for name, values in independent.items()},
     }
 
@@ -245,6 +267,27 @@ def _city(out: Path, floors: int, config: Config, advance: Callable[[float], Non
         entries = [(made, provenance(Path(made.session), "0" * 64, config)) for made in sessions]
         add_sessions(path, entries, config, keep=False, observer=Described())
     return path
+
+
+def _described(out: Path, count: int, config: Config, advance: Callable[[float], None]) -> F32:
+    """Signatures of what was seen from `count` places of office floors, made in blocks unless they exist."""
+    import numpy as np
+
+    from pc2grid.io.atomic import replace_file
+    from signature.evaluation.selection import described_floor
+
+    make_folder(out / "floors")
+    blocks: list[F32] = []
+    while (so_far := sum(map(len, blocks))) < count:
+        first = _FIRST_FLOOR_OF_SCALE + len(blocks) * _FLOORS_AT_ONCE
+        path = out / "floors" / f"{first}.npy"
+        if not path.exists():
+            floors = [described_floor(first + k, config) for k in range(_FLOORS_AT_ONCE)]
+            with replace_file(path) as draft, draft.open("wb") as file:
+                np.save(file, np.concatenate(floors).astype(np.float16))
+            advance(so_far / count)
+        blocks.append(np.load(path).astype(np.float32))
+    return np.concatenate(blocks)[:count]
 
 
 def _map(

@@ -444,6 +444,19 @@ class SelectionRow(TypedDict):
     processor_ms: float
 
 
+class ScaleRow(TypedDict):
+    """Selection among very many places, by all signatures of what was seen: share of the queries whose place
+    is selected, with its 5th and 95th percentile by session, and median processor time of the selection."""
+
+    places: int
+    share: float
+    travel_m: float
+    query_sensor: str
+    queries: int
+    found: list[float]
+    processor_ms: float
+
+
 class SeenApart(TypedDict):
     """How well signatures of what was seen separate one place seen by two sensors from two places: area under
     the curve, its 5th and 95th percentile, and pairs compared."""
@@ -462,6 +475,7 @@ class CompareSignatures(TypedDict):
     plans: list[str]
     setting: dict[str, float]
     rows: list[SelectionRow]
+    scale: list[ScaleRow]
     independence: dict[str, SeenApart]
 
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pc2grid_cli.matrix_report import wide_console
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 _SCOPES = ("building", "city")
 
@@ -57,6 +60,7 @@ def table(document: Mapping[str, Any], selectors: Sequence[str]) -> None:
                 f"{last['processor_ms']:.0f}" if last["right"] is not None else "",
             )
         console.print(shown)
+    _scale_table(console, document["scale"])
     one = Table(title="one place by two sensors against two places by one: area under the curve")
     for heading in ("signatures", "AUC", "5 % to 95 %", "pairs"):
         one.add_column(heading, justify="left" if heading == "signatures" else "right")
@@ -68,6 +72,29 @@ def table(document: Mapping[str, Any], selectors: Sequence[str]) -> None:
             f"{measured['same']:,} / {measured['other']:,}",
         )
     console.print(one)
+
+
+def _scale_table(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print how often the right one of very many places is selected."""
+    from rich.table import Table
+
+    if not rows:
+        return
+    cells = {(r["places"], r["share"], r["query_sensor"], r["travel_m"]): r for r in rows}
+    travels_m = sorted({r["travel_m"] for r in rows})
+    shown = Table(title="right place selected among very many (below: 5 % to 95 %, by session)")
+    for heading in ("places", "selected", "query", *(f"{d:g} m" for d in travels_m), "ms"):
+        shown.add_column(heading, justify="left" if heading == "query" else "right")
+    for places, share, sensor in dict.fromkeys(key[:3] for key in cells):
+        row = [cells.get((places, share, sensor, d)) for d in travels_m]
+        shown.add_row(
+            f"{places:,}",
+            f"{100 * share:g} %",
+            sensor,
+            *(_interval(cell["found"]) if cell else "" for cell in row),
+            f"{max(cell['processor_ms'] for cell in row if cell):.0f}",
+        )
+    console.print(shown)
 
 
 def draw(path: Path, document: Mapping[str, Any], selectors: Sequence[str]) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -88,14 +89,22 @@ def test_the_command_uses_what_it_has_stored(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(compare_signatures, "_plan", lambda _: grid)
     monkeypatch.setattr(compare_signatures, "_city", lambda *_: tmp_path / "city")
     monkeypatch.setattr("signature.evaluation.selection.with_floors", lambda own, *_: own.index)
+    columns = building({"a": grid}).places.described().shape[1]
+    others = np.random.default_rng(0).normal(3, 1, (500, columns)).astype(np.float32)
+    monkeypatch.setattr("signature.evaluation.selection.described_floor", lambda *_: others)
+    monkeypatch.setattr(compare_signatures, "_FLOORS_AT_ONCE", 3)
     arguments = ["compare", "signatures", "a.yaml", "--queries", "1", "--map-length", "12", "--rate", "2"]
     arguments += ["--clutter", "0", "--change", "0", "--share", "0.3", "-o", str(tmp_path), "--json"]
+    arguments += ["--scale", "2000"]
     first = CliRunner().invoke(app, arguments)
     assert first.exit_code == 0, first.output
     document = json.loads(first.stdout)
     jsonschema.validate(document, closed(schema("compare-signatures")))
     assert document["plans"] == ["a"] and (tmp_path / "signatures.png").stat().st_size > 10_000
     assert {row["scope"] for row in document["rows"]} == {"building", "city"}
+    nearly_all = [row for row in document["scale"] if row["share"] == 0.05 and row["travel_m"] == 8.0]
+    assert nearly_all and all(row["found"][0] == 1.0 for row in nearly_all)
+    assert {row["places"] for row in document["scale"]} == {2000}
     monkeypatch.setattr(compare_signatures, "_select", None)  # nothing is selected again
     assert json.loads(CliRunner().invoke(app, arguments).stdout)["rows"] == document["rows"]
     table = CliRunner().invoke(app, [a for a in arguments if a != "--json"])
