@@ -134,8 +134,8 @@ def draw(path: Path, document: Mapping[str, Any], selectors: Sequence[str]) -> N
         places = next((row["places"] for row in document["rows"] if row["scope"] == scope), 0)
         percent = 100 * document["setting"]["share"]
         title = "right place selected" if what == "found" else "located and right"
-        ax.set_title(f"{scope}, {places} places, {percent:g} % selected: {title}", fontsize=10)
-    axes[2].legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3)
+        ax.set_title(f"{title}\n{scope}: {percent:g} % of {places} places", fontsize=10)
+    axes[1].legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3)
     with replace_file(path) as draft:
         figure.savefig(draft, format="png", dpi=110)
     plt.close(figure)
