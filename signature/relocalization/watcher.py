@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from pc2grid.clouds.planar_scan import PlanarScan
@@ -91,6 +91,8 @@ class _Place:
 class Watcher:
     """Takes in scans for as long as the robot runs. Its memory does not grow.
 
+    index : where to look. A prior (`MapIndex.within`) is about the first scan, unless it has a stamp, and
+    counts until the robot is lost or the scans do not go on.
     located : whether the last looks agree on where the robot is.
     """
 
@@ -116,7 +118,8 @@ class Watcher:
         return self._place is not None
 
     def restart(self) -> None:
-        """The scans do not go on from those before: what comes next is a search of its own."""
+        """The scans do not go on from those before: what comes next is a search of its own, everywhere."""
+        self._index = self._index.whole or self._index  # what was known beforehand was about the first search
         self._relocalizer = Relocalizer(self._index, _MOMENTS)
         self._place = self._candidate = None
         self._doubtful = self._lost_scans = 0
@@ -131,6 +134,8 @@ class Watcher:
         may_look : if not, a look that is due is put off until it is true.
         """
         p = self._parameters
+        if self._first_ns is None:
+            self._begin(registered.scan.stamp_ns)
         lost = registered.health is Health.LOST
         self._lost_scans = self._lost_scans + 1 if lost else 0
         begin = self._clock()
@@ -164,6 +169,13 @@ class Watcher:
             registered=registered,
             elapsed_s=self._clock() - begin,
         )
+
+    def _begin(self, stamp_ns: int) -> None:
+        """Take the prior, if there is one without a stamp, for one of the first scan."""
+        prior = self._index.prior
+        if prior is not None and prior.stamp_ns is None:
+            self._index = self._index.within(replace(prior, stamp_ns=stamp_ns))
+            self._relocalizer = Relocalizer(self._index, _MOMENTS)
 
     def _state(self, found: _Place | None, gives_up: bool) -> State:
         if self._place is None:

@@ -57,6 +57,16 @@ class KnownPose:
         if self.check is not None and not all(map(math.isfinite, self.check)):
             raise ConfigError("--check: expected x and y in metres and the heading in degrees")
 
+    def region(self) -> Prior | None:
+        """The region of `--near`; None if nothing is said about it. Raises ConfigError."""
+        from signature.relocalization.prior import Prior
+
+        self.validate(is_map=False)
+        if self.near is None:
+            return None
+        x_m, y_m, radius_m = self.near
+        return Prior.around(x_m, y_m, radius_m, session=self.session)
+
     def prior(self, log: Log, span: TimeSpan) -> Prior | None:
         """The region that the pose is in; None if nothing is said about it.
 
@@ -65,11 +75,8 @@ class KnownPose:
         from pc2grid_cli.nav2_pose import read_pose
         from signature.relocalization.prior import Prior
 
-        if self.near is not None:
-            x_m, y_m, radius_m = self.near
-            return Prior.around(x_m, y_m, radius_m, session=self.session)
         if self.near_pose is None:
-            return None
+            return self.region()
         is_topic = self.near_pose.startswith("/") and not Path(self.near_pose).exists()
         pose = log.map_pose(self.near_pose, end_s(span)) if is_topic else read_pose(Path(self.near_pose))
         if pose.covariance is None:

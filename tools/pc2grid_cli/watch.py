@@ -17,6 +17,7 @@ from pc2grid.display import probability
 from pc2grid.errors import ConfigError, one_line
 from pc2grid_cli import console
 from pc2grid_cli import options as options
+from pc2grid_cli.known_pose import KnownPose
 
 if TYPE_CHECKING:
     from pc2grid.geometry import SE2
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.database.protocol import SessionInfo
+    from signature.relocalization.prior import Prior
     from signature.relocalization.watcher import Look, ResetPolicy
 
 
@@ -53,6 +55,17 @@ def watch_command(
         str | None, typer.Option("--building", metavar="NAME", help="look only in sessions labelled so")
     ] = None,
     floor: Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, of a floor")] = None,
+    near: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            "--near",
+            metavar="X Y RADIUS",
+            help="at the beginning, it is within RADIUS metres of X, Y of the map",
+        ),
+    ] = None,
+    session: Annotated[
+        str | None, typer.Option("--session", metavar="NAME", help="whose map frame --near is in, if several")
+    ] = None,
     keep: Annotated[
         bool, typer.Option("--keep", help="go on when it is located, and say when it is somewhere else")
     ] = False,
@@ -92,6 +105,7 @@ def watch_command(
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
     )
+    prior = KnownPose(near=near, session=session).region()
     terminal = console.of(context)
     end_s = math.inf if timeout is None else time.monotonic() + timeout
     with open_database(database) as opened, open_live(source, settings.read, last_s=last) as live:
@@ -101,7 +115,9 @@ def watch_command(
             console.warn(f"{opened.location}: damaged and left out: {problem.where}: {problem.what}")
         with _Robot.of(live, opened, publish, publish_map, map_frame) as robot:
             forever = keep or publish is Publish.tf
-            located = _watch(live, opened, settings, robot, end_s, forever, as_json=json, terminal=terminal)
+            located = _watch(
+                live, opened, settings, robot, prior, end_s, forever, as_json=json, terminal=terminal
+            )
         _summarize(live, terminal)
     if not located:
         raise typer.Exit(console.UNSURE)
@@ -112,6 +128,7 @@ def _watch(
     database: SubmapDatabase,
     settings: Config,
     robot: _Robot,
+    prior: Prior | None,
     end_s: float,
     forever: bool,
     *,
@@ -121,7 +138,7 @@ def _watch(
     """Follow the robot until it is located, or until nothing comes any more or `end_s`; whether it is
     located.
 
-    forever : go on when it is located.
+    prior : where the robot is at the beginning, as far as it is known. forever : go on when it is located.
     """
     from pc2grid.pipeline import follow
     from signature.relocalization.looking import Looking
@@ -131,7 +148,8 @@ def _watch(
     made_with = database.config()
     own = {name: getattr(settings, name) for name in ("read", "relocalize", "registration")}
     config = made_with.model_copy(update=own)
-    watcher = Watcher(MapIndex.of(database, config))
+    index = MapIndex.of(database, config)
+    watcher = Watcher(index if prior is None else index.within(prior))
     located = over = False
     with Looking(watcher, beside=live.feed.realtime, step_m=config.relocalize.step_m) as looking:
 

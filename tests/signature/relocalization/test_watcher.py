@@ -11,6 +11,8 @@ import numpy as np
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
+from signature.config import Config, RelocalizeConfig
+from signature.relocalization.prior import Prior
 from signature.relocalization.watcher import Look, ResetPolicy, Watcher, WatchParameters
 from tests.helpers.simulated_drives import building, drive, office, plan
 
@@ -143,6 +145,26 @@ def test_the_same_place_in_another_session_is_the_same_place() -> None:
     sessions = {look.session for look, _ in looks if look.state == "located"}
     assert len(sessions) == 1
     assert "doubtful" not in {look.state for look, _ in looks}
+
+
+def test_a_prior_is_about_the_beginning_and_is_forgotten_when_the_search_begins_again() -> None:
+    """Two equal rooms: known to be in the left one at first, later carried to the right one."""
+    bent = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]
+    twins = plan(12, 6, [(6, 0, 6, 6), *bent, *[(x0 + 6, y0, x1 + 6, y1) for x0, y0, x1, y1 in bent]])
+    # The rooms are not quite equal: their outer walls are cut off at the edge of the plan.
+    index = building({"twins": twins}, Config(relocalize=RelocalizeConfig(accept=0.95)))
+    steps = list(stretch([(1.0, 1.0), (5.0, 1.0)], grid=twins))
+    for where, index_of in (("unknown", index), ("left", index.within(Prior.around(1.0, 1.0, 1.0)))):
+        watcher = Watcher(index_of)
+        looks = looks_of(watcher, steps)
+        states = {look.state for look, _ in looks}
+        if where == "unknown":
+            assert states == {"searching"}
+            continue
+        assert "located" in states  # although it has left the disc in which it began
+        check_poses(looks)
+        watcher.restart()
+        assert {look.state for look, _ in looks_of(watcher, steps)} == {"lost"}
 
 
 def test_resets_are_paused_and_bounded() -> None:
