@@ -35,7 +35,7 @@ def room(height_m: float) -> F64:
 def twin_map() -> PointMap:
     """The points of both rooms."""
     low, high = map(room, HEIGHTS_M)
-    return PointMap.of(np.concatenate((low, high + (APART_M, 0.0, 0.0))), 0.05)
+    return PointMap.of(np.concatenate((low, high + np.array((APART_M, 0.0, 0.0)))), 0.05)
 
 
 def drive(height_m: float) -> list[tuple[RegisteredScan, F64]]:
