@@ -44,8 +44,8 @@ METHOD_NAMES = (
 )
 """In the order of Table III."""
 
-EXTRA_METHOD_NAMES = ("point_contexts", "shape_rings", "verified")
-"""Beyond the paper: two other readings of the shape context, and its own method with alignment."""
+EXTRA_METHOD_NAMES = ("point_contexts", "shape_rings", "opencv_shape_context", "verified")
+"""Beyond the paper: three other readings of the shape context, and its own method with alignment."""
 
 
 def make_methods(names: Iterable[str]) -> dict[str, Method]:
@@ -72,6 +72,10 @@ def _make(name: str, vocabularies: dict[str, Vocabulary]) -> Method:
         from signature.baselines.point_contexts import PointContexts
 
         return PointContexts()
+    if name == "opencv_shape_context":
+        from signature.baselines.opencv_shape_context import OpenCvShapeContext
+
+        return OpenCvShapeContext()
     if name == "verified":
         from signature.baselines.verified import Verified
 

@@ -40,6 +40,7 @@ TOGETHER = (
     ("shape_context",),
     ("shape_rings",),
     ("point_contexts",),
+    ("opencv_shape_context",),
     ("verified",),
 )
 """Methods that share their features and therefore run together."""

@@ -19,7 +19,14 @@ if TYPE_CHECKING:
     from pc2grid_cli.console import Console
     from signature.evaluation.paper_task import PaperCell, PaperTask
 
-_COSTS = {"proposed": 1.0, "shape_context": 1.0, "sdf": 14.0, "sift_bow": 8.0, "surf_bow": 14.0}
+_COSTS = {
+    "proposed": 1.0,
+    "shape_context": 1.0,
+    "sdf": 14.0,
+    "sift_bow": 8.0,
+    "surf_bow": 14.0,
+    "opencv_shape_context": 150.0,
+}
 
 
 def compare_paper_command(
@@ -40,7 +47,8 @@ def compare_paper_command(
     methods: Annotated[
         list[str] | None,
         typer.Option(
-            "--methods", help="Only these, repeatable. Extras: point_contexts, shape_rings, verified."
+            "--methods",
+            help="Only these. Extras: point_contexts, shape_rings, opencv_shape_context, verified.",
         ),
     ] = None,
     offset: Annotated[

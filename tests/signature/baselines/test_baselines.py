@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 
+from pc2grid.errors import ConfigError
 from pc2grid.model import Submap
 from signature.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES, Matcher, Method, make_methods
+from signature.baselines.opencv_shape_context import OpenCvShapeContext
 from signature.baselines.point_contexts import PointContexts, _mean_best_costs
 from signature.baselines.sdf import (
     DistanceFeatures,
@@ -23,7 +26,28 @@ from signature.baselines.words import Words, sift, submap_image, surf
 from signature.evaluation.paper_experiment import rotated_submap
 from tests.helpers.rooms import cross, degenerate, disc, l_shape, polygon, random_rooms, rectangle, submap_of
 
-ALL = METHOD_NAMES + EXTRA_METHOD_NAMES
+HAS_OPENCV_SHAPES = hasattr(cv2, "createShapeContextDistanceExtractor")
+ALL = tuple(
+    name for name in METHOD_NAMES + EXTRA_METHOD_NAMES if HAS_OPENCV_SHAPES or name != "opencv_shape_context"
+)
+
+
+@pytest.mark.skipif(HAS_OPENCV_SHAPES, reason="this OpenCV has the module shape")
+def test_a_missing_module_of_opencv_is_named() -> None:
+    with pytest.raises(ConfigError, match="no Shape Context") as caught:
+        make_methods(["opencv_shape_context"])["opencv_shape_context"].fit(rooms())
+    assert caught.value.hint is not None and "opencv-contrib" in caught.value.hint
+
+
+@pytest.mark.parametrize("turned_rad", [0.0, 0.7])
+def test_opencv_gets_the_same_shape_turned(turned_rad: float) -> None:
+    """Without OpenCV's module: what is handed to it are boundary points, as (column, row)."""
+    submap = rooms()[0]
+    turned = rotated_submap(submap.grid, submap.center_m, 8.0, turned_rad)
+    points = OpenCvShapeContext().sample(turned)
+    assert points.shape[1:] == (1, 2) and 3 <= len(points) <= 100 and points.dtype == np.float32
+    column, row = points[:, 0].T.astype(int)
+    assert turned.grid.occupied[row, column].all()
 
 
 def rooms() -> list[Submap]:
