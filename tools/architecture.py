@@ -23,7 +23,7 @@ ABOUT = {
     "signature": "submaps to signatures, database, relocalization",
     "pc2grid": "recordings to clouds, trajectories, maps, submaps",
 }
-PAPER = ("boundary", "freespace", "symmetry", "describe", "similarity", "_kernels")
+PAPER = ("boundary", "freespace", "symmetry", "describe", "similarity", "seen", "seen_likelihood", "_kernels")
 """Files of `signature` that share the box "the paper"."""
 STAGES = ("pipeline",)
 """Files of `pc2grid` beside the folders that have a box of their own; the others share the box "types"."""
