@@ -76,6 +76,14 @@ class Search:
         answer = _answer(self.index, query, verdict, tuple(self._history), dict(self._clock.total_ms))
         return self._with_prior(answer, query, look_outside)
 
+    def ask(self, query: QueryMap, last_metres: Iterable[QueryMap] = ()) -> Moment:
+        """What `answer` would say now, which may be more than `look` says, because it searches whole maps and
+        shorter queries, too. The search goes on as if it had not been asked."""
+        before = self._hypotheses, self._part
+        moment = self.answer(query, last_metres).history[-1]
+        self._hypotheses, self._part = before
+        return moment
+
     def _with_prior(self, answer: Answer, query: QueryMap, look_outside: bool) -> Answer:
         """The answer with what became of the prior. Where nothing that it allows is certain, all places are
         asked: a query that certainly is elsewhere is not in the region."""
@@ -292,6 +300,7 @@ def localize(
     *,
     after: Collection[int] | None = None,
     watch: Watch | None = None,
+    ask: bool = False,
 ) -> Iterator[Asked]:
     """Ask where a registered recording was made, in each of several indexes separately.
 
@@ -299,6 +308,8 @@ def localize(
     indexes : at least one, of databases made with the same settings; of priors for a time, that of the first.
     after : numbers of scans after which the answers are wanted; by default after the last scan.
     watch : called after each scan, with the state of the answer in the first index.
+    ask : that state is what the answer would be then (`Search.ask`), which takes longer than the looks of
+        `Answer.history`.
 
     Raises NoScans if an answer is due and no scan could be used.
     """
@@ -323,6 +334,8 @@ def localize(
         if query.add(registered, planar_scan):
             seen = query.map()
             moments = [search.look(seen) for search in searches]
+            if ask and watch is not None:
+                moments[0] = searches[0].ask(seen, query.last_metres())
             query.resume()
         if watch is not None:
             watch(registered, moments[0] if moments else None)
@@ -339,12 +352,14 @@ def relocalize(
     watch: Watch | None = None,
     *,
     prior: Prior | None = None,
+    ask: bool = False,
 ) -> Answer:
     """Find where a registered recording was made.
 
     query : scans with their planar scans, from `pc2grid.pipeline.follow`, in any frame of their own.
     watch : called with each scan, and with the state of the answer if the database was asked after it.
     prior : what is known of the pose beforehand; other places are no answers.
+    ask : see `localize`.
 
     Where the database keeps points (`convert --points`) and the query is of a lidar or depth camera, the pose
     is refined and checked in space (`Answer.in_space`).
@@ -362,7 +377,7 @@ def relocalize(
     if prior is not None:
         index = index.within(prior)
     if not any(info.provenance.config.projection.points_voxel_m for info in database.sessions()):
-        (asked,) = localize(query, [index], watch=watch)
+        (asked,) = localize(query, [index], watch=watch, ask=ask)
         return asked.answers[0]
     from signature.relocalization.in_space import QueryInSpace, settle_in_space
 
@@ -373,7 +388,7 @@ def relocalize(
         if watch is not None:
             watch(registered, moment)
 
-    (asked,) = localize(query, [index], watch=see)
+    (asked,) = localize(query, [index], watch=see, ask=ask)
     begin = time.perf_counter()
     answer = settle_in_space(asked.answers[0], in_space, database.points, config.relocalize.accept)
     elapsed_ms = 1000.0 * (time.perf_counter() - begin)

@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pc2grid_cli import console
 from pc2grid_cli.options import OUTPUT_FOLDER, Force
 from pc2grid_cli.output_files import make_folder
+
+if TYPE_CHECKING:
+    from pc2grid.model import RegisteredScan
+    from signature.relocalization.answer import Moment
 
 BUILDING_SEED = 3
 MAP_LENGTH_M = 60.0
@@ -76,7 +80,13 @@ def demo_command(
     terminal.note("3/4 relocalize the depth camera's recording in it")
     truth_map, truth_query = read_tum(lidar.with_suffix(".tum")), read_tum(depth.with_suffix(".tum"))
     with open_database(database) as opened, open_log(depth, config.read) as query:
-        answer, poses = locate(query, opened, config, observer=terminal.observer())
+        asked: list[Moment] = []
+
+        def watch(_: RegisteredScan, moment: Moment | None) -> None:
+            if moment is not None:
+                asked.append(moment)
+
+        answer, poses = locate(query, opened, config, observer=terminal.observer(), watch=watch, ask=True)
         # The frame of the database is the first pose of the lidar robot; the truth is in that of the plan.
         T_map_plan = next(truth_map.poses()).inverse()
         true_poses = [T_map_plan @ pose for pose in truth_query.poses()]
@@ -86,7 +96,7 @@ def demo_command(
         truth_m = np.array([(p.x, p.y) for p in true_poses])
         draw_answer(picture, opened, answer, poses, truth_m)
         about = about_log(depth, query, answer, scans=len(poses))
-        found = Found(answer=answer, poses=poses, about=about)
+        found = Found(answer=answer, poses=poses, about=about, asked=tuple(asked))
         write_report(page, opened, found=found, accept=config.relocalize.accept, truth_m=truth_m)
     print(f"map: {len(session.trajectory)} lidar scans, {len(session.submaps)} submaps: {database}")
     print(as_text(answer))

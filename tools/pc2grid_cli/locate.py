@@ -28,6 +28,7 @@ class Found:
     poses : the query in its own frame; empty for a map. drawn : the query if it is a map.
     about : the description of the query in the JSON document.
     report : what was read of a recording, and what was lost; None for a map.
+    asked : what the answer would have been after every metre or so; empty if this was not wanted.
     """
 
     answer: Answer
@@ -35,6 +36,7 @@ class Found:
     about: Query
     drawn: OccupancyGrid | None = None
     report: ReadReport | None = None
+    asked: tuple[Moment, ...] = ()
 
 
 def find_log(
@@ -47,17 +49,30 @@ def find_log(
     observer: Observer = Observer(),
     watch: Watch | None = None,
     known: KnownPose = KnownPose(),
+    ask: bool = False,
 ) -> Found:
-    """Locate a recording, or the part of it that `span` names."""
+    """Locate a recording, or the part of it that `span` names.
+
+    ask : find out, too, what the answer would have been on the way (`Found.asked`, and what `watch` gets).
+    """
     from pc2grid.io import open_log
+
+    asked: list[Moment] = []
+
+    def see(registered: RegisteredScan, moment: Moment | None) -> None:
+        if ask and moment is not None:
+            asked.append(moment)
+        if watch is not None:
+            watch(registered, moment)
 
     with open_log(path, config.read, recover=recover) as query:
         prior = known.prior(query, span)
         answer, poses = locate(
-            query, database, config, span=span, observer=observer, watch=watch, prior=prior
+            query, database, config, span=span, observer=observer, watch=see, prior=prior, ask=ask
         )
         about = about_log(path, query, answer, scans=len(poses))
-        return Found(answer=answer, poses=poses, about=about, report=query.report())
+        report = query.report()
+        return Found(answer=answer, poses=poses, about=about, report=report, asked=tuple(asked))
 
 
 def about_log(path: Path, query: Log, answer: Answer, *, scans: int) -> Query:
@@ -107,11 +122,12 @@ def locate(
     observer: Observer = Observer(),
     watch: Watch | None = None,
     prior: Prior | None = None,
+    ask: bool = False,
 ) -> tuple[Answer, Trajectory]:
     """The answer for a recording, and its poses in its own odometry frame.
 
     watch : called with each scan, and with the state of the answer if the database was asked after it.
-    prior : what is known of the pose beforehand.
+    prior : what is known of the pose beforehand. ask : see `signature.relocalization.relocalizer.localize`.
 
     config : see `query_config`.
     """
@@ -135,7 +151,7 @@ def locate(
                 watch(registered, moment)
 
         scans = follow(query.scans(span.start_s, span.duration_s), config)
-        answer = relocalize(scans, database, config, watch=see, prior=prior)
+        answer = relocalize(scans, database, config, watch=see, prior=prior, ask=ask)
     poses = Trajectory(
         stamps_ns=np.array([s.scan.stamp_ns for s in seen], np.int64),
         T_session_base=np.array([s.T_session_base for s in seen]).reshape(-1, 4, 4),

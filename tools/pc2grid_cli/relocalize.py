@@ -186,6 +186,8 @@ def relocalize_command(
             rerun=rerun,
             terminal=console.of(context),
             known=known,
+            # Only these show it, and it takes time.
+            ask=report is not None or rerun is not None,
         )
         # Printed first: a file that cannot be written must not cost the answer.
         _print(found, where, left_out, as_json=json)
@@ -241,8 +243,12 @@ def _find(
     rerun: str | None,
     terminal: console.Console,
     known: KnownPose,
+    ask: bool,
 ) -> tuple[Found, Trajectory | None]:
-    """The answer, and the query's poses in the map; both are streamed to `rerun` meanwhile."""
+    """The answer, and the query's poses in the map; both are streamed to `rerun` meanwhile.
+
+    ask : find out, too, what the answer would have been on the way.
+    """
     from pc2grid.mapping.drawn_map import is_drawn_map
 
     if is_drawn_map(log):
@@ -263,6 +269,7 @@ def _find(
             observer=terminal.observer(),
             watch=None if shown is None else shown.watch,
             known=known,
+            ask=ask,
         )
         located = in_map(found.poses, found.answer)
         if shown is not None:

@@ -224,7 +224,11 @@ def _answer(found: Found, database: SubmapDatabase, accept: float, truth_m: F64 
             }
             for shown, h, points in zip(document["hypotheses"], answer.hypotheses, compared, strict=True)
         ],
-        "history": document["history"],
+        "history": [
+            {"path_m": m.path_m, "status": m.status, "confidence": m.confidence}
+            for m in (*(found.asked or answer.history[:-1]), answer.history[-1])
+        ],
+        "asked": bool(found.asked),
         "path": runs(found.poses),
         "truth": [] if truth_m is None else _short(np.ravel(truth_m), 2),
     }

@@ -18,11 +18,11 @@ from pc2grid.geometry import SE2
 from pc2grid.model import FREE, Health, OccupancyGrid, RegisteredScan
 from signature.config import Config
 from signature.database import Label
-from signature.relocalization.answer import Verdict
+from signature.relocalization.answer import Moment, Verdict
 from signature.relocalization.confidence import NO_EVIDENCE
 from signature.relocalization.hypotheses import Hypothesis
 from signature.relocalization.query_map import QueryMap, QueryWindow
-from signature.relocalization.relocalizer import Answer, MapIndex, Relocalizer, Search
+from signature.relocalization.relocalizer import Answer, MapIndex, Relocalizer, Search, localize
 from signature.verification.two_way_score import Fit
 from tests.helpers.simulated_drives import building, drive, office, plan
 
@@ -57,6 +57,27 @@ def test_certainty_grows_with_travel_and_history_tells_it() -> None:
     travelled = [m.path_m for m in answer.history]
     assert travelled == sorted(travelled) and len(travelled) >= 8
     assert answer.history[-1].confidence >= answer.history[0].confidence
+
+
+def test_asking_on_the_way_says_what_the_answer_would_be_and_changes_nothing() -> None:
+    scans = list(drive(office(), ROUTE, field_rad=math.radians(90)))
+    asked: list[Moment] = []
+
+    def watch(_: RegisteredScan, moment: Moment | None) -> None:
+        asked.extend([] if moment is None else [moment])
+
+    registered = [(scan, planar_scan) for scan, planar_scan, _ in scans]
+    (quiet,) = localize(registered, [OFFICE])
+    (told,) = localize(registered, [OFFICE], watch=watch, ask=True)
+    assert told.answers[0].to_json()["history"] == quiet.answers[0].to_json()["history"]
+    assert told.answers[0].confidence == quiet.answers[0].confidence
+    assert len(asked) == len(quiet.answers[0].history) - 1
+    for moment in asked[::3]:
+        before = [pair for pair in registered if pair[0].scan.stamp_ns <= moment.stamp_ns]
+        (there,) = localize(before, [OFFICE])
+        answer = there.answers[0]
+        assert (moment.status, moment.confidence) == (answer.status, answer.confidence)
+        assert moment.path_m == answer.path_m
 
 
 def test_another_building_is_not_found() -> None:
