@@ -129,32 +129,29 @@ def _seconds(text: str) -> tuple[float, float]:
 
 
 def _print(trials: list[Trial], counts: QueryCounts, unknown: int) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from pc2grid_cli.tables import show, table
 
-    table = Table(title="later parts of the recording in the map of the earlier one")
-    for heading in ("from", "driven", "covered", "answer", "confidence", "off by"):
-        table.add_column(heading, justify="left" if heading == "answer" else "right")
+    title = "later parts of the recording in the map of the earlier one"
+    found = table(title, ["from", "answer"], ["driven", "covered", "confidence", "off by"])
     for trial in trials:
-        table.add_row(
+        found.add_row(
             f"{trial.seed} s",
+            trial.status.replace("_", " "),
             f"{trial.travel_m:.1f} m",
             f"{trial.mapped:.2f}",
-            trial.status,
             probability(trial.confidence),
             "" if trial.error_m is None or trial.status != "located" else f"{trial.error_m:.2f} m",
         )
-    out = Console()
-    out.print(table)
     share = f", {counts.right / counts.inside:.2f}" if counts.inside else ""
-    out.print(
+    show(
+        found,
         f"where the map covers what the query saw: {counts.right} of {counts.inside} located and right"
-        f"{share}, {counts.wrong} wrong, {counts.unsure} without an answer"
+        f"{share}, {counts.wrong} wrong, {counts.unsure} without an answer",
     )
     if counts.outside:
-        out.print(
+        show(
             f"elsewhere: {counts.refused} of {counts.outside} without an answer, as it should be,"
             f" {counts.wrong_outside} wrong"
         )
     if unknown:
-        out.print(f"{unknown} queries could not be judged: the truth has no pose of them")
+        show(f"{unknown} queries could not be judged: the truth has no pose of them")

@@ -17,6 +17,8 @@ from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from signature.evaluation.map_quality import MappingRun
 
 Row = dict[str, Any]
@@ -48,6 +50,7 @@ def compare_maps_command(
     """
     from pc2grid.errors import ConfigError
     from pc2grid_cli.console import of, print_json
+    from pc2grid_cli.tables import show
 
     logs, truths = log or [], truth or []
     tasks = _simulated_tasks(plans or [], sensors, length, seeds, not no_odometry)
@@ -71,12 +74,26 @@ def compare_maps_command(
     if as_json:
         print_json({"schema_version": 1, "rows": rows})
         return
-    for title, columns, chosen in (
-        ("Simulated", _SIMULATED, [r for r in rows if "plan" in r]),
-        ("Recorded", _RECORDED, [r for r in rows if "log" in r]),
-    ):
-        if chosen:
-            print("\n".join((f"\n{title}\n", *_table(columns, chosen))))
+    simulated, recorded = [r for r in rows if "plan" in r], [r for r in rows if "log" in r]
+    if simulated:
+        show(
+            _table(
+                "simulated: trajectories against the truth, beside bare KISS-ICP",
+                _PLAN,
+                [*_SIMULATED, *_HEALTH],
+                simulated,
+            ),
+            _table("simulated: cells of the maps against the truth, %", _PLAN, _CELLS, simulated),
+        )
+    if recorded:
+        show(
+            _table(
+                "recorded: trajectories against the truth, beside bare KISS-ICP",
+                _LOG,
+                [*_RECORDED, *_HEALTH],
+                recorded,
+            )
+        )
 
 
 def _simulated_tasks(
@@ -226,42 +243,48 @@ def _fits(row: Row) -> str:
     return f"{fit['relations_m']:.4f} / {fit['trajectory_m']:.4f} (ours better in {fit['better']:.0%})"
 
 
-_COMMON: list[tuple[str, Callable[[Row], str]]] = [
+Columns = list[tuple[str, Callable[[Row], str]]]
+"""Headings, and what stands below them."""
+
+_HEALTH: Columns = [
     ("lost, %", lambda r: _percent(r["lost"])),
     ("degenerate, %", lambda r: _percent(r["degenerate"])),
     ("loops", lambda r: str(r["loops"])),
-    ("time / KISS-ICP's", lambda r: f"{r['map_ms'] / r['bare_ms']:.2f}"),
+    ("time / bare", lambda r: f"{r['map_ms'] / r['bare_ms']:.2f}"),
 ]
-_SIMULATED: list[tuple[str, Callable[[Row], str]]] = [
+_PLAN: Columns = [
     ("plan", lambda r: Path(r["plan"]).stem),
     ("sensor", lambda r: r["sensor"]),
     ("seed", lambda r: str(r["seed"])),
     ("odometry", lambda r: "yes" if r["odometry"] else "no"),
+]
+_SIMULATED: Columns = [
     ("ATE, m", lambda r: _metres(r["ours"]["ate_m"])),
     ("RPE, m/m", lambda r: _metres(r["ours"]["rpe_m"])),
-    ("ATE of bare KISS-ICP", lambda r: _metres(r["bare"]["ate_m"])),
-    ("occupied right, %", lambda r: _percent(r["grid"]["occupied_right"])),
-    ("walls found, %", lambda r: _percent(r["grid"]["walls_found"])),
-    ("free wrong, %", lambda r: _percent(r["grid"]["free_wrong"])),
-    ("unseen free, %", lambda r: _percent(r["grid"]["unseen_free"])),
-    *_COMMON,
+    ("bare: ATE, m", lambda r: _metres(r["bare"]["ate_m"])),
 ]
-_RECORDED: list[tuple[str, Callable[[Row], str]]] = [
+_CELLS: Columns = [
+    ("occupied right", lambda r: _percent(r["grid"]["occupied_right"])),
+    ("walls found", lambda r: _percent(r["grid"]["walls_found"])),
+    ("free wrong", lambda r: _percent(r["grid"]["free_wrong"])),
+    ("unseen free", lambda r: _percent(r["grid"]["unseen_free"])),
+]
+_LOG: Columns = [
     ("log", lambda r: Path(r["log"]).stem),
     ("sensor", lambda r: r["sensor"]),
     ("truth", lambda r: Path(r["truth"]).name),
+]
+_RECORDED: Columns = [
     ("error", lambda r: _errors(r, "ours")),
-    ("error of bare KISS-ICP", lambda r: _errors(r, "bare")),
+    ("bare: error", lambda r: _errors(r, "bare")),
     ("scans fit: truth / ours, m", lambda r: _fits(r)),
-    *_COMMON,
 ]
 
 
-def _table(columns: list[tuple[str, Callable[[Row], str]]], rows: list[Row]) -> list[str]:
-    """Lines of a Markdown table, columns aligned."""
-    cells = [[name for name, _ in columns], *([show(row) for _, show in columns] for row in rows)]
-    widths = [max(len(line[k]) for line in cells) for k in range(len(columns))]
-    lines = [
-        "| " + " | ".join(t.ljust(w) for t, w in zip(line, widths, strict=True)) + " |" for line in cells
-    ]
-    return [lines[0], "|" + "|".join("-" * (w + 2) for w in widths) + "|", *lines[1:]]
+def _table(title: str, texts: Columns, numbers: Columns, rows: list[Row]) -> Table:
+    from pc2grid_cli.tables import table
+
+    made = table(title, [name for name, _ in texts], [name for name, _ in numbers])
+    for row in rows:
+        made.add_row(*(shown(row) for _, shown in (*texts, *numbers)))
+    return made

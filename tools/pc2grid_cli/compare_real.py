@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pc2grid_cli.options import OUTPUT_FOLDER
+from pc2grid_cli.output_files import make_folder
+
 if TYPE_CHECKING:
     from pc2grid.model import SensorKind, Trajectory
     from pc2grid.simulate import Building, SimulationConfig
@@ -92,7 +95,7 @@ def compare_real_command(
         Path | None,
         typer.Option("--truth", metavar="TUM", help="true poses of the laser [its own map of the whole log]"),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", help="folder for results; run again to go on")] = Path(
+    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="folder for results; run again to go on")] = Path(
         "real-sensors"
     ),
     queries: Annotated[int, typer.Option("--queries", min=1, help="drives of each sensor to locate")] = 10,
@@ -122,13 +125,13 @@ def compare_real_command(
     Lidar and depth camera are driven through the 3D scan; the laser log is real, of another day. How the
     two lie to each other is fitted to the answers, and each answer is judged by the others.
 
-    Example: pc2grid compare real fr079_floor.ply fr079.mcap --out real-sensors
+    Example: pc2grid compare real fr079_floor.ply fr079.mcap --output real-sensors
     """
-    from pc2grid.errors import LogNotFound, MapFileError, OutputError
+    from pc2grid.errors import LogNotFound, MapFileError
     from pc2grid.io import open_log
     from pc2grid.io.atomic import replace_file
     from pc2grid_cli.console import json_text, of, print_json
-    from pc2grid_cli.real_report import draw, table
+    from pc2grid_cli.real_report import draw, print_table
     from signature.config import Config
     from signature.evaluation.real_sensors import Agreement, judge_all, real_cells
 
@@ -150,11 +153,8 @@ def compare_real_command(
         rate_hz=rate,
         clutter=clutter,
     )
-    try:
-        for folder in ("maps", "sessions"):
-            (out / folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{out}: {error.strerror}", hint="choose another --out") from error
+    for folder in ("maps", "sessions"):
+        make_folder(out / folder)
     with open_log(log, Config().read) as opened:
         length_s = (opened.info.end_ns - opened.info.start_ns) * 1e-9
     starts_s = [round(k * every) for k in range(int(max(length_s - window, 0.0) // every) + 1)]
@@ -203,7 +203,7 @@ def compare_real_command(
     if as_json:
         print_json(document)
         return
-    table(cells, agreement)
+    print_table(cells, agreement)
     print("\n".join(str(out / name) for name in ("real.json", "real.png")))
 
 

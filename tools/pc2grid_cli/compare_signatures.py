@@ -82,7 +82,7 @@ def compare_signatures_command(
     """
     from pc2grid.io.atomic import replace_file
     from pc2grid_cli.console import json_text, of, print_json
-    from pc2grid_cli.signature_report import draw, table
+    from pc2grid_cli.signature_report import draw, print_table
     from signature.config import Config
     from signature.evaluation.ablation import seen_independence
     from signature.evaluation.selection import SELECTORS, queries_of, recall_at_scale, with_floors
@@ -144,7 +144,7 @@ def compare_signatures_command(
     if as_json:
         print_json(document)
     else:
-        table(document, SELECTORS)
+        print_table(document, SELECTORS)
         print(f"{out / 'signatures.png'}, {out / 'signatures.json'}")
 
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from rich.console import Console
+from pc2grid_cli.tables import show, table
 
+if TYPE_CHECKING:
     from signature.evaluation.ablation import Independence
     from signature.evaluation.metrics import MatrixCell
     from signature.evaluation.trial import Trial
@@ -16,37 +16,14 @@ if TYPE_CHECKING:
 _SENSORS = ("lidar", "laser", "depth")
 
 
-def wide_console() -> Console:
-    """A console as wide as the terminal; for a file, wide enough for all columns."""
-    from rich.console import Console
-
-    console = Console()
-    return console if console.is_terminal else Console(width=140)
-
-
 def tables(cells: Sequence[MatrixCell], elsewhere: Sequence[Trial]) -> None:
     """Print the share located and right by metres driven, and the other figures of each cell."""
-    from rich.table import Table
-
-    console = wide_console()
     distances = sorted({cell.travel_m for cell in cells})
-    shares = Table(title="located and right, by metres driven")
-    for heading in ("map", "query", *(f"{d:g} m" for d in distances), "n"):
-        shares.add_column(heading, justify="left" if heading in ("map", "query") else "right")
     last = distances[-1] if distances else 0.0
-    detail = Table(title=f"after {last:g} m")
-    for heading in (
-        "map",
-        "query",
-        "wrong",
-        "ambiguous",
-        "not found",
-        "recall 1/5/20",
-        "median",
-        "95 %",
-        "ms",
-    ):
-        detail.add_column(heading, justify="left" if heading in ("map", "query") else "right")
+    who = ("map", "query")
+    shares = table("located and right, by metres driven", who, (*(f"{d:g} m" for d in distances), "n"))
+    figures = ("wrong", "ambiguous", "not found", "recall 1/5/20", "median", "95 %", "ms")
+    detail = table(f"after {last:g} m", who, figures)
     for map_sensor, query_sensor in ((m, q) for m in _SENSORS for q in _SENSORS):
         row = {c.travel_m: c for c in cells if (c.map_sensor, c.query_sensor) == (map_sensor, query_sensor)}
         if not row:  # no query of this sensor drove where the map is
@@ -71,11 +48,10 @@ def tables(cells: Sequence[MatrixCell], elsewhere: Sequence[Trial]) -> None:
                 _metres(cell.p95_error_m),
                 f"{cell.look_up_ms:.0f}",
             )
-    console.print(shares)
-    console.print(detail)
+    show(shares, detail)
     if elsewhere:
         right = sum(t.status == "not_found" for t in elsewhere)
-        console.print(f"queries from another building: {right} of {len(elsewhere)} answered not_found")
+        show(f"queries from another building: {right} of {len(elsewhere)} answered not_found")
 
 
 def draw(path: Path, cells: Sequence[MatrixCell], reliability: Sequence[tuple[float, float, int]]) -> None:
@@ -130,16 +106,13 @@ def _recall(shares: Mapping[int, float | None]) -> str:
 
 def contribution_table(independent: Mapping[str, Independence], recalls: Recalls, travel_m: float) -> None:
     """Print what each signature contributes: AUC across sensors, and recall of places."""
-    from rich.table import Table
-
-    table = Table(title=f"what the signatures contribute; recall at 1/5/20 after {travel_m:g} m")
-    for heading in ("signatures", "AUC across sensors", *recalls):
-        table.add_column(heading, justify="left" if heading == "signatures" else "right")
+    title = f"what the signatures contribute; recall at 1/5/20 after {travel_m:g} m"
+    shown = table(title, ["signatures"], ["AUC across sensors", *recalls])
     for name in recalls["all"]:
         auc = f"{independent[name].auc:.3f}" if name in independent else ""
         shares = (_recall(row[name]) for row in recalls.values())
-        table.add_row(name, auc, *shares)
-    wide_console().print(table)
+        shown.add_row(name, auc, *shares)
+    show(shown)
 
 
 def draw_signatures(path: Path, independent: Mapping[str, Independence], recalls: Recalls) -> None:

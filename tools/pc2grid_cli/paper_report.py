@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
 from pc2grid.io.atomic import replace_file
+from pc2grid_cli.tables import show, table
 from signature.evaluation.paper_experiment import MatchMeasures, largest_right_share
 from signature.evaluation.paper_tables import MAPS, SUBMAPS, TABLE_3, TABLE_4, Measures
 from signature.evaluation.paper_task import ABLATION, OPEN_CHOICES, RADII_M, Choice, PaperCell, Reading
@@ -32,41 +31,40 @@ def published(result: PaperCell) -> Measures | None:
 
 def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
     """Tables I, III and IV on stdout: published, ours and the difference, in thousandths."""
-    console = Console(width=150, highlight=False)
     plain = [r for r in results if not r.overrides]
     columns = _columns(plain)
-    console.print(
+    show(
         "Of three numbers: paper, ours, difference, in thousandths; +-: half of the interval from 5 to 95 %,"
         " by bootstrap over the queries."
     )
-    _print_submaps(console, plain)
+    _print_submaps(plain)
     for offset_m in dict.fromkeys(r.offset_m for r in plain):
         here = [r for r in plain if r.offset_m == offset_m]
         where = f"queries within {offset_m:g} m of a submap centre"
         for measure in MatchMeasures._fields:
             title = "R@1" if measure == "r_at_1" else measure.upper()
-            table = _table(f"Table III, {title}, {where}", columns, "noise", "method")
+            shown = _table(f"Table III, {title}, {where}", columns, "noise", "method")
             for level in range(len(_LEVELS)):
                 for i, method in enumerate(methods):
                     row = [r for r in here if (r.method, r.level, r.radius_m) == (method, level, 8.0)]
-                    table.add_row(str(level) if i == 0 else "", method, *_cells(row, columns, measure))
-                table.add_section()
-            console.print(table)
-        table = _table(f"Table IV (proposed, noise level 1), {where}", columns, "radius", "measure")
+                    shown.add_row(str(level) if i == 0 else "", method, *_cells(row, columns, measure))
+                shown.add_section()
+            show(shown)
+        shown = _table(f"Table IV (proposed, noise level 1), {where}", columns, "radius", "measure")
         for radius_m in RADII_M:
             row = [r for r in here if (r.method, r.level, r.radius_m) == ("proposed", 1, radius_m)]
             for measure in Measures._fields:
-                table.add_row(
+                shown.add_row(
                     f"{radius_m:g} m" if measure == "auc" else "",
                     measure.upper(),
                     *_cells(row, columns, measure),
                 )
-        console.print(table)
+        show(shown)
         for line in verdicts(here):
-            console.print(line)
+            show(line)
         of_offset = [r for r in results if r.offset_m == offset_m]
-        _print_choices(console, of_offset, columns, "What each signature adds", ABLATION, where)
-        _print_choices(console, of_offset, columns, "What other choices move", OPEN_CHOICES, where)
+        _print_choices(of_offset, columns, "What each signature adds", ABLATION, where)
+        _print_choices(of_offset, columns, "What other choices move", OPEN_CHOICES, where)
 
 
 Column = tuple[str, Reading]
@@ -83,12 +81,8 @@ def _columns(results: Sequence[PaperCell]) -> list[Column]:
 
 def _table(title: str, columns: Sequence[Column], *heads: str) -> Table:
     """A table with a column for each map; killian* is killian at its true size."""
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    for head in heads:
-        table.add_column(head, no_wrap=True)
-    for name, reading in columns:
-        table.add_column(f"{name}*" if reading == "true" else name, no_wrap=True, justify="right")
-    return table
+    maps = [f"{name}*" if reading == "true" else name for name, reading in columns]
+    return table(title, heads, maps)
 
 
 def _cells(row: Sequence[PaperCell], columns: Sequence[Column], measure: str) -> list[str]:
@@ -109,23 +103,19 @@ def _cells(row: Sequence[PaperCell], columns: Sequence[Column], measure: str) ->
     return texts
 
 
-def _print_submaps(console: Console, results: Sequence[PaperCell]) -> None:
-    table = Table(title="Table I, number of submaps", title_justify="left", box=SIMPLE_HEAD)
-    for head in ("map", "paper", "ours", "difference"):
-        table.add_column(head, justify="right")
+def _print_submaps(results: Sequence[PaperCell]) -> None:
+    shown = table("Table I, number of submaps", ["map"], ["paper", "ours", "difference"])
     counts = {(r.map_name, r.reading): r.submaps for r in results if r.radius_m == 8.0}
     for name, reading in _columns(results):
         ours, paper = counts[name, reading], SUBMAPS.get(name)
         label = f"{name}*" if reading == "true" else name
         if paper is None:
-            table.add_row(label, "", str(ours), "")
+            shown.add_row(label, "", str(ours), "")
         else:
-            table.add_row(label, str(paper), str(ours), f"{100 * (ours / paper - 1):+.0f} %")
-    console.print(table)
+            shown.add_row(label, str(paper), str(ours), f"{100 * (ours / paper - 1):+.0f} %")
+    show(shown)
     if any(reading == "true" for _, reading in counts):
-        console.print(
-            "killian: its image as the paper reads it, 0.05 m a pixel; killian*: at its true 0.10 m a pixel"
-        )
+        show("killian: its image as the paper reads it, 0.05 m a pixel; killian*: at its true 0.10 m a pixel")
 
 
 def verdicts(results: Sequence[PaperCell]) -> list[str]:
@@ -169,7 +159,6 @@ def verdicts(results: Sequence[PaperCell]) -> list[str]:
 
 
 def _print_choices(
-    console: Console,
     results: Sequence[PaperCell],
     columns: Sequence[Column],
     title: str,
@@ -181,17 +170,14 @@ def _print_choices(
         return
     maps = [name for name, reading in columns if reading == "paper"]
     base = {(r.map_name, r.level): r.matches.measures() for r in results if _is_base(r)}
-    table = Table(
-        title=f"{title}: AUC x 1000, {where}", title_justify="left", box=SIMPLE_HEAD, pad_edge=False
-    )
-    for head in ("choice", "the paper says", "we do", "noise", *maps, "mean", "mean R@1"):
-        table.add_column(head, justify="right" if head in maps or head.startswith("mean") else "left")
+    heads = ("choice", "the paper says", "we do", "noise")
+    shown = table(f"{title}: AUC x 1000, {where}", heads, (*maps, "mean", "mean R@1"))
     for level in (0, 2):
         here = [base[name, level] for name in maps if (name, level) in base]
         if here:
             means = [float(np.mean(values)) for values in ([m.auc for m in here], [m.r_at_1 for m in here])]
             cells = [f"{1000 * value:.0f}" for value in [m.auc for m in here] + means]
-            table.add_row("all three", "", "Eq. 6", str(level), *cells)
+            shown.add_row("all three", "", "Eq. 6", str(level), *cells)
     for choice in choices:
         for level in (0, 2):
             moved = {
@@ -205,10 +191,10 @@ def _print_choices(
             right = [1000 * (moved[name].r_at_1 - base[name, level].r_at_1) for name in moved]
             shifts = [f"{auc[name]:+.0f}" if name in auc else "" for name in maps]
             words = (choice.name, choice.paper, choice.ours) if level == 0 else ("", "", "")
-            table.add_row(
+            shown.add_row(
                 *words, str(level), *shifts, f"{np.mean(list(auc.values())):+.0f}", f"{np.mean(right):+.0f}"
             )
-    console.print(table)
+    show(shown)
 
 
 def _is_base(result: PaperCell) -> bool:

@@ -17,20 +17,14 @@ _SIZES = {"lidar": 9.0, "depth": 5.5, "laser": 7.0}  # lidar and camera drive th
 _DRAWN_AT_MOST = 30_000  # wall points of a map; more would only make the picture heavier
 
 
-def table(cells: Sequence[RealCell], agreement: Agreement) -> None:
+def print_table(cells: Sequence[RealCell], agreement: Agreement) -> None:
     """Print a row for each pair of sensors."""
-    from rich.console import Console
-    from rich.table import Table
+    from pc2grid_cli.tables import show, table
 
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=170)
-    shown = Table(title="one real floor, maps by each sensor, queries by each")
-    for heading in ("map", "query", "queries", "located, right", "right first"):
-        shown.add_column(heading, justify="left" if heading in ("map", "query") else "right")
-    for heading in ("in the map", "share right", "wrong", "ambiguous", "not found", "median", "95 %"):
-        shown.add_column(heading, justify="right")
-    shown.add_column("wrong outside", justify="right")
+    title = "one real floor, maps by each sensor, queries by each"
+    counts = ("queries", "located, right", "right first", "in the map", "share right")
+    others = ("wrong", "ambiguous", "not found", "median", "95 %", "wrong outside")
+    shown = table(title, ("map", "query"), (*counts, *others))
     for cell in _in_order(cells):
         shown.add_row(
             cell.map_sensor,
@@ -47,10 +41,10 @@ def table(cells: Sequence[RealCell], agreement: Agreement) -> None:
             _metres(cell.p95_error_m),
             f"{cell.wrong_outside} of {cell.queries - cell.in_map}" if cell.queries > cell.in_map else "",
         )
-    console.print(shown)
-    console.print(
+    show(
+        shown,
         f"one rigid transform between scan and log agrees with the first place of {agreement.agreeing} of"
-        f" {len(agreement.clues)} answers across them"
+        f" {len(agreement.clues)} answers across them",
     )
 
 

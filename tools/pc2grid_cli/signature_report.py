@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from pc2grid_cli.matrix_report import wide_console
-
-if TYPE_CHECKING:
-    from rich.console import Console
+from pc2grid_cli.tables import show, table
 
 _SCOPES = ("building", "city")
 
@@ -25,28 +22,21 @@ def _cells(document: Mapping[str, Any]) -> dict[tuple[str, str, float], Mapping[
     return {(row["scope"], row["selector"], row["travel_m"]): row for row in document["rows"]}
 
 
-def table(document: Mapping[str, Any], selectors: Sequence[str]) -> None:
+def print_table(document: Mapping[str, Any], selectors: Sequence[str]) -> None:
     """Print, for building and city, how often the right place is selected and the query located rightly."""
-    from rich.table import Table
-
-    console, cells = wide_console(), _cells(document)
+    cells = _cells(document)
     travels_m = sorted({travel_m for _, _, travel_m in cells})
     for scope in _SCOPES:
         rows = [row for row in document["rows"] if row["scope"] == scope]
         if not rows:
             continue
         some = rows[0]
-        shown = Table(
-            title=f"{scope}: {some['places']} places, {some['queries']} queries of {some['sessions']} "
-            "sessions (below: 5 % to 95 %, by session); processor time without alignment"
+        title = (
+            f"{scope}: {some['places']} places, {some['queries']} queries of {some['sessions']} sessions"
+            " (below: 5 % to 95 %, by session); processor time without alignment"
         )
-        shown.add_column("selected by", no_wrap=True)
-        shown.add_column("places", justify="right")
-        for travel_m in travels_m:
-            shown.add_column(f"selected\n{travel_m:g} m", justify="right")
-        for travel_m in travels_m:
-            shown.add_column(f"right\n{travel_m:g} m", justify="right")
-        shown.add_column("ms", justify="right")
+        figures = [f"{what}\n{travel_m:g} m" for what in ("selected", "right") for travel_m in travels_m]
+        shown = table(title, ["selected by"], ["places", *figures, "ms"])
         for selector in selectors:
             row = [cells.get((scope, selector, travel_m)) for travel_m in travels_m]
             if not any(row):
@@ -59,11 +49,10 @@ def table(document: Mapping[str, Any], selectors: Sequence[str]) -> None:
                 *(_interval(cell["right"]) if cell else "" for cell in row),
                 f"{last['processor_ms']:.0f}" if last["right"] is not None else "",
             )
-        console.print(shown)
-    _scale_table(console, document["scale"])
-    one = Table(title="one place by two sensors against two places by one: area under the curve")
-    for heading in ("signatures", "AUC", "5 % to 95 %", "pairs"):
-        one.add_column(heading, justify="left" if heading == "signatures" else "right")
+        show(shown)
+    _print_scale(document["scale"])
+    title = "one place by two sensors against two places by one: area under the curve"
+    one = table(title, ["signatures"], ["AUC", "5 % to 95 %", "pairs"])
     for name, measured in document["independence"].items():
         one.add_row(
             name,
@@ -71,30 +60,27 @@ def table(document: Mapping[str, Any], selectors: Sequence[str]) -> None:
             f"{measured['low']:.3f}-{measured['high']:.3f}",
             f"{measured['same']:,} / {measured['other']:,}",
         )
-    console.print(one)
+    show(one)
 
 
-def _scale_table(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
+def _print_scale(rows: Sequence[Mapping[str, Any]]) -> None:
     """Print how often the right one of very many places is selected."""
-    from rich.table import Table
-
     if not rows:
         return
     cells = {(r["places"], r["share"], r["query_sensor"], r["travel_m"]): r for r in rows}
     travels_m = sorted({r["travel_m"] for r in rows})
-    shown = Table(title="right place selected among very many (below: 5 % to 95 %, by session)")
-    for heading in ("places", "selected", "query", *(f"{d:g} m" for d in travels_m), "ms"):
-        shown.add_column(heading, justify="left" if heading == "query" else "right")
+    title = "right place selected among very many (below: 5 % to 95 %, by session)"
+    shown = table(title, ["query"], ["places", "selected", *(f"{d:g} m" for d in travels_m), "ms"])
     for places, share, sensor in dict.fromkeys(key[:3] for key in cells):
         row = [cells.get((places, share, sensor, d)) for d in travels_m]
         shown.add_row(
+            sensor,
             f"{places:,}",
             f"{100 * share:g} %",
-            sensor,
             *(_interval(cell["found"]) if cell else "" for cell in row),
             f"{max(cell['processor_ms'] for cell in row if cell):.0f}",
         )
-    console.print(shown)
+    show(shown)
 
 
 def draw(path: Path, document: Mapping[str, Any], selectors: Sequence[str]) -> None:

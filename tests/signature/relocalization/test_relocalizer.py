@@ -215,6 +215,7 @@ class Judged:
 
     config, sessions, labels = Config().relocalize, ("a",), (Label(),)
     places = SimpleNamespace(table=SimpleNamespace(submap_id=[0]))
+    whole = None  # no prior
 
     def look_up(self, query: QueryMap, carried: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
         fit = Fit(
