@@ -24,6 +24,7 @@ def table(title: str, texts: Iterable[str], numbers: Iterable[str] = ()) -> Tabl
         title_style="bold",
         box=SIMPLE_HEAD,
         pad_edge=False,
+        collapse_padding=True,
         highlight=False,
     )
     for heading in texts:
