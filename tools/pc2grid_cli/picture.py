@@ -285,7 +285,9 @@ def _draw_robot(axes: Any, best: Hypothesis, answer: Answer, poses: Trajectory) 
         arrowprops={"arrowstyle": "-|>", "color": PURPLE, "lw": 2.5, "mutation_scale": 18},
         zorder=6,
     )
-    label = "robot at the last scan" if len(poses) else "frame of the query"
+    label = "robot at the last scan" if answer.status == "located" else "robot, if it were here"
+    if not len(poses):
+        label = "frame of the query"
     axes.plot(pose.x, pose.y, "o", color=PURPLE, mec="white", ms=9, zorder=7, label=label)
 
 
