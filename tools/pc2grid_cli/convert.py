@@ -18,6 +18,7 @@ from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
 from pc2grid_cli import options as options
 from pc2grid_cli.output_files import check_database, check_database_name
+from pc2grid_cli.plural import counted
 
 if TYPE_CHECKING:
     from pc2grid.model import SessionMap
@@ -422,8 +423,8 @@ def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
 
 def _as_text(d: Converted) -> str:
     travel = (
-        f"{d['scans']} {d['sensor']} scans, {d['path_m']:.1f} m in {d['duration_s']:.0f} s, "
+        f"{counted(d['scans'], d['sensor'] + ' scan')}, {d['path_m']:.1f} m in {d['duration_s']:.0f} s, "
         if d["scans"]
         else ""
     )
-    return f"{d['session']}: {travel}{d['area_m2']:.0f} m2 free, {d['submaps']} submaps"
+    return f"{d['session']}: {travel}{d['area_m2']:.0f} m2 free, {counted(d['submaps'], 'submap')}"

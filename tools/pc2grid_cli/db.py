@@ -27,8 +27,3 @@ def written(output: str, left_out: Sequence[Problem] = ()) -> DbWrite:
         "sessions": number,
         "left_out": [damage(problem) for problem in left_out],
     }
-
-
-def count(sessions: int) -> str:
-    """A number of sessions in words."""
-    return f"{sessions} session{'' if sessions == 1 else 's'}"

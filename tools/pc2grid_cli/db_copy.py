@@ -8,8 +8,9 @@ from typing import Annotated
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.db import count, written
+from pc2grid_cli.db import written
 from pc2grid_cli.options import AsJson, Database, Force, WrittenDatabase
+from pc2grid_cli.plural import counted
 
 
 def db_copy_command(
@@ -44,4 +45,4 @@ def _size(output: str) -> str:
     if path.is_file():
         return f"{path.stat().st_size / 1e6:.1f} MB"
     with open_database(output) as opened:
-        return count(len(opened.sessions()))
+        return counted(len(opened.sessions()), "session")

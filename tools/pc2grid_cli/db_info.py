@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from pc2grid.errors import one_line
 from pc2grid_cli import console
-from pc2grid_cli.db import count
 from pc2grid_cli.options import AsJson, Database
+from pc2grid_cli.plural import counted
 
 if TYPE_CHECKING:
     from pc2grid_cli.json_schemas import DbInfo, Session
@@ -50,10 +50,12 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
         document: DbInfo = {"schema_version": 1, "database": where, "sessions": documents}
         console.print_json(document)
         return
-    print(f"{where}: {count(len(sessions))}, {sum(s.submaps for s in sessions)} submaps")
+    print(
+        f"{where}: {counted(len(sessions), 'session')}, {counted(sum(s.submaps for s in sessions), 'submap')}"
+    )
     for s in sessions:
-        travel = f", {s.scans} scans, {s.path_m:.1f} m in {s.duration_s:.0f} s" if s.scans else ""
-        line = f"  {s.name} ({s.sensor}): {s.submaps} submaps, {s.area_m2:.0f} m2 free{travel}"
+        travel = f", {counted(s.scans, 'scan')}, {s.path_m:.1f} m in {s.duration_s:.0f} s" if s.scans else ""
+        line = f"  {s.name} ({s.sensor}): {counted(s.submaps, 'submap')}, {s.area_m2:.0f} m2 free{travel}"
         if s.consistency is not None and s.consistency.bent:
             line += f", bent: contradicts itself along {s.consistency.contradicted:.0%} of the travel"
         print(one_line(line))

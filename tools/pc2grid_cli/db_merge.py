@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.db import count as counted
 from pc2grid_cli.db import written
 from pc2grid_cli.options import DATABASE, AsJson, Force, WrittenDatabase
+from pc2grid_cli.plural import counted
 
 
 def db_merge_command(
@@ -28,4 +28,4 @@ def db_merge_command(
     if json:
         console.print_json(written(output))
     else:
-        print(f"{shown(output)}: {counted(count)}")
+        print(f"{shown(output)}: {counted(count, 'session')}")

@@ -7,8 +7,9 @@ from typing import Annotated
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.db import count, written
+from pc2grid_cli.db import written
 from pc2grid_cli.options import AsJson, Database
+from pc2grid_cli.plural import counted
 
 
 def db_remove_command(
@@ -27,4 +28,4 @@ def db_remove_command(
     if json:
         console.print_json(document)
     else:
-        print(f"{document['database']}: {count(document['sessions'])} left")
+        print(f"{document['database']}: {counted(document['sessions'], 'session')} left")

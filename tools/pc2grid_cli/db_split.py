@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.db import count as counted
 from pc2grid_cli.db import written
 from pc2grid_cli.options import AsJson, Database, Force, WrittenDatabase
+from pc2grid_cli.plural import counted
 
 
 def db_split_command(
@@ -29,4 +29,4 @@ def db_split_command(
     if json:
         console.print_json(written(output))
     else:
-        print(f"{shown(output)}: {counted(count)}")
+        print(f"{shown(output)}: {counted(count, 'session')}")

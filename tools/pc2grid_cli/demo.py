@@ -12,6 +12,7 @@ import typer
 from pc2grid_cli import console
 from pc2grid_cli.options import OUTPUT_FOLDER, Force
 from pc2grid_cli.output_files import make_folder
+from pc2grid_cli.plural import counted
 
 if TYPE_CHECKING:
     from pc2grid.model import RegisteredScan
@@ -98,7 +99,8 @@ def demo_command(
         about = about_log(depth, query, answer, scans=len(poses))
         found = Found(answer=answer, poses=poses, about=about, asked=tuple(asked))
         write_report(page, opened, found=found, accept=config.relocalize.accept, truth_m=truth_m)
-    print(f"map: {len(session.trajectory)} lidar scans, {len(session.submaps)} submaps: {database}")
+    scans, submaps = counted(len(session.trajectory), "lidar scan"), counted(len(session.submaps), "submap")
+    print(f"map: {scans}, {submaps}: {database}")
     print(as_text(answer))
     if answer.T_map_base is not None:
         pose, true = answer.T_map_base, true_poses[-1]

@@ -11,6 +11,7 @@ import numpy as np
 from pc2grid.display import probability
 from pc2grid.io.atomic import replace_file
 from pc2grid_cli.evidence import agreements
+from pc2grid_cli.plural import counted
 
 if TYPE_CHECKING:
     from pc2grid.arrays import F64, U8
@@ -235,7 +236,7 @@ def _draw_submaps(axes: Any, database: SubmapDatabase, session: str) -> None:
     index = [info.name for info in database.sessions()].index(session)
     table = database.signatures()
     centers = table.center_m[table.session_index == index]
-    label = f"{len(centers)} submap centre{'' if len(centers) == 1 else 's'}"
+    label = counted(len(centers), "submap centre")
     axes.plot(centers[:, 0], centers[:, 1], ".", color=GREEN, ms=4, label=label)
 
 
