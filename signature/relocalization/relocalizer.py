@@ -73,8 +73,11 @@ class Search:
         verdict = self._look_up(query, self.index.decide)
         if verdict.status != "located":
             query, verdict = self._by_last_metres(query, verdict, last_metres)
-        answer = _answer(self.index, query, verdict, tuple(self._history), dict(self._clock.total_ms))
-        return self._with_prior(answer, query, look_outside)
+        answer = self._answer(query, verdict)
+        return answer if self.index.whole is None else self._with_prior(answer, query, look_outside)
+
+    def _answer(self, query: QueryMap, verdict: Verdict) -> Answer:
+        return _answer(self.index, query, verdict, tuple(self._history), dict(self._clock.total_ms))
 
     def ask(self, query: QueryMap, last_metres: Iterable[QueryMap] = ()) -> Moment:
         """What `answer` would say now, which may be more than `look` says, because it searches whole maps and
@@ -85,18 +88,25 @@ class Search:
         return moment
 
     def _with_prior(self, answer: Answer, query: QueryMap, look_outside: bool) -> Answer:
-        """The answer with what became of the prior. Where nothing that it allows is certain, all places are
-        asked: a query that certainly is elsewhere is not in the region."""
+        """The answer with what became of the prior.
+
+        Where nothing that it allows is certain, all places are asked. What is certain without the prior is
+        not taken away by it, although a search of the whole region finds more rivals than signatures
+        propose; and a query that certainly is elsewhere is not in the region.
+        """
         index, whole = self.index, self.index.whole
-        if whole is None:
-            return answer
+        assert whole is not None
         if not index.prior_applies(query):
             return replace(answer, prior="lapsed")
         answer = replace(answer, prior="used")
         if answer.status == "located" or not look_outside:
             return answer
         verdict = whole.decide(query, whole.look_up(query))
-        if not verdict.hypotheses or index.allowed(verdict.hypotheses[:1], query):
+        if not verdict.hypotheses:
+            return answer
+        if index.allowed(verdict.hypotheses[:1], query):
+            if verdict.status == "located":
+                answer = replace(self._answer(query, verdict), prior="used")
             return answer
         excluded = _moment(whole, query, verdict)
         if excluded.status == "located":
