@@ -119,6 +119,7 @@ NOT_RUN = {
     "ros2": "needs ROS; test_example_nav2 has one that listens",
     "createdb": "needs a PostgreSQL server; test_postgres.py brings one",
     "pc2grid relocalize depth.mcap --rerun": "needs a display and the extra viz; see test_rerun.py",
+    "pc2grid view": "serves until Ctrl-C; see test_view.py",
     "pc2grid watch ws://": "needs a robot; test_watch.py has one",
     "pc2grid watch zenoh://": "needs a robot; test_watch.py has one",
     "pc2grid watch recordings/tuesday": "needs a recorder; test_recording_feed.py has one",

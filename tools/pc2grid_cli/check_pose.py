@@ -36,7 +36,7 @@ def check_log(
     """Check the pose at the end of a recording, or of the part of it that `span` names."""
     from pc2grid.io import open_log
     from pc2grid.pipeline import follow
-    from pc2grid_cli.locate import query_config
+    from signature.files import query_config
     from signature.relocalization.map_index import MapIndex
     from signature.relocalization.pose_check import check_pose
 

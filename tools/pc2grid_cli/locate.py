@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.relocalization.answer import Moment
+    from signature.relocalization.map_index import MapIndex
     from signature.relocalization.prior import Prior
     from signature.relocalization.relocalizer import Answer, Watch
 
@@ -50,10 +51,12 @@ def find_log(
     watch: Watch | None = None,
     known: KnownPose = KnownPose(),
     ask: bool = False,
+    index: MapIndex | None = None,
 ) -> Found:
     """Locate a recording, or the part of it that `span` names.
 
     ask : find out, too, what the answer would have been on the way (`Found.asked`, and what `watch` gets).
+    index : of the database, if it is prepared.
     """
     from pc2grid.io import open_log
 
@@ -68,7 +71,15 @@ def find_log(
     with open_log(path, config.read, recover=recover) as query:
         prior = known.prior(query, span)
         answer, poses = locate(
-            query, database, config, span=span, observer=observer, watch=see, prior=prior, ask=ask
+            query,
+            database,
+            config,
+            span=span,
+            observer=observer,
+            watch=see,
+            prior=prior,
+            ask=ask,
+            index=index,
         )
         about = about_log(path, query, answer, scans=len(poses))
         report = query.report()
@@ -123,11 +134,13 @@ def locate(
     watch: Watch | None = None,
     prior: Prior | None = None,
     ask: bool = False,
+    index: MapIndex | None = None,
 ) -> tuple[Answer, Trajectory]:
     """The answer for a recording, and its poses in its own odometry frame.
 
     watch : called with each scan, and with the state of the answer if the database was asked after it.
     prior : what is known of the pose beforehand. ask : see `signature.relocalization.relocalizer.localize`.
+    index : of the database, if it is prepared.
 
     config : see `query_config`.
     """
@@ -136,7 +149,7 @@ def locate(
     from pc2grid.model import Trajectory
     from pc2grid.pipeline import follow
     from signature.files import query_config
-    from signature.relocalization.relocalizer import relocalize
+    from signature.relocalization.relocalizer import MapIndex, localize
 
     config = query_config(database, config)
     seen: list[RegisteredScan] = []
@@ -151,20 +164,15 @@ def locate(
                 watch(registered, moment)
 
         scans = follow(query.scans(span.start_s, span.duration_s), config)
-        answer = relocalize(scans, database, config, watch=see, prior=prior, ask=ask)
+        index = index or MapIndex.of(database, config)
+        index = index if prior is None else index.within(prior)
+        (asked,) = localize(scans, [index], watch=see, ask=ask)
     poses = Trajectory(
         stamps_ns=np.array([s.scan.stamp_ns for s in seen], np.int64),
         T_session_base=np.array([s.T_session_base for s in seen]).reshape(-1, 4, 4),
         health=tuple(s.health for s in seen),
     )
-    return answer, poses
-
-
-def query_config(database: SubmapDatabase, config: Config) -> Config:
-    """The settings that made the database, with those sections of `config` that are about the query."""
-    return database.config().model_copy(
-        update={"read": config.read, "relocalize": config.relocalize, "registration": config.registration}
-    )
+    return asked.answers[0], poses
 
 
 def in_map(poses: Trajectory, answer: Answer) -> Trajectory | None:

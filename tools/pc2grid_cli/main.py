@@ -32,6 +32,7 @@ from pc2grid_cli.export import export_command
 from pc2grid_cli.info import info_command
 from pc2grid_cli.relocalize import relocalize_command
 from pc2grid_cli.simulate import simulate_command
+from pc2grid_cli.view import view_command
 from pc2grid_cli.watch import watch_command
 
 # Colours and boxes cost a tenth of a second at every --help; they are for terminals that want them.
@@ -81,6 +82,7 @@ app.command("convert", cls=Command)(convert_command)
 app.command("relocalize", cls=Command)(relocalize_command)
 app.command("watch", cls=Command)(watch_command)
 app.command("export", cls=Command)(export_command)
+app.command("view", cls=Command)(view_command)
 
 compare = typer.Typer(cls=Group, help="The paper's tables, sensors against sensors.", no_args_is_help=True)
 compare.command("paper", cls=Command)(compare_paper_command)

@@ -56,12 +56,24 @@ def write_report(
     found : an answer to show over the map. accept : the confidence it needed to be `located`.
     truth_m : (N, 2) the query's true path in the map frame, if known.
     """
-    page = files("pc2grid_cli").joinpath("report.html").read_text(encoding="utf-8")
+    html = page(database, found=found, accept=accept, truth_m=truth_m)
+    with replace_file(path) as temporary:
+        temporary.write_text(html, encoding="utf-8")
+
+
+def page(
+    database: SubmapDatabase,
+    *,
+    found: Found | None = None,
+    accept: float = 0.9,
+    truth_m: F64 | None = None,
+) -> str:
+    """The page as text; parameters as for `write_report`."""
+    template = files("pc2grid_cli").joinpath("report.html").read_text(encoding="utf-8")
     document = contents(database, found=found, accept=accept, truth_m=truth_m)
     # "<" is the only character that could end the script element.
     data = json.dumps(document, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    with replace_file(path) as temporary:
-        temporary.write_text(page.replace("/*DATA*/null", data, 1), encoding="utf-8")
+    return template.replace("/*DATA*/null", data, 1)
 
 
 def contents(

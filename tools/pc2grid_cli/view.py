@@ -1,0 +1,215 @@
+"""`pc2grid view`: a database in the browser, and recordings that are dropped there, located at once."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pc2grid.errors import OutputError
+from pc2grid.observer import Observer
+from pc2grid.time_span import TimeSpan
+from pc2grid_cli import console
+from pc2grid_cli import options as options
+from pc2grid_cli.known_pose import KnownPose
+from pc2grid_cli.view_events import Events, Progress
+from pc2grid_cli.view_server import Options, ViewServer
+
+if TYPE_CHECKING:
+    from signature.config import Config
+    from signature.database import SubmapDatabase
+    from signature.relocalization.map_index import MapIndex
+
+_MOST_GB = 4.0
+_SHARES_EVERY_S = 0.2
+_META = '<meta http-equiv="Content-Security-Policy"'
+
+
+def view_command(
+    context: typer.Context,
+    database: options.Database,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free")] = 0,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="only print the address")] = False,
+    most_gb: Annotated[float, typer.Option("--most-gb", min=0.0, help="largest recording, GB")] = _MOST_GB,
+    building: Annotated[
+        str | None, typer.Option("--building", metavar="NAME", help="look only in sessions labelled so")
+    ] = None,
+    floor: Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, of a floor")] = None,
+    topic: options.Topic = None,
+    odometry: options.OdometryTopic = None,
+    config: options.ConfigFile = None,
+    set_: options.Assignments = None,
+    assume_identity: options.AssumeIdentity = False,
+) -> None:
+    """Look into a database in the browser, and drop recordings there to see them located. Ctrl-C ends it.
+
+    The address is printed. Only this machine is served, and nothing leaves it.
+
+    Example: pc2grid view building.submaps
+    """
+    from signature.database import open_database
+
+    settings = options.make_config(
+        config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
+    )
+    terminal = console.of(context)
+    with (
+        open_database(database) as opened,
+        tempfile.TemporaryDirectory(prefix="pc2grid-view-") as folder,
+    ):
+        if building is not None or floor is not None:
+            opened.keep_only(building=building, floor=floor)
+        for damage in opened.leave_out_damaged():
+            console.warn(f"{opened.location}: damaged and left out: {damage.where}: {damage.what}")
+        locator = Locator(opened, settings)
+        try:
+            server = ViewServer(
+                port, locator.events, Path(folder), locator.work, most_bytes=round(most_gb * 1e9)
+            )
+        except OSError as error:
+            raise OutputError(
+                f"port {port}: {error.strerror}", hint="--port 0 takes any port that is free"
+            ) from error
+        locator.pages = server.pages
+        server.pages[""] = live_page(opened)
+        try:
+            print(server.url, flush=True)
+            terminal.note("drop a recording onto the page; Ctrl-C ends this")
+            if not no_browser:
+                _open_browser(server.url)
+            server.serve_forever(poll_interval=0.2)
+        finally:
+            server.stop()
+
+
+class Locator:
+    """Locates one recording after another in a database, and tells the pages how it goes."""
+
+    def __init__(self, database: SubmapDatabase, settings: Config) -> None:
+        self._database, self._settings = database, settings
+        self._index: MapIndex | None = None
+        self.events = Events()
+        self.pages: dict[str, bytes] = {}
+
+    def work(self, path: Path, options: Options, check: Callable[[], None]) -> dict[str, Any]:
+        """Locate a recording: a `pc2grid_cli.view_server.Work`.
+
+        options : `near`, x,y,radius in metres, and `session`, whose map frame they are in.
+        """
+        from pc2grid.errors import Pc2GridError
+        from pc2grid_cli.locate import find_log
+        from pc2grid_cli.view_server import Cancelled
+
+        events, progress = self.events, Progress(self.events)
+        events.publish("begin", {"source": path.name})
+
+        def see(registered: Any, moment: Any) -> None:
+            check()
+            progress.see(registered, moment)
+
+        try:
+            known = KnownPose(near=_near(options.get("near")), session=options.get("session"))
+            found = find_log(
+                path,
+                self._database,
+                self._settings,
+                span=TimeSpan(),
+                recover=False,
+                observer=_Shares(events),
+                watch=see,
+                known=known,
+                index=self._prepared(),
+            )
+            progress.flush()
+            self.pages["answer"] = live_page(
+                self._database, found=found, accept=self._settings.relocalize.accept
+            )
+        except Pc2GridError as error:
+            # The user knows the recording by its name, not by the place of our copy.
+            error.message = error.message.replace(str(path), path.name)
+            events.publish("end", {"source": path.name, "error": error.message, "hint": error.hint})
+            raise
+        except Cancelled:
+            events.publish("end", {"source": path.name, "error": "stopped", "hint": None})
+            raise
+        except BaseException:
+            failed = "internal error; the terminal shows it"
+            events.publish("end", {"source": path.name, "error": failed, "hint": None})
+            raise
+        answer = found.answer
+        events.publish(
+            "end",
+            {
+                "source": path.name,
+                "status": answer.status,
+                "session": answer.session,
+                "confidence": answer.confidence,
+            },
+        )
+        return {**answer.to_json(), "query": found.about}
+
+    def _prepared(self) -> MapIndex:
+        """The maps, prepared once for all recordings."""
+        from signature.files import query_config
+        from signature.relocalization.map_index import MapIndex
+
+        if self._index is None:
+            self._index = MapIndex.of(self._database, query_config(self._database, self._settings))
+        return self._index
+
+
+class _Shares(Observer):
+    """Publishes the share of the recording that is done."""
+
+    def __init__(self, events: Events) -> None:
+        self._events, self._told_s = events, 0.0
+
+    def on_progress(self, share: float) -> None:
+        """See `Observer.on_progress`."""
+        if time.monotonic() - self._told_s >= _SHARES_EVERY_S:
+            self._told_s = time.monotonic()
+            self._events.publish("share", {"share": round(share, 4)})
+
+
+def live_page(database: SubmapDatabase, **answer: Any) -> bytes:
+    """The page of a report, with the part that takes recordings and shows events."""
+    from pc2grid_cli.report import page
+
+    html = page(database, **answer)
+    live = files("pc2grid_cli").joinpath("view.html").read_text(encoding="utf-8")
+    # The policy of a report allows no connection; the server sends one that allows those to itself.
+    before, _, rest = html.partition(_META)
+    html = before + rest.partition(">")[2] if rest else before
+    main = html.index("<main")
+    script = html.rindex("</body>")
+    panel, _, code = live.partition("<!-- behind the page -->")
+    return (html[:main] + panel + html[main:script] + code + html[script:]).encode()
+
+
+def _near(text: str | None) -> tuple[float, float, float] | None:
+    """x,y,radius of a request. Raises ConfigError."""
+    from pc2grid.errors import ConfigError
+
+    if text is None:
+        return None
+    try:
+        x, y, radius = map(float, text.split(","))
+    except ValueError:
+        raise ConfigError(f"near: expected x,y,radius in metres, found {text!r:.40}") from None
+    return x, y, radius
+
+
+def _open_browser(url: str) -> None:
+    """Open a browser where there is a screen; one for text terminals would take this terminal."""
+    import webbrowser
+
+    if sys.platform == "linux" and not any(os.environ.get(v) for v in ("DISPLAY", "WAYLAND_DISPLAY")):
+        return
+    webbrowser.open(url)
