@@ -22,11 +22,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from pc2grid.errors import NoScans
 from pc2grid.io.nav2_map import save_map
+from pc2grid.io.trajectory import read_tum
 from pc2grid_cli.main import app
 from pc2grid_cli.view import Locator, live_page
 from pc2grid_cli.view_events import Events
@@ -268,7 +270,7 @@ def test_one_recording_at_a_time(serve: Callable[..., Served]) -> None:
     first.start()
     assert slow.begun.wait(120)
     status, told = served.post(b"abc")
-    assert status == 409 and "another recording" in told["error"]
+    assert status == 409 and "something else" in told["error"]
     assert served.get()[0] == 200  # pages are served meanwhile
     slow.go_on.set()
     first.join()
@@ -391,6 +393,33 @@ def test_a_recording_is_located_while_a_page_looks_on(desk: Path, serve: Callabl
         status, told_error = served.post(b"no recording", "name=x.mcap")
         assert status == 422 and told_error["error"].startswith("x.mcap: ")
         assert served.post(recording, "name=drive.mcap&near=1,2")[0] == 422
+
+
+def test_a_robot_is_followed(desk: Path, tmp_path: Path) -> None:
+    """Its recording stands for it: test_watch.py shows that a robot gives the same looks."""
+    with open_database(desk / "office.submaps") as database:
+        locator = Locator(database, Config())
+        server = ViewServer(0, locator.events, tmp_path, locator.work, most_bytes=1000)
+        server.pages[""] = live_page(database)
+        with locator.events.subscribed() as looking_on:
+            assert looking_on is not None
+            with server.in_background():
+                locator.follow(str(desk / "drive.mcap"))
+                status, body, _ = ask(urllib.request.Request(server.url + "locate", data=b"abc"))
+                assert status == 409 and b"something else" in body
+                assert ask(urllib.request.Request(server.url))[0] == 200
+            told = drain(looking_on)
+        server.stop()
+    assert told[0][0] == "begin" and told[-1][1]["error"] == "the source has ended"
+    scans = [row for kind, data in told if kind == "scans" for row in data]
+    truth = read_tum(desk / "drive.tum").planar()
+    assert len(scans) > 0.9 * len(truth)
+    # Each pose lies on the path that was driven, and the last one near its end.
+    moments = [data for kind, data in told if kind == "moment" and data["status"] == "located"]
+    assert moments
+    for moment in moments:
+        assert np.hypot(*(truth[:, :2] - moment["pose"][:2]).T).min() < 0.1
+    assert np.hypot(*(truth[-1, :2] - moments[-1]["pose"][:2])) < 1.5
 
 
 def test_the_command_prints_its_address_and_stops_with_ctrl_c(desk: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from importlib.resources import files
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.relocalization.map_index import MapIndex
+    from signature.relocalization.watcher import Look
 
 _MOST_GB = 4.0
 _SHARES_EVERY_S = 0.2
@@ -35,6 +37,13 @@ _META = '<meta http-equiv="Content-Security-Policy"'
 def view_command(
     context: typer.Context,
     database: options.Database,
+    source: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[ws://ROBOT:8765|RECORDING]",
+            help="a robot to be followed on the page, or a recording that is being written; see watch",
+        ),
+    ] = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free")] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="only print the address")] = False,
     most_gb: Annotated[float, typer.Option("--most-gb", min=0.0, help="largest recording, GB")] = _MOST_GB,
@@ -48,7 +57,8 @@ def view_command(
     set_: options.Assignments = None,
     assume_identity: options.AssumeIdentity = False,
 ) -> None:
-    """Look into a database in the browser, and drop recordings there to see them located. Ctrl-C ends it.
+    """Look into a database in the browser, and drop recordings there to see them located, or see a running
+    robot drive. Ctrl-C ends it.
 
     The address is printed. Only this machine is served, and nothing leaves it.
 
@@ -81,10 +91,17 @@ def view_command(
         server.pages[""] = live_page(opened)
         try:
             print(server.url, flush=True)
-            terminal.note("drop a recording onto the page; Ctrl-C ends this")
+            if source is None:
+                terminal.note("drop a recording onto the page; Ctrl-C ends this")
             if not no_browser:
                 _open_browser(server.url)
-            server.serve_forever(poll_interval=0.2)
+            if source is None:
+                server.serve()
+            else:
+                with server.in_background():
+                    locator.follow(source)
+                    terminal.note("the page stays as it is; Ctrl-C ends this")
+                    threading.Event().wait()
         finally:
             server.stop()
 
@@ -155,6 +172,45 @@ class Locator:
         )
         return {**answer.to_json(), "query": found.about}
 
+    def follow(self, source: str) -> None:
+        """Show a running robot until its source ends.
+
+        source : as `pc2grid watch` takes it. Raises the errors of `pc2grid.io.live.targets.open_live`.
+        """
+        from pc2grid.io.live.targets import open_live
+        from pc2grid.pipeline import follow
+        from signature.files import query_config
+        from signature.relocalization.looking import Looking
+        from signature.relocalization.watcher import Watcher
+
+        config = query_config(self._database, self._settings)
+        watcher, progress = Watcher(self._prepared()), Progress(self.events)
+        with (
+            open_live(source, config.read) as live,
+            Looking(watcher, beside=live.feed.realtime, step_m=config.relocalize.step_m) as looking,
+        ):
+
+            def poll() -> bool:
+                for sentence in live.feed.news.take():
+                    console.warn(sentence)
+                for look in looking.take():
+                    _tell(progress, look)
+                return False
+
+            live.on_poll = poll
+            self.events.publish("begin", {"source": source})
+            while not live.ended:
+                for registered, planar_scan in follow(live.scans(), config):
+                    progress.add(registered)
+                    looking.add(registered, planar_scan)
+                    poll()
+                looking.restart()
+                progress.add(None)
+            looking.finish()
+            poll()
+            progress.flush()
+        self.events.publish("end", {"source": source, "error": "the source has ended", "hint": None})
+
     def _prepared(self) -> MapIndex:
         """The maps, prepared once for all recordings."""
         from signature.files import query_config
@@ -191,6 +247,19 @@ def live_page(database: SubmapDatabase, **answer: Any) -> bytes:
     script = html.rindex("</body>")
     panel, _, code = live.partition("<!-- behind the page -->")
     return (html[:main] + panel + html[main:script] + code + html[script:]).encode()
+
+
+def _tell(progress: Progress, look: Look) -> None:
+    """Publish what a look said; without an answer, the best place all the same."""
+    answer, best = look.answer, look.answer.history[-1]
+    progress.tell(
+        answer.path_m,
+        answer.status,
+        look.session or best.session,
+        answer.confidence,
+        look.T_map_base or best.pose,
+        look.registered,
+    )
 
 
 def _near(text: str | None) -> tuple[float, float, float] | None:

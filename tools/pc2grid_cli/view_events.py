@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pc2grid.geometry import SE2
     from pc2grid.model import RegisteredScan
     from signature.relocalization.answer import Moment
 
@@ -105,43 +106,71 @@ def _put(page: queue.Queue[bytes | None], event: bytes | None) -> None:
 
 @dataclass
 class Progress:
-    """Publishes the scans and moments of one query.
+    """Publishes the scans of one query, and what the database said of it.
 
-    Events: `scans`, a list of x, y, yaw in the query's own frame and whether registration was lost; `moment`,
-    the state of the answer with the pose in the map and the base in the query's frame, from which a page
-    draws the path on the map.
+    Events: `scans`, a list of x, y, yaw in the query's own frame, and 1 where another such frame begins,
+    because registration was lost; `moment`, the state of the answer with the pose in the map and the base in
+    the query's frame, from which a page draws the path on the map.
     """
 
     events: Events
     _waiting: list[list[float]] = field(default_factory=list)
     _sent_s: float = 0.0
+    _base: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def see(self, registered: RegisteredScan, moment: Moment | None) -> None:
         """The next scan, and the state of the answer if the database was asked after it."""
-        from pc2grid.geometry import SE2
+        self.add(registered)
+        if moment is not None:
+            self.tell(
+                moment.path_m, moment.status, moment.session, moment.confidence, moment.pose, registered
+            )
+
+    def add(self, registered: RegisteredScan | None) -> None:
+        """The next scan; None: what follows does not go on from what was before."""
         from pc2grid.model import Health
 
-        base = SE2.from_matrix(registered.T_session_base)
-        lost = registered.health is Health.LOST
-        self._waiting.append([round(base.x, 3), round(base.y, 3), round(base.yaw, 4), int(lost)])
-        if moment is not None or time.monotonic() - self._sent_s >= _SCANS_EVERY_S:
+        if registered is None:
+            self._waiting.append([*self._base, 1])
+            return
+        self._base = _planar(registered)
+        self._waiting.append([*self._base, int(registered.health is Health.LOST)])
+        if time.monotonic() - self._sent_s >= _SCANS_EVERY_S:
             self.flush()
-        if moment is not None:
-            pose = moment.pose
-            self.events.publish(
-                "moment",
-                {
-                    "path_m": moment.path_m,
-                    "status": moment.status,
-                    "session": moment.session,
-                    "confidence": moment.confidence,
-                    "pose": pose and [pose.x, pose.y, pose.yaw],
-                    "base": [base.x, base.y, base.yaw],
-                },
-            )
+
+    def tell(
+        self,
+        path_m: float,
+        status: str,
+        session: str | None,
+        confidence: float,
+        pose: SE2 | None,
+        registered: RegisteredScan,
+    ) -> None:
+        """The state of the answer after a scan. pose : of the base then in the map of `session`."""
+        self.flush()
+        self.events.publish(
+            "moment",
+            {
+                "path_m": path_m,
+                "status": status,
+                "session": session,
+                "confidence": confidence,
+                "pose": pose and [pose.x, pose.y, pose.yaw],
+                "base": _planar(registered),
+            },
+        )
 
     def flush(self) -> None:
         """Send the scans that wait."""
         if self._waiting:
             self.events.publish("scans", self._waiting)
         self._waiting, self._sent_s = [], time.monotonic()
+
+
+def _planar(registered: RegisteredScan) -> tuple[float, float, float]:
+    """x, y, yaw of the base in the query's frame, as finely as it can be seen."""
+    from pc2grid.geometry import SE2
+
+    base = SE2.from_matrix(registered.T_session_base)
+    return round(base.x, 3), round(base.y, 3), round(base.yaw, 4)

@@ -17,7 +17,7 @@ import shutil
 import socket
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,8 @@ _ADDRESS = "127.0.0.1"
 _BLOCK_BYTES = 1 << 20
 _SPARE_BYTES = 200 << 20
 """Space that an upload must leave on the disk."""
+_POLL_S = 0.2
+"""How often the server looks whether it is to stop."""
 _SILENCE_S = 60.0
 """A client that sends nothing for so long is gone."""
 _HEARTBEAT_S = 5.0
@@ -73,6 +75,18 @@ class ViewServer(http.server.ThreadingHTTPServer):
         """The address of the first page."""
         return f"http://{_ADDRESS}:{self.server_port}/{self.token}/"
 
+    @contextlib.contextmanager
+    def in_background(self) -> Iterator[None]:
+        """Serves in a thread of its own; no recordings are taken meanwhile."""
+        thread = threading.Thread(target=self.serve_forever, args=(_POLL_S,), daemon=True)
+        with self.busy:
+            thread.start()
+            try:
+                yield
+            finally:
+                self.shutdown()
+                thread.join()
+
     def stop(self, wait_s: float = 10.0) -> None:
         """Cancel the work that is going on, wait for its end, and close the socket."""
         self.stopping.set()
@@ -80,6 +94,10 @@ class ViewServer(http.server.ThreadingHTTPServer):
         if self.busy.acquire(timeout=wait_s):
             self.busy.release()
         self.server_close()
+
+    def serve(self) -> None:
+        """Serve until the process is interrupted."""
+        self.serve_forever(_POLL_S)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client that went away is no error of ours; anything else is printed."""
@@ -117,7 +135,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.NOT_FOUND, "recordings are sent to locate")
             return
         if self.server.stopping.is_set() or not self.server.busy.acquire(blocking=False):
-            self._refuse(HTTPStatus.CONFLICT, "another recording is being located", "wait until it is done")
+            self._refuse(HTTPStatus.CONFLICT, "something else is being located", "wait until it is done")
             return
         try:
             reply = self._locate()
