@@ -17,7 +17,7 @@ from pc2grid.model import UNKNOWN, OccupancyGrid
 from signature.config import Config
 from signature.database.protocol import Label
 from signature.relocalization.answer import Status, Verdict
-from signature.relocalization.confidence import CALIBRATION, PRESENCE, RIVALS, SAME_PLACE, Evidence
+from signature.relocalization.confidence import CALIBRATION, LIMITS, PRESENCE, RIVALS, SAME_PLACE, Evidence
 from signature.relocalization.hypotheses import (
     HYPOTHESES,
     Hypothesis,
@@ -53,6 +53,8 @@ class DecisionParameters:
         so that two equal rooms are distinguished by what lies around them.
     wall_m : what the query has seen is widened by this, so that the far side of a wall does not count as
         unseen.
+    equal : two places fit equally well if their scores differ by no more: twice the spread of the score
+        between two equal places.
     in_the_map : least probability that the query lies in the map to answer `ambiguous`, not `not_found`.
     same, same_labelled : least probability, by what surrounds them, that two places that fit the query are
         one; the second applies if the labels of their sessions say that they are of one floor.
@@ -62,6 +64,7 @@ class DecisionParameters:
     rival_score: float = 0.2
     around_m: float = 10.0
     wall_m: float = 0.4
+    equal: float = 2.0 * LIMITS.equal_lead
     in_the_map: float = 0.5
     same: float = 0.5
     same_labelled: float = 0.1
@@ -198,9 +201,6 @@ class MapIndex:
             fitted(query, h.session_index, h.row, self.maps[h.session_index], h.fit.T_map_query)
             for h in carried
         ]
-        region = self._region(query)
-        if region is not None and len(region[1]) * HYPOTHESES.square_m**2 <= PRIOR.searched_m2:
-            return self.look_everywhere(query, tuple(old))
         base_m = (query.T_odom_base.x, query.T_odom_base.y)
         proposals = retrieve(
             query.views,
@@ -210,8 +210,11 @@ class MapIndex:
             config=self.config,
             rows=rows,
         )
-        new = verify(query, proposals, self.places, self.maps, self.config)
-        return self._worth_keeping((*old, *new), query)
+        found = (*old, *verify(query, proposals, self.places, self.maps, self.config))
+        region = self._region(query)
+        if region is not None and len(region[1]) * HYPOTHESES.square_m**2 <= PRIOR.searched_m2:
+            return self.look_everywhere(query, found)
+        return self._worth_keeping(found, query)
 
     def look_everywhere(self, query: QueryMap, known: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
         """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole; in
@@ -231,9 +234,23 @@ class MapIndex:
         return self._worth_keeping(tuple(found), query)
 
     def judge(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> Verdict:
-        """What the hypotheses, best first, amount to."""
+        """What the hypotheses, best first, amount to.
+
+        A place that the prior excludes is no answer. But it shows what wrong places score for this query, so
+        it remains a rival, unless it fits as well as the best one that is allowed: between equal places the
+        prior decides. Otherwise any place in a small region, which has few rivals, would look certain.
+        """
         places = self._places(query, hypotheses)
-        rivals = [hypotheses[places.index(k)] for k in range(max(places, default=-1) + 1)]
+        allowed = {id(h) for h in self.allowed(hypotheses, query)}
+        kept = [(h, k) for h, k in zip(hypotheses, places, strict=True) if id(h) in allowed]
+        numbers = list(dict.fromkeys(k for _, k in kept))
+        best = [hypotheses[places.index(k)] for k in dict.fromkeys(places)]
+        rivals = [h for h, _ in kept[:1]]
+        rivals += [
+            h
+            for k, h in zip(dict.fromkeys(places), best, strict=True)
+            if kept and k != kept[0][1] and (k in numbers or not same_score(h.fit, kept[0][0].fit))
+        ]
         evidence = Evidence.of(rivals, query.walls.weight)
         confidence = CALIBRATION.probability(evidence)
         status: Status = "not_found"
@@ -244,8 +261,8 @@ class MapIndex:
         return Verdict(
             status=status,
             confidence=confidence,
-            hypotheses=hypotheses,
-            places=places,
+            hypotheses=tuple(h for h, _ in kept),
+            places=tuple(numbers.index(k) for _, k in kept),
             evidence=evidence,
         )
 
@@ -260,9 +277,18 @@ class MapIndex:
         return self.judge(query, self.look_everywhere(query, hypotheses))
 
     def _worth_keeping(self, found: tuple[Hypothesis, ...], query: QueryMap) -> tuple[Hypothesis, ...]:
-        kept = distinct(self.allowed(found, query), query.T_odom_base)
-        floor = DECISION.keep * kept[0].fit.score if kept else 0.0
-        return tuple(h for h in kept if h.fit.score >= floor)[: self.config.hypotheses]
+        """Best first, what scores enough beside the best one; what a prior excludes is kept beside it."""
+        distinct_ones = distinct(found, query.T_odom_base)
+        inside = {id(h) for h in self.allowed(distinct_ones, query)}
+        groups = (
+            [h for h in distinct_ones if id(h) in inside],
+            [h for h in distinct_ones if id(h) not in inside],
+        )
+        kept = []
+        for group in groups:
+            floor = DECISION.keep * group[0].fit.score if group else 0.0
+            kept += [h for h in group if h.fit.score >= floor][: self.config.hypotheses]
+        return tuple(sorted(kept, key=lambda h: -h.fit.score))
 
     def _places(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> tuple[int, ...]:
         """The place of each hypothesis, numbered from 0 in their order; a place has one hypothesis a session.
@@ -321,6 +347,11 @@ class MapIndex:
         agreement = min(fit.known_agreement, fit.backward)
         needed = DECISION.same_labelled if labelled else DECISION.same
         return SAME_PLACE.probability(agreement, fit.overlap * around.weight) >= needed
+
+
+def same_score(a: Fit, b: Fit) -> bool:
+    """Whether two places fit equally well, for all that their scores tell."""
+    return abs(a.score - b.score) <= DECISION.equal
 
 
 def unseen_by(query: QueryMap, grid: OccupancyGrid, fit: Fit) -> OccupancyGrid:

@@ -181,7 +181,8 @@ def judge_pose(
     # another place, they exclude each other.
     at_most = near.confidence if is_there else min(near.confidence, 1.0 - near.confidence)
     known_walls = here.overlap * query.walls.weight
-    contradicted = at_most <= 1.0 - index.config.accept and known_walls >= LIMITS.few_walls
+    contradicted = near.status == "not_found" and known_walls >= LIMITS.few_walls
+    contradicted = contradicted and at_most <= 1.0 - index.config.accept
     return judged("lost" if contradicted else "unsure", at_most)
 
 

@@ -1,8 +1,9 @@
 """What is known of a robot's pose beforehand: a region of the map that it is in.
 
-A prior excludes: a place outside has probability 0, so it is no answer, and as a rival it counts nothing.
-What fits better outside is therefore no reason to doubt; it is reported when nothing inside fits
-(`Answer.excluded`).
+A prior excludes: a place outside has probability 0 and is no answer. Between places that fit equally well it
+decides. But what scores differently outside still shows what wrong places score for this query, so it remains
+evidence (`MapIndex.judge`): a place that fits poorly is not certain because few others are in the region, and
+if another place fits better by far, nothing inside is. That place is reported (`Answer.excluded`).
 """
 
 from __future__ import annotations
