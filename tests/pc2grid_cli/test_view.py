@@ -451,6 +451,8 @@ def test_the_command_prints_its_address_and_stops_with_ctrl_c(desk: Path, tmp_pa
         view.wait()
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(600)  # some seconds of work; on a busy machine many times as long
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
 def test_a_browser_shows_what_happens(desk: Path, serve: Callable[..., Served], tmp_path: Path) -> None:
     with open_database(desk / "office.submaps") as database:
@@ -478,7 +480,7 @@ def test_a_browser_shows_what_happens(desk: Path, serve: Callable[..., Served], 
         with subprocess.Popen(browser, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as run:
             wait_until(lambda: events.looking_on > 0)
             events.close()  # the virtual time of the browser stands still while a request is going on
-            page, _ = run.communicate(timeout=240)
+            page, _ = run.communicate(timeout=500)
     assert "after 2.0 m: located, confidence 0.97; best place: office, x 5.00 m, y 7.00 m" in page
     # The path of the query, laid on the map: it began 2 m to the left of where the robot is.
     trace = re.search(r'<g id="trace".*?</g></g>', page, re.S)
