@@ -1,6 +1,6 @@
 """A planar pose refined in space, and checked there: points on points, where both sides have them.
 
-1. The heights of the two floors say how high the query lies in the map.
+1. The two floors say how high the query lies in the map, and how it is tilted.
 2. ICP, point to plane (Open3D), brings the points of the query on those of the map, in all six degrees of
    freedom, with ever smaller distances and Tukey's loss, so that what has changed does not pull.
 3. Each ray of the query is compared with the map: it ends on a surface of the map, or passes through one, or
@@ -22,7 +22,13 @@ from pc2grid.arrays import F64, freeze
 from pc2grid.clouds.ground import find_ground
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.clouds.voxel_cloud import VoxelCloud
-from pc2grid.geometry import SE2, invert_pose, rotation_vector, transform_points
+from pc2grid.geometry import (
+    SE2,
+    invert_pose,
+    pose_from_rotation_vector,
+    rotation_vector,
+    transform_points,
+)
 from pc2grid.model import PointMap
 
 
@@ -32,6 +38,7 @@ class RegistrationParameters:
 
     voxel_m : edge of the voxels that the query is reduced to.
     margin_m : of the part of the map that is used, around the query.
+    floor_m : the floors are compared so far around the sensor.
     normal_radius_m, normal_neighbours : neighbourhood in which the normals of the map are estimated.
     rounds_m : largest distance of corresponding points, round by round.
     iterations : of each round.
@@ -44,6 +51,7 @@ class RegistrationParameters:
 
     voxel_m: float = 0.1
     margin_m: float = 1.0
+    floor_m: float = 8.0
     normal_radius_m: float = 0.25
     normal_neighbours: int = 30
     rounds_m: tuple[float, ...] = (0.6, 0.3, 0.15)
@@ -154,12 +162,9 @@ def register_in_space(
         return None
     lifted = T_map_query.lift()
     target = _around(points.points_m(), transform_points(lifted, query), p.margin_m)
-    sensor_m = transform_points(lifted, views[-1].sensor_m[None])[0]
-    height_m = _height(target, query, lifted, sensor_m)
-    if height_m is None:
+    start = _on_floor(target, query, lifted, views[-1].sensor_m)
+    if start is None:
         return None
-    start = lifted.copy()
-    start[2, 3] += height_m
     found = _icp(query, target, start, p)
     if found is None:
         return None
@@ -194,20 +199,32 @@ def _around(points: F64, query: F64, margin_m: float) -> F64:
     return around
 
 
-def _height(target: F64, query: F64, lifted: F64, sensor_m: F64) -> float | None:
-    """How far the floor of the map lies above that of the query, at the sensor; None if one is not seen."""
-    placed = transform_points(lifted, query)
-    heights = []
-    for points in (target, placed):
-        near = points[np.linalg.norm(points[:, :2] - sensor_m[:2], axis=1) < 8.0]
+def _on_floor(target: F64, query: F64, lifted: F64, sensor_m: F64) -> F64 | None:
+    """The pose (4, 4) `lifted` of a query in the map, tilted and raised so that the two floors are one.
+
+    The odom frame of a query without tf is as level as its first scan showed it to be. None if the floor near
+    the sensor (3,), odom frame, is not seen on both sides.
+    """
+    at_m = transform_points(lifted, sensor_m[None])[0]
+    normals, heights_m = [], []
+    for points in (target, transform_points(lifted, query)):
+        near = points[np.linalg.norm(points[:, :2] - at_m[:2], axis=1) < REGISTRATION.floor_m]
         if not len(near):
             return None
-        middle = np.array([sensor_m[0], sensor_m[1], float(np.median(near[:, 2]))])
+        middle = np.array([at_m[0], at_m[1], float(np.median(near[:, 2]))])
         ground = find_ground(near - middle, np.zeros(3))
         if ground is None:
             return None
-        heights.append(middle[2] - ground.offset_m / ground.normal[2])
-    return float(heights[0] - heights[1])
+        normals.append(ground.normal)
+        heights_m.append(middle[2] - ground.offset_m / ground.normal[2])
+    axis = np.cross(normals[1], normals[0])
+    sine = float(np.linalg.norm(axis))
+    turn = pose_from_rotation_vector(axis / max(sine, 1e-12) * math.asin(min(sine, 1.0)))
+    foot_m = np.array([at_m[0], at_m[1], heights_m[1]])
+    turn[:3, 3] = foot_m - turn[:3, :3] @ foot_m
+    turn[2, 3] += heights_m[0] - heights_m[1]
+    start: F64 = turn @ lifted
+    return start
 
 
 def _icp(

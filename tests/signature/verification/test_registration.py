@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pc2grid.arrays import F64
-from pc2grid.geometry import SE2, invert_pose, rotation_vector
+from pc2grid.geometry import SE2, invert_pose, pose_from_rotation_vector, rotation_vector, transform_points
 from pc2grid.model import PointMap
 from signature.relocalization.in_space import QueryInSpace
 from signature.verification.registration import SpatialView, register_in_space
@@ -41,6 +41,23 @@ def test_pose_in_space_is_exact_to_a_centimetre(height_m: float, x_m: float) -> 
     assert fit.on > 0.97 and fit.through < 0.02 and fit.rmse_m < 0.03
     sigma = np.sqrt(np.diag(fit.covariance_at(T_odom_base)))
     assert (sigma[:3] > 1e-3).all() and (sigma[:3] < 0.05).all() and (sigma[3:] < math.radians(1.0)).all()
+
+
+def test_a_query_that_is_not_level_is_tilted_with_its_floor() -> None:
+    """Without tf, the first scan decides how level the odom frame is; here it is wrong by 12 degrees."""
+    query, T_room_odom, T_room_base, T_odom_base = asked(HEIGHTS_M[0])
+    tilt = pose_from_rotation_vector([math.radians(12.0), 0.0, 0.0])
+    tilted = [
+        SpatialView(
+            sensor_m=transform_points(tilt, view.sensor_m[None])[0],
+            points_m=transform_points(tilt, view.points_m),
+        )
+        for view in query.views
+    ]
+    fit = register_in_space(tilted, twin_map(), T_room_odom)
+    assert fit is not None
+    error = invert_pose(T_room_base) @ fit.T_map_query @ tilt @ T_odom_base
+    assert np.linalg.norm(error[:3, 3]) < 0.02
 
 
 def test_twin_rooms_of_other_height_are_told_apart() -> None:
