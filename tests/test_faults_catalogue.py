@@ -638,8 +638,8 @@ for _command in (*USES, CONVERT + " --add"):
         database(lambda d: bytes(reversed(d)), _command)
     )
     fault(43, 1, errors.NotADatabase, "another program's SQLite file")(database(header(68, 0), _command))
-    fault(44, 1, errors.DatabaseVersion, "database format 5; this pc2grid reads up to 4", "a newer pc2grid")(
-        database(header(60, 4), _command)
+    fault(44, 1, errors.DatabaseVersion, "database format 8; this pc2grid reads up to", "a newer pc2grid")(
+        database(header(60, 8), _command)
     )
 for _command in USES:
     fault(43, 1, errors.NotADatabase, "x.submaps: empty file")(database(lambda d: b"", _command))

@@ -52,9 +52,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             "copy it to that place",
         ),
         ("convert office.pgm -o c.submaps", NotALog, "looks like a PGM image", "give the .yaml"),
-        ("relocalize ws://localhost:8765 -d b.submaps", LogNotFound, "no such file", "ros2 bag record"),
-        ("relocalize - -d b.submaps", LogNotFound, "-: no such file", "ros2 bag record"),
-        ("relocalize /dev/null -d b.submaps", LogNotFound, "not a regular file", "ros2 bag record"),
+        ("relocalize ws://localhost:8765 -d b.submaps", LogNotFound, "no such file", "pc2grid watch"),
+        ("relocalize - -d b.submaps", LogNotFound, "-: no such file", "pc2grid watch"),
+        ("relocalize /dev/null -d b.submaps", LogNotFound, "not a regular file", "pc2grid watch"),
         ("relocalize none.mcap -d b.submaps", LogNotFound, "none.mcap: no such file", "check the path"),
     ],
 )
