@@ -173,7 +173,7 @@ def longest_of(maps: Sequence[SessionMap]) -> SessionMap:
 
     Its report is that of the whole recording, and says which maps are left out.
     """
-    longest = max(maps, key=lambda part: _travel_m(part.trajectory))
+    longest = max(maps, key=lambda part: part.trajectory.length_m)
     if len(maps) == 1:
         return longest
     others = ", ".join(part.session for part in maps if part is not longest)
@@ -188,8 +188,8 @@ def _of_use(parts: Sequence[_Mapped]) -> list[_Mapped]:
     """The parts that are long enough to be recognised, or the longest one if none is."""
     from pc2grid.mapping.parts import PARTS
 
-    kept = [part for part in parts if _travel_m(part.trajectory) >= PARTS.least_travel_m]
-    return kept or [max(parts, key=lambda part: _travel_m(part.trajectory))]
+    kept = [part for part in parts if part.trajectory.length_m >= PARTS.least_travel_m]
+    return kept or [max(parts, key=lambda part: part.trajectory.length_m)]
 
 
 def check_followed(trajectory: Trajectory, name: str) -> None:
@@ -483,7 +483,7 @@ def _division_warning(session: str, parts: Sequence[_Mapped], kept: Sequence[_Ma
         return (int(part.trajectory.stamps_ns[0]) - start_ns) * 1e-9
 
     named = ", ".join(
-        f"{part_name(session, k)} from {begin_s(part):.0f} s ({_travel_m(part.trajectory):.0f} m)"
+        f"{part_name(session, k)} from {begin_s(part):.0f} s ({part.trajectory.length_m:.0f} m)"
         for k, part in enumerate(kept)
     )
     short = len(parts) - len(kept)
@@ -493,11 +493,6 @@ def _division_warning(session: str, parts: Sequence[_Mapped], kept: Sequence[_Ma
         f"because tracking was lost or the map would contradict itself: {named}{dropped}; record with "
         "odometry, or come back to known places more often, to keep them together"
     )
-
-
-def _travel_m(trajectory: Trajectory) -> float:
-    """Planar distance driven, metres."""
-    return float(trajectory.path_m()[-1]) if len(trajectory) else 0.0
 
 
 def _in_order(parts: Sequence[Trajectory]) -> Trajectory:

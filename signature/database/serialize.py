@@ -274,7 +274,7 @@ def document(session_map: SessionMap, provenance: Provenance) -> str:
         "floor": provenance.label.floor,
         "config": provenance.config.model_dump(mode="json"),
         "submaps": len(session_map.submaps),
-        "area_m2": round(int(np.count_nonzero(grid.free)) * grid.resolution_m**2, 3),
+        "area_m2": round(grid.free_m2, 3),
         "path_m": round(float(path_m[-1]), 3) if len(path_m) else 0.0,
         "driven_s": round(float(stamps[-1] - stamps[0]) / 1e9, 3) if len(stamps) else 0.0,
         "report": {

@@ -52,8 +52,3 @@ class DatabaseGrids(Mapping[str, OccupancyGrid]):
 
     def __len__(self) -> int:
         return len(self._sessions)
-
-
-def free_m2(grid: OccupancyGrid) -> float:
-    """Free space of a map."""
-    return float(grid.free.sum()) * grid.resolution_m**2

@@ -27,7 +27,7 @@ from signature.relocalization.hypotheses import (
     search_everywhere,
     verify,
 )
-from signature.relocalization.lazy_maps import DatabaseGrids, LazySequence, free_m2
+from signature.relocalization.lazy_maps import DatabaseGrids, LazySequence
 from signature.relocalization.prior import PRIOR, Prior
 from signature.relocalization.query_map import QueryMap
 from signature.retrieval.viewpoints import AT_ONCE_M2, Places
@@ -108,7 +108,7 @@ class MapIndex:
         self.grids: LazySequence[OccupancyGrid] = LazySequence(lambda i: grids[self.sessions[i]], count)
         self.maps: LazySequence[SearchMap] = LazySequence(lambda i: SearchMap.of(self.grids[i]), count)
         self._free: LazySequence[F64] = LazySequence(lambda i: free_squares(self.grids[i]), count)
-        areas_m2 = areas_m2 or {name: free_m2(grid) for name, grid in grids.items()}
+        areas_m2 = areas_m2 or {name: grid.free_m2 for name, grid in grids.items()}
         self._areas_m2 = tuple(areas_m2[name] for name in self.sessions)
         self.places = Places(
             table,

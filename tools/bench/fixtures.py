@@ -233,7 +233,7 @@ def floors(path: Path, count: int, copies: int, config: Config) -> tuple[int, fl
             name = f"s{seed}" if copy == 0 else f"s{seed}copy{copy}"
             made = SessionMap(session=name, sensor="map", grid=grid, submaps=submaps, trajectory=still)
             entries.append((made, signatures, origin))
-            area_m2 += float(grid.free.sum()) * grid.resolution_m**2
+            area_m2 += grid.free_m2
     store(path, entries, keep=False)
     return len(entries), area_m2
 

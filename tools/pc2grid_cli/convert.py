@@ -346,7 +346,6 @@ def _stored(output: str, jobs: list[Job], *, add: bool, force: bool) -> dict[str
 
 def summary(session: SessionMap, origin: Provenance) -> Converted:
     """The session made of one input, as the JSON document describes it."""
-    import numpy as np
 
     from pc2grid_cli.json_schemas import consistency_document, odometry_document
 
@@ -364,7 +363,7 @@ def summary(session: SessionMap, origin: Provenance) -> Converted:
         "scans": len(session.trajectory),
         "path_m": round(float(path_m[-1]), 2) if len(path_m) else 0.0,
         "duration_s": round(float(stamps[-1] - stamps[0]) / 1e9, 2) if len(stamps) else 0.0,
-        "area_m2": round(float(np.count_nonzero(grid.free)) * grid.resolution_m**2, 1),
+        "area_m2": round(grid.free_m2, 1),
         "submaps": len(session.submaps),
         "consistency": consistency_document(session.consistency),
         "odometry": odometry_document(session.odometry),

@@ -93,7 +93,7 @@ def describe_map(path: Path, assignments: list[str] | None = None) -> InfoMap:
         "height": height,
         "resolution_m": grid.resolution_m,
         "origin_m": list(grid.origin_m),
-        "free_m2": round(float(np.count_nonzero(grid.free)) * cell_m2, 2),
+        "free_m2": round(grid.free_m2, 2),
         "occupied_m2": round(float(np.count_nonzero(grid.occupied)) * cell_m2, 2),
         "voxels": len(drawn.level_points_m),
         "floor_z_m": round(_floor_z_m(drawn), 3),
