@@ -44,8 +44,17 @@ METHOD_NAMES = (
 )
 """In the order of Table III."""
 
-EXTRA_METHOD_NAMES = ("point_contexts", "shape_rings", "opencv_shape_context", "verified")
-"""Beyond the paper: three other readings of the shape context, and its own method with alignment."""
+EXTRA_METHOD_NAMES = (
+    "point_contexts",
+    "shape_rings",
+    "opencv_shape_context",
+    "verified",
+    "proposed_centres",
+    "boundary_centres",
+    "shape_context_centres",
+)
+"""Beyond the paper: three other readings of the shape context, its own method with alignment, and places
+described from several centres: by Eq. 6, by its boundary alone, and by the shape context."""
 
 
 def make_methods(names: Iterable[str]) -> dict[str, Method]:
@@ -60,6 +69,17 @@ def make_methods(names: Iterable[str]) -> dict[str, Method]:
 
 def _make(name: str, vocabularies: dict[str, Vocabulary]) -> Method:
     # Imported here because each method needs a library that the others do not need.
+    if name == "boundary_centres":
+        from signature.baselines.proposed import Proposed
+        from signature.baselines.several_centres import SeveralCentres
+        from signature.config import SignatureConfig
+
+        # A spread of 1e6 makes Omega of Eq. 6 equal to 1.
+        return SeveralCentres(method=Proposed(SignatureConfig(weight_boundary=1.0, symmetry_sigma=1e6)))
+    if name in ("proposed_centres", "shape_context_centres"):
+        from signature.baselines.several_centres import SeveralCentres
+
+        return SeveralCentres(method=_make(name.removesuffix("_centres"), vocabularies))
     if name == "proposed":
         from signature.baselines.proposed import Proposed
 

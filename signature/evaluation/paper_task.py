@@ -42,6 +42,9 @@ TOGETHER = (
     ("point_contexts",),
     ("opencv_shape_context",),
     ("verified",),
+    ("proposed_centres",),
+    ("boundary_centres",),
+    ("shape_context_centres",),
 )
 """Methods that share their features and therefore run together."""
 
@@ -149,6 +152,9 @@ OPEN_CHOICES = (
     Choice(name="omega_b = 0.7", paper="0.9", ours="0.9", overrides=(("weight_boundary", 0.7),)),
 )
 """Where the default departs from the paper, and other values of what the paper leaves open."""
+
+_BY_SIGNATURES = ("proposed", "verified", "proposed_centres", "boundary_centres")
+"""Methods whose results depend on SignatureConfig."""
 
 _FORMAT = 2  # of the result files; a change of the meaning of their numbers changes it too
 
@@ -315,7 +321,7 @@ def fingerprint(task: PaperTask, method: str) -> str:
         "map": hashlib.sha256(task.map_path.read_bytes() + _image_bytes(task.map_path)).hexdigest(),
         "noise": asdict(task.noise),
         "partition": PartitionConfig.paper(task.radius_m).model_dump(),
-        "signature": signature.model_dump() if method == "proposed" else None,
+        "signature": signature.model_dump() if method in _BY_SIGNATURES else None,
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 

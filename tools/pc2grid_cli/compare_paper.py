@@ -26,6 +26,9 @@ _COSTS = {
     "sift_bow": 8.0,
     "surf_bow": 14.0,
     "opencv_shape_context": 150.0,
+    "proposed_centres": 4.0,
+    "boundary_centres": 4.0,
+    "shape_context_centres": 4.0,
 }
 
 
@@ -48,7 +51,8 @@ def compare_paper_command(
         list[str] | None,
         typer.Option(
             "--methods",
-            help="Only these. Extras: point_contexts, shape_rings, opencv_shape_context, verified.",
+            help="Only these; repeatable. Extras: point_contexts, shape_rings, opencv_shape_context, "
+            "verified, proposed_centres, boundary_centres, shape_context_centres.",
         ),
     ] = None,
     offset: Annotated[

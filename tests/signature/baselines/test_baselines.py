@@ -20,6 +20,7 @@ from signature.baselines.sdf import (
     _mean_distances,
     _orientation_shares,
 )
+from signature.baselines.several_centres import SeveralCentres, lattice, smaller_disc
 from signature.baselines.shape_context import ShapeContext
 from signature.baselines.surf import describe_points, interest_points
 from signature.baselines.words import Words, sift, submap_image, surf
@@ -229,3 +230,44 @@ def test_where_nothing_changes_descriptors_are_zero_and_finite() -> None:
     assert _mean_distances(keypoints, directions, distance, 10.0, 2.0) == pytest.approx(np.full(3, 2.0))
     nothing = np.zeros((40, 40), np.uint8)
     assert not describe_points(nothing, np.array([[20.0, 20.0, 1.2], [0.0, 0.0, 2.0]])).any()
+
+
+def test_several_centres_find_a_query_beside_the_centre() -> None:
+    """Places 3 m apart; the queries lie 0.9 m beside their centres."""
+    halls = [submap_of(random_rooms(seed, walls=40)) for seed in (3, 4, 5)]
+    at = [(hall, offset_m) for hall in halls for offset_m in lattice(3.0, 3.0)]
+    submaps = [smaller_disc(hall, offset_m, 4.0) for hall, offset_m in at]
+    matchers = {
+        "plain": ShapeContext().fit(submaps),
+        "several": SeveralCentres(method=ShapeContext()).fit(submaps),
+    }
+    right = dict.fromkeys(matchers, 0)
+    for number, (hall, offset_m) in enumerate(at):
+        beside = smaller_disc(hall, offset_m + 0.9 * np.array([math.cos(number), math.sin(number)]), 4.0)
+        turned = rotated_submap(beside.grid, _middle(beside), beside.radius_m, 0.7 * number)
+        for name, matcher in matchers.items():
+            right[name] += int(np.argmax(matcher.similarities(turned))) == number
+    assert right["several"] > right["plain"]
+
+
+def _middle(submap: Submap) -> tuple[float, float]:
+    height, width = submap.grid.cells.shape
+    x, y = np.asarray(submap.grid.origin_m) + 0.5 * submap.grid.resolution_m * np.array([width, height])
+    return float(x), float(y)
+
+
+def test_a_smaller_disc_keeps_the_cells_within_its_radius() -> None:
+    submap = submap_of(random_rooms(3, walls=40))
+    offset_m = np.array([0.5, -0.25])
+    part = smaller_disc(submap, offset_m, 2.0)
+    assert part.radius_m == submap.radius_m - 2.0
+    middle = np.asarray(_middle(submap)) + offset_m
+    cells = np.argwhere(part.grid.occupied)
+    away = np.hypot(*(part.grid.to_point(cells) - middle).T)
+    assert len(cells) and away.max() <= part.radius_m + part.grid.resolution_m
+    assert submap.grid.occupied[tuple(submap.grid.to_cell(part.grid.to_point(cells)).T)].all()
+
+
+def test_a_lattice_holds_the_centre_and_stays_within_its_reach() -> None:
+    points = lattice(1.0, 0.5)
+    assert len(points) == 13 and (np.hypot(*points.T) <= 1.0).all() and [0.0, 0.0] in points.tolist()
