@@ -1,9 +1,11 @@
-"""Where localization on the robot believed to be: the last pose in the map that a recording holds."""
+"""Where localization on the robot believes to be: its newest pose in the map."""
 
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -12,7 +14,7 @@ from pc2grid.errors import FrameError, NoScans, TopicError
 from pc2grid.geometry import SE2, pose_from_xyz_quat
 from pc2grid.io import topics
 from pc2grid.io.frames import FrameTree
-from pc2grid.io.message_source import MessageSource, TopicInfo
+from pc2grid.io.message_source import MessageSource, RawMessage, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Odometry, PoseStamped, Seven, valid_pose
 from pc2grid.io.read_plan import is_static, tolerant
@@ -35,32 +37,127 @@ def last_map_pose(source: MessageSource, topic: str, base_frame: str, end_ns: in
 
     Raises TopicError, UnsupportedSchema, FrameError, or NoScans if there is no pose.
     """
-    channel = _channel(source.info.topics, topic)
-    if channel.type in topics.TF:
-        return _from_tf(source, base_frame, end_ns)
-    decode = decoder_for(channel)
-    last: tuple[Odometry | PoseStamped, int] | None = None
-    for message in source.messages({topic}, None, end_ns):
-        if message.channel == channel:
-            found = tolerant(decode, message.data, None)
-            if found is not None and valid_pose(found.pose):
-                last = found, message.log_time_ns
-    if last is None:
-        raise NoScans(f"{topic}: no pose in the part asked for")
-    found, log_time_ns = last
-    if found.header.frame and not _is_map(found.header.frame):
-        raise FrameError(
-            f"{topic}: its poses are in frame {found.header.frame}, not in a map",
-            hint="name a topic of localization, such as /amcl_pose or /tf",
+    poses = map_poses(source.info.topics, topic, base_frame)
+    for message in source.messages(poses.topics, None, end_ns):
+        poses.take(message)
+    return poses.newest(source.info.end_ns)
+
+
+class MapPoses(Protocol):
+    """The newest pose of the base in the map, message by message. topics : whose messages it takes."""
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """See above."""
+        ...
+
+    def take(self, message: RawMessage) -> None:
+        """Take in a message; of other topics it is left out."""
+        ...
+
+    def newest(self, now_ns: int) -> MapPose:
+        """The pose. now_ns : its time if all transforms are static. Raises FrameError, or NoScans if there is
+        none yet."""
+        ...
+
+
+def map_poses(known: Sequence[TopicInfo], topic: str, base_frame: str) -> MapPoses:
+    """For a topic of a pose, an odometry or tf among those that are known.
+
+    Raises TopicError, UnsupportedSchema.
+    """
+    channel = _channel(known, topic)
+    return _TfPoses(known, base_frame) if channel.type in topics.TF else _TopicPoses(channel)
+
+
+class _TopicPoses:
+    """The poses of one topic."""
+
+    def __init__(self, channel: TopicInfo) -> None:
+        self._topic, self._type = channel.topic, channel.type
+        self._decode = decoder_for(channel)
+        self._last: tuple[Odometry | PoseStamped, int] | None = None
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """See MapPoses."""
+        return frozenset({self._topic})
+
+    def take(self, message: RawMessage) -> None:
+        """See MapPoses."""
+        if (message.channel.topic, message.channel.type) != (self._topic, self._type):
+            return
+        found = tolerant(self._decode, message.data, None)
+        if found is not None and valid_pose(found.pose):
+            self._last = found, message.log_time_ns
+
+    def newest(self, now_ns: int) -> MapPose:
+        """See MapPoses."""
+        if self._last is None:
+            raise NoScans(f"{self._topic}: no pose in the part asked for")
+        found, log_time_ns = self._last
+        if found.header.frame and not _is_map(found.header.frame):
+            raise FrameError(
+                f"{self._topic}: its poses are in frame {found.header.frame}, not in a map",
+                hint="name a topic of localization, such as /amcl_pose or /tf",
+            )
+        return MapPose(
+            stamp_ns=found.header.stamp_ns or log_time_ns,
+            T_map_base=_planar(found.pose),
+            covariance=_covariance(found),
         )
-    return MapPose(
-        stamp_ns=found.header.stamp_ns or log_time_ns,
-        T_map_base=_planar(found.pose),
-        covariance=_covariance(found),
-    )
 
 
-def _channel(known: tuple[TopicInfo, ...], topic: str) -> TopicInfo:
+class _TfPoses:
+    """map -> base at the newest time that all transforms between them are known for.
+
+    The transform map -> odom is published ahead of time or rarely, so each one holds until the next.
+    """
+
+    def __init__(self, known: Sequence[TopicInfo], base_frame: str) -> None:
+        self._decoders = {(t.topic, t.type): decoder_for(t) for t in known if t.type in topics.TF}
+        self._base_frame = base_frame
+        self._tree = FrameTree()
+        self._newest_ns: dict[str, int] = {}
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """See MapPoses."""
+        return frozenset(topic for topic, _ in self._decoders)
+
+    def take(self, message: RawMessage) -> None:
+        """See MapPoses."""
+        decode = self._decoders.get((message.channel.topic, message.channel.type))
+        if decode is None:
+            return
+        static = is_static(message.channel)
+        for edge in tolerant(decode, message.data, ()):
+            self._tree.add(replace(edge, lasting=True), static=static, log_time_ns=message.log_time_ns)
+            if not static:
+                self._newest_ns[edge.child] = edge.header.stamp_ns or message.log_time_ns
+
+    def newest(self, now_ns: int) -> MapPose:
+        """See MapPoses."""
+        tree, base_frame = self._tree, self._base_frame
+        above = tree.chain(base_frame) if base_frame in tree else [base_frame]
+        map_frame = next((frame for frame in above[1:] if _is_map(frame)), None)
+        if map_frame is None:
+            there = ", ".join(tree.frames[:12]) or "nothing"
+            raise FrameError(
+                f"tf has no frame map above {base_frame}; there is: {there}",
+                hint="name a topic of localization, such as /amcl_pose",
+            )
+        moving = [self._newest_ns[f] for f in above[: above.index(map_frame)] if f in self._newest_ns]
+        stamp_ns = min(moving, default=now_ns)
+        T_map_base = tree.lookup(map_frame, base_frame, stamp_ns)
+        if T_map_base is None:
+            raise NoScans(
+                f"tf: {map_frame} -> {base_frame} is not known at any one time in the part asked for"
+            )
+        return MapPose(stamp_ns=stamp_ns, T_map_base=SE2.from_matrix(T_map_base))
+
+
+def _channel(known: Sequence[TopicInfo], topic: str) -> TopicInfo:
     usable = [t for t in known if t.type in (*topics.POSES, *topics.ODOMETRY, *topics.TF)]
     for channel in known:
         if channel.topic == topic:
@@ -71,38 +168,6 @@ def _channel(known: tuple[TopicInfo, ...], topic: str) -> TopicInfo:
     guess = f"; did you mean {close[0]}?" if close else ""
     there = ", ".join(f"{t.topic} ({t.type})" for t in usable[:12])
     raise TopicError(f"no topic {topic} in the log{guess}", hint=f"topics with poses: {there or 'none'}")
-
-
-def _from_tf(source: MessageSource, base_frame: str, end_ns: int | None) -> MapPose:
-    """map -> base at the newest time that all transforms between them are known for.
-
-    The transform map -> odom is published ahead of time or rarely, so each one holds until the next.
-    """
-    tf_topics = [t for t in source.info.topics if t.type in topics.TF]
-    decoders = {t: decoder_for(t) for t in tf_topics}
-    tree = FrameTree()
-    newest_ns: dict[str, int] = {}
-    for message in source.messages({t.topic for t in tf_topics}, None, end_ns):
-        if message.channel not in decoders:
-            continue
-        static = is_static(message.channel)
-        for edge in tolerant(decoders[message.channel], message.data, ()):
-            tree.add(replace(edge, lasting=True), static=static, log_time_ns=message.log_time_ns)
-            if not static:
-                newest_ns[edge.child] = edge.header.stamp_ns or message.log_time_ns
-    above = tree.chain(base_frame) if base_frame in tree else [base_frame]
-    map_frame = next((frame for frame in above[1:] if _is_map(frame)), None)
-    if map_frame is None:
-        raise FrameError(
-            f"tf has no frame map above {base_frame}; there is: {', '.join(tree.frames[:12]) or 'nothing'}",
-            hint="name a topic of localization, such as /amcl_pose",
-        )
-    moving = [newest_ns[frame] for frame in above[: above.index(map_frame)] if frame in newest_ns]
-    stamp_ns = min(moving, default=source.info.end_ns)
-    T_map_base = tree.lookup(map_frame, base_frame, stamp_ns)
-    if T_map_base is None:
-        raise NoScans(f"tf: {map_frame} -> {base_frame} is not known at any one time in the part asked for")
-    return MapPose(stamp_ns=stamp_ns, T_map_base=SE2.from_matrix(T_map_base))
 
 
 def _is_map(frame: str) -> bool:

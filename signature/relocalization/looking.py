@@ -11,25 +11,42 @@ import threading
 from collections import deque
 from dataclasses import replace
 from types import TracebackType
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
 from pc2grid.model import RegisteredScan
-from signature.relocalization.watcher import Look, Watcher
+
+LookT = TypeVar("LookT", covariant=True)
+
+
+class Looks(Protocol[LookT]):
+    """What looks at the database: a `Watcher` or a `PoseWatcher`."""
+
+    def add(
+        self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_look: bool = True
+    ) -> LookT | None:
+        """Take in the next scan; returns what a look said if there was one after it."""
+        ...
+
+    def restart(self) -> None:
+        """The scans do not go on from those before."""
+        ...
+
 
 _MOST_WAITING = 2000
 """Scans that wait for a look to end; beyond, the oldest are left out. Chosen by hand: some 20 MB."""
 
 
-class Looking:
-    """Feeds a `Watcher` with scans, here or in a thread. Use as a context manager.
+class Looking(Generic[LookT]):
+    """Feeds a `Watcher` or a `PoseWatcher` with scans, here or in a thread. Use as a context manager.
 
     lock : is held while the database is read; hold it to read the database in between.
     """
 
-    def __init__(self, watcher: Watcher, *, beside: bool, step_m: float = 1.0) -> None:
+    def __init__(self, watcher: Looks[LookT], *, beside: bool, step_m: float = 1.0) -> None:
         """beside : in a thread; otherwise each look is made before `add` returns, always after the same
         scans.
 
@@ -37,7 +54,7 @@ class Looking:
         """
         self.lock = threading.Lock()
         self._watcher, self._step_m = watcher, step_m
-        self._done: deque[Look] = deque()
+        self._done: deque[LookT] = deque()
         self._waiting: deque[tuple[RegisteredScan, PlanarScan, float] | None] = deque()
         self._path_m = 0.0
         self._last: SE2 | None = None
@@ -48,7 +65,7 @@ class Looking:
         if self._thread is not None:
             self._thread.start()
 
-    def __enter__(self) -> Looking:
+    def __enter__(self) -> Looking[LookT]:
         return self
 
     def __exit__(
@@ -91,7 +108,7 @@ class Looking:
             self._waiting.append(None)
             self._changed.notify_all()
 
-    def take(self) -> list[Look]:
+    def take(self) -> list[LookT]:
         """The looks that are done. Raises what the thread raised."""
         if self._error is not None:
             raise self._error

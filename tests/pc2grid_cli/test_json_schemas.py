@@ -91,6 +91,7 @@ def test_every_document_is_validated_by_a_test() -> None:
         "compare-sensors": "signature/evaluation/test_sensor_matrix.py",
         "compare-signatures": "signature/evaluation/test_selection.py",
         "watch": "pc2grid_cli/test_watch.py",
+        "watch-check": "pc2grid_cli/test_known_pose.py",
     }
     for name, file in elsewhere.items():
         assert f'schema("{name}")' in (Path(__file__).parents[1] / file).read_text()

@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 import yaml
@@ -17,8 +18,10 @@ from typer.testing import CliRunner
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
 from pc2grid_cli.console import Console
+from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app
 from pc2grid_cli.nav2_pose import initialpose, read_pose
+from tests.helpers.json_schema import closed
 from tests.helpers.recordings import ros
 from tests.helpers.simulated_drives import plan
 
@@ -188,3 +191,38 @@ def test_a_pose_file_is_read_as_it_is_written_and_as_ros2_prints_it(tmp_path: Pa
         assert (pose.T_map_base.x, pose.T_map_base.y) == (1.0, -2.0)
         assert pose.T_map_base.yaw == pytest.approx(2.5)
         assert np.allclose(pose.covariance, covariance)
+
+
+def test_a_robot_is_told_after_each_metre_whether_its_pose_is_right(rooms: tuple[Path, SE2]) -> None:
+    """The pose of /amcl_pose is 0.8 m off, that of /initialpose right; both at one time of the drive."""
+    folder, _ = rooms
+    words = ("watch", folder / "drive.mcap", "-d", folder / "twins.submaps", "--json", "--last", "1000")
+    done = pc2grid(*words, "--check-topic", "/initialpose")
+    looks = [json.loads(line) for line in done.stdout.splitlines()]
+    assert done.exit_code == 0, done.output
+    for look in looks:
+        jsonschema.validate(look, closed(schema("watch-check")))
+    last = looks[-1]
+    assert len(looks) > 1 and last["status"] == "fine" and last["comparable"] and last["off_m"] < 0.1
+    done = pc2grid(*words, "--check-topic", "/amcl_pose")
+    looks = [json.loads(line) for line in done.stdout.splitlines()]
+    assert done.exit_code == 4 and looks[-1]["status"] == "lost", done.output
+    better, believed = looks[-1]["better"]["pose"], looks[-1]["pose"]
+    assert 0.6 < math.dist((better["x"], better["y"]), (believed["x"], believed["y"])) < 1.0
+
+
+def test_a_missing_pose_of_a_robot_is_named(rooms: tuple[Path, SE2]) -> None:
+    folder, _ = rooms
+    done = pc2grid(
+        "watch", folder / "drive.mcap", "-d", folder / "twins.submaps", "--check-topic", "/amcl_pos"
+    )
+    assert (
+        done.exit_code == 4
+        and "did you mean /amcl_pose" in done.stderr
+        and "nothing was checked" in done.stderr
+    )
+    done = pc2grid(
+        *("watch", folder / "drive.mcap", "-d", folder / "twins.submaps"),
+        *("--check-topic", "/amcl_pose", "--publish", "tf"),
+    )
+    assert "do not go together" in str(done.exception)

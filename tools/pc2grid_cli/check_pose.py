@@ -1,4 +1,4 @@
-"""`pc2grid relocalize --check` and `--check-topic`: is the pose that the robot believes in still right?"""
+"""`relocalize --check`, `--check-topic`, `watch --check-topic`: is the pose the robot believes in right?"""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ from pc2grid_cli.known_pose import KnownPose, end_s
 if TYPE_CHECKING:
     from pc2grid.geometry import SE2
     from pc2grid.io import Log
+    from pc2grid.io.live.live_log import LiveLog
     from pc2grid.model import RegisteredScan
-    from pc2grid_cli.json_schemas import RelocalizeCheck
+    from pc2grid_cli.json_schemas import CheckedPoseJudgement, RelocalizeCheck, WatchCheck
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.relocalization.pose_check import PoseCheck
+    from signature.relocalization.pose_watcher import PoseLook
 
 
 def check_log(
@@ -77,6 +79,34 @@ def _believed(log: Log, known: KnownPose, span: TimeSpan) -> tuple[SE2, int | No
 
 def _document(checked: PoseCheck, log: Log, path: Path, where: str, scans: int) -> RelocalizeCheck:
     report = log.report()
+    return {
+        **_judgement(checked, where),
+        "query": {
+            "path_m": checked.path_m,
+            "stamp_ns": checked.stamp_ns,
+            "source": path.name,
+            "scans": scans,
+            "sensor": log.choose().sensor,
+            "lossy": report.lossy,
+            "warnings": list(report.warnings),
+        },
+    }
+
+
+def live_document(look: PoseLook, live: LiveLog, where: str) -> WatchCheck:
+    """What one look at a running robot said of the pose that it believes in."""
+    return {
+        **_judgement(look.checked, where),
+        "path_m": look.checked.path_m,
+        "scans": live.report().scans_read,
+        "dropped": live.feed.counts.dropped,
+        "reconnected": live.feed.counts.reconnected,
+        "lag_s": live.lag_s,
+        "elapsed_s": look.elapsed_s,
+    }
+
+
+def _judgement(checked: PoseCheck, where: str) -> CheckedPoseJudgement:
     pose = checked.T_map_base
     better = None if checked.better is None else checked.better.to_json()
     return {
@@ -95,15 +125,6 @@ def _document(checked: PoseCheck, log: Log, path: Path, where: str, scans: int) 
             "floor": better["floor"],
             "pose": better["pose"],
             "confidence": better["confidence"],
-        },
-        "query": {
-            "path_m": checked.path_m,
-            "stamp_ns": checked.stamp_ns,
-            "source": path.name,
-            "scans": scans,
-            "sensor": log.choose().sensor,
-            "lossy": report.lossy,
-            "warnings": list(report.warnings),
         },
         "database": {"path": where},
     }

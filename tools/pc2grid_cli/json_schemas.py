@@ -71,8 +71,8 @@ class CheckedAgainst(TypedDict):
     path: str
 
 
-class RelocalizeCheck(TypedDict):
-    """`pc2grid relocalize --check` and `--check-topic`, with `--json`.
+class CheckedPoseJudgement(TypedDict):
+    """What is said of a pose that the robot believes in.
 
     status: fine, lost, or unsure. probability: that the pose is right; an upper bound unless it is fine.
     off_m, off_rad: from the pose to the best fit near it, null if nothing fits there. comparable: false if
@@ -88,8 +88,25 @@ class RelocalizeCheck(TypedDict):
     off_rad: float | None
     comparable: bool
     better: BetterPlace | None
-    query: Query
     database: CheckedAgainst
+
+
+class RelocalizeCheck(CheckedPoseJudgement):
+    """`pc2grid relocalize --check` and `--check-topic`, with `--json`."""
+
+    query: Query
+
+
+class WatchCheck(CheckedPoseJudgement):
+    """A line of `pc2grid watch --check-topic --json`. path_m: travel that the judgement rests on. scans,
+    dropped, reconnected, lag_s, elapsed_s: as in those of `watch`."""
+
+    path_m: float
+    scans: int
+    dropped: int
+    reconnected: int
+    lag_s: float
+    elapsed_s: float
 
 
 class WatchedMap(TypedDict):
@@ -559,6 +576,7 @@ DOCUMENTS: dict[str, type] = {
     "relocalize-check": RelocalizeCheck,
     "simulate": Simulate,
     "watch": Watch,
+    "watch-check": WatchCheck,
 }
 """By command."""
 

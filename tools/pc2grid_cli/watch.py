@@ -7,9 +7,9 @@ import enum
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, TypeVar, cast
 
 import typer
 
@@ -27,8 +27,12 @@ if TYPE_CHECKING:
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.database.protocol import SessionInfo
+    from signature.relocalization.looking import Looking
     from signature.relocalization.prior import Prior
     from signature.relocalization.watcher import Look, ResetPolicy
+
+
+LookT = TypeVar("LookT")
 
 
 class Publish(str, enum.Enum):
@@ -63,8 +67,17 @@ def watch_command(
             help="at the beginning, it is within RADIUS metres of X, Y of the map",
         ),
     ] = None,
+    check_topic: Annotated[
+        str | None,
+        typer.Option(
+            "--check-topic",
+            metavar="TOPIC",
+            help="judge the pose that the robot believes in, such as /amcl_pose or /tf: fine, lost or unsure",
+        ),
+    ] = None,
     session: Annotated[
-        str | None, typer.Option("--session", metavar="NAME", help="whose map frame --near is in, if several")
+        str | None,
+        typer.Option("--session", metavar="NAME", help="whose map frame that or --near is in, if several"),
     ] = None,
     keep: Annotated[
         bool, typer.Option("--keep", help="go on when it is located, and say when it is somewhere else")
@@ -97,6 +110,9 @@ def watch_command(
 ) -> None:
     """Find where a running robot is, while it drives. Exit code 4: it was not located.
 
+    With --check-topic, say after each metre whether it is where it believes to be. Exit code 4: at last it
+    was not.
+
     Example: pc2grid watch ws://robot:8765 --database building.submaps --publish initialpose
     """
     from pc2grid.io.live.targets import open_live
@@ -105,7 +121,10 @@ def watch_command(
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
     )
-    prior = KnownPose(near=near, session=session).region()
+    known = KnownPose(near=near, check_topic=check_topic, session=session)
+    prior = known.region()
+    if check_topic is not None and (publish is not Publish.none or publish_map):
+        raise ConfigError("--check-topic and --publish do not go together", hint="run `watch` twice")
     terminal = console.of(context)
     end_s = math.inf if timeout is None else time.monotonic() + timeout
     with open_database(database) as opened, open_live(source, settings.read, last_s=last) as live:
@@ -113,61 +132,51 @@ def watch_command(
             opened.keep_only(building=building, floor=floor)
         for problem in opened.leave_out_damaged():
             console.warn(f"{opened.location}: damaged and left out: {problem.where}: {problem.what}")
-        with _Robot.of(live, opened, publish, publish_map, map_frame) as robot:
-            forever = keep or publish is Publish.tf
-            located = _watch(
-                live, opened, settings, robot, prior, end_s, forever, as_json=json, terminal=terminal
-            )
+        following = _Following(live, opened, settings, end_s, terminal)
+        if check_topic is not None:
+            good = _check(following, check_topic, session, as_json=json)
+        else:
+            with _Robot.of(live, opened, publish, publish_map, map_frame) as robot:
+                good = _search(following, robot, prior, keep or publish is Publish.tf, as_json=json)
         _summarize(live, terminal)
-    if not located:
+    if not good:
         raise typer.Exit(console.UNSURE)
 
 
-def _watch(
-    live: LiveLog,
-    database: SubmapDatabase,
-    settings: Config,
-    robot: _Robot,
-    prior: Prior | None,
-    end_s: float,
-    forever: bool,
-    *,
-    as_json: bool,
-    terminal: console.Console,
-) -> bool:
-    """Follow the robot until it is located, or until nothing comes any more or `end_s`; whether it is
-    located.
+@dataclass(frozen=True)
+class _Following:
+    """A robot that is followed until `end_s` of `time.monotonic`, or until nothing comes any more."""
 
-    prior : where the robot is at the beginning, as far as it is known. forever : go on when it is located.
-    """
-    from pc2grid.pipeline import follow
-    from signature.relocalization.looking import Looking
-    from signature.relocalization.map_index import MapIndex
-    from signature.relocalization.watcher import Watcher
+    live: LiveLog
+    database: SubmapDatabase
+    settings: Config
+    end_s: float
+    terminal: console.Console
 
-    made_with = database.config()
-    own = {name: getattr(settings, name) for name in ("read", "relocalize", "registration")}
-    config = made_with.model_copy(update=own)
-    index = MapIndex.of(database, config)
-    watcher = Watcher(index if prior is None else index.within(prior))
-    located = over = False
-    with Looking(watcher, beside=live.feed.realtime, step_m=config.relocalize.step_m) as looking:
+    @property
+    def config(self) -> Config:
+        """That of the database, but for what is the user's to set of a query."""
+        own = {name: getattr(self.settings, name) for name in ("read", "relocalize", "registration")}
+        return self.database.config().model_copy(update=own)
+
+    def run(self, looking: Looking[LookT], use: Callable[[LookT], bool]) -> None:
+        """Feed `looking` with scans. use : what to do with each look; true if that was enough."""
+        from pc2grid.pipeline import follow
+
+        live, config = self.live, self.config
+        over = False
 
         def poll() -> bool:
-            nonlocal located, over
+            nonlocal over
             _tell_news(live)
             for look in looking.take():
-                if over:
-                    break
-                _print(look, live, robot, robot.tell(look, looking.lock), as_json=as_json)
-                located = look.state in ("located", "recovered")
-                over = located and not forever
-            over = over or time.monotonic() > end_s
+                over = over or use(look)
+            over = over or time.monotonic() > self.end_s
             return over
 
         live.on_poll = poll
         choice = live.choose()
-        terminal.note(f"{live.feed.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
+        self.terminal.note(f"{live.feed.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
         while not live.ended and not over:
             for registered, planar_scan in follow(live.scans(), config):
                 looking.add(registered, planar_scan)
@@ -177,7 +186,62 @@ def _watch(
         if not over:
             looking.finish()
             poll()
+
+
+def _search(
+    following: _Following, robot: _Robot, prior: Prior | None, forever: bool, *, as_json: bool
+) -> bool:
+    """Follow the robot until it is located; whether it is.
+
+    prior : where the robot is at the beginning, as far as it is known. forever : go on when it is located.
+    """
+    from signature.relocalization.looking import Looking
+    from signature.relocalization.map_index import MapIndex
+    from signature.relocalization.watcher import Watcher
+
+    live, config = following.live, following.config
+    index = MapIndex.of(following.database, config)
+    watcher = Watcher(index if prior is None else index.within(prior))
+    located = False
+    with Looking(watcher, beside=live.feed.realtime, step_m=config.relocalize.step_m) as looking:
+
+        def use(look: Look) -> bool:
+            nonlocal located
+            _print(look, live, robot, robot.tell(look, looking.lock), as_json=as_json)
+            located = look.state in ("located", "recovered")
+            return located and not forever
+
+        following.run(looking, use)
     return located
+
+
+def _check(following: _Following, topic: str, session: str | None, *, as_json: bool) -> bool:
+    """Follow the robot, and judge the pose that it believes in; whether the last one was fine."""
+    from pc2grid_cli.check_pose import as_text as check_as_text
+    from pc2grid_cli.check_pose import live_document
+    from signature.relocalization.looking import Looking
+    from signature.relocalization.map_index import MapIndex
+    from signature.relocalization.pose_watcher import PoseLook, PoseWatcher
+
+    live, config = following.live, following.config
+    live.listen_to_pose(topic)
+    watcher = PoseWatcher(MapIndex.of(following.database, config), lambda: live.believed, session)
+    fine = False
+    with Looking(watcher, beside=live.feed.realtime, step_m=config.relocalize.step_m) as looking:
+
+        def use(look: PoseLook) -> bool:
+            nonlocal fine
+            fine = look.checked.status == "fine"
+            if as_json:
+                console.print_json_line(live_document(look, live, following.database.location))
+            else:
+                print(check_as_text(look.checked), flush=True)
+            return False
+
+        following.run(looking, use)
+    if live.believed is None:
+        console.warn(f"{topic}: no pose of the robot in a map; nothing was checked")
+    return fine
 
 
 @dataclass(kw_only=True)

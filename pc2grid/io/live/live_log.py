@@ -14,11 +14,12 @@ from pathlib import Path
 
 from pc2grid.arrays import F64
 from pc2grid.config import ReadConfig
-from pc2grid.errors import FrameError, NoScans
+from pc2grid.errors import FrameError, NoScans, TopicError
 from pc2grid.io import topics
 from pc2grid.io.error_translation import guarded, guarded_stream
 from pc2grid.io.frames import FrameTree
 from pc2grid.io.live.feed import Arrived, Feed
+from pc2grid.io.map_pose import MapPose, MapPoses, map_poses
 from pc2grid.io.message_source import Choice, LogInfo, RawMessage, Tally, TopicInfo
 from pc2grid.io.read_plan import Plan, make_plan, published_once
 from pc2grid.io.scan_stream import Stream, StreamParameters
@@ -82,6 +83,8 @@ class LiveLog:
 
     feed : where the messages arrive. lag_s : time from the arrival of the last scan to the end of its use.
     keeps_up : whether the scans that were held back for the plan are used up, so that late ones are dropped.
+    believed : the newest pose of the base in the map, as localization on the robot says on the topic given to
+    `listen_to_pose`; None before the first.
     on_poll : called several times a second while scans are awaited and with each scan; if it returns true, no
     more scans are given.
     """
@@ -96,6 +99,9 @@ class LiveLog:
         self.feed = feed
         self.lag_s = 0.0
         self.on_poll: Callable[[], bool] = lambda: False
+        self.believed: MapPose | None = None
+        self._pose_topic: str | None = None
+        self._poses: MapPoses | None = None
         self._stopped = False
         self._config, self._parameters, self._clock = config, parameters, clock
         self._frames = FrameTree()
@@ -208,9 +214,13 @@ class LiveLog:
         self._held, self._source, self._plan = held, source, plan
         self._new_stream()
         assert self._stream is not None
-        self.feed.want(self._stream.topics)
+        self._want()
         source.found = [m for m in source.found if published_once(m.channel)]
         self._planned_s = self._heard_s = self._clock()
+
+    def _want(self) -> None:
+        assert self._stream is not None
+        self.feed.want(self._stream.topics | (self._poses.topics if self._poses is not None else frozenset()))
 
     def _new_stream(self) -> None:
         assert self._source is not None and self._plan is not None
@@ -247,6 +257,7 @@ class LiveLog:
                     return
                 continue
             message = arrived.message
+            self._hear_pose(message)
             if message.channel == scans_topic:
                 gap_ns = 0 if last_scan_ns is None else message.log_time_ns - last_scan_ns
                 last_scan_ns = message.log_time_ns
@@ -290,6 +301,7 @@ class LiveLog:
         if arrived is None:
             self._keep_up()
             self._name_silent(now_s)
+            self._find_pose_topic(now_s)
             return None
         if now_s - self._planned_s > self._parameters.catch_up_s:
             self._keep_up()
@@ -303,6 +315,38 @@ class LiveLog:
         if not self.keeps_up:
             self.keeps_up = True
             self.feed.keep_up()
+
+    # --- the pose that the robot believes in ----------------------------------------------------------
+
+    def listen_to_pose(self, topic: str) -> None:
+        """Keep `believed` up to date from a topic of a pose, an odometry or tf, also if it begins later."""
+        self._pose_topic = topic
+
+    def _find_pose_topic(self, now_s: float) -> None:
+        """Ask for the messages of the pose's topic as soon as it is there."""
+        if self._pose_topic is None or self._poses is not None or self._plan is None:
+            return
+        try:
+            base_frame = self._plan.choice.base_frame
+            self._poses = map_poses(self.feed.topics(), self._pose_topic, base_frame)
+        except TopicError as error:
+            if now_s - self._planned_s > self._parameters.silent_s or self.feed.ended:
+                self.feed.news.tell(str(error))
+            return
+        self._want()
+
+    def _hear_pose(self, message: RawMessage) -> None:
+        self._find_pose_topic(self._clock())
+        if self._poses is None or message.channel.topic not in self._poses.topics:
+            return
+        self._poses.take(message)
+        try:
+            self.believed = self._poses.newest(message.log_time_ns)
+        except NoScans:
+            return
+        except FrameError as error:  # tf of the map may begin later
+            if self._clock() - self._planned_s > self._parameters.silent_s:
+                self.feed.news.tell(str(error))
 
     # --- odometry, now --------------------------------------------------------------------------------
 
