@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from pc2grid.arrays import F64, I64
 from pc2grid.model import UNKNOWN, OccupancyGrid, Submap
@@ -34,8 +35,22 @@ class SeveralCentres:
         """Describe every disc of every submap."""
         offsets = lattice(self.reach_m, self.spacing_m)
         discs = [smaller_disc(submap, offset, self.reach_m) for submap in submaps for offset in offsets]
-        owner = np.repeat(np.arange(len(submaps)), len(offsets))
-        return _Centres(self.method.fit(discs), owner, len(submaps), self.reach_m)
+        own = np.repeat(np.arange(len(submaps)), len(offsets))
+        centers_m = np.array([submap.center_m for submap in submaps]).reshape(-1, 2)
+        at_m = centers_m[own] + np.tile(offsets, (len(submaps), 1))
+        return _Centres(self.method.fit(discs), _nearest(at_m, centers_m, own), len(submaps), self.reach_m)
+
+
+def _nearest(at_m: F64, centers_m: F64, own: I64) -> I64:
+    """For each disc, at (N, 2), the submap with the nearest centre (M, 2); its own (N,) if none is nearer.
+
+    Submaps overlap. A disc of one of them that lies beside the centre of another one stands for that one.
+    """
+    if not len(at_m):
+        return own
+    away_m, nearest = cKDTree(centers_m).query(at_m)
+    own_m = np.hypot(*(at_m - centers_m[own]).T)
+    return np.where(own_m <= away_m + 1e-9, own, nearest)
 
 
 @dataclass(frozen=True, slots=True)

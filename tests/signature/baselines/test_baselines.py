@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -271,3 +272,13 @@ def test_a_smaller_disc_keeps_the_cells_within_its_radius() -> None:
 def test_a_lattice_holds_the_centre_and_stays_within_its_reach() -> None:
     points = lattice(1.0, 0.5)
     assert len(points) == 13 and (np.hypot(*points.T) <= 1.0).all() and [0.0, 0.0] in points.tolist()
+
+
+def test_a_disc_beside_the_centre_of_another_submap_stands_for_that_one() -> None:
+    """Two submaps 1.2 m apart: the disc of the first that is cut 0.2 m beside the second belongs to it."""
+    hall = submap_of(random_rooms(3, walls=40))
+    offsets = np.array([[0.0, 0.0], [1.2, 0.0]])
+    submaps = [replace(smaller_disc(hall, o, 2.0), center_m=(float(o[0]), float(o[1]))) for o in offsets]
+    matcher = SeveralCentres(method=ShapeContext()).fit(submaps)
+    query = smaller_disc(hall, np.array([1.0, 0.0]), 2.0)
+    assert np.argmax(matcher.similarities(query)) == 1
