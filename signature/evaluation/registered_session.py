@@ -7,7 +7,7 @@ many maps it is located in and however many methods are compared on it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -67,6 +67,15 @@ class RegisteredSession:
             np.concatenate([_pose(self.T_odom_base[k]).apply(ahead) for k in known]),
             np.concatenate([_pose(self.T_world_base[k]).apply(ahead) for k in known]),
         )
+
+    def true_pose(self, scan: int) -> SE2 | None:
+        """T_world_base of a scan: the truth of the nearest scan that has one, carried on by registration."""
+        known = np.flatnonzero(~np.isnan(self.T_world_base[:, 0]))
+        if not len(known):
+            return None
+        nearest = known[np.argmin(np.abs(known - scan))]
+        T_nearest_scan = _pose(self.T_odom_base[nearest]).inverse() @ _pose(self.T_odom_base[scan])
+        return _pose(self.T_world_base[nearest]) @ T_nearest_scan
 
     def scans(self) -> Iterator[tuple[RegisteredScan, PlanarScan, SE2]]:
         """Each scan (without its points), its planar scan and its true pose, in order of time."""
@@ -129,10 +138,12 @@ def register(
     *,
     sensor: SensorKind,
     until_m: float = math.inf,
+    see: Callable[[RegisteredScan], object] = lambda registered: None,
 ) -> RegisteredSession:
     """Register scans with the settings of a user, and stop after `until_m` of travel.
 
     scans : each with its true pose, None where it is not known; registration does not get it.
+    see : called with each scan, whose points are not kept here.
     """
     truths: list[SE2 | None] = []
 
@@ -149,6 +160,7 @@ def register(
         pose = SE2.from_matrix(registered.T_session_base)
         if poses:
             travel_m += math.hypot(pose.x - poses[-1].x, pose.y - poses[-1].y)
+        see(registered)
         planar_scans.append(planar_scan)
         poses.append(pose)
         lost.append(registered.health is Health.LOST)

@@ -87,6 +87,7 @@ def test_every_document_is_validated_by_a_test() -> None:
     elsewhere = {
         "compare-paper": "pc2grid_cli/test_compare_paper.py",
         "compare-maps": "signature/evaluation/test_map_quality.py",
+        "compare-peers": "signature/evaluation/test_peers.py",
         "compare-real": "signature/evaluation/test_real_sensors.py",
         "compare-sensors": "signature/evaluation/test_sensor_matrix.py",
         "compare-signatures": "signature/evaluation/test_selection.py",

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from typing_extensions import TypedDict
 
 from signature.evaluation.metrics import ConfidenceError, MatrixCell, QueryCounts
+from signature.evaluation.peers.outcome import PeerCell, PeerTrial
 from signature.evaluation.real_sensors import RealCell
 from signature.evaluation.trial import Trial
 from signature.relocalization.answer_json import Pose, Result, Sessions, StampedPose, Status, Travel, Version
@@ -397,6 +398,21 @@ class ComparePaper(TypedDict):
     cells: list[dict[str, Any]]
 
 
+class ComparePeers(TypedDict):
+    """`pc2grid compare peers --json`, and its peers.json.
+
+    setting: the options, the seed of the intervals, and by name the seconds that `--mapped` gives.
+    not_installed: by peer, the command that installs it.
+    """
+
+    schema_version: Version
+    recordings: list[str]
+    setting: dict[str, float]
+    not_installed: dict[str, str]
+    cells: list[PeerCell]
+    trials: list[PeerTrial]
+
+
 class CompareReal(TypedDict):
     """`pc2grid compare real --json`, and its real.json.
 
@@ -558,6 +574,7 @@ DOCUMENTS: dict[str, type] = {
     "compare-log": CompareLog,
     "compare-maps": CompareMaps,
     "compare-paper": ComparePaper,
+    "compare-peers": ComparePeers,
     "compare-real": CompareReal,
     "compare-sensors": CompareSensors,
     "compare-signatures": CompareSignatures,

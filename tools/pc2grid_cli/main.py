@@ -14,6 +14,7 @@ from pc2grid_cli.command_line import Command, Group
 from pc2grid_cli.compare_log import compare_log_command
 from pc2grid_cli.compare_maps import compare_maps_command
 from pc2grid_cli.compare_paper import compare_paper_command
+from pc2grid_cli.compare_peers import compare_peers_command
 from pc2grid_cli.compare_real import compare_real_command
 from pc2grid_cli.compare_sensors import compare_sensors_command
 from pc2grid_cli.compare_signatures import compare_signatures_command
@@ -91,6 +92,7 @@ compare.command("signatures", cls=Command)(compare_signatures_command)
 compare.command("log", cls=Command)(compare_log_command)
 compare.command("maps", cls=Command)(compare_maps_command)
 compare.command("real", cls=Command)(compare_real_command)
+compare.command("peers", cls=Command)(compare_peers_command)
 app.add_typer(compare, name="compare")
 
 db = typer.Typer(
