@@ -1,13 +1,54 @@
-"""Time of `pc2grid relocalize`, from the start of the process to the answer."""
+"""Time of `pc2grid relocalize`, from the start of the process to the answer, and of the answer alone."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
 import fixtures
-from measure import Row, median, program
+from measure import Row, median, program, timed
 from reading import bare_kiss
+
+from pc2grid.model import OccupancyGrid
+from signature.config import Config
+
+WINDOW_M = 15.0
+
+
+def look_up_time(folder: Path, quick: bool) -> Iterator[Row]:
+    """The time from a query's grid, drawn over 15 m, to its pose in the map of an office."""
+    config = Config()
+    index = fixtures.index_of(fixtures.grid_of(fixtures.drive(30.0 if quick else 150.0, seed=0)), config)
+    windows = [
+        window
+        for seed in ((1,) if quick else (1, 2, 3))
+        for window in _windows(list(fixtures.drive(16.0 if quick else 62.0, seed=seed)))
+    ]
+    index.look_up(fixtures.query_map(windows[0], config))  # compiles
+    times = []
+    for window in windows:
+        grid = fixtures.grid_of(window)
+
+        def locate(window: list[fixtures.PosedScan] = window, grid: OccupancyGrid = grid) -> None:
+            query = fixtures.query_map(window, config, grid)
+            index.judge(query, index.look_up(query))
+
+        times.append(timed(locate))
+    wall, cpu = median(times).times(1e3)
+    what = f"query to pose in {len(index.places.table)} submaps"
+    yield Row(what=what, measured=wall, cpu=cpu, unit="ms", goal=60.0, note=f"{len(times)} queries")
+
+
+def _windows(scans: list[fixtures.PosedScan]) -> Iterator[list[fixtures.PosedScan]]:
+    """The scans of each 15 m of travel."""
+    start, path_m = 0, 0.0
+    for k in range(1, len(scans)):
+        a, b = scans[k - 1].T_map_base, scans[k].T_map_base
+        path_m += math.hypot(b.x - a.x, b.y - a.y)
+        if path_m >= WINDOW_M:
+            yield scans[start : k + 1]
+            start, path_m = k + 1, 0.0
 
 
 def relocalize_time(folder: Path, quick: bool) -> Iterator[Row]:

@@ -16,7 +16,7 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from real_queries import STANDING_SCANS, index_of, read, true_pose
+from real_queries import STANDING_SCANS, index_of, read
 from scipy.spatial import cKDTree
 
 from pc2grid.geometry import SE2, wrap_angle
@@ -56,7 +56,7 @@ def count(name: str, grid: OccupancyGrid, queries: list[RegisteredSession], inde
         for travel_m, asked in zip(TRAVEL_M, localize(scans, [index], after=set(after)), strict=False):
             (answer,) = asked.answers
             scan = asked.scans - 1
-            truth = true_pose(driven, scan)
+            truth = driven.true_pose(scan)
             if truth is None:
                 continue
             kind = "covered" if covered(grid, driven, scan, truth) else "uncovered"

@@ -80,19 +80,6 @@ def index_of(name: str, grid: OccupancyGrid, config: Config) -> MapIndex:
     return MapIndex({name: grid}, table, config, config)
 
 
-def true_pose(driven: RegisteredSession, scan: int) -> SE2 | None:
-    """T_world_base of a scan: the truth of the nearest scan that has one, carried on by registration."""
-    known = np.flatnonzero(~np.isnan(driven.T_world_base[:, 0]))
-    if not len(known):
-        return None
-    k = known[np.argmin(np.abs(known - scan))]
-    truth, then, now = (
-        SE2(*row.tolist())
-        for row in (driven.T_world_base[k], driven.T_odom_base[k], driven.T_odom_base[scan])
-    )
-    return truth @ then.inverse() @ now
-
-
 def moments(
     driven: RegisteredSession, config: Config
 ) -> Iterator[tuple[float, dict[float, QueryMap], SE2 | None]]:
@@ -110,7 +97,7 @@ def moments(
             window.add(planar_scan, T_odom_base)
         if i + 1 < STANDING_SCANS or not want or windows[WINDOWS_M[0]].path_m < want[0]:
             continue
-        truth = true_pose(driven, i)
+        truth = driven.true_pose(i)
         travel_m = want.pop(0)
         maps = {
             m: w.query(config.partition, config.signature)

@@ -48,6 +48,7 @@ MEASURES: dict[str, Measure] = {
     "retrieve": large_database.retrieve_time,
     "open": large_database.open_time,
     "floors": large_database.floors_time,
+    "look-up": locating.look_up_time,
     "relocalize": locating.relocalize_time,
     "live": live.lag,
     "hour": live.memory,

@@ -47,7 +47,8 @@ class SiteParameters:
     mapped : share of a recording that becomes the map, unless its seconds are given.
     query_s : a query lasts at most so long, and at most this share (`query_share`) of what is not mapped.
     gap : seconds between map and first query, as a share of the longest query.
-    keyframe_m, keyframe_rad : a scan of the map is used if the robot has moved or turned so far.
+    keyframe_m, keyframe_rad : a scan of the map is used if the robot has moved or turned so far; of a lidar,
+        which sees all around, after `lidar_keyframe_m`.
     cloud_voxel_m : edge of the voxels that clouds are thinned to; each matcher thins further as it needs.
     same_ns : a true pose belongs to a scan if their stamps differ by no more than this.
     near_m, covered : a query is covered if this share of its last planar scan lies so near to a wall of the
@@ -62,6 +63,7 @@ class SiteParameters:
     query_share: float = 0.25
     gap: float = 1.0 / 30.0
     keyframe_m: float = 0.15
+    lidar_keyframe_m: float = 0.5
     keyframe_rad: float = 0.1
     cloud_voxel_m: float = 0.1
     same_ns: int = 1_000_000
@@ -244,6 +246,7 @@ def _has_map(site: Site) -> bool:
 
 def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
     """Draw the grid at the true poses and, of a lidar, keep the clouds."""
+    step_m = SITE.keyframe_m if site.sensor == "laser" else SITE.lidar_keyframe_m
     builder, last = GridBuilder(config.projection), None
     path, clouds = [], []
     for scan, T_world_base in scans:
@@ -253,8 +256,8 @@ def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
         step = pose if last is None else last.inverse() @ pose
         if (
             last is not None
-            and math.hypot(step.x, step.y) < SITE.keyframe_m
-            and abs(step.yaw) < SITE.keyframe_rad
+            and math.hypot(step.x, step.y) < step_m
+            and (abs(step.yaw) < SITE.keyframe_rad or site.sensor != "laser")
         ):
             continue
         last = pose
