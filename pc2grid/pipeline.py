@@ -6,6 +6,7 @@ import dataclasses
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,7 +37,7 @@ from pc2grid.time_span import TimeSpan
 if TYPE_CHECKING:
     from pc2grid.io import Log
     from pc2grid.mapping.keyframes import Keyframe, Keyframes
-    from pc2grid.mapping.loop_closure import SettledKeyframes
+    from pc2grid.mapping.loop_closure import LoopParameters, SettledKeyframes
     from pc2grid.mapping.place_recognition import PlaceRecognizer
     from pc2grid.odometry.overruled import Disagreement
     from pc2grid.odometry.tracker import Tracked
@@ -257,6 +258,7 @@ def _map(
     """
     from pc2grid.mapping.keyframe_points import KeyframePoints
     from pc2grid.mapping.keyframes import Keyframes
+    from pc2grid.mapping.loop_closure import CAMERA_LOOPS, LOOPS
     from pc2grid.mapping.parts import PARTS
     from pc2grid.odometry.tracker import Tracker
 
@@ -270,8 +272,12 @@ def _map(
         kept = None
         if voxel_m is not None:
             kept = stack.enter_context(closing(KeyframePoints(voxel_m, config.projection.max_range_m)))
-        selection = _KeyframeSelection(keyframes, config.projection, recognizer)
-        for scan in scans:
+        rest = iter(scans)
+        begin = [scan for scan in (next(rest, None),) if scan is not None]
+        depth = bool(begin) and begin[0].sensor == "depth"
+        loops = CAMERA_LOOPS if depth else LOOPS
+        selection = _KeyframeSelection(keyframes, config.projection, recognizer, loops)
+        for scan in chain(begin, rest):
             tracked = tracker.track(scan)
             selection.add(tracked, index=len(stamps))
             if kept is not None and tracked.keyframe and scan.sensor != "laser":
@@ -409,12 +415,16 @@ class _KeyframeSelection:
     """
 
     def __init__(
-        self, keyframes: Keyframes, projection: ProjectionConfig, recognizer: PlaceRecognizer | None
+        self,
+        keyframes: Keyframes,
+        projection: ProjectionConfig,
+        recognizer: PlaceRecognizer | None,
+        loops: LoopParameters,
     ) -> None:
         from pc2grid.mapping.loop_closure import LoopCloser
         from pc2grid.mapping.unseen_hits import UnseenHits
 
-        self.closer = LoopCloser(keyframes, recognizer=recognizer, projection=projection)
+        self.closer = LoopCloser(keyframes, recognizer=recognizer, projection=projection, parameters=loops)
         self._keyframes = keyframes
         self._unseen_hits = UnseenHits(projection.max_range_m, projection.resolution_m)
         self._latest: Keyframe | None = None

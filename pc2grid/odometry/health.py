@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from pc2grid.model import Health
 from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.odometry.point_to_line import Match
@@ -35,11 +33,7 @@ class HealthJudge:
             self._lost_scans += lost
             return Health.LOST if lost else Health.DEGENERATE
         self._poor_scans = self._lost_scans = 0
-        # Information on x and y with the yaw eliminated (Schur complement).
-        J = match.information
-        across = J[:2, :2] - np.outer(J[:2, 2], J[2, :2]) / max(J[2, 2], 1e-9)
-        weakest = float(np.linalg.eigvalsh(across)[0])
-        return Health.FINE if weakest > p.max_sigma_m**-2 else Health.DEGENERATE
+        return Health.FINE if match.measured else Health.DEGENERATE
 
     @property
     def gives_up(self) -> bool:

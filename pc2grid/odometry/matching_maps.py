@@ -9,20 +9,31 @@ import numpy as np
 from pc2grid.arrays import F64
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
-from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.odometry.parameters import (
+    MATCHING_PARAMETERS,
+    TRACKING_PARAMETERS,
+    MatchingParameters,
+    TrackingParameters,
+)
 from pc2grid.odometry.point_to_line import Match, PointGrid, best_placements, evenly
 
 
 class MatchingMaps:
     """Two overlapping local maps: scans are matched with the older one, and the younger replaces it in time.
 
-    reach_m : range of the hits of a scan.
+    reach_m : range of the hits of a scan. matching : numbers of the matching, which depend on the sensor.
     restarts : how often the maps were started again.
     """
 
-    def __init__(self, reach_m: float, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
+    def __init__(
+        self,
+        reach_m: float,
+        parameters: TrackingParameters = TRACKING_PARAMETERS,
+        matching: MatchingParameters = MATCHING_PARAMETERS,
+    ) -> None:
         self._half_m = reach_m + 2.0 * parameters.map_travel_m
         self._parameters = parameters
+        self._matching = matching
         self._maps: list[tuple[PointGrid, float]] = []  # each with the travel at which it was begun
         self._last_keyframe: SE2 | None = None
         self._travel_m = 0.0
@@ -79,7 +90,8 @@ class MatchingMaps:
             self._travel_m += distance_m
         if not self._maps or self._travel_m - self._maps[-1][1] > p.map_travel_m:
             middle = np.array([pose.x, pose.y])
-            self._maps.append((PointGrid(middle - self._half_m, middle + self._half_m), self._travel_m))
+            low_m, high_m = middle - self._half_m, middle + self._half_m
+            self._maps.append((PointGrid(low_m, high_m, parameters=self._matching), self._travel_m))
         if len(self._maps) > 2:
             del self._maps[0]
         for grid, _ in self._maps:

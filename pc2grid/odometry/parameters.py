@@ -15,6 +15,8 @@ class MatchingParameters:
         beside it.
     point_sigma_m : standard deviation that one point counts with. It is far above the noise of a range,
         since the errors of neighbours on one wall are not independent.
+    least_points : with fewer points (sum of their weights) across it, a direction of the position counts as
+        not measured.
     residual_scale_m : scale of the Cauchy weight of a point, times the radius of its neighbourhood in cells.
     prior_scale : scale of the Cauchy weight of the prior, in standard deviations.
     radii_cells : half width of the neighbourhood that gives each point its line, one entry an iteration:
@@ -25,6 +27,7 @@ class MatchingParameters:
     cell_m: float = 0.1
     sectors: int = 8
     point_sigma_m: float = 0.1
+    least_points: float = 0.44
     residual_scale_m: float = 0.05
     prior_scale: float = 2.0
     radii_cells: tuple[int, ...] = (3, 3, 2, 2, 1, 1, 1, 1, 1, 1)
@@ -103,7 +106,6 @@ class TrackingParameters:
     min_overlap, min_overlap_carried : least share of the hits that meet a line of the local map. It is
         smaller for a carried sensor, since the plane shows less of a scene when the sensor tilts.
     max_residual_m : largest mean distance of the hits from their lines.
-    max_sigma_m : a direction whose standard deviation is larger counts as not measured.
     bridged_scans : poor scans in a row that odometry may bridge.
     give_up_scans : lost scans in a row after which tracking starts again.
 
@@ -177,7 +179,6 @@ class TrackingParameters:
     min_overlap: float = 0.3
     min_overlap_carried: float = 0.1
     max_residual_m: float = 0.1
-    max_sigma_m: float = 0.15
     bridged_scans: int = 30
     give_up_scans: int = 10
 
@@ -197,4 +198,19 @@ class TrackingParameters:
 
 
 MATCHING_PARAMETERS = MatchingParameters()
+CAMERA_MATCHING = MatchingParameters(
+    cell_m=0.05, point_sigma_m=0.03, radii_cells=(6, 4, 4, 2, 2, 1, 1, 1, 1, 1)
+)
+"""For a depth camera on wheels.
+
+A hit is the mean of some dozen pixels: 2 to 10 mm from the wall at ranges up to 6 m (simulated), so it
+counts more than a beam of a laser. A camera sees a quarter of its surroundings, and an error of a turn
+stays if the view passes on before the scans have corrected odometry. The cells are smaller, because not
+noise but the shape of walls within a cell limits the heading of a scan (RMS 0.10 instead of 0.14 degrees on
+a map with true poses; as much without any noise). Chosen on 60 m of intel, seed 2: ATE of tracking 0.016
+instead of 0.042 m.
+
+Weights that fall with the square of the range were tried there, and made the heading worse (ATE 0.018 to
+0.044 m): the noise of a hit is small beside the shape of walls, and far hits determine the heading.
+"""
 TRACKING_PARAMETERS = TrackingParameters()

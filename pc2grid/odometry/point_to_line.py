@@ -28,12 +28,14 @@ class Match:
 
     pose : T_map_points. information : (3, 3) of x, y, yaw in the map frame, from the points alone.
     overlap : share of the points that found a line. residual_m : mean distance of those from their lines.
+    measured : whether the points fix every direction of the position.
     """
 
     pose: SE2
     information: F64
     overlap: float
     residual_m: float
+    measured: bool
 
 
 class PointGrid:
@@ -136,7 +138,15 @@ class PointGrid:
             information,
             found / max(len(points), 1),
             distance / max(found, 1),
+            _weakest(information) > unit * p.least_points,
         )
+
+
+def _weakest(information: F64) -> float:
+    """Information on the position in its weakest direction, the yaw eliminated (Schur complement)."""
+    J = information
+    across = J[:2, :2] - np.outer(J[:2, 2], J[2, :2]) / max(J[2, 2], 1e-9)
+    return float(np.linalg.eigvalsh(across)[0])
 
 
 def sector_of(normal_rad: F64, sectors: int) -> NDArray[np.int64]:

@@ -26,7 +26,12 @@ from pc2grid.odometry.health import HealthJudge
 from pc2grid.odometry.matching_maps import MatchingMaps
 from pc2grid.odometry.motion_model import MotionModel, Prediction, not_credible
 from pc2grid.odometry.overruled import Disagreement
-from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.odometry.parameters import (
+    CAMERA_MATCHING,
+    MATCHING_PARAMETERS,
+    TRACKING_PARAMETERS,
+    TrackingParameters,
+)
 from pc2grid.odometry.point_to_line import Match
 from pc2grid.odometry.registration import KissRegistration
 
@@ -66,9 +71,9 @@ class Tracker:
         self._parameters = parameters
         self._started = False
         self._motion = MotionModel(parameters)
-        self._maps = MatchingMaps(self._projection.max_range_m, parameters)
-        # These three depend on how the sensor is carried; `start` makes them from the first scan.
+        # These four depend on the sensor and on how it is carried; `start` makes them from the first scan.
         self._ground = GroundModel(None, rolling=True, parameters=parameters)
+        self._maps = MatchingMaps(self._projection.max_range_m, parameters)
         self._health = HealthJudge(rolling=True, parameters=parameters)
         self.kiss = KissRegistration(registration, parameters=parameters)
 
@@ -76,6 +81,12 @@ class Tracker:
         """Begin with the first scan: find the floor, and put the base at the origin of the session frame."""
         points = self._deskewed(scan, *self._motion.within(scan, None))
         self._ground = GroundModel.start(points, scan, self._parameters)
+        on_wheels = scan.sensor == "depth" and self._ground.rolling
+        self._maps = MatchingMaps(
+            self._projection.max_range_m,
+            self._parameters,
+            CAMERA_MATCHING if on_wheels else MATCHING_PARAMETERS,
+        )
         self._health = HealthJudge(rolling=self._ground.rolling, parameters=self._parameters)
         self.kiss = self._new_kiss()
         self._started = True
