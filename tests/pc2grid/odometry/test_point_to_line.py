@@ -9,6 +9,7 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.odometry._kernels import normal_equations, placement_scores
+from pc2grid.odometry.parameters import CAMERA_MATCHING, MATCHING_PARAMETERS
 from pc2grid.odometry.point_to_line import (
     PointGrid,
     best_placements,
@@ -30,6 +31,20 @@ def test_points_beside_a_map_are_no_part_of_it_and_a_heap_is_no_line() -> None:
     grid.add(wall, south)
     found = grid.match(wall, south, SE2(0.0, 0.08), SE2(0.0, 0.08), np.eye(3))
     assert found.overlap > 0.9 and abs(found.pose.y) < 0.01
+
+
+def test_one_wall_leaves_a_direction_unmeasured_however_much_a_point_counts() -> None:
+    line, side = np.linspace(0.5, 3.5, 200), np.full(200, 0.5)
+    walls = np.column_stack((line, side)), np.column_stack((side, line))
+    normals = np.full(200, math.pi / 2), np.zeros(200)
+    for parameters in (MATCHING_PARAMETERS, CAMERA_MATCHING):
+        grid = PointGrid((0.0, 0.0), (4.0, 4.0), parameters=parameters)
+        for wall, normal in zip(walls, normals, strict=True):
+            grid.add(wall, normal)
+        one = grid.match(walls[0][50:], normals[0][50:], SE2(), SE2(), np.eye(3))
+        both = grid.match(np.concatenate(walls), np.concatenate(normals), SE2(), SE2(), np.eye(3))
+        assert one.overlap > 0.9 and not one.measured
+        assert both.measured
 
 
 def test_moments_of_points_added_in_parts_are_those_of_all_at_once() -> None:

@@ -9,13 +9,13 @@ import pytest
 from pc2grid.clouds.deskew import deskew
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.config import ProjectionConfig, RegistrationConfig
-from pc2grid.geometry import SE2, invert_pose, transform_points
+from pc2grid.geometry import SE2, invert_pose, transform_points, wrap_angle
 from pc2grid.model import Health, Scan
 from pc2grid.odometry.motion_model import MotionModel
 from pc2grid.odometry.registration import KissRegistration
 from pc2grid.odometry.tracker import Tracker
 from pc2grid.simulate import SimulationConfig, iter_session
-from pc2grid.simulate.config import LidarConfig
+from pc2grid.simulate.config import LidarConfig, OdometryConfig
 
 
 def session(sensor, *, length_m=6.0, seed=4):
@@ -51,6 +51,20 @@ def test_each_sensor_is_followed(sensor, limit_m):
     assert errors(pairs, [r.T_session_base for r in registered]).max() < limit_m
     assert sum(r.health is Health.LOST for r in registered) == 0
     assert np.array_equal(registered[0].T_session_base, np.eye(4)) or sensor != "laser"
+
+
+def test_a_camera_keeps_its_heading_where_wheels_turn_a_tenth_too_far():
+    config = SimulationConfig(length_m=6.0, seed=5, odometry=OdometryConfig(rotation_bias=0.1))
+    pairs = list(iter_session(sensor="depth", config=config))
+    start = pairs[0][1].yaw
+    true = np.array([pose.yaw - start for _, pose in pairs])
+
+    def worst_deg(poses):
+        yaws = np.array([SE2.from_matrix(T).yaw for T in poses])
+        return np.degrees(np.abs(wrap_angle(yaws - yaws[0] - true)).max())
+
+    assert worst_deg([scan.T_odom_base for scan, _ in pairs]) > 2.0
+    assert worst_deg([r.T_session_base for r in follow(scan for scan, _ in pairs)]) < 0.2
 
 
 def test_odometry_with_the_wrong_sign_is_overruled(laser):
