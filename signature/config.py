@@ -142,7 +142,7 @@ class RelocalizeConfig(Section):
     shortlist: int = Field(
         400,
         gt=0,
-        description="in a larger one, the places that the signatures select for this, for each view",
+        description="in a larger one, so many places are selected for each view, by signatures and isovists",
     )
     select_by: SelectBy = Field(
         "seen", description="signatures of what was seen, hidden rays left out; paper: Eq. 6"

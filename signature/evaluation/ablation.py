@@ -205,7 +205,7 @@ def _seen_pairs(buildings: Sequence[Sequence[SensorMap]]) -> tuple[Rows, Rows]:
     for maps in buildings:
         for one in maps:
             places = one.index.places
-            mine, centers = places.described(), places.table.center_m
+            mine, centers = places.described().signatures, places.table.center_m
             a, b = np.nonzero(np.hypot(*(centers[:, None] - centers[None]).transpose(2, 0, 1)) >= FAR_M)
             other.append((mine[a], mine[b], first + a))
             for two in maps:

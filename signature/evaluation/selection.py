@@ -7,6 +7,7 @@ those it selects, and useful if more queries are located than with as many place
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pc2grid.arrays import F32, I64
+from pc2grid.arrays import I64
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.model import OCCUPIED, OccupancyGrid, SensorKind, SessionMap, Trajectory
 from signature.config import Config
@@ -24,6 +25,7 @@ from signature.evaluation.sensor_map import SensorMap
 from signature.evaluation.trial import JUDGEMENT
 from signature.relocalization.map_index import MapIndex
 from signature.relocalization.query_map import QueryMap, QueryWindow
+from signature.retrieval.place_index import PlaceBlock, PlaceIndex
 from signature.retrieval.seen_index import SeenIndex
 from signature.retrieval.vote import retrieve
 from signature.seen_likelihood import COMBINATIONS, seen_weights
@@ -31,11 +33,14 @@ from signature.seen_likelihood import COMBINATIONS, seen_weights
 if TYPE_CHECKING:
     from pathlib import Path
 
-ALL, PAPER, RANDOM = "all places", "paper (Eq. 6)", "random"
+ALL, VOTED, PAPER, RANDOM = "all places", "signatures, then isovists", "paper (Eq. 6)", "random"
+"""VOTED is what the program does: the signatures of what was seen, then isovists and a vote of all views
+(`PlaceIndex`)."""
 SEEN_SELECTORS = {"+".join(names): names for names in reversed(COMBINATIONS)}
 """The signatures of what was seen, all and some of them: name -> names of the signatures."""
-SELECTORS = (ALL, *SEEN_SELECTORS, PAPER, RANDOM)
-LOCATED_BY = (ALL, next(iter(SEEN_SELECTORS)), PAPER, RANDOM)
+SIGNATURES = next(iter(SEEN_SELECTORS))
+SELECTORS = (ALL, VOTED, *SEEN_SELECTORS, PAPER, RANDOM)
+LOCATED_BY = (ALL, VOTED, PAPER, RANDOM)
 """The selectors for which queries are also located, which takes most of the time."""
 TRAVELS_M = (1.0, 3.0, 8.0)
 """Metres of travel after which a query is asked."""
@@ -146,9 +151,8 @@ class Selection:
         """scope : what the index is called in the results. share : of the places, 0..1, that is selected."""
         self.index, self.scope, self.share = index, scope, share
         self._rng = np.random.default_rng(seed)
-        places = index.places
-        places.seen()
-        described = places.described()
+        index.places.index()
+        described = index.places.described().signatures
         self._seen = {
             name: SeenIndex.of(described, seen_weights(*names)) for name, names in SEEN_SELECTORS.items()
         }
@@ -207,6 +211,9 @@ class Selection:
             return np.arange(count)
         if selector == RANDOM:
             return np.sort(self._rng.choice(count, most, replace=False))
+        if selector == VOTED:
+            placed = places.index()
+            return placed.select(query.views, placed.nearest_to_each(query.views), most)
         each = max(1, most // len(query.views))
         if selector == PAPER:
             found = places.shortlists(query.views, each, self.index.made_with.signature, "paper")
@@ -223,8 +230,9 @@ SHARES = (0.05, 0.01, 0.002)
 class Recalled:
     """A query among very many places.
 
-    plan, query_sensor, seed, travel_m : the query. places : how many there are. share : of them, selected.
-    found : whether the right one is among those. processor_ms : of the selection.
+    plan, query_sensor, seed, travel_m : the query. places : how many there are. selector : VOTED or
+    SIGNATURES. share : of the places, selected. found : whether the right one is among those. processor_ms :
+    of the selection.
     """
 
     plan: str
@@ -232,6 +240,7 @@ class Recalled:
     seed: int
     travel_m: float
     places: int
+    selector: str
     share: float
     found: bool
     processor_ms: float
@@ -242,14 +251,15 @@ Asked = tuple[SensorKind, int, float, QueryMap, SE2]
 plan."""
 
 
-def recall_at_scale(own: SensorMap, others: F32, queries: Iterable[Asked]) -> Iterator[Recalled]:
+def recall_at_scale(
+    own: SensorMap, others: Iterable[PlaceBlock], queries: Iterable[Asked]
+) -> Iterator[Recalled]:
     """Whether the right places of queries are selected among those of the map and `others`, by what was seen.
 
-    others (N, K) : signatures of what was seen from other places. Queries from where the map has no place are
-    left out.
+    others : places of other maps. Queries from where the map has no place are left out.
     """
     places = own.index.places
-    index = SeenIndex.of(np.concatenate((places.described(), others)))
+    index = PlaceIndex.of(itertools.chain([places.described()], others), places.sight_m)
     for sensor, seed, travel_m, query, T_plan_query in queries:
         views_m = (own.T_plan_map.inverse() @ T_plan_query).apply(
             np.array([view.center_m for view in query.views]).reshape(-1, 2)
@@ -258,26 +268,32 @@ def recall_at_scale(own: SensorMap, others: F32, queries: Iterable[Asked]) -> It
         right = np.flatnonzero((apart <= JUDGEMENT.retrieved_m).any(axis=0))
         if not len(right):
             continue
-        profiles = [view.profile for view in query.views]
-        for share in SHARES:
-            each = max(1, round(share * len(index.vectors)) // len(profiles))
-            begin = time.process_time()
-            near = index.nearest_to_each(profiles, each)
-            processor_ms = 1000.0 * (time.process_time() - begin)
-            yield Recalled(
-                plan=own.name,
-                query_sensor=sensor,
-                seed=seed,
-                travel_m=travel_m,
-                places=len(index.vectors),
-                share=share,
-                found=bool(np.isin(np.concatenate([n.rows for n in near]), right).any()),
-                processor_ms=processor_ms,
-            )
+        for selector in (VOTED, SIGNATURES):
+            for share in SHARES:
+                most = max(1, round(share * len(index)))
+                begin = time.process_time()
+                if selector == VOTED:
+                    rows = index.select(query.views, index.nearest_to_each(query.views), most)
+                else:
+                    profiles = [view.profile for view in query.views]
+                    near = index.seen.nearest_to_each(profiles, max(1, most // len(profiles)))
+                    rows = np.unique(np.concatenate([n.rows for n in near]))
+                processor_ms = 1000.0 * (time.process_time() - begin)
+                yield Recalled(
+                    plan=own.name,
+                    query_sensor=sensor,
+                    seed=seed,
+                    travel_m=travel_m,
+                    places=len(index),
+                    selector=selector,
+                    share=share,
+                    found=bool(np.isin(rows, right).any()),
+                    processor_ms=processor_ms,
+                )
 
 
-def described_floor(seed: int, config: Config) -> F32:
-    """The signatures of what is seen from the places of `office_floor`, (N, K)."""
+def described_floor(seed: int, config: Config) -> PlaceBlock:
+    """What is seen from the places of `office_floor`; its seed is the number of the session."""
     from pc2grid.submaps.isovist import look_around
     from pc2grid.submaps.partition import submap_centers
     from signature.retrieval.view import PROFILE_BEARINGS
@@ -285,23 +301,27 @@ def described_floor(seed: int, config: Config) -> F32:
 
     grid, sight_m = office_floor(seed), config.partition.radius_m
     centers_m = submap_centers(grid, config.partition)
-    return seen_signatures(*look_around(grid, centers_m, sight_m, bearings=PROFILE_BEARINGS), sight_m)
+    ranges_m, ends = look_around(grid, centers_m, sight_m, bearings=PROFILE_BEARINGS)
+    signatures = seen_signatures(ranges_m, ends, sight_m)
+    return PlaceBlock(signatures, ranges_m, ends, centers_m, np.full(len(centers_m), seed))
 
 
 def tally_at_scale(trials: Sequence[Recalled], *, draws: int = 1000) -> list[Mapping[str, object]]:
-    """By number of places, share, travel and sensor (and "all"): share found with its 5th and 95th percentile
-    over sessions drawn anew (bootstrap), and median time."""
+    """By number of places, selector, share, travel and sensor (and "all"): share found with its 5th and 95th
+    percentile over sessions drawn anew (bootstrap), and median time."""
     from signature.evaluation.calibration import share_by_session
 
-    groups: dict[tuple[int, float, float, str], list[Recalled]] = {}
+    groups: dict[tuple[int, str, float, float, str], list[Recalled]] = {}
     for trial in trials:
         for sensor in ("all", trial.query_sensor):
             # Maps differ in size; the other places do not.
             places = round(trial.places, -3)
-            groups.setdefault((places, trial.share, trial.travel_m, sensor), []).append(trial)
+            key = (places, trial.selector, trial.share, trial.travel_m, sensor)
+            groups.setdefault(key, []).append(trial)
     return [
         {
             "places": places,
+            "selector": selector,
             "share": share,
             "travel_m": travel_m,
             "query_sensor": sensor,
@@ -313,7 +333,7 @@ def tally_at_scale(trials: Sequence[Recalled], *, draws: int = 1000) -> list[Map
             ),
             "processor_ms": float(np.median([m.processor_ms for m in members])),
         }
-        for (places, share, travel_m, sensor), members in sorted(groups.items())
+        for (places, selector, share, travel_m, sensor), members in sorted(groups.items())
     ]
 
 

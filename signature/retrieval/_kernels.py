@@ -1,4 +1,4 @@
-"""Compiled twin of the comparison of isovists."""
+"""Compiled twins of the comparisons of isovists."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, I64
+from pc2grid.arrays import F32, F64, I64
 
 _BLOCK = 64
 """Viewpoints at a time, so that the sums of a block stay small."""
@@ -22,7 +22,7 @@ def compare_rotated(
     doubt: float,
     out: F32,
 ) -> None:
-    """Twin of `vote.plain_rotate_and_compare` for one view, into `out` (B, N).
+    """Twin of `likeness.plain_rotate_and_compare` for one view, into `out` (B, N).
 
     own : ranges of some `rays` of the view. others (N, B) : ranges of the viewpoints, `known` or not. Ranges
     that differ by `width` or more are not alike. Sums are exact in 16 bits.
@@ -53,3 +53,38 @@ def compare_rotated(
             for i in range(size):
                 j = shift * size + i
                 out[shift, first + i] = np.float32(total[j]) * scale / (np.float32(count[j]) + more)
+
+
+@numba.njit(cache=True, nogil=True)
+def compare_beside(
+    turned: NDArray[np.uint8],
+    ranges: NDArray[np.uint8],
+    shift: I64,
+    beside: I64,
+    width: int,
+    doubt: float,
+    out: F64,
+) -> None:
+    """Twin of `place_index.plain_likeness_beside`, into `out` (C, V).
+
+    turned (V, B, B) : ranges of each view at each rotation. 255 stands for a hidden one.
+    """
+    placements, views = beside.shape
+    bearings = ranges.shape[1]
+    full, unseen = np.int16(width), np.int16(255)
+    for placement in range(placements):
+        for view in range(views):
+            if beside[placement, view] < 0:
+                continue
+            place = ranges[beside[placement, view]]
+            for turn in range(-1, 2):
+                mine = turned[view, (shift[placement] + turn) % bearings]
+                total, count = np.int16(0), np.int16(0)
+                for k in range(bearings):
+                    a, b = np.int16(mine[k]), np.int16(place[k])
+                    both = np.int16(a != unseen) & np.int16(b != unseen)
+                    total += both * max(np.int16(full - abs(np.int16(a - b))), np.int16(0))
+                    count += both
+                likeness = total / full / (count + doubt)
+                if likeness > out[placement, view]:
+                    out[placement, view] = likeness

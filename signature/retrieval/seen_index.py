@@ -19,6 +19,8 @@ from signature.seen_likelihood import SeenWeights, seen_weights
 
 _CHUNK = 65_536
 """Places at a time, so that intermediate results stay in the cache of the processor."""
+_SAMPLE = 20_000
+"""Scores from which mean, spread and a first bound are estimated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +37,11 @@ class SeenIndex:
         weights = weights or seen_weights()
         chunks = range(0, max(len(signatures), 1), _CHUNK)
         vectors = np.concatenate([weights.of_places(signatures[at : at + _CHUNK]) for at in chunks])
+        return SeenIndex.of_vectors(vectors, weights)
+
+    @staticmethod
+    def of_vectors(vectors: F32, weights: SeenWeights) -> SeenIndex:
+        """An index of places by the vectors (N, D) that `weights` have made."""
         return SeenIndex(vectors, 0.5 * np.einsum("nd,nd->n", vectors, vectors), weights)
 
     def nearest_to_each(self, profiles: Sequence[Isovist], k: int) -> tuple[Nearest, ...]:
@@ -56,10 +63,13 @@ class SeenIndex:
 def _nearest(scores: F32, k: int) -> Nearest:
     if not len(scores):
         return Nearest(np.empty(0, np.int64), np.empty(0), 0.0, 0.0)
-    rows = (
-        np.arange(len(scores))
-        if k >= len(scores)
-        else np.flatnonzero(scores <= np.partition(scores, k - 1)[k - 1])
-    )
+    # A sample bounds the scores of the first k, and some more, without a look at all the others.
+    sample = scores[:: max(1, len(scores) // _SAMPLE)]
+    rank = min(round(1.5 * k * len(sample) / len(scores)) + 8, len(sample) - 1)
+    rows = np.flatnonzero(scores <= np.partition(sample, rank)[rank])
+    if len(rows) < min(k, len(scores)):
+        rows = np.arange(len(scores))
+    if k < len(rows):
+        rows = rows[scores[rows] <= np.partition(scores[rows], k - 1)[k - 1]]
     rows = rows[np.argsort(scores[rows], kind="stable")][:k]
-    return Nearest(rows, scores[rows].astype(np.float64), float(scores.mean()), float(scores.std()))
+    return Nearest(rows, scores[rows].astype(np.float64), float(sample.mean()), float(sample.std()))

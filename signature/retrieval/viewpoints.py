@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from pc2grid.arrays import F32, F64, I64, BoolGrid
 from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.isovist import HIDDEN, look_around
-from signature.config import SelectBy, SignatureConfig
+from signature.config import RelocalizeConfig, SelectBy, SignatureConfig
+from signature.retrieval.place_index import PlaceBlock, PlaceIndex
 from signature.retrieval.seen_index import SeenIndex
 from signature.retrieval.signature_index import Nearest, SignatureIndex, sessions_by_likeness
 from signature.retrieval.view import PROFILE_BEARINGS, View
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 LATTICE_M = 0.4
-"""Distance of viewpoints: a view is at most 0.28 m from one of them, about `VoteParameters.range_scale_m`."""
+"""Distance of viewpoints: a view is at most 0.28 m from one of them, about the scale of `LIKENESS`."""
 AT_ONCE_M2 = 200_000.0
 """So much free floor is searched at once; of a larger database, the sessions that look likeliest. Chosen by
 the time of a look-up."""
@@ -109,8 +110,8 @@ class Places:
         self.sight_m = sight_m
         self._grids = grids
         self._paper: SignatureIndex | None = None
-        self._seen: SeenIndex | None = None
-        self._described: F32 | None = None if fewer is None else fewer._described
+        self._index: PlaceIndex | None = None
+        self._described: PlaceBlock | None = None if fewer is None else fewer._described
         self._areas_m2 = np.asarray(areas_m2, np.float64)
         self._grounds: dict[int, _Ground] = {} if fewer is None else dict(fewer._grounds)
         self._known: dict[int, tuple[F64, F32, NDArray[np.bool_]]] = (
@@ -121,6 +122,22 @@ class Places:
     def may_all_be_compared(self, most: int) -> bool:
         """Whether there are at most `most` places, and at most `AT_ONCE_M2` of free floor."""
         return len(self.table) <= most and self._areas_m2.sum() <= AT_ONCE_M2
+
+    def select(
+        self, views: Sequence[View], signature: SignatureConfig, config: RelocalizeConfig
+    ) -> tuple[I64, tuple[Nearest, ...]]:
+        """The places, ascending, to compare with a query, `config.shortlist` for each view; and for each view
+        those of them with the nearest signatures.
+
+        By `PlaceIndex.select`; by the signatures alone where `shortlists` uses Eq. 6.
+        """
+        if config.select_by == "paper" or self._areas_m2.sum() > AT_ONCE_M2:
+            found = self.shortlists(views, config.shortlist, signature, config.select_by)
+            return np.unique(np.concatenate([near.rows for near in found])), found
+        index = self.index()
+        near = index.nearest_to_each(views)
+        rows = index.select(views, near, config.shortlist * len(views))
+        return rows, tuple(found.only(np.isin(found.rows, rows)) for found in near)
 
     def shortlists(
         self, views: Sequence[View], k: int, config: SignatureConfig, select_by: SelectBy = "seen"
@@ -146,14 +163,18 @@ class Places:
 
     def seen(self) -> SeenIndex:
         """The places by the signatures of what was seen."""
-        if self._seen is None:
-            self._seen = SeenIndex.of(self.described())
-        return self._seen
+        return self.index().seen
 
-    def described(self) -> F32:
-        """The signatures of what was seen from each place, (N, K); computed from the maps when they are first
-        asked for, 0.2 ms a place."""
-        known = 0 if self._described is None else len(self._described)
+    def index(self) -> PlaceIndex:
+        """The places by the signatures of what was seen and their isovists."""
+        if self._index is None:
+            self._index = PlaceIndex.of([self.described()], self.sight_m)
+        return self._index
+
+    def described(self) -> PlaceBlock:
+        """What was seen from each place; computed from the maps when it is first asked for, 0.2 ms a
+        place."""
+        known = 0 if self._described is None else len(self._described.session)
         if self._described is None or known < len(self.table):
             sessions, centers_m = self.table.session_index[known:], self.table.center_m[known:]
             ranges_m = np.empty((len(sessions), PROFILE_BEARINGS), np.float32)
@@ -163,8 +184,11 @@ class Places:
                 ranges_m[here], ends[here] = look_around(
                     self._grids[session], centers_m[here], self.sight_m, bearings=PROFILE_BEARINGS
                 )
-            found = seen_signatures(ranges_m, ends, self.sight_m)
-            self._described = found if self._described is None else np.concatenate((self._described, found))
+            signatures = seen_signatures(ranges_m, ends, self.sight_m)
+            found = PlaceBlock(signatures, ranges_m, ends, centers_m, sessions.astype(np.int64))
+            if self._described is not None:
+                found = PlaceBlock.concatenated((self._described, found))
+            self._described = found
         return self._described
 
     def sessions(self, views: Sequence[View], k: int, config: SignatureConfig) -> list[int]:

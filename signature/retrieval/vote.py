@@ -2,8 +2,8 @@
 
 Three steps, each slower and better than the one before:
 
-1. in a large database, the three signatures of what was seen make a shortlist of places for each view. They
-   contain no direction and no order, so they are compared fast, but many places are alike;
+1. in a large database, places are selected (`place_index`): by the three signatures of what was seen, which
+   contain no direction and are compared fast, and by one isovist of each place;
 2. at these places the ranges of the isovists are compared at every rotation, from many viewpoints; rays that
    either side has not observed are left out;
 3. the best matches of each view are placements of the whole query. Each placement predicts where the other
@@ -17,11 +17,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64, I64
 from pc2grid.submaps.isovist import HIDDEN
 from signature.config import RelocalizeConfig, SignatureConfig
+from signature.retrieval.likeness import peaks, rotate_and_compare
 from signature.retrieval.signature_index import Nearest
 from signature.retrieval.view import View
 from signature.retrieval.viewpoints import Places, Viewpoints
@@ -29,12 +29,8 @@ from signature.retrieval.viewpoints import Places, Viewpoints
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VoteParameters:
-    """How isovists are compared and votes are counted. All chosen on fr079 and intel unless said otherwise.
+    """How votes are counted. All chosen on fr079 and intel unless said otherwise.
 
-    range_scale_m : the likeness of two ranges is 1/2 at this difference and 0 at twice that; about the
-        distance of a view from the nearest viewpoint.
-    prior_share : rays added to the number of common rays, as a share of all rays, so that a likeness of few
-        common rays counts for less.
     spread_floor : lower bound of the standard deviation of a view's likeness.
     candidates : placements that each view proposes.
     apart_m, apart_rad : placements nearer than this are one: the lattice of viewpoints, twice, and two rays.
@@ -42,8 +38,6 @@ class VoteParameters:
         view cannot veto a placement.
     """
 
-    range_scale_m: float = 0.25
-    prior_share: float = 0.15
     spread_floor: float = 1e-3
     candidates: int = 100
     apart_m: float = 0.75
@@ -52,8 +46,6 @@ class VoteParameters:
 
 
 VOTE = VoteParameters()
-_UNSEEN = 65535
-"""Stands for an unknown range, in units: it is alike to no known one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,8 +90,7 @@ def retrieve(
     elif places.may_all_be_compared(config.all_places):
         rows = np.arange(len(places.table))
     else:
-        shortlists = places.shortlists(views, config.shortlist, signature, config.select_by)
-        rows = np.unique(np.concatenate([s.rows for s in shortlists]))
+        rows, shortlists = places.select(views, signature, config)
     stand = places.around(rows)
     ranges = np.stack([v.profile.ranges_m for v in views])
     seen = np.stack([v.profile.ends != HIDDEN for v in views])
@@ -150,15 +141,6 @@ def _candidates(likeness: F32, best: F32) -> tuple[I64, I64]:
     at, shift = peaks(likeness, np.argsort(-best, kind="stable")[: VOTE.candidates])
     order = np.argsort(-likeness[shift, at], kind="stable")[: VOTE.candidates]
     return at[order], shift[order]
-
-
-def peaks(likeness: F32, columns: I64) -> tuple[I64, I64]:
-    """Column and rotation of the local maxima over the rotations in the `columns` of `likeness` (B, K):
-    higher than at the next rotation and no lower than at the one before. Ordered by column, then rotation."""
-    chosen = likeness[:, columns].T
-    before, after = np.roll(chosen, 1, axis=1), np.roll(chosen, -1, axis=1)
-    at, shift = np.nonzero((chosen >= before) & (chosen > after))
-    return columns[at], shift
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,53 +205,3 @@ def distinct_placements(order: I64, base_m: F64, yaw_rad: F64, session: I64, mos
         near = (session[left] == session[first]) & (apart < VOTE.apart_m) & (turn < VOTE.apart_rad)
         left = left[~near]
     return np.array(chosen, np.int64)
-
-
-def rotate_and_compare(
-    ranges_m: F32, seen: NDArray[np.bool_], others_m: F32, others_seen: NDArray[np.bool_]
-) -> F32:
-    """Likeness (V, B, N), 0..1, of isovists (V, B) with others (N, B), for each rotation by 2 pi s / B.
-
-    See `plain_rotate_and_compare`, which this agrees with to 0.002 for ranges up to 20 m.
-    """
-    from signature.retrieval._kernels import compare_rotated
-
-    views, bearings = ranges_m.shape
-    # In units of 16 bits, as fine as the sum over all rays and the longest range permit.
-    longest_m = max(float(ranges_m.max(initial=0.0)), float(others_m.max(initial=0.0)))
-    width_m = 2.0 * VOTE.range_scale_m
-    per_m = np.float32(min(65535 // bearings / width_m, (_UNSEEN - 1) / (longest_m + width_m)))
-    own, others = ((m * per_m + np.float32(0.5)).astype(np.uint16) for m in (ranges_m, others_m))
-    others[~others_seen] = _UNSEEN
-    likeness = np.empty((views, bearings, len(others)), np.float32)
-    for view in range(views):
-        rays = np.flatnonzero(seen[view])
-        compare_rotated(
-            rays,
-            own[view, rays],
-            others,
-            np.ascontiguousarray(others_seen),
-            int(width_m * per_m),
-            VOTE.prior_share * bearings,
-            likeness[view],
-        )
-    return likeness
-
-
-def plain_rotate_and_compare(
-    ranges_m: F32, seen: NDArray[np.bool_], others_m: F32, others_seen: NDArray[np.bool_]
-) -> F64:
-    """Likeness (V, B, N), 0..1, of isovists (V, B) with others (N, B), for each rotation by 2 pi s / B.
-
-    The mean over the rays that both sides know of a triangular kernel of the difference of their ranges, with
-    `VoteParameters.prior_share` added to the number of rays.
-    """
-    bearings = ranges_m.shape[1]
-    likeness = np.empty((len(ranges_m), bearings, len(others_m)))
-    for shift in range(bearings):
-        other, known = np.roll(others_m, -shift, axis=1), np.roll(others_seen, -shift, axis=1)
-        both = seen[:, None] & known
-        apart = np.abs(ranges_m[:, None] - other) / (2.0 * VOTE.range_scale_m)
-        total = (np.maximum(0.0, 1.0 - apart) * both).sum(axis=2)
-        likeness[:, shift] = total / (both.sum(axis=2) + VOTE.prior_share * bearings)
-    return likeness

@@ -21,7 +21,7 @@ from signature.config import Config
 from signature.describe import describe
 from signature.relocalization.hypotheses import coarse_points
 from signature.relocalization.query_map import QueryMap
-from signature.retrieval.vote import rotate_and_compare
+from signature.retrieval.likeness import rotate_and_compare
 from signature.verification.refinement import refine
 from signature.verification.two_way_score import Fit, score_fit
 from signature.verification.window_search import SearchMap, SearchParameters, search_windows

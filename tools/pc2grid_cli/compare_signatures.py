@@ -14,7 +14,6 @@ from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
 
 if TYPE_CHECKING:
-    from pc2grid.arrays import F32
     from pc2grid.geometry import SE2
     from pc2grid.model import OccupancyGrid, SensorKind
     from pc2grid.simulate import SimulationConfig
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from signature.evaluation.sensor_map import SensorMap
     from signature.relocalization.map_index import MapIndex
     from signature.relocalization.query_map import QueryMap
+    from signature.retrieval.place_index import PlaceBlock
 
 MAP_SEED = 1000
 """Map sessions and query sessions never share a seed: other clutter, start, direction and noise."""
@@ -127,7 +127,7 @@ def compare_signatures_command(
     recalled: list[Recalled] = []
     if scale:
         with of(context).progress("scale") as advance:
-            others = _described(out, max(scale), config, advance)
+            _describe_floors(out, max(scale), config, advance)
             for name, plan in drawn.items():
                 asked = [
                     (sensor, number, *query)
@@ -136,7 +136,7 @@ def compare_signatures_command(
                     for query in queries_of(_drive(out, name, plan, sensor, number, setting, config), config)
                 ]
                 for count in scale:
-                    recalled += recall_at_scale(maps[name][0], others[:count], asked)
+                    recalled += recall_at_scale(maps[name][0], _floors(out, count), asked)
     document = _document(trials, independent, recalled, list(drawn), setting, share, seed)
     with replace_file(out / "signatures.json") as draft:
         draft.write_text(json_text(document) + "\n", encoding="utf-8")
@@ -269,25 +269,53 @@ def _city(out: Path, floors: int, config: Config, advance: Callable[[float], Non
     return path
 
 
-def _described(out: Path, count: int, config: Config, advance: Callable[[float], None]) -> F32:
-    """Signatures of what was seen from `count` places of office floors, made in blocks unless they exist."""
+def _block_file(out: Path, number: int) -> Path:
+    return out / "floors" / f"{_FIRST_FLOOR_OF_SCALE + number * _FLOORS_AT_ONCE}.npz"
+
+
+def _describe_floors(out: Path, count: int, config: Config, advance: Callable[[float], None]) -> None:
+    """What is seen from `count` places of office floors, made in blocks unless they exist."""
     import numpy as np
 
     from pc2grid.io.atomic import replace_file
     from signature.evaluation.selection import described_floor
+    from signature.retrieval.place_index import PlaceBlock
 
     make_folder(out / "floors")
-    blocks: list[F32] = []
-    while (so_far := sum(map(len, blocks))) < count:
-        first = _FIRST_FLOOR_OF_SCALE + len(blocks) * _FLOORS_AT_ONCE
-        path = out / "floors" / f"{first}.npy"
+    so_far = number = 0
+    while so_far < count:
+        path = _block_file(out, number)
         if not path.exists():
+            first = _FIRST_FLOOR_OF_SCALE + number * _FLOORS_AT_ONCE
             floors = [described_floor(first + k, config) for k in range(_FLOORS_AT_ONCE)]
+            block = PlaceBlock.concatenated(floors)
+            # Half precision is 4 mm at 5 m.
+            block = block._replace(
+                signatures=block.signatures.astype(np.float16), ranges_m=block.ranges_m.astype(np.float16)
+            )
             with replace_file(path) as draft, draft.open("wb") as file:
-                np.save(file, np.concatenate(floors).astype(np.float16))
-            advance(so_far / count)
-        blocks.append(np.load(path).astype(np.float32))
-    return np.concatenate(blocks)[:count]
+                np.savez(file, **block._asdict())
+        with np.load(path) as stored:
+            so_far += len(stored["session"])
+        number += 1
+        advance(min(so_far / count, 1.0))
+
+
+def _floors(out: Path, count: int) -> Iterator[PlaceBlock]:
+    """The first `count` places of `_describe_floors`, a block at a time."""
+    import numpy as np
+
+    from signature.retrieval.place_index import PlaceBlock
+
+    number = 0
+    while count > 0:
+        with np.load(_block_file(out, number)) as stored:
+            block = PlaceBlock(**{name: stored[name][:count] for name in PlaceBlock._fields})
+        yield block._replace(
+            signatures=block.signatures.astype(np.float32), ranges_m=block.ranges_m.astype(np.float32)
+        )
+        count -= len(block.session)
+        number += 1
 
 
 def _map(

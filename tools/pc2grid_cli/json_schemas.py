@@ -482,6 +482,7 @@ class ScaleRow(TypedDict):
     is selected, with its 5th and 95th percentile by session, and median processor time of the selection."""
 
     places: int
+    selector: str
     share: float
     travel_m: float
     query_sensor: str

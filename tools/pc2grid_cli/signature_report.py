@@ -67,13 +67,15 @@ def _print_scale(rows: Sequence[Mapping[str, Any]]) -> None:
     """Print how often the right one of very many places is selected."""
     if not rows:
         return
-    cells = {(r["places"], r["share"], r["query_sensor"], r["travel_m"]): r for r in rows}
+    cells = {(r["places"], r["share"], r["selector"], r["query_sensor"], r["travel_m"]): r for r in rows}
     travels_m = sorted({r["travel_m"] for r in rows})
     title = "right place selected among very many (below: 5 % to 95 %, by session)"
-    shown = table(title, ["query"], ["places", "selected", *(f"{d:g} m" for d in travels_m), "ms"])
-    for places, share, sensor in dict.fromkeys(key[:3] for key in cells):
-        row = [cells.get((places, share, sensor, d)) for d in travels_m]
+    columns = ["places", "selected", *(f"{d:g} m" for d in travels_m), "ms"]
+    shown = table(title, ["selected by", "query"], columns)
+    for places, share, selector, sensor in dict.fromkeys(key[:4] for key in sorted(cells)):
+        row = [cells.get((places, share, selector, sensor, d)) for d in travels_m]
         shown.add_row(
+            selector,
             sensor,
             f"{places:,}",
             f"{100 * share:g} %",

@@ -16,9 +16,20 @@ from pc2grid_cli import compare_signatures
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app
 from signature.evaluation.ablation import seen_independence
-from signature.evaluation.selection import ALL, PAPER, RANDOM, SELECTORS, Selected, Selection, tally
+from signature.evaluation.selection import (
+    ALL,
+    PAPER,
+    RANDOM,
+    SELECTORS,
+    SIGNATURES,
+    VOTED,
+    Selected,
+    Selection,
+    tally,
+)
 from signature.evaluation.sensor_map import SensorMap
 from signature.relocalization.query_map import QueryWindow
+from signature.retrieval.place_index import PlaceBlock
 from tests.helpers.json_schema import closed
 from tests.helpers.simulated_drives import building, drive, office, plan
 
@@ -44,11 +55,20 @@ def test_each_selector_looks_at_its_share_and_all_places_find_the_right_one() ->
     places = len(OFFICE.places.table)
     for selector, (looked_at, hit, located, right, processor_ms) in found.items():
         assert looked_at == places if selector == ALL else 0 < looked_at <= 0.3 * places + 1
-        assert (located is None) == (selector not in (ALL, SELECTORS[1], PAPER, RANDOM))
+        assert (located is None) == (selector not in (ALL, VOTED, PAPER, RANDOM))
         assert right is None or located or not right
         assert processor_ms > 0 and isinstance(hit, bool)
-    assert found[ALL][1] and found[SELECTORS[1]][1]
+    assert found[ALL][1] and found[VOTED][1] and found[SIGNATURES][1]
     assert found[ALL][3]
+
+
+def made_up_floor(seed: int, _: object) -> PlaceBlock:
+    """500 places that look like nothing."""
+    rng, places = np.random.default_rng(seed), OFFICE.places.described()
+    signatures = rng.normal(3, 1, (500, places.signatures.shape[1])).astype(np.float32)
+    ranges_m = rng.uniform(0.2, 5.0, (500, places.ranges_m.shape[1])).astype(np.float32)
+    ends = np.ones(ranges_m.shape, np.int8)
+    return PlaceBlock(signatures, ranges_m, ends, rng.uniform(0, 20, (500, 2)), np.full(500, seed))
 
 
 def test_a_query_from_elsewhere_is_not_counted() -> None:
@@ -89,9 +109,7 @@ def test_the_command_uses_what_it_has_stored(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(compare_signatures, "_plan", lambda _: grid)
     monkeypatch.setattr(compare_signatures, "_city", lambda *_: tmp_path / "city")
     monkeypatch.setattr("signature.evaluation.selection.with_floors", lambda own, *_: own.index)
-    columns = building({"a": grid}).places.described().shape[1]
-    others = np.random.default_rng(0).normal(3, 1, (500, columns)).astype(np.float32)
-    monkeypatch.setattr("signature.evaluation.selection.described_floor", lambda *_: others)
+    monkeypatch.setattr("signature.evaluation.selection.described_floor", made_up_floor)
     monkeypatch.setattr(compare_signatures, "_FLOORS_AT_ONCE", 3)
     arguments = ["compare", "signatures", "a.yaml", "--queries", "1", "--map-length", "12", "--rate", "2"]
     arguments += ["--clutter", "0", "--change", "0", "--share", "0.3", "-o", str(tmp_path), "--json"]
@@ -105,6 +123,7 @@ def test_the_command_uses_what_it_has_stored(tmp_path: Path, monkeypatch: pytest
     nearly_all = [row for row in document["scale"] if row["share"] == 0.05 and row["travel_m"] == 8.0]
     assert nearly_all and all(row["found"][0] == 1.0 for row in nearly_all)
     assert {row["places"] for row in document["scale"]} == {2000}
+    assert {row["selector"] for row in document["scale"]} == {VOTED, SIGNATURES}
     monkeypatch.setattr(compare_signatures, "_select", None)  # nothing is selected again
     assert json.loads(CliRunner().invoke(app, arguments).stdout)["rows"] == document["rows"]
     table = CliRunner().invoke(app, [a for a in arguments if a != "--json"])

@@ -9,14 +9,8 @@ import pytest
 
 from pc2grid.geometry import SE2
 from signature.relocalization.query_map import QueryWindow
-from signature.retrieval.vote import (
-    distinct_placements,
-    peaks,
-    plain_rotate_and_compare,
-    retrieve,
-    rotate_and_compare,
-    view_scores,
-)
+from signature.retrieval.likeness import peaks, plain_rotate_and_compare, rotate_and_compare
+from signature.retrieval.vote import distinct_placements, retrieve, view_scores
 from tests.helpers.simulated_drives import building, drive, office
 
 OFFICE = building({"office": office()})
