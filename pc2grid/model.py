@@ -395,6 +395,60 @@ class Consistency:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Loose:
+    """A stretch of a trajectory whose place relative to the rest of the map is known only roughly.
+
+    from_ns, to_ns : stamps of its ends. length_m : planar distance driven.
+    sigma_m : largest standard deviation of a position along it, in the least certain direction.
+    x_m, y_m : position of the base, in the session frame, where that is so.
+    """
+
+    from_ns: int
+    to_ns: int
+    x_m: float
+    y_m: float
+    length_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Precision:
+    """How exactly the places of a map lie to each other (`pc2grid.mapping.precision`).
+
+    stamps_ns : (N,) increasing, of scans along the travel, a few metres apart.
+    sigma_m : (N,) standard deviation of the position there, in the least certain direction, relative to the
+        part of the map that is well tied together.
+    loose : stretches where it is too large to rely on, the least certain first.
+
+    >>> Precision(stamps_ns=(0, 10), sigma_m=(0.1, 0.3)).at(5)
+    0.2
+    """
+
+    stamps_ns: tuple[int, ...] = ()
+    sigma_m: tuple[float, ...] = ()
+    loose: tuple[Loose, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.stamps_ns) != len(self.sigma_m):
+            raise ValueError(
+                f"Precision: expected as many stamps as sigmas, got {len(self.stamps_ns)}"
+                f" and {len(self.sigma_m)}"
+            )
+
+    @property
+    def worst_m(self) -> float:
+        """The largest standard deviation, 0 without any."""
+        return max(self.sigma_m, default=0.0)
+
+    def at(self, stamp_ns: int) -> float:
+        """The standard deviation at a time, interpolated; 0 if nothing is known."""
+        if not self.stamps_ns:
+            return 0.0
+        since_s = np.array([stamp - self.stamps_ns[0] for stamp in self.stamps_ns]) * 1e-9
+        return float(np.interp((stamp_ns - self.stamps_ns[0]) * 1e-9, since_s, self.sigma_m))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Overruled:
     """A stretch of time in which the scans showed another motion than odometry.
 
@@ -492,6 +546,7 @@ class SessionMap:
         made from; empty if none was made.
     consistency : how well the map agrees with its own scans; None if that is not known.
     odometry : how well odometry agrees with the scans; None if that is not known.
+    precision : how exactly its places lie to each other; None if that is not known.
     points : the points of the recording in space; None if they were not asked for, or there are none.
 
     >>> import numpy as np
@@ -514,6 +569,7 @@ class SessionMap:
     graph: nx.Graph = field(default_factory=_empty_graph)
     consistency: Consistency | None = None
     odometry: OdometryCheck | None = None
+    precision: Precision | None = None
     points: PointMap | None = None
     report: ReadReport = field(default_factory=ReadReport)
 
@@ -545,6 +601,8 @@ class SessionMap:
         ]
         if self.consistency is not None and self.consistency.bent:
             rows.append(("probably bent", f"along {100 * self.consistency.contradicted:.0f} % of the travel"))
+        if self.precision is not None and self.precision.loose:
+            rows.append(("loosely tied", f"+- {self.precision.worst_m:.1f} m"))
         rows += [("warning", text) for text in self.report.warnings]
         centers_m = np.array([submap.center_m for submap in self.submaps]).reshape(-1, 2)
         path_m = travel.planar()[:, :2]

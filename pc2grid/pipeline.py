@@ -24,6 +24,7 @@ from pc2grid.model import (
     OccupancyGrid,
     OdometryCheck,
     PointMap,
+    Precision,
     ReadReport,
     RegisteredScan,
     Scan,
@@ -161,6 +162,7 @@ def build_maps(
                 graph=graph,
                 consistency=part.consistency,
                 odometry=part.odometry,
+                precision=part.precision,
                 points=part.points,
                 report=report,
             )
@@ -241,6 +243,7 @@ class _Mapped:
     loops: tuple[Loop, ...]
     consistency: Consistency
     odometry: OdometryCheck
+    precision: Precision
     points: PointMap | None = None
 
 
@@ -324,6 +327,7 @@ def _draw_parts(
     tracked : the poses of all scans before loops were closed. disagreements : of odometry, at each scan.
     """
     from pc2grid.mapping.consistency import measure_consistency
+    from pc2grid.mapping.precision import precision_of
     from pc2grid.odometry.overruled import check_odometry
 
     part, T_part_base = _settled(tracked, closed)
@@ -333,14 +337,20 @@ def _draw_parts(
         scans = np.flatnonzero(part == number)
         own = [k for k, other in enumerate(closed.parts.tolist()) if other == number]
         grid = _draw((keyframes[k] for k in own), T_part_base, projection)
+        trajectory = _chosen(everywhere, scans)
+        anchored = np.flatnonzero(closed.parts[closed.anchors] == number)
+        anchor_scans = closed.scans[closed.anchors[anchored]]
         drawn.append(
             _Mapped(
                 grid=grid,
-                trajectory=_chosen(everywhere, scans),
+                trajectory=trajectory,
                 loops=_loops_within(closed.loops, scans),
                 consistency=measure_consistency((keyframes[k] for k in own), grid, everywhere),
                 odometry=check_odometry(
                     tracked.stamps_ns[scans].tolist(), [disagreements[k] for k in scans.tolist()]
+                ),
+                precision=precision_of(
+                    trajectory, np.searchsorted(scans, anchor_scans), closed.sigma_m[anchored]
                 ),
             )
         )
@@ -520,6 +530,7 @@ def _in_order(parts: Sequence[Trajectory]) -> Trajectory:
 def _with_warnings(report: ReadReport, part: _Mapped) -> ReadReport:
     """The report of a part with the warnings of registration and of the map added."""
     from pc2grid.mapping.consistency import consistency_warning
+    from pc2grid.mapping.precision import precision_warning
 
     trajectory = part.trajectory
     lost = sum(h is Health.LOST for h in trajectory.health)
@@ -541,6 +552,9 @@ def _with_warnings(report: ReadReport, part: _Mapped) -> ReadReport:
     bent = consistency_warning(part.consistency, trajectory)
     if bent is not None:
         warnings.append(bent)
+    loose = precision_warning(part.precision, trajectory)
+    if loose is not None:
+        warnings.append(loose)
     return dataclasses.replace(report, scans_skipped=skipped, warnings=tuple(warnings))
 
 

@@ -13,12 +13,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, wrap_angle
+
+if TYPE_CHECKING:
+    from scipy.sparse import coo_matrix
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +101,7 @@ def optimise(poses: F64, edges: Sequence[Edge], parameters: PoseGraphParameters 
     measured = np.array([(e.T_first_second.x, e.T_first_second.y, e.T_first_second.yaw) for e in edges])
     information = np.array([e.information for e in edges])
     loop = np.array([e.loop for e in edges])
-    rows = np.stack((3 * i, 3 * i + 1, 3 * i + 2, 3 * j, 3 * j + 1, 3 * j + 2), axis=1)
+    rows = _unknowns(i, j)
     row = np.repeat(rows, 6, axis=1).ravel()
     column = np.tile(rows, (1, 6)).ravel()
     size = 3 * len(poses)
@@ -125,6 +129,29 @@ def optimise(poses: F64, edges: Sequence[Edge], parameters: PoseGraphParameters 
             break
         scale = np.maximum(scale / parameters.annealing, 1.0)
     return Solution(poses, ~loop | (chi2 <= limit))
+
+
+def information_matrix(poses: F64, edges: Sequence[Edge]) -> coo_matrix:
+    """The information matrix (3 N, 3 N) of poses (N, 3), sparse: x, y, yaw of one pose after the other.
+
+    It leaves open where the whole lies.
+    """
+    from scipy.sparse import coo_matrix
+
+    i = np.array([e.first for e in edges])
+    j = np.array([e.second for e in edges])
+    measured = np.array([(e.T_first_second.x, e.T_first_second.y, e.T_first_second.yaw) for e in edges])
+    information = np.array([e.information for e in edges])
+    _, jacobian = _linearise(poses, i, j, measured)
+    rows = _unknowns(i, j)
+    row, column = np.repeat(rows, 6, axis=1).ravel(), np.tile(rows, (1, 6)).ravel()
+    H = jacobian.transpose(0, 2, 1) @ information @ jacobian
+    return coo_matrix((H.ravel(), (row, column)), shape=(3 * len(poses), 3 * len(poses)))
+
+
+def _unknowns(i: NDArray[np.intp], j: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The numbers (E, 6) of the coordinates of both poses of each edge among those of all poses."""
+    return np.stack((3 * i, 3 * i + 1, 3 * i + 2, 3 * j, 3 * j + 1, 3 * j + 2), axis=1)
 
 
 def _confirmed(

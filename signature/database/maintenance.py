@@ -237,6 +237,7 @@ def _entry(database: SubmapDatabase, info: SessionInfo, recover: bool) -> Entry:
         graph=_graph(database, info.name, recover),
         consistency=info.consistency,
         odometry=info.odometry,
+        precision=info.precision,
         points=_points(database, info.name, recover),
         report=info.report,
     )

@@ -15,6 +15,7 @@ from pc2grid.model import (
     OccupancyGrid,
     OdometryCheck,
     PointMap,
+    Precision,
     ReadReport,
     SessionMap,
     Submap,
@@ -88,6 +89,7 @@ class SessionInfo:
     consistency : how well its map agrees with its own scans; None for an imported map, and for a session that
         was stored before this was measured.
     odometry : how well odometry agrees with its scans; None likewise.
+    precision : how exactly its places lie to each other; None likewise.
     """
 
     name: str
@@ -103,6 +105,7 @@ class SessionInfo:
     provenance: Provenance
     consistency: Consistency | None = None
     odometry: OdometryCheck | None = None
+    precision: Precision | None = None
 
     def __repr__(self) -> str:
         driven = f"{self.path_m:.1f} m in {self.duration_s:.0f} s, " if self.scans else ""

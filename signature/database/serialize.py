@@ -32,10 +32,12 @@ from pc2grid.model import (
     Contradiction,
     Health,
     Loop,
+    Loose,
     OccupancyGrid,
     OdometryCheck,
     Overruled,
     PointMap,
+    Precision,
     ReadReport,
     SessionMap,
     Submap,
@@ -289,6 +291,8 @@ def document(session_map: SessionMap, provenance: Provenance) -> str:
         content["consistency"] = asdict(session_map.consistency)
     if session_map.odometry is not None:
         content["odometry"] = asdict(session_map.odometry)
+    if session_map.precision is not None:
+        content["precision"] = asdict(session_map.precision)
     return json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
 
 
@@ -353,6 +357,32 @@ def read_info(row: Row, resolution_m: float, scans: int, location: Path | str) -
         ),
         consistency=_consistency(content.get("consistency")),
         odometry=_odometry(content.get("odometry")),
+        precision=_precision(content.get("precision")),
+    )
+
+
+def _precision(content: Any) -> Precision | None:
+    """The precision in a session's document; None for a session that has none."""
+    if content is None:
+        return None
+
+    def not_negative(value: Any, what: str) -> float:
+        return validation.number(value, what, 0.0, validation.MOST)
+
+    return Precision(
+        stamps_ns=tuple(validation.stamp(stamp, "stamps_ns") for stamp in content["stamps_ns"]),
+        sigma_m=tuple(not_negative(sigma, "sigma_m") for sigma in content["sigma_m"]),
+        loose=tuple(
+            Loose(
+                from_ns=validation.stamp(stretch["from_ns"], "from_ns"),
+                to_ns=validation.stamp(stretch["to_ns"], "to_ns"),
+                x_m=validation.number(stretch["x_m"], "x_m"),
+                y_m=validation.number(stretch["y_m"], "y_m"),
+                length_m=not_negative(stretch["length_m"], "length_m"),
+                sigma_m=not_negative(stretch["sigma_m"], "sigma_m"),
+            )
+            for stretch in content["loose"]
+        ),
     )
 
 

@@ -15,10 +15,12 @@ from pc2grid.model import (
     Contradiction,
     Health,
     Loop,
+    Loose,
     OccupancyGrid,
     OdometryCheck,
     Overruled,
     PointMap,
+    Precision,
     ReadReport,
     SessionMap,
     Submap,
@@ -96,6 +98,20 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
                 ),
             ),
         ),
+        precision=Precision(
+            stamps_ns=(int(trajectory.stamps_ns[0]), int(trajectory.stamps_ns[-1])),
+            sigma_m=(0.05, 0.7),
+            loose=(
+                Loose(
+                    from_ns=int(trajectory.stamps_ns[3]),
+                    to_ns=int(trajectory.stamps_ns[-1]),
+                    x_m=1 / 3,
+                    y_m=-0.2,
+                    length_m=5.5,
+                    sigma_m=0.7,
+                ),
+            ),
+        ),
         points=PointMap.of(rng.uniform(-1.0, 1.0, (40, 3)), 0.1),
         report=ReadReport(scans_read=7, warnings=("no per-point time",)),
     )
@@ -154,6 +170,7 @@ def assert_holds(database: SubmapDatabase, entry: Entry) -> None:
     assert np.array_equal(trajectory.T_session_base, session_map.trajectory.T_session_base)
     assert trajectory.health == session_map.trajectory.health
     assert info.consistency == session_map.consistency
+    assert info.precision == session_map.precision
     assert info.odometry == session_map.odometry
     assert_same_graph(database.graph(name), session_map.graph)
     points, wanted_points = database.points(name), session_map.points

@@ -19,7 +19,7 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
-from pc2grid.model import Consistency, Contradiction, OccupancyGrid, Trajectory
+from pc2grid.model import Consistency, Contradiction, OccupancyGrid, Precision, Trajectory
 from pc2grid_cli.deviation import deviation
 from pc2grid_cli.locate import Found, find_map
 from pc2grid_cli.nav2_pose import initialpose
@@ -143,6 +143,26 @@ def test_where_map_and_scans_disagree_is_marked_on_the_path(tmp_path: Path) -> N
         shown = contents(database)["sessions"][0]
     assert (shown["agreement"], shown["bent"]) == (0.7, True)
     assert np.allclose(shown["contradicted"], [way().planar()[5:10, :2].ravel()], atol=0.006)
+
+
+def test_how_exactly_places_are_known_is_drawn_along_the_path(tmp_path: Path) -> None:
+    stamps = way().stamps_ns
+    loose = replace(
+        session("office", office(), way()),
+        precision=Precision(
+            stamps_ns=tuple(int(stamps[k]) for k in (0, 4, 9)),
+            sigma_m=(0.01, 0.05, 0.75),
+        ),
+    )
+    add_sessions(
+        tmp_path / "loose.submaps", [(loose, provenance(Path("office.mcap"), "a" * 64, Config()))], Config()
+    )
+    with open_database(tmp_path / "loose.submaps") as database:
+        shown = contents(database)["sessions"][0]
+    assert shown["worst_m"] == 0.75
+    ((sigma_m, *xy),) = shown["loose"]  # the first piece is known better than a path is wide
+    assert sigma_m == 0.4
+    assert np.allclose((xy[:2], xy[-2:]), way().planar()[[4, 9], :2], atol=0.006)
 
 
 def test_the_answer_on_the_page_is_the_answer(database: SubmapDatabase, found: Found) -> None:

@@ -347,7 +347,7 @@ def _stored(output: str, jobs: list[Job], *, add: bool, force: bool) -> dict[str
 def summary(session: SessionMap, origin: Provenance) -> Converted:
     """The session made of one input, as the JSON document describes it."""
 
-    from pc2grid_cli.json_schemas import consistency_document, odometry_document
+    from pc2grid_cli.json_schemas import consistency_document, odometry_document, precision_document
 
     path_m = session.trajectory.path_m()
     grid = session.grid
@@ -367,6 +367,7 @@ def summary(session: SessionMap, origin: Provenance) -> Converted:
         "submaps": len(session.submaps),
         "consistency": consistency_document(session.consistency),
         "odometry": odometry_document(session.odometry),
+        "precision": precision_document(session.precision),
         "report": {
             "scans_read": report.scans_read,
             "points_dropped": report.points_dropped,

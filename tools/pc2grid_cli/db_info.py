@@ -18,7 +18,7 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
 
     Example: pc2grid db info building.submaps
     """
-    from pc2grid_cli.json_schemas import consistency_document, odometry_document
+    from pc2grid_cli.json_schemas import consistency_document, odometry_document, precision_document
     from signature.database import open_database
 
     with open_database(database) as opened:
@@ -41,6 +41,7 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
                 "lossy": s.lossy,
                 "consistency": consistency_document(s.consistency),
                 "odometry": odometry_document(s.odometry),
+                "precision": precision_document(s.precision),
                 "warnings": list(s.warnings),
                 "versions": dict(s.provenance.versions),
                 "config": s.provenance.config.model_dump(mode="json"),
@@ -58,4 +59,6 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
         line = f"  {s.name} ({s.sensor}): {counted(s.submaps, 'submap')}, {s.area_m2:.0f} m2 free{travel}"
         if s.consistency is not None and s.consistency.bent:
             line += f", bent: contradicts itself along {s.consistency.contradicted:.0%} of the travel"
+        if s.precision is not None and s.precision.loose:
+            line += f", loosely tied: places up to +- {s.precision.worst_m:.1f} m"
         print(one_line(line))

@@ -7,6 +7,7 @@ a reader must ignore keys that it does not know.
 
 from __future__ import annotations
 
+import statistics
 from typing import TYPE_CHECKING, Any, Literal
 
 # Before Python 3.12 pydantic, which makes the schemas, does not take the TypedDict of typing.
@@ -256,9 +257,31 @@ class OdometryCheck(TypedDict):
     stretches: list[Overruled]
 
 
+class Loose(TypedDict):
+    """A stretch of the travel that is tied only loosely to the rest of the map. sigma_m: largest standard
+    deviation of a position along it. x_m, y_m: where that is so, in the frame of the session."""
+
+    from_ns: int
+    to_ns: int
+    x_m: float
+    y_m: float
+    length_m: float
+    sigma_m: float
+
+
+class Precision(TypedDict):
+    """How exactly the places of a map lie to each other: standard deviations of a position in the least
+    certain direction. median_m: half of the places are known better. worst_m: the largest. loose: stretches
+    where it is too large to rely on, the least certain first."""
+
+    median_m: float
+    worst_m: float
+    loose: list[Loose]
+
+
 class Converted(TypedDict):
-    """What became of one input. digest: sha256 of it, hex. area_m2: free space. consistency, odometry: null
-    for an imported map."""
+    """What became of one input. digest: sha256 of it, hex. area_m2: free space. consistency, odometry,
+    precision: null for an imported map."""
 
     session: str
     building: str | None
@@ -273,6 +296,7 @@ class Converted(TypedDict):
     submaps: int
     consistency: Consistency | None
     odometry: OdometryCheck | None
+    precision: Precision | None
     report: Report
 
 
@@ -306,6 +330,7 @@ class Session(TypedDict):
     lossy: bool
     consistency: Consistency | None
     odometry: OdometryCheck | None
+    precision: Precision | None
     warnings: list[str]
     versions: dict[str, str]
     config: dict[str, Any]
@@ -567,6 +592,27 @@ def odometry_document(check: model.OdometryCheck | None) -> OdometryCheck | None
                 "turn_rad": round(stretch.turn_rad, 4),
             }
             for stretch in check.stretches
+        ],
+    }
+
+
+def precision_document(precision: model.Precision | None) -> Precision | None:
+    """How exactly the places of a map lie to each other, as the documents show it."""
+    if precision is None:
+        return None
+    return {
+        "median_m": round(float(statistics.median(precision.sigma_m or (0.0,))), 3),
+        "worst_m": round(precision.worst_m, 3),
+        "loose": [
+            {
+                "from_ns": stretch.from_ns,
+                "to_ns": stretch.to_ns,
+                "x_m": round(stretch.x_m, 2),
+                "y_m": round(stretch.y_m, 2),
+                "length_m": round(stretch.length_m, 2),
+                "sigma_m": round(stretch.sigma_m, 3),
+            }
+            for stretch in precision.loose
         ],
     }
 

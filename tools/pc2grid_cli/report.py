@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import networkx as nx
 
     from pc2grid.arrays import F64
-    from pc2grid.model import Consistency, Loop, OccupancyGrid, Trajectory
+    from pc2grid.model import Consistency, Loop, OccupancyGrid, Precision, Trajectory
     from pc2grid_cli.locate import Found
     from signature.database import SessionInfo, SubmapDatabase
     from signature.relocalization.answer import Answer
@@ -41,6 +41,8 @@ _CLOCK_FROM_S = 3e8
 """Stamps below this, 1979, are not read as a date: no robot recorded then, but logs count from 0."""
 _STEP_M = 0.05
 """Poses nearer than this to the last one drawn are left out: they would not be visible."""
+_BAND_FROM_M = 0.1
+"""Positions with a smaller standard deviation have no band: two cells of the default resolution."""
 
 
 def write_report(
@@ -104,6 +106,7 @@ def contents(
                 "graph": _graph(database.graph(info.name)),
                 "path": runs(database.trajectory(info.name)),
                 "contradicted": _contradicted(database.trajectory(info.name), info.consistency),
+                "loose": _bands(database.trajectory(info.name), info.precision),
                 "loops": _loops(database.trajectory(info.name), database.loops(info.name)),
             }
             for index, info in enumerate(infos)
@@ -126,6 +129,7 @@ def _facts(info: SessionInfo, poses: Trajectory) -> dict[str, Any]:
         "lossy": info.lossy,
         "agreement": None if info.consistency is None else round(1.0 - info.consistency.contradicted, 4),
         "bent": info.consistency is not None and info.consistency.bent,
+        "worst_m": None if info.precision is None else round(info.precision.worst_m, 2),
         "warnings": list(info.warnings),
     }
 
@@ -208,6 +212,23 @@ def _contradicted(poses: Trajectory, consistency: Consistency | None) -> list[li
         drawn[-1] = True
         parts.append(_short(np.ravel(part[drawn]), 2))
     return parts
+
+
+def _bands(poses: Trajectory, precision: Precision | None) -> list[list[float]]:
+    """Pieces of a path with the standard deviation of the positions there: metres, then x, y, x, y, ...
+
+    Pieces that are known better than a path is drawn wide are left out.
+    """
+    if precision is None or len(precision.stamps_ns) < 2:
+        return []
+    xy, bands = poses.planar()[:, :2], []
+    at = np.searchsorted(poses.stamps_ns, precision.stamps_ns)
+    for first, last, *sigmas_m in zip(at, at[1:], precision.sigma_m, precision.sigma_m[1:], strict=False):
+        sigma_m = sum(sigmas_m) / 2.0
+        if sigma_m >= _BAND_FROM_M:
+            kept = np.unique(np.linspace(first, last, 5).astype(np.int64))
+            bands.append([round(sigma_m, 2), *_short(np.ravel(xy[kept]), 2)])
+    return bands
 
 
 def _answer(found: Found, database: SubmapDatabase, accept: float, truth_m: F64 | None) -> dict[str, Any]:

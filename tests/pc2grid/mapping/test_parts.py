@@ -14,7 +14,15 @@ from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.loop_closure import LoopCloser, LoopParameters, SettledKeyframes
 from pc2grid.mapping.parts import Conflict, connected, cuts_for
 from pc2grid.mapping.pose_graph import Edge
-from pc2grid.model import Consistency, Health, OdometryCheck, ReadReport, RegisteredScan, Trajectory
+from pc2grid.model import (
+    Consistency,
+    Health,
+    OdometryCheck,
+    Precision,
+    ReadReport,
+    RegisteredScan,
+    Trajectory,
+)
 from pc2grid.pipeline import _doubtful, _draw_parts, _Mapped, _of_use, _reports
 from tests.helpers.simulated_drives import drive, office
 
@@ -164,7 +172,12 @@ def part_of(length_m: float, begin_ns: int) -> _Mapped:
     stamps_ns, health = begin_ns + np.arange(count) * 10**8, (Health.FINE,) * count
     way = Trajectory(stamps_ns=stamps_ns, T_session_base=poses, health=health)
     return _Mapped(
-        grid=office(), trajectory=way, loops=(), consistency=Consistency(), odometry=OdometryCheck()
+        grid=office(),
+        trajectory=way,
+        loops=(),
+        consistency=Consistency(),
+        odometry=OdometryCheck(),
+        precision=Precision(),
     )
 
 

@@ -86,15 +86,17 @@ def test_a_session_is_summed_up(filled: str | Path) -> None:
     assert (info.duration_s, info.scans, info.submaps, info.resolution_m) == (0.6, 7, 3, 0.05)
     assert (info.sensor, info.report, info.provenance) == ("lidar", session_map.report, origin)
     assert info.consistency == session_map.consistency
+    assert info.precision == session_map.precision
     assert info.odometry == session_map.odometry is not None
 
 
 def test_a_session_that_was_stored_before_consistency_was_measured(filled: str | Path) -> None:
     session_map, signatures, origin = make_entry("old", 5)
-    entry = replace(session_map, consistency=None, odometry=None), signatures, origin
+    entry = replace(session_map, consistency=None, odometry=None, precision=None), signatures, origin
     store_anywhere(filled, [entry], keep=True)
     with open_database(filled) as database:
         assert database.sessions(["old"])[0].consistency is None
+        assert database.sessions(["old"])[0].precision is None
         assert database.sessions(["old"])[0].odometry is None
         assert database.check() == ()
 
