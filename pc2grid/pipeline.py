@@ -10,6 +10,7 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pc2grid.arrays import F64, I64
 from pc2grid.clouds.planar_scan import PlanarScan
@@ -29,6 +30,7 @@ from pc2grid.model import (
     RegisteredScan,
     Scan,
     SessionMap,
+    Storey,
     Trajectory,
     part_name,
 )
@@ -55,7 +57,8 @@ _WARN_DEGENERATE = 0.1
 def follow(scans: Iterable[Scan], config: Config = Config()) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
     """Each scan with its pose, and its planar scan, as they come.
 
-    The memory needed is that of one local map, however many scans there are.
+    The memory needed is that of one local map, however many scans there are. Scans on the way to
+    another floor, and the first one there, count as lost.
 
     >>> import pc2grid
     >>> with pc2grid.open_log("tuesday.mcap") as log:
@@ -68,7 +71,11 @@ def follow(scans: Iterable[Scan], config: Config = Config()) -> Iterator[tuple[R
     tracker = Tracker(config.registration, config.projection)
     for scan in scans:
         tracked = tracker.track(scan)
-        yield tracked.registered, tracked.planar_scan
+        registered = tracked.registered
+        if tracked.riding or tracked.arrived:
+            # What was seen before says nothing of where the robot is after a ride.
+            registered = dataclasses.replace(registered, health=Health.LOST)
+        yield registered, tracked.planar_scan
 
 
 def build_map(
@@ -136,7 +143,7 @@ def build_maps(
             yield scan
             observer.on_progress(_SHARE_BEFORE_LOOPS * span.share_done(scan.stamp_ns, start_ns, end_ns))
 
-    parts = _map(reported(), config, observer, recognizer)
+    parts, storeys = _map(reported(), config, observer, recognizer)
     sensor = log.choose().sensor
     if not any(len(part.trajectory) for part in parts):
         raise NoScans(f"{log.info.path}: no scans in the part asked for", hint="check --start and --duration")
@@ -147,7 +154,8 @@ def build_maps(
     if config.projection.points_voxel_m is not None and sensor == "laser":
         no_points = "a 2D laser shows no points in space, so none are kept"
         read = dataclasses.replace(read, warnings=(*read.warnings, no_points))
-    reports = _reports(read, session, parts, kept)
+    floors = floor_names(storeys, [part.storey for part in kept])
+    reports = _reports(read, session, parts, kept, floors)
     maps = []
     for number, (part, report) in enumerate(zip(kept, reports, strict=True)):
         graph, submaps = divide(part.grid, config.partition)
@@ -164,6 +172,7 @@ def build_maps(
                 odometry=part.odometry,
                 precision=part.precision,
                 points=part.points,
+                floor=floors[number],
                 report=report,
             )
         )
@@ -193,6 +202,30 @@ def _of_use(parts: Sequence[_Mapped]) -> list[_Mapped]:
 
     kept = [part for part in parts if part.trajectory.length_m >= PARTS.least_travel_m]
     return kept or [max(parts, key=lambda part: part.trajectory.length_m)]
+
+
+def floor_names(storeys: Sequence[Storey], reached: Sequence[int]) -> list[str | None]:
+    """The names of the floors that parts of a recording are on, by height: 0, 1, 2, the lowest is 0.
+
+    storeys : of the recording. reached : number of the storey of each part. A ride in a lift shows no height:
+    what lies behind the first one is "lift 1", or "lift 1, floor 0" and so on if stairs lead on from there.
+    None for all, if the recording stays on one floor.
+
+    >>> floor_names([Storey(group=0, height_m=0.0), Storey(group=0, height_m=-3.0)], [0, 1, 0])
+    ['1', '0', '1']
+    >>> floor_names([Storey(group=0, height_m=0.0), Storey(group=1, height_m=0.0)], [0, 1])
+    ['0', 'lift 1']
+    """
+    if len(storeys) == 1:
+        return [None] * len(reached)
+    names = []
+    for storey in (storeys[k] for k in reached):
+        heights = [other.height_m for other in storeys if other.group == storey.group]
+        rank = str(sum(height < storey.height_m for height in heights))
+        if storey.group:
+            rank = f"lift {storey.group}" + (f", floor {rank}" if len(heights) > 1 else "")
+        names.append(rank)
+    return [*names]
 
 
 def check_followed(trajectory: Trajectory, name: str) -> None:
@@ -230,7 +263,7 @@ def map_scans(
     >>> grid.resolution_m, bool(grid.occupied.any())
     (0.05, True)
     """
-    (mapped,) = _map(scans, config, observer, recognizer, whole=True)
+    (mapped,), _ = _map(scans, config, observer, recognizer, whole=True)
     return mapped.grid, mapped.trajectory, mapped.loops
 
 
@@ -245,6 +278,22 @@ class _Mapped:
     odometry: OdometryCheck
     precision: Precision
     points: PointMap | None = None
+    storey: int = 0
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Track:
+    """What tracking says of all scans of a session.
+
+    trajectory : before loops are closed. disagreements : of odometry, at each scan. riding : (N,) scans on a
+    ride from floor to floor. storey : (N,) number of the floor of each in `storeys`.
+    """
+
+    trajectory: Trajectory
+    disagreements: Sequence[Disagreement | None]
+    riding: NDArray[np.bool_]
+    storey: I64
+    storeys: tuple[Storey, ...]
 
 
 def _map(
@@ -254,8 +303,9 @@ def _map(
     recognizer: PlaceRecognizer | None,
     *,
     whole: bool = False,
-) -> list[_Mapped]:
-    """Track the scans, close the loops, and draw a map of each part; see `build_maps`.
+) -> tuple[list[_Mapped], tuple[Storey, ...]]:
+    """Track the scans, close the loops, and draw a map of each part; see `build_maps`. Returns the floors,
+    too, that the parts are on.
 
     A part whose map contradicts itself is divided, and drawn again. whole : all scans are one part.
     """
@@ -269,6 +319,7 @@ def _map(
     stamps, poses = array("q"), array("d")
     health: list[Health] = []
     disagreements: list[Disagreement | None] = []
+    riding, storeys = array("b"), array("q")
     voxel_m = config.projection.points_voxel_m
     with ExitStack() as stack:
         keyframes = stack.enter_context(closing(Keyframes()))
@@ -289,6 +340,8 @@ def _map(
             poses.extend(tracked.registered.T_session_base.ravel())
             health.append(tracked.registered.health)
             disagreements.append(tracked.disagreement)
+            riding.append(tracked.riding)
+            storeys.append(tracked.storey)
             observer.on_scan(tracked.registered)
         selection.finish()
         trajectory = Trajectory(
@@ -296,45 +349,52 @@ def _map(
             T_session_base=np.frombuffer(poses).reshape(-1, 4, 4),
             health=tuple(health),
         )
+        track = _Track(
+            trajectory,
+            disagreements,
+            np.array(riding, dtype=bool),
+            np.array(storeys, dtype=np.int64),
+            tracker.storeys,
+        )
         closed = selection.closer.finish()
         if whole:
             closed = closed.undivided()
-        drawn = _draw_parts(keyframes, trajectory, disagreements, closed, config.projection)
+        drawn = _draw_parts(keyframes, track, closed, config.projection)
         for _ in range(0 if whole else PARTS.rounds):
             divided = selection.closer.divide([run for part in drawn for run in _doubtful(part, trajectory)])
             if divided is None:
                 break
             closed = divided
-            drawn = _draw_parts(keyframes, trajectory, disagreements, closed, config.projection)
+            drawn = _draw_parts(keyframes, track, closed, config.projection)
         if kept is not None:
             part, T_part_base = _settled(trajectory, closed)
             drawn = [
                 dataclasses.replace(mapped, points=kept.registered(T_part_base, part == number))
                 for number, mapped in enumerate(drawn)
             ]
-    return drawn
+    return drawn, track.storeys
 
 
 def _draw_parts(
     keyframes: Keyframes,
-    tracked: Trajectory,
-    disagreements: Sequence[Disagreement | None],
+    track: _Track,
     closed: SettledKeyframes,
     projection: ProjectionConfig,
 ) -> list[_Mapped]:
     """The map of each part of a session in a frame of its own, compared with its scans.
 
-    tracked : the poses of all scans before loops were closed. disagreements : of odometry, at each scan.
+    The scans of a ride are in no part.
     """
     from pc2grid.mapping.consistency import measure_consistency
     from pc2grid.mapping.precision import precision_of
     from pc2grid.odometry.overruled import check_odometry
 
+    tracked = track.trajectory
     part, T_part_base = _settled(tracked, closed)
     everywhere = dataclasses.replace(tracked, T_session_base=T_part_base)
     drawn = []
     for number in range(int(part.max(initial=0)) + 1):
-        scans = np.flatnonzero(part == number)
+        scans = np.flatnonzero((part == number) & ~track.riding)
         own = [k for k, other in enumerate(closed.parts.tolist()) if other == number]
         grid = _draw((keyframes[k] for k in own), T_part_base, projection)
         trajectory = _chosen(everywhere, scans)
@@ -347,11 +407,12 @@ def _draw_parts(
                 loops=_loops_within(closed.loops, scans),
                 consistency=measure_consistency((keyframes[k] for k in own), grid, everywhere),
                 odometry=check_odometry(
-                    tracked.stamps_ns[scans].tolist(), [disagreements[k] for k in scans.tolist()]
+                    tracked.stamps_ns[scans].tolist(), [track.disagreements[k] for k in scans.tolist()]
                 ),
                 precision=precision_of(
                     trajectory, np.searchsorted(scans, anchor_scans), closed.sigma_m[anchored]
                 ),
+                storey=int(track.storey[closed.scans[own[0]]]) if own else 0,
             )
         )
     return drawn
@@ -438,6 +499,7 @@ class _KeyframeSelection:
         self._keyframes = keyframes
         self._unseen_hits = UnseenHits(projection.max_range_m, projection.resolution_m)
         self._latest: Keyframe | None = None
+        self._storey = 0  # of the latest keyframe
 
     def add(self, tracked: Tracked, *, index: int) -> None:
         """The next scan, number `index` of the session."""
@@ -447,8 +509,9 @@ class _KeyframeSelection:
         if tracked.keyframe:
             self.finish()
             self._latest = Keyframe(index, tracked.planar_scan, pose, tracked.restart)
+            self._storey = tracked.storey
             self._unseen_hits.restart(tracked.planar_scan, pose)
-        elif self._latest is not None and tracked.registered.health is not Health.LOST:
+        elif self._latest is not None and not tracked.riding and tracked.registered.health is not Health.LOST:
             self._unseen_hits.add(tracked.planar_scan, pose)
 
     def finish(self) -> None:
@@ -456,7 +519,7 @@ class _KeyframeSelection:
         if self._latest is not None:
             complete = dataclasses.replace(self._latest, unseen_hits_m=self._unseen_hits.take())
             self._keyframes.append(complete)
-            self.closer.extend(self._latest)
+            self.closer.extend(self._latest, self._storey)
 
 
 def _draw(keyframes: Iterable[Keyframe], T_session_base: F64, projection: ProjectionConfig) -> OccupancyGrid:
@@ -470,7 +533,11 @@ def _draw(keyframes: Iterable[Keyframe], T_session_base: F64, projection: Projec
 
 
 def _reports(
-    report: ReadReport, session: str, parts: Sequence[_Mapped], kept: Sequence[_Mapped]
+    report: ReadReport,
+    session: str,
+    parts: Sequence[_Mapped],
+    kept: Sequence[_Mapped],
+    floors: Sequence[str | None],
 ) -> list[ReadReport]:
     """The report of each part that is kept, with the warnings of registration and of its map.
 
@@ -479,7 +546,7 @@ def _reports(
     elsewhere = sum(len(part.trajectory) for part in kept[1:])
     warnings, skipped = list(report.warnings), dict(report.scans_skipped)
     if len(parts) > 1:
-        warnings.append(_division_warning(session, parts, kept))
+        warnings.append(_division_warning(session, parts, kept, floors))
     left_out = sum(len(part.trajectory) for part in parts) - elsewhere - len(kept[0].trajectory)
     if left_out:
         skipped["in a part too short to be of use"] = left_out
@@ -493,25 +560,32 @@ def _reports(
     return [_with_warnings(r, part) for r, part in zip([first, *others], kept, strict=True)]
 
 
-def _division_warning(session: str, parts: Sequence[_Mapped], kept: Sequence[_Mapped]) -> str:
+def _division_warning(
+    session: str, parts: Sequence[_Mapped], kept: Sequence[_Mapped], floors: Sequence[str | None]
+) -> str:
     """One sentence that says into what a recording was divided, where, and what to do."""
     from pc2grid.mapping.parts import PARTS
 
-    start_ns = min(int(part.trajectory.stamps_ns[0]) for part in parts)
+    start_ns = min(int(part.trajectory.stamps_ns[0]) for part in parts if len(part.trajectory))
 
     def begin_s(part: _Mapped) -> float:
         return (int(part.trajectory.stamps_ns[0]) - start_ns) * 1e-9
 
     named = ", ".join(
-        f"{part_name(session, k)} from {begin_s(part):.0f} s ({part.trajectory.length_m:.0f} m)"
+        f"{part_name(session, k)} "
+        + (f"(floor {floors[k]}) " if floors[k] is not None else "")
+        + f"from {begin_s(part):.0f} s ({part.trajectory.length_m:.0f} m)"
         for k, part in enumerate(kept)
     )
     short = len(parts) - len(kept)
     dropped = f"; {short} shorter than {PARTS.least_travel_m:.0f} m left out" if short else ""
+    if len({part.storey for part in parts}) == len(parts):
+        return f"the recording goes over {len(parts)} floors: {named}{dropped}"
     return (
         f"the recording falls into {len(parts)} parts whose places relative to each other are not known, "
-        f"because tracking was lost or the map would contradict itself: {named}{dropped}; record with "
-        "odometry, or come back to known places more often, to keep them together"
+        "because tracking was lost, stairs or a lift lay between, or the map would contradict itself: "
+        f"{named}{dropped}; record with odometry, or come back to known places more often, to keep them "
+        "together"
     )
 
 

@@ -20,7 +20,7 @@ from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from signature.config import Config
 from signature.database.protocol import Entry, Label, Provenance
-from signature.sessions import build_sessions, describe_all, digest_of, provenance
+from signature.sessions import build_sessions, describe_all, digest_of, on_floors, provenance
 
 LOCAL = "local"
 """In place of the address of a scheduler: start a cluster of processes on this machine."""
@@ -95,8 +95,12 @@ def convert(job: Job, observer: Observer = Observer()) -> tuple[Entry, ...]:
         label=job.label,
         observer=observer,
     )
+    maps, origins = on_floors(maps, origin)
     with observer.step("describe"):
-        return tuple((part, describe_all(part, job.config, observer), origin) for part in maps)
+        return tuple(
+            (part, describe_all(part, job.config, observer), made_from)
+            for part, made_from in zip(maps, origins, strict=True)
+        )
 
 
 def here(jobs: Sequence[Job], observer: Observer = Observer()) -> Generator[Outcome, None, None]:

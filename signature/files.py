@@ -11,7 +11,7 @@ from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from signature.config import Config
 from signature.database import Label
-from signature.sessions import add_sessions, build_sessions
+from signature.sessions import add_sessions, build_sessions, on_floors
 
 if TYPE_CHECKING:
     from signature.database import SubmapDatabase
@@ -69,7 +69,8 @@ def convert(
         label=label,
         observer=observer,
     )
-    add_sessions(database, [(part, origin) for part in maps], config, keep=add, force=force)
+    maps, origins = on_floors(maps, origin)
+    add_sessions(database, list(zip(maps, origins, strict=True)), config, keep=add, force=force)
     return max(maps, key=lambda part: part.trajectory.length_m)
 
 

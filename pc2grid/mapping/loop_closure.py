@@ -214,6 +214,7 @@ class LoopCloser:
         self._known_places: list[bool] = []  # whether each local map overlaps one of an earlier visit
         self._stretch_begin = 0  # first local map of the stretch that is not complete yet
         self._scans = array("q")
+        self._storeys = array("q")  # of each keyframe
         self._poses = array("d")  # as tracked: x, y, yaw of one keyframe after the other
         self._begin = 0  # first keyframe of the local map that is not complete yet
         self._travel_m = 0.0
@@ -225,8 +226,12 @@ class LoopCloser:
         self._drift_m = 0.0  # travel since the pose was last certain
         self._travelled_m = array("d")  # at each local map; a lost part counts as `lost_m`
 
-    def extend(self, keyframe: Keyframe) -> None:
-        """Take the keyframe that was appended last; every few metres this completes a local map."""
+    def extend(self, keyframe: Keyframe, storey: int = 0) -> None:
+        """Take the keyframe that was appended last; every few metres this completes a local map.
+
+        storey : number of the floor; loops are closed only within a floor, however alike two floors look. It
+        changes only with a keyframe that restarts.
+        """
         number = len(self._scans)
         pose = keyframe.T_session_base
         if number:
@@ -237,6 +242,7 @@ class LoopCloser:
         if keyframe.restart:
             self._restarts.add(number)
         self._scans.append(keyframe.index)
+        self._storeys.append(storey)
         self._poses.extend((pose.x, pose.y, pose.yaw))
 
     def finish(self) -> SettledKeyframes:
@@ -249,7 +255,10 @@ class LoopCloser:
         self._complete_local_map()
         if self._recognizer is not None and self._stretch_begin < len(self._nodes):
             # The last local maps make a stretch that may overlap the one before.
-            begin = max(len(self._nodes) - self._parameters.stretch_maps, 0)
+            last = len(self._nodes) - 1
+            begin = max(last + 1 - self._parameters.stretch_maps, 0)
+            while self._storey(begin) != self._storey(last):
+                begin += 1
             if not all(self._known_places[begin:]):
                 self._recognize(range(begin, len(self._nodes)))
         return self._settled_keyframes()
@@ -419,11 +428,16 @@ class LoopCloser:
         # The local map before the newest is left out: tracking matched both against the same walls.
         before = self._nodes[: max(newest - 1, 0), :2]
         distance_m = np.hypot(*(before - self._nodes[newest, :2]).T)
+        distance_m[[self._storey(k) != self._storey(newest) for k in range(len(before))]] = np.inf
         near_m = self._parameters.near_m + window_m
         for older in _spread_over_visits(distance_m, near_m, self._parameters.compared):
             edge = self._compare(older, newest, window_m, window_rad)
             if edge is not None:
                 yield edge
+
+    def _storey(self, number: int) -> int:
+        """The floor of a local map."""
+        return self._storeys[self._local_maps.runs[number].start]
 
     def _compare(self, older: int, newer: int, window_m: float, window_rad: float) -> Edge | None:
         """The measured relative pose of two local maps, near the present one; None if they do not match."""
@@ -479,6 +493,7 @@ class LoopCloser:
                 )
                 for found in self._recognizer.recognize(self._draw_stretch(index, numbers))
                 if found.probability >= self._parameters.min_probability
+                and self._storey(self._stretches[found.older].start) == self._storey(numbers.start)
             ]
         )
         self._close_candidates()

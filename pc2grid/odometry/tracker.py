@@ -19,8 +19,8 @@ from pc2grid.clouds.deskew import deskew
 from pc2grid.clouds.planar_scan import PlanarScan, project_to_plane
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.config import ProjectionConfig, RegistrationConfig
-from pc2grid.geometry import SE2
-from pc2grid.model import Health, RegisteredScan, Scan
+from pc2grid.geometry import SE2, invert_pose
+from pc2grid.model import Health, RegisteredScan, Scan, Storey
 from pc2grid.odometry.ground_model import GroundModel
 from pc2grid.odometry.health import HealthJudge
 from pc2grid.odometry.matching_maps import MatchingMaps
@@ -34,6 +34,7 @@ from pc2grid.odometry.parameters import (
 )
 from pc2grid.odometry.point_to_line import Match
 from pc2grid.odometry.registration import KissRegistration
+from pc2grid.odometry.rides import Ride, RideWatch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,6 +46,8 @@ class Tracked:
     keyframe : whether the robot had moved enough for the scan to become part of the local map.
     restart : the first keyframe after tracking was lost: its pose relative to those before is unknown.
     disagreement : of odometry with the pose; None for a lost scan, and where there is nothing to compare.
+    riding : on the way to another floor: the scan belongs to none, see `Ride`. arrived : the first scan after
+    a ride to another floor. storey : number of the floor, see `Tracker.storeys`.
     """
 
     registered: RegisteredScan
@@ -52,6 +55,9 @@ class Tracked:
     keyframe: bool
     restart: bool = False
     disagreement: Disagreement | None = None
+    riding: bool = False
+    arrived: bool = False
+    storey: int = 0
 
 
 class Tracker:
@@ -71,11 +77,18 @@ class Tracker:
         self._parameters = parameters
         self._started = False
         self._motion = MotionModel(parameters)
+        self._rides = RideWatch()
+        self._restarted = False  # no keyframe has been reported since tracking started again
         # These four depend on the sensor and on how it is carried; `start` makes them from the first scan.
         self._ground = GroundModel(None, rolling=True, parameters=parameters)
         self._maps = MatchingMaps(self._projection.max_range_m, parameters)
         self._health = HealthJudge(rolling=True, parameters=parameters)
         self.kiss = KissRegistration(registration, parameters=parameters)
+
+    @property
+    def storeys(self) -> tuple[Storey, ...]:
+        """The floors so far, in the order in which they were first reached."""
+        return tuple(self._rides.storeys)
 
     def start(self, scan: Scan) -> Tracked:
         """Begin with the first scan: find the floor, and put the base at the origin of the session frame."""
@@ -141,14 +154,19 @@ class Tracker:
         prediction: Prediction | None = None,
     ) -> Tracked:
         """Extend the maps by a scan if it is worth it, and remember its final pose."""
-        after_restart = not self._maps and self._maps.restarts > 0
-        keyframe = (
+        ride = self._ride(scan, points, planar_scan, pose)
+        if ride.arrived:
+            self._restart()
+        extended = (
             health is not Health.LOST
             and len(planar_scan.hits_m) > 0
             and self._maps.extend(planar_scan, SE2.from_matrix(pose))
         )
-        if keyframe:
+        if extended:
             self.kiss.update_map(pose)
+        keyframe = extended and not ride.riding
+        restart = keyframe and self._restarted
+        self._restarted &= not keyframe
         disagreement = None
         if prediction is not None and health is not Health.LOST:
             disagreement = self._motion.disagreement(prediction, pose)
@@ -158,15 +176,26 @@ class Tracker:
             registered=RegisteredScan(scan=deskewed, T_session_base=pose, health=health),
             planar_scan=planar_scan,
             keyframe=keyframe,
-            restart=keyframe and after_restart,
+            restart=restart,
             disagreement=disagreement,
+            riding=ride.riding,
+            arrived=ride.arrived,
+            storey=self._rides.storey,
         )
+
+    def _ride(self, scan: Scan, points: F32, planar_scan: PlanarScan, pose: F64) -> Ride:
+        """Look whether the robot leaves its floor. A sensor in the hand tilts as it likes."""
+        if not self._ground.rolling:
+            return Ride()
+        step = invert_pose(self._motion.last_pose) @ pose
+        return self._rides.observe(scan, points, planar_scan, pose, float(step[0, 3]), self._ground.ground)
 
     def _restart(self) -> None:
         """Forget the local maps, of the plane and of KISS-ICP; the poses go on from the last one."""
         self._maps.restart()
         self._health.restart()
         self.kiss = self._new_kiss()
+        self._restarted = True
 
     def _new_kiss(self) -> KissRegistration:
         return KissRegistration(self._config, carried=not self._ground.rolling, parameters=self._parameters)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.io.atomic import refuse_existing
 from pc2grid.io.export.mcap import LogWriter
@@ -16,6 +17,7 @@ from pc2grid.model import OccupancyGrid, SensorKind, Trajectory
 from pc2grid.simulate.building import Building
 from pc2grid.simulate.change import Change
 from pc2grid.simulate.config import DepthConfig, LaserConfig, SimulationConfig
+from pc2grid.simulate.house import HouseConfig, HouseSession, prepare_house_session
 from pc2grid.simulate.sensors import depth_intrinsics, laser_angle_min, laser_time_increment
 from pc2grid.simulate.session import EPOCH_NS, Reading, Session, prepare_session
 
@@ -53,6 +55,7 @@ def simulate_session(
     *,
     sensor: SensorKind,
     grid: OccupancyGrid | Building | None = None,
+    house: HouseConfig | None = None,
     config: SimulationConfig | None = None,
     progress: Callable[[float], None] | None = None,
     force: bool = False,
@@ -62,6 +65,8 @@ def simulate_session(
     out : MCAP to write; the ground truth is written beside it as `.tum`. Existing files are refused without
         `force`.
     grid : the floor plan, or a real building; None for the procedural office of `config.building_seed`.
+    house : drive through several floors with the plan of that office, `config.length_m` on each; not with a
+        grid. The ground truth has z = 0 on floor 0.
     progress : called with the share that is done, 0..1.
 
     Topics: the sensor's (TOPICS; a camera has INFO_TOPIC too), /tf_static base_link -> sensor and, unless
@@ -76,7 +81,15 @@ def simulate_session(
     truth_path = out.with_suffix(".tum")
     refuse_existing(out, force)
     refuse_existing(truth_path, force)
-    session = prepare_session(sensor=sensor, grid=grid, config=config)
+    session: Session | HouseSession
+    if house is not None:
+        if grid is not None:
+            raise ConfigError(
+                "a house has the plan of an office", hint="leave out the building, or the floors"
+            )
+        session = prepare_house_session(sensor=sensor, house=house, config=config)
+    else:
+        session = prepare_session(sensor=sensor, grid=grid, config=config)
     count = session.scan_count
     stamps, poses = [], []
     with LogWriter(out, force=force) as log:
@@ -87,7 +100,7 @@ def simulate_session(
             odometry_sent = _write_odometry(log, session, odometry_sent, reading.time_s)
             _write_reading(log, session, reading)
             stamps.append(reading.stamp_ns)
-            poses.append(session.drive.pose(reading.time_s).lift())
+            poses.append(session.pose(reading.time_s))
             if progress is not None:
                 progress((reading.index + 1) / count)
         _write_odometry(log, session, odometry_sent, np.inf)
@@ -104,7 +117,7 @@ def simulate_session(
     )
 
 
-def _write_odometry(log: LogWriter, session: Session, sent: int, until_s: float) -> int:
+def _write_odometry(log: LogWriter, session: Session | HouseSession, sent: int, until_s: float) -> int:
     """Write the odometry up to a time, from message `sent` on; returns how many messages are written then."""
     odometry = session.odometry
     if odometry is None:
@@ -118,7 +131,7 @@ def _write_odometry(log: LogWriter, session: Session, sent: int, until_s: float)
     return end
 
 
-def _write_reading(log: LogWriter, session: Session, reading: Reading) -> None:
+def _write_reading(log: LogWriter, session: Session | HouseSession, reading: Reading) -> None:
     """Write one scan as the driver of its sensor publishes it."""
     sensor, values, stamp_ns = session.sensor, reading.values_m, reading.stamp_ns
     topic, config = TOPICS[sensor.kind], sensor.config

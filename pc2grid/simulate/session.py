@@ -113,33 +113,41 @@ class Session:
                 rng = np.random.default_rng([self.config.seed, _NOISE, int(index)])
                 yield Reading(int(index), float(index) / sensor.rate_hz, sensor.measure(ranges, rng))
 
+    def pose(self, time_s: float) -> F64:
+        """The true T_map_base (4, 4)."""
+        return self.drive.pose(time_s).lift()
+
     def scan(self, reading: Reading) -> Scan:
         """A reading as the scan that `pc2grid.io` decodes from the recording."""
-        sensor = self.sensor
-        T = sensor.T_base_sensor
-        kept = np.isfinite(reading.values_m)
-        points = (reading.values_m[kept, None] * sensor.directions[kept]).astype(np.float32)
-        moving = bool(sensor.offsets_s.any())
-        offsets = sensor.offsets_s[kept].astype(np.float32) if moving else None
-        odometry, motion = self.odometry, None
-        if odometry is not None and offsets is not None and len(offsets):
-            first, last = (odometry.at(reading.time_s + float(s)) for s in (offsets.min(), offsets.max()))
-            motion = (first.inverse() @ last).lift()
-        return Scan(
-            stamp_ns=reading.stamp_ns,
-            points_m=(points @ T[:3, :3].T + T[:3, 3]).astype(np.float32),
-            T_base_sensor=T,
-            sensor=sensor.kind,
-            offsets_s=offsets,
-            T_odom_base=None if odometry is None else odometry.at(reading.time_s).lift(),
-            T_first_last=motion,
-            dropped=int((~kept).sum()),
-        )
+        return scan_of(reading, self.sensor, self.odometry)
 
     def scans(self) -> Iterator[tuple[Scan, SE2]]:
         """Scans in the base frame, not deskewed, with the true T_map_base at their stamps."""
         for reading in self.readings():
             yield self.scan(reading), self.drive.pose(reading.time_s)
+
+
+def scan_of(reading: Reading, sensor: Sensor, odometry: Odometry | None) -> Scan:
+    """A reading as the scan that `pc2grid.io` decodes from the recording."""
+    T = sensor.T_base_sensor
+    kept = np.isfinite(reading.values_m)
+    points = (reading.values_m[kept, None] * sensor.directions[kept]).astype(np.float32)
+    moving = bool(sensor.offsets_s.any())
+    offsets = sensor.offsets_s[kept].astype(np.float32) if moving else None
+    motion = None
+    if odometry is not None and offsets is not None and len(offsets):
+        first, last = (odometry.at(reading.time_s + float(s)) for s in (offsets.min(), offsets.max()))
+        motion = (first.inverse() @ last).lift()
+    return Scan(
+        stamp_ns=reading.stamp_ns,
+        points_m=(points @ T[:3, :3].T + T[:3, 3]).astype(np.float32),
+        T_base_sensor=T,
+        sensor=sensor.kind,
+        offsets_s=offsets,
+        T_odom_base=None if odometry is None else odometry.at(reading.time_s).lift(),
+        T_first_last=motion,
+        dropped=int((~kept).sum()),
+    )
 
 
 def _rays(poses: F64, mount_m: F64, directions: F64) -> F32:

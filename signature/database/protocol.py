@@ -32,22 +32,43 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Label:
-    """Where a session was recorded, in the user's words; None: not given."""
+    """Where a session was recorded; None: not known.
+
+    building, floor : in the user's words.
+    told_apart : the floor is not in the user's words: its recording reaches several floors, which got names
+        of their own. It tells the sessions of that recording apart, and says nothing of other recordings.
+    """
 
     building: str | None = None
     floor: str | None = None
+    told_apart: bool = False
 
     def __str__(self) -> str:
-        return ", ".join(word for word in (self.building, self.floor) if word) or "no label"
+        floor = f"floor {self.floor}" if self.told_apart and self.floor else self.floor
+        return ", ".join(word for word in (self.building, floor) if word) or "no label"
 
     def fits(self, building: str | None, floor: str | None) -> bool:
         """Whether it is this building and floor; None: any, "": those that were not given."""
         return building in (None, self.building or "") and floor in (None, self.floor or "")
 
-    def contradicts(self, other: Label) -> bool:
-        """Whether the two name different buildings, or different floors; None differs from nothing."""
-        pairs = ((self.building, other.building), (self.floor, other.floor))
+    def comparable(self, other: Label, *, one_recording: bool) -> bool:
+        """Whether the names of the two floors mean the same."""
+        return one_recording or not (self.told_apart or other.told_apart)
+
+    def contradicts(self, other: Label, *, one_recording: bool = False) -> bool:
+        """Whether the two name different buildings, or different floors; None differs from nothing.
+
+        one_recording : both sessions are parts of one recording.
+        """
+        pairs = [(self.building, other.building)]
+        if self.comparable(other, one_recording=one_recording):
+            pairs.append((self.floor, other.floor))
         return any(a is not None and b is not None and a != b for a, b in pairs)
+
+    def agrees(self, other: Label, *, one_recording: bool = False) -> bool:
+        """Whether the two name the same building, and the same floor or none."""
+        known = self.building is not None and self.building == other.building and self.floor == other.floor
+        return known and self.comparable(other, one_recording=one_recording)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

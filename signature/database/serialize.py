@@ -190,6 +190,7 @@ def storable(entry: Entry) -> Entry:
     label = Label(
         building=None if label.building is None else _text(label.building),
         floor=None if label.floor is None else _text(label.floor),
+        told_apart=label.told_apart,
     )
     return (
         replace(session_map, session=_text(session_map.session), report=report),
@@ -287,6 +288,8 @@ def document(session_map: SessionMap, provenance: Provenance) -> str:
             "warnings": list(report.warnings),
         },
     }
+    if provenance.label.told_apart:
+        content["told_apart"] = True
     if session_map.consistency is not None:
         content["consistency"] = asdict(session_map.consistency)
     if session_map.odometry is not None:
@@ -353,7 +356,11 @@ def read_info(row: Row, resolution_m: float, scans: int, location: Path | str) -
             start_s=validation.number(content["start_s"], "start_s"),
             duration_s=None if content["duration_s"] is None else not_negative("duration_s"),
             versions=versions,
-            label=Label(building=text_or_none("building"), floor=text_or_none("floor")),
+            label=Label(
+                building=text_or_none("building"),
+                floor=text_or_none("floor"),
+                told_apart=content.get("told_apart") is True,
+            ),
         ),
         consistency=_consistency(content.get("consistency")),
         odometry=_odometry(content.get("odometry")),

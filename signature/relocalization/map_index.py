@@ -13,7 +13,7 @@ import numpy as np
 from pc2grid.arrays import F64, I64, BoolGrid
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2
-from pc2grid.model import UNKNOWN, OccupancyGrid
+from pc2grid.model import UNKNOWN, OccupancyGrid, same_recording
 from signature.config import Config
 from signature.database.protocol import Label
 from signature.relocalization.answer import Status, Verdict
@@ -325,7 +325,8 @@ class MapIndex:
         other rule it out; labels that agree lower the probability that is needed.
         """
         label, other = self.labels[a.session_index], self.labels[b.session_index]
-        if label.contradicts(other):
+        one_recording = same_recording(self.sessions[a.session_index], self.sessions[b.session_index])
+        if label.contradicts(other, one_recording=one_recording):
             return False
         at = query.T_odom_base
         there = b.fit.T_map_query @ at
@@ -339,7 +340,7 @@ class MapIndex:
         if not same_pose(T_a_b @ there, refined @ there):
             return False
         fit = score_fit(target.walls, around, refined, covariance)
-        labelled = label.building is not None and label == other
+        labelled = label.agrees(other, one_recording=one_recording)
         if not fit.overlap:  # nothing beyond is in both maps
             return labelled
         # Ground that only one of the maps knows does not count here, and neither map may contradict the

@@ -46,7 +46,12 @@ def convert_command(
     building: Annotated[
         str | None, typer.Option("--building", metavar="NAME", help="where it was recorded; answers name it")
     ] = None,
-    floor: Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, within it")] = None,
+    floor: Annotated[
+        str | None,
+        typer.Option(
+            "--floor", metavar="NAME", help="the same, within it; of several floors: A,B,A in order"
+        ),
+    ] = None,
     points: Annotated[
         float | None,
         typer.Option(
@@ -392,7 +397,7 @@ def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
             continue
         was = present[job.name]
         asked = job.made_from(was.digest)
-        if was.label != asked.label:
+        if not _label_kept(was.label, asked.label):
             return (
                 f"; its session {job.name!r} has the label {str(was.label)!r}, this one would have"
                 f" {str(asked.label)!r} (--building, --floor)"
@@ -421,10 +426,21 @@ def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
     return ""
 
 
+def _label_kept(was: Label, asked: Label) -> bool:
+    """Whether a stored session, the first of its recording, has the label that is asked for.
+
+    The floors of a recording may have got names of their own; several names may be given, see `on_floors`.
+    """
+    if was.told_apart or (asked.floor is not None and was.floor == asked.floor.split(",")[0].strip()):
+        return was.building == asked.building
+    return was == asked
+
+
 def _as_text(d: Converted) -> str:
     travel = (
         f"{counted(d['scans'], d['sensor'] + ' scan')}, {d['path_m']:.1f} m in {d['duration_s']:.0f} s, "
         if d["scans"]
         else ""
     )
-    return f"{d['session']}: {travel}{d['area_m2']:.0f} m2 free, {counted(d['submaps'], 'submap')}"
+    floor = "" if d["floor"] is None else f" (floor {d['floor']})"
+    return f"{d['session']}{floor}: {travel}{d['area_m2']:.0f} m2 free, {counted(d['submaps'], 'submap')}"

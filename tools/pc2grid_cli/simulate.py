@@ -23,6 +23,13 @@ class SensorName(str, enum.Enum):
     laser = "laser"
 
 
+class RideName(str, enum.Enum):
+    """How a robot changes floors."""
+
+    stairs = "stairs"
+    lift = "lift"
+
+
 def simulate_command(
     context: typer.Context,
     files: Annotated[
@@ -49,6 +56,14 @@ def simulate_command(
         typer.Option(metavar="X Y", help="where to start in the map; default: anywhere"),
     ] = None,
     building_seed: Annotated[int, typer.Option(min=0, help="which office, when no building is given")] = 0,
+    floors: Annotated[
+        int, typer.Option(min=1, max=20, help="visited one after the other; each has the office's plan")
+    ] = 1,
+    ride: Annotated[RideName, typer.Option(help="how the robot gets from floor to floor")] = RideName.stairs,
+    slope: Annotated[
+        float, typer.Option(min=0.02, max=0.8, help="of the stairs; ramps if flatter than 0.3")
+    ] = 0.6,
+    alike: Annotated[bool, typer.Option("--alike", help="the same movable objects on every floor")] = False,
     no_odometry: Annotated[bool, typer.Option("--no-odometry", help="leave odometry out of the log")] = False,
     force: Force = False,
     json: AsJson = False,
@@ -56,7 +71,7 @@ def simulate_command(
     """Drive a robot through a building and record it: OUT.mcap, and OUT.tum with the true poses.
 
     A cloud or a mesh of a real building is driven through as it is: its floor is found and levelled, and
-    rays hit its surfaces.
+    rays hit its surfaces. With --floors, --length is driven on each floor.
 
     Example: pc2grid simulate map.yaml drive.mcap --sensor depth --length 20
     """
@@ -64,7 +79,7 @@ def simulate_command(
 
     from pc2grid.errors import ConfigError
     from pc2grid.io.atomic import require_writable
-    from pc2grid.simulate import SimulationConfig, load_building, simulate_session
+    from pc2grid.simulate import HouseConfig, SimulationConfig, load_building, simulate_session
     from pc2grid.simulate.config import ChangeConfig, OdometryConfig
 
     if len(files) > 2:
@@ -90,12 +105,26 @@ def simulate_command(
     except ValidationError as error:
         first = error.errors()[0]
         raise ConfigError(f"{first['loc'][0]}: {first['msg']}, got {first['input']}") from error
+    house = None
+    if floors > 1:
+        for value, option in ((change, "--change"), (walkers, "--walkers"), (relief, "--relief")):
+            if value:
+                raise typer.BadParameter(f"{option} is for a single floor, not with --floors")
+        if glass or mirrors or start is not None:
+            raise typer.BadParameter("--glass, --mirrors and --start are for a single floor")
+        house = HouseConfig(visits=tuple(range(floors)), ride=ride.value, slope=slope, alike=alike)
     with console.of(context).progress(f"simulate {sensor.value}") as update:
         made = simulate_session(
-            files[-1], sensor=sensor.value, grid=grid, config=config, progress=update, force=force
+            files[-1],
+            sensor=sensor.value,
+            grid=grid,
+            house=house,
+            config=config,
+            progress=update,
+            force=force,
         )
-    if made.clutter < clutter:
-        console.warn(f"only {made.clutter} of {clutter} pieces of clutter could be placed")
+    if made.clutter < clutter * floors:
+        console.warn(f"only {made.clutter} of {clutter * floors} pieces of clutter could be placed")
     if json:
         document: Simulate = {
             "schema_version": 1,

@@ -1,0 +1,97 @@
+"""Which way is up, by the walls that one scan shows.
+
+The floor under a robot tilts with it on a slope and says nothing. Walls stay upright: the vertical is the
+direction to which their normals are perpendicular.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.arrays import F64
+from pc2grid.clouds.sampling import random_subset
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UprightParameters:
+    """How the vertical is measured. Chosen on simulated scans of a 16-beam lidar, where 98 % of the
+    measurements on level ground err by less than 0.6 degrees.
+
+    points, voxel_m, normals : so many of a scan are used, of these one a voxel, so that near walls count no
+        more, and for so many of them a normal is estimated.
+    neighbours : points of which a normal is estimated. squeeze : their heights count this many times when
+        neighbours are looked for, so that they lie on several rings of a lidar.
+    flatness : largest ratio of the variances across a surface and along its shorter side.
+    breadth_m : least standard deviation along that side: points of a single ring have no normal.
+    steepest_rad : normals nearer to the vertical than 90 degrees minus this are not of walls.
+    scale : of the robust weight of a normal, sine of its angle with the horizontal.
+    rounds : of reweighting.
+    least_normals, least_share : with fewer normals, or with less weight on the second direction of walls,
+        the vertical is not determined.
+    """
+
+    points: int = 12_000
+    voxel_m: float = 0.07
+    normals: int = 700
+    neighbours: int = 40
+    squeeze: float = 0.4
+    flatness: float = 0.05
+    breadth_m: float = 0.12
+    steepest_rad: float = math.radians(37.0)
+    scale: float = 0.05
+    rounds: int = 8
+    least_normals: int = 30
+    least_share: float = 0.05
+
+
+UPRIGHT = UprightParameters()
+
+
+def vertical_of(
+    points_m: NDArray[np.floating], guesses: tuple[F64, ...], parameters: UprightParameters = UPRIGHT
+) -> F64 | None:
+    """The vertical (3,), a unit vector that points up, by the walls in a scan; None if they do not show it.
+
+    points_m : (N, 3) in the base frame, without the sensor's motion. guesses : (3,) each; the vertical is
+    looked for around each of them, and the one that most normals agree with is returned.
+    """
+    normals = _normals(points_m, parameters)
+    found = [fit for guess in guesses if (fit := _perpendicular(normals, guess, parameters)) is not None]
+    return max(found, key=lambda fit: fit[1])[0] if found else None
+
+
+def _normals(points_m: NDArray[np.floating], p: UprightParameters) -> F64:
+    """Normals (K, 3) of flat surfaces."""
+    from scipy.spatial import cKDTree
+
+    points = points_m[random_subset(len(points_m), p.points)].astype(np.float64)
+    _, first = np.unique(np.floor(points / p.voxel_m).astype(np.int64), axis=0, return_index=True)
+    points = points[np.sort(first)]
+    if len(points) < p.neighbours:
+        return np.empty((0, 3))
+    squeezed = points * (1.0, 1.0, p.squeeze)
+    _, near = cKDTree(squeezed).query(squeezed[random_subset(len(points), p.normals)], k=p.neighbours)
+    around = points[near]
+    around -= around.mean(axis=1, keepdims=True)
+    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / p.neighbours)
+    flat = (variances[:, 0] < p.flatness * variances[:, 1]) & (variances[:, 1] > p.breadth_m**2)
+    normals: F64 = axes[flat, :, 0]
+    return normals
+
+
+def _perpendicular(normals: F64, guess: F64, p: UprightParameters) -> tuple[F64, float] | None:
+    """The direction (3,) perpendicular to most normals, near a guess, and how much weight agrees with it."""
+    walls = normals[np.abs(normals @ guess) < math.sin(p.steepest_rad)]
+    if len(walls) < p.least_normals:
+        return None
+    vertical, spread, weight = guess, np.zeros(3), np.zeros(1)
+    for _ in range(p.rounds):
+        weight = (1.0 + ((walls @ vertical) / p.scale) ** 2) ** -2
+        spread, axes = np.linalg.eigh((walls * weight[:, None]).T @ walls)
+        vertical = axes[:, 0] if axes[:, 0] @ guess > 0.0 else -axes[:, 0]
+    total = float(weight.sum())
+    return (vertical, total) if spread[1] > p.least_share * total else None

@@ -1,0 +1,268 @@
+"""Rides from floor to floor: slopes and stairs, by the tilt against the walls, and lifts, by their doors.
+
+A map in the plane ends where a ride begins. On a slope the floor tilts with the robot, and the height is the
+travel times the sine of the pitch. A lift shows no motion at all: the robot stands in a small room whose
+door shuts and opens again, and how high it is then is not known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from pc2grid.arrays import F32, F64, I64
+from pc2grid.clouds.ground import Ground
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.clouds.upright import vertical_of
+from pc2grid.geometry import SE2
+from pc2grid.model import Scan, SensorKind, Storey
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RideParameters:
+    """When a robot is on a slope, in a lift, or on another floor. Chosen by hand, on simulated houses.
+
+    Slopes:
+
+    every_m : travel from one measurement of the vertical to the next.
+    measurements : whose median is used.
+    begin_rad, end_rad : tilt from which on a robot is on a slope, and below which it is not any more, by a
+        lidar; 1 in 12 is 4.8 degrees. camera_factor : these times, by a depth camera, which sees fewer walls.
+    settled_m : level travel after which a slope has ended. More than the way over the landing between two
+        flights of stairs.
+    storey_m : a rise of at least this leads to another floor.
+    same_m : floors whose heights differ by less are one.
+    steep_rad : a steeper slope, such as stairs, is not mapped. Tracking in the plane measures wrong distances
+        there, so the pose after it is not known, unless it rose or fell by less than `brief_m`. A flatter one
+        is mapped like level ground.
+
+    Lifts:
+
+    sectors : of equal angle around a robot that stands.
+    stands_m : a robot that moves no farther stands.
+    near_m : in the cabin of a lift every wall is nearer than this.
+    far_m : through an open door one sees farther than this.
+    seen, open : least sectors that must have been seen, and most of these that may be open, in a shut cabin.
+    shut_s, still_m : least time for which it is shut, and how far the robot moves meanwhile at most.
+    door : neighbouring sectors that are open when the door is.
+    """
+
+    every_m: float = 0.15
+    measurements: int = 3
+    begin_rad: float = math.radians(2.5)
+    end_rad: float = math.radians(1.5)
+    camera_factor: float = 3.2
+    settled_m: float = 4.0
+    storey_m: float = 1.5
+    same_m: float = 1.0
+    steep_rad: float = math.radians(12.0)
+    brief_m: float = 0.3
+
+    sectors: int = 72
+    stands_m: float = 0.5
+    near_m: float = 2.2
+    far_m: float = 3.0
+    seen: int = 50
+    open: int = 2
+    shut_s: float = 3.0
+    still_m: float = 0.1
+    door: int = 4
+
+
+RIDES = RideParameters()
+
+
+@dataclass(frozen=True, slots=True)
+class Ride:
+    """What a scan says of a ride.
+
+    riding : the robot is on its way to another floor, or on stairs, or not far behind them: the scan shows no
+    floor that could be mapped. arrived : with this scan the
+    robot is somewhere whose place relative to what was before is not known.
+    """
+
+    riding: bool = False
+    arrived: bool = False
+
+
+class RideWatch:
+    """Follows the rides of a session, scan by scan.
+
+    storeys : the floors so far, in the order in which they were first reached. storey : number of the
+    present one.
+    """
+
+    def __init__(self, parameters: RideParameters = RIDES) -> None:
+        self._parameters = parameters
+        self._slope: _Slope | None = None
+        self._lift = _Lift(parameters)
+        self.storeys: list[Storey] = [Storey(group=0, height_m=0.0)]
+        self.storey = 0
+
+    def observe(
+        self,
+        scan: Scan,
+        points_m: F32,
+        planar_scan: PlanarScan,
+        pose: F64,
+        forward_m: float,
+        ground: Ground | None,
+    ) -> Ride:
+        """Take in a scan at its pose (4, 4) T_session_base.
+
+        points_m : (N, 3) deskewed, base frame. forward_m : travel of the base along its own x axis since the
+        last scan. ground : the floor in the base frame; None for a planar laser and for a sensor in the hand.
+        """
+        on_slope = self._slope is not None and self._slope.underway  # where landings are as small as cabins
+        if not on_slope and self._lift.observe(planar_scan, SE2.from_matrix(pose)):
+            self._slope = None
+            self.storeys.append(Storey(group=self.storeys[-1].group + 1, height_m=0.0))
+            self.storey = len(self.storeys) - 1
+            return Ride(arrived=True)
+        if ground is None:
+            return Ride()
+        if self._slope is None:
+            self._slope = _Slope(scan.sensor, self._parameters)
+        ended = self._slope.observe(points_m, forward_m, ground)
+        return Ride(self._slope.riding, ended is not None and self._arrives(ended))
+
+    def _arrives(self, slope: _Ended) -> bool:
+        """Whether a slope led to another floor, which becomes the present one, or to an unknown place."""
+        p = self._parameters
+        if abs(slope.rise_m) < p.storey_m:
+            return slope.steepest_rad > p.steep_rad and abs(slope.rise_m) > p.brief_m
+        here = self.storeys[self.storey]
+        reached = Storey(group=here.group, height_m=here.height_m + slope.rise_m)
+        known = [
+            k
+            for k, other in enumerate(self.storeys)
+            if other.group == reached.group and abs(other.height_m - reached.height_m) < p.same_m
+        ]
+        if not known:
+            self.storeys.append(reached)
+        self.storey = known[0] if known else len(self.storeys) - 1
+        return True
+
+
+@dataclass(frozen=True, slots=True)
+class _Ended:
+    """A slope that the robot has left behind, with its largest tilt."""
+
+    rise_m: float
+    steepest_rad: float
+
+
+class _Slope:
+    """Measures the tilt of the base against the walls, and the rise on a slope."""
+
+    def __init__(self, sensor: SensorKind, parameters: RideParameters) -> None:
+        self._parameters = parameters
+        self._factor = parameters.camera_factor if sensor == "depth" else 1.0
+        self._latest: deque[tuple[float, float]] = deque(maxlen=parameters.measurements)
+        self._vertical: F64 | None = None
+        self._unmeasured_m = math.inf
+        self._tilted = False
+        self._level_m = 0.0
+        self._rise_m = 0.0
+        self._steepest_rad = 0.0
+        self.underway = False  # on a slope, or not far behind it
+
+    @property
+    def riding(self) -> bool:
+        """Whether the slope is underway and too steep to be mapped, or leads to another floor."""
+        p = self._parameters
+        return self.underway and (self._steepest_rad > p.steep_rad or abs(self._rise_m) >= p.storey_m)
+
+    def observe(self, points_m: F32, forward_m: float, ground: Ground) -> _Ended | None:
+        """Take in a scan; returns the slope that it shows to be over."""
+        p = self._parameters
+        self._unmeasured_m += abs(forward_m)
+        if self._unmeasured_m >= p.every_m:
+            self._unmeasured_m = 0.0
+            self._measure(points_m, ground)
+        if not self._latest:
+            return None
+        pitch_rad, tilt_rad = np.median(np.array(self._latest), axis=0).tolist()
+        limit_rad = self._factor * (p.end_rad if self._tilted else p.begin_rad)
+        self._tilted = tilt_rad > limit_rad
+        if self._tilted:
+            if not self.underway:
+                self.underway, self._rise_m, self._steepest_rad = True, 0.0, 0.0
+            self._level_m = 0.0
+            self._rise_m += forward_m * math.sin(pitch_rad)
+            self._steepest_rad = max(self._steepest_rad, tilt_rad)
+            return None
+        self._level_m += abs(forward_m)
+        if not self.underway or self._level_m < p.settled_m:
+            return None
+        self.underway = False
+        return _Ended(self._rise_m, self._steepest_rad)
+
+    def _measure(self, points_m: F32, ground: Ground) -> None:
+        up = ground.normal
+        last = up if self._vertical is None else self._vertical
+        vertical = vertical_of(points_m, (up,) if last is up else (last, up))
+        if vertical is None:
+            return
+        self._vertical = vertical
+        level = ground.leveling()[:3, :3] @ vertical
+        tilt_rad = math.acos(min(float(vertical @ up), 1.0))
+        self._latest.append((math.asin(float(np.clip(level[0], -1.0, 1.0))), tilt_rad))
+
+
+class _Lift:
+    """Watches the walls around a robot that stands: near on all sides, then a door opens."""
+
+    def __init__(self, parameters: RideParameters) -> None:
+        self._parameters = parameters
+        self._start(SE2())
+
+    def _start(self, at: SE2) -> None:
+        self._at = at
+        self._far: I64 = np.full(self._parameters.sectors, -1)  # 1: far, 0: near, -1: not seen yet
+        self._shut_since: tuple[int, SE2] | None = None  # stamp, and pose at that time
+        self._shut_ns = 0
+
+    def observe(self, planar_scan: PlanarScan, pose: SE2) -> bool:
+        """Take in a scan at its pose; returns whether the door of a lift has opened before it."""
+        p = self._parameters
+        if math.hypot(pose.x - self._at.x, pose.y - self._at.y) > p.stands_m:
+            self._start(pose)
+        near_m, far_m = _ranges(planar_scan, p.sectors, pose.yaw)
+        near = near_m < p.near_m
+        self._far[near & (far_m < p.far_m)] = 0
+        self._far[far_m >= p.far_m] = 1
+        if (self._far >= 0).sum() >= p.seen and (self._far == 1).sum() <= p.open:
+            since_ns, at = self._shut_since or (planar_scan.stamp_ns, pose)
+            if math.hypot(pose.x - at.x, pose.y - at.y) > p.still_m:
+                since_ns, at = planar_scan.stamp_ns, pose
+            self._shut_since = since_ns, at
+            self._shut_ns = planar_scan.stamp_ns - since_ns
+            return False
+        self._shut_since = None
+        if self._shut_ns < p.shut_s * 1e9:
+            self._shut_ns = 0
+            return False
+        around = np.concatenate((self._far, self._far[: p.door])) == 1
+        if not any(around[k : k + p.door].all() for k in range(p.sectors)):
+            return False
+        self._shut_ns = 0
+        return True
+
+
+def _ranges(planar_scan: PlanarScan, sectors: int, yaw_rad: float) -> tuple[F64, F64]:
+    """The nearest hit and the farthest free range (sectors,), metres, in sectors of the session frame; inf
+    and 0 where there is none."""
+    turn = 2.0 * math.pi / sectors
+    away = planar_scan.hits_m - planar_scan.origin_m
+    sector = np.floor((np.arctan2(away[:, 1], away[:, 0]) + yaw_rad) / turn).astype(np.int64) % sectors
+    near_m = np.full(sectors, np.inf)
+    np.minimum.at(near_m, sector, np.linalg.norm(away, axis=1))
+    bearing = np.arange(len(planar_scan.free_m)) * (2.0 * math.pi / len(planar_scan.free_m))
+    sector = np.floor((bearing + yaw_rad) / turn).astype(np.int64) % sectors
+    far_m = np.zeros(sectors)
+    np.maximum.at(far_m, sector, planar_scan.free_m)
+    return near_m, far_m
