@@ -57,10 +57,15 @@ class RegisteredSession:
         """The true pose of the session's frame, by the end of the session.
 
         It is fitted over the scans of the last `_FITTED_M` whose true pose is known, because the heading of a
-        single scan, taken while the robot turns, may be wrong by some degrees.
+        single scan, taken while the robot turns, may be wrong by some degrees. Scans from before registration
+        was lost are left out: the motion since is not known. (Unless no other pose is known.)
         """
         path_m = self.path_m()
         known = np.flatnonzero(~np.isnan(self.T_world_base[:, 0]))
+        lost = np.flatnonzero(self.lost)
+        first = min(lost[-1] + 1, len(self) - 1) if len(lost) else 0  # a lost last scan is a query of its own
+        if known[-1] >= first:
+            known = known[known >= first]
         known = known[path_m[known] >= path_m[known[-1]] - _FITTED_M]
         ahead = np.array([(0.0, 0.0), (_FITTED_M, 0.0)])
         return SE2.fit(
