@@ -18,19 +18,21 @@ class Known:
 
     group : the building that it is left out with when the fit is judged, with the sensors if these differ.
     right : whether the best hypothesis is where the query truly was. session : the drive it belongs to;
-    answers of one drive depend on each other.
+    answers of one drive depend on each other. weight : of the answer in a fit.
     """
 
     group: str
     session: str
     evidence: Evidence
     right: bool
+    weight: float = 1.0
 
 
-def fit(answers: Sequence[Known]) -> Calibration:
+def fit(answers: Sequence[Known], share_right: float | None = None) -> Calibration:
     """Coefficients of highest likelihood (logistic regression), none of them but the bias below 0.
 
-    Raises ValueError unless there are both right and wrong answers.
+    share_right : the right answers weigh so much of all together, 0..1, however many of each there are; None:
+    as much as their weights say. Raises ValueError unless there are both right and wrong answers.
     """
     from scipy.optimize import minimize
 
@@ -39,15 +41,17 @@ def fit(answers: Sequence[Known]) -> Calibration:
         raise ValueError("a fit needs right and wrong answers")
     terms = np.array([answer.evidence.terms for answer in answers])
     sign = np.where(right, 1.0, -1.0)
+    weights = np.array([answer.weight for answer in answers])
+    weights /= weights.sum()
+    if share_right is not None:
+        share = float(weights[right].sum())
+        weights = weights * np.where(right, share_right / share, (1.0 - share_right) / (1.0 - share))
 
     def loss(x: F64) -> tuple[float, F64]:
         margin = sign * (terms @ x)
-        slope = -sign / (1.0 + np.exp(np.clip(margin, -500.0, 500.0)))
+        slope = -weights * sign / (1.0 + np.exp(np.clip(margin, -500.0, 500.0)))
         penalty = _PENALTY * x
-        return (
-            float(np.logaddexp(0.0, -margin).mean() + 0.5 * penalty @ x),
-            slope @ terms / len(sign) + penalty,
-        )
+        return float(weights @ np.logaddexp(0.0, -margin) + 0.5 * penalty @ x), slope @ terms + penalty
 
     bounds = [(None, None), (0.0, None), (0.0, None)]
     found = minimize(loss, np.array([0.0, 1.0, 1.0]), jac=True, bounds=bounds, method="L-BFGS-B")
@@ -55,22 +59,26 @@ def fit(answers: Sequence[Known]) -> Calibration:
     return Calibration(bias=bias, support=support, clearance=clearance)
 
 
-def left_out(answers: Sequence[Known]) -> F64:
-    """(N,) probability of each answer by the coefficients fitted to all other groups."""
+def left_out(answers: Sequence[Known], share_right: float | None = None) -> F64:
+    """(N,) probability of each answer by the coefficients fitted (see `fit`) to all other groups."""
     groups = np.array([answer.group for answer in answers])
     probabilities = np.zeros(len(answers))
     for group in np.unique(groups):
-        model = fit([answer for answer in answers if answer.group != group])
+        model = fit([answer for answer in answers if answer.group != group], share_right)
         for i in np.flatnonzero(groups == group).tolist():
             probabilities[i] = model.probability(answers[i].evidence)
     return probabilities
 
 
-def log_loss(answers: Sequence[Known], probabilities: F64) -> float:
-    """Mean of the negative logarithm of the probability of what is true."""
+def log_losses(answers: Sequence[Known], probabilities: F64) -> F64:
+    """(N,) negative logarithm of the probability of what is true."""
     right = np.array([answer.right for answer in answers])
-    p = np.clip(np.where(right, probabilities, 1.0 - probabilities), 1e-4, 1.0)
-    return float(-np.log(p).mean())
+    return np.asarray(-np.log(np.clip(np.where(right, probabilities, 1.0 - probabilities), 1e-4, 1.0)))
+
+
+def log_loss(answers: Sequence[Known], probabilities: F64) -> float:
+    """Mean of `log_losses`."""
+    return float(log_losses(answers, probabilities).mean())
 
 
 def roc_area(answers: Sequence[Known], probabilities: F64) -> float:

@@ -71,6 +71,7 @@ def judge(
         forward=answer.evidence.forward,
         backward=answer.evidence.backward,
         looked_at=answer.evidence.looked_at,
+        likeness=answer.evidence.likeness,
     )
 
 

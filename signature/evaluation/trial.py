@@ -39,9 +39,9 @@ class Trial:
     confidence, error_m, error_rad: of the best hypothesis; the errors are null if there is none. right: the
     error of the best hypothesis is small enough. rank: of the first right place among those retrieved, -1 if
     there is none; alone: the same by each combination of signatures, without isovists. forward, walls,
-    backward, looked_at, lead: the evidence of the decision, see `signature.relocalization.confidence`;
-    agreement: the better one of forward and backward. In the results of earlier versions, forward, backward
-    and looked_at are null.
+    backward, looked_at, lead, likeness: the evidence of the decision, see
+    `signature.relocalization.confidence`; agreement: the better one of forward and backward. In the results
+    of earlier versions, forward, backward, looked_at and likeness are null.
     """
 
     building: str
@@ -65,6 +65,7 @@ class Trial:
     forward: float | None = None
     backward: float | None = None
     looked_at: float | None = None
+    likeness: float | None = None
 
     @property
     def in_map(self) -> bool:

@@ -251,7 +251,7 @@ class MapIndex:
             for k, h in zip(dict.fromkeys(places), best, strict=True)
             if kept and k != kept[0][1] and (k in numbers or not same_score(h.fit, kept[0][0].fit))
         ]
-        evidence = Evidence.of(rivals, query.walls.weight)
+        evidence = Evidence.of(rivals, query.walls)
         confidence = CALIBRATION.probability(evidence)
         status: Status = "not_found"
         if confidence >= self.config.accept:
@@ -331,7 +331,9 @@ class MapIndex:
         at = query.T_odom_base
         there = b.fit.T_map_query @ at
         beyond = unseen_by(
-            query, self.grids[b.session_index].crop((there.x, there.y), DECISION.around_m), b.fit
+            query,
+            self.grids[b.session_index].crop((there.x, there.y), DECISION.around_m),
+            b.fit.T_map_query,
         )
         around = Walls.of(beyond)
         target = self.maps[a.session_index]
@@ -355,8 +357,8 @@ def same_score(a: Fit, b: Fit) -> bool:
     return abs(a.score - b.score) <= DECISION.equal
 
 
-def unseen_by(query: QueryMap, grid: OccupancyGrid, fit: Fit) -> OccupancyGrid:
-    """A part of a map in which all that the query has seen, placed as `fit` says, is made unknown.
+def unseen_by(query: QueryMap, grid: OccupancyGrid, T_map_query: SE2) -> OccupancyGrid:
+    """A map, or a part of one, in which all that the query has seen, placed at a pose, is made unknown.
 
     What it has seen is widened by `DecisionParameters.wall_m`.
     """
@@ -366,7 +368,7 @@ def unseen_by(query: QueryMap, grid: OccupancyGrid, fit: Fit) -> OccupancyGrid:
     n = math.ceil(DECISION.wall_m / grid.resolution_m)
     known = cv2.dilate(known.astype(np.uint8), np.ones((2 * n + 1, 2 * n + 1), np.uint8)).astype(bool)
     cells = np.argwhere(grid.cells != UNKNOWN)
-    at = query.grid.to_cell(fit.T_map_query.inverse().apply(grid.to_point(cells)))
+    at = query.grid.to_cell(T_map_query.inverse().apply(grid.to_point(cells)))
     inside: BoolGrid = np.all((at >= 0) & (at < query.grid.cells.shape), axis=1)
     inside[inside] = known[at[inside, 0], at[inside, 1]]
     left = grid.cells.copy()

@@ -2,6 +2,8 @@
 
 The map of a building is drawn from the first part of its log at the poses of the ground truth, so that only
 the decision is measured, not mapping. Later parts of every log, registered as a user would, are the queries.
+Each is asked in its own map once more with all that it sees there made unknown ("blanked"): a place that the
+map lacks, in a building that it knows.
 
     python tools/bench/real_queries.py DATA OUT.json [--logs fr079,intel] [--queries 24]
 
@@ -33,7 +35,7 @@ from signature.describe import describe
 from signature.evaluation.registered_session import RegisteredSession, register
 from signature.evaluation.replay import Replay
 from signature.relocalization.confidence import Evidence
-from signature.relocalization.map_index import MapIndex
+from signature.relocalization.map_index import MapIndex, unseen_by
 from signature.relocalization.query_map import QueryMap, QueryWindow
 from signature.similarity import SignatureTable
 from signature.verification.two_way_score import score_fit
@@ -110,35 +112,44 @@ def moments(
 def evidence_rows(
     name: str, start: int, driven: RegisteredSession, indexes: dict[str, MapIndex], config: Config
 ) -> Iterator[dict[str, Any]]:
-    """The evidence for one query in each map, after each distance and for each window, and all errors.
-
-    As in `MapIndex.decide`, there are two answers: by what is proposed, and by a search of the whole map.
-    """
+    """The evidence for one query in each map, after each distance and for each window, and all errors."""
     for travel_m, maps, truth in moments(driven, config):
         for map_name, index in indexes.items():
             own = map_name == name
             for window_m, query in maps.items():
-                covered = 0.0
-                if own and truth is not None:
-                    T = truth @ query.T_odom_base.inverse()
-                    covered = score_fit(index.maps[0].walls, query.walls, T, np.eye(3)).overlap
-                proposed = index.look_up(query)
-                for stage, found in (
-                    ("proposed", proposed),
-                    ("everywhere", index.look_everywhere(query, proposed)),
-                ):
-                    poses = [h.fit.T_map_query @ query.T_odom_base for h in found]
-                    yield {
-                        "log": name,
-                        "map": map_name,
-                        "start": start,
-                        "travel_m": travel_m,
-                        "window_m": window_m,
-                        "stage": stage,
-                        "covered": covered,
-                        "evidence": asdict(Evidence.of(found, query.walls.weight)),
-                        "errors": [_error(pose, truth if own else None) for pose in poses],
-                    }
+                row = {
+                    "log": name,
+                    "map": map_name,
+                    "start": start,
+                    "travel_m": travel_m,
+                    "window_m": window_m,
+                    "covered": 0.0,
+                }
+                if not own or truth is None:
+                    yield from _looks(
+                        index, query, None, row | {"place": "in the map" if own else "elsewhere"}
+                    )
+                    continue
+                T_map_query = truth @ query.T_odom_base.inverse()
+                row["covered"] = score_fit(index.maps[0].walls, query.walls, T_map_query, np.eye(3)).overlap
+                yield from _looks(index, query, truth, row | {"place": "in the map"})
+                blanked = unseen_by(query, index.grids[0], T_map_query)
+                without = MapIndex({name: blanked}, index.places.table, config, config)
+                yield from _looks(without, query, truth, row | {"place": "blanked"})
+
+
+def _looks(
+    index: MapIndex, query: QueryMap, truth: SE2 | None, row: dict[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """As in `MapIndex.decide`, two answers: by what is proposed, and by a search of the whole map."""
+    proposed = index.look_up(query)
+    for stage, found in (("proposed", proposed), ("everywhere", index.look_everywhere(query, proposed))):
+        poses = [h.fit.T_map_query @ query.T_odom_base for h in found]
+        yield row | {
+            "stage": stage,
+            "evidence": asdict(Evidence.of(found, query.walls)),
+            "errors": [_error(pose, truth) for pose in poses],
+        }
 
 
 def _error(pose: SE2, truth: SE2 | None) -> tuple[float, float]:

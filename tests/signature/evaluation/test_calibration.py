@@ -19,6 +19,7 @@ def answers(count: int) -> list[Known]:
             backward=float(rng.uniform(0.3, 0.98)),
             looked_at=float(rng.uniform(30, 300)),
             lead=float(rng.uniform(0.05, 0.3)),  # so long that the places are not equal
+            likeness=float(rng.uniform(0.0, 1.0)),
         )
         right = bool(rng.random() < TRUTH.probability(evidence))
         made.append(Known(group="abc"[i % 3], session=str(i // 4), evidence=evidence, right=right))
@@ -30,6 +31,15 @@ def test_the_fit_recovers_the_model_that_made_the_answers() -> None:
     assert found.bias == pytest.approx(TRUTH.bias, abs=0.5)
     assert found.support == pytest.approx(TRUTH.support, rel=0.15)
     assert found.clearance == pytest.approx(TRUTH.clearance, rel=0.15)
+
+
+def test_right_answers_weigh_what_they_are_told_to() -> None:
+    """Half of the wrong answers left out: with a given weight of the right ones, the fit is the same."""
+    some = answers(6000)
+    kept = [a for i, a in enumerate(some) if a.right or i % 2]
+    by_number, by_weight = ([fit(of, share_right).bias for of in (some, kept)] for share_right in (None, 0.5))
+    assert by_number[1] - by_number[0] == pytest.approx(np.log(2.0), abs=0.2)
+    assert by_weight[1] == pytest.approx(by_weight[0], abs=0.2)
 
 
 def test_answers_are_judged_by_a_fit_without_their_group() -> None:

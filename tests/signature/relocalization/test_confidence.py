@@ -20,18 +20,19 @@ from signature.relocalization.confidence import (
 AGREEMENTS = np.linspace(0.0, 1.0, 11).tolist()
 WALLS = [5.0, 30.0, 100.0, 300.0, 2000.0]
 LEADS = [0.0, 0.01, 0.05, 0.1, LIMITS.longest_lead, 1.0]
-USUAL = Evidence(forward=0.8, walls=200.0, backward=0.9, looked_at=150.0, lead=0.1)
+USUAL = Evidence(forward=0.8, walls=200.0, backward=0.9, looked_at=150.0, lead=0.1, likeness=0.4)
 
 
 @pytest.mark.parametrize("model", [CALIBRATION, PRESENCE])
 @pytest.mark.parametrize(
-    ("field", "values"), [("forward", AGREEMENTS), ("backward", AGREEMENTS), ("lead", LEADS)]
+    ("field", "values"),
+    [("forward", AGREEMENTS), ("backward", AGREEMENTS), ("lead", LEADS)],
 )
 def test_more_agreement_or_a_longer_lead_never_lowers_it(
     model: Calibration | Presence, field: str, values: list[float]
 ) -> None:
     for agreement, walls, lead in itertools.product(AGREEMENTS[::2], WALLS, LEADS[::2]):
-        other = Evidence(forward=agreement, backward=agreement, walls=walls, looked_at=walls, lead=lead)
+        other = replace(USUAL, forward=agreement, backward=agreement, walls=walls, looked_at=walls, lead=lead)
         along = [model.probability(replace(other, **{field: value})) for value in values]
         assert along == sorted(along) and along[-1] > along[0]
 
@@ -56,16 +57,34 @@ def test_an_agreement_counts_by_the_points_that_it_rests_on() -> None:
 
 def test_a_changed_hall_is_located_by_its_lead() -> None:
     """Figures of a real scanner in a real hall that has been changed: no other place fits nearly as well."""
-    changed = Evidence(forward=0.75, walls=450.0, backward=0.71, looked_at=436.0, lead=LIMITS.longest_lead)
+    changed = replace(
+        USUAL, forward=0.75, walls=450.0, backward=0.71, looked_at=436.0, lead=LIMITS.longest_lead
+    )
     assert CALIBRATION.probability(changed) > 0.9
     assert CALIBRATION.probability(replace(changed, lead=0.02)) < 0.3
 
 
 def test_a_lead_on_few_walls_is_chance() -> None:
     """Figures of a standing scanner asked in another building: a long lead, on 32 wall points."""
-    elsewhere = Evidence(forward=0.89, walls=32.0, backward=0.62, looked_at=45.0, lead=0.17)
+    elsewhere = replace(USUAL, forward=0.89, walls=32.0, backward=0.62, looked_at=45.0, lead=0.17)
     assert CALIBRATION.probability(elsewhere) < 0.7
     assert CALIBRATION.probability(replace(elsewhere, walls=300.0, looked_at=300.0)) > 0.9
+
+
+@pytest.mark.parametrize("model", [CALIBRATION, PRESENCE])
+def test_a_lead_says_the_less_the_more_the_query_is_like_itself(model: Calibration | Presence) -> None:
+    along = [model.probability(replace(USUAL, likeness=like)) for like in (0.0, 0.3, 0.6, 0.9, 1.0)]
+    assert along == sorted(along, reverse=True) and along[-1] < along[0]
+
+
+def test_a_corridor_that_the_map_lacks_is_not_located_in_another() -> None:
+    """Figures of a real laser, 73 m from where it was: 406 wall points fit, most of them slid along, too."""
+    corridor = Evidence(
+        forward=0.913, walls=406.0, backward=0.826, looked_at=582.0, lead=0.033, likeness=0.835
+    )
+    assert CALIBRATION.probability(corridor) < 0.85
+    longer = replace(corridor, lead=LIMITS.longest_lead)
+    assert CALIBRATION.probability(longer) > 0.9  # a corridor that no other resembles
 
 
 def test_without_walls_there_is_no_answer() -> None:
