@@ -23,6 +23,7 @@ from pc2grid.model import Consistency, Contradiction, OccupancyGrid, Precision, 
 from pc2grid_cli.deviation import deviation
 from pc2grid_cli.locate import Found, find_map
 from pc2grid_cli.nav2_pose import initialpose
+from pc2grid_cli.relocalize import map_sigma_m
 from pc2grid_cli.report import contents, runs, write_report
 from signature.boundary import boundary_histogram
 from signature.config import Config
@@ -163,6 +164,22 @@ def test_how_exactly_places_are_known_is_drawn_along_the_path(tmp_path: Path) ->
     ((sigma_m, *xy),) = shown["loose"]  # the first piece is known better than a path is wide
     assert sigma_m == 0.4
     assert np.allclose((xy[:2], xy[-2:]), way().planar()[[4, 9], :2], atol=0.006)
+
+
+def test_an_answer_comes_with_how_exactly_the_map_is_known_there(tmp_path: Path, found: Found) -> None:
+    stamps, pose = way().stamps_ns, found.answer.T_map_base
+    assert pose is not None
+    nearest = int(np.argmin(np.hypot(*(way().planar()[:, :2] - (pose.x, pose.y)).T)))
+    known = Precision(stamps_ns=(int(stamps[0]), int(stamps[nearest]) + 1), sigma_m=(0.1, 0.75))
+    office_map = session("office", office(), way())
+    for name, precision in (("known", known), ("unknown", None)):
+        path = tmp_path / f"{name}.submaps"
+        origin = provenance(Path("office.mcap"), "a" * 64, Config())
+        add_sessions(path, [(replace(office_map, precision=precision), origin)], Config())
+    with open_database(tmp_path / "known.submaps") as database:
+        assert map_sigma_m(found.answer, database) == pytest.approx(0.75, abs=1e-6)
+    with open_database(tmp_path / "unknown.submaps") as database:
+        assert map_sigma_m(found.answer, database) is None
 
 
 def test_the_answer_on_the_page_is_the_answer(database: SubmapDatabase, found: Found) -> None:

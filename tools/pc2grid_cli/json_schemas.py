@@ -45,10 +45,12 @@ class Searched(Sessions):
 
 class Relocalize(Result):
     """`pc2grid relocalize --json`. T_map_odom puts the query's own frame into the map. confidence: the
-    probability that the best hypothesis is right. hypotheses: best first."""
+    probability that the best hypothesis is right. hypotheses: best first. map_sigma_m: standard deviation of
+    the map itself there, relative to the rest of it; the covariance of the pose is about the walls around."""
 
     query: Query
     database: Searched
+    map_sigma_m: float | None
 
 
 class CheckedPose(Pose):

@@ -190,7 +190,7 @@ def relocalize_command(
             ask=report is not None or rerun is not None,
         )
         # Printed first: a file that cannot be written must not cost the answer.
-        _print(found, where, left_out, as_json=json)
+        _print(found, where, left_out, map_sigma_m(found.answer, opened), as_json=json)
         _write(outputs, opened, found, located, settings)
     for path in (trajectory, initialpose, output):
         if path is not None and located is None:
@@ -310,18 +310,49 @@ def _write(
         write_report(outputs.report, database, found=found, accept=settings.relocalize.accept)
 
 
-def _print(found: Found, where: str, left_out: list[str], *, as_json: bool) -> None:
-    """The answer on stdout."""
+def map_sigma_m(answer: Answer, database: SubmapDatabase) -> float | None:
+    """Standard deviation (m) of the map itself where the query is; None if it is not known or not located.
+
+    The covariance of the answer is about the walls there. Where these lie in the map is another question.
+    """
+    import numpy as np
+
+    if answer.T_map_base is None or answer.session is None:
+        return None
+    (info,) = database.sessions([answer.session])
+    trajectory = database.trajectory(answer.session)
+    if info.precision is None or not info.precision.stamps_ns or not len(trajectory):
+        return None
+    x, y, _ = trajectory.planar().T
+    nearest = int(np.argmin(np.hypot(x - answer.T_map_base.x, y - answer.T_map_base.y)))
+    return info.precision.at(int(trajectory.stamps_ns[nearest]))
+
+
+def _about_map(sigma_m: float | None) -> str:
+    """A line about the map where it is not known well enough to rely on; else nothing."""
+    from pc2grid.mapping.precision import PRECISION
+
+    if sigma_m is None or sigma_m <= PRECISION.promised_m:
+        return ""
+    return (
+        f"\n  the map itself may be off by {sigma_m:.1f} m here (standard deviation), see `pc2grid db info`"
+    )
+
+
+def _print(found: Found, where: str, left_out: list[str], sigma_m: float | None, *, as_json: bool) -> None:
+    """The answer on stdout. sigma_m : of the map where the query is."""
     if as_json:
         answer = found.answer.to_json()
         document: Relocalize = {
             **answer,
             "query": found.about,
             "database": {**answer["database"], "path": where, "left_out": left_out},
+            "map_sigma_m": None if sigma_m is None else round(sigma_m, 3),
         }
         console.print_json(document)
     else:
-        print(as_text(found.answer, is_map=found.drawn is not None), flush=True)
+        text = as_text(found.answer, is_map=found.drawn is not None)
+        print(text + _about_map(sigma_m), flush=True)
 
 
 def _warn_of_prior(answer: Answer) -> None:
