@@ -61,6 +61,9 @@ class HouseConfig(Section):
     slope: float = Field(
         default=0.6, gt=0, le=0.8, description="rise of a flight over its length in the plan"
     )
+    furniture_seed: int | None = Field(
+        default=None, ge=0, description="of the movable objects; null: that of the session"
+    )
     alike: bool = Field(default=False, description="the same movable objects in the same places everywhere")
 
 
@@ -395,13 +398,14 @@ def prepare_house_session(
     def stream(*numbers: int) -> np.random.Generator:
         return np.random.default_rng([config.seed, *numbers])
 
+    furniture_seed = config.seed if house.furniture_seed is None else house.furniture_seed
     x, y = built.door_m
     clear_m = (built.inside_m, (x, y), (x + 0.5 * _LANDING_M, y - 0.7), (x + 0.5 * _LANDING_M, y + 0.7))
     clutter = {
         floor: place_clutter(
             built.plan,
             config.clutter,
-            stream(_CLUTTER, 0 if house.alike else floor),
+            np.random.default_rng([furniture_seed, _CLUTTER, 0 if house.alike else floor]),
             robot_m=robot_m,
             keep_free_m=clear_m,
         )

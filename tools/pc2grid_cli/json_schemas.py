@@ -408,6 +408,33 @@ class CompareLog(TypedDict):
     trials: list[Trial]
 
 
+class FloorRow(TypedDict):
+    """A house of `pc2grid compare floors`, and what became of it; see `signature.evaluation.floors`."""
+
+    seed: int
+    way: Literal["stairs", "lift", "logs"]
+    alike: bool
+    sensor: str
+    floors: int
+    length_m: float
+    query_m: float
+    queries: int
+    told_apart: bool
+    named: bool
+    right: int
+    wrong: int
+    ambiguous: int
+    not_found: int
+    misplaced: int
+
+
+class CompareFloors(TypedDict):
+    """`pc2grid compare floors --json`: a row a house."""
+
+    schema_version: Version
+    rows: list[FloorRow]
+
+
 class CompareMaps(TypedDict):
     """`pc2grid compare maps --json`: a row a session, with the errors of its trajectory and of its cells."""
 
@@ -621,6 +648,7 @@ def precision_document(precision: model.Precision | None) -> Precision | None:
 
 DOCUMENTS: dict[str, type] = {
     "compare-log": CompareLog,
+    "compare-floors": CompareFloors,
     "compare-maps": CompareMaps,
     "compare-paper": ComparePaper,
     "compare-peers": ComparePeers,

@@ -11,6 +11,7 @@ import typer
 import pc2grid
 from pc2grid_cli import console
 from pc2grid_cli.command_line import Command, Group
+from pc2grid_cli.compare_floors import compare_floors_command
 from pc2grid_cli.compare_log import compare_log_command
 from pc2grid_cli.compare_maps import compare_maps_command
 from pc2grid_cli.compare_paper import compare_paper_command
@@ -91,6 +92,7 @@ compare.command("sensors", cls=Command)(compare_sensors_command)
 compare.command("signatures", cls=Command)(compare_signatures_command)
 compare.command("log", cls=Command)(compare_log_command)
 compare.command("maps", cls=Command)(compare_maps_command)
+compare.command("floors", cls=Command)(compare_floors_command)
 compare.command("real", cls=Command)(compare_real_command)
 compare.command("peers", cls=Command)(compare_peers_command)
 app.add_typer(compare, name="compare")
