@@ -28,10 +28,12 @@ class HypothesisParameters:
         a ray of their isovists, with some reserve.
     square_m : side of the squares of free ground that a whole map is searched in; headings are searched in
         equal parts of at most 2 `half_a_rad`.
-    few_points : wall points in the coarse search, enough to rank poses.
+    few_points : near wall points in the coarse search, and as many far ones; enough to rank poses.
     few_spacing_m : they are at least about so far apart.
-    near_m : walls farther from the centre of rotation are left out of the coarse search: a small error of yaw
-        would move them by more than a wall's width.
+    near_m : near are walls up to so far from the centre of rotation. A small error of yaw moves those beyond
+        by more than a wall's width, so that they must not outweigh the near ones.
+    far_m : walls beyond are left out. What is near may be people and carts only: of a real hall, 4 s of a
+        lidar were found with the walls between 8 and 20 m and not without them.
     refined : share of `RelocalizeConfig.hypotheses` that is refined; some of these will merge.
     same_m, same_rad : two hypotheses nearer than this are one.
     """
@@ -42,6 +44,7 @@ class HypothesisParameters:
     few_points: int = 128
     few_spacing_m: float = 0.25
     near_m: float = 8.0
+    far_m: float = 20.0
     refined: int = 2
     same_m: float = 0.5
     same_rad: float = math.radians(10.0)
@@ -176,13 +179,20 @@ def same_pose(a: SE2, b: SE2) -> bool:
 
 
 def coarse_points(points_m: F32, center_m: tuple[float, float]) -> F32:
-    """(M, 2) float32: a few of the wall points (N, 2), spread evenly around `center_m` and relative to it."""
+    """(M, 2) float32: a few of the wall points (N, 2), near and far, spread evenly around `center_m` and
+    relative to it."""
+    p = HYPOTHESES
     local = points_m - np.asarray(center_m, np.float32)
-    local = local[np.hypot(local[:, 0], local[:, 1]) < HYPOTHESES.near_m]
-    local = local[thin_evenly(local, HYPOTHESES.few_spacing_m)]
-    if len(local) > HYPOTHESES.few_points:
-        local = local[np.linspace(0, len(local) - 1, HYPOTHESES.few_points).astype(int)]
-    return local
+    away_m = np.hypot(local[:, 0], local[:, 1])
+    near, far = local[away_m < p.near_m], local[(away_m >= p.near_m) & (away_m < p.far_m)]
+    return np.concatenate((_few(near), _few(far)))
+
+
+def _few(points_m: F32) -> F32:
+    points_m = points_m[thin_evenly(points_m, HYPOTHESES.few_spacing_m)]
+    if len(points_m) > HYPOTHESES.few_points:
+        points_m = points_m[np.linspace(0, len(points_m) - 1, HYPOTHESES.few_points).astype(int)]
+    return points_m
 
 
 def _about(center_m: tuple[float, float], pose: SE2) -> SE2:
