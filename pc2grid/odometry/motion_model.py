@@ -63,16 +63,15 @@ class MotionModel:
         if scan.T_odom_base is None or self._measured is None:
             return self.continued(seconds)
         T_odom_then, T_session_then = self._measured
-        odometry: F64 = invert_pose(T_odom_then) @ scan.T_odom_base
+        odometry: F64 = self._trust.corrected(invert_pose(T_odom_then) @ scan.T_odom_base)
         motion = odometry
         if not self._last_had_odometry:
             motion = invert_pose(self.last_pose) @ T_session_then @ odometry
         windowed = None
         if self._window:
             _, T_odom_then, T_session_then = self._window[0]
-            windowed = (
-                invert_pose(self.last_pose) @ T_session_then @ invert_pose(T_odom_then) @ scan.T_odom_base
-            )
+            over_window = self._trust.corrected(invert_pose(T_odom_then) @ scan.T_odom_base)
+            windowed = invert_pose(self.last_pose) @ T_session_then @ over_window
         return Prediction(motion=motion, seconds=seconds, odometry=odometry, windowed=windowed)
 
     def continued(self, seconds: float) -> Prediction:

@@ -13,6 +13,7 @@ import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, invert_pose
+from pc2grid.odometry.odometry_calibration import OdometryCalibration
 from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
 
 
@@ -29,6 +30,11 @@ class OdometryTrust:
         self._travel_m = 0.0
         self._turn_rad = 0.0
         self._errors: list[float] = []  # of the last windows, in standard deviations of unknown odometry
+        self._calibration = OdometryCalibration()
+
+    def corrected(self, motion: F64) -> F64:
+        """A motion (4, 4) that odometry reports, without the systematic error that it has shown so far."""
+        return self._calibration.corrected(motion)
 
     @property
     def doubt(self) -> float:
@@ -51,18 +57,23 @@ class OdometryTrust:
         if self._begin is None or self._last is None or not sure:
             self._begin = (T_odom_base, T_session_base) if sure else None
             self._last, self._travel_m, self._turn_rad = T_odom_base, 0.0, 0.0
+            self._calibration.restart()
             return
-        distance, turn = motion_size(invert_pose(self._last) @ T_odom_base)
+        motion = invert_pose(self._last) @ T_odom_base
+        distance, turn = motion_size(motion)
         self._last = T_odom_base
         self._travel_m += distance
         self._turn_rad += turn
+        self._calibration.extend(motion)
         if self._travel_m < self._parameters.trust_window_m:
             return
         reported = SE2.from_matrix(invert_pose(self._begin[0]) @ T_odom_base)
         actual = SE2.from_matrix(invert_pose(self._begin[1]) @ T_session_base)
+        # Judged without the correction: an estimate from the poses must not make odometry count more in them.
         wrong = actual.inverse() @ reported
         sigma_m, sigma_rad = self._sigmas(self._travel_m, self._turn_rad)
         error = max(math.hypot(wrong.x, wrong.y) / sigma_m, abs(wrong.yaw) / sigma_rad)
+        self._calibration.observe(actual, self.doubt * sigma_m, self.doubt * sigma_rad)
         self._errors = [*self._errors[1 - self._parameters.trust_windows :], error]
         self._begin, self._travel_m, self._turn_rad = (T_odom_base, T_session_base), 0.0, 0.0
 
