@@ -31,7 +31,8 @@ class PrecisionParameters:
     promised_m : standard deviation of a position from which a place is called loose. An answer of
         relocalization is called right within this distance (`compare log`). Beyond it, an answer that is
         exact to the walls around it is off in the map by more than that as often as one in three.
-    least_travel_m : shorter loose stretches are not named; the travel of one local map.
+    least_travel_m : shorter loose stretches are not named: later recordings are recognised by stretches of
+        8 m and more.
     rounds : in which the weights of the places are found; they change little after two.
     most_places : whose covariance is computed, evenly chosen. It is interpolated between them, so that the
         time grows linearly with the length of a session.
@@ -40,7 +41,7 @@ class PrecisionParameters:
     """
 
     promised_m: float = 0.5
-    least_travel_m: float = 4.0
+    least_travel_m: float = 8.0
     rounds: int = 3
     most_places: int = 1000
     held: float = 1e4
