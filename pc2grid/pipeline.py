@@ -511,7 +511,7 @@ class _KeyframeSelection:
             self._latest = Keyframe(index, tracked.planar_scan, pose, tracked.restart)
             self._storey = tracked.storey
             self._unseen_hits.restart(tracked.planar_scan, pose)
-        elif self._latest is not None and not tracked.riding and tracked.registered.health is not Health.LOST:
+        elif self._latest is not None and tracked.mapped and tracked.registered.health is not Health.LOST:
             self._unseen_hits.add(tracked.planar_scan, pose)
 
     def finish(self) -> None:

@@ -50,7 +50,7 @@ class RideParameters:
     door : neighbouring sectors that are open when the door is.
     """
 
-    every_m: float = 0.15
+    every_m: float = 0.1
     measurements: int = 3
     begin_rad: float = math.radians(2.5)
     end_rad: float = math.radians(1.5)
@@ -80,12 +80,14 @@ class Ride:
     """What a scan says of a ride.
 
     riding : the robot is on its way to another floor, or on stairs, or not far behind them: the scan shows no
-    floor that could be mapped. arrived : with this scan the
+    floor that could be mapped. tilting : the latest measurement shows another tilt than those before, so the
+    scan had better not be mapped, whether that is a slope or an error. arrived : with this scan the
     robot is somewhere whose place relative to what was before is not known.
     """
 
     riding: bool = False
     arrived: bool = False
+    tilting: bool = False
 
 
 class RideWatch:
@@ -127,7 +129,9 @@ class RideWatch:
         if self._slope is None:
             self._slope = _Slope(scan.sensor, self._parameters)
         ended = self._slope.observe(points_m, forward_m, ground)
-        return Ride(self._slope.riding, ended is not None and self._arrives(ended))
+        return Ride(
+            self._slope.riding, ended is not None and self._arrives(ended), tilting=self._slope.tilting
+        )
 
     def _arrives(self, slope: _Ended) -> bool:
         """Whether a slope led to another floor, which becomes the present one, or to an unknown place."""
@@ -175,6 +179,14 @@ class _Slope:
         """Whether the slope is underway and too steep to be mapped, or leads to another floor."""
         p = self._parameters
         return self.underway and (self._steepest_rad > p.steep_rad or abs(self._rise_m) >= p.storey_m)
+
+    @property
+    def tilting(self) -> bool:
+        """Whether the latest measurement shows another tilt than those before."""
+        if not self._latest:
+            return False
+        tilts_rad = [tilt_rad for _, tilt_rad in self._latest]
+        return abs(tilts_rad[-1] - float(np.median(tilts_rad))) > self._factor * self._parameters.begin_rad
 
     def observe(self, points_m: F32, forward_m: float, ground: Ground) -> _Ended | None:
         """Take in a scan; returns the slope that it shows to be over."""

@@ -46,8 +46,9 @@ class Tracked:
     keyframe : whether the robot had moved enough for the scan to become part of the local map.
     restart : the first keyframe after tracking was lost: its pose relative to those before is unknown.
     disagreement : of odometry with the pose; None for a lost scan, and where there is nothing to compare.
-    riding : on the way to another floor: the scan belongs to none, see `Ride`. arrived : the first scan after
-    a ride to another floor. storey : number of the floor, see `Tracker.storeys`.
+    mapped : the scan may become part of the map. riding : on the way to another floor: the scan belongs to
+    none, see `Ride`. arrived : the first scan after a ride to another floor. storey : number of the floor,
+    see `Tracker.storeys`.
     """
 
     registered: RegisteredScan
@@ -55,6 +56,7 @@ class Tracked:
     keyframe: bool
     restart: bool = False
     disagreement: Disagreement | None = None
+    mapped: bool = True
     riding: bool = False
     arrived: bool = False
     storey: int = 0
@@ -164,7 +166,8 @@ class Tracker:
         )
         if extended:
             self.kiss.update_map(pose)
-        keyframe = extended and not ride.riding
+        mapped = not (ride.riding or ride.tilting)
+        keyframe = extended and mapped
         restart = keyframe and self._restarted
         self._restarted &= not keyframe
         disagreement = None
@@ -178,6 +181,7 @@ class Tracker:
             keyframe=keyframe,
             restart=restart,
             disagreement=disagreement,
+            mapped=mapped,
             riding=ride.riding,
             arrived=ride.arrived,
             storey=self._rides.storey,

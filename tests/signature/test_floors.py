@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pc2grid.model import SessionMap
+from pc2grid.model import UNKNOWN, SessionMap
 from signature.config import Config
 from signature.database import Label, Provenance, open_database
 from signature.relocalization.relocalizer import Answer, MapIndex, locate_map
@@ -47,6 +47,31 @@ def test_floors_that_look_alike_are_ambiguous(tmp_path: Path, floor: SessionMap,
     answer = asked(tmp_path, floor, {"house": origins[0], "house#2": origins[1]})
     assert answer.status == "ambiguous"
     assert {answer.labels[h.session_index].floor for h in answer.hypotheses} == {"0", "1"}
+
+
+def test_a_floor_that_looks_alike_may_hold_what_its_map_does_not_show(
+    tmp_path: Path, floor: SessionMap, origin: Provenance
+) -> None:
+    """The map of one floor ends in the middle of the office; the query is from beyond."""
+    whole = office()
+    cells = whole.cells.copy()
+    cells[:, round(11.0 / whole.resolution_m) :] = UNKNOWN
+    half = session("half", replace(whole, cells=cells), way())
+    mirrored = session("half", replace(whole, cells=cells[::-1]), way())
+    query = cut(whole, 11.5, 0.0, 20.0, 14.0)
+    labels = [replace(origin, label=Label(building="house", floor=k)) for k in FLOORS]
+
+    def ask(other: SessionMap, name: str) -> Answer:
+        path = tmp_path / f"{name}.submaps"
+        maps = zip((floor, replace(other, session="other")), labels, strict=True)
+        add_sessions(path, list(maps), Config(), keep=False)
+        with open_database(path) as database:
+            return locate_map(query, MapIndex.of(database, Config()))
+
+    answer = ask(half, "alike")
+    assert answer.status == "ambiguous"
+    assert [answer.sessions[h.session_index] for h in answer.hypotheses][-1] == "other"
+    assert ask(mirrored, "otherwise").status == "located"
 
 
 def test_own_names_of_two_recordings_mean_nothing_to_each_other(
