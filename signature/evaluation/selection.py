@@ -158,10 +158,15 @@ class Selection:
         }
 
     def measure(
-        self, query: QueryMap, T_map_query: SE2, selectors: Sequence[str] = SELECTORS
+        self,
+        query: QueryMap,
+        T_map_query: SE2,
+        selectors: Sequence[str] = SELECTORS,
+        *,
+        locate: bool = True,
     ) -> Iterator[tuple[str, int, bool, bool | None, bool | None, float]]:
         """For each selector: its name, places looked at, and `found`, `located`, `right` and `processor_ms`
-        of `Selected`."""
+        of `Selected`. locate : whether the query is also located, by the selectors of `LOCATED_BY`."""
         table = self.index.places.table
         views_m = T_map_query.apply(np.array([view.center_m for view in query.views]).reshape(-1, 2))
         own = table.session_index == 0
@@ -175,7 +180,7 @@ class Selection:
             rows = self._rows(query, selector)
             processor_ms = 1000.0 * (time.process_time() - begin)
             found, located, well = bool(right[rows].any()), None, None
-            if selector in LOCATED_BY:
+            if locate and selector in LOCATED_BY:
                 self.index.places.around(rows)  # as if these places had been asked for before
                 begin = time.process_time()
                 base_m = (query.T_odom_base.x, query.T_odom_base.y)

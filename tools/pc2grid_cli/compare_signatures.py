@@ -65,6 +65,10 @@ def compare_signatures_command(
         list[int] | None,
         typer.Option("--scale", min=1000, help="Also select among so many places; may be repeated."),
     ] = None,
+    locate: Annotated[
+        bool,
+        typer.Option("--locate/--no-locate", help="Also locate the queries, which takes most of the time."),
+    ] = True,
     fit: Annotated[
         Path | None,
         typer.Option("--fit", metavar="FILE.npz", help="Learn the weights from these plans, and store them."),
@@ -110,7 +114,7 @@ def compare_signatures_command(
                 maps[name].append(_map(out, name, plan, sensor, setting, config))
                 advance((done := done + 1) / steps)
             sessions = [(sensor, seed + i) for i in range(queries) for sensor in SENSORS]
-            results = {key: _result(out, name, *key, setting, floors, share) for key in sessions}
+            results = {key: _result(out, name, *key, setting, floors, share, locate) for key in sessions}
             indexes = {}
             if not all(path.exists() for path in results.values()):
                 own = maps[name][0]
@@ -118,7 +122,7 @@ def compare_signatures_command(
             for (sensor, number), path in results.items():
                 if not path.exists():
                     drive = _drive(out, name, plan, sensor, number, setting, config)
-                    found = _select(maps[name][0], indexes, drive, number, share, config)
+                    found = _select(maps[name][0], indexes, drive, number, share, locate, config)
                     with replace_file(path) as draft:
                         draft.write_text(json.dumps([asdict(trial) for trial in found]))
                 trials += _read(path)
@@ -369,8 +373,9 @@ def _result(
     setting: dict[str, float],
     floors: int,
     share: float,
+    locate: bool,
 ) -> Path:
-    tag = f"{_tag(setting)}.floors{floors}.share{share:g}"
+    tag = f"{_tag(setting)}.floors{floors}.share{share:g}{'' if locate else '.selected'}"
     return out / "selected" / f"{name}.{sensor}.{seed}.{tag}.json"
 
 
@@ -380,6 +385,7 @@ def _select(
     drive: RegisteredSession,
     seed: int,
     share: float,
+    locate: bool,
     config: Config,
 ) -> list[Selected]:
     from signature.evaluation.selection import Selected, Selection, queries_of
@@ -391,7 +397,7 @@ def _select(
         for travel_m, query, T_plan_query in asked:
             T_map_query = own.T_plan_map.inverse() @ T_plan_query
             for selector, looked_at, hit, located, right, processor_ms in selection.measure(
-                query, T_map_query
+                query, T_map_query, locate=locate
             ):
                 found.append(
                     Selected(

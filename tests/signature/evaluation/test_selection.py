@@ -62,6 +62,14 @@ def test_each_selector_looks_at_its_share_and_all_places_find_the_right_one() ->
     assert found[ALL][3]
 
 
+def test_places_are_selected_without_locating_the_query() -> None:
+    seen, T_map_query = query()
+    selection = Selection(OFFICE, "building", 0.3)
+    rows = list(selection.measure(seen, T_map_query, (ALL, VOTED), locate=False))  # type: ignore[arg-type]
+    assert [row[0] for row in rows] == [ALL, VOTED]
+    assert all(row[2] and row[3] is None and row[4] is None for row in rows)
+
+
 def made_up_floor(seed: int, _: object) -> PlaceBlock:
     """500 places that look like nothing."""
     rng, places = np.random.default_rng(seed), OFFICE.places.described()
