@@ -86,7 +86,8 @@ def _print_scale(rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def draw(path: Path, document: Mapping[str, Any], selectors: Sequence[str]) -> None:
-    """One picture: share of the queries whose place is selected, and that are located rightly."""
+    """One picture: share of the queries whose place is selected, that are located rightly, and whose place is
+    selected among very many; what was not measured is left out."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -98,9 +99,12 @@ def draw(path: Path, document: Mapping[str, Any], selectors: Sequence[str]) -> N
 
     cells = _cells(document)
     travels_m = sorted({travel_m for _, _, travel_m in cells})
-    figure, axes = plt.subplots(1, 3, figsize=(15, 4.6), constrained_layout=True, sharey=False)
-    panels = ((axes[0], "building", "found"), (axes[1], "city", "found"), (axes[2], "city", "right"))
-    for ax, scope, what in panels:
+    panels = [("building", "found"), ("city", "found")]
+    if any(row["right"] for row in document["rows"]):
+        panels.append(("city", "right"))
+    columns = len(panels) + bool(document["scale"])
+    figure, axes = plt.subplots(1, columns, figsize=(5 * columns, 4.6), constrained_layout=True)
+    for ax, (scope, what) in zip(axes, panels, strict=False):
         named = [s for s in selectors if any(cells.get((scope, s, t), {}).get(what) for t in travels_m)]
         at, height = np.arange(len(named)), 0.8 / max(len(travels_m), 1)
         for number, (travel_m, colour) in enumerate(zip(travels_m, (VERMILLION, ORANGE, BLUE), strict=False)):
@@ -123,7 +127,36 @@ def draw(path: Path, document: Mapping[str, Any], selectors: Sequence[str]) -> N
         percent = 100 * document["setting"]["share"]
         title = "right place selected" if what == "found" else "located and right"
         ax.set_title(f"{title}\n{scope}: {percent:g} % of {places} places", fontsize=10)
+    if document["scale"]:
+        _draw_scale(axes[-1], document["scale"])
     axes[1].legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3)
     with replace_file(path) as draft:
         figure.savefig(draft, format="png", dpi=110)
     plt.close(figure)
+
+
+def _draw_scale(ax: Any, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Share selected against the share of the places that is looked at, for the largest number of places."""
+    from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
+
+    most = max(row["places"] for row in rows)
+    chosen = [row for row in rows if row["places"] == most and row["query_sensor"] == "all"]
+    travels_m = sorted({row["travel_m"] for row in chosen})
+    selectors = sorted({row["selector"] for row in chosen}, reverse=True)
+    for selector, line in zip(selectors, ("-", ":"), strict=False):
+        for travel_m, colour in zip(travels_m, (VERMILLION, ORANGE, BLUE), strict=False):
+            some = [r for r in chosen if (r["selector"], r["travel_m"]) == (selector, travel_m)]
+            some.sort(key=lambda row: row["share"])
+            percent = [100 * row["share"] for row in some]
+            found, low, high = zip(*(row["found"] for row in some), strict=True)
+            label = selector if travel_m == travels_m[-1] else None
+            ax.plot(percent, found, line, color=colour, marker="o", markersize=3, label=label)
+            if line == "-":
+                ax.fill_between(percent, low, high, color=colour, alpha=0.12)
+    ax.set(xscale="log", ylim=(0, 1.02), xlabel="% of the places looked at")
+    ax.set_xticks(sorted({100 * row["share"] for row in chosen}))
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.minorticks_off()
+    ax.grid(alpha=0.3)
+    ax.legend(loc="lower right", fontsize=8)
+    ax.set_title(f"right place selected\nof {most:,} places", fontsize=10)
