@@ -121,8 +121,7 @@ def test_the_command_uses_what_it_has_stored(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(compare_signatures, "_FLOORS_AT_ONCE", 3)
     arguments = ["compare", "signatures", "a.yaml", "--queries", "1", "--map-length", "12", "--rate", "2"]
     arguments += ["--clutter", "0", "--change", "0", "--share", "0.3", "-o", str(tmp_path), "--json"]
-    arguments += ["--scale", "2000"]
-    first = CliRunner().invoke(app, arguments)
+    first = CliRunner().invoke(app, [*arguments, "--scale", "2000"])
     assert first.exit_code == 0, first.output
     document = json.loads(first.stdout)
     jsonschema.validate(document, closed(schema("compare-signatures")))
