@@ -32,7 +32,7 @@ from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind, Trajectory
 from pc2grid.odometry.tracker import Tracker
 from signature.config import Config
-from signature.evaluation.registered_session import RegisteredSession, register
+from signature.evaluation.registered_session import register
 from signature.evaluation.sensor_matrix import query_start
 
 if TYPE_CHECKING:
@@ -293,9 +293,9 @@ def _save_query(
     seen: list[RegisteredScan] = []
     planar = ((scan, None if T is None else SE2.from_matrix(T)) for scan, T in scans)
     session = register(planar, config, sensor=site.sensor, until_m=travel_m, see=seen.append)
-    truth = session.true_pose(len(session) - 1)
-    if truth is None:
+    if np.isnan(session.T_world_base[:, 0]).all():
         return
+    truth = session.T_world_odom() @ SE2(*session.T_odom_base[-1].tolist())
     session.save(stem.with_suffix(".npz"))
     if site.sensor == "laser":
         save_beams(stem.with_suffix(".ranges.npz"), [registered.scan for registered in seen])
@@ -308,16 +308,26 @@ def _save_query(
             np.savez(file, points_m=_thinned(np.concatenate(cloud)))
     query = SiteQuery(
         pose=(truth.x, truth.y, truth.yaw),
-        covered=is_covered(load_map(site.map_stem.with_suffix(".yaml")), session, truth),
+        covered=is_covered(
+            load_map(site.map_stem.with_suffix(".yaml")), hits_of(seen[-1].scan, config), truth
+        ),
         travel_m=float(session.path_m()[-1]),
     )
     with replace_file(stem.with_suffix(".json")) as draft:  # last: it says that the query is complete
         draft.write_text(json.dumps(asdict(query)))
 
 
-def is_covered(grid: OccupancyGrid, session: RegisteredSession, T_map_base: SE2) -> bool:
-    """Whether the map shows what the last scan of a query has seen, by the true pose."""
-    hits_m = T_map_base.apply(session.planar_scans[-1].hits_m)
+def hits_of(scan: Scan, config: Config) -> F32:
+    """(M, 2) obstacles of a scan by itself, as if a query began with it.
+
+    What registration made of the scans before must not decide which queries count.
+    """
+    return Tracker(config.registration, config.projection).start(scan).planar_scan.hits_m
+
+
+def is_covered(grid: OccupancyGrid, planar_hits_m: F32, T_map_base: SE2) -> bool:
+    """Whether the map shows what the last scan of a query has seen (M, 2), by the true pose."""
+    hits_m = T_map_base.apply(planar_hits_m)
     walls_m = grid.to_point(np.argwhere(grid.occupied))
     if not len(hits_m) or not len(walls_m):
         return False

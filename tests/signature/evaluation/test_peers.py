@@ -136,8 +136,10 @@ def test_a_query_is_covered_where_the_map_shows_what_it_saw() -> None:
     driven = session()
     truth = driven.true_pose(len(driven) - 1)
     assert truth is not None
-    assert is_covered(office(), driven, truth)
-    assert not is_covered(office(), driven, truth @ SE2(1.3, 0.7, 0.4))
+    hits_m = driven.planar_scans[-1].hits_m
+    assert is_covered(office(), hits_m, truth)
+    assert not is_covered(office(), hits_m, truth @ SE2(1.3, 0.7, 0.4))
+    assert not is_covered(office(), hits_m[:0], truth)
 
 
 def test_a_true_pose_is_carried_on_from_the_nearest_known_one() -> None:
