@@ -432,7 +432,7 @@ class Precision:
         part of the map that is well tied together.
     loose : stretches where it is too large to rely on, the least certain first.
 
-    >>> Precision(stamps_ns=(0, 10), sigma_m=(0.1, 0.3)).at(5)
+    >>> round(Precision(stamps_ns=(0, 10), sigma_m=(0.1, 0.3)).at(5), 3)
     0.2
     """
 
