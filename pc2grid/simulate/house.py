@@ -56,6 +56,7 @@ class HouseConfig(Section):
     visits: tuple[int, ...] = Field(
         default=(0, 1, 2), min_length=1, description="floors in the order in which they are visited"
     )
+    floors: int | None = Field(default=None, ge=1, le=20, description="null: up to the highest visited")
     ride: Literal["stairs", "lift"] = Field(default="stairs", description="how the robot changes floors")
     storey_m: float = Field(default=3.0, ge=2.6, le=8, description="height from one floor to the next")
     slope: float = Field(
@@ -65,6 +66,11 @@ class HouseConfig(Section):
         default=None, ge=0, description="of the movable objects; null: that of the session"
     )
     alike: bool = Field(default=False, description="the same movable objects in the same places everywhere")
+
+    @property
+    def storeys(self) -> int:
+        """How many floors the house has."""
+        return max(self.floors or 1, max(self.visits) + 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +228,7 @@ class House:
     def stairs(self) -> Mesh:
         """Landings, flights and the walls of the staircase, of all storeys."""
         (x0, y), storey_m, flight_m = self.door_m, self.config.storey_m, self.flight_m
-        floors = max(self.config.visits) + 1
+        floors = self.config.storeys
         half, spine = _LANE_M + 0.5 * _SPINE_M, 0.5 * _SPINE_M
         x1, x2, x3 = x0 + _LANDING_M, x0 + _LANDING_M + flight_m, x0 + 2 * _LANDING_M + flight_m
         top_m = floors * storey_m
@@ -500,7 +506,7 @@ def _scenes(
     }
     if house.config.ride == "stairs":
         raised = [
-            _raised(shell, k * house.config.storey_m) for k in range(max(floors) + 1) if k not in floors
+            _raised(shell, k * house.config.storey_m) for k in range(house.config.storeys) if k not in floors
         ]
         raised += [_raised(mesh, floor * house.config.storey_m) for floor, mesh in floors.items()]
         return (Mesh.join([*raised, house.stairs()]),)

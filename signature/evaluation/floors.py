@@ -122,7 +122,9 @@ def _simulation(task: FloorTask, seed: int, length_m: float) -> SimulationConfig
 
 def _house(task: FloorTask, visits: tuple[int, ...]) -> HouseConfig:
     ride: Literal["stairs", "lift"] = "lift" if task.way == "lift" else "stairs"
-    return HouseConfig(visits=visits, ride=ride, alike=task.alike, furniture_seed=task.seed)
+    return HouseConfig(
+        visits=visits, floors=task.floors, ride=ride, alike=task.alike, furniture_seed=task.seed
+    )
 
 
 def _build(task: FloorTask, folder: Path, config: Config) -> list[_Part]:
