@@ -35,6 +35,7 @@ from pc2grid.odometry.parameters import (
 from pc2grid.odometry.point_to_line import Match
 from pc2grid.odometry.registration import KissRegistration
 from pc2grid.odometry.rides import Ride, RideWatch
+from pc2grid.odometry.surface_map import SurfaceMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,9 +82,11 @@ class Tracker:
         self._motion = MotionModel(parameters)
         self._rides = RideWatch()
         self._restarted = False  # no keyframe has been reported since tracking started again
-        # These four depend on the sensor and on how it is carried; `start` makes them from the first scan.
+        # These six depend on the sensor and on how it is carried; `start` makes them from the first scan.
         self._ground = GroundModel(None, rolling=True, parameters=parameters)
         self._maps = MatchingMaps(self._projection.max_range_m, parameters)
+        self._camera_on_wheels = False
+        self._surfaces: SurfaceMap | None = None
         self._health = HealthJudge(rolling=True, parameters=parameters)
         self.kiss = KissRegistration(registration, parameters=parameters)
 
@@ -96,17 +99,18 @@ class Tracker:
         """Begin with the first scan: find the floor, and put the base at the origin of the session frame."""
         points = self._deskewed(scan, *self._motion.within(scan, None))
         self._ground = GroundModel.start(points, scan, self._parameters)
-        on_wheels = scan.sensor == "depth" and self._ground.rolling
+        self._camera_on_wheels = scan.sensor == "depth" and self._ground.rolling
         self._maps = MatchingMaps(
             self._projection.max_range_m,
             self._parameters,
-            CAMERA_MATCHING if on_wheels else MATCHING_PARAMETERS,
+            CAMERA_MATCHING if self._camera_on_wheels else MATCHING_PARAMETERS,
         )
         self._health = HealthJudge(rolling=self._ground.rolling, parameters=self._parameters)
         self.kiss = self._new_kiss()
+        self._surfaces = SurfaceMap() if scan.sensor == "depth" and not self._ground.rolling else None
         self._started = True
         pose = self._ground.start_pose()
-        self.kiss.register(self._ground.remove(points), pose, np.eye(4), 0.0)
+        self._register(scan, points, pose, np.eye(4), 0.0)
         planar_scan = self._project(points, scan, _split(pose)[1])
         return self._finish(scan, points, planar_scan, pose, Health.FINE)
 
@@ -125,14 +129,12 @@ class Tracker:
         points = self._deskewed(scan, *self._motion.within(scan, prediction))
         # 3. Follow the floor.
         self._ground.follow(points, scan, prediction.motion)
-        # 4. Let KISS-ICP bring the scan near, in space.
-        pose = self.kiss.register(
-            self._ground.remove(points), last_pose, prediction.motion, prediction.seconds
-        )
+        # 4. Let KISS-ICP bring the scan near, in space; a camera in the hand on to the surfaces seen before.
+        pose = self._register(scan, points, last_pose, prediction.motion, prediction.seconds)
         planar, T_level_base = _split(self._ground.hold(pose))
         # 5. Reduce the scan to the plane.
         planar_scan = self._project(points, scan, T_level_base)
-        # 6. Refine the pose in the plane; a carried sensor, with six degrees of freedom, keeps KISS-ICP's.
+        # 6. Refine the pose in the plane; a carried sensor keeps the one with six degrees of freedom.
         health = Health.FINE
         if self._maps:
             refined, match = self._refine(planar_scan, planar, predicted, prediction)
@@ -166,6 +168,8 @@ class Tracker:
         )
         if extended:
             self.kiss.update_map(pose)
+        if self._surfaces is not None and health is not Health.LOST:
+            self._surfaces.extend(pose)
         mapped = not (ride.riding or ride.tilting)
         keyframe = extended and mapped
         restart = keyframe and self._restarted
@@ -199,7 +203,21 @@ class Tracker:
         self._maps.restart()
         self._health.restart()
         self.kiss = self._new_kiss()
+        self._surfaces = None if self._surfaces is None else SurfaceMap()
         self._restarted = True
+
+    def _register(self, scan: Scan, points: F32, last_pose: F64, motion: F64, seconds: float) -> F64:
+        """The pose (4, 4) in space of the points (N, 3) of a scan, `motion` (4, 4) after the last pose."""
+        kept = self._ground.remove(points)
+        pose = self.kiss.register(kept, last_pose, motion, seconds)
+        if self._surfaces is None:
+            return pose
+        return self._surfaces.refine(kept, scan.T_base_sensor[:3, 3], pose)
+
+    def _is_sure(self, match: Match) -> bool:
+        """Whether a placement alone decides between odometry and the motion before."""
+        p = self._parameters
+        return match.overlap >= p.sure_overlap and match.residual_m <= p.max_residual_m
 
     def _new_kiss(self) -> KissRegistration:
         return KissRegistration(self._config, carried=not self._ground.rolling, parameters=self._parameters)
@@ -257,21 +275,27 @@ class Tracker:
         """Match a planar scan with the local map, from KISS-ICP's pose `guess`.
 
         The prior is the predicted pose if that rests on odometry, else the guess. Where the two disagree
-        both start a refinement, and the better match is taken.
+        both start a refinement, and the better match is taken. For a camera on wheels that is so only if
+        the scan does not fit where odometry leads: KISS-ICP, which knows a quarter of the surroundings,
+        slides along walls, where a scan fits as well.
         """
         p = self._parameters
         prior = guess if prediction.odometry is None else predicted
+        information = self._motion.information(prediction)
+        if self._camera_on_wheels and prediction.odometry is not None:
+            match = self._maps.refine(planar_scan, [predicted], prior, information)
+            if match is not None and self._is_sure(match):
+                return match.pose, match
         guesses = [guess]
         apart = predicted.inverse() @ guess
         if math.hypot(apart.x, apart.y) > p.disagree_m or abs(apart.yaw) > p.disagree_rad:
             guesses.append(predicted)
         if prediction.windowed is not None and any(self._motion.owed(prediction)):
             guesses.append(SE2.from_matrix(self._motion.last_pose @ prediction.windowed))
-        information = self._motion.information(prediction)
         match = self._maps.refine(planar_scan, guesses, prior, information)
         if match is None:
             return predicted, None
-        if match.overlap < p.sure_overlap or match.residual_m > p.max_residual_m:
+        if not self._is_sure(match):
             window_m, window_rad = self._motion.search_window(prediction)
             if window_m > p.search_above_m or window_rad > p.search_above_rad:
                 found = self._maps.search(planar_scan, predicted, window_m, window_rad)
