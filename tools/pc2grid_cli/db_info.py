@@ -56,7 +56,11 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
     )
     for s in sessions:
         travel = f", {counted(s.scans, 'scan')}, {s.path_m:.1f} m in {s.duration_s:.0f} s" if s.scans else ""
-        line = f"  {s.name} ({s.sensor}): {counted(s.submaps, 'submap')}, {s.area_m2:.0f} m2 free{travel}"
+        label = s.provenance.label
+        where = f", {label}" if label.building or label.floor else ""
+        line = (
+            f"  {s.name} ({s.sensor}{where}): {counted(s.submaps, 'submap')}, {s.area_m2:.0f} m2 free{travel}"
+        )
         if s.consistency is not None and s.consistency.bent:
             line += f", bent: contradicts itself along {s.consistency.contradicted:.0%} of the travel"
         if s.precision is not None and s.precision.loose:
