@@ -86,6 +86,7 @@ def test_documents_are_as_their_schema_says(
 def test_every_document_is_validated_by_a_test() -> None:
     elsewhere = {
         "compare-paper": "pc2grid_cli/test_compare_paper.py",
+        "compare-floors": "pc2grid_cli/test_compare_floors.py",
         "compare-maps": "signature/evaluation/test_map_quality.py",
         "compare-peers": "signature/evaluation/test_peers.py",
         "compare-real": "signature/evaluation/test_real_sensors.py",
