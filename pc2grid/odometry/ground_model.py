@@ -44,23 +44,32 @@ class GroundModel:
         ground = found or find_ground(points_m, sensor_m) or assumed
         return cls(ground, rolling=is_rolling(scan), parameters=parameters)
 
-    def follow(self, points_m: F32, scan: Scan, motion: F64) -> None:
-        """Update the floor by the points (N, 3) of a scan after a motion (4, 4) T_last_now.
+    def follow_fixed(self, points_m: F32, scan: Scan) -> None:
+        """Update a floor that is fixed to the robot by the points (N, 3) of a scan.
 
-        A floor that is fixed to the robot is looked for only in some of the scans.
+        It is looked for only in some of the scans, before they are registered, as `remove` needs it. A floor
+        that is not fixed stays as it is.
         """
-        if self.ground is None:
+        if self.ground is None or not self.rolling:
             return
-        p = self._parameters
-        expected = self.ground
-        if self.rolling:
-            self._scans += 1
-            if self._scans % p.rolling_every:
-                return
-        else:
-            expected = expected.moved(invert_pose(motion))
+        self._scans += 1
+        if self._scans % self._parameters.rolling_every == 0:
+            self._update(self.ground, points_m, scan, self._parameters.rolling_gain)
+
+    def follow_moving(self, points_m: F32, scan: Scan, motion: F64) -> None:
+        """Update the floor under a sensor in the hand by the points (N, 3) of a scan after a motion (4, 4)
+        T_last_now.
+
+        The motion is the registered one: at the beginning, or when the hand turns, a predicted one is several
+        degrees off, and points of the floor would become walls. A floor that is fixed stays as it is.
+        """
+        if self.ground is None or self.rolling:
+            return
+        expected = self.ground.moved(invert_pose(motion))
+        self._update(expected, points_m, scan, self._parameters.carried_gain)
+
+    def _update(self, expected: Ground, points_m: F32, scan: Scan, gain: float) -> None:
         found = find_ground(points_m, scan.T_base_sensor[:3, 3], expected)
-        gain = p.rolling_gain if self.rolling else p.carried_gain
         self.ground = expected if found is None else expected.toward(found, gain)
 
     def remove(self, points_m: F32) -> F32:

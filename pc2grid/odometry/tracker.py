@@ -127,10 +127,11 @@ class Tracker:
         predicted = SE2.from_matrix(last_pose @ prediction.motion)
         # 2. Undo the motion within the scan.
         points = self._deskewed(scan, *self._motion.within(scan, prediction))
-        # 3. Follow the floor.
-        self._ground.follow(points, scan, prediction.motion)
+        # 3. Follow a floor that is fixed to the robot: KISS-ICP is not given its points.
+        self._ground.follow_fixed(points, scan)
         # 4. Let KISS-ICP bring the scan near, in space; a camera in the hand on to the surfaces seen before.
         pose = self._register(scan, points, last_pose, prediction.motion, prediction.seconds)
+        self._ground.follow_moving(points, scan, invert_pose(last_pose) @ pose)
         planar, T_level_base = _split(self._ground.hold(pose))
         # 5. Reduce the scan to the plane.
         planar_scan = self._project(points, scan, T_level_base)
