@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F64
 from pc2grid.clouds.sampling import random_subset
-from pc2grid.geometry import invert_pose
+from pc2grid.geometry import invert_pose, pose_from_rotation_vector, rotation_vector
 from pc2grid.odometry.wheel_odometry import motion_size
 
 
@@ -95,11 +95,14 @@ class SurfaceMap:
             icp.TransformationEstimationPointToPlane(icp.TukeyLoss(p.tukey_m)),
             icp.ICPConvergenceCriteria(1e-6, 1e-6, p.iterations),
         )
+        T = np.asarray(found.transformation)
+        if found.fitness < p.min_overlap or not np.isfinite(T).all():
+            return guess
         # Open3D adds up in an order that depends on its threads. Without the last digits all runs are equal.
-        pose = np.round(found.transformation, 9)
+        # Rounded are the six degrees of freedom: a rounded matrix is no rotation, and KISS-ICP refuses it.
+        pose = pose_from_rotation_vector(np.round(rotation_vector(T), 9), np.round(T[:3, 3], 9))
         moved_m, _ = motion_size(invert_pose(guess) @ pose)
-        fits = found.fitness >= p.min_overlap and np.isfinite(pose).all() and moved_m < p.reach_m
-        return pose if fits else guess
+        return pose if moved_m < p.reach_m else guess
 
     def extend(self, T_session_base: F64) -> None:
         """Add the scan refined last at its final pose (4, 4), if the camera has moved enough."""
