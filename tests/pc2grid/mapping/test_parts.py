@@ -23,12 +23,24 @@ from pc2grid.model import (
     RegisteredScan,
     Trajectory,
 )
-from pc2grid.pipeline import _doubtful, _draw_parts, _Mapped, _of_use, _reports
+from pc2grid.pipeline import _doubtful, _draw_parts, _Mapped, _of_use, _reports, _Track
 from tests.helpers.simulated_drives import drive, office
 
 LAP_M = [(2.0, 7.0), (11.0, 7.0), (11.0, 3.0), (9.5, 5.0), (9.5, 7.0), (18.5, 7.0), (16.5, 4.0), (16.5, 7.0)]
 """Along the corridor of the office, and into two of its rooms."""
 WITHOUT_LOOPS = LoopParameters(compared=0)
+
+
+def on_one_floor(trajectory: Trajectory) -> _Track:
+    """What tracking says of scans without a ride."""
+    count = len(trajectory)
+    return _Track(
+        trajectory=trajectory,
+        disagreements=[None] * count,
+        riding=np.zeros(count, np.bool_),
+        storey=np.zeros(count, np.int64),
+        storeys=(),
+    )
 
 
 def keyframes_of(
@@ -78,7 +90,7 @@ def mapped(
     return (
         closer,
         closed,
-        _draw_parts(keyframes, trajectory, [None] * len(trajectory), closed, ProjectionConfig()),
+        _draw_parts(keyframes, on_one_floor(trajectory), closed, ProjectionConfig()),
     )
 
 
@@ -115,7 +127,7 @@ def test_a_map_that_contradicts_itself_is_divided_into_parts_that_do_not() -> No
     assert whole.consistency.bent and closed.segments.max() == 0
     divided = closer.divide(_doubtful(whole, trajectory))
     assert divided is not None
-    parts = _draw_parts(keyframes, trajectory, [None] * len(trajectory), divided, ProjectionConfig())
+    parts = _draw_parts(keyframes, on_one_floor(trajectory), divided, ProjectionConfig())
     assert len(parts) == 2 and not any(part.consistency.bent for part in parts)
     # The place of the cut is not known better than to a local map.
     assert abs(len(parts[0].trajectory) - begin_of_second_lap()) < 30
@@ -129,7 +141,7 @@ def test_loops_may_join_what_was_divided() -> None:
     closer._parameters = LoopParameters()
     divided = closer.divide(_doubtful(whole, trajectory))
     assert divided is not None and not divided.parts.any() and divided.segments.max() >= 1
-    (part,) = _draw_parts(keyframes, trajectory, [None] * len(trajectory), divided, ProjectionConfig())
+    (part,) = _draw_parts(keyframes, on_one_floor(trajectory), divided, ProjectionConfig())
     assert wrong_m(part, truths) < 0.4 < wrong_m(whole, truths)
     assert not part.consistency.bent
 
@@ -185,7 +197,9 @@ def test_a_part_too_short_to_be_of_use_is_left_out_and_counted() -> None:
     long, short, other = part_of(20.0, 0), part_of(3.0, 30 * 10**9), part_of(12.0, 60 * 10**9)
     kept = _of_use([long, short, other])
     assert kept == [long, other]
-    first, second = _reports(ReadReport(scans_read=300, bytes_lost=7), "log", [long, short, other], kept)
+    first, second = _reports(
+        ReadReport(scans_read=300, bytes_lost=7), "log", [long, short, other], kept, [None] * len(kept)
+    )
     assert first.scans_skipped == {"in a part too short to be of use": len(short.trajectory)}
     assert first.scans_read + second.scans_read == 300 and first.bytes_lost == 7 and not second.lossy
     (warning,) = first.warnings
