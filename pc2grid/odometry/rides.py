@@ -27,7 +27,8 @@ class RideParameters:
 
     Slopes:
 
-    every_m : travel from one measurement of the vertical to the next.
+    level_every_m, every_m : travel from one measurement of the vertical to the next, while the last one was
+        level, and otherwise. A measurement takes as long as tracking a scan.
     measurements : whose median is used.
     begin_rad, end_rad : tilt from which on a robot is on a slope, and below which it is not any more, by a
         lidar; 1 in 12 is 4.8 degrees. camera_factor : these times, by a depth camera, which sees fewer walls.
@@ -50,6 +51,7 @@ class RideParameters:
     door : neighbouring sectors that are open when the door is.
     """
 
+    level_every_m: float = 0.3
     every_m: float = 0.1
     measurements: int = 3
     begin_rad: float = math.radians(2.5)
@@ -192,7 +194,7 @@ class _Slope:
         """Take in a scan; returns the slope that it shows to be over."""
         p = self._parameters
         self._unmeasured_m += abs(forward_m)
-        if self._unmeasured_m >= p.every_m:
+        if self._unmeasured_m >= (p.level_every_m if self._is_level else p.every_m):
             self._unmeasured_m = 0.0
             self._measure(points_m, ground)
         if not self._latest:
@@ -212,6 +214,11 @@ class _Slope:
             return None
         self.underway = False
         return _Ended(self._rise_m, self._steepest_rad)
+
+    @property
+    def _is_level(self) -> bool:
+        """Whether the latest measurement is that of level ground."""
+        return bool(self._latest) and self._latest[-1][1] < self._factor * self._parameters.end_rad
 
     def _measure(self, points_m: F32, ground: Ground) -> None:
         up = ground.normal
