@@ -16,8 +16,12 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F64
 from pc2grid.config import RegistrationConfig
+from pc2grid.geometry import pose_from_rotation_vector, rotation_vector
 from pc2grid.model import Scan
 from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
+
+_EXACT = 1e-12
+"""A rotation matrix times its transpose differs from 1 by less; products of a few of them do, too."""
 
 
 class KissRegistration:
@@ -60,7 +64,7 @@ class KissRegistration:
         The scan becomes part of the local map only by `update_map`.
         """
         self._pending = None
-        guess: F64 = T_session_last @ predicted_motion
+        guess = _proper(T_session_last @ predicted_motion)
         if len(points_m) < self._parameters.icp_min_frame:
             return guess
         points = np.ascontiguousarray(points_m, dtype=np.float64)
@@ -88,7 +92,7 @@ class KissRegistration:
     def update_map(self, T_session_base: F64) -> None:
         """Add the scan registered last to the local map, at its final pose (4, 4)."""
         if self._pending is not None:
-            self._map.update(self._pending, T_session_base)
+            self._map.update(self._pending, _proper(T_session_base))
             self._pending = None
 
     def _downsample(self, points: F64, voxels: float = 0.5) -> F64:
@@ -155,3 +159,12 @@ class BareKissIcp:
         if len(scan.points_m):
             self._kiss.register_frame(scan.points_m.astype(np.float64), times)
         return np.array(self._kiss.last_pose, dtype=np.float64)
+
+
+def _proper(pose: F64) -> F64:
+    """The pose (4, 4) with an exact rotation: KISS-ICP ends the whole process for any other matrix."""
+    R = pose[:3, :3]
+    off = np.abs(R @ R.T - np.eye(3)).max()
+    if off < _EXACT or not np.isfinite(pose).all():
+        return pose
+    return pose_from_rotation_vector(rotation_vector(pose), pose[:3, 3])
