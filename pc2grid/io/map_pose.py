@@ -1,4 +1,4 @@
-"""Where localization on the robot believes to be: its newest pose in the map."""
+"""Where the robot's own localization says that it is: its newest pose in the map."""
 
 from __future__ import annotations
 
@@ -76,12 +76,8 @@ class _TopicPoses:
     def __init__(self, channel: TopicInfo) -> None:
         self._topic, self._type = channel.topic, channel.type
         self._decode = decoder_for(channel)
+        self.topics = frozenset({channel.topic})
         self._last: tuple[Odometry | PoseStamped, int] | None = None
-
-    @property
-    def topics(self) -> frozenset[str]:
-        """See MapPoses."""
-        return frozenset({self._topic})
 
     def take(self, message: RawMessage) -> None:
         """See MapPoses."""
@@ -119,11 +115,7 @@ class _TfPoses:
         self._base_frame = base_frame
         self._tree = FrameTree()
         self._newest_ns: dict[str, int] = {}
-
-    @property
-    def topics(self) -> frozenset[str]:
-        """See MapPoses."""
-        return frozenset(topic for topic, _ in self._decoders)
+        self.topics = frozenset(topic for topic, _ in self._decoders)
 
     def take(self, message: RawMessage) -> None:
         """See MapPoses."""

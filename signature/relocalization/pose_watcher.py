@@ -137,10 +137,19 @@ class PoseWatcher:
             self._waiting.append(newest)
         while self._waiting and self._waiting[0].stamp_ns <= self._driven[-1][0]:
             pose = self._waiting.popleft()
-            nearest_ns, T_session_base = min(self._driven, key=lambda known: abs(known[0] - pose.stamp_ns))
+            nearest_ns, T_session_base = self._nearest(pose.stamp_ns)
             if abs(nearest_ns - pose.stamp_ns) <= POSE_WATCH.nearest_s * 1e9:
                 self._T_map_session = pose.T_map_base @ T_session_base.inverse()
         return self._T_map_session
+
+    def _nearest(self, stamp_ns: int) -> tuple[int, SE2]:
+        """The scan nearest in time: stamp and pose. A belief is recent, so the newest are looked at first."""
+        later = self._driven[-1]
+        for known in reversed(self._driven):
+            if known[0] <= stamp_ns:
+                return min(known, later, key=lambda scan: abs(scan[0] - stamp_ns))
+            later = known
+        return later
 
     def _jumped(self, T_map_base: SE2, T_session_base: SE2) -> bool:
         """Whether the robot believes in another place than at the last look."""

@@ -83,7 +83,7 @@ class LiveLog:
 
     feed : where the messages arrive. lag_s : time from the arrival of the last scan to the end of its use.
     keeps_up : whether the scans that were held back for the plan are used up, so that late ones are dropped.
-    believed : the newest pose of the base in the map, as localization on the robot says on the topic given to
+    believed : the newest pose of the base in the map, by the robot's own localization, on the topic given to
     `listen_to_pose`; None before the first.
     on_poll : called several times a second while scans are awaited and with each scan; if it returns true, no
     more scans are given.
