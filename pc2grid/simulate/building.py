@@ -36,11 +36,12 @@ class Building:
     """A real building.
 
     plan : where the robot may drive, in the map frame. shell : what rays hit, in the same frame, with the
-    floor at z = 0.
+    floor at z = 0. T_map_file : (4, 4), the frame of the file in the map frame.
     """
 
     plan: OccupancyGrid
     shell: Mesh
+    T_map_file: F64
 
     @staticmethod
     def of_cloud(points_m: NDArray[np.floating]) -> Building:
@@ -49,14 +50,15 @@ class Building:
         T_map_cloud = level_cloud(points)
         # The voxels follow the axes of the cloud, in which they may have been a lattice before.
         shell = _moved(voxel_faces(points, voxel_m(points)), T_map_cloud)
-        return Building(drivable_plan(transform_points(T_map_cloud, points)), shell)
+        return Building(drivable_plan(transform_points(T_map_cloud, points)), shell, T_map_cloud)
 
     @staticmethod
     def of_mesh(mesh: Mesh) -> Building:
         """Of a mesh whose z axis points up. Raises MapFileError if it shows no floor."""
         points = voxel_cloud(sampled(mesh.vertices_m.astype(np.float64), mesh.triangles.astype(np.int64)))
         T_map_mesh = level_cloud(points)
-        return Building(drivable_plan(transform_points(T_map_mesh, points)), _moved(mesh, T_map_mesh))
+        plan = drivable_plan(transform_points(T_map_mesh, points))
+        return Building(plan, _moved(mesh, T_map_mesh), T_map_mesh)
 
 
 def load_building(path: str | Path) -> OccupancyGrid | Building:

@@ -1,7 +1,7 @@
 """Maps by one sensor, queries by another, on real data of one floor.
 
 Two sources show the floor, recorded in different years. Its 3D scan is driven through with a lidar and a
-depth camera, whose true poses are known in the frame of the scan ("floor"). The log of a real 2D laser has
+depth camera, whose true poses are known in the frame of the scan ("floor"); it is a map itself, too. The log of a real 2D laser has
 its poses in a frame of its own ("log"). Nobody has measured how the two frames lie to each other, but all
 right answers across them imply the same rigid transform, and wrong ones imply scattered ones. So the
 transform that most answers agree with is taken for the truth. Each answer is judged by the transform that
@@ -21,7 +21,7 @@ from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.model import SensorKind
 from signature.evaluation.judgement import judge
-from signature.evaluation.sensor_map import SensorMap
+from signature.evaluation.sensor_map import MapKind, SensorMap
 from signature.evaluation.trial import Trial
 from signature.relocalization.query_map import QueryMap
 from signature.relocalization.relocalizer import Answer
@@ -52,8 +52,8 @@ class AgreementParameters:
 AGREEMENT = AgreementParameters()
 
 
-def frame_of(sensor: SensorKind) -> Frame:
-    """The frame that true poses of a sensor are in: only the laser is real."""
+def frame_of(sensor: MapKind) -> Frame:
+    """The frame that true poses of a sensor, or the places of a map, are in: only the laser is real."""
     return "log" if sensor == "laser" else "floor"
 
 

@@ -5,22 +5,26 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from pc2grid.geometry import SE2
 from pc2grid.model import SensorKind, SessionMap
 from signature.config import Config
 from signature.relocalization.map_index import MapIndex
 
+MapKind = SensorKind | Literal["scan"]
+"""The sensor that has made a map; or "scan", a 3D scan of the building that is a map as it is."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorMap:
-    """The map of the building `name` that one sensor has made, ready to be searched.
+    """The map of the building `name` that one sensor has made, or its 3D scan, ready to be searched.
 
     T_plan_map : the frame of the map in the true plan.
     """
 
     name: str
-    sensor: SensorKind
+    sensor: MapKind
     T_plan_map: SE2
     index: MapIndex
 
@@ -44,7 +48,7 @@ def save_map(path: Path, session_map: SessionMap, T_plan_map: SE2, source: Path,
         draft.write_text(json.dumps([T_plan_map.x, T_plan_map.y, T_plan_map.yaw]))
 
 
-def load_map(path: Path, *, name: str, sensor: SensorKind, config: Config) -> SensorMap:
+def load_map(path: Path, *, name: str, sensor: MapKind, config: Config) -> SensorMap:
     """Read what `save_map` has written, as the map of the building `name`."""
     from signature.database import open_database
 

@@ -1,4 +1,7 @@
-"""`pc2grid compare real`: the sensors compared on real data, a 3D scan and a laser log of one floor."""
+"""`pc2grid compare real`: the sensors compared on real data, a 3D scan and a laser log of one floor.
+
+The scan is driven through, and is a map itself.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +25,14 @@ if TYPE_CHECKING:
     from pc2grid.simulate import Building, SimulationConfig
     from signature.evaluation.real_sensors import RealQuery
     from signature.evaluation.replay import Replay
-    from signature.evaluation.sensor_map import SensorMap
+    from signature.evaluation.sensor_map import MapKind, SensorMap
 
 MAP_SEED = 1000
 """Map sessions and query sessions never share a seed: other clutter, start, direction and noise."""
 _DRIVEN: tuple[SensorKind, ...] = ("lidar", "depth")
+_SCAN = "scan"  # the map that the 3D scan is, without a drive
 _LOG, _EARLIER = "laser", "laser-earlier"  # maps of the whole log and of its first part
+_MAPS = (*_DRIVEN, _SCAN, _LOG, _EARLIER)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +54,8 @@ class Setting:
         """Of the map by a driven sensor, or of the log."""
         if name in _DRIVEN:
             made = f"{self.floor.stem}.{name}.{self.map_length_m:g}m.{self.rate_hz:g}Hz.{self.clutter}"
+        elif name == _SCAN:
+            made = f"{self.floor.stem}.{name}"
         else:
             made = f"{self.log.stem}.{name}.{self._judged_by}" + (
                 f".{self.earlier:g}" if name == _EARLIER else ""
@@ -120,7 +127,7 @@ def compare_real_command(
     jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="processes [one a core]")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON document, not a table")] = False,
 ) -> None:
-    """Lidar, depth camera and laser on one real floor: each located in the maps of each.
+    """Lidar, depth camera and laser on one real floor: each located in the maps of each, and in the scan.
 
     Lidar and depth camera are driven through the 3D scan; the laser log is real, of another day. How the
     two lie to each other is fitted to the answers, and each answer is judged by the others.
@@ -167,11 +174,11 @@ def compare_real_command(
                 return _all(pool, function, list(tasks), advance)
 
         # The camera takes longest to map and the log's parts wait for its poses, so these come first.
-        run("map", _make_map, [(setting, name) for name in ("depth", _LOG, "lidar")])
+        run("map", _make_map, [(setting, name) for name in ("depth", _LOG, "lidar", _SCAN)])
         run("drive", _register, [(setting, *task) for task in asking])
         asked = run("locate", _locate, [(setting, *task) for task in asking])
     found: list[RealQuery] = [query for query in asked if query is not None]
-    maps = {name: _map(setting, name) for name in (*_DRIVEN, _LOG, _EARLIER)}
+    maps = {name: _map(setting, name) for name in _MAPS}
     agreement = Agreement.of(found, maps)
     trials = judge_all(found, maps, agreement)
     cells = real_cells(trials)
@@ -233,7 +240,7 @@ def _building(floor: Path) -> Building:
 
 
 def _make_map(setting: Setting, name: str) -> None:
-    """Make the map of a driven sensor, or those of the log, unless they exist."""
+    """Make the map of a driven sensor, of the scan, or those of the log, unless they exist."""
     from signature.config import Config
     from signature.evaluation.sensor_map import is_saved, save_map
     from signature.evaluation.sensor_matrix import map_building
@@ -244,10 +251,28 @@ def _make_map(setting: Setting, name: str) -> None:
     target, config = setting.map_file(name), Config()
     if is_saved(target):
         return
+    if name == _SCAN:
+        _map_scan(setting.floor, target)
+        return
     sensor: SensorKind = "lidar" if name == "lidar" else "depth"
     simulation = setting.simulation(setting.map_length_m, MAP_SEED)
     made, T_floor_map = map_building("floor", _building(setting.floor), sensor, simulation, config)
     save_map(target, made, T_floor_map, setting.floor, config)
+
+
+def _map_scan(floor: Path, target: Path) -> None:
+    """The 3D scan as `pc2grid convert` makes a map of it, in the frame that is driven in."""
+    from pc2grid.geometry import SE2, invert_pose
+    from pc2grid.mapping.drawn_map import load_drawn_map
+    from signature.config import Config
+    from signature.evaluation.sensor_map import save_map
+    from signature.sessions import build_session
+
+    config = Config()
+    made, _ = build_session(floor, "floor-scan", config)
+    T_map_file = load_drawn_map(floor, config).T_map_file
+    T_floor_map = SE2.from_matrix(_building(floor).T_map_file @ invert_pose(T_map_file))
+    save_map(target, made, T_floor_map, floor, config)
 
 
 def _map_log(setting: Setting) -> None:
@@ -327,8 +352,9 @@ def _map(setting: Setting, name: str) -> SensorMap:
     from signature.config import Config
     from signature.evaluation.sensor_map import load_map
 
-    sensor: SensorKind = "laser" if name in (_LOG, _EARLIER) else ("lidar" if name == "lidar" else "depth")
-    return load_map(setting.map_file(name), name="floor", sensor=sensor, config=Config())
+    kinds: dict[str, MapKind] = {"lidar": "lidar", "depth": "depth", _SCAN: "scan"}
+    kind = kinds.get(name, "laser")
+    return load_map(setting.map_file(name), name="floor", sensor=kind, config=Config())
 
 
 def _locate(setting: Setting, sensor: SensorKind, seed: int) -> RealQuery | None:
@@ -342,7 +368,7 @@ def _locate(setting: Setting, sensor: SensorKind, seed: int) -> RealQuery | None
     session = RegisteredSession.load(setting.session_file(sensor, seed))
     if session.lost.all() or np.isnan(session.T_world_base[:, 0]).all():
         return None
-    names: list[str] = list(_DRIVEN)
+    names: list[str] = [*_DRIVEN, _SCAN]
     if sensor != "laser":
         names.append(_LOG)
     elif session.planar_scans[0].stamp_ns > _last_stamp_ns(setting):

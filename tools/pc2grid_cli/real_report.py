@@ -12,7 +12,9 @@ if TYPE_CHECKING:
     from signature.evaluation.trial import Trial
 
 _SENSORS = ("lidar", "depth", "laser")
+_MAPS = (*_SENSORS, "scan")
 _SHOWN = {"lidar": "lidar", "depth": "depth camera", "laser": "2D laser"}
+_TITLES = {**{name: f"map by {shown}" for name, shown in _SHOWN.items()}, "scan": "the 3D scan as map"}
 _SIZES = {"lidar": 9.0, "depth": 5.5, "laser": 7.0}  # lidar and camera drive the same ways
 _DRAWN_AT_MOST = 30_000  # wall points of a map; more would only make the picture heavier
 
@@ -49,7 +51,7 @@ def print_table(cells: Sequence[RealCell], agreement: Agreement) -> None:
 
 
 def _in_order(cells: Sequence[RealCell]) -> list[RealCell]:
-    return sorted(cells, key=lambda c: (_SENSORS.index(c.map_sensor), _SENSORS.index(c.query_sensor)))
+    return sorted(cells, key=lambda c: (_MAPS.index(c.map_sensor), _SENSORS.index(c.query_sensor)))
 
 
 def _share(cell: RealCell) -> str:
@@ -101,9 +103,9 @@ def draw(
     (x0, y0), (x1, y1) = everything.min(axis=0), everything.max(axis=0)
     height = min(max(9.0 * (y1 - y0) / (x1 - x0), 2.0), 9.0) + 0.45
     figure, axes = plt.subplots(
-        len(_SENSORS), 1, figsize=(9.0, height * len(_SENSORS)), constrained_layout=True, sharex=True
+        len(_MAPS), 1, figsize=(9.0, height * len(_MAPS)), constrained_layout=True, sharex=True
     )
-    for ax, name in zip(axes, _SENSORS, strict=True):
+    for ax, name in zip(axes, _MAPS, strict=True):
         ax.plot(*walls_m[name].T, ".", color="0.35", ms=1.0, mew=0)
         for query in queries:
             asked = "laser-earlier" if name == query.sensor == "laser" else name
@@ -124,7 +126,7 @@ def draw(
             for q in _SENSORS
             if (c := shares.get((name, q))) is not None
         ]
-        ax.set_title(f"map by {_SHOWN[name]}; located and right: " + "; ".join(texts), fontsize=9)
+        ax.set_title(f"{_TITLES[name]}; located and right: " + "; ".join(texts), fontsize=9)
         ax.set(xlim=(x0 - 0.5, x1 + 0.5), ylim=(y0 - 0.5, y1 + 0.5), aspect="equal")
         ax.tick_params(labelsize=7)
     for sensor in _SENSORS:

@@ -87,7 +87,7 @@ def test_no_answer_is_judged_by_itself() -> None:
 
 
 def test_only_the_laser_is_in_the_frame_of_the_log() -> None:
-    assert [frame_of(s) for s in ("lidar", "depth", "laser")] == ["floor", "floor", "log"]
+    assert [frame_of(s) for s in ("lidar", "depth", "scan", "laser")] == ["floor", "floor", "floor", "log"]
 
 
 def test_cells_keep_what_the_map_does_not_cover_apart() -> None:
@@ -151,6 +151,9 @@ def test_small_run(tmp_path: Path) -> None:
         ("laser", "lidar"),
         ("lidar", "lidar"),
         ("depth", "laser"),
+        ("scan", "lidar"),
+        ("scan", "depth"),
+        ("scan", "laser"),
     }
     assert sum(c["wrong"] + c["wrong_outside"] for c in document["cells"]) == 0
     assert sum(c["right"] for c in document["cells"]) >= 3
