@@ -47,7 +47,8 @@ class RideParameters:
     near_m : in the cabin of a lift every wall is nearer than this.
     far_m : through an open door one sees farther than this.
     seen, open : least sectors that must have been seen, and most of these that may be open, in a shut cabin.
-    shut_s, still_m : least time for which it is shut, and how far the robot moves meanwhile at most.
+    shut_s, still_m : least time for which it is shut, and how far the robot moves meanwhile, and until the
+        door is open, at most.
     door : neighbouring sectors that are open when the door is.
     """
 
@@ -244,6 +245,7 @@ class _Lift:
         self._far: I64 = np.full(self._parameters.sectors, -1)  # 1: far, 0: near, -1: not seen yet
         self._shut_since: tuple[int, SE2] | None = None  # stamp, and pose at that time
         self._shut_ns = 0
+        self._shut_at = at  # the last pose at which the door was shut
 
     def observe(self, planar_scan: PlanarScan, pose: SE2) -> bool:
         """Take in a scan at its pose; returns whether the door of a lift has opened before it."""
@@ -259,10 +261,12 @@ class _Lift:
             if math.hypot(pose.x - at.x, pose.y - at.y) > p.still_m:
                 since_ns, at = planar_scan.stamp_ns, pose
             self._shut_since = since_ns, at
-            self._shut_ns = planar_scan.stamp_ns - since_ns
+            self._shut_ns, self._shut_at = planar_scan.stamp_ns - since_ns, pose
             return False
         self._shut_since = None
-        if self._shut_ns < p.shut_s * 1e9:
+        # A robot that drives out of a dead end sees far, too, but only once it has moved.
+        left = math.hypot(pose.x - self._shut_at.x, pose.y - self._shut_at.y) > p.still_m
+        if left or self._shut_ns < p.shut_s * 1e9:
             self._shut_ns = 0
             return False
         around = np.concatenate((self._far, self._far[: p.door])) == 1

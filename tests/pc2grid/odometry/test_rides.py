@@ -103,15 +103,15 @@ def cabin_scan(seconds: float, *, shut: bool) -> PlanarScan:
     )
 
 
-def rides(plan: list[tuple[float, bool]], *, drift_m: float = 0.0) -> list[float]:
+def rides(plan: list[tuple[float, bool]], *, drift_m: float = 0.0, since_s: float = 0.0) -> list[float]:
     """The times at which a robot that stands still arrives somewhere else. plan : until when the door is
-    shut or open. drift_m : metres that it moves a second."""
+    shut or open. drift_m : metres that it moves a second, after `since_s`."""
     watch = RideWatch()
     scan = Scan(stamp_ns=0, points_m=np.zeros((0, 3), np.float32), T_base_sensor=np.eye(4), sensor="laser")
     arrived, seconds = [], 0.0
     for until_s, shut in plan:
         while seconds < until_s:
-            pose = SE2(drift_m * seconds, 0.0, 0.0).lift()
+            pose = SE2(drift_m * max(seconds - since_s, 0.0), 0.0, 0.0).lift()
             seen = cabin_scan(seconds, shut=shut)
             if watch.observe(scan, scan.points_m, seen, pose, 0.0, None).arrived:
                 arrived.append(seconds)
@@ -125,6 +125,8 @@ def test_a_lift_is_a_cabin_whose_door_shuts_and_opens() -> None:
     assert not rides([(12.0, False)])
     assert not rides([(3.0, False), (12.0, True)])  # it has not opened yet
     assert not rides([(3.0, False), (9.0, True), (12.0, False)], drift_m=0.2)
+    # A robot that has turned in a dead end sees out of it again when it drives.
+    assert not rides([(3.0, False), (9.0, True), (12.0, False)], drift_m=0.8, since_s=8.8)
 
 
 def test_level_ground_with_a_tilted_sensor_is_no_slope() -> None:
