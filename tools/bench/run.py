@@ -22,6 +22,7 @@ import large_database
 import live
 import locating
 import peers
+import points
 import reading
 import submaps
 from measure import ROOT, Row, machine, table
@@ -43,6 +44,7 @@ MEASURES: dict[str, Measure] = {
     "convert": reading.convert_time,
     "memory": reading.convert_memory,
     "growth": reading.growth,
+    "points": points.kept,
     "describe": submaps.describe_time,
     "align": submaps.align_time,
     "retrieve": large_database.retrieve_time,
