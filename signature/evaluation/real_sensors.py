@@ -1,11 +1,11 @@
 """Maps by one sensor, queries by another, on real data of one floor.
 
 Two sources show the floor, recorded in different years. Its 3D scan is driven through with a lidar and a
-depth camera, whose true poses are known in the frame of the scan ("floor"); it is a map itself, too. The log of a real 2D laser has
-its poses in a frame of its own ("log"). Nobody has measured how the two frames lie to each other, but all
-right answers across them imply the same rigid transform, and wrong ones imply scattered ones. So the
-transform that most answers agree with is taken for the truth. Each answer is judged by the transform that
-is fitted to the other queries only.
+depth camera, whose true poses are known in the frame of the scan ("floor"); it is a map itself, too. The log
+of a real 2D laser has its poses in a frame of its own ("log"). Nobody has measured how the two frames lie to
+each other, but all right answers across them imply the same rigid transform, and wrong ones imply scattered
+ones. So the transform that most answers agree with is taken for the truth. Each answer is judged by the
+transform that is fitted to the other queries only.
 """
 
 from __future__ import annotations
