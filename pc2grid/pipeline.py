@@ -431,13 +431,12 @@ def _settled(tracked: Trajectory, closed: SettledKeyframes) -> tuple[I64, F64]:
         return np.zeros(len(tracked), np.int64), T_session_base
     before = np.searchsorted(closed.scans, np.arange(len(tracked)), side="right") - 1
     keyframe = np.maximum(before, 0)
-    if closed.loops:
-        planar = np.array([(p.x, p.y, p.yaw) for p in map(SE2.from_matrix, T_session_base)])
-        for segment in np.unique(closed.segments):
-            scans = np.flatnonzero(closed.segments[keyframe] == segment)
-            known = closed.segments == segment
-            poses = spread(planar[scans], closed.scans[known] - scans[0], closed.poses[known])
-            T_session_base[scans] = _moved_in_plane(T_session_base[scans], planar[scans], poses)
+    planar = np.array([(p.x, p.y, p.yaw) for p in map(SE2.from_matrix, T_session_base)])
+    for segment in np.unique(closed.segments):
+        scans = np.flatnonzero(closed.segments[keyframe] == segment)
+        known = closed.segments == segment
+        poses = spread(planar[scans], closed.scans[known] - scans[0], closed.poses[known])
+        T_session_base[scans] = _moved_in_plane(T_session_base[scans], planar[scans], poses)
     part: I64 = closed.parts[keyframe]
     for number in range(1, int(part.max()) + 1):
         scans = np.flatnonzero(part == number)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.mapping.building_axes import WallDirection, pull_to_axes
 
 if TYPE_CHECKING:
     from scipy.sparse import coo_matrix
@@ -80,8 +81,16 @@ class Solution:
     accepted: NDArray[np.bool_]
 
 
-def optimise(poses: F64, edges: Sequence[Edge], parameters: PoseGraphParameters = POSE_GRAPH) -> Solution:
+def optimise(
+    poses: F64,
+    edges: Sequence[Edge],
+    walls: Sequence[WallDirection] | None = None,
+    parameters: PoseGraphParameters = POSE_GRAPH,
+) -> Solution:
     """The poses (N, 3) that agree best with the edges; the first pose stays where it is.
+
+    walls : of each pose, where the building's axes are to hold the headings; see
+        `pc2grid.mapping.building_axes`.
 
     A loop edge starts with its robust weight, because a false one at full weight would bend the graph before
     the other loops can outvote it. There are two exceptions: loops that place recognition found, and loops
@@ -119,6 +128,10 @@ def optimise(poses: F64, edges: Sequence[Edge], parameters: PoseGraphParameters 
         H = coo_matrix(((JtO @ jacobian).ravel(), (row, column)), shape=(size, size)).tocsc()
         g = np.zeros(size)
         np.add.at(g, rows, np.einsum("eab,eb->ea", JtO, error))
+        if walls is not None:
+            deviation, heading = pull_to_axes(poses[:, 2], walls)
+            H += _of_headings(heading)
+            g[2::3] += heading * deviation
         delta = np.zeros(size)
         delta[3:] = spsolve(H[3:, 3:] + damping, -g[3:])
         poses += delta.reshape(-1, 3)
@@ -131,10 +144,12 @@ def optimise(poses: F64, edges: Sequence[Edge], parameters: PoseGraphParameters 
     return Solution(poses, ~loop | (chi2 <= limit))
 
 
-def information_matrix(poses: F64, edges: Sequence[Edge]) -> coo_matrix:
+def information_matrix(
+    poses: F64, edges: Sequence[Edge], walls: Sequence[WallDirection] | None = None
+) -> coo_matrix:
     """The information matrix (3 N, 3 N) of poses (N, 3), sparse: x, y, yaw of one pose after the other.
 
-    It leaves open where the whole lies.
+    It leaves open where the whole lies. walls : as for `optimise`.
     """
     from scipy.sparse import coo_matrix
 
@@ -146,7 +161,18 @@ def information_matrix(poses: F64, edges: Sequence[Edge]) -> coo_matrix:
     rows = _unknowns(i, j)
     row, column = np.repeat(rows, 6, axis=1).ravel(), np.tile(rows, (1, 6)).ravel()
     H = jacobian.transpose(0, 2, 1) @ information @ jacobian
-    return coo_matrix((H.ravel(), (row, column)), shape=(3 * len(poses), 3 * len(poses)))
+    by_edges = coo_matrix((H.ravel(), (row, column)), shape=(3 * len(poses), 3 * len(poses)))
+    if walls is None:
+        return by_edges
+    return by_edges + _of_headings(pull_to_axes(poses[:, 2], walls)[1])
+
+
+def _of_headings(information: F64) -> coo_matrix:
+    """The information matrix (3 N, 3 N) of headings that are known with `information` (N,)."""
+    from scipy.sparse import coo_matrix
+
+    yaw = 3 * np.arange(len(information)) + 2
+    return coo_matrix((information, (yaw, yaw)), shape=(3 * len(yaw), 3 * len(yaw)))
 
 
 def _unknowns(i: NDArray[np.intp], j: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -15,13 +15,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F64, I64
+from pc2grid.mapping.building_axes import WallDirection
 from pc2grid.mapping.pose_graph import Edge, information_matrix
 from pc2grid.model import Loose, Precision, Trajectory
+
+if TYPE_CHECKING:
+    from scipy.sparse import coo_matrix
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,11 +59,15 @@ _TOGETHER = 64
 
 
 def position_sigmas(
-    poses: F64, edges: Sequence[Edge], parameters: PrecisionParameters = PRECISION
+    poses: F64,
+    edges: Sequence[Edge],
+    walls: Sequence[WallDirection] | None = None,
+    parameters: PrecisionParameters = PRECISION,
 ) -> tuple[F64, F64]:
     """Standard deviation (N,) of each position in metres, in its least certain direction, and weights (N,).
 
     poses : (N, 3) x, y, yaw that agree best with the edges. edges : those that count; they connect all poses.
+    walls : of each pose, if the building's axes held the headings.
     weights : with which the places count when the map is placed on the truth.
     """
     count = len(poses)
@@ -66,7 +75,7 @@ def position_sigmas(
     if count < 2:
         return np.zeros(count), weight
     places = np.unique(np.linspace(0, count - 1, parameters.most_places).astype(np.int64))
-    solve = _inverse(poses, edges, parameters)
+    solve = _inverse(poses, information_matrix(poses, edges, walls), parameters)
     blocks = _diagonal_blocks(solve, count, places)
     moved = _moved_by_whole(poses)
     sigma = np.zeros(count)
@@ -87,7 +96,7 @@ def position_sigmas(
     return sigma, weight
 
 
-def _inverse(poses: F64, edges: Sequence[Edge], parameters: PrecisionParameters) -> Callable[[F64], F64]:
+def _inverse(poses: F64, information: coo_matrix, parameters: PrecisionParameters) -> Callable[[F64], F64]:
     """The product of columns (3 N, K) with the covariance (3 N, 3 N) of the poses, the first one held."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import splu
@@ -95,7 +104,7 @@ def _inverse(poses: F64, edges: Sequence[Edge], parameters: PrecisionParameters)
     held = coo_matrix(
         (np.full(3, parameters.held), (np.arange(3), np.arange(3))), shape=(3 * len(poses),) * 2
     )
-    factors = splu((information_matrix(poses, edges) + held).tocsc(), permc_spec="MMD_AT_PLUS_A")
+    factors = splu((information + held).tocsc(), permc_spec="MMD_AT_PLUS_A")
 
     def solve(columns: F64) -> F64:
         product: F64 = factors.solve(columns)

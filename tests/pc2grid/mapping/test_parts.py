@@ -108,7 +108,8 @@ def test_a_restart_that_no_loop_joins_gives_two_parts_each_in_its_own_frame() ->
     middle = begin_of_second_lap()
     assert closed.parts.tolist() == [0] * middle + [1] * (len(truths) - middle)
     assert [len(part.trajectory) for part in parts] == [middle, len(truths) - middle]
-    assert wrong_m(parts[0], truths) < 1e-6 and wrong_m(parts[1], truths, middle) < 1e-6
+    # Tracking is exact here; the axes of the walls move it by less than a millimetre.
+    assert wrong_m(parts[0], truths) < 1e-3 and wrong_m(parts[1], truths, middle) < 1e-3
     assert not any(part.consistency.bent for part in parts)
     assert parts[1].grid.occupied.any()
 

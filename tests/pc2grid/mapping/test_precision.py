@@ -129,7 +129,7 @@ def _turned(edge: Edge) -> F64:
 
 def test_fewer_places_are_interpolated() -> None:
     sigma, _ = position_sigmas(TRUTH, edges(TRUTH))
-    few, _ = position_sigmas(TRUTH, edges(TRUTH), replace(PRECISION, most_places=len(TRUTH) // 2))
+    few, _ = position_sigmas(TRUTH, edges(TRUTH), parameters=replace(PRECISION, most_places=len(TRUTH) // 2))
     assert np.abs(few - sigma).max() < 0.02
 
 
