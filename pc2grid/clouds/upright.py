@@ -32,6 +32,10 @@ class UprightParameters:
     rounds : of reweighting.
     least_normals, least_share : with fewer normals, or with less weight on the second direction of walls,
         the vertical is not determined.
+    side_share : weight, as a share of that of all normals, with which the vertical is held perpendicular to
+        the y axis of the base: a robot on wheels hardly rolls. So one wall ahead, which shows the pitch, is
+        enough.
+    most_rad : no robot is tilted by more; seen from a landing, stairs are flatter than their own walls.
     """
 
     points: int = 12_000
@@ -46,9 +50,15 @@ class UprightParameters:
     rounds: int = 8
     least_normals: int = 30
     least_share: float = 0.05
+    side_share: float = 0.0
+    most_rad: float = math.radians(40.0)
 
 
 UPRIGHT = UprightParameters()
+CAMERA_UPRIGHT = UprightParameters(voxel_m=0.1, squeeze=0.7, side_share=0.1)
+"""Of a depth camera. It sees small patches densely: with the voxels of a lidar, the neighbours of a point
+span less than `breadth_m`. On simulated level ground 81 to 92 % of its scans show the vertical with these,
+95 % of them to 0.6 degrees."""
 
 
 def vertical_of(
@@ -57,10 +67,13 @@ def vertical_of(
     """The vertical (3,), a unit vector that points up, by the walls in a scan; None if they do not show it.
 
     points_m : (N, 3) in the base frame, without the sensor's motion. guesses : (3,) each; the vertical is
-    looked for around each of them, and the one that most normals agree with is returned.
+    looked for around each of them, and the one that most normals agree with is returned. The last guess is
+    the vertical of level ground, which limits the tilt.
     """
     normals = _normals(points_m, parameters)
-    found = [fit for guess in guesses if (fit := _perpendicular(normals, guess, parameters)) is not None]
+    least = math.cos(parameters.most_rad)
+    fits = [_perpendicular(normals, guess, parameters) for guess in guesses]
+    found = [fit for fit in fits if fit is not None and fit[0] @ guesses[-1] > least]
     return max(found, key=lambda fit: fit[1])[0] if found else None
 
 
@@ -91,7 +104,9 @@ def _perpendicular(normals: F64, guess: F64, p: UprightParameters) -> tuple[F64,
     vertical, spread, weight = guess, np.zeros(3), np.zeros(1)
     for _ in range(p.rounds):
         weight = (1.0 + ((walls @ vertical) / p.scale) ** 2) ** -2
-        spread, axes = np.linalg.eigh((walls * weight[:, None]).T @ walls)
+        scatter = (walls * weight[:, None]).T @ walls
+        scatter[1, 1] += p.side_share * weight.sum()
+        spread, axes = np.linalg.eigh(scatter)
         vertical = axes[:, 0] if axes[:, 0] @ guess > 0.0 else -axes[:, 0]
     total = float(weight.sum())
     return (vertical, total) if spread[1] > p.least_share * total else None

@@ -159,7 +159,7 @@ class Tracker:
         prediction: Prediction | None = None,
     ) -> Tracked:
         """Extend the maps by a scan if it is worth it, and remember its final pose."""
-        ride = self._ride(scan, points, planar_scan, pose)
+        ride = self._ride(scan, points, planar_scan, pose, prediction)
         if ride.arrived:
             self._restart()
         extended = (
@@ -192,11 +192,18 @@ class Tracker:
             storey=self._rides.storey,
         )
 
-    def _ride(self, scan: Scan, points: F32, planar_scan: PlanarScan, pose: F64) -> Ride:
-        """Look whether the robot leaves its floor. A sensor in the hand tilts as it likes."""
+    def _ride(
+        self, scan: Scan, points: F32, planar_scan: PlanarScan, pose: F64, prediction: Prediction | None
+    ) -> Ride:
+        """Look whether the robot leaves its floor. A sensor in the hand tilts as it likes.
+
+        The travel is that of the wheels where they are known: tracking in the plane errs on stairs.
+        """
         if not self._ground.rolling:
             return Ride()
         step = invert_pose(self._motion.last_pose) @ pose
+        if prediction is not None and prediction.odometry is not None and prediction.credible:
+            step = prediction.motion
         return self._rides.observe(scan, points, planar_scan, pose, float(step[0, 3]), self._ground.ground)
 
     def _restart(self) -> None:

@@ -10,15 +10,15 @@ import pytest
 
 from pc2grid.clouds.ground import Ground
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.clouds.upright import vertical_of
+from pc2grid.clouds.upright import CAMERA_UPRIGHT, vertical_of
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.geometry import SE2
-from pc2grid.model import Scan
+from pc2grid.model import Scan, SensorKind
 from pc2grid.odometry.rides import RIDES, RideWatch
 from pc2grid.odometry.tracker import Tracker
 from pc2grid.pipeline import floor_names
 from pc2grid.simulate import HouseConfig, HouseSession, SimulationConfig, prepare_house_session
-from pc2grid.simulate.config import LidarConfig
+from pc2grid.simulate.config import DepthConfig, LidarConfig
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -49,15 +49,40 @@ def test_a_single_wall_does_not_show_it() -> None:
     assert vertical_of(np.column_stack((np.full(y.size, 2.0), y.ravel(), z.ravel())), (UP,)) is None
 
 
-def house(**settings: object) -> HouseSession:
-    lidar = LidarConfig(columns=450, rate_hz=5.0)
-    config = SimulationConfig(length_m=4.0, seed=3, building_seed=2, clutter=10, lidar=lidar)
-    return prepare_house_session(sensor="lidar", house=HouseConfig.model_validate(settings), config=config)
+def test_a_camera_sees_the_pitch_by_a_single_wall_ahead() -> None:
+    rng = np.random.default_rng(1)
+    pitch = math.radians(20.0)
+    y, z = np.meshgrid(np.linspace(-1.5, 1.5, 80), np.linspace(-0.5, 1.5, 60))
+    wall = np.column_stack((np.full(y.size, 2.0), y.ravel(), z.ravel())) + rng.normal(0, 0.005, (y.size, 3))
+    c, s = math.cos(pitch), math.sin(pitch)
+    points = wall @ np.array([(c, 0, -s), (0, 1, 0), (s, 0, c)])
+    assert vertical_of(points, (UP,)) is None
+    vertical = vertical_of(points, (UP,), CAMERA_UPRIGHT)
+    assert vertical is not None
+    assert math.degrees(math.asin(vertical[0])) == pytest.approx(20.0, abs=0.5)
+    beside = points[:, [1, 0, 2]] * (1.0, -1.0, 1.0)  # a wall along the way shows no pitch
+    assert vertical_of(beside, (UP,), CAMERA_UPRIGHT) is None
 
 
-@pytest.mark.parametrize("settings", [{"ride": "stairs"}, {"ride": "lift"}], ids=["stairs", "lift"])
-def test_a_ride_leads_to_another_floor(settings: dict[str, object]) -> None:
-    session = house(visits=(0, 1), **settings)
+def house(sensor: SensorKind = "lidar", **settings: object) -> HouseSession:
+    config = SimulationConfig(
+        length_m=4.0,
+        seed=3,
+        building_seed=2,
+        clutter=10,
+        lidar=LidarConfig(columns=450, rate_hz=5.0),
+        depth=DepthConfig(rate_hz=3.0),
+    )
+    return prepare_house_session(sensor=sensor, house=HouseConfig.model_validate(settings), config=config)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "settings"),
+    [("lidar", {"ride": "stairs"}), ("depth", {"ride": "stairs"}), ("lidar", {"ride": "lift"})],
+    ids=["stairs", "stairs by camera", "lift"],
+)
+def test_a_ride_leads_to_another_floor(sensor: SensorKind, settings: dict[str, object]) -> None:
+    session = house(sensor, visits=(0, 1), **settings)
     tracker = Tracker(RegistrationConfig(), ProjectionConfig())
     arrived, told, true = [], [], []
     for reading in session.readings():
@@ -79,7 +104,7 @@ def test_a_ride_leads_to_another_floor(settings: dict[str, object]) -> None:
         assert (first.group, second.group) == (0, 1)
     else:
         assert not wrong
-        assert second.height_m == pytest.approx(3.0, abs=0.5)
+        assert second.height_m == pytest.approx(3.0, abs=0.25)
 
 
 def test_a_house_is_as_it_is_asked_for() -> None:
