@@ -35,8 +35,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from signature.relocalization.hypotheses import Hypothesis
-from signature.verification.self_likeness import self_likeness
-from signature.verification.walls import Walls
+from signature.relocalization.query_map import QueryMap
 
 TUNED_ON = ("fr079", "intel")
 """Plans whose simulated sessions anything was tuned on; calibration in simulation is judged on others."""
@@ -97,18 +96,18 @@ class Evidence:
     likeness: float
 
     @staticmethod
-    def of(rivals: Sequence[Hypothesis], query: Walls) -> Evidence:
-        """Evidence of one hypothesis for each place, best first, for the walls of a query."""
+    def of(rivals: Sequence[Hypothesis], query: QueryMap) -> Evidence:
+        """Evidence of one hypothesis for each place, best first, for a query."""
         if not rivals:
             return NO_EVIDENCE
         best = rivals[0].fit
         return Evidence(
             forward=best.known_agreement,
-            walls=best.overlap * query.weight,
+            walls=best.overlap * query.walls.weight,
             backward=best.backward,
             looked_at=best.looked_at,
             lead=best.score - rivals[1].fit.score if len(rivals) > 1 else LIMITS.longest_lead,
-            likeness=self_likeness(query),
+            likeness=query.likeness,
         )
 
     @property

@@ -35,6 +35,7 @@ class HypothesisParameters:
     far_m : walls beyond are left out. What is near may be people and carts only: of a real hall, 4 s of a
         lidar were found with the walls between 8 and 20 m and not without them.
     refined : share of `RelocalizeConfig.hypotheses` that is refined; some of these will merge.
+    half_coarse_rad : of a pose whose coarse score is asked for; about half a step of heading of the search.
     same_m, same_rad : two hypotheses nearer than this are one.
     """
 
@@ -46,6 +47,7 @@ class HypothesisParameters:
     near_m: float = 8.0
     far_m: float = 20.0
     refined: int = 2
+    half_coarse_rad: float = math.radians(0.8)
     same_m: float = 0.5
     same_rad: float = math.radians(10.0)
 
@@ -111,12 +113,18 @@ def verify(
 
 
 def search_everywhere(
-    query: QueryMap, session_index: int, target: SearchMap, free_xy_m: F64, config: RelocalizeConfig
+    query: QueryMap,
+    session_index: int,
+    target: SearchMap,
+    free_xy_m: F64,
+    config: RelocalizeConfig,
+    least: float = 0.0,
 ) -> tuple[Hypothesis, ...]:
     """Align the query on the whole map of a session: slower than at proposals, but nothing is left out.
 
     free_xy_m : (K, 2) centres of the squares of `HYPOTHESES.square_m` that hold free space; the base is in
-    one of them.
+    one of them. least : placements with a lower coarse score are left out; the higher it is, the faster is
+    the search.
     """
     center = (query.T_odom_base.x, query.T_odom_base.y)
     count = math.ceil(math.pi / HYPOTHESES.half_a_rad)
@@ -130,7 +138,7 @@ def search_everywhere(
         half_t_m=0.5 * HYPOTHESES.square_m,
         half_a_rad=half_a_rad,
         parameters=SearchParameters(
-            floor=config.coarse_floor, keep=config.coarse_keep, most=config.hypotheses
+            floor=max(config.coarse_floor, least), keep=config.coarse_keep, most=config.hypotheses
         ),
     )
     found = [
@@ -138,6 +146,21 @@ def search_everywhere(
         for x, y, yaw, _ in poses.tolist()
     ]
     return distinct(found, query.T_odom_base)
+
+
+def coarse_score(query: QueryMap, target: SearchMap, T_map_query: SE2) -> float:
+    """What `search_everywhere` scores a pose with, 0..1."""
+    center = (query.T_odom_base.x, query.T_odom_base.y)
+    at = T_map_query @ SE2(*center)
+    poses = search_windows(
+        target,
+        coarse_points(query.walls.points_m, center),
+        np.array([[at.x, at.y, at.yaw]]),
+        half_t_m=target.field.resolution_m,
+        half_a_rad=HYPOTHESES.half_coarse_rad,
+        parameters=SearchParameters(floor=0.0, most=1),
+    )
+    return float(poses[0, 3]) if len(poses) else 0.0
 
 
 def fitted(query: QueryMap, session_index: int, row: int, target: SearchMap, T_map_query: SE2) -> Hypothesis:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from pc2grid.submaps.skeleton import cells_of, skeleton_of
 from signature.config import RelocalizeConfig, SignatureConfig
 from signature.describe import describe
 from signature.retrieval.view import PROFILE_BEARINGS, View
+from signature.verification.self_likeness import self_likeness
 from signature.verification.walls import Walls
 
 
@@ -50,7 +52,7 @@ class QueryParameters:
 QUERY = QueryParameters()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)  # no slots, for what is computed once
 class QueryMap:
     """The query at one moment of its travel.
 
@@ -72,6 +74,11 @@ class QueryMap:
     part: int = 0
     T_odom_prior: SE2 | None = None
     since_prior_m: float = 0.0
+
+    @cached_property
+    def likeness(self) -> float:
+        """`signature.verification.self_likeness` of the walls."""
+        return self_likeness(self.walls)
 
 
 @dataclass(frozen=True, slots=True)

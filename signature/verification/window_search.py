@@ -31,10 +31,10 @@ from pc2grid.mapping.likelihood_field import LikelihoodField
 from pc2grid.model import OccupancyGrid
 from signature.verification.walls import Walls
 
-MARGIN_M = 3.0
+MARGIN_M = 4.6
 """Unknown cells around a map that is searched. Points farther outside are taken to lie on its edge, which
 scores the same if the margin is wider than the largest of `REACHES_M` and a box together."""
-REACHES_M = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.3, 1.6)
+REACHES_M = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.3, 1.6, 2.0, 2.5, 3.2)
 """Radii (Chebyshev) of the sliding maxima; the first is the field itself. Each is about a quarter more than
 the one before: a bound is loose by that much at most."""
 MOST_POINTS = 256
@@ -45,6 +45,10 @@ FEW_BOXES, SPLIT_ABOVE_M, PROBES = 100, 0.25, 16
 """Of more boxes than this, with a larger half width, those that remain are divided by 8; before that, so many
 of the most promising are searched for a lower bound of the best score. Chosen by the time of a search of a
 floor."""
+
+BOUND_SLACK = 0.98
+"""A pose may exceed the bound of its box, because `levels_for` neglects half a cell. A box is left out only
+if its bound is below this share of the best score found. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,7 +131,7 @@ def search_windows(
     """
     if len(points_m) > MOST_POINTS:
         raise ValueError(f"{len(points_m)} points; at most {MOST_POINTS}")
-    if not len(points_m) or not len(boxes):
+    if not len(points_m) or not len(boxes) or parameters.floor > 1.0:
         return np.empty((0, 4))
     res = target.field.resolution_m
     origin = np.array([*target.field.origin_m, 0.0])
@@ -136,7 +140,7 @@ def search_windows(
     cells, half_t, half_a_rad = _split(
         cells, half_t_m / res, half_a_rad, MOST_HALF_T_M / res, MOST_HALF_A_RAD
     )
-    keep = parameters.keep if parameters.most > 1 else 1.0
+    keep = min(parameters.keep if parameters.most > 1 else 1.0, BOUND_SLACK)
     least = parameters.floor
     while True:
         bounds = _bounds(target, points, cells, half_t, half_a_rad)
@@ -161,11 +165,17 @@ def search_windows(
 
 
 def _bounds(target: SearchMap, points: F64, boxes: F64, half_t: float, half_a_rad: float) -> I64:
-    """(B,) the sum over the points, in units of 1/255, that no pose of a box exceeds; lengths in cells."""
+    """(B,) the sum over the points, in units of 1/255, that no pose of a box exceeds; lengths in cells.
+
+    A point that a box moves farther than the last of the sliding maxima covers may be on a wall.
+    """
     from signature.verification._kernels import box_bounds
 
+    res = target.field.resolution_m
     reach = 2 * math.ceil(half_t / 2) + np.hypot(points[:, 0], points[:, 1]) * half_a_rad
-    return box_bounds(target.levels, levels_for(reach, target.field.resolution_m), points, boxes)
+    covered = reach <= REACHES_M[-1] / res
+    bounds = box_bounds(target.levels, levels_for(reach[covered], res), points[covered], boxes)
+    return np.asarray(bounds + 255 * np.count_nonzero(~covered), np.int64)
 
 
 def _best(

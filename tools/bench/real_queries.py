@@ -147,7 +147,7 @@ def _looks(
         poses = [h.fit.T_map_query @ query.T_odom_base for h in found]
         yield row | {
             "stage": stage,
-            "evidence": asdict(Evidence.of(found, query.walls)),
+            "evidence": asdict(Evidence.of(found, query)),
             "errors": [_error(pose, truth) for pose in poses],
         }
 

@@ -20,9 +20,9 @@ from signature.config import Config
 from signature.database import Label
 from signature.relocalization.answer import Moment, Verdict
 from signature.relocalization.confidence import NO_EVIDENCE
-from signature.relocalization.hypotheses import Hypothesis
+from signature.relocalization.hypotheses import Hypothesis, fitted
 from signature.relocalization.query_map import QueryMap, QueryWindow
-from signature.relocalization.relocalizer import Answer, MapIndex, Relocalizer, Search, localize
+from signature.relocalization.relocalizer import Answer, MapIndex, Query, Relocalizer, Search, localize
 from signature.verification.two_way_score import Fit
 from tests.helpers.simulated_drives import building, drive, office, plan
 
@@ -50,6 +50,34 @@ def test_a_drive_through_a_known_building_is_located(field_deg: float) -> None:
     assert answer.confidence >= 0.9
     whole = answer.T_map_odom @ answer.T_odom_base if answer.T_map_odom else None
     assert whole is not None and math.dist((whole.x, whole.y), (pose.x, pose.y)) < 1e-9
+
+
+def test_a_better_place_that_was_not_proposed_takes_a_certain_answer_away() -> None:
+    """Proposals may lack the right place; what leads among them is not certain before the map is searched."""
+    config = Config()
+    daring = config.model_copy(update={"relocalize": config.relocalize.model_copy(update={"accept": 0.001})})
+    index = MapIndex({"office": office()}, OFFICE.places.table, config, daring)
+    query = Query(index)
+    for registered, planar_scan, end in drive(office(), ROUTE, field_rad=math.radians(90)):
+        query.add(registered, planar_scan)
+        truth = end
+    seen = query.map()
+    proposed = index.look_up(seen)
+    wrong = tuple(h for h in proposed if math.dist(position(h, seen), (truth.x, truth.y)) > 1.0) or (
+        fitted(seen, 0, -1, index.maps[0], SE2(4.0, 3.0, 1.0)),
+    )
+    alone = index.judge(seen, wrong[:1])
+    assert alone.status == "located"
+    verdict = index.decide(seen, wrong[:1])
+    assert math.dist(position(verdict.hypotheses[0], seen), (truth.x, truth.y)) < 0.1
+    # Nothing is found that would shake a right answer.
+    right = index.decide(seen, proposed)
+    assert right.hypotheses[0] == proposed[0] and right.confidence == index.judge(seen, proposed).confidence
+
+
+def position(hypothesis: Hypothesis, query: QueryMap) -> tuple[float, float]:
+    base = hypothesis.fit.T_map_query @ query.T_odom_base
+    return base.x, base.y
 
 
 def test_certainty_grows_with_travel_and_history_tells_it() -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from pc2grid.geometry import SE2
 from pc2grid.mapping.likelihood_field import LIKELIHOOD
+from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
 from signature.verification._kernels import best_of_boxes, box_bounds
 from signature.verification.refinement import refine
 from signature.verification.two_way_score import score_fit
@@ -135,6 +136,27 @@ def test_the_right_one_of_several_boxes_wins(count: int) -> None:
         assert math.dist(found[0, :2], truth[:2]) < 0.15 and abs(found[0, 2] - truth[2]) < 0.03
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_best_pose_is_found_by_what_is_far_away(seed: int) -> None:
+    """Half a box turns points 20 m away farther than the sliding maxima look; that must not exclude it."""
+    rng = np.random.default_rng(seed)
+    cells = np.full((900, 900), FREE, np.int8)
+    far, angle = rng.uniform(240, 400, 100), rng.uniform(-math.pi, math.pi, 100)
+    cells[(450 + far * np.sin(angle)).astype(int), (450 + far * np.cos(angle)).astype(int)] = OCCUPIED
+    posts = SearchMap.of(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0)))
+    truth = np.array([22.5, 22.5, 0.3])
+    elsewhere = np.column_stack((rng.uniform(-5, 5, (150, 2)), rng.uniform(1, 5, 150)))
+    found = search_windows(
+        posts,
+        seen_from(truth, posts.walls.points_m),
+        truth + np.concatenate(([(0.3, 0.3, 0.12)], elsewhere)),
+        half_t_m=0.4,
+        half_a_rad=math.radians(7.8),
+        parameters=SearchParameters(most=1),
+    )
+    assert len(found) == 1 and math.dist(found[0, :2], truth[:2]) < 0.2 and found[0, 3] > 0.9
+
+
 def test_reported_poses_lie_apart_and_best_first() -> None:
     points = np.random.default_rng(0).uniform(-2, 2, (40, 2)).astype(np.float32)
     starts = np.array([(x, 7.0, yaw) for x in range(4, 16) for yaw in (0.0, 0.1, 2.0)])
@@ -179,7 +201,7 @@ def test_leaving_out_what_would_not_be_reported_changes_nothing(seed: int, half_
 def test_points_so_far_away_that_no_maximum_covers_them() -> None:
     """Half a heading moves them further than any sliding maximum looks, and they may be on a wall."""
     rng, half_a_rad = np.random.default_rng(5), math.radians(10.0)
-    angles, far = rng.uniform(-math.pi, math.pi, 24), rng.uniform(1, 9, 24)
+    angles, far = rng.uniform(-math.pi, math.pi, 24), rng.uniform(1, 20, 24)
     points = np.column_stack((far * np.cos(angles), far * np.sin(angles))).astype(np.float32)
     starts = np.array([(10.02, 7.03, 0.2 + turn * 2 * half_a_rad) for turn in (-1, 0, 1)])
     coarse = SearchParameters(step_rad=2 * half_a_rad, **ALL)
