@@ -561,6 +561,8 @@ class SessionMap:
     precision : how exactly its places lie to each other; None if that is not known.
     points : the points of the recording in space; None if they were not asked for, or there are none.
     floor : name of the floor within its recording; None if the recording does not leave it.
+    floor_height_m : of that floor above the lowest one that the recording reaches before it takes a lift;
+        None if it does not leave its floor, and behind a lift, which shows no height.
 
     >>> import numpy as np
     >>> import pc2grid
@@ -585,6 +587,7 @@ class SessionMap:
     precision: Precision | None = None
     points: PointMap | None = None
     floor: str | None = None
+    floor_height_m: float | None = None
     report: ReadReport = field(default_factory=ReadReport)
 
     def __post_init__(self) -> None:

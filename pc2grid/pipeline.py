@@ -154,7 +154,8 @@ def build_maps(
     if config.projection.points_voxel_m is not None and sensor == "laser":
         no_points = "a 2D laser shows no points in space, so none are kept"
         read = dataclasses.replace(read, warnings=(*read.warnings, no_points))
-    floors = floor_names(storeys, [part.storey for part in kept])
+    reached = [part.storey for part in kept]
+    floors, heights_m = floor_names(storeys, reached), floor_heights(storeys, reached)
     reports = _reports(read, session, parts, kept, floors)
     maps = []
     for number, (part, report) in enumerate(zip(kept, reports, strict=True)):
@@ -173,6 +174,7 @@ def build_maps(
                 precision=part.precision,
                 points=part.points,
                 floor=floors[number],
+                floor_height_m=heights_m[number],
                 report=report,
             )
         )
@@ -226,6 +228,23 @@ def floor_names(storeys: Sequence[Storey], reached: Sequence[int]) -> list[str |
             rank = f"lift {storey.group}" + (f", floor {rank}" if len(heights) > 1 else "")
         names.append(rank)
     return [*names]
+
+
+def floor_heights(storeys: Sequence[Storey], reached: Sequence[int]) -> list[float | None]:
+    """The heights in metres of the floors that parts of a recording are on, above the lowest one.
+
+    Parameters are those of `floor_names`. None where no stairs lead, and behind a lift.
+
+    >>> floor_heights([Storey(group=0, height_m=0.0), Storey(group=0, height_m=-3.0)], [0, 1, 0])
+    [3.0, 0.0, 3.0]
+    >>> floor_heights([Storey(group=0, height_m=0.0), Storey(group=1, height_m=0.0)], [0, 1])
+    [None, None]
+    """
+    known = [storey.height_m for storey in storeys if not storey.group]
+    if len(known) == 1:
+        return [None] * len(reached)
+    here = [storeys[k] for k in reached]
+    return [None if storey.group else storey.height_m - min(known) for storey in here]
 
 
 def check_followed(trajectory: Trajectory, name: str) -> None:

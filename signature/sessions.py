@@ -187,7 +187,14 @@ def on_floors(
         maps, given = (replace(maps[0], report=report), *maps[1:]), []
     names = dict(zip(own, given or own, strict=True))
     labels = [
-        label if part.floor is None else replace(label, floor=names[part.floor], told_apart=not given)
+        label
+        if part.floor is None
+        else replace(
+            label,
+            floor=names[part.floor],
+            told_apart=not given,
+            floor_height_m=part.floor_height_m,
+        )
         for part in maps
     ]
     return tuple(maps), tuple(replace(origin, label=each) for each in labels)

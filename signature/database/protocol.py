@@ -37,14 +37,18 @@ class Label:
     building, floor : in the user's words.
     told_apart : the floor is not in the user's words: its recording reaches several floors, which got names
         of their own. It tells the sessions of that recording apart, and says nothing of other recordings.
+    floor_height_m : of the floor above the lowest one of its recording, where stairs or ramps join them.
     """
 
     building: str | None = None
     floor: str | None = None
     told_apart: bool = False
+    floor_height_m: float | None = None
 
     def __str__(self) -> str:
         floor = f"floor {self.floor}" if self.told_apart and self.floor else self.floor
+        if floor and self.floor_height_m is not None:
+            floor += f" at {self.floor_height_m:.1f} m"
         return ", ".join(word for word in (self.building, floor) if word) or "no label"
 
     def fits(self, building: str | None, floor: str | None) -> bool:

@@ -191,6 +191,7 @@ def storable(entry: Entry) -> Entry:
         building=None if label.building is None else _text(label.building),
         floor=None if label.floor is None else _text(label.floor),
         told_apart=label.told_apart,
+        floor_height_m=label.floor_height_m,
     )
     return (
         replace(session_map, session=_text(session_map.session), report=report),
@@ -290,6 +291,8 @@ def document(session_map: SessionMap, provenance: Provenance) -> str:
     }
     if provenance.label.told_apart:
         content["told_apart"] = True
+    if provenance.label.floor_height_m is not None:
+        content["floor_height_m"] = round(provenance.label.floor_height_m, 3)
     if session_map.consistency is not None:
         content["consistency"] = asdict(session_map.consistency)
     if session_map.odometry is not None:
@@ -327,6 +330,9 @@ def read_info(row: Row, resolution_m: float, scans: int, location: Path | str) -
     def text_or_none(key: str) -> str | None:
         return None if content.get(key) is None else validation.text(content[key], key)
 
+    def number_or_none(key: str) -> float | None:
+        return None if content.get(key) is None else validation.number(content[key], key)
+
     digest = validation.text(content["digest"], "digest")
     report = content["report"]
     return SessionInfo(
@@ -360,6 +366,7 @@ def read_info(row: Row, resolution_m: float, scans: int, location: Path | str) -
                 building=text_or_none("building"),
                 floor=text_or_none("floor"),
                 told_apart=content.get("told_apart") is True,
+                floor_height_m=number_or_none("floor_height_m"),
             ),
         ),
         consistency=_consistency(content.get("consistency")),

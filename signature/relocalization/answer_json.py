@@ -114,13 +114,15 @@ class PoseInSpace(TypedDict):
 class Result(TypedDict):
     """What is found. T_map_odom puts the query's own frame into the map. confidence: the probability that the
     best hypothesis is right. hypotheses: best first. prior: null if nothing was known beforehand.
-    in_space: null if the map or the query has no points."""
+    in_space: null if the map or the query has no points. floor_height_m: of the floor, above the lowest one
+    that the map's recording reaches by stairs or ramps; null if it reaches one only, and behind a lift."""
 
     schema_version: Version
     status: Status
     session: str | None
     building: str | None
     floor: str | None
+    floor_height_m: float | None
     pose: StampedPose | None
     T_map_odom: Pose | None
     confidence: float
@@ -150,6 +152,7 @@ def document(answer: answer.Answer) -> AnswerDocument:
         "session": answer.session,
         "building": answer.label.building,
         "floor": answer.label.floor,
+        "floor_height_m": answer.label.floor_height_m,
         "pose": stamped,
         "T_map_odom": None if answer.T_map_odom is None else _pose(answer.T_map_odom),
         "confidence": answer.confidence,

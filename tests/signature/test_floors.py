@@ -40,10 +40,14 @@ def asked(folder: Path, floor: SessionMap, sessions: dict[str, Provenance]) -> A
 
 
 def test_floors_that_look_alike_are_ambiguous(tmp_path: Path, floor: SessionMap, origin: Provenance) -> None:
-    parts = [replace(floor, session=f"house#{k}", floor=k) for k in FLOORS]
+    parts = [
+        replace(floor, session=f"house#{k}", floor=k, floor_height_m=3.0 * number)
+        for number, k in enumerate(FLOORS)
+    ]
     _, origins = on_floors(parts, origin)
     assert [o.label.floor for o in origins] == ["0", "1"]
     assert all(o.label.told_apart for o in origins)
+    assert [str(o.label) for o in origins] == ["house, floor 0 at 0.0 m", "house, floor 1 at 3.0 m"]
     answer = asked(tmp_path, floor, {"house": origins[0], "house#2": origins[1]})
     assert answer.status == "ambiguous"
     assert {answer.labels[h.session_index].floor for h in answer.hypotheses} == {"0", "1"}

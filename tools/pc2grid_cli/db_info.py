@@ -30,6 +30,7 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
                 "sensor": s.sensor,
                 "building": s.provenance.label.building,
                 "floor": s.provenance.label.floor,
+                "floor_height_m": s.provenance.label.floor_height_m,
                 "source": s.provenance.source,
                 "digest": s.digest,
                 "submaps": s.submaps,

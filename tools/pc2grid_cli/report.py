@@ -116,8 +116,10 @@ def contents(
 
 
 def _facts(info: SessionInfo, poses: Trajectory) -> dict[str, Any]:
+    label = info.provenance.label
     return {
         "name": info.name,
+        "place": str(label) if label.building or label.floor else None,
         "date": _date(poses),
         "source": info.provenance.source,
         "sensor": info.sensor,

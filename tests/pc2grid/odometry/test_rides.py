@@ -13,10 +13,10 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.upright import CAMERA_UPRIGHT, vertical_of
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.geometry import SE2
-from pc2grid.model import Scan, SensorKind
+from pc2grid.model import Scan, SensorKind, Storey
 from pc2grid.odometry.rides import RIDES, RideWatch
 from pc2grid.odometry.tracker import Tracker
-from pc2grid.pipeline import floor_names
+from pc2grid.pipeline import floor_heights, floor_names
 from pc2grid.simulate import HouseConfig, HouseSession, SimulationConfig, prepare_house_session
 from pc2grid.simulate.config import DepthConfig, LidarConfig
 
@@ -174,10 +174,11 @@ def test_level_ground_with_a_tilted_sensor_is_no_slope() -> None:
 
 
 def test_floors_are_named_by_height() -> None:
-    from pc2grid.model import Storey
-
     storeys = [Storey(group=0, height_m=h) for h in (0.0, 3.1, -2.9)]
     assert floor_names(storeys, [0, 1, 2, 0]) == ["1", "2", "0", "1"]
     assert floor_names(storeys[:1], [0]) == [None]
     lift = [*storeys[:2], Storey(group=1, height_m=0.0), Storey(group=1, height_m=-3.0)]
     assert floor_names(lift, [0, 1, 2, 3]) == ["0", "1", "lift 1, floor 1", "lift 1, floor 0"]
+    assert floor_heights(storeys, [0, 2]) == pytest.approx([2.9, 0.0])
+    assert floor_heights(lift, [0, 1, 2, 3]) == [0.0, 3.1, None, None]
+    assert floor_heights(storeys[:1], [0]) == [None]
