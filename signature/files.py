@@ -115,7 +115,7 @@ def relocalize(
 
     with open_database(database) as opened:
         settings = query_config(opened, config)
-        index = MapIndex.of(opened, settings)
+        index = MapIndex.of(opened, settings, observer)
         if is_drawn_map(Path(query)):
             if prior is not None:
                 raise ConfigError("prior: there is no robot in a map")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -81,6 +81,11 @@ class SignatureTable:
             submap_id=np.arange(n, dtype=np.int32) if submap_id is None else np.asarray(submap_id, np.int32),
             center_m=np.asarray(center_m, np.float64).reshape(n, 2),
         )
+
+    def without_histograms(self) -> SignatureTable:
+        """The rows with what says where they are, and no bins: 36 bytes instead of some 400 each."""
+        none = np.empty((len(self), 0), np.float32)
+        return replace(self, boundary=none, freespace=none)
 
     @staticmethod
     def concatenated(tables: Sequence[SignatureTable]) -> SignatureTable:

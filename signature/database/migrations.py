@@ -6,6 +6,7 @@
 | 2 | the table `loop` |
 | 3 | the table `graph` |
 | 4 | the table `points` |
+| 5 | the table `isovist` |
 
 SQLite files and PostgreSQL databases count their formats alike. A reader never changes a database of an older
 format: the tables that it lacks are added in memory (SQLite) or treated as empty (PostgreSQL). A writer
@@ -16,8 +17,8 @@ from __future__ import annotations
 
 from typing import Any
 
-FORMAT = 4
-SINCE = {"loop": 2, "graph": 3, "points": 4}
+FORMAT = 5
+SINCE = {"loop": 2, "graph": 3, "points": 4, "isovist": 5}
 """The format that brought a table; tables that are not listed were there from the first."""
 REMOVED_SETTINGS = (("signature", "occupied_percent", 65),)
 """Settings that earlier versions stored, with the value that is now fixed; any other value is refused."""

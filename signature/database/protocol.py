@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from signature.config import Config
     from signature.describe import Signature
+    from signature.seen_places import SeenPlaces
     from signature.similarity import SignatureTable
 
 
@@ -250,6 +251,11 @@ class SubmapDatabase(Protocol):
 
     def points(self, session: str) -> PointMap | None:
         """The points of a session in space; None if none were stored."""
+        ...
+
+    def seen_places(self, session: str) -> SeenPlaces | None:
+        """What is seen from the centre of each submap of a session, by id; None if it was not stored, as in
+        databases of formats 1 to 4."""
         ...
 
     def submap(self, session: str, submap_id: int) -> Submap:

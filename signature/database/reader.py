@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import networkx as nx
 
     from signature.config import Config
+    from signature.seen_places import SeenPlaces
 
 T = TypeVar("T")
 
@@ -93,6 +94,10 @@ class RowReader(ABC):
     def points(self, session: str) -> PointMap | None:
         """The points of a session in space; see `SubmapDatabase.points`."""
         return self._read("points", session, lambda row, _: serialize.read_points(row))
+
+    def seen_places(self, session: str) -> SeenPlaces | None:
+        """What is seen from the places of a session; see `SubmapDatabase.seen_places`."""
+        return self._read("isovist", session, lambda row, _: serialize.read_isovists(row))
 
     def submap(self, session: str, submap_id: int) -> Submap:
         """One submap. Raises DatabaseError if the session has none of that number."""

@@ -1,10 +1,10 @@
 """A session as rows and bytes, and back: what the engines of the database share.
 
-A session is a few rows of plain values (`Row`): one each of grid, trajectory, loops, junction graph and
-signatures, and one for each submap. Every engine stores these rows with the checksum `row_crc` of their
-values. Reading trusts nothing: lengths are compared with shapes, shapes with a limit, numbers must be finite
-and plausible (`validation`). The readers of single values raise ValueError; `explained` turns that into
-DatabaseCorrupt, which names the row.
+A session is a few rows of plain values (`Row`): one each of grid, trajectory, loops, junction graph, points,
+isovists and signatures, and one for each submap. Every engine stores these rows with the checksum `row_crc`
+of their values. Reading trusts nothing: lengths are compared with shapes, shapes with a limit, numbers must
+be finite and plausible (`validation`). The readers of single values raise ValueError; `explained` turns that
+into DatabaseCorrupt, which names the row.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     import networkx as nx
 
     from signature.config import Config
+    from signature.seen_places import SeenPlaces
 
 Row = dict[str, Any]
 """Column -> value."""
@@ -228,17 +229,20 @@ def rows_of(session_map: SessionMap, provenance: Provenance) -> dict[str, list[R
         "loop": [loop_row(session_map.loops)],
         "graph": [graph_row(session_map.graph)],
         "points": [points_row(session_map.points)],
+        "isovist": [isovist_row(_seen_places(session_map, provenance.config))],
         "submap": [submap_row(submap) for submap in session_map.submaps],
     }
 
 
 def row_of_older_format(table: str) -> Row:
     """The row of a table for a session that was stored before the table existed: no loops, an empty graph,
-    no points."""
+    no points, no isovists."""
     import networkx as nx
 
     if table == "points":
         return points_row(None)
+    if table == "isovist":
+        return isovist_row(None)
     return loop_row(()) if table == "loop" else graph_row(nx.Graph())
 
 
@@ -259,6 +263,8 @@ def decode(table: str, row: Row, sizes: validation.Sizes | None) -> object:
         return read_graph(row, sizes)
     if table == "points":
         return read_points(row)
+    if table == "isovist":
+        return read_isovists(row)
     assert table == "submap", table
     return read_submap(row, sizes)
 
@@ -611,6 +617,45 @@ def read_points(row: Row) -> PointMap | None:
     )
 
 
+def _seen_places(session_map: SessionMap, config: Config) -> SeenPlaces:
+    """What is seen from the centres of the submaps of a session. It follows from the map, so it is computed
+    whenever a session is stored."""
+    from signature.seen_places import SeenPlaces
+
+    centers_m = np.array([submap.center_m for submap in session_map.submaps], np.float64).reshape(-1, 2)
+    return SeenPlaces.of(session_map.grid, centers_m, config.partition.radius_m)
+
+
+def isovist_row(seen: SeenPlaces | None) -> Row:
+    """The inverse of `read_isovists`."""
+    bearings, columns = (0, 0) if seen is None else (seen.ranges.shape[1], seen.signatures.shape[1])
+    return {
+        "count": 0 if seen is None else len(seen),
+        "bearings": bearings,
+        "columns": columns,
+        "sight_m": 0.0 if seen is None else float(seen.sight_m),
+        "ranges": zlib.compress(b"" if seen is None else pack_array(seen.ranges, "u1"), _ZLIB_LEVEL),
+        # Column by column: neighbouring places have similar shares in each bin.
+        "seen": zlib.compress(b"" if seen is None else pack_array(seen.signatures.T, "u1"), _ZLIB_LEVEL),
+    }
+
+
+def read_isovists(row: Row) -> SeenPlaces | None:
+    """What is seen from the places of a session; None if it was not stored. Raises ValueError for implausible
+    numbers."""
+    from signature.seen_places import PROFILE_BEARINGS, SIGNATURE_COLUMNS, SeenPlaces
+
+    n, bearings, columns = (validation.count(row[name], name) for name in ("count", "bearings", "columns"))
+    if not n:
+        return None
+    if (bearings, columns) != (PROFILE_BEARINGS, SIGNATURE_COLUMNS) or n > MAX_POINTS:
+        raise ValueError(f"{n} isovists of {bearings} rays and {columns} columns")
+    ranges: Any = unpack_array(_inflate(row["ranges"], n * bearings), "u1", (n, bearings))
+    seen: Any = unpack_array(_inflate(row["seen"], n * columns), "u1", (columns, n))
+    sight_m = validation.number(row["sight_m"], "sight_m", 1e-3, validation.MAX_RADIUS_M)
+    return SeenPlaces(sight_m=sight_m, ranges=ranges, signatures=hand_over(np.ascontiguousarray(seen.T)))
+
+
 def submap_row(submap: Submap) -> Row:
     """The inverse of `read_submap`."""
     return {
@@ -679,14 +724,20 @@ def name_is_taken(name: str, location: Path | str) -> DatabaseError:
 
 
 def mismatch(
-    submaps: Sequence[tuple[int, float, float]], signatures: Sequence[tuple[int, float, float]], count: int
+    submaps: Sequence[tuple[int, float, float]],
+    signatures: Sequence[tuple[int, float, float]],
+    isovists: int,
+    count: int,
 ) -> str | None:
     """How the submaps and the signatures of a session differ, given the id and centre of each; None if not.
 
-    count : how many the session was stored with.
+    isovists : how many isovists the session has; 0: none were stored. count : how many submaps it was stored
+    with.
     """
     if not len(submaps) == len(signatures) == count or [s[0] for s in submaps] != [s[0] for s in signatures]:
         return f"has {len(submaps)} submaps and {len(signatures)} signatures where {count} were stored"
+    if isovists not in (0, count):
+        return f"has {isovists} isovists where {count} were stored"
     for submap, signature in zip(submaps, signatures, strict=True):
         if submap != signature:
             return f"submap {submap[0]} lies elsewhere than its signature says"

@@ -25,11 +25,11 @@ from signature.evaluation.metrics import recall
 from signature.evaluation.sensor_map import SensorMap
 from signature.evaluation.trial import Trial
 from signature.relocalization.query_map import QueryMap
-from signature.retrieval.view import PROFILE_BEARINGS
 from signature.retrieval.viewpoints import Places
 from signature.seen import seen_signatures
 from signature.seen_likelihood import COMBINATIONS as SEEN_COMBINATIONS
 from signature.seen_likelihood import SeenStatistics, seen_weights
+from signature.seen_places import PROFILE_BEARINGS
 from signature.similarity import SignatureTable, histogram_distance, structural_factor
 
 PARTS = ("boundary", "freespace", "symmetry")
@@ -205,7 +205,7 @@ def _seen_pairs(buildings: Sequence[Sequence[SensorMap]]) -> tuple[Rows, Rows]:
     for maps in buildings:
         for one in maps:
             places = one.index.places
-            mine, centers = places.described().signatures, places.table.center_m
+            mine, centers = places.described().seen.shares, places.table.center_m
             a, b = np.nonzero(np.hypot(*(centers[:, None] - centers[None]).transpose(2, 0, 1)) >= FAR_M)
             other.append((mine[a], mine[b], first + a))
             for two in maps:

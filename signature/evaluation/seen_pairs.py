@@ -13,9 +13,9 @@ from pc2grid.submaps.isovist import look_around
 from signature.config import Config
 from signature.evaluation.sensor_map import SensorMap
 from signature.relocalization.query_map import QueryMap, best_observed
-from signature.retrieval.view import PROFILE_BEARINGS
 from signature.seen import seen_signatures
 from signature.seen_likelihood import Pairs
+from signature.seen_places import PROFILE_BEARINGS
 
 _VIEWS = 16
 """Views of each query, closer together than those that are looked up."""

@@ -152,7 +152,7 @@ class Selection:
         self.index, self.scope, self.share = index, scope, share
         self._rng = np.random.default_rng(seed)
         index.places.index()
-        described = index.places.described().signatures
+        described = index.places.described().seen.shares
         self._seen = {
             name: SeenIndex.of(described, seen_weights(*names)) for name, names in SEEN_SELECTORS.items()
         }
@@ -218,10 +218,10 @@ class Selection:
             return np.sort(self._rng.choice(count, most, replace=False))
         if selector == VOTED:
             placed = places.index()
-            return placed.select(query.views, placed.nearest_to_each(query.views), most)
+            return np.sort(placed.select(query.views, placed.nearest_to_each(query.views), most))
         each = max(1, most // len(query.views))
         if selector == PAPER:
-            found = places.shortlists(query.views, each, self.index.made_with.signature, "paper")
+            found = places.nearest_by_paper(query.views, each, self.index.made_with.signature)
         else:
             found = self._seen[selector].nearest_to_each([view.profile for view in query.views], each)
         return np.unique(np.concatenate([near.rows for near in found]))
@@ -299,16 +299,13 @@ def recall_at_scale(
 
 def described_floor(seed: int, config: Config) -> PlaceBlock:
     """What is seen from the places of `office_floor`; its seed is the number of the session."""
-    from pc2grid.submaps.isovist import look_around
     from pc2grid.submaps.partition import submap_centers
-    from signature.retrieval.view import PROFILE_BEARINGS
-    from signature.seen import seen_signatures
+    from signature.seen_places import SeenPlaces
 
-    grid, sight_m = office_floor(seed), config.partition.radius_m
+    grid = office_floor(seed)
     centers_m = submap_centers(grid, config.partition)
-    ranges_m, ends = look_around(grid, centers_m, sight_m, bearings=PROFILE_BEARINGS)
-    signatures = seen_signatures(ranges_m, ends, sight_m)
-    return PlaceBlock(signatures, ranges_m, ends, centers_m, np.full(len(centers_m), seed))
+    seen = SeenPlaces.of(grid, centers_m, config.partition.radius_m)
+    return PlaceBlock(seen, centers_m, np.full(len(centers_m), seed))
 
 
 def tally_at_scale(trials: Sequence[Recalled], *, draws: int = 1000) -> list[Mapping[str, object]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar, overload
 
@@ -14,11 +15,11 @@ T = TypeVar("T")
 
 
 class LazySequence(Sequence[T]):
-    """A sequence of `count` items, each made when it is first asked for, and kept."""
+    """A sequence of `count` items, each made when it is first asked for; the `most` used last are kept."""
 
-    def __init__(self, make: Callable[[int], T], count: int) -> None:
-        self._make, self._count = make, count
-        self._made: dict[int, T] = {}
+    def __init__(self, make: Callable[[int], T], count: int, most: int | None = None) -> None:
+        """most : None: all are kept."""
+        self._made, self._count = functools.lru_cache(maxsize=most)(make), count
 
     def __len__(self) -> int:
         return self._count
@@ -32,10 +33,7 @@ class LazySequence(Sequence[T]):
     def __getitem__(self, index: int | slice) -> T | tuple[T, ...]:
         if isinstance(index, slice):
             return tuple(self[i] for i in range(*index.indices(self._count)))
-        index = range(self._count)[index]
-        if index not in self._made:
-            self._made[index] = self._make(index)
-        return self._made[index]
+        return self._made(range(self._count)[index])
 
 
 class DatabaseGrids(Mapping[str, OccupancyGrid]):

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pc2grid.arrays import F64, I64, BoolGrid
-from pc2grid.errors import ConfigError
+from pc2grid.errors import ConfigError, DatabaseCorrupt
 from pc2grid.geometry import SE2
 from pc2grid.model import UNKNOWN, OccupancyGrid, same_recording
+from pc2grid.observer import Observer
 from signature.config import Config
 from signature.database.protocol import Label
 from signature.relocalization.answer import Status, Verdict
@@ -33,6 +35,7 @@ from signature.relocalization.prior import PRIOR, Prior
 from signature.relocalization.query_map import QueryMap, query_of
 from signature.retrieval.viewpoints import AT_ONCE_M2, Places
 from signature.retrieval.vote import retrieve
+from signature.seen_places import SeenPlaces
 from signature.similarity import SignatureTable
 from signature.verification.refinement import refine
 from signature.verification.two_way_score import Fit, score_fit
@@ -105,6 +108,7 @@ class MapIndex:
         config: Config,
         labels: Mapping[str, Label] | None = None,
         areas_m2: Mapping[str, float] | None = None,
+        stored: Callable[[str], SeenPlaces | None] = lambda session: None,
     ) -> None:
         """grids : map of each session, in the order of `table.session_index`.
 
@@ -112,39 +116,73 @@ class MapIndex:
         config : its relocalize section says how to search and when to be sure.
         labels : building and floor of sessions, where known.
         areas_m2 : free space of each map, for maps that are not to be read before they are needed.
+        stored : what is seen from the places of a session; None: it is computed from the map when it is
+            needed.
         """
         self.made_with = made_with
         self.config = config.relocalize
         self.sessions = tuple(grids)
         self.labels = tuple((labels or {}).get(name, Label()) for name in grids)
         count = len(grids)
-        self.grids: LazySequence[OccupancyGrid] = LazySequence(lambda i: grids[self.sessions[i]], count)
-        self.maps: LazySequence[SearchMap] = LazySequence(lambda i: SearchMap.of(self.grids[i]), count)
-        self._alike: dict[tuple[int, int], SE2 | None] = {}  # see `_aligned`
-        self._free: LazySequence[F64] = LazySequence(lambda i: free_squares(self.grids[i]), count)
         areas_m2 = areas_m2 or {name: grid.free_m2 for name, grid in grids.items()}
         self._areas_m2 = tuple(areas_m2[name] for name in self.sessions)
+        # Of a large database, about as many maps are kept as are searched at once.
+        area_m2 = sum(self._areas_m2)
+        most = math.ceil(count * AT_ONCE_M2 / area_m2) if area_m2 > AT_ONCE_M2 else None
+        self.grids: LazySequence[OccupancyGrid] = LazySequence(lambda i: grids[self.sessions[i]], count, most)
+        self.maps: LazySequence[SearchMap] = LazySequence(lambda i: SearchMap.of(self.grids[i]), count, most)
+        self._alike: dict[tuple[int, int], SE2 | None] = {}  # see `_aligned`
+        self._free: LazySequence[F64] = LazySequence(lambda i: free_squares(self.grids[i]), count)
         self.places = Places(
             table,
             self.grids,
             made_with.partition.radius_m,
             self._areas_m2,
+            stored=lambda i: stored(self.sessions[i]),
         )
 
     @staticmethod
-    def of(database: SubmapDatabase, config: Config) -> MapIndex:
+    def of(database: SubmapDatabase, config: Config, observer: Observer = Observer()) -> MapIndex:
         """Everything that is in a database.
 
         If that is more than `signature.retrieval.viewpoints.AT_ONCE_M2` of free floor, maps are read when
         they first matter, so the database must stay open as long as the index is used.
+
+        observer : gets the progress where places have to be selected and the database, which is of an older
+            format, lacks what is seen from them.
         """
         infos = {info.name: info for info in database.sessions()}
         areas_m2 = {name: info.area_m2 for name, info in infos.items()}
         grids: Mapping[str, OccupancyGrid] = DatabaseGrids(database, tuple(infos))
-        if sum(areas_m2.values()) <= AT_ONCE_M2:
+        is_large = sum(areas_m2.values()) > AT_ONCE_M2
+        if not is_large:
             grids = dict(grids)
         labels = {name: info.provenance.label for name, info in infos.items()}
-        return MapIndex(grids, database.signatures(), database.config(), config, labels, areas_m2)
+        lacking: list[str] = []
+
+        def stored(name: str) -> SeenPlaces | None:
+            # What is seen from a place follows from the map, so damage to it costs time and no answer.
+            with contextlib.suppress(DatabaseCorrupt):
+                if (seen := database.seen_places(name)) is not None:
+                    return seen
+            lacking.append(name)
+            return None
+
+        table, by_paper = database.signatures(), config.relocalize.select_by == "paper"
+        if is_large and not by_paper:
+            table = table.without_histograms()
+        made_with = database.config()
+        if by_paper or not (is_large or len(table) > config.relocalize.all_places):
+            return MapIndex(grids, table, made_with, config, labels, areas_m2)
+        index = MapIndex(grids, table, made_with, config, labels, areas_m2, stored)
+        with observer.step("prepare places"):
+            index.places.index(observer.on_progress)
+        if lacking:
+            observer.on_warning(
+                f"{database.location}: lacks what is seen from the places of {len(lacking)} of its"
+                f" {len(infos)} sessions, so it was computed now; a copy by `pc2grid db copy` holds it"
+            )
+        return index
 
     def within(self, prior: Prior) -> MapIndex:
         """An index of which only places that the prior allows are answers; all that is prepared is shared.
@@ -245,7 +283,7 @@ class MapIndex:
             if len(free) * HYPOTHESES.square_m**2 <= self.config.exhaustive_m2:
                 found.extend(search_everywhere(query, index, self.maps[index], free, self.config, least))
             return self._worth_keeping(tuple(found), query)
-        for index in self.places.sessions(query.views, self.config.shortlist, self.made_with.signature):
+        for index in self.places.sessions(query.views, self.made_with.signature, self.config):
             if self._areas_m2[index] <= self.config.exhaustive_m2:
                 found.extend(
                     search_everywhere(query, index, self.maps[index], self._free[index], self.config, least)
@@ -299,7 +337,7 @@ class MapIndex:
         """
         here = best.session_index
         found = []
-        for there in self.places.sessions(query.views, self.config.shortlist, self.made_with.signature):
+        for there in self.places.sessions(query.views, self.made_with.signature, self.config):
             if not self._other_floor(here, there):
                 continue
             T_there_here = self._aligned(here, there)

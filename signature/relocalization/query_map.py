@@ -25,7 +25,8 @@ from pc2grid.submaps.sampling import sample_evenly
 from pc2grid.submaps.skeleton import cells_of, skeleton_of
 from signature.config import RelocalizeConfig, SignatureConfig
 from signature.describe import describe
-from signature.retrieval.view import PROFILE_BEARINGS, View
+from signature.retrieval.view import View
+from signature.seen_places import PROFILE_BEARINGS
 from signature.verification.self_likeness import self_likeness
 from signature.verification.walls import Walls
 

@@ -22,13 +22,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64
+from pc2grid.arrays import F32, F64, I64, U8
 from pc2grid.submaps.isovist import HIDDEN
 from signature.retrieval.likeness import LIKENESS, peaks, rotate_and_compare
 from signature.retrieval.seen_index import SeenIndex
 from signature.retrieval.signature_index import Nearest
-from signature.retrieval.view import PROFILE_BEARINGS, View
+from signature.retrieval.view import View
 from signature.seen_likelihood import SeenWeights, seen_weights
+from signature.seen_places import PROFILE_BEARINGS, RANGE_UNITS, UNSEEN, SeenPlaces, in_units
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,10 +59,6 @@ class SelectionParameters:
 
 
 SELECTION = SelectionParameters()
-_UNITS = 254
-"""Units of a range up to the limit of sight: 2 cm at 5 m, less than the width of a cell."""
-_UNSEEN = 255
-"""Stands for a range whose end is hidden."""
 _MANY = 1 << 20
 """More cells than any map has along an axis."""
 _SQUARE_M = 0.5
@@ -69,12 +66,9 @@ _SQUARE_M = 0.5
 
 
 class PlaceBlock(NamedTuple):
-    """Some places: signatures of what was seen (N, K), ranges and ends (N, B) of isovists, positions (N, 2)
-    in the map of a session (N,)."""
+    """Some places: what is seen from them, positions (N, 2) in the map of a session (N,)."""
 
-    signatures: F32
-    ranges_m: F32
-    ends: NDArray[np.int8]
+    seen: SeenPlaces
     center_m: F64
     session: I64
 
@@ -82,9 +76,7 @@ class PlaceBlock(NamedTuple):
     def concatenated(blocks: Sequence[PlaceBlock]) -> PlaceBlock:
         """The places of all blocks, in their order."""
         return PlaceBlock(
-            signatures=np.concatenate([block.signatures for block in blocks]),
-            ranges_m=np.concatenate([block.ranges_m for block in blocks]),
-            ends=np.concatenate([block.ends for block in blocks]),
+            seen=SeenPlaces.concatenated([block.seen for block in blocks]),
             center_m=np.concatenate([block.center_m for block in blocks]),
             session=np.concatenate([block.session for block in blocks]),
         )
@@ -101,19 +93,19 @@ class Placements(NamedTuple):
     beside: I64
 
     def rows(self, most: int) -> I64:
-        """The places of the best placements, ascending, at most `most`."""
+        """The places of the best placements, best first, at most `most`."""
         views = np.where(self.beside >= 0, self.beside, self.row[:, None])
         whole = _first_unique(views.ravel(), max(1, round(SELECTION.whole * most)))
-        return np.sort(_first_unique(np.concatenate((whole, self.row, views.ravel())), most))
+        return _first_unique(np.concatenate((whole, self.row, views.ravel())), most)
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceIndex:
-    """N places: vectors of their signatures, ranges (N, B) in units of `sight_m` / 254 (255: hidden), and
-    where they are, (N, 2) float32 in the map of a session (N,) int32."""
+    """N places: vectors of their signatures, ranges (N, B) as in `SeenPlaces`, and where they are, (N, 2)
+    float32 in the map of a session (N,) int32."""
 
     seen: SeenIndex
-    ranges: NDArray[np.uint8]
+    ranges: U8
     center_m: F32
     session: NDArray[np.int32]
     sight_m: float
@@ -125,10 +117,8 @@ class PlaceIndex:
         weights = weights or seen_weights()
         parts = [
             (
-                weights.of_places(block.signatures),
-                np.where(block.ends == HIDDEN, _UNSEEN, np.rint(block.ranges_m * (_UNITS / sight_m))).astype(
-                    np.uint8
-                ),
+                weights.of_places(block.seen.shares),
+                block.seen.ranges,
                 np.asarray(block.center_m, np.float32),
                 np.asarray(block.session, np.int32),
             )
@@ -164,17 +154,17 @@ class PlaceIndex:
         return self.seen.nearest_to_each([view.profile for view in views], most)
 
     def select(self, views: Sequence[View], near: Sequence[Nearest], most: int) -> I64:
-        """The at most `most` places, ascending, that are worth a closer look for a query of these views.
+        """The at most `most` places, likeliest first, that are worth a closer look for these views.
 
         near : of `nearest_to_each`; only these places and those beside them are selected. Equal inputs give
-        equal places. If fewer than `most` are proposed, those with the nearest signatures are added.
+        equal places. If fewer than `most` are proposed, those with the nearest signatures are added, and the
+        others if all are asked for.
         """
-        if most >= len(self):
-            return np.arange(len(self))
         rows = self.placements(views, near).rows(most)
         if len(rows) < most:
             each = np.stack([found.rows for found in near], axis=1).ravel()
-            rows = np.sort(_first_unique(np.concatenate((rows, each)), most))
+            others = np.arange(len(self) if most >= len(self) else 0)
+            rows = _first_unique(np.concatenate((rows, each, others)), most)
         return rows
 
     def placements(self, views: Sequence[View], near: Sequence[Nearest]) -> Placements:
@@ -197,7 +187,7 @@ class PlaceIndex:
         there = self.center_m[row][:, None] + turned
         beside = self.raster.beside(there, self.session[row])
         beside[np.arange(len(row)), view] = row
-        own_units = np.where(seen, np.rint(ranges_m * (_UNITS / self.sight_m)), _UNSEEN).astype(np.uint8)
+        own_units = np.where(seen, in_units(ranges_m, self.sight_m), np.uint8(UNSEEN))
         likeness = likeness_beside(own_units, self.ranges, shift, beside, self._width, LIKENESS.prior_share)
         likeness[np.arange(len(row)), view] = own
         votes = np.where(beside < 0, SELECTION.least_vote, (likeness - mean) / spread)
@@ -215,15 +205,15 @@ class PlaceIndex:
     @property
     def _width(self) -> int:
         """Difference in units at which two ranges are not alike at all."""
-        return int(2.0 * LIKENESS.range_scale_m * _UNITS / self.sight_m)
+        return int(2.0 * LIKENESS.range_scale_m * RANGE_UNITS / self.sight_m)
 
     def _proposed(
         self, ranges_m: F32, seen: NDArray[np.bool_], rows: I64
     ) -> tuple[I64, I64, F32, float, float]:
         """Places, rotations and likenesses of the placements that one view (1, B) proposes, and mean and
         standard deviation of the likeness over all of the `rows`."""
-        known = self.ranges[rows] != _UNSEEN
-        others_m = self.ranges[rows].astype(np.float32) * np.float32(self.sight_m / _UNITS)
+        known = self.ranges[rows] != UNSEEN
+        others_m = self.ranges[rows].astype(np.float32) * np.float32(self.sight_m / RANGE_UNITS)
         likeness = rotate_and_compare(ranges_m, seen, others_m, known)[0]
         best = likeness.max(axis=0)
         most = max(1, round(SELECTION.candidates * len(rows)))
@@ -318,7 +308,7 @@ def plain_likeness_beside(
         place = ranges[beside[placement, view]].astype(np.int64)
         for turn in (-1, 0, 1):
             mine = np.roll(own[view].astype(np.int64), shift[placement] + turn)
-            both = (mine != _UNSEEN) & (place != _UNSEEN)
+            both = (mine != UNSEEN) & (place != UNSEEN)
             alike = np.maximum(width - np.abs(mine - place), 0)[both].sum() / width
             likeness = alike / (both.sum() + prior_share * bearings)
             found[placement, view] = max(found[placement, view], likeness)

@@ -7,9 +7,9 @@ Isovists are computed when a place is first on a shortlist.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,22 +17,26 @@ from numpy.typing import NDArray
 from pc2grid.arrays import F32, F64, I64, BoolGrid
 from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.isovist import HIDDEN, look_around
-from signature.config import RelocalizeConfig, SelectBy, SignatureConfig
+from signature.config import RelocalizeConfig, SignatureConfig
 from signature.retrieval.place_index import PlaceBlock, PlaceIndex
 from signature.retrieval.seen_index import SeenIndex
 from signature.retrieval.signature_index import Nearest, SignatureIndex, sessions_by_likeness
-from signature.retrieval.view import PROFILE_BEARINGS, View
-from signature.seen import seen_signatures
+from signature.retrieval.view import View
+from signature.seen_places import PROFILE_BEARINGS, SeenPlaces
 from signature.similarity import SignatureTable
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
+
+T = TypeVar("T")
 
 LATTICE_M = 0.4
 """Distance of viewpoints: a view is at most 0.28 m from one of them, about the scale of `LIKENESS`."""
 AT_ONCE_M2 = 200_000.0
 """So much free floor is searched at once; of a larger database, the sessions that look likeliest. Chosen by
 the time of a look-up."""
+_KEPT_PLACES, _KEPT_GROUNDS = 50_000, 200
+"""Places whose viewpoints are kept, and sessions whose grounds are: 150 MB each, of floors of 40 x 60 m."""
 _AROUND_M = 1.2
 """A viewpoint farther than this from every place is left out: places are 1 m apart by default."""
 _CLEARANCE_M = 0.2
@@ -85,12 +89,22 @@ class Viewpoints:
         return found
 
 
+@dataclass(frozen=True, slots=True)
+class Selected:
+    """The places, ascending, that are compared with a query; for each view those of them with the nearest
+    signatures; and the sessions that are searched, likeliest first."""
+
+    rows: I64
+    near: tuple[Nearest, ...]
+    sessions: I64
+
+
 class Places:
     """All places of a database, ready for retrieval.
 
     table : their signatures. sight_m : length of the rays of their isovists.
 
-    The isovists of a place are computed when it is first on a shortlist, so that a large database answers its
+    The viewpoints of a place are computed when it is first selected, so that a large database answers its
     first question soon and places that are not asked for take no memory.
     """
 
@@ -101,102 +115,111 @@ class Places:
         sight_m: float,
         areas_m2: Sequence[float],
         fewer: Places | None = None,
+        stored: Callable[[int], SeenPlaces | None] = lambda session: None,
     ) -> None:
         """grids, areas_m2 : the map of each session and its free space in m^2, by session_index.
 
         fewer : the places of the first of these sessions; viewpoints that it has computed are taken over.
+        stored : what is seen from the places of a session, if it need not be computed from the map.
         """
         self.table = table
         self.sight_m = sight_m
-        self._grids = grids
+        self._grids, self._stored = grids, stored
         self._paper: SignatureIndex | None = None
         self._index: PlaceIndex | None = None
-        self._described: PlaceBlock | None = None if fewer is None else fewer._described
+        self._described: dict[int, SeenPlaces] = {} if fewer is None else dict(fewer._described)
         self._areas_m2 = np.asarray(areas_m2, np.float64)
         self._grounds: dict[int, _Ground] = {} if fewer is None else dict(fewer._grounds)
         self._known: dict[int, tuple[F64, F32, NDArray[np.bool_]]] = (
             {} if fewer is None else dict(fewer._known)
         )
         self._last: tuple[I64, Viewpoints] | None = None
+        self._selected: tuple[Sequence[View], RelocalizeConfig, Selected] | None = None
 
     def may_all_be_compared(self, most: int) -> bool:
         """Whether there are at most `most` places, and at most `AT_ONCE_M2` of free floor."""
-        return len(self.table) <= most and self._areas_m2.sum() <= AT_ONCE_M2
+        return len(self.table) <= most and not self.is_large
 
-    def select(
+    @property
+    def is_large(self) -> bool:
+        """Whether there is more free floor than is searched at once."""
+        return bool(self._areas_m2.sum() > AT_ONCE_M2)
+
+    def select(self, views: Sequence[View], signature: SignatureConfig, config: RelocalizeConfig) -> Selected:
+        """The places to compare with a query, `config.shortlist` for each view, by `PlaceIndex.select`; by
+        Eq. 6 alone where `config.select_by` says so.
+
+        If there is more than `AT_ONCE_M2` of free floor, those of them in the likeliest sessions, up to so
+        much: the maps of a session take more memory and time than its places.
+        """
+        if self._selected is None or self._selected[0] is not views or self._selected[1] is not config:
+            self._selected = views, config, self._select(views, signature, config)
+        return self._selected[2]
+
+    def _select(
         self, views: Sequence[View], signature: SignatureConfig, config: RelocalizeConfig
-    ) -> tuple[I64, tuple[Nearest, ...]]:
-        """The places, ascending, to compare with a query, `config.shortlist` for each view; and for each view
-        those of them with the nearest signatures.
-
-        By `PlaceIndex.select`; by the signatures alone where `shortlists` uses Eq. 6.
-        """
-        if config.select_by == "paper" or self._areas_m2.sum() > AT_ONCE_M2:
-            found = self.shortlists(views, config.shortlist, signature, config.select_by)
-            return np.unique(np.concatenate([near.rows for near in found])), found
-        index = self.index()
-        near = index.nearest_to_each(views)
-        rows = index.select(views, near, config.shortlist * len(views))
-        return rows, tuple(found.only(np.isin(found.rows, rows)) for found in near)
-
-    def shortlists(
-        self, views: Sequence[View], k: int, config: SignatureConfig, select_by: SelectBy = "seen"
-    ) -> tuple[Nearest, ...]:
-        """For each view of a query the `k` places nearest by their signatures; in a database of more than
-        `AT_ONCE_M2`, those of them that lie in the likeliest sessions.
-
-        select_by : "seen", the signatures of what was seen, or "paper", Eq. 6. In a database of more than
-        `AT_ONCE_M2` it is Eq. 6, because the others would have to be computed from all of its maps.
-        """
-        large = self._areas_m2.sum() > AT_ONCE_M2
-        if select_by == "paper" or large:
-            if self._paper is None:
-                self._paper = SignatureIndex.of(self.table)
-            found = self._paper.nearest_to_each([view.signature for view in views], k, config)
+    ) -> Selected:
+        session_index = self.table.session_index
+        if config.select_by == "paper":
+            near = self.nearest_by_paper(views, config.shortlist, signature)
+            rows = np.unique(np.concatenate([found.rows for found in near]))
+            sessions = sessions_by_likeness(near, session_index)
         else:
-            found = self.seen().nearest_to_each([view.profile for view in views], k)
-        if not large or not found:
-            return found
-        sessions = sessions_by_likeness(found, self.table.session_index)
-        chosen = sessions[np.cumsum(self._areas_m2[sessions]) <= max(AT_ONCE_M2, self._areas_m2[sessions[0]])]
-        return tuple(near.only(np.isin(self.table.session_index[near.rows], chosen)) for near in found)
+            near = self.index().nearest_to_each(views)
+            best = self.index().select(views, near, config.shortlist * len(views))
+            rows, sessions = np.sort(best), _in_order(session_index[best])
+        if self.is_large:
+            areas_m2 = self._areas_m2[sessions]
+            sessions = sessions[np.cumsum(areas_m2) <= max(AT_ONCE_M2, areas_m2[0])]
+            rows = rows[np.isin(session_index[rows], sessions)]
+        return Selected(rows, tuple(found.only(np.isin(found.rows, rows)) for found in near), sessions)
+
+    def nearest_by_paper(
+        self, views: Sequence[View], k: int, signature: SignatureConfig
+    ) -> tuple[Nearest, ...]:
+        """For each view the `k` places that are nearest by Eq. 6."""
+        if self._paper is None:
+            self._paper = SignatureIndex.of(self.table)
+        return self._paper.nearest_to_each([view.signature for view in views], k, signature)
 
     def seen(self) -> SeenIndex:
         """The places by the signatures of what was seen."""
         return self.index().seen
 
-    def index(self) -> PlaceIndex:
-        """The places by the signatures of what was seen and their isovists."""
+    def index(self, on_progress: Callable[[float], None] = lambda share: None) -> PlaceIndex:
+        """The places by the signatures of what was seen and their isovists; made when first asked for.
+
+        on_progress : is told the share of the places that is done.
+        """
         if self._index is None:
-            self._index = PlaceIndex.of([self.described()], self.sight_m)
+            self._index = PlaceIndex.of(self._blocks(on_progress), self.sight_m)
         return self._index
 
     def described(self) -> PlaceBlock:
-        """What was seen from each place; computed from the maps when it is first asked for, 0.2 ms a
-        place."""
-        known = 0 if self._described is None else len(self._described.session)
-        if self._described is None or known < len(self.table):
-            sessions, centers_m = self.table.session_index[known:], self.table.center_m[known:]
-            ranges_m = np.empty((len(sessions), PROFILE_BEARINGS), np.float32)
-            ends = np.empty(ranges_m.shape, np.int8)
-            for session in np.unique(sessions).tolist():
-                here = sessions == session
-                ranges_m[here], ends[here] = look_around(
-                    self._grids[session], centers_m[here], self.sight_m, bearings=PROFILE_BEARINGS
-                )
-            signatures = seen_signatures(ranges_m, ends, self.sight_m)
-            found = PlaceBlock(signatures, ranges_m, ends, centers_m, sessions.astype(np.int64))
-            if self._described is not None:
-                found = PlaceBlock.concatenated((self._described, found))
-            self._described = found
-        return self._described
+        """What is seen from each place."""
+        return PlaceBlock.concatenated(list(self._blocks()))
 
-    def sessions(self, views: Sequence[View], k: int, config: SignatureConfig) -> list[int]:
-        """Indices of the sessions to be searched as a whole: all, or those of the `shortlists`."""
-        if self._areas_m2.sum() <= AT_ONCE_M2:
+    def _blocks(self, on_progress: Callable[[float], None] = lambda share: None) -> Iterator[PlaceBlock]:
+        """What is seen from each place, session by session: as stored, or else computed from the map and
+        kept."""
+        session_index, centers_m = self.table.session_index, self.table.center_m
+        first = np.flatnonzero(np.diff(session_index, prepend=-1))
+        for begin, end in zip(first.tolist(), [*first[1:].tolist(), len(session_index)], strict=False):
+            session = int(session_index[begin])
+            seen = self._described.get(begin) or self._stored(session)
+            if seen is None or len(seen) != end - begin:
+                seen = SeenPlaces.of(self._grids[session], centers_m[begin:end], self.sight_m)
+                self._described[begin] = seen
+            on_progress(end / len(session_index))
+            yield PlaceBlock(seen, centers_m[begin:end], session_index[begin:end].astype(np.int64))
+
+    def sessions(
+        self, views: Sequence[View], signature: SignatureConfig, config: RelocalizeConfig
+    ) -> list[int]:
+        """Indices of the sessions to be searched as a whole: all, or those of the selected places."""
+        if not self.is_large:
             return list(range(len(self._areas_m2)))
-        rows = [near.rows for near in self.shortlists(views, k, config)]
-        return np.unique(self.table.session_index[np.concatenate(rows)]).tolist() if rows else []
+        return self.select(views, signature, config).sessions.tolist() if views else []
 
     def around(self, rows: I64) -> Viewpoints:
         """The viewpoints at the places `rows` (R,) of the table."""
@@ -212,6 +235,7 @@ class Places:
         place = np.repeat(np.arange(len(rows)), counts)
         viewpoints = Viewpoints.of(place, at_m, session, ranges_m, seen)
         self._last = rows.copy(), viewpoints
+        _forget(self._known, _KEPT_PLACES)
         return viewpoints
 
     def _look_around(self, row: int) -> tuple[F64, F32, NDArray[np.bool_]]:
@@ -222,6 +246,7 @@ class Places:
         center, session = self.table.center_m[row], int(self.table.session_index[row])
         grid = self._grids[session]
         if session not in self._grounds:
+            _forget(self._grounds, _KEPT_GROUNDS - 1)
             self._grounds[session] = _Ground.of(grid, self.table, session)
         ground = self._grounds[session]
         steps = np.arange(np.floor(-_AROUND_M / LATTICE_M), np.ceil(_AROUND_M / LATTICE_M) + 1)
@@ -254,6 +279,18 @@ class _Ground:
 
         rows = np.flatnonzero(table.session_index == session)
         return _Ground(_roomy(grid), rows, cKDTree(table.center_m[rows]))
+
+
+def _in_order(sessions: NDArray[np.int32]) -> I64:
+    """The different sessions, in the order in which they come first."""
+    unique, first = np.unique(sessions, return_index=True)
+    return unique[np.argsort(first)].astype(np.int64)
+
+
+def _forget(kept: dict[int, T], most: int) -> None:
+    """Leave the `most` entries that were added last."""
+    for key in list(kept)[: max(0, len(kept) - most)]:
+        del kept[key]
 
 
 def _roomy(grid: OccupancyGrid) -> BoolGrid:

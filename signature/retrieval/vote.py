@@ -90,7 +90,8 @@ def retrieve(
     elif places.may_all_be_compared(config.all_places):
         rows = np.arange(len(places.table))
     else:
-        rows, shortlists = places.select(views, signature, config)
+        selected = places.select(views, signature, config)
+        rows, shortlists = selected.rows, selected.near
     stand = places.around(rows)
     ranges = np.stack([v.profile.ranges_m for v in views])
     seen = np.stack([v.profile.ends != HIDDEN for v in views])

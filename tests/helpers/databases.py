@@ -173,6 +173,8 @@ def assert_holds(database: SubmapDatabase, entry: Entry) -> None:
     assert info.precision == session_map.precision
     assert info.odometry == session_map.odometry
     assert_same_graph(database.graph(name), session_map.graph)
+    seen = database.seen_places(name)  # None in older formats
+    assert seen is None or len(seen) == len(session_map.submaps)
     points, wanted_points = database.points(name), session_map.points
     assert (points is None) == (wanted_points is None)
     if points is not None and wanted_points is not None:

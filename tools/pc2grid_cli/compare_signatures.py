@@ -140,7 +140,8 @@ def compare_signatures_command(
                     for query in queries_of(_drive(out, name, plan, sensor, number, setting, config), config)
                 ]
                 for count in scale:
-                    recalled += recall_at_scale(maps[name][0], _floors(out, count), asked)
+                    elsewhere = _floors(out, count, config.partition.radius_m)
+                    recalled += recall_at_scale(maps[name][0], elsewhere, asked)
     document = _document(trials, independent, recalled, list(drawn), setting, share, seed)
     with replace_file(out / "signatures.json") as draft:
         draft.write_text(json_text(document) + "\n", encoding="utf-8")
@@ -293,32 +294,34 @@ def _describe_floors(out: Path, count: int, config: Config, advance: Callable[[f
             first = _FIRST_FLOOR_OF_SCALE + number * _FLOORS_AT_ONCE
             floors = [described_floor(first + k, config) for k in range(_FLOORS_AT_ONCE)]
             block = PlaceBlock.concatenated(floors)
-            # Half precision is 4 mm at 5 m.
-            block = block._replace(
-                signatures=block.signatures.astype(np.float16), ranges_m=block.ranges_m.astype(np.float16)
-            )
             with replace_file(path) as draft, draft.open("wb") as file:
-                np.savez(file, **block._asdict())
+                np.savez(
+                    file,
+                    ranges=block.seen.ranges,
+                    signatures=block.seen.signatures,
+                    center_m=block.center_m,
+                    session=block.session,
+                )
         with np.load(path) as stored:
             so_far += len(stored["session"])
         number += 1
         advance(min(so_far / count, 1.0))
 
 
-def _floors(out: Path, count: int) -> Iterator[PlaceBlock]:
+def _floors(out: Path, count: int, sight_m: float) -> Iterator[PlaceBlock]:
     """The first `count` places of `_describe_floors`, a block at a time."""
     import numpy as np
 
     from signature.retrieval.place_index import PlaceBlock
+    from signature.seen_places import SeenPlaces
 
     number = 0
     while count > 0:
         with np.load(_block_file(out, number)) as stored:
-            block = PlaceBlock(**{name: stored[name][:count] for name in PlaceBlock._fields})
-        yield block._replace(
-            signatures=block.signatures.astype(np.float32), ranges_m=block.ranges_m.astype(np.float32)
-        )
-        count -= len(block.session)
+            columns = {name: stored[name][:count] for name in stored.files}
+        seen = SeenPlaces(sight_m=sight_m, ranges=columns["ranges"], signatures=columns["signatures"])
+        yield PlaceBlock(seen, columns["center_m"], columns["session"])
+        count -= len(seen)
         number += 1
 
 

@@ -152,6 +152,7 @@ def locate(
     from signature.relocalization.relocalizer import MapIndex, localize
 
     config = query_config(database, config)
+    index = index or MapIndex.of(database, config, observer)
     seen: list[RegisteredScan] = []
     ends_ns = query.info.start_ns, query.info.end_ns
     with observer.step("locate", span.length_ns(*ends_ns) * 1e-9):
@@ -164,7 +165,6 @@ def locate(
                 watch(registered, moment)
 
         scans = follow(query.scans(span.start_s, span.duration_s), config)
-        index = index or MapIndex.of(database, config)
         index = index if prior is None else index.within(prior)
         (asked,) = localize(scans, [index], watch=see, ask=ask)
     poses = Trajectory(

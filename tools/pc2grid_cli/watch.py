@@ -200,7 +200,7 @@ def _search(
     from signature.relocalization.watcher import Watcher
 
     live, config = following.live, following.config
-    index = MapIndex.of(following.database, config)
+    index = MapIndex.of(following.database, config, following.terminal.observer())
     watcher = Watcher(index if prior is None else index.within(prior))
     located = False
     with Looking(watcher, beside=live.feed.realtime, step_m=config.relocalize.step_m) as looking:
@@ -225,7 +225,8 @@ def _check(following: _Following, topic: str, session: str | None, *, as_json: b
 
     live, config = following.live, following.config
     live.listen_to_pose(topic)
-    watcher = PoseWatcher(MapIndex.of(following.database, config), lambda: live.believed, session)
+    index = MapIndex.of(following.database, config, following.terminal.observer())
+    watcher = PoseWatcher(index, lambda: live.believed, session)
     fine = False
     with Looking(watcher, beside=live.feed.realtime, step_m=config.relocalize.step_m) as looking:
 

@@ -619,7 +619,11 @@ class PostgresDatabase(RowReader):
             for table in ("submap", "signature")
         )
         count = serialize.read_info(session, 1.0, 0, self._where).submaps
-        what = serialize.mismatch(submaps, signatures, count)
+        isovists = 0
+        if "isovist" in schema.tables(self._format):
+            ((isovist, _),) = self._rows("isovist", key)
+            isovists = isovist["count"]
+        what = serialize.mismatch(submaps, signatures, isovists, count)
         if what:
             yield Problem(f"session {session['name']!r}", what)
 

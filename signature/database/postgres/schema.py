@@ -61,6 +61,9 @@ TABLES = {
     "points": f"{_OF_SESSION}, count integer NOT NULL, voxel_m float8 NOT NULL, origin_x_m float8 NOT NULL,"
     " origin_y_m float8 NOT NULL, origin_z_m float8 NOT NULL, voxels bytea NOT NULL, within bytea NOT NULL,"
     f" crc32 bigint NOT NULL, PRIMARY KEY (building, session_id), {_REFERENCES}",
+    "isovist": f"{_OF_SESSION}, count integer NOT NULL, bearings integer NOT NULL, columns integer NOT NULL,"
+    " sight_m float8 NOT NULL, ranges bytea NOT NULL, seen bytea NOT NULL, crc32 bigint NOT NULL,"
+    f" PRIMARY KEY (building, session_id), {_REFERENCES}",
     "submap": f"{_OF_SESSION}, submap_id integer NOT NULL, center_x_m float8 NOT NULL, center_y_m float8 NOT"
     f" NULL, radius_m float8 NOT NULL, {_GRID}, crc32 bigint NOT NULL,"
     f" PRIMARY KEY (building, session_id, submap_id), {_REFERENCES}",

@@ -237,6 +237,8 @@ def _incomplete(connection: sqlite3.Connection, path: Path) -> Iterator[Problem]
         ((row, _),) = rows.select(connection, path, "signature", "session_id = ?", session_id)
         arrays = rows.read_signature_arrays(row)
         signatures = list(zip(arrays["submap_id"].tolist(), *arrays["center_m"].T.tolist(), strict=True))
-        what = serialize.mismatch(submaps, signatures, serialize.read_info(session, 1.0, 0, path).submaps)
+        ((isovists,),) = connection.execute("SELECT count FROM isovist WHERE session_id = ?", (session_id,))
+        count = serialize.read_info(session, 1.0, 0, path).submaps
+        what = serialize.mismatch(submaps, signatures, isovists, count)
         if what:
             yield Problem(where, what)

@@ -37,6 +37,10 @@ TABLES = {
     "points": "session_id INTEGER PRIMARY KEY REFERENCES session(id), count INTEGER NOT NULL,"
     " voxel_m REAL NOT NULL, origin_x_m REAL NOT NULL, origin_y_m REAL NOT NULL, origin_z_m REAL NOT NULL,"
     " voxels BLOB NOT NULL, within BLOB NOT NULL, crc32 INTEGER NOT NULL",
+    # What is seen from each place (`signature.seen_places.SeenPlaces`); without places, none was stored.
+    "isovist": "session_id INTEGER PRIMARY KEY REFERENCES session(id), count INTEGER NOT NULL,"
+    " bearings INTEGER NOT NULL, columns INTEGER NOT NULL, sight_m REAL NOT NULL, ranges BLOB NOT NULL,"
+    " seen BLOB NOT NULL, crc32 INTEGER NOT NULL",
     "submap": "id INTEGER PRIMARY KEY, session_id INTEGER NOT NULL REFERENCES session(id),"
     " submap_id INTEGER NOT NULL, center_x_m REAL NOT NULL, center_y_m REAL NOT NULL, radius_m REAL NOT NULL,"
     " height INTEGER NOT NULL, width INTEGER NOT NULL, resolution_m REAL NOT NULL,"
@@ -48,7 +52,7 @@ TABLES = {
     " center_m BLOB NOT NULL, boundary BLOB NOT NULL, freespace BLOB NOT NULL, symmetry BLOB NOT NULL,"
     " crc32 INTEGER NOT NULL",
 }
-ONE_EACH = ("grid", "trajectory", "loop", "graph", "points", "signature")
+ONE_EACH = ("grid", "trajectory", "loop", "graph", "points", "isovist", "signature")
 """The tables in which every session has exactly one row."""
 
 # What the checksum covers: all columns except itself and the row's own number.

@@ -132,6 +132,7 @@ READ: dict[str, Callable[[Any], object]] = {
     "loop": lambda database: database.loops("monday"),
     "graph": lambda database: database.graph("monday"),
     "points": lambda database: database.points("monday"),
+    "isovist": lambda database: database.seen_places("monday"),
     "submap": lambda database: list(database.submaps("monday")),
     "signature": lambda database: database.signatures(),
 }
@@ -184,6 +185,12 @@ CASES: list[tuple[str, Change, str]] = [
     ("points", put(count=2**30), "1073741824 points"),
     ("points", put(voxel_m=0.0), "voxel_m is 0"),
     ("points", put(origin_z_m=INF), "origin_m is inf"),
+    ("isovist", put(bearings=36), "isovists of 36 rays and 111 columns"),
+    ("isovist", put(columns=110), "of 48 rays and 110 columns"),
+    ("isovist", put(count=4), "does not hold the 192 bytes"),
+    ("isovist", put(count=2**30), "1073741824 isovists"),
+    ("isovist", put(sight_m=INF), "sight_m is inf"),
+    ("isovist", lambda row: {**row, "seen": serialize.zlib.compress(bytes(9))}, "does not hold the"),
     ("graph", put(nodes=4), "needs 64"),
     ("graph", put(nodes=-1), "nodes is -1 instead of a count"),
     ("graph", put(edges=3), "needs 24"),
@@ -287,7 +294,7 @@ def test_what_cannot_be_true_is_refused_by_row(place: Any, table: str, change: C
     problems = maintenance.check(place)
     assert any(problem.where.startswith(table) for problem in problems), problems
     assert all("1" in problem.where or "monday" in problem.where for problem in problems), problems
-    if table in ("loop", "graph", "points", "submap"):  # the others are what a search rests on
+    if table in ("loop", "graph", "points", "isovist", "submap"):  # the others are what a search rests on
         with open_database(place) as database:
             assert len(database.signatures()) == 8
 

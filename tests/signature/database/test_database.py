@@ -379,6 +379,7 @@ def test_strangers_trigger_is_refused(path: Path) -> None:
         ("loop", "measured"),
         ("graph", "path_m"),
         ("points", "within"),
+        ("isovist", "ranges"),
         ("submap", "cells"),
         ("signature", "boundary"),
         ("signature", "center_m"),

@@ -58,6 +58,7 @@ BLOBS = {
     "loop": ["pairs", "measured", "information", "accepted"],
     "graph": ["center_m", "kind", "pixels", "ends", "length_m", "path_start", "path_m"],
     "points": ["voxels", "within"],
+    "isovist": ["ranges", "seen"],
     "submap": ["cells"],
     "signature": ["submap_id", "center_m", "boundary", "freespace", "symmetry"],
 }
@@ -491,7 +492,7 @@ def change(path: Path, *statements: str) -> None:
         connection.commit()
 
 
-@pytest.mark.parametrize("table", ["grid", "trajectory", "loop", "graph", "points", "signature"])
+@pytest.mark.parametrize("table", ["grid", "trajectory", "loop", "graph", "points", "isovist", "signature"])
 def test_a_row_that_is_gone_is_missed_by_name(path: Path, tmp_path: Path, table: str) -> None:
     change(path, f"DELETE FROM {table} WHERE session_id = 1")
     assert check(path) != ()
@@ -501,6 +502,7 @@ def test_a_row_that_is_gone_is_missed_by_name(path: Path, tmp_path: Path, table:
         "loop": lambda database: database.loops("monday"),
         "graph": lambda database: database.graph("monday"),
         "points": lambda database: database.points("monday"),
+        "isovist": lambda database: database.seen_places("monday"),
         "signature": lambda database: list(database.submaps("monday")),
     }
     words = rf"session 1: has no {table}" if table in ("grid", "trajectory") else "missing"
@@ -512,7 +514,7 @@ def test_a_row_that_is_gone_is_missed_by_name(path: Path, tmp_path: Path, table:
     assert check(good) == ()
     with open_database(good) as database:
         names = [info.name for info in database.sessions()]
-        assert names == (["monday", "tuesday"] if table in ("graph", "points") else ["tuesday"])
+        assert names == (["monday", "tuesday"] if table in ("graph", "points", "isovist") else ["tuesday"])
 
 
 def test_a_submap_too_many_or_too_few_is_found(path: Path) -> None:
@@ -557,8 +559,8 @@ def test_checking_what_is_no_database_of_ours(path: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("statement", "words"),
     [
-        ("CREATE VIEW more AS SELECT * FROM grid", "its tables are not those of format 4 ('more')"),
-        ("CREATE TRIGGER t AFTER DELETE ON grid BEGIN DELETE FROM loop; END", "format 4 ('t')"),
+        ("CREATE VIEW more AS SELECT * FROM grid", "its tables are not those of format 5 ('more')"),
+        ("CREATE TRIGGER t AFTER DELETE ON grid BEGIN DELETE FROM loop; END", "format 5 ('t')"),
         ("DELETE FROM session WHERE id = 2", "belongs to no session"),
     ],
 )

@@ -21,6 +21,7 @@ from signature.database.maintenance import check, copy, merge
 from signature.database.protocol import Entry
 from signature.database.sqlite import schema
 from signature.database.sqlite.database import store
+from signature.seen_places import PROFILE_BEARINGS, SIGNATURE_COLUMNS, SeenPlaces
 from tests.helpers.databases import (
     assert_holds,
     everything,
@@ -30,6 +31,7 @@ from tests.helpers.databases import (
     without_points,
 )
 
+TABLES_OF_5 = "4febdfc79861d299"
 TABLES_OF_4 = "426a35821938db4a"
 TABLES_OF_3 = "3cd6744c04d08d3b"
 TABLES_OF_2 = "8636326504420fd1"
@@ -45,7 +47,7 @@ TABLE_OF_2 = (
     " pairs BLOB NOT NULL, measured BLOB NOT NULL, information BLOB NOT NULL, accepted BLOB NOT NULL,"
     " crc32 INTEGER NOT NULL)"
 )
-LATEST = 4
+LATEST = 5
 
 
 def entries(version: int) -> list[Entry]:
@@ -56,7 +58,7 @@ def entries(version: int) -> list[Entry]:
     return [without_points(with_graph_of_grid(entry)) for entry in made]
 
 
-@pytest.fixture(params=[1, 2, 3])
+@pytest.fixture(params=[1, 2, 3, 4])
 def version(request: pytest.FixtureRequest) -> int:
     """An older format."""
     return int(request.param)
@@ -73,6 +75,7 @@ def old(version: int, tmp_path: Path) -> Path:
     connection.execute("ATTACH ? AS today", (str(today),))
     statements = TABLES_OF_1.strip().splitlines() + [TABLE_OF_2] * (version >= 2)
     statements += [schema.statements(3)["graph"]] * (version >= 3)
+    statements += [schema.statements(4)["points"]] * (version >= 4)
     for statement in statements:
         connection.execute(statement)
         table = statement.split()[2]
@@ -90,8 +93,8 @@ def test_the_tables_are_unchanged() -> None:
         tables = migrations.tables_of(version, schema.TABLES)
         return hashlib.sha256(json.dumps(tables, sort_keys=True).encode()).hexdigest()[:16]
 
-    assert (migrations.FORMAT, digest(4)) == (LATEST, TABLES_OF_4)
-    assert (digest(3), digest(2)) == (TABLES_OF_3, TABLES_OF_2)
+    assert (migrations.FORMAT, digest(5)) == (LATEST, TABLES_OF_5)
+    assert (digest(4), digest(3), digest(2)) == (TABLES_OF_4, TABLES_OF_3, TABLES_OF_2)
     assert list(schema.statements(1).values()) == TABLES_OF_1.strip().splitlines()
     assert schema.statements(2)["loop"] == TABLE_OF_2
 
@@ -181,6 +184,30 @@ def test_damage_in_a_file_of_an_older_format_is_found(old: Path, tmp_path: Path)
     assert copy(old, tmp_path / "good.submaps", recover=True) == (problem,)
     with open_database(tmp_path / "good.submaps") as database:
         assert [info.name for info in database.sessions()] == ["monday"]
+
+
+def test_a_stored_isovist_is_as_it_was() -> None:
+    """The bytes of a row of format 5, written down."""
+    ranges = np.arange(2 * PROFILE_BEARINGS).reshape(2, PROFILE_BEARINGS)
+    columns = np.arange(2 * SIGNATURE_COLUMNS).reshape(2, SIGNATURE_COLUMNS)
+    row = serialize.isovist_row(SeenPlaces(sight_m=5.0, ranges=ranges, signatures=columns))
+    assert (row["count"], row["bearings"], row["columns"], row["sight_m"]) == (2, 48, 111, 5.0)
+    assert zlib.decompress(row["ranges"]) == bytes(range(96))
+    assert zlib.decompress(row["seen"])[:4] == bytes((0, 111, 1, 112))
+
+
+def test_what_is_seen_from_the_places_of_an_older_file_is_stored_by_a_copy(old: Path, tmp_path: Path) -> None:
+    with open_database(old) as database:
+        assert database.seen_places("monday") is None
+    store(old, [make_entry("friday", 5)], keep=True)
+    copy(old, tmp_path / "copied.submaps")
+    with open_database(old) as part, open_database(tmp_path / "copied.submaps") as whole:
+        assert part.seen_places("monday") is None and part.seen_places("friday") is not None
+        table, grid, seen = whole.signatures("tuesday"), whole.grid("tuesday"), whole.seen_places("tuesday")
+    assert seen is not None
+    expected = SeenPlaces.of(grid, table.center_m, 5.0)
+    assert np.array_equal(seen.ranges, expected.ranges)
+    assert np.array_equal(seen.signatures, expected.signatures)
 
 
 @pytest.mark.fault(43)

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pc2grid.errors import DatabaseCorrupt
+from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid, SessionMap, Trajectory
+from pc2grid.observer import Observer
 from pc2grid.submaps.partition import partition
 from signature.config import Config
-from signature.database import open_database
+from signature.database import maintenance, open_database, serialize
+from signature.database.sqlite import rows
 from signature.relocalization import map_index as building_file
+from signature.relocalization.query_map import query_of
 from signature.relocalization.relocalizer import MapIndex, locate_map
 from signature.retrieval import viewpoints
+from signature.retrieval.view import View
+from signature.seen_places import SeenPlaces
 from signature.sessions import add_session, provenance
 from tests.helpers.simulated_drives import building, office, plan
 
@@ -25,6 +34,13 @@ MAPS = {
 }
 ALL = building(MAPS)
 PART = MAPS["office"].crop((8.0, 7.0), 5.0)
+SEEN = {
+    name: SeenPlaces.of(
+        grid, ALL.places.table.center_m[ALL.places.table.session_index == number], ALL.places.sight_m
+    )
+    for number, (name, grid) in enumerate(MAPS.items())
+}
+"""What is seen from the places of each map, as a database stores it."""
 
 
 class _Counted(Mapping[str, OccupancyGrid]):
@@ -48,7 +64,7 @@ def test_few_maps_are_read_and_the_answer_is_the_same(monkeypatch: pytest.Monkey
     areas_m2 = {name: float(grid.free.sum()) * 0.05**2 for name, grid in MAPS.items()}
     monkeypatch.setattr(viewpoints, "AT_ONCE_M2", 2 * max(areas_m2.values()))
     maps = _Counted()
-    large = MapIndex(maps, ALL.places.table, ALL.made_with, Config(), areas_m2=areas_m2)
+    large = MapIndex(maps, ALL.places.table, ALL.made_with, Config(), areas_m2=areas_m2, stored=SEEN.get)
     assert maps.read == []
     answer = locate_map(PART, large)
     assert 1 <= len(maps.read) <= 3 and len(set(maps.read)) == len(maps.read) and "office" in maps.read
@@ -64,15 +80,30 @@ def test_a_map_larger_than_what_is_searched_at_once_is_still_searched(
     monkeypatch.setattr(viewpoints, "AT_ONCE_M2", 1.0)
     areas_m2 = {name: float(grid.free.sum()) * 0.05**2 for name, grid in MAPS.items()}
     maps = _Counted()
-    answer = locate_map(PART, MapIndex(maps, ALL.places.table, ALL.made_with, Config(), areas_m2=areas_m2))
+    index = MapIndex(maps, ALL.places.table, ALL.made_with, Config(), areas_m2=areas_m2, stored=SEEN.get)
+    answer = locate_map(PART, index)
     assert answer.session == "office" and maps.read == ["office"]
 
 
-def test_a_stored_map_is_read_when_it_matters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file, config = tmp_path / "large.submaps", ALL.made_with
+class News(Observer):
+    """The progress and the warnings."""
+
+    def __init__(self) -> None:
+        self.shares: list[float] = []
+        self.warnings: list[str] = []
+
+    def on_progress(self, share: float) -> None:
+        self.shares.append(share)
+
+    def on_warning(self, text: str) -> None:
+        self.warnings.append(text)
+
+
+def store_maps(file: Path, maps: Mapping[str, OccupancyGrid]) -> None:
+    """A database of drawn maps."""
+    config = ALL.made_with
     still = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
-    for name in ("other0", "office"):
-        grid = MAPS[name]
+    for name, grid in maps.items():
         made = SessionMap(
             session=name,
             sensor="map",
@@ -81,6 +112,24 @@ def test_a_stored_map_is_read_when_it_matters(tmp_path: Path, monkeypatch: pytes
             trajectory=still,
         )
         add_session(file, made, config, provenance(Path(name), "0" * 64, config))
+
+
+def query_views() -> tuple[View, ...]:
+    """The views of `PART`."""
+    made_with = ALL.made_with
+    return query_of(
+        PART,
+        np.empty((0, 2)),
+        partition=made_with.partition,
+        signature=made_with.signature,
+        config=made_with.relocalize,
+        T_odom_base=SE2(),
+    ).views
+
+
+def test_a_stored_map_is_read_when_it_matters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, config = tmp_path / "large.submaps", ALL.made_with
+    store_maps(file, {name: MAPS[name] for name in ("other0", "office")})
     monkeypatch.setattr(viewpoints, "AT_ONCE_M2", 1.0)
     monkeypatch.setattr(building_file, "AT_ONCE_M2", 1.0)
     with open_database(file) as database:
@@ -89,3 +138,47 @@ def test_a_stored_map_is_read_when_it_matters(tmp_path: Path, monkeypatch: pytes
         monkeypatch.setattr(database, "grid", lambda name: (read.append(name), take(name))[1])
         answer = locate_map(PART, MapIndex.of(database, config))
     assert answer.session == "office" and read == ["office"]
+
+
+def test_places_are_selected_by_what_is_stored_and_computed_where_it_is_not(tmp_path: Path) -> None:
+    """A database of more places than are all compared, of which only a share is selected."""
+    file, copied = tmp_path / "old.submaps", tmp_path / "copied.submaps"
+    store_maps(file, MAPS)
+    settings = ALL.made_with.relocalize.model_copy(update={"all_places": 0, "shortlist": 2})
+    config = ALL.made_with.model_copy(update={"relocalize": settings})
+    with contextlib.closing(sqlite3.connect(file)) as connection:
+        connection.execute("DELETE FROM isovist")
+        empty = {"session_id": 1, **serialize.isovist_row(None)}
+        for number in range(1, 1 + len(MAPS)):
+            rows.insert(connection, "isovist", {**empty, "session_id": number})
+        connection.commit()
+    maintenance.copy(file, copied)
+    answers, news = {}, {}
+    for path in (file, copied):
+        news[path] = News()
+        with open_database(path) as database:
+            index = MapIndex.of(database, config, news[path])
+            assert len(index.places.select(query_views(), index.made_with.signature, index.config).rows) < 20
+            answers[path] = locate_map(PART, index)
+    assert answers[file].session == answers[copied].session == "office"
+    assert answers[file].T_map_base == answers[copied].T_map_base
+    (warning,) = news[file].warnings
+    assert "old.submaps: lacks what is seen from the places of 7 of its 7 sessions" in warning
+    assert news[copied].warnings == [] and news[copied].shares[-1] == 1.0
+
+
+def test_damage_to_what_is_seen_costs_no_answer(tmp_path: Path) -> None:
+    file = tmp_path / "x.submaps"
+    store_maps(file, {"office": MAPS["office"]})
+    with contextlib.closing(sqlite3.connect(file)) as connection:
+        connection.execute("UPDATE isovist SET crc32 = crc32 + 1")
+        connection.commit()
+    settings = ALL.made_with.relocalize.model_copy(update={"all_places": 0})
+    with open_database(file) as database:
+        assert database.leave_out_damaged() == ()
+        with pytest.raises(DatabaseCorrupt, match="wrong checksum"):
+            database.seen_places("office")
+        news = News()
+        index = MapIndex.of(database, ALL.made_with.model_copy(update={"relocalize": settings}), news)
+        assert locate_map(PART, index).status == "located"
+    assert len(news.warnings) == 1

@@ -154,7 +154,13 @@ def test_schema_of_another_version(filled: str, number: int, error: type[Databas
 
 @pytest.mark.fault(44)
 @pytest.mark.parametrize(
-    ("version", "since"), [(1, ["loop", "graph", "points"]), (2, ["graph", "points"]), (3, ["points"])]
+    ("version", "since"),
+    [
+        (1, ["loop", "graph", "points", "isovist"]),
+        (2, ["graph", "points", "isovist"]),
+        (3, ["points", "isovist"]),
+        (4, ["isovist"]),
+    ],
 )
 def test_a_database_of_an_older_format_is_read_as_it_is_and_migrated_when_written(
     url: str, version: int, since: list[str]
@@ -178,7 +184,7 @@ def test_a_database_of_an_older_format_is_read_as_it_is_and_migrated_when_writte
         assert len(early.loops("monday")) == len(plain[0][0].loops)
         assert early.check() == ()
     with open_database(url) as late, postgresql.connect(url) as connection:
-        assert connection.execute("SELECT format FROM pc2grid.about").fetchone() == (4,)
+        assert connection.execute("SELECT format FROM pc2grid.about").fetchone() == (5,)
         for entry in (*plain, make_entry("friday", 5)):
             assert_holds(late, entry)
         assert late.check() == ()
@@ -301,6 +307,7 @@ def test_writer_that_waits_too_long_is_told(filled: str, monkeypatch) -> None:
         ("loop", "measured", "set_byte(measured, 9, 1)"),
         ("graph", "length_m", "set_byte(length_m, 9, 1)"),
         ("points", "within", "set_byte(within, 9, 1)"),
+        ("isovist", "seen", "set_byte(seen, 9, 1)"),
         ("submap", "center_x_m", "center_x_m + 1"),
         ("signature", "boundary", "set_byte(boundary, 9, 1)"),
         ("signature", "embedding", "embedding + embedding"),
@@ -322,6 +329,7 @@ def test_changed_rows_are_found(filled: str, table: str, column: str, value: str
             database.loops(info.name)
             database.graph(info.name)
             database.points(info.name)
+            database.seen_places(info.name)
             list(database.submaps(info.name))
         database.signatures()
 

@@ -36,7 +36,7 @@ def change(url: str, *statements: str) -> None:
             connection.execute(statement)
 
 
-@pytest.mark.parametrize("table", ["grid", "trajectory", "loop", "graph", "points", "signature"])
+@pytest.mark.parametrize("table", ["grid", "trajectory", "loop", "graph", "points", "isovist", "signature"])
 def test_a_row_that_is_gone_is_missed_by_name(url: str, tmp_path: Path, table: str) -> None:
     change(url, f"DELETE FROM pc2grid.{table} WHERE session_id = 1")
     uses: dict[str, Callable[[Any], object]] = {
@@ -45,6 +45,7 @@ def test_a_row_that_is_gone_is_missed_by_name(url: str, tmp_path: Path, table: s
         "loop": lambda database: database.loops("monday"),
         "graph": lambda database: database.graph("monday"),
         "points": lambda database: database.points("monday"),
+        "isovist": lambda database: database.seen_places("monday"),
         "signature": lambda database: database.grid("monday"),
     }
     reads: dict[str, Callable[[Any], object]] = {
@@ -53,6 +54,7 @@ def test_a_row_that_is_gone_is_missed_by_name(url: str, tmp_path: Path, table: s
         "loop": lambda database: database.loops("monday"),
         "graph": lambda database: database.graph("monday"),
         "points": lambda database: database.points("monday"),
+        "isovist": lambda database: database.seen_places("monday"),
         "signature": lambda database: list(database.submaps("monday")),
     }
     words = f"session 1: has no {table}" if table in ("grid", "trajectory") else f"{table} .*missing"
@@ -92,7 +94,7 @@ def test_merging_takes_nothing_from_a_damaged_database(url: str, tmp_path: Path)
 
 def test_tables_that_are_not_ours(url: str) -> None:
     change(url, "ALTER TABLE pc2grid.loop RENAME COLUMN accepted TO believed")
-    with open_database(url) as database, pytest.raises(DatabaseCorrupt, match="not those of format 4"):
+    with open_database(url) as database, pytest.raises(DatabaseCorrupt, match="not those of format 5"):
         database.loops("monday")
     change(url, "DELETE FROM pc2grid.about")
     with pytest.raises(DatabaseCorrupt, match=r"pc2grid\.about has 0 rows instead of one"):

@@ -30,6 +30,7 @@ from signature.evaluation.selection import (
 from signature.evaluation.sensor_map import SensorMap
 from signature.relocalization.query_map import QueryWindow
 from signature.retrieval.place_index import PlaceBlock
+from signature.seen_places import SeenPlaces
 from tests.helpers.json_schema import closed
 from tests.helpers.simulated_drives import building, drive, office, plan
 
@@ -72,11 +73,11 @@ def test_places_are_selected_without_locating_the_query() -> None:
 
 def made_up_floor(seed: int, _: object) -> PlaceBlock:
     """500 places that look like nothing."""
-    rng, places = np.random.default_rng(seed), OFFICE.places.described()
-    signatures = rng.normal(3, 1, (500, places.signatures.shape[1])).astype(np.float32)
-    ranges_m = rng.uniform(0.2, 5.0, (500, places.ranges_m.shape[1])).astype(np.float32)
-    ends = np.ones(ranges_m.shape, np.int8)
-    return PlaceBlock(signatures, ranges_m, ends, rng.uniform(0, 20, (500, 2)), np.full(500, seed))
+    rng, known = np.random.default_rng(seed), OFFICE.places.described().seen
+    signatures = rng.integers(200, 256, (500, known.signatures.shape[1]))
+    ranges = rng.integers(10, 255, (500, known.ranges.shape[1]))
+    seen = SeenPlaces(sight_m=known.sight_m, ranges=ranges, signatures=signatures)
+    return PlaceBlock(seen, rng.uniform(0, 20, (500, 2)), np.full(500, seed))
 
 
 def test_a_query_from_elsewhere_is_not_counted() -> None:

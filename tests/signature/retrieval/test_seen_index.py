@@ -6,8 +6,8 @@ import numpy as np
 
 from pc2grid.submaps.isovist import Isovist, isovist
 from signature.retrieval.seen_index import SeenIndex
-from signature.retrieval.view import PROFILE_BEARINGS
 from signature.seen import seen_signatures
+from signature.seen_places import PROFILE_BEARINGS
 from tests.helpers.simulated_drives import building, office
 
 OFFICE = building({"office": office()})
