@@ -350,7 +350,7 @@ def test_newer_format_is_refused_by_number(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[60:64] = (99).to_bytes(4, "big")
     path.write_bytes(data)
-    with pytest.raises(DatabaseVersion, match="format 99; this pc2grid reads up to 4"):
+    with pytest.raises(DatabaseVersion, match="format 99; this pc2grid reads up to 5"):
         open_database(path)
 
 
@@ -408,6 +408,7 @@ def test_flipped_bit_in_any_blob_is_found_where_integrity_check_is_blind(path: P
             database.loops(info.name)
             database.graph(info.name)
             database.points(info.name)
+            database.seen_places(info.name)
             list(database.submaps(info.name))
         database.signatures()
     assert "db check" in str(caught.value)

@@ -95,6 +95,8 @@ def read_all(file: maintenance.Place) -> dict[str, str]:
             digest.update(repr(trajectory.health).encode())
             digest.update(repr(database.loops(info.name)).encode())
             digest.update(repr(database.graph(info.name).edges(data=True)).encode())
+            seen = database.seen_places(info.name)
+            digest.update(b"" if seen is None else seen.ranges.tobytes() + seen.signatures.tobytes())
             points = database.points(info.name)
             digest.update(b"" if points is None else points.points_m().tobytes())
             for submap in database.submaps(info.name):
@@ -128,13 +130,17 @@ def set_header(offset: int, value: int) -> Callable[[bytes], bytes]:
         (lambda data: data[:100] + bytes(len(data) - 100), DatabaseCorrupt, "x.submaps"),
         (lambda data: bytes(range(256)) * 64, NotADatabase, "not a pc2grid database"),
         (set_header(68, 0), NotADatabase, "another program's SQLite file (application id 0x0)"),
-        (set_header(60, 5), DatabaseVersion, "database format 5; this pc2grid reads up to 4"),
+        (set_header(60, 6), DatabaseVersion, "database format 6; this pc2grid reads up to 5"),
         (
             set_header(60, 1),
             DatabaseCorrupt,
-            "its tables are not those of format 1 ('graph', 'loop', 'points')",
+            "its tables are not those of format 1 ('graph', 'isovist', 'loop', 'points')",
         ),
-        (set_header(60, 2), DatabaseCorrupt, "its tables are not those of format 2 ('graph', 'points')"),
+        (
+            set_header(60, 2),
+            DatabaseCorrupt,
+            "its tables are not those of format 2 ('graph', 'isovist', 'points')",
+        ),
         (set_header(60, 2**31 - 1), DatabaseVersion, "database format 2147483647"),
         (set_header(60, 0), DatabaseCorrupt, "database format 0 never existed"),
     ],
@@ -189,7 +195,7 @@ def test_command_line_refuses_a_newer_format_in_one_line(path: Path) -> None:
     done = pc2grid("db", "info", path.name, cwd=path.parent)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.splitlines() == [
-        "pc2grid: error: x.submaps: database format 7; this pc2grid reads up to 4",
+        "pc2grid: error: x.submaps: database format 7; this pc2grid reads up to 5",
         "hint: use a newer pc2grid",
     ]
 

@@ -140,7 +140,7 @@ def test_server_without_pgvector(url: str, monkeypatch) -> None:
 @pytest.mark.parametrize(
     ("number", "error", "words"),
     [
-        (99, DatabaseVersion, r"format 99; this pc2grid reads up to 4 \(use a newer"),
+        (99, DatabaseVersion, r"format 99; this pc2grid reads up to 5 \(use a newer"),
         (0, DatabaseCorrupt, "never existed"),
     ],
 )
