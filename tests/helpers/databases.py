@@ -224,8 +224,6 @@ def digest_of(database: SubmapDatabase) -> str:
         digest.update(repr(database.loops(info.name)).encode())
         arrays = graph_to_arrays(database.graph(info.name))
         digest.update(repr([getattr(arrays, field).tolist() for field in arrays.__slots__]).encode())
-        seen = database.seen_places(info.name)
-        digest.update(b"" if seen is None else seen.ranges.tobytes() + seen.signatures.tobytes())
         points = database.points(info.name)
         digest.update(b"" if points is None else points.points_m().tobytes())
         for submap in database.submaps(info.name):
