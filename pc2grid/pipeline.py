@@ -143,7 +143,7 @@ def build_maps(
             yield scan
             observer.on_progress(_SHARE_BEFORE_LOOPS * span.share_done(scan.stamp_ns, start_ns, end_ns))
 
-    parts, storeys = _map(reported(), config, observer, recognizer)
+    parts, track = _map(reported(), config, observer, recognizer)
     sensor = log.choose().sensor
     if not any(len(part.trajectory) for part in parts):
         raise NoScans(f"{log.info.path}: no scans in the part asked for", hint="check --start and --duration")
@@ -151,11 +151,12 @@ def build_maps(
         check_followed(_in_order([part.trajectory for part in parts]), str(log.info.path))
     kept = _of_use(parts)
     read = log.report()
+    read = dataclasses.replace(read, warnings=(*read.warnings, *_cabin_warnings(track)))
     if config.projection.points_voxel_m is not None and sensor == "laser":
         no_points = "a 2D laser shows no points in space, so none are kept"
         read = dataclasses.replace(read, warnings=(*read.warnings, no_points))
     reached = [part.storey for part in kept]
-    floors, heights_m = floor_names(storeys, reached), floor_heights(storeys, reached)
+    floors, heights_m = floor_names(track.storeys, reached), floor_heights(track.storeys, reached)
     reports = _reports(read, session, parts, kept, floors)
     maps = []
     for number, (part, report) in enumerate(zip(kept, reports, strict=True)):
@@ -305,7 +306,8 @@ class _Track:
     """What tracking says of all scans of a session.
 
     trajectory : before loops are closed. disagreements : of odometry, at each scan. riding : (N,) scans on a
-    ride from floor to floor. storey : (N,) number of the floor of each in `storeys`.
+    ride from floor to floor. storey : (N,) number of the floor of each in `storeys`. cabins_ns : see
+    `Tracker`.
     """
 
     trajectory: Trajectory
@@ -313,6 +315,7 @@ class _Track:
     riding: NDArray[np.bool_]
     storey: I64
     storeys: tuple[Storey, ...]
+    cabins_ns: tuple[int, ...] = ()
 
 
 def _map(
@@ -322,9 +325,9 @@ def _map(
     recognizer: PlaceRecognizer | None,
     *,
     whole: bool = False,
-) -> tuple[list[_Mapped], tuple[Storey, ...]]:
-    """Track the scans, close the loops, and draw a map of each part; see `build_maps`. Returns the floors,
-    too, that the parts are on.
+) -> tuple[list[_Mapped], _Track]:
+    """Track the scans, close the loops, and draw a map of each part; see `build_maps`. Returns what tracking
+    says, too.
 
     A part whose map contradicts itself is divided, and drawn again. whole : all scans are one part.
     """
@@ -374,6 +377,7 @@ def _map(
             np.array(riding, dtype=bool),
             np.array(storeys, dtype=np.int64),
             tracker.storeys,
+            tracker.cabins_ns,
         )
         closed = selection.closer.finish()
         if whole:
@@ -391,7 +395,7 @@ def _map(
                 dataclasses.replace(mapped, points=kept.registered(T_part_base, part == number))
                 for number, mapped in enumerate(drawn)
             ]
-    return drawn, track.storeys
+    return drawn, track
 
 
 def _draw_parts(
@@ -605,6 +609,19 @@ def _division_warning(
         f"{named}{dropped}; record with odometry, or come back to known places more often, to keep them "
         "together"
     )
+
+
+def _cabin_warnings(track: _Track) -> list[str]:
+    """A sentence that says where the robot may have taken a lift unnoticed, and what to do."""
+    if not track.cabins_ns:
+        return []
+    start_ns = int(track.trajectory.stamps_ns[0])
+    times = ", ".join(f"{(stamp_ns - start_ns) * 1e-9:.0f} s" for stamp_ns in track.cabins_ns)
+    return [
+        f"the robot stood in a room as small as a lift, its door out of sight, {times} after the first scan; "
+        "if it left on another floor, the map shows two floors as one: convert each by itself, with --start, "
+        "--duration and --floor"
+    ]
 
 
 def _in_order(parts: Sequence[Trajectory]) -> Trajectory:

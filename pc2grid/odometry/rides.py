@@ -17,7 +17,7 @@ from pc2grid.arrays import F32, F64, I64
 from pc2grid.clouds.ground import Ground
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.upright import CAMERA_UPRIGHT, UPRIGHT, vertical_of
-from pc2grid.geometry import SE2
+from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.model import Scan, SensorKind, Storey
 
 
@@ -51,6 +51,9 @@ class RideParameters:
     shut_s, still_m : least time for which it is shut, and how far the robot moves meanwhile, and until the
         door is open, at most.
     door : neighbouring sectors that are open when the door is.
+    turned_rad : a robot that turns by more does not stand. around, opening : least sectors that are near, and
+        most that are far, around a robot that stood in what may be the cabin of a lift, whose door it did not
+        look at. The door of a cabin spans 62 degrees.
     """
 
     level_every_m: float = 0.3
@@ -74,6 +77,9 @@ class RideParameters:
     shut_s: float = 3.0
     still_m: float = 0.1
     door: int = 4
+    turned_rad: float = 0.1
+    around: int = 36
+    opening: int = 16
 
 
 RIDES = RideParameters()
@@ -98,13 +104,16 @@ class RideWatch:
     """Follows the rides of a session, scan by scan.
 
     storeys : the floors so far, in the order in which they were first reached. storey : number of the
-    present one.
+    present one. cabins_ns : stamps at which the robot began to stand in what may have been a lift, whose door
+    was out of sight.
     """
 
     def __init__(self, parameters: RideParameters = RIDES) -> None:
         self._parameters = parameters
         self._slope: _Slope | None = None
         self._lift = _Lift(parameters)
+        self._cabin = _Cabin(parameters)
+        self.cabins_ns: list[int] = []
         self.storeys: list[Storey] = [Storey(group=0, height_m=0.0)]
         self.storey = 0
 
@@ -123,8 +132,12 @@ class RideWatch:
         last scan. ground : the floor in the base frame; None for a planar laser and for a sensor in the hand.
         """
         on_slope = self._slope is not None and self._slope.underway  # where landings are as small as cabins
-        if not on_slope and self._lift.observe(planar_scan, SE2.from_matrix(pose)):
-            self._slope = None
+        place = SE2.from_matrix(pose)
+        stood_ns = self._cabin.observe(planar_scan, place)
+        if stood_ns is not None and not on_slope:
+            self.cabins_ns.append(stood_ns)
+        if not on_slope and self._lift.observe(planar_scan, place):
+            self._slope, self._cabin = None, _Cabin(self._parameters)
             self.storeys.append(Storey(group=self.storeys[-1].group + 1, height_m=0.0))
             self.storey = len(self.storeys) - 1
             return Ride(arrived=True)
@@ -296,6 +309,49 @@ class _Lift:
             return False
         self._shut_ns = 0
         return True
+
+
+class _Cabin:
+    """Watches for a robot that stands and turns in a room as small as the cabin of a lift, and that sees too
+    little at a time to notice a door behind it."""
+
+    def __init__(self, parameters: RideParameters) -> None:
+        self._parameters = parameters
+        self._start(0, SE2())
+
+    def _start(self, stamp_ns: int, at: SE2) -> None:
+        self._at = at
+        self._still = stamp_ns, at.yaw  # since when, and in which direction
+        self._stood = 0, stamp_ns  # the longest time, and since when
+        self._far: I64 = np.full(self._parameters.sectors, -1)  # 1: far, 0: near, -1: not seen yet
+        self._at_once = 0  # most sectors that one scan has shown
+
+    def observe(self, planar_scan: PlanarScan, pose: SE2) -> int | None:
+        """Take in a scan at its pose; returns, when the robot has left such a room, since when it stood."""
+        p, stamp_ns = self._parameters, planar_scan.stamp_ns
+        left_ns = None
+        if math.hypot(pose.x - self._at.x, pose.y - self._at.y) > p.still_m:
+            left_ns = self._stood[1] if self._was_cabin else None
+            self._start(stamp_ns, pose)
+        if abs(wrap_angle(pose.yaw - self._still[1])) > p.turned_rad:
+            self._still = stamp_ns, pose.yaw
+        self._stood = max(self._stood, (stamp_ns - self._still[0], self._still[0]))
+        near_m, far_m = _ranges(planar_scan, p.sectors, pose.yaw)
+        far, near = far_m >= p.far_m, (near_m < p.near_m) & (far_m < p.far_m)
+        self._far[near] = 0
+        self._far[far] = 1
+        self._at_once = max(self._at_once, int((near | far).sum()))
+        return left_ns
+
+    @property
+    def _was_cabin(self) -> bool:
+        p = self._parameters
+        return (
+            self._stood[0] >= p.shut_s * 1e9
+            and self._at_once < p.seen
+            and int((self._far == 0).sum()) >= p.around
+            and int((self._far == 1).sum()) <= p.opening
+        )
 
 
 def _ranges(planar_scan: PlanarScan, sectors: int, yaw_rad: float) -> tuple[F64, F64]:

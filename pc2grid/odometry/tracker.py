@@ -95,6 +95,11 @@ class Tracker:
         """The floors so far, in the order in which they were first reached."""
         return tuple(self._rides.storeys)
 
+    @property
+    def cabins_ns(self) -> tuple[int, ...]:
+        """Stamps at which the robot began to stand in what may have been a lift, its door out of sight."""
+        return tuple(self._rides.cabins_ns)
+
     def start(self, scan: Scan) -> Tracked:
         """Begin with the first scan: find the floor, and put the base at the origin of the session frame."""
         points = self._deskewed(scan, *self._motion.within(scan, None))

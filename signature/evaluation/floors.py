@@ -18,7 +18,7 @@ import numpy as np
 from pc2grid.arrays import F64
 from pc2grid.model import SensorKind, Trajectory
 from pc2grid.simulate import HouseConfig, SimulationConfig, prepare_house_session, simulate_session
-from pc2grid.simulate.config import LidarConfig
+from pc2grid.simulate.config import DepthConfig, LidarConfig
 from pc2grid.simulate.session import EPOCH_NS
 from signature.config import Config
 from signature.database import Label, open_database
@@ -31,6 +31,7 @@ WAYS: tuple[Way, ...] = ("stairs", "lift", "logs")
 
 _LIDAR = LidarConfig(columns=450, rate_hz=5.0)
 """Half the points and half the scans of the default, which halves the time twice."""
+_DEPTH = DepthConfig(rate_hz=5.0)
 _MOSTLY = 0.98
 """A session shows a floor if so much of its trajectory is there: the door of a lift opens before it is seen
 to. Chosen by hand."""
@@ -41,24 +42,31 @@ class FloorTask:
     """One house and the queries in it.
 
     seed : of the plan, the furniture and the routes. alike : the same furniture in the same places on every
-    floor. length_m, query_m : travel on each floor, of the map and of a query. queries : on each floor.
+    floor. visits : floors in the order in which the map's recording reaches them. length_m, query_m : travel
+    on each visit, of the map and of a query. queries : on each floor.
     """
 
     seed: int
     way: Way
     alike: bool
     sensor: SensorKind = "lidar"
-    floors: int = 3
+    visits: tuple[int, ...] = (0, 1, 2)
     length_m: float = 15.0
     query_m: float = 8.0
     queries: int = 2
+
+    @property
+    def floors(self) -> tuple[int, ...]:
+        """The floors that are visited, from the lowest one."""
+        return tuple(sorted(set(self.visits)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FloorResult:
     """What became of a house.
 
-    told_apart : every session is on one floor, every floor has one, and no two floors have the same name.
+    told_apart : every session is on one floor, every floor has one, no two floors have the same name, and no
+    floor has two, if it was visited twice.
     named : the names are the numbers of the floors, which a lift does not show.
     right, wrong : queries located on the right floor, and on a wrong one. ambiguous, not_found : the others.
     misplaced : of the right ones, those that are off by more than half a metre.
@@ -95,7 +103,7 @@ def run_floors(task: FloorTask, config: Config = Config()) -> FloorResult:
         by_name = {part.session: part for part in parts}
         names = {part.floor: part.name for part in parts}
         counts: Counter[str] = Counter()
-        for floor in range(task.floors):
+        for floor in task.floors:
             for number in range(task.queries):
                 status, session, error_m = _ask(task, Path(folder), floor, number, by_name, config)
                 if status == "located":
@@ -106,7 +114,9 @@ def run_floors(task: FloorTask, config: Config = Config()) -> FloorResult:
     pure = all(part.purity >= _MOSTLY for part in parts)
     same_floor_same_name = all(names[part.floor] == part.name for part in parts)
     return FloorResult(
-        told_apart=pure and same_floor_same_name and len(set(names.values())) == task.floors == len(names),
+        told_apart=pure
+        and same_floor_same_name
+        and len(set(names.values())) == len(task.floors) == len(names),
         named=all(name == str(floor) for floor, name in names.items()),
         right=counts["right"],
         wrong=counts["wrong"],
@@ -117,22 +127,27 @@ def run_floors(task: FloorTask, config: Config = Config()) -> FloorResult:
 
 
 def _simulation(task: FloorTask, seed: int, length_m: float) -> SimulationConfig:
-    return SimulationConfig(length_m=length_m, seed=seed, building_seed=task.seed, clutter=20, lidar=_LIDAR)
+    return SimulationConfig(
+        length_m=length_m, seed=seed, building_seed=task.seed, clutter=20, lidar=_LIDAR, depth=_DEPTH
+    )
 
 
 def _house(task: FloorTask, visits: tuple[int, ...]) -> HouseConfig:
     ride: Literal["stairs", "lift"] = "lift" if task.way == "lift" else "stairs"
     return HouseConfig(
-        visits=visits, floors=task.floors, ride=ride, alike=task.alike, furniture_seed=task.seed
+        visits=visits,
+        floors=max(task.visits) + 1,
+        ride=ride,
+        alike=task.alike,
+        furniture_seed=task.seed,
     )
 
 
 def _build(task: FloorTask, folder: Path, config: Config) -> list[_Part]:
     """Record the house and convert it; the sessions that this makes."""
     database = folder / "house.submaps"
-    every = tuple(range(task.floors))
     parts: list[_Part] = []
-    for number, visits in enumerate([(floor,) for floor in every] if task.way == "logs" else [every]):
+    for number, visits in enumerate([(k,) for k in task.visits] if task.way == "logs" else [task.visits]):
         house, simulation = _house(task, visits), _simulation(task, 100 + number, task.length_m)
         log = folder / f"log{number}.mcap"
         simulate_session(log, sensor=task.sensor, house=house, config=simulation)

@@ -10,6 +10,7 @@ import typer
 
 from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
+from pc2grid_cli.simulate import SensorName
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -22,6 +23,8 @@ def compare_floors_command(
     context: typer.Context,
     ways: Annotated[str, typer.Option(help="how the house becomes a database")] = "stairs,lift,logs",
     seeds: Annotated[str, typer.Option(help="of the houses, for example 1,2,3")] = "1,2",
+    visits: Annotated[str, typer.Option(help="floors in the order in which they are reached")] = "0,1,2",
+    sensor: Annotated[SensorName, typer.Option(help="of maps and queries")] = SensorName.lidar,
     length: Annotated[float, typer.Option(min=8.0, metavar="M", help="metres to drive on each floor")] = 15.0,
     query: Annotated[float, typer.Option(min=1.0, metavar="M", help="the same of a query")] = 8.0,
     queries: Annotated[int, typer.Option(min=1, help="on each floor")] = 2,
@@ -30,9 +33,11 @@ def compare_floors_command(
     ),
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON document, not a table")] = False,
 ) -> None:
-    """Are floors told apart, and is the right one found? Simulated houses of three floors with one plan.
+    """Are floors told apart, and is the right one found? Simulated houses whose floors have one plan.
 
     Each house twice: with the same furniture everywhere, and with other furniture on each floor.
+
+    Wrong up to: what so few queries leave possible, at 95 % (Wilson's interval).
 
     Example: pc2grid compare floors --seeds 1,2,3
     """
@@ -45,12 +50,18 @@ def compare_floors_command(
     unknown = [name for name in names if name not in WAYS]
     if unknown:
         raise ConfigError(f"--ways: no way {unknown[0]!r}", hint=f"known are {', '.join(WAYS)}")
-    try:
-        numbers = [int(word) for word in seeds.split(",")]
-    except ValueError:
-        raise ConfigError(f"--seeds: expected whole numbers, found {seeds!r}") from None
+    numbers, floors = _whole_numbers(seeds, "--seeds"), _whole_numbers(visits, "--visits")
     tasks = [
-        FloorTask(seed=seed, way=way, alike=alike, length_m=length, query_m=query, queries=queries)
+        FloorTask(
+            seed=seed,
+            way=way,
+            alike=alike,
+            sensor=sensor.value,
+            visits=floors,
+            length_m=length,
+            query_m=query,
+            queries=queries,
+        )
         for seed in numbers
         for way in WAYS
         if way in names
@@ -69,6 +80,15 @@ def compare_floors_command(
     show(_table(rows))
 
 
+def _whole_numbers(text: str, option: str) -> tuple[int, ...]:
+    from pc2grid.errors import ConfigError
+
+    try:
+        return tuple(int(word) for word in text.split(","))
+    except ValueError:
+        raise ConfigError(f"{option}: expected whole numbers, found {text!r}") from None
+
+
 def _row(task: FloorTask, out: Path) -> FloorRow:
     """The result of one house; computed unless it is in the folder."""
     from dataclasses import asdict
@@ -78,7 +98,8 @@ def _row(task: FloorTask, out: Path) -> FloorRow:
 
     furniture = "alike" if task.alike else "differs"
     travel = f"{task.length_m:g}m.{task.query_m:g}m.{task.queries}"
-    file = out / f"{task.way}.{furniture}.{task.seed}.{travel}.json"
+    visits = "".join(map(str, task.visits))
+    file = out / f"{task.sensor}.{task.way}.{visits}.{furniture}.{task.seed}.{travel}.json"
     if not file.exists():
         row = {**asdict(task), **asdict(run_floors(task))}
         with replace_file(file) as draft:
@@ -97,15 +118,19 @@ _ANSWERS: tuple[Literal["right", "ambiguous", "not_found", "wrong", "misplaced"]
 
 
 def _table(rows: list[FloorRow]) -> Table:
+    from scipy.stats import binomtest
+
     from pc2grid_cli.tables import table
 
     made = table(
-        "three floors with one plan",
+        "floors with one plan",
         ("by", "furniture"),
-        ("houses", "told apart", "named", *(name.replace("_", " ") for name in _ANSWERS)),
+        ("houses", "told apart", "named", *(name.replace("_", " ") for name in _ANSWERS), "wrong up to"),
     )
     for way, alike in dict.fromkeys((row["way"], row["alike"]) for row in rows):
         group = [row for row in rows if (row["way"], row["alike"]) == (way, alike)]
+        asked = sum(row["queries"] * len(set(row["visits"])) for row in group)
+        wrong = binomtest(sum(row["wrong"] for row in group), asked).proportion_ci(method="wilson")
         made.add_row(
             way,
             "alike" if alike else "differs",
@@ -113,5 +138,6 @@ def _table(rows: list[FloorRow]) -> Table:
             str(sum(row["told_apart"] for row in group)),
             str(sum(row["named"] for row in group)),
             *(str(sum(row[answer] for row in group)) for answer in _ANSWERS),
+            f"{wrong.high:.1%}",
         )
     return made

@@ -419,7 +419,7 @@ class FloorRow(TypedDict):
     way: Literal["stairs", "lift", "logs"]
     alike: bool
     sensor: str
-    floors: int
+    visits: list[int]
     length_m: float
     query_m: float
     queries: int

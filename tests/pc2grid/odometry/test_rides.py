@@ -154,6 +154,39 @@ def test_a_lift_is_a_cabin_whose_door_shuts_and_opens() -> None:
     assert not rides([(3.0, False), (9.0, True), (12.0, False)], drift_m=0.8, since_s=8.8)
 
 
+def narrow_scan(seconds: float, yaw_rad: float, *, walls_m: float) -> PlanarScan:
+    """What a camera of 90 degrees sees in a square room with an open door of 60 degrees behind its start."""
+    bearing = np.arange(1440) * (2.0 * math.pi / 1440)
+    there = bearing + yaw_rad
+    away_m = walls_m / np.maximum(np.abs(np.cos(there)), np.abs(np.sin(there)))
+    away_m[np.abs(np.angle(-np.exp(1j * there))) < math.radians(30.0)] = 8.0
+    away_m[np.abs(np.angle(np.exp(1j * bearing))) > math.radians(45.0)] = 0.0
+    seen, m = away_m > 0.0, away_m[:, None]
+    hits = (m * np.column_stack((np.cos(bearing), np.sin(bearing))))[seen].astype(np.float32)
+    return PlanarScan.of_hits(
+        stamp_ns=int(seconds * 1e9), hits_m=hits, origin_m=np.zeros(2), free_m=away_m.astype(np.float32)
+    )
+
+
+@pytest.mark.parametrize(
+    ("walls_m", "stands_s", "cabins_s"),
+    [(1.0, 8.0, [0.0]), (3.0, 8.0, []), (1.0, 2.0, [])],
+    ids=["cabin", "room", "short stop"],
+)
+def test_a_camera_that_stood_in_a_cabin_may_have_taken_a_lift(
+    walls_m: float, stands_s: float, cabins_s: list[float]
+) -> None:
+    """It stands, turns by half a turn, and leaves; it never saw the door shut."""
+    watch = RideWatch()
+    scan = Scan(stamp_ns=0, points_m=np.zeros((0, 3), np.float32), T_base_sensor=np.eye(4), sensor="depth")
+    for seconds in np.arange(0.0, stands_s + 8.0, 0.2).tolist():
+        yaw = min(max(seconds - stands_s, 0.0) * 0.8, math.pi)
+        pose = SE2(-0.5 * max(seconds - stands_s - 5.0, 0.0), 0.0, yaw).lift()
+        seen = narrow_scan(seconds, yaw, walls_m=walls_m)
+        assert not watch.observe(scan, scan.points_m, seen, pose, 0.0, None).arrived
+    assert [stamp_ns * 1e-9 for stamp_ns in watch.cabins_ns] == cabins_s
+
+
 def test_level_ground_with_a_tilted_sensor_is_no_slope() -> None:
     """A mounting that is wrong by 5 degrees tilts the floor, too."""
     rng = np.random.default_rng(0)
