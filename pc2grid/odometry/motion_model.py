@@ -129,11 +129,9 @@ class MotionModel:
     def search_window(self, prediction: Prediction) -> tuple[float, float]:
         """Return how far (m, rad) the robot can be from where it is predicted."""
         p = self._parameters
-        if prediction.odometry is None:
-            sigma_m, sigma_rad = p.unsteady_mps * prediction.seconds, p.unsteady_radps * prediction.seconds
-        else:
-            variances = np.diag(np.linalg.inv(self.information(prediction)))
-            sigma_m, sigma_rad = math.sqrt(variances[0]), math.sqrt(variances[2])
+        known = self.information if prediction.odometry is not None else self.information_on_continued
+        variances = np.diag(np.linalg.inv(known(prediction)))
+        sigma_m, sigma_rad = math.sqrt(variances[0]), math.sqrt(variances[2])
         return min(p.search_sigmas * sigma_m, p.search_most_m), min(
             p.search_sigmas * sigma_rad, p.search_most_rad
         )
@@ -156,8 +154,14 @@ class MotionModel:
                     return motion, seconds
         return (np.eye(4), 0.0) if prediction is None else (prediction.motion, prediction.seconds)
 
+    def information_on_continued(self, prediction: Prediction) -> F64:
+        """Return the information (3, 3) that the motion before gives on x, y, yaw, without odometry."""
+        p, seconds = self._parameters, prediction.seconds
+        sigma_m, sigma_rad = p.unsteady_mps * seconds, p.unsteady_radps * seconds
+        return np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
+
     def information(self, prediction: Prediction) -> F64:
-        """Return the information (3, 3) of a prediction on x, y, yaw."""
+        """Return the information (3, 3) on x, y, yaw: of odometry, else of the pose that KISS-ICP found."""
         if prediction.odometry is not None:
             information = self._trust.information(prediction.odometry)
             owed_m, owed_rad = self.owed(prediction)

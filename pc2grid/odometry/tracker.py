@@ -288,14 +288,18 @@ class Tracker:
         """Match a planar scan with the local map, from KISS-ICP's pose `guess`.
 
         The prior is the predicted pose if that rests on odometry, else the guess. Where the two disagree
-        both start a refinement, and the better match is taken. For a camera on wheels that is so only if
-        the scan does not fit where odometry leads: KISS-ICP, which knows a quarter of the surroundings,
-        slides along walls, where a scan fits as well.
+        both start a refinement, and the better match is taken. For a camera on wheels the prior is always
+        the predicted pose, without odometry as the motion before continues it, and the guess counts only if
+        the scan does not fit there: KISS-ICP, which knows a quarter of the surroundings, slides along walls,
+        by up to half a metre a scan, where a scan fits as well.
         """
         p = self._parameters
         prior = guess if prediction.odometry is None else predicted
         information = self._motion.information(prediction)
-        if self._camera_on_wheels and prediction.odometry is not None:
+        if self._camera_on_wheels:
+            prior = predicted
+            if prediction.odometry is None:
+                information = self._motion.information_on_continued(prediction)
             match = self._maps.refine(planar_scan, [predicted], prior, information)
             if match is not None and self._is_sure(match):
                 return match.pose, match

@@ -67,6 +67,30 @@ def test_a_camera_keeps_its_heading_where_wheels_turn_a_tenth_too_far():
     assert worst_deg([r.T_session_base for r in follow(scan for scan, _ in pairs)]) < 0.2
 
 
+def facing_a_wall(scans, apart_ns=100_000_000):
+    """What a camera sees that stands 3 m in front of a long wall: it, and the floor before it."""
+    rng = np.random.default_rng(3)
+    for k in range(scans):
+        floor = np.column_stack((rng.uniform(1.0, 2.9, 1500), rng.uniform(-1.5, 1.5, 1500), np.zeros(1500)))
+        along, up = rng.uniform(-1.7, 1.7, 3000), rng.uniform(0.0, 2.0, 3000)
+        wall = np.column_stack((np.full(3000, 3.0), along, up))
+        points = np.concatenate((floor, wall)) + rng.normal(0.0, 0.003, (4500, 3))
+        T_base_camera = np.eye(4)
+        T_base_camera[2, 3] = 0.6
+        yield Scan(stamp_ns=k * apart_ns, points_m=points, T_base_sensor=T_base_camera, sensor="depth")
+
+
+def test_a_camera_without_odometry_does_not_follow_kiss_icp_along_a_wall(monkeypatch):
+    """KISS-ICP, which knows a quarter of the surroundings, slides by up to half a metre a scan."""
+
+    def sliding(self, points, T_session_last, predicted_motion, period_s):
+        return SE2(0.0, 0.3, 0.0).lift() @ T_session_last @ predicted_motion
+
+    monkeypatch.setattr(KissRegistration, "register", sliding)
+    registered = follow(facing_a_wall(12))
+    assert np.abs([r.T_session_base[:2, 3] for r in registered]).max() < 0.05
+
+
 def test_odometry_with_the_wrong_sign_is_overruled(laser):
     wrong = []
     for k, (scan, pose) in enumerate(laser):
