@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -17,7 +18,9 @@ from pc2grid.arrays import F64
 from pc2grid.clouds.voxel_cloud import VoxelCloud
 from pc2grid.geometry import SE2, transform_points
 from pc2grid.model import Health, PointMap, RegisteredScan
+from signature.database.protocol import SubmapDatabase
 from signature.relocalization.answer import Answer
+from signature.relocalization.confidence import LIMITS
 from signature.relocalization.hypotheses import Hypothesis
 from signature.relocalization.pose_in_space import PoseInSpace, SpaceStatus
 from signature.verification.registration import RAYS, SpatialFit, SpatialView, register_in_space
@@ -34,7 +37,7 @@ class SpaceParameters:
         contradicts.
     sure : of several places one is chosen only from this share on.
     equal : spread of this share between equal places. A place elsewhere is as likely as exp(-lead / equal).
-    places : with more places than this, none is chosen.
+    places : of more places than this, none is chosen.
     """
 
     last_m: float = 5.0
@@ -49,37 +52,65 @@ class SpaceParameters:
 
 SPACE = SpaceParameters()
 
+PointsOf = Callable[[str], PointMap | None]
+"""The points of a session by its name; None if it has none."""
+
+
+def points_reader(database: SubmapDatabase) -> PointsOf | None:
+    """Reads the points of the sessions of a database, and keeps the latest; None if none has any."""
+    if not any(info.provenance.config.projection.points_voxel_m for info in database.sessions()):
+        return None
+    return lru_cache(maxsize=SPACE.places)(database.points)
+
+
+class ViewSpacing:
+    """Which scans of a query are compared in space: one every `SPACE.every_m` of travel."""
+
+    def __init__(self) -> None:
+        self.path_m = 0.0
+        self._last_m: F64 | None = None
+
+    def takes(self, registered: RegisteredScan) -> bool:
+        """Whether the next scan is one of them. One that registration was lost on begins anew."""
+        if registered.health is Health.LOST:
+            self.__init__()  # type: ignore[misc]
+            return False
+        at_m = registered.T_session_base[:3, 3]
+        if registered.scan.sensor == "laser":
+            return False
+        if self._last_m is not None:
+            step_m = float(np.linalg.norm(at_m - self._last_m))
+            if step_m < SPACE.every_m:
+                return False
+            self.path_m += step_m
+        self._last_m = at_m
+        return True
+
 
 class QueryInSpace:
     """The scans of the last metres of a query, in its odom frame. Memory is bounded by the metres."""
 
     def __init__(self) -> None:
         self._views: deque[tuple[float, SpatialView]] = deque()
-        self._path_m = 0.0
-        self._last: F64 | None = None
+        self._spacing = ViewSpacing()
         self.T_odom_base: F64 | None = None
 
     def add(self, registered: RegisteredScan) -> None:
         """Take in the next scan. One that registration was lost on begins anew."""
         scan, T = registered.scan, registered.T_session_base
-        if scan.sensor == "laser":
-            return
         if registered.health is Health.LOST:
             self.__init__()  # type: ignore[misc]
             return
         self.T_odom_base = T
-        if self._last is not None:
-            step_m = float(np.linalg.norm(T[:3, 3] - self._last[:3, 3]))
-            if step_m < SPACE.every_m:
-                return
-            self._path_m += step_m
-        self._last = T
+        # A scan may come without its points, which `Looking` leaves out.
+        if not len(scan.points_m) or not self._spacing.takes(registered):
+            return
         cloud = VoxelCloud(SPACE.voxel_m)
         cloud.add(scan.points_m)
         sensor_m = (T @ scan.T_base_sensor)[:3, 3]
         view = SpatialView(sensor_m=sensor_m, points_m=transform_points(T, cloud.points_m()))
-        self._views.append((self._path_m, view))
-        while self._path_m - self._views[0][0] > SPACE.last_m:
+        self._views.append((self._spacing.path_m, view))
+        while self._spacing.path_m - self._views[0][0] > SPACE.last_m:
             self._views.popleft()
 
     @property
@@ -88,9 +119,7 @@ class QueryInSpace:
         return tuple(view for _, view in self._views)
 
 
-def settle_in_space(
-    answer: Answer, query: QueryInSpace, points_of: Callable[[str], PointMap | None], accept: float
-) -> Answer:
+def settle_in_space(answer: Answer, query: QueryInSpace, points_of: PointsOf, accept: float) -> Answer:
     """The answer, refined and checked in space; as it was where the query or the map has no points.
 
     points_of : the points of a session. accept : least confidence to be located.
@@ -98,36 +127,33 @@ def settle_in_space(
     views, T_odom_base = query.views, query.T_odom_base
     if not views or T_odom_base is None or not answer.hypotheses or answer.status == "not_found":
         return answer
-    fits = _fits(answer, views, points_of)
+    rivals = _rivals(answer)
     if answer.status == "located":
-        best = fits[0]
+        (best,) = _fits(answer, rivals[:1], views, points_of)
         if best is None:
             return answer
         in_space = _pose(best, T_odom_base)
         if in_space.status == "contradicts":
             return _refused(answer, in_space)
-        return _located(answer, 0, best, T_odom_base, answer.confidence)
+        return _located(answer, rivals[0], best, T_odom_base, answer.confidence)
+    if not 2 <= len(rivals) <= SPACE.places:
+        return answer
     # Ambiguous: one place must agree, and every other place must have been compared and agree less.
-    compared = [fit for fit in fits if fit is not None]
-    if len(compared) < max(2, len(fits)):
+    compared = [fit for fit in _fits(answer, rivals, views, points_of) if fit is not None]
+    if len(compared) < len(rivals):
         return answer
     shares = np.array([fit.on for fit in compared])
     first = int(shares.argmax())
     confidence = float(1.0 / np.exp((shares - shares[first]) / SPACE.equal).sum())
     if shares[first] < SPACE.sure or confidence < accept:
         return answer
-    return _located(answer, first, compared[first], T_odom_base, confidence)
+    return _located(answer, rivals[first], compared[first], T_odom_base, confidence)
 
 
 def _fits(
-    answer: Answer, views: tuple[SpatialView, ...], points_of: Callable[[str], PointMap | None]
+    answer: Answer, wanted: list[Hypothesis], views: tuple[SpatialView, ...], points_of: PointsOf
 ) -> list[SpatialFit | None]:
-    """A fit for the best hypothesis of each place; of a located answer, of the first place only."""
-    wanted = _best_of_places(answer)
-    if answer.status == "located":
-        wanted = wanted[:1]
-    elif len(wanted) > SPACE.places:
-        return [None]
+    """A fit for each of these hypotheses of the answer; None for one that cannot be compared."""
     compared: list[SpatialFit | None] = []
     maps: dict[str, PointMap | None] = {}
     for hypothesis in wanted:
@@ -140,12 +166,14 @@ def _fits(
     return compared
 
 
-def _best_of_places(answer: Answer) -> list[Hypothesis]:
-    """The best hypothesis of each place, best first."""
+def _rivals(answer: Answer) -> list[Hypothesis]:
+    """The best hypothesis of each place, best first, without those that lie so far behind the best one that
+    they do not lessen its confidence."""
     first: dict[int, Hypothesis] = {}
     for hypothesis, place in zip(answer.hypotheses, answer.places, strict=True):
         first.setdefault(place, hypothesis)
-    return list(first.values())
+    least = answer.hypotheses[0].fit.score - LIMITS.longest_lead
+    return [hypothesis for hypothesis in first.values() if hypothesis.fit.score >= least]
 
 
 def _pose(fit: SpatialFit, T_odom_base: F64) -> PoseInSpace:
@@ -180,10 +208,11 @@ def _refused(answer: Answer, in_space: PoseInSpace) -> Answer:
     )
 
 
-def _located(answer: Answer, place: int, fit: SpatialFit, T_odom_base: F64, confidence: float) -> Answer:
-    """The answer at the best hypothesis of a place, with the pose that its points give."""
+def _located(
+    answer: Answer, hypothesis: Hypothesis, fit: SpatialFit, T_odom_base: F64, confidence: float
+) -> Answer:
+    """The answer at one of its hypotheses, with the pose that its points give."""
     in_space = _pose(fit, T_odom_base)
-    hypothesis = _best_of_places(answer)[place]
     T_map_base = SE2.from_matrix(in_space.T_map_base)
     T_map_odom = T_map_base @ answer.T_odom_base.inverse()
     planar = np.ix_((0, 1, 5), (0, 1, 5))

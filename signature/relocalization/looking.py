@@ -18,12 +18,21 @@ import numpy as np
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
 from pc2grid.model import RegisteredScan
+from signature.relocalization.in_space import ViewSpacing
 
 LookT = TypeVar("LookT", covariant=True)
 
 
 class Looks(Protocol[LookT]):
-    """What looks at the database: a `Watcher` or a `PoseWatcher`."""
+    """What looks at the database: a `Watcher` or a `PoseWatcher`.
+
+    uses_points : whether the scans that `ViewSpacing` takes are needed with their points.
+    """
+
+    @property
+    def uses_points(self) -> bool:
+        """See above."""
+        ...
 
     def add(
         self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_look: bool = True
@@ -37,7 +46,8 @@ class Looks(Protocol[LookT]):
 
 
 _MOST_WAITING = 2000
-"""Scans that wait for a look to end; beyond, the oldest are left out. Chosen by hand: some 20 MB."""
+"""Scans that wait for a look to end; beyond, the oldest are left out. Chosen by hand: some 20 MB,
+and the points of a scan every 0.2 m where they are used."""
 
 
 class Looking(Generic[LookT]):
@@ -58,6 +68,7 @@ class Looking(Generic[LookT]):
         self._waiting: deque[tuple[RegisteredScan, PlanarScan, float] | None] = deque()
         self._path_m = 0.0
         self._last: SE2 | None = None
+        self._spacing = ViewSpacing()
         self._changed = threading.Condition()
         self._stop = self._busy = False
         self._error: BaseException | None = None
@@ -90,17 +101,19 @@ class Looking(Generic[LookT]):
             if look is not None:
                 self._done.append(look)
             return
-        # Of a scan only its pose is used, and a lidar's points would fill the memory.
-        scan = replace(registered.scan, points_m=np.empty((0, 3), np.float32), offsets_s=None)
+        if not (self._watcher.uses_points and self._spacing.takes(registered)):
+            # Of most scans only the pose is used, and a lidar's points would fill the memory.
+            scan = replace(registered.scan, points_m=np.empty((0, 3), np.float32), offsets_s=None)
+            registered = replace(registered, scan=scan)
         with self._changed:
-            self._waiting.append((replace(registered, scan=scan), planar_scan, self._path_m))
+            self._waiting.append((registered, planar_scan, self._path_m))
             while len(self._waiting) > _MOST_WAITING:
                 self._waiting.popleft()
             self._changed.notify_all()
 
     def restart(self) -> None:
         """The scans do not go on from those before."""
-        self._last = None
+        self._last, self._spacing = None, ViewSpacing()
         if self._thread is None:
             self._watcher.restart()
             return

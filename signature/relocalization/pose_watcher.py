@@ -57,6 +57,8 @@ class PoseWatcher:
     first. session : whose map frame that is; may be None if there is only one.
     """
 
+    uses_points = False
+
     def __init__(
         self,
         index: MapIndex,

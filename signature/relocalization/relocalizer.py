@@ -386,11 +386,12 @@ def relocalize(
     index = MapIndex.of(database, config)
     if prior is not None:
         index = index.within(prior)
-    if not any(info.provenance.config.projection.points_voxel_m for info in database.sessions()):
+    from signature.relocalization.in_space import QueryInSpace, points_reader, settle_in_space
+
+    points = points_reader(database)
+    if points is None:
         (asked,) = localize(query, [index], watch=watch, ask=ask)
         return asked.answers[0]
-    from signature.relocalization.in_space import QueryInSpace, settle_in_space
-
     in_space = QueryInSpace()
 
     def see(registered: RegisteredScan, moment: Moment | None) -> None:
@@ -400,7 +401,7 @@ def relocalize(
 
     (asked,) = localize(query, [index], watch=see, ask=ask)
     begin = time.perf_counter()
-    answer = settle_in_space(asked.answers[0], in_space, database.points, config.relocalize.accept)
+    answer = settle_in_space(asked.answers[0], in_space, points, config.relocalize.accept)
     elapsed_ms = 1000.0 * (time.perf_counter() - begin)
     return replace(answer, timing_ms={**answer.timing_ms, "in_space": elapsed_ms})
 

@@ -1,6 +1,7 @@
 """Where is the robot, and is it still there? A `Relocalizer` that goes on after it is located.
 
-The database is asked after every metre. Once the robot is located, its odometry says where the next answer
+The database is asked after every metre; where it has points, a located answer is refined and checked in
+space. Once the robot is located, its odometry says where the next answer
 must be. An answer elsewhere, or none for several metres, means that the robot was carried away, or that the
 first answer was wrong: the search starts again, and one answer is not enough then.
 """
@@ -18,6 +19,7 @@ from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, RegisteredScan
 from signature.relocalization.answer import Answer
+from signature.relocalization.in_space import PointsOf, QueryInSpace, settle_in_space
 from signature.relocalization.map_index import MapIndex
 from signature.relocalization.relocalizer import Relocalizer
 
@@ -93,6 +95,7 @@ class Watcher:
 
     index : where to look. A prior (`MapIndex.within`) is about the first scan, unless it has a stamp, and
     counts until the robot is lost or the scans do not go on.
+    points_of : the points of the maps in space (`in_space.points_reader`), if they have any.
     located : whether the last looks agree on where the robot is.
     """
 
@@ -101,8 +104,11 @@ class Watcher:
         index: MapIndex,
         parameters: WatchParameters = WATCH,
         clock: Callable[[], float] = time.perf_counter,
+        *,
+        points_of: PointsOf | None = None,
     ) -> None:
         self._index, self._parameters, self._clock = index, parameters, clock
+        self._points_of, self._in_space = points_of, QueryInSpace()
         self._relocalizer = Relocalizer(index, _MOMENTS)
         self._place: _Place | None = None
         self._candidate: _Place | None = None
@@ -113,6 +119,11 @@ class Watcher:
         self._stood = self._due = False
 
     @property
+    def uses_points(self) -> bool:
+        """Whether scans must be given with their points."""
+        return self._points_of is not None
+
+    @property
     def located(self) -> bool:
         """See above."""
         return self._place is not None
@@ -120,7 +131,7 @@ class Watcher:
     def restart(self) -> None:
         """The scans do not go on from those before: what comes next is a search of its own, everywhere."""
         self._index = self._index.whole or self._index  # what was known beforehand was about the first search
-        self._relocalizer = Relocalizer(self._index, _MOMENTS)
+        self._relocalizer, self._in_space = Relocalizer(self._index, _MOMENTS), QueryInSpace()
         self._place = self._candidate = None
         self._doubtful = self._lost_scans = 0
         self._path_m = 0.0
@@ -140,6 +151,8 @@ class Watcher:
         self._lost_scans = self._lost_scans + 1 if lost else 0
         begin = self._clock()
         self._due = self._relocalizer.take(registered, planar_scan) or (self._due and not lost)
+        if self._points_of is not None:
+            self._in_space.add(registered)
         path_m = self._relocalizer.path_m
         self._driven_m += max(path_m - self._path_m, 0.0)
         self._path_m = path_m
@@ -155,7 +168,7 @@ class Watcher:
         try:
             if self._due:
                 self._relocalizer.look()
-            answer = self._relocalizer.answer()
+            answer = self._answer()
         except NoScans:  # the scans since the start, or since registration was lost, show nothing
             return None
         self._due = False
@@ -169,6 +182,12 @@ class Watcher:
             registered=registered,
             elapsed_s=self._clock() - begin,
         )
+
+    def _answer(self) -> Answer:
+        answer = self._relocalizer.answer()
+        if self._points_of is None:
+            return answer
+        return settle_in_space(answer, self._in_space, self._points_of, self._index.config.accept)
 
     def _begin(self, stamp_ns: int) -> None:
         """Take the prior, if there is one without a stamp, for one of the first scan."""

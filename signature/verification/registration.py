@@ -165,7 +165,8 @@ def register_in_space(
     start = _on_floor(target, query, lifted, views[-1].sensor_m)
     if start is None:
         return None
-    found = _icp(query, target, start, p)
+    near = _near(target, transform_points(start, query), 2.0 * p.rounds_m[0] + p.normal_radius_m)
+    found = _icp(query, near, start, p)
     if found is None:
         return None
     T, information, center_m, rmse_m = found
@@ -197,6 +198,24 @@ def _around(points: F64, query: F64, margin_m: float) -> F64:
     inside = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
     around: F64 = points[inside]
     return around
+
+
+def _near(points: F64, query: F64, edge_m: float) -> F64:
+    """At least the points of a map (V, 3) that are within `edge_m` of a query (N, 3) in the map.
+
+    Normals take most of the time, and walls that the query has not seen need none.
+    """
+    low = points.min(axis=0) - 2.0 * edge_m
+
+    def cells(of: F64) -> NDArray[np.int64]:
+        index = np.clip((of - low) / edge_m, 0, (1 << 20) - 1).astype(np.int64)
+        code: NDArray[np.int64] = (index[:, 0] << 42) + (index[:, 1] << 21) + index[:, 2]
+        return code
+
+    around = np.array([(x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])
+    seen = np.unique(np.unique(cells(query))[:, None] + around)
+    chosen: F64 = points[np.isin(cells(points), seen)]
+    return chosen
 
 
 def _on_floor(target: F64, query: F64, lifted: F64, sensor_m: F64) -> F64 | None:

@@ -43,6 +43,8 @@ def test_a_thread_makes_the_same_looks() -> None:
 class Slow:
     """A watcher whose looks last until they are let go."""
 
+    uses_points = False
+
     def __init__(self) -> None:
         self.go = threading.Event()
         self.scans = self.looks = self.restarts = 0
