@@ -126,11 +126,17 @@ class MapIndex:
         count = len(grids)
         areas_m2 = areas_m2 or {name: grid.free_m2 for name, grid in grids.items()}
         self._areas_m2 = tuple(areas_m2[name] for name in self.sessions)
-        # Of a large database, about as many maps are kept as are searched at once.
+        # Of a large database, about as many grids are kept as are searched at once, and as many prepared
+        # maps, which take ten times as much memory, as one look uses.
         area_m2 = sum(self._areas_m2)
-        most = math.ceil(count * AT_ONCE_M2 / area_m2) if area_m2 > AT_ONCE_M2 else None
+        most = most_prepared = None
+        if area_m2 > AT_ONCE_M2:
+            most = math.ceil(count * AT_ONCE_M2 / area_m2)
+            most_prepared = self.config.top_k + self.config.hypotheses
         self.grids: LazySequence[OccupancyGrid] = LazySequence(lambda i: grids[self.sessions[i]], count, most)
-        self.maps: LazySequence[SearchMap] = LazySequence(lambda i: SearchMap.of(self.grids[i]), count, most)
+        self.maps: LazySequence[SearchMap] = LazySequence(
+            lambda i: SearchMap.of(self.grids[i]), count, most_prepared
+        )
         self._alike: dict[tuple[int, int], SE2 | None] = {}  # see `_aligned`
         self._free: LazySequence[F64] = LazySequence(lambda i: free_squares(self.grids[i]), count)
         self.places = Places(

@@ -147,10 +147,8 @@ class Places:
 
     def select(self, views: Sequence[View], signature: SignatureConfig, config: RelocalizeConfig) -> Selected:
         """The places to compare with a query, `config.shortlist` for each view, by `PlaceIndex.select`; by
-        Eq. 6 alone where `config.select_by` says so.
-
-        If there is more than `AT_ONCE_M2` of free floor, those of them in the likeliest sessions, up to so
-        much: the maps of a session take more memory and time than its places.
+        Eq. 6 alone where `config.select_by` says so. The sessions are those of the places, in a large
+        database up to `AT_ONCE_M2`.
         """
         if self._selected is None or self._selected[0] is not views or self._selected[1] is not config:
             self._selected = views, config, self._select(views, signature, config)
@@ -168,10 +166,8 @@ class Places:
             near = self.index().nearest_to_each(views)
             best = self.index().select(views, near, config.shortlist * len(views))
             rows, sessions = np.sort(best), _in_order(session_index[best])
-        if self.is_large:
-            areas_m2 = self._areas_m2[sessions]
-            sessions = sessions[np.cumsum(areas_m2) <= max(AT_ONCE_M2, areas_m2[0])]
-            rows = rows[np.isin(session_index[rows], sessions)]
+        areas_m2 = self._areas_m2[sessions]
+        sessions = sessions[np.cumsum(areas_m2) <= max(AT_ONCE_M2, areas_m2[0])]
         return Selected(rows, tuple(found.only(np.isin(found.rows, rows)) for found in near), sessions)
 
     def nearest_by_paper(
