@@ -53,7 +53,7 @@ class RideParameters:
     door : neighbouring sectors that are open when the door is.
     turned_rad : a robot that turns by more does not stand. around, opening : least sectors that are near, and
         most that are far, around a robot that stood in what may be the cabin of a lift, whose door it did not
-        look at. The door of a cabin spans 62 degrees.
+        look at. From half a metre before it, the door of a cabin spans 100 degrees.
     """
 
     level_every_m: float = 0.3
@@ -78,8 +78,8 @@ class RideParameters:
     still_m: float = 0.1
     door: int = 4
     turned_rad: float = 0.1
-    around: int = 36
-    opening: int = 16
+    around: int = 28
+    opening: int = 24
 
 
 RIDES = RideParameters()
@@ -133,10 +133,10 @@ class RideWatch:
         """
         on_slope = self._slope is not None and self._slope.underway  # where landings are as small as cabins
         place = SE2.from_matrix(pose)
-        stood_ns = self._cabin.observe(planar_scan, place)
+        stood_ns = self._cabin.observe(planar_scan, place.yaw, forward_m)
         if stood_ns is not None and not on_slope:
             self.cabins_ns.append(stood_ns)
-        if not on_slope and self._lift.observe(planar_scan, place):
+        if not on_slope and self._lift.observe(planar_scan, place, forward_m):
             self._slope, self._cabin = None, _Cabin(self._parameters)
             self.storeys.append(Storey(group=self.storeys[-1].group + 1, height_m=0.0))
             self.storey = len(self.storeys) - 1
@@ -278,13 +278,19 @@ class _Lift:
     def _start(self, at: SE2) -> None:
         self._at = at
         self._far: I64 = np.full(self._parameters.sectors, -1)  # 1: far, 0: near, -1: not seen yet
-        self._shut_since: tuple[int, SE2] | None = None  # stamp, and pose at that time
+        self._travel_m = 0.0
+        self._shut_since: tuple[int, float] | None = None  # stamp, and travel until then
         self._shut_ns = 0
-        self._shut_at = at  # the last pose at which the door was shut
+        self._shut_m = 0.0  # travel until the door was last seen shut
 
-    def observe(self, planar_scan: PlanarScan, pose: SE2) -> bool:
-        """Take in a scan at its pose; returns whether the door of a lift has opened before it."""
+    def observe(self, planar_scan: PlanarScan, pose: SE2, forward_m: float) -> bool:
+        """Take in a scan at its pose; returns whether the door of a lift has opened before it.
+
+        Whether the robot stands is said by its travel since the last scan, which the wheels measure: a shut
+        door looks like the wall of a room that the map shows, and the pose jumps.
+        """
         p = self._parameters
+        self._travel_m += forward_m
         if math.hypot(pose.x - self._at.x, pose.y - self._at.y) > p.stands_m:
             self._start(pose)
         near_m, far_m = _ranges(planar_scan, p.sectors, pose.yaw)
@@ -292,15 +298,15 @@ class _Lift:
         self._far[near & (far_m < p.far_m)] = 0
         self._far[far_m >= p.far_m] = 1
         if (self._far >= 0).sum() >= p.seen and (self._far == 1).sum() <= p.open:
-            since_ns, at = self._shut_since or (planar_scan.stamp_ns, pose)
-            if math.hypot(pose.x - at.x, pose.y - at.y) > p.still_m:
-                since_ns, at = planar_scan.stamp_ns, pose
-            self._shut_since = since_ns, at
-            self._shut_ns, self._shut_at = planar_scan.stamp_ns - since_ns, pose
+            since_ns, since_m = self._shut_since or (planar_scan.stamp_ns, self._travel_m)
+            if abs(self._travel_m - since_m) > p.still_m:
+                since_ns, since_m = planar_scan.stamp_ns, self._travel_m
+            self._shut_since = since_ns, since_m
+            self._shut_ns, self._shut_m = planar_scan.stamp_ns - since_ns, self._travel_m
             return False
         self._shut_since = None
         # A robot that drives out of a dead end sees far, too, but only once it has moved.
-        left = math.hypot(pose.x - self._shut_at.x, pose.y - self._shut_at.y) > p.still_m
+        left = abs(self._travel_m - self._shut_m) > p.still_m
         if left or self._shut_ns < p.shut_s * 1e9:
             self._shut_ns = 0
             return False
@@ -317,26 +323,32 @@ class _Cabin:
 
     def __init__(self, parameters: RideParameters) -> None:
         self._parameters = parameters
-        self._start(0, SE2())
+        self._start(0, 0.0)
 
-    def _start(self, stamp_ns: int, at: SE2) -> None:
-        self._at = at
-        self._still = stamp_ns, at.yaw  # since when, and in which direction
-        self._stood = 0, stamp_ns  # the longest time, and since when
+    def _start(self, stamp_ns: int, yaw_rad: float) -> None:
+        self._since_ns, self._yaw_rad = stamp_ns, yaw_rad
+        self._travel_m = 0.0
+        self._stood = False
         self._far: I64 = np.full(self._parameters.sectors, -1)  # 1: far, 0: near, -1: not seen yet
         self._at_once = 0  # most sectors that one scan has shown
 
-    def observe(self, planar_scan: PlanarScan, pose: SE2) -> int | None:
-        """Take in a scan at its pose; returns, when the robot has left such a room, since when it stood."""
+    def observe(self, planar_scan: PlanarScan, yaw_rad: float, forward_m: float) -> int | None:
+        """Take in a scan; returns, when the robot has left such a room, since when it stood.
+
+        yaw_rad : heading of the base in the session frame. forward_m : travel since the last scan.
+        """
         p, stamp_ns = self._parameters, planar_scan.stamp_ns
+        self._travel_m += forward_m
         left_ns = None
-        if math.hypot(pose.x - self._at.x, pose.y - self._at.y) > p.still_m:
-            left_ns = self._stood[1] if self._was_cabin else None
-            self._start(stamp_ns, pose)
-        if abs(wrap_angle(pose.yaw - self._still[1])) > p.turned_rad:
-            self._still = stamp_ns, pose.yaw
-        self._stood = max(self._stood, (stamp_ns - self._still[0], self._still[0]))
-        near_m, far_m = _ranges(planar_scan, p.sectors, pose.yaw)
+        if self._stood and abs(self._travel_m) > p.stands_m:
+            left_ns = self._since_ns if self._was_cabin else None
+            self._start(stamp_ns, yaw_rad)
+        elif not self._stood:
+            turned = abs(wrap_angle(yaw_rad - self._yaw_rad)) > p.turned_rad
+            if turned or abs(self._travel_m) > p.still_m:
+                self._start(stamp_ns, yaw_rad)
+            self._stood = stamp_ns - self._since_ns >= p.shut_s * 1e9
+        near_m, far_m = _ranges(planar_scan, p.sectors, yaw_rad)
         far, near = far_m >= p.far_m, (near_m < p.near_m) & (far_m < p.far_m)
         self._far[near] = 0
         self._far[far] = 1
@@ -346,12 +358,8 @@ class _Cabin:
     @property
     def _was_cabin(self) -> bool:
         p = self._parameters
-        return (
-            self._stood[0] >= p.shut_s * 1e9
-            and self._at_once < p.seen
-            and int((self._far == 0).sum()) >= p.around
-            and int((self._far == 1).sum()) <= p.opening
-        )
+        near, far = int((self._far == 0).sum()), int((self._far == 1).sum())
+        return self._at_once < p.seen and near >= p.around and far <= p.opening
 
 
 def _ranges(planar_scan: PlanarScan, sectors: int, yaw_rad: float) -> tuple[F64, F64]:

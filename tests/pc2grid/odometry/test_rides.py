@@ -133,12 +133,15 @@ def rides(plan: list[tuple[float, bool]], *, drift_m: float = 0.0, since_s: floa
     shut or open. drift_m : metres that it moves a second, after `since_s`."""
     watch = RideWatch()
     scan = Scan(stamp_ns=0, points_m=np.zeros((0, 3), np.float32), T_base_sensor=np.eye(4), sensor="laser")
-    arrived, seconds = [], 0.0
+    arrived, seconds, x = [], 0.0, 0.0
     for until_s, shut in plan:
         while seconds < until_s:
-            pose = SE2(drift_m * max(seconds - since_s, 0.0), 0.0, 0.0).lift()
+            forward_m = drift_m * max(seconds - since_s, 0.0) - x
+            x += forward_m
+            # The pose jumps to and fro, as the shut door is taken for a wall that was seen before.
+            pose = SE2(x + 0.3 * shut, 0.0, 0.0).lift()
             seen = cabin_scan(seconds, shut=shut)
-            if watch.observe(scan, scan.points_m, seen, pose, 0.0, None).arrived:
+            if watch.observe(scan, scan.points_m, seen, pose, forward_m, None).arrived:
                 arrived.append(seconds)
             seconds += 0.2
     return arrived
@@ -181,9 +184,10 @@ def test_a_camera_that_stood_in_a_cabin_may_have_taken_a_lift(
     scan = Scan(stamp_ns=0, points_m=np.zeros((0, 3), np.float32), T_base_sensor=np.eye(4), sensor="depth")
     for seconds in np.arange(0.0, stands_s + 8.0, 0.2).tolist():
         yaw = min(max(seconds - stands_s, 0.0) * 0.8, math.pi)
-        pose = SE2(-0.5 * max(seconds - stands_s - 5.0, 0.0), 0.0, yaw).lift()
+        forward_m = 0.1 if seconds > stands_s + 5.0 else 0.0
         seen = narrow_scan(seconds, yaw, walls_m=walls_m)
-        assert not watch.observe(scan, scan.points_m, seen, pose, 0.0, None).arrived
+        pose = SE2(0.0, 0.0, yaw).lift()
+        assert not watch.observe(scan, scan.points_m, seen, pose, forward_m, None).arrived
     assert [stamp_ns * 1e-9 for stamp_ns in watch.cabins_ns] == cabins_s
 
 
