@@ -59,12 +59,18 @@ def fit(answers: Sequence[Known], share_right: float | None = None) -> Calibrati
     return Calibration(bias=bias, support=support, clearance=clearance)
 
 
-def left_out(answers: Sequence[Known], share_right: float | None = None) -> F64:
-    """(N,) probability of each answer by the coefficients fitted (see `fit`) to all other groups."""
+def left_out(
+    answers: Sequence[Known], share_right: float | None = None, *, fitted_to: Sequence[Known] | None = None
+) -> F64:
+    """(N,) probability of each answer by the coefficients fitted (see `fit`) to all other groups.
+
+    fitted_to : answers that the coefficients are fitted to, of the same groups; None: `answers`.
+    """
     groups = np.array([answer.group for answer in answers])
     probabilities = np.zeros(len(answers))
     for group in np.unique(groups):
-        model = fit([answer for answer in answers if answer.group != group], share_right)
+        others = [answer for answer in fitted_to or answers if answer.group != group]
+        model = fit(others, share_right)
         for i in np.flatnonzero(groups == group).tolist():
             probabilities[i] = model.probability(answers[i].evidence)
     return probabilities

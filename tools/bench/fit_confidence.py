@@ -7,8 +7,8 @@ Each file is one that `tools/bench/real_queries.py` has written, or the document
 log loss, and by kind of pair and distance how many answers are right, and how many would be located by the
 coefficients in use and by those fitted without the building, rightly and wrongly.
 
-Right and wrong answers weigh the same in the fit, however many of each there are, and a quarter of the weight
-of wrong ones is that of queries whose place is not in the map of their building.
+Right and wrong answers weigh the same in the fit, however many of each there are. Queries whose place is not
+in the map of their building, and the likeness of a query to itself, judge the fit and take no part in it.
 """
 
 from __future__ import annotations
@@ -34,10 +34,6 @@ NEAR_M = 1.0
 """Answers so near to the place of a query that is not in the map are left out: neither right nor wrong."""
 SHARE_RIGHT = 0.5
 """Weight of the right answers together. So the probability holds for queries half of which lie in the map."""
-SHARE_BLANKED = 0.25
-"""Weight of queries whose place is blanked out of the map, among wrong answers. Chosen by hand: few queries
-are made where the building has never been driven. With a half, 3 fewer of 535 are located wrongly, and some
-20 fewer of 581 right places are located."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,12 +98,16 @@ def read(file: Path) -> list[Answered]:
     return list(of_rows(document))
 
 
-def weighted(answered: list[Answered]) -> list[Known]:
-    """The answers, those of blanked places with `SHARE_BLANKED` of the weight of wrong ones."""
-    blanked = sum(a.blanked for a in answered)
-    other = sum(not a.blanked and not a.known.right for a in answered)
-    weight = other * SHARE_BLANKED / (1.0 - SHARE_BLANKED) / max(blanked, 1)
-    return [replace(a.known, weight=weight) if a.blanked and other else a.known for a in answered]
+def fitted_to(answered: list[Answered]) -> list[Known]:
+    """The answers that the coefficients are fitted to: not those of blanked places, and as if no query were
+    like itself.
+
+    Otherwise larger coefficients make up for what the likeness takes from a lead, also where nothing is
+    alike, and blanked places, which are rare, lower the confidence everywhere. Both judge the fit.
+    """
+    return [
+        replace(a.known, evidence=replace(a.known.evidence, likeness=0.0)) for a in answered if not a.blanked
+    ]
 
 
 @dataclass(slots=True)
@@ -127,13 +127,13 @@ def main() -> None:
     )
     parser.add_argument("files", type=Path, nargs="+")
     answered = [a for file in parser.parse_args().files for a in read(file)]
-    known = weighted(answered)
+    known = [a.known for a in answered]
     if len({k.group for k in known}) < 2:
         raise SystemExit(
             "the fit is judged by leaving buildings out, and this evidence is of one building only"
         )
     in_use = np.array([CALIBRATION.probability(k.evidence) for k in known])
-    refitted = left_out(known, SHARE_RIGHT)
+    refitted = left_out(known, SHARE_RIGHT, fitted_to=fitted_to(answered))
     accept = Config().relocalize.accept
     counts: dict[tuple[str, int], Count] = {}
     for a, *probabilities in zip(answered, in_use, refitted, strict=True):
@@ -162,7 +162,7 @@ def main() -> None:
             f" {np.count_nonzero(located & ~right)} of {np.count_nonzero(~right)} wrong ones"
             f" ({wrong:.2%} of all answers; 5 to 95 %, by drive: {low:.2%} to {high:.2%})"
         )
-    print(fit(known, SHARE_RIGHT))
+    print(fit(fitted_to(answered), SHARE_RIGHT))
 
 
 if __name__ == "__main__":
