@@ -10,12 +10,14 @@ import time
 import types
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from pc2grid.errors import ConfigError, OutputError
+from pc2grid.model import OccupancyGrid
 from pc2grid.simulate import SimulationConfig, simulate_session
-from pc2grid_cli import rerun_target
+from pc2grid_cli import rerun_stream, rerun_target
 from pc2grid_cli.main import app
 from tests.helpers.simulated_drives import office
 
@@ -193,3 +195,15 @@ def test_a_viewer_sees_it_as_it_happens(folder: Path, tmp_path: Path) -> None:
         viewer.send_signal(signal.SIGINT)
         viewer.wait(timeout=20)
     assert {*MAP, "map/base", *(f"map/{e}" for e in LIVE)} <= entities(kept)
+
+
+def test_the_image_of_a_grid_begins_with_the_row_of_the_largest_y(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the viewer draws it: the first row at the top, the lower left corner at `translation`."""
+    components = types.SimpleNamespace(ImageFormat=dict, Colormap=types.SimpleNamespace(RvizMap="rviz"))
+    fake = types.SimpleNamespace(GridMap=dict, components=components)
+    monkeypatch.setattr(rerun_stream, "require_rerun", lambda: fake)
+    cells = np.array([[0, 100, -1], [0, 0, 0]], np.int8)  # y is smallest in the first row
+    made = rerun_stream._grid_map(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(1.0, 2.0)))
+    assert list(made["data"]) == [0, 0, 0, 0, 100, 255]
+    assert (made["format"]["width"], made["format"]["height"]) == (3, 2)
+    assert made["translation"][:2] == [1.0, 2.0] and made["translation"][2] < 0.0

@@ -10,7 +10,7 @@ from pc2grid_cli.rerun_target import require_rerun
 if TYPE_CHECKING:
     from pc2grid.model import OccupancyGrid
 
-LOOPS, GRAPH, CONFIDENCE = "map/loops", "map/ways", "query/confidence"
+LOOPS, GRAPH, GRID, CONFIDENCE = "map/loops", "map/ways", "map/grid", "query/confidence"
 _HEIGHT, _LEAST_RATIO = 1.1, 1.2
 """The eye is so many times the height of the map (+y) above it, or its width by the ratio of a window, to
 have the whole map in sight. Tried in the viewer, whose eye sees as much as it is high."""
@@ -25,8 +25,8 @@ def layout(grid: OccupancyGrid | None, *, asked: bool = False, hidden: Collectio
 
     grid : the map that is shown, to look at from above its middle; None if it is still being made.
     asked : whether a recording is being located, so that there is a confidence to show.
-    hidden : entities that are off until they are switched on, beside the loops and the junction graph,
-        which would cover the rest.
+    hidden : entities that are off until they are switched on, beside the loops, the junction graph and the
+        grid, which would cover the rest.
     """
     require_rerun()
     import rerun.blueprint as rrb
@@ -41,7 +41,7 @@ def layout(grid: OccupancyGrid | None, *, asked: bool = False, hidden: Collectio
         origin="/",
         contents=["+ /**", f"- /{CONFIDENCE}"],
         name="map",
-        overrides=dict.fromkeys((LOOPS, GRAPH, *hidden), off),
+        overrides=dict.fromkeys((LOOPS, GRAPH, GRID, *hidden), off),
         line_grid=False,
         eye_controls=rrb.EyeControls3D(
             position=(x, y, height_m), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)

@@ -1,12 +1,12 @@
 """Maps, and recordings during the work on them, in the rerun viewer or in `.rrd` files; needs the extra viz.
 
-Entities: map/walls, map/points (if the session has them), map/submaps, map/ways, map/path, map/loops,
-map/base. While a recording is converted, map/live holds the scans at their tracked poses, before loops are
-closed. While a recording is located, query/live holds the same at the pose of the best hypothesis, and
-query/confidence its confidence. At the end query/path, query/hypotheses and query/base follow, and for each
-hypothesis query/evidence/1, 2, ... with the query's walls, coloured by what the map says about them, and the
-map's walls where the query saw free ground; of these the first is shown. The timeline `time` has the time of
-the recording.
+Entities: map/walls, map/grid (if rerun has GridMap), map/points (if the session has them), map/submaps,
+map/ways, map/path, map/loops, map/base. While a recording is converted, map/live holds the scans at their
+tracked poses, before loops are closed. While a recording is located, query/live holds the same at the pose of
+the best hypothesis, and query/confidence its confidence. At the end query/path, query/hypotheses and
+query/base follow, and for each hypothesis query/evidence/1, 2, ... with the query's walls, coloured by what
+the map says about them, and the map's walls where the query saw free ground; of these the first is shown. The
+timeline `time` has the time of the recording.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from pc2grid_cli.picture import (
     VERMILLION,
     YELLOW,
 )
-from pc2grid_cli.rerun_layout import CONFIDENCE, GRAPH, LOOPS, layout
+from pc2grid_cli.rerun_layout import CONFIDENCE, GRAPH, GRID, LOOPS, layout
 from pc2grid_cli.rerun_target import VIEWER, require_rerun, url_of
 
 if TYPE_CHECKING:
@@ -48,6 +48,8 @@ _MOST_POINTS = 4000
 """Points of a scan that are sent at most, so that a remote viewer can keep up; chosen by hand."""
 _KEPT_EVERY_M = 1.0
 """A scan stays visible after so much travel; chosen by hand."""
+_BELOW_M = 0.05
+"""The grid lies so far below the floor, so that walls and paths are seen on it; chosen by hand."""
 _EVIDENCE_RADIUS_M, _ABOVE_M = 0.06, 0.1
 """Of the points of the evidence: half of their distance; from above they cover the walls of the map."""
 _FLUSH_S = 10.0
@@ -306,6 +308,21 @@ def _log_map(
         (LOOPS, rr.LineStrips3D(closed, colors=_rgb(YELLOW), radii=thin)),
     ):
         recording.log(entity, shown, static=True)
+    if hasattr(rr, "GridMap"):
+        recording.log(GRID, _grid_map(grid), static=True)
+
+
+def _grid_map(grid: OccupancyGrid) -> Any:
+    """The occupancy grid with the colours of RViz. The image begins with the row of the largest y."""
+    rr = require_rerun()
+    rows, columns = grid.cells.shape
+    return rr.GridMap(
+        data=grid.cells[::-1].tobytes(),
+        format=rr.components.ImageFormat(width=columns, height=rows, color_model="L", channel_datatype="U8"),
+        cell_size=grid.resolution_m,
+        translation=[*grid.origin_m, -_BELOW_M],
+        colormap=rr.components.Colormap.RvizMap,
+    )
 
 
 def _log_moving(recording: Any, entity: str, poses: Trajectory, color: str) -> None:
