@@ -41,8 +41,7 @@ class SelectionParameters:
         this share of all; 10,000 take 4 ms.
     candidates : placements that each view proposes, as a share of these.
     beside_m : a place so near to where a view would be tells what it would see; places are 1 m apart.
-    least_vote : lower bound of a view's vote (standard deviations), which is also the vote of a view without
-        a place beside it.
+    least_vote : lower bound of a view's vote (standard deviations).
     apart_m, apart_rad : placements in one cell of this size are one.
     whole : share of the selected places that is spent on the places of all views of the best placements; of
         the others only the place of the view that proposed them is selected.
@@ -190,8 +189,7 @@ class PlaceIndex:
         own_units = np.where(seen, in_units(ranges_m, self.sight_m), np.uint8(UNSEEN))
         likeness = likeness_beside(own_units, self.ranges, shift, beside, self._width, LIKENESS.prior_share)
         likeness[np.arange(len(row)), view] = own
-        votes = np.where(beside < 0, SELECTION.least_vote, (likeness - mean) / spread)
-        votes = np.maximum(votes, SELECTION.least_vote).sum(axis=1)
+        votes = summed_votes((likeness - mean) / spread, beside >= 0)
         order = np.argsort(-votes, kind="stable")
         # The middle of the views stands for the query.
         cell = np.rint(there.mean(axis=1) / SELECTION.apart_m).astype(np.int64)
@@ -271,6 +269,19 @@ class PlaceRaster:
         known = ((inside >= 0) & (inside < self.shape[number])).all(axis=2)
         at = self.first[number] + inside[..., 0] * self.shape[number, 1] + inside[..., 1]
         return np.where(known, self.rows[np.where(known, at, 0)], -1).astype(np.int64)
+
+
+def summed_votes(evidence: F64, known: NDArray[np.bool_]) -> F64:
+    """(C,) the votes of all views on each placement, in standard deviations.
+
+    evidence : (C, V) of each view, of mean 0 and standard deviation 1 over all places; at least
+    `SelectionParameters.least_vote` is counted. known : (C, V) whether there is a place beside the view.
+
+    The sum divided by the square root of the number of summands (Stouffer's method), so that a query whose
+    path leaves the mapped part of its building is not behind placements in maps that are known all around.
+    """
+    votes = np.where(known, np.maximum(evidence, SELECTION.least_vote), 0.0).sum(axis=1)
+    return np.asarray(votes / np.sqrt(np.maximum(known.sum(axis=1), 1)))
 
 
 def likeness_beside(

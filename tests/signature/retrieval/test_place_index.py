@@ -20,6 +20,7 @@ from signature.retrieval.place_index import (
     PlaceRaster,
     likeness_beside,
     plain_likeness_beside,
+    summed_votes,
 )
 from signature.seen_places import PROFILE_BEARINGS, SeenPlaces
 from tests.helpers.simulated_drives import building, drive, office
@@ -145,3 +146,15 @@ def test_a_raster_gives_the_place_next_to_the_middle_of_the_square_in_the_same_s
             apart = np.hypot(*(center_m[members] - middle).T)
             expected = members[apart.argmin()] if apart.min() < SELECTION.beside_m - 1e-6 else -1
             assert place == expected
+
+
+def test_views_outside_of_a_map_count_neither_for_nor_against() -> None:
+    evidence = np.array([[3.0, 3.0, 9.0, -9.0], [1.5, 1.5, 1.5, 1.5], [0.0, -7.0, 9.0, 9.0]])
+    known = np.array([[1, 1, 0, 0], [1, 1, 1, 1], [1, 1, 0, 0]], bool)
+    votes = summed_votes(evidence, known)
+    np.testing.assert_allclose(votes, [6.0 / math.sqrt(2.0), 3.0, SELECTION.least_vote / math.sqrt(2.0)])
+    # By chance, a placement has the same votes however many of its views lie on the map.
+    chance = np.random.default_rng(0).normal(0.5, 0.1, (4000, 8))
+    lie_on_it = [np.broadcast_to(np.arange(8) < count, chance.shape) for count in (1, 4, 8)]
+    spread = [summed_votes(chance - 0.5, known).std() for known in lie_on_it]
+    assert max(spread) / min(spread) < 1.1
