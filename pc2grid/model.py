@@ -77,11 +77,17 @@ class Scan:
 
 
 class Health(enum.Enum):
-    """How well the pose of a scan is determined."""
+    """How well the pose of a scan is determined.
+
+    FINE : in every direction, and odometry, if there is any, agrees. DEGENERATE : some direction rests on
+    odometry or the motion before. LOST : not at all; the scan is not mapped. OVERRULED : as FINE, but
+    odometry says something else (`pc2grid.odometry.overruled`).
+    """
 
     FINE = "fine"
     DEGENERATE = "degenerate"
     LOST = "lost"
+    OVERRULED = "overruled"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,7 +109,7 @@ class RegisteredScan:
     scan : the scan, its points deskewed to `scan.stamp_ns` (base frame at that time).
     T_session_base : (4, 4) pose of the base at `scan.stamp_ns`. The session frame is the base at the
         session's first scan, levelled (z up).
-    health : FINE; DEGENERATE (some direction rests on odometry or the motion model); LOST (do not map).
+    health : how well the pose is determined.
 
     >>> import numpy as np
     >>> scan = Scan(stamp_ns=0, points_m=np.ones((5, 3)), T_base_sensor=np.eye(4), sensor="lidar")

@@ -184,6 +184,8 @@ class Tracker:
         if prediction is not None and health is not Health.LOST:
             disagreement = self._motion.disagreement(prediction, pose)
         self._motion.observe(scan, pose, sure=health is Health.FINE)
+        if health is Health.FINE and disagreement is not None and disagreement.overrules:
+            health = Health.OVERRULED
         deskewed = dataclasses.replace(scan, points_m=points, offsets_s=None)
         return Tracked(
             registered=RegisteredScan(scan=deskewed, T_session_base=pose, health=health),

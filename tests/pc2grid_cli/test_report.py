@@ -19,7 +19,8 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
-from pc2grid.model import Consistency, Contradiction, OccupancyGrid, Precision, Trajectory
+from pc2grid.model import Consistency, Contradiction, Health, OccupancyGrid, Precision, Trajectory
+from pc2grid_cli import report
 from pc2grid_cli.deviation import deviation
 from pc2grid_cli.locate import Found, find_map
 from pc2grid_cli.nav2_pose import initialpose
@@ -112,6 +113,12 @@ def test_a_path_is_cut_where_its_health_changes_and_stays_connected() -> None:
     for before, after in itertools.pairwise(pieces):
         assert before["xy"][-2:] == after["xy"][:2]
     assert pieces[-1]["xy"][-2:] == [8.8, 7.0]
+
+
+def test_the_page_knows_every_health() -> None:
+    page = (Path(report.__file__).parent / "report.html").read_text()
+    line = next(line for line in page.splitlines() if line.startswith("const HEALTH"))
+    assert all(f"{health.value}: [" in line for health in Health)
 
 
 def test_standing_still_costs_no_points() -> None:

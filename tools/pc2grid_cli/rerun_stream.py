@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from signature.database import SubmapDatabase
     from signature.relocalization.answer import Answer, Moment
 
+_COLOURS = {"fine": VERMILLION, "overruled": YELLOW, "degenerate": ORANGE, "lost": PURPLE}
+"""Of a scan, by its health."""
 _MOST_POINTS = 4000
 """Points of a scan that are sent at most, so that a remote viewer can keep up; chosen by hand."""
 _KEPT_EVERY_M = 1.0
@@ -235,7 +237,7 @@ class _Live:
         _set_time(self._recording, scan.stamp_ns)
         step = -(-len(scan.points_m) // _MOST_POINTS) or 1
         points = transform_points(T, scan.points_m[::step])
-        colour = {Health.FINE: VERMILLION, Health.DEGENERATE: ORANGE, Health.LOST: PURPLE}[registered.health]
+        colour = _COLOURS[registered.health.value]
         self._recording.log(f"{self._entity}/scan", rr.Points3D(points, colors=_rgb(colour), radii=0.03))
         ahead = rr.Arrows3D(origins=[T[:3, 3]], vectors=[0.5 * T[:3, 0]], colors=_rgb(colour), radii=0.06)
         self._recording.log(f"{self._entity}/base", ahead)

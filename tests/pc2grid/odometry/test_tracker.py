@@ -103,8 +103,10 @@ def test_odometry_with_the_wrong_sign_is_overruled(laser):
         within = scan.T_first_last.copy()
         within[:2, 3] *= -1.0
         wrong.append((dataclasses.replace(scan, T_odom_base=odometry, T_first_last=within), pose))
-    poses = [r.T_session_base for r in follow(scan for scan, _ in wrong)]
-    assert errors(laser, poses).max() < 0.15
+    registered = follow(scan for scan, _ in wrong)
+    assert errors(laser, [r.T_session_base for r in registered]).max() < 0.15
+    assert sum(r.health is Health.OVERRULED for r in registered) > 0.5 * len(registered)
+    assert not any(r.health is Health.OVERRULED for r in follow(scan for scan, _ in laser))
 
 
 def test_laser_without_odometry_is_followed_or_reported_lost(laser):

@@ -115,7 +115,7 @@ def test_what_expands_without_end_is_not_expanded() -> None:
 
 def test_trajectories_survive() -> None:
     poses = np.stack([SE2(i, -i, 0.1 * i).lift() for i in range(5)])
-    health = (Health.FINE, Health.LOST, Health.DEGENERATE, Health.FINE, Health.FINE)
+    health = (Health.FINE, Health.LOST, Health.DEGENERATE, Health.OVERRULED, Health.FINE)
     trajectory = Trajectory(stamps_ns=np.arange(5), T_session_base=poses, health=health)
     np.testing.assert_array_equal(serialize.unpack_poses(serialize.pack_poses(trajectory), 5), poses)
     assert serialize.unpack_health(serialize.pack_health(trajectory)) == health
@@ -124,4 +124,4 @@ def test_trajectories_survive() -> None:
     with pytest.raises(ValueError, match="does not hold the 576 bytes"):
         serialize.unpack_poses(serialize.pack_poses(trajectory), 6)
     with pytest.raises(ValueError, match="an unknown health code"):
-        serialize.unpack_health(b"\0\3")
+        serialize.unpack_health(bytes([0, len(Health)]))
