@@ -27,14 +27,15 @@ class RideParameters:
 
     Slopes:
 
-    level_every_m, every_m : travel from one measurement of the vertical to the next, while the last one was
-        level, and otherwise. A measurement takes as long as tracking a scan.
+    level_every_m, every_m : travel from one measurement of the vertical to the next, on level ground, and on
+        a slope and up to `settled_m` behind it. A measurement takes as long as tracking a scan.
     measurements : whose median is used.
     begin_rad, end_rad : tilt from which on a robot is on a slope, and below which it is not any more; 1 in 12
         is 4.8 degrees. camera_factor : these times, by a depth camera: in the real 3D scan of a level floor,
         the median of its measurements reaches 2.9 degrees.
     settled_m : level travel after which a slope has ended. More than the way over the landing between two
         flights of stairs.
+    known_m : travel after a measurement for which it holds: farther on the ground is not known to be level.
     storey_m : a rise of at least this leads to another floor.
     same_m : floors whose heights differ by less are one.
     steep_rad : a steeper slope, such as stairs, is not mapped. Tracking in the plane measures wrong distances
@@ -63,6 +64,7 @@ class RideParameters:
     end_rad: float = math.radians(1.5)
     camera_factor: float = 1.4
     settled_m: float = 4.0
+    known_m: float = 1.0
     storey_m: float = 1.5
     same_m: float = 1.0
     steep_rad: float = math.radians(12.0)
@@ -188,7 +190,8 @@ class _Slope:
         self._unmeasured_m = math.inf
         self._tilted = False
         self._level_m = 0.0
-        self._forward_m = 0.0  # travel since the last measurement
+        self._forward_m = 0.0  # travel since the last measurement, forward
+        self._unknown_m = 0.0  # the same, to and fro
         self._travels_m: deque[float] = deque(maxlen=(parameters.measurements + 1) // 2)
         self._pitch_rad = 0.0  # the last median
         self._rise_m = 0.0
@@ -214,8 +217,9 @@ class _Slope:
         p = self._parameters
         self._unmeasured_m += abs(forward_m)
         self._forward_m += forward_m
+        self._unknown_m += abs(forward_m)
         measured = False
-        if self._unmeasured_m >= (p.level_every_m if self._is_level else p.every_m):
+        if self._unmeasured_m >= (p.level_every_m if self._is_level and not self.underway else p.every_m):
             self._unmeasured_m = 0.0
             measured = self._measure(points_m, ground)
         if len(self._latest) < p.measurements:
@@ -225,13 +229,15 @@ class _Slope:
         if self._tilted and not self.underway:
             self.underway, self._steepest_rad = True, 0.0
         if measured:
+            self._unknown_m = 0.0
             rise_m = self._rise_between(pitch_rad)
             self._rise_m = self._rise_m + rise_m if self.underway else rise_m
         if self._tilted:
             self._level_m = 0.0
             self._steepest_rad = max(self._steepest_rad, tilt_rad)
             return None
-        self._level_m += abs(forward_m)
+        if self._unknown_m < p.known_m:
+            self._level_m += abs(forward_m)
         if not self.underway or self._level_m < p.settled_m:
             return None
         self.underway = False
@@ -323,9 +329,9 @@ class _Cabin:
 
     def __init__(self, parameters: RideParameters) -> None:
         self._parameters = parameters
-        self._start(0, 0.0)
+        self._start(None, 0.0)
 
-    def _start(self, stamp_ns: int, yaw_rad: float) -> None:
+    def _start(self, stamp_ns: int | None, yaw_rad: float) -> None:
         self._since_ns, self._yaw_rad = stamp_ns, yaw_rad
         self._travel_m = 0.0
         self._stood = False
@@ -340,14 +346,17 @@ class _Cabin:
         p, stamp_ns = self._parameters, planar_scan.stamp_ns
         self._travel_m += forward_m
         left_ns = None
-        if self._stood and abs(self._travel_m) > p.stands_m:
+        if self._since_ns is None:
+            self._start(stamp_ns, yaw_rad)
+        elif self._stood and abs(self._travel_m) > p.stands_m:
             left_ns = self._since_ns if self._was_cabin else None
             self._start(stamp_ns, yaw_rad)
         elif not self._stood:
             turned = abs(wrap_angle(yaw_rad - self._yaw_rad)) > p.turned_rad
             if turned or abs(self._travel_m) > p.still_m:
                 self._start(stamp_ns, yaw_rad)
-            self._stood = stamp_ns - self._since_ns >= p.shut_s * 1e9
+            else:
+                self._stood = stamp_ns - self._since_ns >= p.shut_s * 1e9
         near_m, far_m = _ranges(planar_scan, p.sectors, yaw_rad)
         far, near = far_m >= p.far_m, (near_m < p.near_m) & (far_m < p.far_m)
         self._far[near] = 0

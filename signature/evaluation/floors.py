@@ -33,8 +33,8 @@ _LIDAR = LidarConfig(columns=450, rate_hz=5.0)
 """Half the points and half the scans of the default, which halves the time twice."""
 _DEPTH = DepthConfig(rate_hz=5.0)
 _MOSTLY = 0.98
-"""A session shows a floor if so much of its trajectory is there: the door of a lift opens before it is seen
-to. Chosen by hand."""
+"""A session shows a floor if so much of its travel is there: a landing of stairs may count to either. Time
+in the shut cabin of a lift shows no floor, and is no travel. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +85,7 @@ class FloorResult:
 class _Part:
     """A session of the database.
 
-    floor : the true one of most of its scans. purity : their share. name : of the floor in the label.
+    floor : the true one of most of its travel. purity : the share of that. name : of the floor in the label.
     T_house_map : (4, 4), by its first scan.
     """
 
@@ -161,11 +161,19 @@ def _build(task: FloorTask, folder: Path, config: Config) -> list[_Part]:
                     continue
                 trajectory: Trajectory = opened.trajectory(info.name)
                 seconds = (trajectory.stamps_ns - EPOCH_NS) * 1e-9
-                floors = Counter(truth.floor_at(float(s)) for s in seconds)
-                (most, count) = floors.most_common(1)[0]
+                on = np.array([truth.floor_at(float(s)) for s in seconds])
+                steps_m = np.diff(trajectory.path_m(), prepend=0.0)
+                travel_m = np.bincount(on, steps_m)
+                most = int(travel_m.argmax())
                 T_house_map = truth.pose(float(seconds[0])) @ np.linalg.inv(trajectory.T_session_base[0])
                 parts.append(
-                    _Part(info.name, most, count / len(seconds), info.provenance.label.floor, T_house_map)
+                    _Part(
+                        info.name,
+                        most,
+                        float(travel_m[most] / travel_m.sum()),
+                        info.provenance.label.floor,
+                        T_house_map,
+                    )
                 )
     return parts
 
