@@ -74,6 +74,10 @@ class RayParameters:
     gap_m : a surface is passed, or not reached, if it is at least so far off along the ray.
     floor_m : points this near to the floor say nothing: it is the same everywhere.
     least : fewer rays than this say nothing.
+    patch_m : rays that end within a cell of this size see one thing.
+    patch_rays : so many more rays of a patch must end on a surface of one place than of another for the patch
+        to speak for it.
+    above_m : what is higher above the floor is part of the building: it is seldom moved.
     """
 
     views: int = 5
@@ -83,6 +87,9 @@ class RayParameters:
     gap_m: float = 0.4
     floor_m: float = 0.15
     least: int = 100
+    patch_m: float = 0.5
+    patch_rays: int = 3
+    above_m: float = 2.0
 
 
 REGISTRATION = RegistrationParameters()
@@ -102,20 +109,78 @@ class SpatialView:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Rays:
+    """The rays of a query compared with a map; the same rays in the same order whatever the place is.
+
+    end_m : (R, 3) where they end, in the query. height_m : (R,) above the floor, NaN if that was not found.
+    on, through, before : (R,) whether a ray ends on a surface of the map, behind one that should have stopped
+    it, or before one where the map shows no other; none of them for a ray to the floor or to where the map
+    shows nothing.
+    """
+
+    end_m: F64
+    height_m: F64
+    on: NDArray[np.bool_]
+    through: NDArray[np.bool_]
+    before: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        freeze(self, "end_m", np.float64, (None, 3))
+        freeze(self, "height_m", np.float64, (None,))
+        for name in ("on", "through", "before"):
+            freeze(self, name, np.bool_, (None,))
+
+    @staticmethod
+    def joined(parts: Sequence[Rays]) -> Rays:
+        """The rays of several views."""
+        none = np.empty(0, bool)
+        return Rays(
+            end_m=np.concatenate([np.empty((0, 3)), *(part.end_m for part in parts)]),
+            height_m=np.concatenate([np.empty(0), *(part.height_m for part in parts)]),
+            on=np.concatenate([none, *(part.on for part in parts)]),
+            through=np.concatenate([none, *(part.through for part in parts)]),
+            before=np.concatenate([none, *(part.before for part in parts)]),
+        )
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """How many are on, through and before."""
+        on, through, before = (int(np.count_nonzero(k)) for k in (self.on, self.through, self.before))
+        return on, through, before
+
+    def patches_over(self, other: Rays, parameters: RayParameters = RAYS) -> int:
+        """Patches of the building that only this place explains, less those that only the other one does.
+
+        What one of the maps has not seen speaks for neither, nor does what stands on the floor: of two rooms
+        alike that which is furnished like the query need not be the right one.
+        """
+        contradicted = self.through | self.before, other.through | other.before
+        balance = (self.on & contradicted[1]).astype(np.int64) - (other.on & contradicted[0])
+        high = np.minimum(self.height_m, other.height_m) > parameters.above_m
+        balance, end_m = balance[high], self.end_m[high]
+        cells = np.floor(end_m / parameters.patch_m).astype(np.int64)
+        _, patch = np.unique(cells, axis=0, return_inverse=True)
+        lead = np.bincount(patch.ravel(), balance)
+        over, under = lead >= parameters.patch_rays, lead <= -parameters.patch_rays
+        return int(np.count_nonzero(over)) - int(np.count_nonzero(under))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SpatialFit:
     """A query in space on a map.
 
     T_map_query : (4, 4). information : (6, 6) inverse covariance of a small motion at `center_m` (3,), map
         frame: along x, y, z, then about x, y, z.
     rmse_m : of the distances of corresponding points from the surfaces of the map.
-    rays : how many rays were compared. on, through, before : shares of them that end on a surface of the map,
-        behind one that should have stopped them, and before one where the map shows no other; their sum is 1.
+    compared : all rays. rays : how many of them say something. on, through, before : shares of these; their
+        sum is 1.
     """
 
     T_map_query: F64
     information: F64
     center_m: F64
     rmse_m: float
+    compared: Rays
     rays: int
     on: float
     through: float
@@ -178,13 +243,15 @@ def register_in_space(
         or math.hypot(turn_rad[0], turn_rad[1]) > p.tilt_rad
     ):
         return None
-    on, through, before = compare_rays(views, target, T, rays)
+    compared = compare_rays(views, target, T, rays)
+    on, through, before = compared.counts
     count = on + through + before
     return SpatialFit(
         T_map_query=T,
         information=information,
         center_m=center_m,
         rmse_m=rmse_m,
+        compared=compared,
         rays=count,
         on=on / max(count, 1),
         through=through / max(count, 1),
@@ -285,28 +352,27 @@ def _icp(
 
 def compare_rays(
     views: Sequence[SpatialView], target: F64, T_map_query: F64, parameters: RayParameters = RAYS
-) -> tuple[int, int, int]:
-    """How many rays of the views end on a surface of the map (V, 3), behind one, and before one.
-
-    Rays to where the map shows nothing along the way are not counted, nor are those to the floor.
-    """
+) -> Rays:
+    """Compare rays of the views with the surfaces of a map (V, 3)."""
     from scipy.spatial import cKDTree
 
     p = parameters
     if not len(target):
-        return 0, 0, 0
+        return Rays.joined([])
     tree = cKDTree(target)
     every = max(1, math.ceil(len(views) / p.views))
-    counts = np.zeros(3, np.int64)
+    found = []
     for view in views[::-1][::every]:
         chosen = random_subset(len(view.points_m), p.rays)
         placed = transform_points(T_map_query, view.points_m[chosen])
         origin = transform_points(T_map_query, view.sensor_m[None])[0]
-        ground = find_ground(placed - origin, np.zeros(3))
-        if ground is not None:
-            placed = placed[np.abs(ground.heights(placed - origin)) > p.floor_m]
         if not len(placed):
             continue
+        height_m = np.full(len(placed), np.nan)
+        ground = find_ground(placed - origin, np.zeros(3))
+        if ground is not None:
+            height_m = ground.heights(placed - origin)
+        stands = ~(np.abs(height_m) <= p.floor_m)
         on = tree.query(placed, distance_upper_bound=p.near_m)[0] < p.near_m
         ray_bin, range_m = _directions(placed - origin, p.bin_rad)
         map_bin, map_m = _directions(target - origin, p.bin_rad)
@@ -316,9 +382,16 @@ def compare_rays(
         np.maximum.at(last, map_bin, map_m)
         through = ~on & (first[ray_bin] < range_m - p.gap_m)
         before = ~on & ~through & (last[ray_bin] > range_m + p.gap_m)
-        counts += np.count_nonzero(on), np.count_nonzero(through), np.count_nonzero(before)
-    on_, through_, before_ = counts.tolist()
-    return on_, through_, before_
+        found.append(
+            Rays(
+                end_m=view.points_m[chosen],
+                height_m=height_m,
+                on=stands & on,
+                through=stands & through,
+                before=stands & before,
+            )
+        )
+    return Rays.joined(found)
 
 
 def _directions(away: F64, bin_rad: float) -> tuple[NDArray[np.int64], F64]:

@@ -17,7 +17,7 @@ APART_M = 20.0
 """The lower room begins at (0, 0), the higher one so far along x."""
 
 
-def room(height_m: float) -> F64:
+def room(height_m: float, *, cupboard: bool = False) -> F64:
     """The surfaces (N, 3) of a room with an alcove wall, so that no turn of it looks the same."""
     x, y = PLAN_M
     parts = [
@@ -29,7 +29,19 @@ def room(height_m: float) -> F64:
         box_surface((0, y, 0), (x, y, height_m)),
         box_surface((0, 3.5, 0), (1.5, 3.5, height_m)),
     ]
+    if cupboard:
+        left, front, top = 2.5, 3.6, 1.8
+        parts += [
+            box_surface((left, front, 0), (x, front, top)),
+            box_surface((left, front, 0), (left, y, top)),
+        ]
     return np.concatenate(parts)
+
+
+def furnished_map() -> PointMap:
+    """The points of two rooms of the lower height, with a cupboard in the second only."""
+    first, second = room(HEIGHTS_M[0]), room(HEIGHTS_M[0], cupboard=True)
+    return PointMap.of(np.concatenate((first, second + np.array((APART_M, 0.0, 0.0)))), 0.05)
 
 
 def twin_map() -> PointMap:
@@ -38,12 +50,12 @@ def twin_map() -> PointMap:
     return PointMap.of(np.concatenate((low, high + np.array((APART_M, 0.0, 0.0)))), 0.05)
 
 
-def drive(height_m: float) -> list[tuple[RegisteredScan, F64]]:
+def drive(height_m: float, *, cupboard: bool = False) -> list[tuple[RegisteredScan, F64]]:
     """Scans of a lidar 1 m above its base, which drives 1 m in a room; each with its true pose T_room_base.
 
     The session frame is 0.4 m above the floor, and the base tilts by a degree.
     """
-    surfaces = room(height_m)
+    surfaces = room(height_m, cupboard=cupboard)
     rng = np.random.default_rng(0)
     T_base_sensor = np.eye(4)
     T_base_sensor[2, 3] = 1.0

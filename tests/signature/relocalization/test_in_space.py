@@ -14,8 +14,9 @@ from signature.relocalization.answer import Answer
 from signature.relocalization.confidence import NO_EVIDENCE
 from signature.relocalization.hypotheses import Hypothesis
 from signature.relocalization.in_space import QueryInSpace, settle_in_space
+from signature.verification.registration import register_in_space
 from signature.verification.two_way_score import Fit
-from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, twin_map
+from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, furnished_map, twin_map
 
 
 @pytest.fixture(scope="module")
@@ -23,9 +24,9 @@ def points() -> PointMap:
     return twin_map()
 
 
-def ask(height_m: float, *rooms_x_m: float) -> tuple[QueryInSpace, Answer]:
+def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[QueryInSpace, Answer]:
     """A query, and the planar answer that it lies in the rooms that begin at these x."""
-    query, scans = QueryInSpace(), drive(height_m)
+    query, scans = QueryInSpace(), drive(height_m, cupboard=cupboard)
     for registered, _ in scans:
         query.add(registered)
     last, T_room_base = scans[-1]
@@ -93,6 +94,17 @@ def test_equal_twins_stay_ambiguous(points: PointMap) -> None:
     query, answer = ask(HEIGHTS_M[0], 0.0, 0.0)
     settled = settle_in_space(answer, query, lambda _: points, accept=0.9)
     assert settled is answer
+
+
+def test_furniture_does_not_tell_twins_apart() -> None:
+    """The query is in the second room, or in the first one, into which a cupboard was brought since."""
+    query, answer = ask(HEIGHTS_M[0], 0.0, APART_M, cupboard=True)
+    points = furnished_map()
+    fits = [register_in_space(query.views, points, h.fit.T_map_query) for h in answer.hypotheses]
+    assert fits[0] is not None and fits[1] is not None
+    assert fits[1].on - fits[0].on > 0.05
+    assert fits[1].compared.patches_over(fits[0].compared) == 0
+    assert settle_in_space(answer, query, lambda _: points, accept=0.9) is answer
 
 
 def test_a_located_pose_is_refined_and_keeps_its_confidence(points: PointMap) -> None:
