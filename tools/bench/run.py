@@ -24,6 +24,7 @@ import locating
 import peers
 import points
 import reading
+import space
 import submaps
 from measure import ROOT, Row, machine, table
 
@@ -45,6 +46,7 @@ MEASURES: dict[str, Measure] = {
     "memory": reading.convert_memory,
     "growth": reading.growth,
     "points": points.kept,
+    "space": space.poses,
     "describe": submaps.describe_time,
     "align": submaps.align_time,
     "retrieve": large_database.retrieve_time,
