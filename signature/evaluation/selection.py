@@ -257,11 +257,12 @@ plan."""
 
 
 def recall_at_scale(
-    own: SensorMap, others: Iterable[PlaceBlock], queries: Iterable[Asked]
+    own: SensorMap, others: Iterable[PlaceBlock], queries: Iterable[Asked], least_mapped: float = 0.0
 ) -> Iterator[Recalled]:
     """Whether the right places of queries are selected among those of the map and `others`, by what was seen.
 
-    others : places of other maps. Queries from where the map has no place are left out.
+    others : places of other maps. Queries from where the map has no place are left out, and those of which
+    less than the share `least_mapped` of the views has one.
     """
     places = own.index.places
     index = PlaceIndex.of(itertools.chain([places.described()], others), places.sight_m)
@@ -270,8 +271,9 @@ def recall_at_scale(
             np.array([view.center_m for view in query.views]).reshape(-1, 2)
         )
         apart = np.hypot(*(views_m[:, None] - places.table.center_m[None]).transpose(2, 0, 1))
-        right = np.flatnonzero((apart <= JUDGEMENT.retrieved_m).any(axis=0))
-        if not len(right):
+        near = apart <= JUDGEMENT.retrieved_m
+        right = np.flatnonzero(near.any(axis=0))
+        if not len(right) or near.any(axis=1).mean() < least_mapped:
             continue
         for selector in (VOTED, SIGNATURES):
             for share in SHARES:
