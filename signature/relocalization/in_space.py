@@ -8,7 +8,7 @@ space, for example of two rooms that differ in height only.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -144,14 +144,24 @@ def settle_in_space(answer: Answer, query: QueryInSpace, points_of: PointsOf, ac
     compared = [fit for fit in _fits(answer, rivals, views, points_of) if fit is not None]
     if len(compared) < len(rivals):
         return answer
-    odds = np.array([[other.compared.patches_over(fit.compared) for other in compared] for fit in compared])
+    best_of = winner(compared, accept)
+    if best_of is None:
+        return answer
+    first, confidence = best_of
+    return _located(answer, rivals[first], compared[first], T_odom_base, confidence)
+
+
+def winner(fits: Sequence[SpatialFit], accept: float) -> tuple[int, float] | None:
+    """Number and confidence of the one of several places that alone agrees in space; None if none does.
+
+    accept : least confidence to be chosen.
+    """
+    odds = np.array([[other.compared.patches_over(fit.compared) for other in fits] for fit in fits])
     # Each row: how much more likely the other places are than this one; 0 for the place itself.
     probabilities = 1.0 / np.exp(SPACE.patch_log_odds * odds).sum(axis=1)
     first = int(probabilities.argmax())
     confidence = float(probabilities[first])
-    if compared[first].on < SPACE.sure or confidence < accept:
-        return answer
-    return _located(answer, rivals[first], compared[first], T_odom_base, confidence)
+    return (first, confidence) if fits[first].on >= SPACE.sure and confidence >= accept else None
 
 
 def _fits(

@@ -47,6 +47,7 @@ MEASURES: dict[str, Measure] = {
     "growth": reading.growth,
     "points": points.kept,
     "space": space.poses,
+    "twins": space.twins,
     "describe": submaps.describe_time,
     "align": submaps.align_time,
     "retrieve": large_database.retrieve_time,

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import combinations, islice, product
 from pathlib import Path
 
 import fixtures
@@ -18,10 +20,11 @@ from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import PointMap, Scan, SensorKind
 from pc2grid.pipeline import follow
-from pc2grid.simulate import SimulationConfig, office_floorplan, simulate_session
+from pc2grid.simulate import SimulationConfig, iter_session, office_floorplan, simulate_session
 from signature.config import Config
 from signature.database import open_database
 from signature.evaluation.sensor_matrix import query_start
+from signature.relocalization.in_space import QueryInSpace, winner
 from signature.relocalization.relocalizer import relocalize
 from signature.sessions import add_sessions, build_session
 from signature.verification.registration import SpatialView, register_in_space
@@ -112,6 +115,70 @@ def _hall() -> Iterator[Row]:
             errors.append(_Error.of(T, fit.T_map_query @ T))
     note = f"{len(errors)} scans on a map of the {_HALL_MAP} before, all at their true poses"
     yield from _rows(what, errors, note, goal=False)
+
+
+def twins(folder: Path, quick: bool) -> Iterator[Row]:
+    """Rooms that differ in height only, and rooms that differ in nothing but what stands in them.
+
+    A small office is mapped four times by a lidar, each time with other things in it, twice with a ceiling of
+    2.5 m and twice of 3.5 m. Queries are registered at their true place in all four maps. Of two maps of
+    different height the one of the right height should win, of two maps of one height none.
+    """
+    from tests.helpers.simulated_drives import office
+
+    config, plan = _with_points(), office()
+    maps: list[tuple[float, PointMap, SE2]] = []
+    for number, height_m in enumerate((2.5, 2.5, 3.5, 3.5)):
+        log = folder / f"twin{number}.mcap"
+        drive = _twin(40.0, 100 + number, height_m)
+        simulate_session(log, sensor="lidar", grid=plan, config=drive)
+        made, _ = build_session(log, "office", config)
+        assert made.points is not None
+        true = _true_at(log.with_suffix(".tum"), made.trajectory.stamps_ns)
+        maps.append((height_m, made.points, SE2.fit(made.trajectory.planar()[:, :2], true[:, :2])))
+    won: Counter[str] = Counter()
+    for seed, height_m in product(range(1, 3 if quick else 9), (2.5, 3.5)):
+        query, T_plan_odom = QueryInSpace(), SE2()
+        simulated = list(
+            islice(iter_session(sensor="lidar", grid=plan, config=_twin(8.0, seed, height_m)), 30)
+        )
+        for (registered, _), (_, T_plan_base) in zip(
+            follow((scan for scan, _ in simulated), config), simulated, strict=True
+        ):
+            query.add(registered)
+            T_plan_odom = T_plan_base @ SE2.from_matrix(registered.T_session_base).inverse()
+        fits = [
+            (of_m, register_in_space(query.views, points, T_plan_map.inverse() @ T_plan_odom))
+            for of_m, points, T_plan_map in maps
+        ]
+        for (a_m, a), (b_m, b) in combinations(fits, 2):
+            if a is None or b is None:
+                continue
+            best = winner((a, b), 0.9)
+            if a_m == b_m:
+                won["alike" if best is None else "alike, chosen"] += 1
+            else:
+                won["none" if best is None else "right" if (a_m, b_m)[best[0]] == height_m else "wrong"] += 1
+    different = won["right"] + won["wrong"] + won["none"]
+    alike = won["alike"] + won["alike, chosen"]
+    what = "rooms whose heights differ by 1 m"
+    yield Row(what=f"{what}: the right one is chosen", measured=won["right"], unit=f"of {different}")
+    yield Row(what=f"{what}: the wrong one", measured=won["wrong"], unit=f"of {different}", goal=0.0)
+    yield Row(
+        what="rooms of one height: one is chosen", measured=won["alike, chosen"], unit=f"of {alike}", goal=0.0
+    )
+
+
+def _twin(length_m: float, seed: int, height_m: float) -> SimulationConfig:
+    return SimulationConfig.model_validate(
+        {
+            "length_m": length_m,
+            "seed": seed,
+            "clutter": 8,
+            "wall_height_m": height_m,
+            "lidar": {"rate_hz": 4.0, "columns": 360},
+        }
+    )
 
 
 def _rows(what: str, errors: list[_Error], note: str, *, goal: bool = True) -> Iterator[Row]:
