@@ -151,7 +151,7 @@ def build_maps(
         check_followed(_in_order([part.trajectory for part in parts]), str(log.info.path))
     kept = _of_use(parts)
     read = log.report()
-    read = dataclasses.replace(read, warnings=(*read.warnings, *_cabin_warnings(track)))
+    read = dataclasses.replace(read, warnings=(*read.warnings, *_ride_warnings(track)))
     if config.projection.points_voxel_m is not None and sensor == "laser":
         no_points = "a 2D laser shows no points in space, so none are kept"
         read = dataclasses.replace(read, warnings=(*read.warnings, no_points))
@@ -306,8 +306,8 @@ class _Track:
     """What tracking says of all scans of a session.
 
     trajectory : before loops are closed. disagreements : of odometry, at each scan. riding : (N,) scans on a
-    ride from floor to floor. storey : (N,) number of the floor of each in `storeys`. cabins_ns : see
-    `Tracker`.
+    ride from floor to floor. storey : (N,) number of the floor of each in `storeys`. cabins_ns, carried :
+    see `Tracker`.
     """
 
     trajectory: Trajectory
@@ -316,6 +316,7 @@ class _Track:
     storey: I64
     storeys: tuple[Storey, ...]
     cabins_ns: tuple[int, ...] = ()
+    carried: bool = False
 
 
 def _map(
@@ -378,6 +379,7 @@ def _map(
             np.array(storeys, dtype=np.int64),
             tracker.storeys,
             tracker.cabins_ns,
+            tracker.carried,
         )
         closed = selection.closer.finish()
         if whole:
@@ -611,17 +613,40 @@ def _division_warning(
     )
 
 
-def _cabin_warnings(track: _Track) -> list[str]:
-    """A sentence that says where the robot may have taken a lift unnoticed, and what to do."""
-    if not track.cabins_ns:
+def _ride_warnings(track: _Track) -> list[str]:
+    """What may have been a ride to another floor that did not divide the recording: where, and what to do."""
+    from pc2grid.odometry.rides import RIDES
+
+    if not len(track.trajectory):
         return []
-    start_ns = int(track.trajectory.stamps_ns[0])
-    times = ", ".join(f"{(stamp_ns - start_ns) * 1e-9:.0f} s" for stamp_ns in track.cabins_ns)
-    return [
-        f"the robot stood in a room as small as a lift, its door out of sight, {times} after the first scan; "
-        "if it left on another floor, the map shows two floors as one: convert each by itself, with --start, "
-        "--duration and --floor"
-    ]
+    stamps_ns, heights_m = track.trajectory.stamps_ns, track.trajectory.T_session_base[:, 2, 3]
+    advice = "the map shows two floors as one: convert each by itself, with --start, --duration and --floor"
+    warnings = []
+    if track.cabins_ns:
+        times = ", ".join(f"{(stamp_ns - stamps_ns[0]) * 1e-9:.0f} s" for stamp_ns in track.cabins_ns)
+        warnings.append(
+            f"the robot stood in a room as small as a lift, its door out of sight, {times} after the first "
+            f"scan; if it left on another floor, {advice}"
+        )
+    if len(track.riding) and track.riding[-1]:
+        last = int(np.flatnonzero(~track.riding)[-1]) if not track.riding.all() else -1
+        begin_s = (stamps_ns[last + 1] - stamps_ns[0]) * 1e-9
+        lost = len(track.riding) - 1 - last
+        warnings.append(
+            f"from {begin_s:.0f} s after the first scan on, the robot is on a slope that leads to another "
+            f"floor, or less than {RIDES.settled_m:.0f} m behind it: these {lost} scans are in no map; "
+            "record more of that floor"
+        )
+    away = np.flatnonzero(np.abs(heights_m - heights_m[0]) > RIDES.storey_m)
+    if track.carried and len(away):
+        begin_s = (stamps_ns[away[0]] - stamps_ns[0]) * 1e-9
+        farthest_m = float(max(heights_m - heights_m[0], key=abs))
+        where = f"{abs(farthest_m):.1f} m {'above' if farthest_m > 0 else 'below'}"
+        warnings.append(
+            f"the sensor in the hand is up to {where} its first height, and more than {RIDES.storey_m:.1f} m "
+            f"from {begin_s:.0f} s after the first scan on; if that was by stairs, {advice}"
+        )
+    return warnings
 
 
 def _in_order(parts: Sequence[Trajectory]) -> Trajectory:

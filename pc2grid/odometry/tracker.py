@@ -100,6 +100,11 @@ class Tracker:
         """Stamps at which the robot began to stand in what may have been a lift, its door out of sight."""
         return tuple(self._rides.cabins_ns)
 
+    @property
+    def carried(self) -> bool:
+        """Whether the sensor is in the hand, so that tilts and heights say nothing of a slope."""
+        return not self._ground.rolling
+
     def start(self, scan: Scan) -> Tracked:
         """Begin with the first scan: find the floor, and put the base at the origin of the session frame."""
         points = self._deskewed(scan, *self._motion.within(scan, None))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from pc2grid.model import (
     RegisteredScan,
     Trajectory,
 )
-from pc2grid.pipeline import _doubtful, _draw_parts, _Mapped, _of_use, _reports, _Track
+from pc2grid.pipeline import _doubtful, _draw_parts, _Mapped, _of_use, _reports, _ride_warnings, _Track
 from tests.helpers.simulated_drives import drive, office
 
 LAP_M = [(2.0, 7.0), (11.0, 7.0), (11.0, 3.0), (9.5, 5.0), (9.5, 7.0), (18.5, 7.0), (16.5, 4.0), (16.5, 7.0)]
@@ -206,3 +207,18 @@ def test_a_part_too_short_to_be_of_use_is_left_out_and_counted() -> None:
     (warning,) = first.warnings
     assert "log from 0 s (20 m), log#2 from 60 s (12 m); 1 shorter than 8 m left out" in warning
     assert _of_use([short]) == [short]
+
+
+def test_rides_that_did_not_divide_a_recording_are_named() -> None:
+    heights_m = np.repeat((0.0, 3.0), 10)
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, 2, 3] = heights_m
+    stamps_ns = np.arange(20) * 10**9
+    track = on_one_floor(Trajectory(stamps_ns=stamps_ns, T_session_base=poses, health=(Health.FINE,) * 20))
+    assert not _ride_warnings(track)
+    (by_hand,) = _ride_warnings(replace(track, carried=True))
+    assert "3.0 m above" in by_hand and "from 10 s" in by_hand
+    (cabin,) = _ride_warnings(replace(track, cabins_ns=(4 * 10**9,)))
+    assert "4 s after the first scan" in cabin and "--floor" in cabin
+    (unfinished,) = _ride_warnings(replace(track, riding=np.arange(20) >= 15))
+    assert "from 15 s" in unfinished and "these 5 scans" in unfinished
