@@ -5,7 +5,8 @@
 
 The experiment of `tools/bench/real_queries.py`, but asked as a user asks: standing (six scans), after 3 m and
 after 10 m. A query is covered if half of its last scan lies within 0.2 m of a wall of the map at its true
-pose. An answer is right within 0.3 m and 5 degrees of the ground truth.
+pose, be it the other side of that wall, seen from another room; and known if the map also knows half of the
+ground that it has seen. An answer is right within 0.3 m and 5 degrees of the ground truth.
 """
 
 from __future__ import annotations
@@ -23,13 +24,14 @@ from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
 from signature.evaluation.registered_session import RegisteredSession
-from signature.relocalization.map_index import MapIndex
+from signature.relocalization.map_index import MapIndex, share_known
 from signature.relocalization.relocalizer import localize
 
 TRAVEL_M = (0.0, 3.0, 10.0)
 ELSEWHERE_M = (1.0, 3.0, 5.0, 8.0)
 RIGHT_M, RIGHT_RAD = 0.3, math.radians(5.0)
 NEAR_M = 0.2
+KNOWN = 0.5
 
 
 def covered(grid: OccupancyGrid, driven: RegisteredSession, scan: int, T_world_base: SE2) -> bool:
@@ -60,6 +62,9 @@ def count(name: str, grid: OccupancyGrid, queries: list[RegisteredSession], inde
             if truth is None:
                 continue
             kind = "covered" if covered(grid, driven, scan, truth) else "uncovered"
+            share = share_known(grid, asked.query.grid, truth @ asked.query.T_odom_base.inverse())
+            if kind == "covered" and share >= KNOWN:
+                kind = "covered, known"
             error = ""
             if answer.hypotheses:
                 e = truth.inverse() @ answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base
@@ -81,6 +86,7 @@ def count(name: str, grid: OccupancyGrid, queries: list[RegisteredSession], inde
                 kind,
                 answer.status,
                 f"{answer.confidence:.3f}",
+                f"knows {share:.2f}",
                 error,
                 note,
                 flush=True,
