@@ -64,7 +64,8 @@ class DecisionParameters:
         and so much of the walls of one is known to the other. By hand: simulated floors with one plan and
         other furniture reach 0.82 and 0.45; a mirrored plan reaches 0.88, but 0.24.
     seen_there : where two floors look alike, and the map of the other one shows less than this share of what
-        the query has seen, the query may have been made there as well.
+        the query has seen, the query may have been made there as well; and so it may if what is known there
+        agrees with it as well as here, by `equal`.
     clearly_better : before an answer is certain, the maps are searched for places with a coarse score so many
         times that of the best hypothesis. By hand: with 1 the search takes twice as long, and finds what the
         refinement makes no better.
@@ -326,6 +327,16 @@ class MapIndex:
             unseen = self._unseen_alike(query, found[0])
             if unseen:
                 status = "ambiguous"
+                base = query.T_odom_base
+                unseen = [
+                    h
+                    for h in unseen
+                    if not any(
+                        h.session_index == other.session_index
+                        and same_pose(h.fit.T_map_query @ base, other.fit.T_map_query @ base)
+                        for other in found
+                    )
+                ]
                 found_at += range(max(found_at) + 1, max(found_at) + 1 + len(unseen))
                 found += unseen
         return Verdict(
@@ -337,11 +348,13 @@ class MapIndex:
         )
 
     def _unseen_alike(self, query: QueryMap, best: Hypothesis) -> list[Hypothesis]:
-        """The same place on other floors of the building that look alike, but whose maps do not show it.
+        """The same place on other floors of the building that look alike, where what their maps show does not
+        contradict the query: they show too little of it, or agree with it as well as the best floor does.
 
-        No score tells such a floor from that of the best hypothesis.
+        A score tells the two apart by what is unknown there, which says nothing.
         """
-        here = best.session_index
+        here, base = best.session_index, query.T_odom_base
+        least = best.fit.known_agreement_both_ways - DECISION.equal
         found = []
         for there in self.places.sessions(query.views, self.made_with.signature, self.config):
             if not self._other_floor(here, there):
@@ -349,9 +362,11 @@ class MapIndex:
             T_there_here = self._aligned(here, there)
             if T_there_here is None:
                 continue
-            pose = T_there_here @ best.fit.T_map_query
-            if share_known(self.grids[there], query.grid, pose) < DECISION.seen_there:
-                fit = score_fit(self.maps[there].walls, query.walls, pose, best.fit.covariance)
+            target, pose = self.maps[there], T_there_here @ best.fit.T_map_query
+            unseen = share_known(self.grids[there], query.grid, pose) < DECISION.seen_there
+            refined, covariance = refine(target.field, query.walls.points_m, pose, (base.x, base.y))
+            fit = score_fit(target.walls, query.walls, refined, covariance)
+            if unseen or fit.known_agreement_both_ways >= least:
                 found.append(Hypothesis(session_index=there, row=-1, fit=fit))
         return found
 
@@ -379,7 +394,7 @@ class MapIndex:
             alike = [
                 fit
                 for fit in fits
-                if min(fit.known_agreement, fit.backward) >= DECISION.alike_agreement
+                if fit.known_agreement_both_ways >= DECISION.alike_agreement
                 and fit.overlap >= DECISION.alike_overlap
             ]
             self._alike[here, there] = alike[0].T_map_query if alike else None
@@ -474,7 +489,7 @@ class MapIndex:
             return labelled
         # Ground that only one of the maps knows does not count here, and neither map may contradict the
         # other.
-        agreement = min(fit.known_agreement, fit.backward)
+        agreement = fit.known_agreement_both_ways
         needed = DECISION.same_labelled if labelled else DECISION.same
         return SAME_PLACE.probability(agreement, fit.overlap * around.weight) >= needed
 

@@ -51,6 +51,11 @@ class Fit:
         known = (self.forward - LIKELIHOOD.neutral * (1.0 - self.overlap)) / self.overlap
         return min(max(known, 0.0), 1.0)
 
+    @property
+    def known_agreement_both_ways(self) -> float:
+        """0..1, the smaller of `known_agreement` and `backward`: how well each fits what the other knows."""
+        return min(self.known_agreement, self.backward)
+
 
 def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) -> Fit:
     """Score the query at a pose on the map `target`."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pc2grid.model import UNKNOWN, SessionMap
 from signature.config import Config
@@ -53,15 +55,20 @@ def test_floors_that_look_alike_are_ambiguous(tmp_path: Path, floor: SessionMap,
     assert {answer.labels[h.session_index].floor for h in answer.hypotheses} == {"0", "1"}
 
 
+@pytest.mark.parametrize("known_m", [11.0, 17.5], ids=["nothing of it", "most of it"])
 def test_a_floor_that_looks_alike_may_hold_what_its_map_does_not_show(
-    tmp_path: Path, floor: SessionMap, origin: Provenance
+    tmp_path: Path, floor: SessionMap, origin: Provenance, known_m: float
 ) -> None:
-    """The map of one floor ends in the middle of the office; the query is from beyond."""
+    """The map of one floor ends in the office; the query is from beyond, or reaches beyond."""
     whole = office()
-    cells = whole.cells.copy()
-    cells[:, round(11.0 / whole.resolution_m) :] = UNKNOWN
-    half = session("half", replace(whole, cells=cells), way())
-    mirrored = session("half", replace(whole, cells=cells[::-1]), way())
+
+    def cells_up_to(end_m: float) -> NDArray[np.int8]:
+        cells = whole.cells.copy()
+        cells[:, round(end_m / whole.resolution_m) :] = UNKNOWN
+        return cells
+
+    half = session("half", replace(whole, cells=cells_up_to(known_m)), way())
+    mirrored = session("half", replace(whole, cells=cells_up_to(11.0)[::-1]), way())
     query = cut(whole, 11.5, 0.0, 20.0, 14.0)
     labels = [replace(origin, label=Label(building="house", floor=k)) for k in FLOORS]
 
