@@ -171,7 +171,7 @@ def document(answer: answer.Answer) -> AnswerDocument:
         ],
         "history": [_moment(moment) for moment in answer.history],
         "prior": _prior(answer),
-        "in_space": _in_space(answer),
+        "in_space": in_space_document(answer),
         "query": {"path_m": answer.path_m, "stamp_ns": answer.stamp_ns},
         "database": {"sessions": list(answer.sessions)},
         "timing_ms": answer.timing_ms,
@@ -195,7 +195,8 @@ def _prior(answer: answer.Answer) -> PriorUse | None:
     return {"status": answer.prior, "excluded": excluded}
 
 
-def _in_space(answer: answer.Answer) -> PoseInSpace | None:
+def in_space_document(answer: answer.Answer) -> PoseInSpace | None:
+    """The pose with six degrees of freedom; None if the map or the query has no points."""
     pose = answer.in_space
     if pose is None:
         return None

@@ -17,7 +17,16 @@ from signature.evaluation.metrics import ConfidenceError, MatrixCell, QueryCount
 from signature.evaluation.peers.outcome import PeerCell, PeerTrial
 from signature.evaluation.real_sensors import RealCell
 from signature.evaluation.trial import Trial
-from signature.relocalization.answer_json import Pose, Result, Sessions, StampedPose, Status, Travel, Version
+from signature.relocalization.answer_json import (
+    Pose,
+    PoseInSpace,
+    Result,
+    Sessions,
+    StampedPose,
+    Status,
+    Travel,
+    Version,
+)
 from signature.relocalization.watcher import State
 
 if TYPE_CHECKING:
@@ -127,9 +136,10 @@ class Watch(TypedDict):
     """A line of `pc2grid watch --json`: what one look at the database said. state: searching (not located
     yet), located, doubtful (this look does not confirm it), lost, recovered (located again, by two looks that
     agree). pose: of the base at `stamp_ns`; null unless the status is `located`. T_map_odom: of the robot's
-    own odometry frame. confidence: the probability that the best place is right. published: topics on which
-    it was said. lag_s, elapsed_s: seconds from a scan's arrival to its use, and for this look. scans: used so
-    far, dropped: left out because the computer is too slow, reconnected: lost connections made again."""
+    own odometry frame. in_space: null if the map or the scans have no points. confidence: the probability
+    that the best place is right. published: topics on which it was said. lag_s, elapsed_s: seconds from a
+    scan's arrival to its use, and for this look. scans: used so far, dropped: left out because the computer
+    is too slow, reconnected: lost connections made again."""
 
     schema_version: Version
     state: State
@@ -139,6 +149,7 @@ class Watch(TypedDict):
     map: WatchedMap | None
     pose: StampedPose | None
     T_map_odom: Pose | None
+    in_space: PoseInSpace | None
     confidence: float
     published: list[str]
     scans: int

@@ -389,6 +389,8 @@ def as_text(look: Look, published: list[str]) -> str:
 
 
 def _document(look: Look, live: LiveLog, robot: _Robot, published: list[str]) -> Watch:
+    from signature.relocalization.answer_json import in_space_document
+
     answer, pose, T_map_odom, counts = look.answer, look.T_map_base, look.T_map_odom, live.feed.counts
     document: Watch = {
         "schema_version": 1,
@@ -399,6 +401,7 @@ def _document(look: Look, live: LiveLog, robot: _Robot, published: list[str]) ->
         "map": None,
         "pose": None,
         "T_map_odom": None,
+        "in_space": in_space_document(answer),
         "confidence": answer.confidence,
         "published": published,
         "scans": live.report().scans_read,
