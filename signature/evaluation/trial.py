@@ -41,7 +41,8 @@ class Trial:
     there is none; alone: the same by each combination of signatures, without isovists. forward, walls,
     backward, looked_at, lead, likeness: the evidence of the decision, see
     `signature.relocalization.confidence`; agreement: the better one of forward and backward. In the results
-    of earlier versions, forward, backward, looked_at and likeness are null.
+    of earlier versions, forward, backward, looked_at and likeness are null. map_bent_m: how far the map
+    around the true place lies from where the map as a whole puts it; null in simulation.
     """
 
     building: str
@@ -66,6 +67,7 @@ class Trial:
     backward: float | None = None
     looked_at: float | None = None
     likeness: float | None = None
+    map_bent_m: float | None = None
 
     @property
     def in_map(self) -> bool:

@@ -79,12 +79,12 @@ def compare_log_command(
         replay = Replay(opened, read_tum(truth), settings, of_base=of_base)
         observer = console.of(context).observer()
         with observer.step("map"):
-            sensor_map = replay.map(TimeSpan(from_s, to_s - from_s), observer)
+            part = replay.map(TimeSpan(from_s, to_s - from_s), observer)
         trials = []
         with console.of(context).progress("locate") as advance:
             spans = spread(to_s, end_s, queries, length_s)
             for done, span in enumerate(spans, start=1):
-                trials.append(replay.locate(span, sensor_map))
+                trials.append(replay.locate(span, part))
                 advance(done / len(spans))
     judged = [trial for trial in trials if trial is not None]
     counts = QueryCounts.of(judged)
@@ -132,7 +132,7 @@ def _print(trials: list[Trial], counts: QueryCounts, unknown: int) -> None:
     from pc2grid_cli.tables import show, table
 
     title = "later parts of the recording in the map of the earlier one"
-    found = table(title, ["from", "answer"], ["driven", "covered", "confidence", "off by"])
+    found = table(title, ["from", "answer"], ["driven", "covered", "confidence", "off by", "map bent by"])
     for trial in trials:
         found.add_row(
             f"{trial.seed} s",
@@ -141,10 +141,12 @@ def _print(trials: list[Trial], counts: QueryCounts, unknown: int) -> None:
             f"{trial.mapped:.2f}",
             probability(trial.confidence),
             "" if trial.error_m is None or trial.status != "located" else f"{trial.error_m:.2f} m",
+            "" if trial.map_bent_m is None else f"{trial.map_bent_m:.2f} m",
         )
     share = f", {counts.right / counts.inside:.2f}" if counts.inside else ""
     show(
         found,
+        "off by: against the map around, which as a whole may be bent by what the last column says",
         f"where the map covers what the query saw: {counts.right} of {counts.inside} located and right"
         f"{share}, {counts.wrong} wrong, {counts.unsure} without an answer",
     )

@@ -7,9 +7,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pc2grid.errors import ConfigError
+from pc2grid.geometry import SE2
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum, write_tum
 from pc2grid.model import Trajectory
@@ -18,7 +20,8 @@ from pc2grid.time_span import TimeSpan
 from pc2grid_cli import compare_log
 from signature.config import Config
 from signature.evaluation.metrics import QueryCounts
-from signature.evaluation.replay import Replay, spread
+from signature.evaluation.replay import MappedPart, Replay, spread
+from signature.evaluation.sensor_map import SensorMap
 from tests.helpers.simulated_drives import office
 from tests.helpers.trials import trial
 
@@ -62,11 +65,29 @@ def test_later_parts_are_located_in_the_map_of_the_earlier(recorded: Path) -> No
     with open_log(recorded / "round.mcap", Config().read) as log:
         replay = Replay(log, read_tum(recorded / "round.tum"), Config(), of_base=True)
         end_s = (log.info.end_ns - log.info.start_ns) * 1e-9
-        sensor_map = replay.map(TimeSpan(0.0, 0.8 * end_s))
-        found = replay.locate(TimeSpan(0.82 * end_s, 0.18 * end_s), sensor_map)
+        part = replay.map(TimeSpan(0.0, 0.8 * end_s))
+        found = replay.locate(TimeSpan(0.82 * end_s, 0.18 * end_s), part)
     assert found is not None and found.mapped > 0.8
     assert found.status == "located" and found.right
     assert found.error_m is not None and found.error_m < 0.15
+    assert found.map_bent_m is not None and found.map_bent_m < 0.05
+
+
+def test_an_answer_is_judged_by_the_map_around_it() -> None:
+    """A map that is bent by 1 m from end to end, and exact around each place."""
+    true_xy = np.column_stack((np.linspace(0.0, 100.0, 401), np.zeros(401)))
+    mapped_xy = true_xy + np.column_stack((np.zeros(401), (true_xy[:, 0] / 100.0) ** 2))
+    whole = SE2.fit(mapped_xy, true_xy)
+    index: Any = None
+    part = MappedPart(
+        SensorMap(name="bent", sensor="laser", T_plan_map=whole, index=index), mapped_xy, true_xy
+    )
+    end = SE2(100.0, 0.0, 0.0)
+    T_map_base = part.around(end).T_plan_map.inverse() @ end
+    assert abs(T_map_base.y - 1.0) < 0.02 and abs(T_map_base.x - 100.0) < 0.02
+    assert abs((whole.inverse() @ end).y - 1.0) > 0.1
+    assert part.bent_m(end) > 0.1
+    assert part.around(SE2(50.0, 60.0, 0.0)) is part.sensor_map  # no scan of the map is near
 
 
 def test_without_truth_nothing_is_judged(recorded: Path, tmp_path: Path) -> None:
