@@ -99,8 +99,8 @@ def build_map(
     >>> import pc2grid
     >>> with pc2grid.open_log("monday.mcap") as log:
     ...     monday = build_map(log, session="monday", span=pc2grid.TimeSpan(0.0, 2.0))
-    >>> monday.sensor, len(monday.trajectory) > 10, monday.trajectory.planar()[0].tolist()
-    ('laser', True, [0.0, 0.0, 0.0])
+    >>> monday.sensor, len(monday.trajectory) > 10, bool(abs(monday.trajectory.planar()[0]).max() < 1e-9)
+    ('laser', True, True)
     """
     return longest_of(
         build_maps(log, config, session=session, span=span, observer=observer, recognizer=recognizer)
