@@ -614,7 +614,9 @@ def _division_warning(
 
 
 def _ride_warnings(track: _Track) -> list[str]:
-    """What may have been a ride to another floor that did not divide the recording: where, and what to do."""
+    """What may have been a ride to another floor that did not divide the recording, or a slope that was not
+    noticed: where, and what to do."""
+    from pc2grid.odometry.overruled import stalls
     from pc2grid.odometry.rides import RIDES
 
     if not len(track.trajectory):
@@ -636,6 +638,14 @@ def _ride_warnings(track: _Track) -> list[str]:
             f"from {begin_s:.0f} s after the first scan on, the robot is on a slope that leads to another "
             f"floor, or less than {RIDES.settled_m:.0f} m behind it: these {lost} scans are in no map; "
             "record more of that floor"
+        )
+    for stall in stalls(stamps_ns.tolist(), track.disagreements):
+        from_s, to_s = ((stamp_ns - stamps_ns[0]) * 1e-9 for stamp_ns in (stall.from_ns, stall.to_ns))
+        warnings.append(
+            f"from {from_s:.0f} to {to_s:.0f} s after the first scan odometry reports "
+            f"{stall.reported_m:.1f} m of travel, and the scans show {stall.moved_m:.1f} m: unless the "
+            "wheels spun, the robot was on a slope that was not noticed, and the map is wrong there; leave "
+            "that part out with --start and --duration"
         )
     away = np.flatnonzero(np.abs(heights_m - heights_m[0]) > RIDES.storey_m)
     if track.carried and len(away):

@@ -124,7 +124,7 @@ class MotionModel:
         overrules = distance_m > p.owed_m + p.slip_sigma * max(
             reported_m, moved_m
         ) or turn_rad > p.owed_rad + p.slip_sigma * max(reported_rad, moved_rad)
-        return Disagreement(distance_m, turn_rad, overrules)
+        return Disagreement(distance_m, turn_rad, overrules, reported_m=reported_m, moved_m=moved_m)
 
     def search_window(self, prediction: Prediction) -> tuple[float, float]:
         """Return how far (m, rad) the robot can be from where it is predicted."""

@@ -6,6 +6,7 @@ and tracking follows them; the poses are fine, but a user wants to know where an
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,18 +17,38 @@ _TOGETHER_NS = 10**9
 _SHOWN = 20
 """Stretches that are kept."""
 
+_STALLED_M = 2.0
+"""Odometry and scans are compared over this travel: late or bunched odometry has caught up by then."""
+_STALLED_SHARE = 0.5
+"""Of that travel, what the poses must make at least. Wheels slip by a few percent."""
+
 
 @dataclass(frozen=True, slots=True)
 class Disagreement:
     """By how much the motion to a scan that odometry reports differs from that which the scan shows.
 
     distance_m, turn_rad : size of the difference. overrules : whether it is more than odometry that is merely
-        inexact explains.
+        inexact explains. reported_m, moved_m : length of both motions.
     """
 
     distance_m: float
     turn_rad: float
     overrules: bool
+    reported_m: float = 0.0
+    moved_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Stall:
+    """A stretch of metres over which wheels turn and poses stay behind.
+
+    from_ns, to_ns : its first and its last scan. reported_m, moved_m : travel by odometry and by the poses.
+    """
+
+    from_ns: int
+    to_ns: int
+    reported_m: float
+    moved_m: float
 
 
 def check_odometry(stamps_ns: Sequence[int], disagreements: Sequence[Disagreement | None]) -> OdometryCheck:
@@ -58,3 +79,35 @@ def check_odometry(stamps_ns: Sequence[int], disagreements: Sequence[Disagreemen
         stretches.append(stretch)
     stretches.sort(key=lambda s: (-(s.distance_m + s.turn_rad), s.from_ns))
     return OdometryCheck(compared=compared, overruled=overruled, stretches=tuple(stretches[:_SHOWN]))
+
+
+def stalls(stamps_ns: Sequence[int], disagreements: Sequence[Disagreement | None]) -> list[Stall]:
+    """Where the poses make less than half of the travel that odometry reports, in the order of time.
+
+    From scan to scan that may be too little to be noticed. Either the wheels spin, or the scans show
+    something that goes along with the robot, such as the floor ahead on a slope that was not noticed. The
+    lengths of the ways are compared, since odometry may have the direction wrong (fr079: forwards for
+    backwards).
+    """
+    known = [(stamp, found) for stamp, found in zip(stamps_ns, disagreements, strict=True) if found]
+    behind = [False] * len(known)
+    first, reported_m, moved_m = 0, 0.0, 0.0
+    for last, (_, found) in enumerate(known):
+        reported_m += found.reported_m
+        moved_m += found.moved_m
+        while reported_m - known[first][1].reported_m >= _STALLED_M:
+            reported_m -= known[first][1].reported_m
+            moved_m -= known[first][1].moved_m
+            first += 1
+        if reported_m >= _STALLED_M and moved_m < _STALLED_SHARE * reported_m:
+            behind[first : last + 1] = [True] * (last + 1 - first)
+    return [
+        Stall(
+            from_ns=known[members[0]][0],
+            to_ns=known[members[-1]][0],
+            reported_m=sum(known[k][1].reported_m for k in members),
+            moved_m=sum(known[k][1].moved_m for k in members),
+        )
+        for stalled, group in itertools.groupby(range(len(known)), key=behind.__getitem__)
+        if stalled and (members := list(group))
+    ]
