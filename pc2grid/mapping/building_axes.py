@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F64
+from pc2grid.geometry import wrap_angle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,17 +77,14 @@ def pull_to_axes(
     """
     direction = np.array([wall.direction_rad for wall in walls]) + yaw_rad
     weight = np.array([wall.concentration for wall in walls]) ** 2
-    robust = weight
-    deviation = np.zeros(len(direction))
     axis_rad = float(np.angle((weight * np.exp(4j * direction)).sum())) / 4.0
     for _ in range(parameters.rounds):
-        deviation = _within_right_angle(direction - axis_rad)
+        deviation = _from_axis(direction, axis_rad)
         robust = weight / (1.0 + (deviation / parameters.robust_rad) ** 2) ** 2
         axis_rad += float((robust * deviation).sum() / max(robust.sum(), np.finfo(float).tiny))
-    return _within_right_angle(direction - axis_rad), robust / parameters.sigma_rad**2
+    return _from_axis(direction, axis_rad), robust / parameters.sigma_rad**2
 
 
-def _within_right_angle(angle_rad: F64) -> F64:
-    """The same angles (N,) modulo 90 degrees, from -45 to 45."""
-    quarter = math.pi / 2
-    return (angle_rad + quarter / 2) % quarter - quarter / 2
+def _from_axis(direction_rad: F64, axis_rad: float) -> F64:
+    """Directions (N,) relative to the nearest axis, from -45 to 45 degrees."""
+    return wrap_angle(4.0 * (direction_rad - axis_rad)) / 4.0
