@@ -114,7 +114,7 @@ def assumed_ground(T_base_sensor: F64) -> Ground:
 
 def _downsample(points_m: NDArray[np.floating], p: CloudParameters) -> F64:
     """Return at most `ground_points` points (N, 3), one a voxel, so that near surfaces count no more."""
-    import open3d as o3d
+    from pc2grid.open3d_core import o3d
 
     sample = points_m[random_subset(len(points_m), p.ground_sample)].astype(np.float64)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(sample))
@@ -146,7 +146,7 @@ def _largest_plane(
     points: F64, tolerance_m: float, iterations: int, p: CloudParameters
 ) -> tuple[Plane, NDArray[np.intp]] | None:
     """Return the plane that holds the most points, least squares of these, and their indices."""
-    import open3d as o3d
+    from pc2grid.open3d_core import o3d
 
     if len(points) < p.min_plane_points:
         return None

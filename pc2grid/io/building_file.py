@@ -97,7 +97,7 @@ def load_mesh(path: Path) -> tuple[F64, I64]:
 
     Raises MapFileError if it holds no triangles or a vertex is not finite.
     """
-    import open3d as o3d
+    from pc2grid.open3d_core import o3d
 
     with _quietly():
         found = o3d.io.read_triangle_mesh(path)
@@ -173,7 +173,7 @@ def _cloud_blocks(path: Path) -> Iterator[F64]:
 
 
 def _text_blocks(path: Path) -> Iterator[F64]:
-    import open3d as o3d
+    from pc2grid.open3d_core import o3d
 
     with _quietly():
         cloud = o3d.io.read_point_cloud(path, remove_nan_points=True, remove_infinite_points=True)
@@ -201,6 +201,6 @@ def sampled(vertices: F64, triangles: I64) -> Iterator[F64]:
 
 def _quietly() -> Any:
     """Open3D prints a warning of its own for each file without triangles."""
-    import open3d as o3d
+    from pc2grid.open3d_core import o3d
 
     return o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)

@@ -136,7 +136,7 @@ def check_plausible(points_m: NDArray[np.floating], parameters: CloudMapParamete
 
 def _refined(points: F64, ground: Ground, p: CloudMapParameters) -> Ground:
     """The ground fitted to all points near it; `find_ground` uses a small sample."""
-    import open3d as o3d
+    from pc2grid.open3d_core import o3d
 
     near = points[np.abs(ground.heights(points)) < p.floor_m]
     near = near[random_subset(len(near), p.refine_points)]

@@ -75,7 +75,7 @@ class SurfaceMap:
 
         points_m : (N, 3) base frame. sensor_m : (3,) position of the sensor, same frame.
         """
-        import open3d as o3d
+        from pc2grid.open3d_core import o3d
 
         p = self._parameters
         away = points_m - sensor_m
@@ -106,7 +106,7 @@ class SurfaceMap:
 
     def extend(self, T_session_base: F64) -> None:
         """Add the scan refined last at its final pose (4, 4), if the camera has moved enough."""
-        import open3d as o3d
+        from pc2grid.open3d_core import o3d
 
         p = self._parameters
         if self._last is not None:

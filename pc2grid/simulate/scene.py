@@ -103,7 +103,7 @@ class Scene:
     """Casts rays into a mesh (Open3D RaycastingScene, Embree). The constructor loads Open3D."""
 
     def __init__(self, mesh: Mesh) -> None:
-        import open3d as o3d
+        from pc2grid.open3d_core import o3d
 
         tensor: Any = o3d.core.Tensor
         self._tensor = tensor

@@ -317,7 +317,7 @@ def _icp(
     query: F64, target: F64, start: F64, p: RegistrationParameters
 ) -> tuple[F64, F64, F64, float] | None:
     """The pose (4, 4), its information (6, 6) at a point (3,), and the rmse, m; None without overlap."""
-    import open3d as o3d
+    from pc2grid.open3d_core import o3d
 
     def cloud_of(points: F64) -> Any:
         return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))

@@ -124,6 +124,8 @@ def program(*arguments: str | Path, environment: Mapping[str, str] | None = None
 def run_python(code: str, *arguments: str | Path, environment: Mapping[str, str] | None = None) -> Child:
     """Run Python code as a process of its own. environment : additional variables.
 
+    Byte code is kept, as it is where pc2grid is installed: to compile 200 modules takes 0.4 s each time.
+
     Raises RuntimeError if it fails; exit codes 3 and 4 of the program are results, not failures.
     """
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
@@ -134,7 +136,7 @@ def run_python(code: str, *arguments: str | Path, environment: Mapping[str, str]
         text=True,
         cwd=ROOT,
         env={
-            **os.environ,
+            **{name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"},
             "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tools"))),
             **(environment or {}),
         },

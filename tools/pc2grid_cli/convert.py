@@ -352,7 +352,7 @@ def _stored(output: str, jobs: list[Job], *, add: bool, force: bool) -> dict[str
 def summary(session: SessionMap, origin: Provenance) -> Converted:
     """The session made of one input, as the JSON document describes it."""
 
-    from pc2grid_cli.json_schemas import consistency_document, odometry_document, precision_document
+    from pc2grid_cli.session_documents import consistency_document, odometry_document, precision_document
 
     path_m = session.trajectory.path_m()
     grid = session.grid

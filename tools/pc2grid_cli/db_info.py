@@ -18,7 +18,7 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
 
     Example: pc2grid db info building.submaps
     """
-    from pc2grid_cli.json_schemas import consistency_document, odometry_document, precision_document
+    from pc2grid_cli.session_documents import consistency_document, odometry_document, precision_document
     from signature.database import open_database
 
     with open_database(database) as opened:
