@@ -105,21 +105,24 @@ def compare_peers_command(
 def _site(
     recording: Path, folder: Path, queries: int, travel_m: float, mapped_s: float | None, of_base: bool
 ) -> Site:
-    """The building of a recording, or of a 3D scan; what was prepared before is used again."""
+    """The building of a recording, or of a 3D scan; what was prepared from the same before is used again."""
     from pc2grid.errors import LogNotFound
     from pc2grid.io.building_file import is_building_file
     from signature.config import Config
-    from signature.evaluation.peers.site import recorded_site, simulated_site
+    from signature.evaluation.peers.site import recorded_site, simulated_site, site_name
 
     if not recording.exists():
         raise LogNotFound(f"{recording}: no such file")
-    made = f"{recording.stem}.{travel_m:g}m.{queries}" + (f".{mapped_s:g}s" if mapped_s else "")
+    config = Config()
+    made = folder / site_name(
+        recording, config, queries=queries, travel_m=travel_m, mapped_s=mapped_s, of_base=of_base
+    )
     if is_building_file(recording):
-        return simulated_site(recording, folder / made, Config(), queries=queries, travel_m=travel_m)
+        return simulated_site(recording, made, config, queries=queries, travel_m=travel_m)
     return recorded_site(
         recording,
-        folder / made,
-        Config(),
+        made,
+        config,
         queries=queries,
         travel_m=travel_m,
         mapped_s=mapped_s,

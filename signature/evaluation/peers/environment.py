@@ -10,17 +10,18 @@ import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 
 from pc2grid.errors import Pc2GridError
 from pc2grid.model import SensorKind
+from signature.evaluation.peers import particle_filter
+from signature.evaluation.peers.asked import MATCHERS, OWN, digest, digest_of_sources
 from signature.evaluation.peers.particle_filter import PROGRAMS, ParticleFilter
 from signature.evaluation.peers.peer_process import Peer, PeerProcess
 
 PINS = ("map-closures==2.2.0", "kiss-matcher==1.0.2")
 """The versions that the parameters of `cloud_matchers` were chosen for."""
-
-_MATCHERS = Path(__file__).with_name("cloud_matchers.py")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,6 +74,16 @@ class PeerEnvironment:
                     f"{self.folder}: {' '.join(PINS)} cannot be installed", hint=" ".join(map(str, command))
                 )
 
+    def version(self, kind: PeerKind) -> str:
+        """A digest of what its answers depend on besides map and query: sources, versions, programs."""
+        if kind.name == "pc2grid":
+            return digest_of_sources(OWN)
+        if kind.name == "particle-filter":
+            programs = [Path(found) for name in PROGRAMS if (found := shutil.which(name)) is not None]
+            return digest_of_sources([Path(particle_filter.__file__), *programs])
+        own = [metadata.version(name) for name in metadata.packages_distributions().get("open3d", ())]
+        return digest(own if kind.name == "fpfh-ransac" else PINS, digest_of_sources([MATCHERS]))
+
     def start(self, kind: PeerKind, map_stem: Path) -> Peer:
         """The peer, with a map."""
         if kind.name == "particle-filter":
@@ -81,7 +92,7 @@ class PeerEnvironment:
             own = [sys.executable, "-m", "signature.evaluation.peers.own_process"]
             return PeerProcess(own, kind.name, map_stem)
         python = sys.executable if kind.name == "fpfh-ransac" else self.python
-        return PeerProcess([python, _MATCHERS], kind.name, map_stem)
+        return PeerProcess([python, MATCHERS], kind.name, map_stem)
 
 
 class InstallFailed(Pc2GridError):

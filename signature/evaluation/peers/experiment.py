@@ -10,6 +10,7 @@ from pathlib import Path
 from pc2grid.io.atomic import replace_file
 from signature.evaluation.peers.environment import PEERS, PeerEnvironment, PeerKind
 from signature.evaluation.peers.outcome import PeerTrial
+from signature.evaluation.peers.peer_process import PeerAnswer
 from signature.evaluation.peers.site import Site
 
 Task = tuple[PeerKind, Site, Site]
@@ -30,22 +31,32 @@ def tasks(sites: Sequence[Site], environment: PeerEnvironment) -> list[Task]:
 
 
 def run(task: Task, environment: PeerEnvironment, folder: Path) -> Iterator[PeerTrial]:
-    """The judged answers, one by one. Those in `folder` from an earlier run are taken from there."""
+    """The judged answers, one by one.
+
+    An answer in `folder` from an earlier run is used again if map, query and program are the same; it is
+    judged again in any case.
+    """
     kind, site, map_site = task
+    asked = (kind.name, site.folder.name, "in", map_site.folder.name, environment.version(kind))
+    file = folder / (".".join(asked) + ".json")
+    answers = _kept(file)
     queries = site.queries()
-    file = folder / f"{kind.name}.{site.name}.in.{map_site.name}.json"
-    trials = [PeerTrial(**row) for row in json.loads(file.read_text())] if file.exists() else []
-    yield from (trial for trial in trials if trial.query in queries)
-    rest = {n: query for n, query in queries.items() if n not in {trial.query for trial in trials}}
-    if not rest:
-        return
-    peer = environment.start(kind, map_site.map_stem)
+    rest = [number for number in queries if number not in answers]
+    peer = environment.start(kind, map_site.map_stem) if rest else None
     try:
-        for number, query in rest.items():
-            answer = peer.locate(site.stem(number))
-            trials.append(PeerTrial.of(kind.name, site.name, map_site.name, number, query, answer))
-            with replace_file(file) as draft:
-                draft.write_text(json.dumps([asdict(trial) for trial in trials]))
-            yield trials[-1]
+        for number, query in queries.items():
+            if number not in answers:
+                assert peer is not None
+                answers[number] = peer.locate(site.stem(number))
+                with replace_file(file) as draft:
+                    draft.write_text(json.dumps({n: asdict(answer) for n, answer in answers.items()}))
+            yield PeerTrial.of(kind.name, site.name, map_site.name, number, query, answers[number])
     finally:
-        peer.close()
+        if peer is not None:
+            peer.close()
+
+
+def _kept(file: Path) -> dict[int, PeerAnswer]:
+    """The answers of an earlier run by the numbers of their queries."""
+    rows = json.loads(file.read_text()) if file.exists() else {}
+    return {int(number): PeerAnswer.of(fields) for number, fields in rows.items()}

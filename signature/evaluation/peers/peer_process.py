@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol
+from typing import Any, Protocol
 
 from pc2grid.errors import Pc2GridError
 
@@ -39,6 +39,12 @@ class PeerAnswer:
     score: float
     cpu_s: float
     peak_mb: float
+
+    @staticmethod
+    def of(fields: dict[str, Any]) -> PeerAnswer:
+        """From the fields as JSON holds them."""
+        pose = fields["pose"]
+        return PeerAnswer(**{**fields, "pose": None if pose is None else tuple(pose)})
 
 
 class Peer(Protocol):
@@ -78,8 +84,7 @@ class PeerProcess:
             fields = json.loads(self._process.stdout.readline())
         except (BrokenPipeError, ValueError) as error:
             raise PeerFailed(f"{self._name}: no answer to {query}") from error
-        pose = fields.pop("pose")
-        return PeerAnswer(pose=None if pose is None else tuple(pose), **fields)
+        return PeerAnswer.of(fields)
 
     def close(self) -> None:
         """End the process."""

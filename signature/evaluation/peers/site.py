@@ -11,6 +11,7 @@ A site is a folder: `map.yaml` and `map.png` (nav2), `map.npz` (clouds along the
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Iterable, Iterator
@@ -26,14 +27,17 @@ from pc2grid.errors import ConfigError, LogNotFound
 from pc2grid.geometry import SE2, transform_points
 from pc2grid.io import open_log
 from pc2grid.io.atomic import replace_file
+from pc2grid.io.building_file import is_building_file
 from pc2grid.io.nav2_map import load_map, save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind, Trajectory
 from pc2grid.odometry.tracker import Tracker
 from signature.config import Config
+from signature.evaluation.peers.asked import PREPARES, digest, digest_of_sources
 from signature.evaluation.registered_session import register
 from signature.evaluation.sensor_matrix import query_start
+from signature.sessions import digest_of
 
 if TYPE_CHECKING:
     from pc2grid.io import Log
@@ -155,6 +159,20 @@ def truth_file(log: Path) -> Path:
     raise LogNotFound(
         f"{log}: no true poses beside it", hint=f"put them into {log.stem}.tum, stamped as the scans"
     )
+
+
+def site_name(
+    source: Path, config: Config, *, queries: int, travel_m: float, mapped_s: float | None, of_base: bool
+) -> str:
+    """A name for the folder of a site, that differs where anything differs that the site is made from.
+
+    source : a recording with true poses beside it, or a 3D scan of a building. Raises what `digest_of` and
+    `truth_file` do.
+    """
+    truth = "" if is_building_file(source) else hashlib.sha256(truth_file(source).read_bytes()).hexdigest()
+    settings = (queries, travel_m, mapped_s, of_base, config.model_dump(mode="json"))
+    made = digest(digest_of(source, config), truth, settings, digest_of_sources(PREPARES))
+    return f"{source.stem}.{made}"
 
 
 def recorded_site(

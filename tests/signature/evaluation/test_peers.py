@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,13 @@ from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli import peers_report
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app
-from signature.evaluation.peers.environment import PEERS, PINS, PeerEnvironment
-from signature.evaluation.peers.experiment import tasks
+from signature.config import Config
+from signature.evaluation.peers.environment import PEERS, PINS, PeerEnvironment, PeerKind
+from signature.evaluation.peers.experiment import run, tasks
 from signature.evaluation.peers.outcome import PeerTrial, best_threshold, counted
 from signature.evaluation.peers.particle_filter import carmen_log
 from signature.evaluation.peers.peer_process import PeerAnswer, PeerFailed, PeerProcess
-from signature.evaluation.peers.site import Site, SiteQuery, is_covered, save_beams, truth_file
+from signature.evaluation.peers.site import Site, SiteQuery, is_covered, save_beams, site_name, truth_file
 from signature.evaluation.registered_session import RegisteredSession
 from tests.helpers.json_schema import closed
 from tests.helpers.simulated_drives import drive, office
@@ -186,12 +188,73 @@ def test_what_is_missing_is_named_with_its_command(tmp_path: Path, monkeypatch: 
         Site(name="a", sensor="laser", folder=tmp_path),
         *(Site(name=name, sensor="lidar", folder=tmp_path) for name in "bc"),
     ]
-    run = [(kind.name, site.name, other.name) for kind, site, other in tasks(sites, environment)]
-    assert run == [
+    asked = [(kind.name, site.name, other.name) for kind, site, other in tasks(sites, environment)]
+    assert asked == [
         ("pc2grid", "a", "a"),
         *(("pc2grid", *pair) for pair in ("bb", "bc", "cc", "cb")),
         *(("fpfh-ransac", *pair) for pair in ("bb", "bc", "cc", "cb")),
     ]
+
+
+def test_kept_answers_are_judged_again_and_asked_for_again_of_another_program(tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    class Here:
+        def locate(self, query: Path) -> PeerAnswer:
+            asked.append(query.name)
+            return PeerAnswer(pose=QUERY.pose, score=1.0, cpu_s=1.0, peak_mb=1.0)
+
+        def close(self) -> None:
+            asked.append("closed")
+
+    class Environment(PeerEnvironment):
+        def version(self, kind: PeerKind) -> str:
+            return self.folder.name
+
+        def start(self, kind: PeerKind, map_stem: Path) -> Here:
+            return Here()
+
+    def true_poses(*poses: tuple[float, float, float]) -> None:
+        for number, pose in enumerate(poses):
+            made = SiteQuery(pose=pose, covered=True, travel_m=10.0)
+            site.stem(number).with_suffix(".json").write_text(json.dumps(asdict(made)))
+
+    site = Site(name="a", sensor="laser", folder=tmp_path / "a.1")
+    (site.folder / "queries").mkdir(parents=True)
+    true_poses(QUERY.pose)
+
+    def right(version: str, map_site: Site = site) -> list[bool]:
+        environment = Environment(folder=tmp_path / version)
+        return [trial.right for trial in run((PEERS[0], site, map_site), environment, tmp_path)]
+
+    assert right("first") == [True] and asked == ["00", "closed"]
+    true_poses((9.0, 3.0, 0.5), QUERY.pose)
+    assert right("first") == [False, True] and asked[2:] == ["01", "closed"]
+    assert right("first") == [False, True] and len(asked) == 4
+    assert right("second") == [False, True] and asked[4:] == ["00", "01", "closed"]
+    moved = Site(name="a", sensor="laser", folder=tmp_path / "a.2")
+    assert right("first", moved) == [False, True] and asked[7:] == ["00", "01", "closed"]
+
+
+def test_what_a_site_is_made_from_is_in_the_name_of_its_folder(tmp_path: Path) -> None:
+    for name, y_m in (("a", 0.0), ("b", 1.0)):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "plan.xyz").write_text(f"0 {y_m} 0\n1 0 0\n")
+    config, coarser = Config(), Config.model_validate({"projection": {"resolution_m": 0.1}})
+    asked = {"queries": 2, "travel_m": 3.0, "mapped_s": None, "of_base": False}
+    cases = [
+        (tmp_path / "a" / "plan.xyz", config, asked),
+        (tmp_path / "b" / "plan.xyz", config, asked),
+        (tmp_path / "a" / "plan.xyz", coarser, asked),
+        *(
+            (tmp_path / "a" / "plan.xyz", config, {**asked, **other})
+            for other in ({"queries": 3}, {"of_base": True})
+        ),
+    ]
+    names = [site_name(source, settings, **other) for source, settings, other in cases]
+    assert len(set(names)) == len(names) and all(name.startswith("plan.") for name in names)
+    assert site_name(tmp_path / "a" / "plan.xyz", config, **asked) == names[0]
 
 
 def test_true_poses_stand_beside_the_recording(tmp_path: Path) -> None:
