@@ -55,6 +55,8 @@ class RideParameters:
     turned_rad : a robot that turns by more does not stand. around, opening : least sectors that are near, and
         most that are far, around a robot that stood in what may be the cabin of a lift, whose door it did not
         look at. From half a metre before it, the door of a cabin spans 100 degrees.
+    car_m : what is near around a robot that stands lies in a rectangle, whose longer side is no longer than
+    this in a lift. The longest cars, for beds, are 2.7 m deep (ISO 8100-30).
     """
 
     level_every_m: float = 0.3
@@ -82,6 +84,7 @@ class RideParameters:
     turned_rad: float = 0.1
     around: int = 28
     opening: int = 24
+    car_m: float = 3.0
 
 
 RIDES = RideParameters()
@@ -337,6 +340,8 @@ class _Cabin:
         self._stood = False
         self._far: I64 = np.full(self._parameters.sectors, -1)  # 1: far, 0: near, -1: not seen yet
         self._at_once = 0  # most sectors that one scan has shown
+        # How far the near hits reach in each direction, from where the robot stood until it was sure to stand
+        self._reach_m: F64 = np.zeros(self._parameters.sectors)
 
     def observe(self, planar_scan: PlanarScan, yaw_rad: float, forward_m: float) -> int | None:
         """Take in a scan; returns, when the robot has left such a room, since when it stood.
@@ -362,13 +367,32 @@ class _Cabin:
         self._far[near] = 0
         self._far[far] = 1
         self._at_once = max(self._at_once, int((near | far).sum()))
+        if not self._stood:
+            self._reach_m = np.maximum(self._reach_m, _reach(planar_scan, p.sectors, p.near_m))
         return left_ns
 
     @property
     def _was_cabin(self) -> bool:
         p = self._parameters
         near, far = int((self._far == 0).sum()), int((self._far == 1).sum())
-        return self._at_once < p.seen and near >= p.around and far <= p.opening
+        if self._at_once >= p.seen or near < p.around or far > p.opening:
+            return False
+        # Every wall is near in the middle of a room that is twice as wide, too.
+        widths_m = self._reach_m + np.roll(self._reach_m, p.sectors // 2)
+        across_m = np.roll(widths_m, p.sectors // 4)
+        smallest = int((widths_m * across_m).argmin())
+        return max(float(widths_m[smallest]), float(across_m[smallest])) <= p.car_m
+
+
+def _reach(planar_scan: PlanarScan, directions: int, near_m: float) -> F64:
+    """How far the hits that are nearer than `near_m` reach in each direction (directions,), metres, in the
+    base frame; never less than 0, the sensor itself."""
+    away = planar_scan.hits_m - planar_scan.origin_m
+    away = away[np.linalg.norm(away, axis=1) < near_m]
+    bearing = np.arange(directions) * (2.0 * math.pi / directions)
+    along_m = away @ np.array((np.cos(bearing), np.sin(bearing)))
+    reach_m: F64 = along_m.max(axis=0, initial=0.0)
+    return reach_m
 
 
 def _ranges(planar_scan: PlanarScan, sectors: int, yaw_rad: float) -> tuple[F64, F64]:

@@ -157,13 +157,17 @@ def test_a_lift_is_a_cabin_whose_door_shuts_and_opens() -> None:
     assert not rides([(3.0, False), (9.0, True), (12.0, False)], drift_m=0.8, since_s=8.8)
 
 
-def narrow_scan(seconds: float, yaw_rad: float, *, walls_m: float) -> PlanarScan:
-    """What a camera of 90 degrees sees in a square room with an open door of 60 degrees behind its start."""
+def narrow_scan(
+    seconds: float, yaw_rad: float, *, walls_m: tuple[float, float], field_deg: float
+) -> PlanarScan:
+    """What a sensor with a narrow field sees from the middle of a room with an open door of 60 degrees behind
+    its start. walls_m : ahead, and at the sides."""
     bearing = np.arange(1440) * (2.0 * math.pi / 1440)
     there = bearing + yaw_rad
-    away_m = walls_m / np.maximum(np.abs(np.cos(there)), np.abs(np.sin(there)))
+    ahead_m, side_m = walls_m
+    away_m = 1.0 / np.maximum(np.abs(np.cos(there)) / ahead_m, np.abs(np.sin(there)) / side_m)
     away_m[np.abs(np.angle(-np.exp(1j * there))) < math.radians(30.0)] = 8.0
-    away_m[np.abs(np.angle(np.exp(1j * bearing))) > math.radians(45.0)] = 0.0
+    away_m[np.abs(np.angle(np.exp(1j * bearing))) > math.radians(0.5 * field_deg)] = 0.0
     seen, m = away_m > 0.0, away_m[:, None]
     hits = (m * np.column_stack((np.cos(bearing), np.sin(bearing))))[seen].astype(np.float32)
     stamp_ns = int((1000.0 + seconds) * 1e9)
@@ -172,12 +176,19 @@ def narrow_scan(seconds: float, yaw_rad: float, *, walls_m: float) -> PlanarScan
 
 
 @pytest.mark.parametrize(
-    ("walls_m", "stands_s", "cabins_s"),
-    [(1.0, 8.0, [0.0]), (3.0, 8.0, []), (1.0, 2.0, [])],
-    ids=["cabin", "room", "short stop"],
+    ("walls_m", "field_deg", "stands_s", "cabins_s"),
+    [
+        ((1.0, 1.0), 90.0, 8.0, [0.0]),
+        ((1.0, 1.0), 180.0, 8.0, [0.0]),
+        ((1.3, 0.9), 180.0, 8.0, [0.0]),
+        ((3.0, 3.0), 90.0, 8.0, []),
+        ((1.0, 1.0), 90.0, 2.0, []),
+        ((1.0, 1.9), 180.0, 8.0, []),
+    ],
+    ids=["cabin", "cabin by laser", "lift for beds", "room", "short stop", "end of a hall"],
 )
-def test_a_camera_that_stood_in_a_cabin_may_have_taken_a_lift(
-    walls_m: float, stands_s: float, cabins_s: list[float]
+def test_a_sensor_that_stood_in_a_cabin_may_have_taken_a_lift(
+    walls_m: tuple[float, float], field_deg: float, stands_s: float, cabins_s: list[float]
 ) -> None:
     """It stands, turns by half a turn, and leaves; it never saw the door shut."""
     watch = RideWatch()
@@ -185,7 +196,7 @@ def test_a_camera_that_stood_in_a_cabin_may_have_taken_a_lift(
     for seconds in np.arange(0.0, stands_s + 8.0, 0.2).tolist():
         yaw = min(max(seconds - stands_s, 0.0) * 0.8, math.pi)
         forward_m = 0.1 if seconds > stands_s + 5.0 else 0.0
-        seen = narrow_scan(seconds, yaw, walls_m=walls_m)
+        seen = narrow_scan(seconds, yaw, walls_m=walls_m, field_deg=field_deg)
         pose = SE2(0.0, 0.0, yaw).lift()
         assert not watch.observe(scan, scan.points_m, seen, pose, forward_m, None).arrived
     assert [stamp_ns * 1e-9 - 1000.0 for stamp_ns in watch.cabins_ns] == pytest.approx(cabins_s, abs=0.01)
