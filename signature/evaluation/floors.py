@@ -338,15 +338,15 @@ def _ask(
     with open_database(database) as opened:
         settings = query_config(opened, config)
         index = MapIndex.of(opened, settings)
-        for scans in _queries(session, task):
+        for scans in cut_queries(session, task):
             (asked,) = localize(follow(scans, settings), [index])
             (answer,) = asked.answers
             true = SE2.from_matrix(session.pose((answer.stamp_ns - EPOCH_NS) * 1e-9))
-            yield _judged(answer, asked.query.walls.points_m, floor, true, parts)
+            yield _judged(answer, asked.query.walls.points_m.astype(np.float32), floor, true, parts)
 
 
-def _queries(session: HouseSession, task: FloorTask) -> Iterator[list[Scan]]:
-    """The scans of one query after the other; only these are in memory."""
+def cut_queries(session: HouseSession, task: FloorTask) -> Iterator[list[Scan]]:
+    """The scans of one query after the other, cut from a drive; only these are in memory."""
     scans: list[Scan] = []
     travel_m, number, last = 0.0, 0, None
     for scan, T_house_base in session.scans():
@@ -365,7 +365,7 @@ def _queries(session: HouseSession, task: FloorTask) -> Iterator[list[Scan]]:
         yield scans
 
 
-def _judged(answer: Answer, walls_m: F64, floor: int, true: SE2, parts: dict[str, _Part]) -> FloorAnswer:
+def _judged(answer: Answer, walls_m: F32, floor: int, true: SE2, parts: dict[str, _Part]) -> FloorAnswer:
     """An answer beside the truth. true : T_house_base at the query's last scan."""
     poses: dict[str, SE2] = {}
     for hypothesis in answer.hypotheses:
@@ -378,7 +378,7 @@ def _judged(answer: Answer, walls_m: F64, floor: int, true: SE2, parts: dict[str
         error_m=None,
         poses=poses,
         T_house_query=true @ answer.T_odom_base.inverse(),
-        walls_m=walls_m.astype(np.float32),
+        walls_m=walls_m,
     )
     if answer.session is None or answer.T_map_base is None:
         return judged

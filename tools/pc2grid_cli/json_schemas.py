@@ -440,9 +440,10 @@ class FloorRow(TypedDict):
 
 
 class CompareFloors(TypedDict):
-    """`pc2grid compare floors --json`: a row a house."""
+    """`pc2grid compare floors --json`: a row a house. program: changes with any of its source files."""
 
     schema_version: Version
+    program: str
     rows: list[FloorRow]
 
 
