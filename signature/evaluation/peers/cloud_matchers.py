@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,7 +160,17 @@ def peak_mb() -> float:
     return next(int(line.split()[1]) / 1000.0 for line in lines if line.startswith("VmHWM"))
 
 
-def serve(locate: Callable[[str], Found], *, compiles: bool = False) -> None:
+def answer_stream() -> TextIO:
+    """The standard output, for answers alone: what libraries print goes to the standard error from now on.
+
+    Open3D, for one, prints a warning where RANSAC has too few matches.
+    """
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    return answers
+
+
+def serve(locate: Callable[[str], Found], answers: TextIO, *, compiles: bool = False) -> None:
     """Answer the queries of the standard input until it ends. compiles : the first one is asked twice."""
     for number, line in enumerate(sys.stdin):
         query = line.rstrip("\n")
@@ -174,12 +185,13 @@ def serve(locate: Callable[[str], Found], *, compiles: bool = False) -> None:
             pose = [float(T[0, 3]), float(T[1, 3]), math.atan2(T[1, 0], T[0, 0])]
         score = 0.0 if found is None else found[1]
         answer = {"pose": pose, "score": score, "cpu_s": cpu_s, "peak_mb": peak_mb()}
-        sys.stdout.write(json.dumps(answer) + "\n")
-        sys.stdout.flush()
+        answers.write(json.dumps(answer) + "\n")
+        answers.flush()
 
 
 def main() -> None:
     """Load the map, then answer."""
+    answers = answer_stream()
     name, map_stem = sys.argv[1:]
     with np.load(f"{map_stem}.npz") as file:
         path, points_m, count = file["T_map_base"], file["points_m"], file["count"]
@@ -196,7 +208,7 @@ def main() -> None:
             points_m = file["points_m"]
         return matcher.locate(points_m)
 
-    serve(locate)
+    serve(locate, answers)
 
 
 if __name__ == "__main__":

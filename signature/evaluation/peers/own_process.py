@@ -15,7 +15,7 @@ from pc2grid.io.nav2_map import load_map
 from pc2grid.submaps.partition import partition
 from signature.config import Config
 from signature.describe import describe
-from signature.evaluation.peers.cloud_matchers import Found, serve
+from signature.evaluation.peers.cloud_matchers import Found, answer_stream, serve
 from signature.evaluation.registered_session import RegisteredSession
 from signature.relocalization.map_index import MapIndex
 from signature.relocalization.relocalizer import localize
@@ -43,8 +43,9 @@ def locate(index: MapIndex, query: str) -> Found:
 
 def main() -> None:
     """Load the map, then answer."""
+    answers = answer_stream()
     index = index_of(Path(f"{sys.argv[2]}.yaml"))
-    serve(lambda query: locate(index, query), compiles=True)
+    serve(lambda query: locate(index, query), answers, compiles=True)
 
 
 if __name__ == "__main__":

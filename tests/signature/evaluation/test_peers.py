@@ -177,6 +177,26 @@ def test_a_process_is_asked_line_by_line_and_its_end_is_an_error(tmp_path: Path)
             peer.locate(tmp_path / "01")
 
 
+def test_what_a_library_prints_is_no_answer(tmp_path: Path) -> None:
+    """Open3D prints warnings to the standard output, from C++."""
+    code = tmp_path / "peer.py"
+    code.write_text(
+        "import os, sys\n"
+        "import numpy as np\n"
+        "from signature.evaluation.peers.cloud_matchers import answer_stream, serve\n"
+        "answers = answer_stream()\n"
+        "def locate(query):\n"
+        "    os.write(1, b'[Open3D WARNING] Too few correspondences\\n')\n"
+        "    print('a line', flush=True)\n"
+        "    return np.eye(4), 3.0\n"
+        "serve(locate, answers)\n"
+    )
+    with PeerProcess([sys.executable, code], "name", tmp_path / "map") as peer:
+        for number in ("00", "01"):
+            answer = peer.locate(tmp_path / number)
+            assert (answer.pose, answer.score) == ((0.0, 0.0, 0.0), 3.0)
+
+
 def test_what_is_missing_is_named_with_its_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     environment = PeerEnvironment(folder=tmp_path / "none")
