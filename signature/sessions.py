@@ -136,7 +136,7 @@ def build_sessions(
     if is_drawn_map(path):
         drawn = load_drawn_map(path, config)
         origin = provenance(path, drawn.digest, config, label=label)
-        return (_map_session(drawn, name, config),), origin
+        return (session_of_map(drawn, name, config),), origin
 
     from pc2grid.io import open_log
     from pc2grid.pipeline import build_maps
@@ -212,7 +212,7 @@ def digest_of(path: Path, config: Config) -> str:
         return log.digest()
 
 
-def _map_session(drawn: DrawnMap, name: str, config: Config) -> SessionMap:
+def session_of_map(drawn: DrawnMap, name: str, config: Config) -> SessionMap:
     """A session of a map, in the frame of that map and without a trajectory."""
     from pc2grid.submaps.partition import divide
 

@@ -266,13 +266,12 @@ def _map_scan(floor: Path, target: Path) -> None:
     from pc2grid.mapping.drawn_map import load_drawn_map
     from signature.config import Config
     from signature.evaluation.sensor_map import save_map
-    from signature.sessions import build_session
+    from signature.sessions import session_of_map
 
     config = Config()
-    made, _ = build_session(floor, "floor-scan", config)
-    T_map_file = load_drawn_map(floor, config).T_map_file
-    T_floor_map = SE2.from_matrix(_building(floor).T_map_file @ invert_pose(T_map_file))
-    save_map(target, made, T_floor_map, floor, config)
+    drawn = load_drawn_map(floor, config)
+    T_floor_map = SE2.from_matrix(_building(floor).T_map_file @ invert_pose(drawn.T_map_file))
+    save_map(target, session_of_map(drawn, "floor-scan", config), T_floor_map, floor, config)
 
 
 def _map_log(setting: Setting) -> None:
