@@ -157,7 +157,7 @@ def build_maps(
         read = dataclasses.replace(read, warnings=(*read.warnings, no_points))
     reached = [part.storey for part in kept]
     floors, heights_m = floor_names(track.storeys, reached), floor_heights(track.storeys, reached)
-    reports = _reports(read, session, parts, kept, floors)
+    reports = _reports(read, session, parts, kept, floors, slopes_unseen=sensor == "laser")
     maps = []
     for number, (part, report) in enumerate(zip(kept, reports, strict=True)):
         graph, submaps = divide(part.grid, config.partition)
@@ -562,6 +562,8 @@ def _reports(
     parts: Sequence[_Mapped],
     kept: Sequence[_Mapped],
     floors: Sequence[str | None],
+    *,
+    slopes_unseen: bool,
 ) -> list[ReadReport]:
     """The report of each part that is kept, with the warnings of registration and of its map.
 
@@ -581,7 +583,10 @@ def _reports(
         warnings=tuple(warnings),
     )
     others = [ReadReport(scans_read=len(part.trajectory)) for part in kept[1:]]
-    return [_with_warnings(r, part) for r, part in zip([first, *others], kept, strict=True)]
+    return [
+        _with_warnings(r, part, slopes_unseen=slopes_unseen)
+        for r, part in zip([first, *others], kept, strict=True)
+    ]
 
 
 def _division_warning(
@@ -671,7 +676,7 @@ def _in_order(parts: Sequence[Trajectory]) -> Trajectory:
     )
 
 
-def _with_warnings(report: ReadReport, part: _Mapped) -> ReadReport:
+def _with_warnings(report: ReadReport, part: _Mapped, *, slopes_unseen: bool) -> ReadReport:
     """The report of a part with the warnings of registration and of the map added."""
     from pc2grid.mapping.consistency import consistency_warning
     from pc2grid.mapping.precision import precision_warning
@@ -693,7 +698,7 @@ def _with_warnings(report: ReadReport, part: _Mapped) -> ReadReport:
             f"{weak} of {total} scans did not fix the pose in every direction: there it rests on odometry "
             "or on the motion before"
         )
-    bent = consistency_warning(part.consistency, trajectory)
+    bent = consistency_warning(part.consistency, trajectory, slopes_unseen=slopes_unseen)
     if bent is not None:
         warnings.append(bent)
     loose = precision_warning(part.precision, trajectory)

@@ -17,7 +17,8 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.pipeline import build_map, build_maps, check_followed, follow, map_scans
-from pc2grid.simulate import SimulationConfig, prepare_session, simulate_session
+from pc2grid.simulate import HouseConfig, SimulationConfig, prepare_session, simulate_session
+from pc2grid.simulate.config import LaserConfig
 from pc2grid.simulate.session import Session
 from pc2grid.time_span import TimeSpan
 from signature.evaluation.slam_relations import read_relations, relation_error
@@ -137,6 +138,19 @@ def test_a_robot_that_was_carried_elsewhere_makes_two_maps(
     (said, *_) = [w for w in maps[0].report.warnings if "falls into 2 parts" in w]
     assert "robot#2 from 3" in said and "record with odometry" in said
     assert longest.session == "robot" and "is used here, without" in longest.report.warnings[-1]
+
+
+def test_a_laser_that_goes_upstairs_contradicts_itself_there(tmp_path: Path) -> None:
+    """It shows no slope, so both floors and the stairs are drawn into one map."""
+    house = HouseConfig(visits=(0, 1), alike=True)
+    config = SimulationConfig(
+        length_m=3.0, seed=3, building_seed=3, laser=LaserConfig(rate_hz=5.0, step_deg=1.0)
+    )
+    simulate_session(tmp_path / "house.mcap", sensor="laser", house=house, config=config)
+    with open_log(tmp_path / "house.mcap") as log:
+        (made,) = build_maps(log, session="house")
+    (warning,) = made.report.warnings
+    assert "contradicts itself" in warning and "stairs" in warning and "--floor" in warning
 
 
 def test_no_scans_no_trajectory() -> None:

@@ -199,9 +199,8 @@ def test_a_part_too_short_to_be_of_use_is_left_out_and_counted() -> None:
     long, short, other = part_of(20.0, 0), part_of(3.0, 30 * 10**9), part_of(12.0, 60 * 10**9)
     kept = _of_use([long, short, other])
     assert kept == [long, other]
-    first, second = _reports(
-        ReadReport(scans_read=300, bytes_lost=7), "log", [long, short, other], kept, [None] * len(kept)
-    )
+    read = ReadReport(scans_read=300, bytes_lost=7)
+    first, second = _reports(read, "log", [long, short, other], kept, [None] * len(kept), slopes_unseen=True)
     assert first.scans_skipped == {"in a part too short to be of use": len(short.trajectory)}
     assert first.scans_read + second.scans_read == 300 and first.bytes_lost == 7 and not second.lossy
     (warning,) = first.warnings
