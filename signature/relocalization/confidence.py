@@ -50,8 +50,10 @@ class EvidenceParameters:
 
     slack : keeps the log-odds finite at an agreement of 1. Chosen on fr079 and intel.
     least_agreement : lower ones count as this.
-    longest_lead : longer leads count as this; a hypothesis without a rival has it. Chosen by hand: a search
-        reports what scores 0.8 of the best, so a rival that was not reported may be so near.
+    longest_lead : longer leads count as this. Chosen by hand.
+    unreported : a hypothesis without a rival leads by this share of its own score, as searches report what
+        scores 0.8 of the best or more (`coarse_keep`): a rival that was not reported may be so near. A poor
+        score does not become sure by being the only one.
     equal_lead : the spread of the score between two equal places. Chosen by hand: simulated twin rooms differ
         by up to 0.018, by the paths that they were seen from.
     few_walls, few_looked_at : the agreement forward or backward counts half if it rests on so many wall
@@ -66,6 +68,7 @@ class EvidenceParameters:
     slack: float = 0.2
     least_agreement: float = 0.01
     longest_lead: float = 0.15
+    unreported: float = 0.2
     equal_lead: float = 0.01
     few_walls: float = 30.0
     few_looked_at: float = 100.0
@@ -85,7 +88,7 @@ class Evidence:
         `signature.verification.walls.steadiness`; `forward` rests on them.
     backward : the agreement the other way round. looked_at : wall points of the map that it rests on.
     lead : two-way score of the best hypothesis less that of the best one at another place;
-        `EvidenceParameters.longest_lead` if there is no other.
+        if there is no other, what an unreported one may lie behind (`EvidenceParameters.unreported`).
     likeness : `signature.verification.self_likeness` of the query.
     """
 
@@ -102,12 +105,13 @@ class Evidence:
         if not rivals:
             return NO_EVIDENCE
         best = rivals[0].fit
+        rival = rivals[1].fit.score if len(rivals) > 1 else (1.0 - LIMITS.unreported) * best.score
         return Evidence(
             forward=best.known_agreement,
             walls=best.overlap * query.walls.weight,
             backward=best.backward,
             looked_at=best.looked_at,
-            lead=best.score - rivals[1].fit.score if len(rivals) > 1 else LIMITS.longest_lead,
+            lead=best.score - rival,
             likeness=query.likeness,
         )
 

@@ -2,6 +2,8 @@
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -16,6 +18,8 @@ from signature.relocalization.confidence import (
     Evidence,
     Presence,
 )
+from signature.relocalization.hypotheses import Hypothesis
+from signature.relocalization.query_map import QueryMap
 
 AGREEMENTS = np.linspace(0.0, 1.0, 11).tolist()
 WALLS = [5.0, 30.0, 100.0, 300.0, 2000.0]
@@ -53,6 +57,25 @@ def test_an_agreement_counts_by_the_points_that_it_rests_on() -> None:
     assert CALIBRATION.probability(replace(USUAL, backward=1.0, looked_at=0.0)) == pytest.approx(
         CALIBRATION.probability(replace(USUAL, backward=0.0, looked_at=0.0))
     )
+
+
+def found(score: float, **known: float) -> Hypothesis:
+    """As much of a hypothesis as the evidence is made of."""
+    return cast(Hypothesis, SimpleNamespace(fit=SimpleNamespace(score=score, **known)))
+
+
+def test_the_only_place_that_was_found_is_not_sure_by_being_the_only_one() -> None:
+    """Two scans of a real hall, in the map of an office: a wall fits, the walls of the office do not."""
+    query = cast(QueryMap, SimpleNamespace(walls=SimpleNamespace(weight=709.0), likeness=0.0))
+    hall = {"known_agreement": 0.966, "overlap": 0.447, "backward": 0.115, "looked_at": 2199.0}
+    alone = Evidence.of([found(0.269, **hall)], query)
+    assert alone.lead == pytest.approx(0.0538) and CALIBRATION.probability(alone) < 0.6
+    assert CALIBRATION.probability(replace(alone, lead=LIMITS.longest_lead)) > 0.9
+    office = {"known_agreement": 0.95, "overlap": 0.9, "backward": 0.9, "looked_at": 300.0}
+    assert Evidence.of([found(0.9, **office)], query).clearance == pytest.approx(
+        Evidence.of([found(0.9, **office), found(0.9 - LIMITS.longest_lead)], query).clearance
+    )
+    assert Evidence.of([found(0.9, **office), found(0.85)], query).lead == pytest.approx(0.05)
 
 
 def test_a_changed_hall_is_located_by_its_lead() -> None:
