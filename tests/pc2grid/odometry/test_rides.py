@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.upright import CAMERA_UPRIGHT, vertical_of
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.geometry import SE2
+from pc2grid.io import open_log
 from pc2grid.model import Scan, SensorKind, Storey
 from pc2grid.odometry.rides import RIDES, RideWatch
 from pc2grid.odometry.tracker import Tracker
@@ -21,6 +24,7 @@ from pc2grid.simulate import HouseConfig, HouseSession, SimulationConfig, prepar
 from pc2grid.simulate.config import DepthConfig, LidarConfig
 
 UP = np.array([0.0, 0.0, 1.0])
+DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
 
 
 def room(tilt_rad: float, *, rng: np.random.Generator) -> np.ndarray:
@@ -200,6 +204,16 @@ def test_a_sensor_that_stood_in_a_cabin_may_have_taken_a_lift(
         pose = SE2(0.0, 0.0, yaw).lift()
         assert not watch.observe(scan, scan.points_m, seen, pose, forward_m, None).arrived
     assert [stamp_ns * 1e-9 - 1000.0 for stamp_ns in watch.cabins_ns] == pytest.approx(cabins_s, abs=0.01)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="PC2GRID_DATA is not there")
+def test_the_end_of_a_real_hall_is_no_lift() -> None:
+    """A robot stands there for 7 s, with all walls near, until somebody opens the door ahead."""
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    with open_log(DATA / "laser" / "killian.mcap") as log:
+        scans = [tracker.track(scan) for scan in log.scans(1465.0, 20.0)]
+    assert len(scans) > 150
+    assert not tracker.cabins_ns and len(tracker.storeys) == 1
 
 
 def test_level_ground_with_a_tilted_sensor_is_no_slope() -> None:
