@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pc2grid.geometry import SE2
-from pc2grid_cli.floors_report import example_answer, example_of
+from pc2grid_cli.floors_report import example_answer, example_of, mapped
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app
 from signature.config import Config
@@ -81,7 +81,8 @@ def test_stored_results_are_shown(tmp_path: Path) -> None:
     ]
     table = CliRunner().invoke(app, arguments, catch_exceptions=False).stdout
     rows = [line.split() for line in table.splitlines()]
-    assert ["lift", "alike", *"11011011", "79.2%", "0.667", "[0.667,", "0.667]"] in rows
+    assert ["lift", "alike", *"11011011", "79.2%", "3", "0.667", "[0.667,", "0.667]"] in rows
+    assert [row["not_found_in_the_map"] for row in document["rows"]] == [0, 1]
     assert str(tmp_path / "floors.png") in table
     picture = cv2.imread(str(tmp_path / "floors.png"))
     assert picture is not None and picture.std() > 10.0
@@ -102,6 +103,16 @@ def test_results_of_another_version_are_computed_again(
         monkeypatch.setattr(floors, "program_digest", lambda digest=digest: digest)
         assert floors.stored_floors(task, tmp_path).count("ambiguous") == 1
     assert [database.name.split(".")[-2] for database in asked] == ["a" * 12, "b" * 12]
+
+
+def test_a_query_from_beyond_the_map_cannot_be_found() -> None:
+    made = result("not_found")
+    there = made.answers[0].T_house_query.apply(made.answers[0].walls_m)
+    grid = office()
+    assert np.all(grid.cells[tuple(grid.to_cell(there).T)] >= 0)
+    assert len(mapped(made, dict.fromkeys(NAMES, grid)).answers) == 1
+    beyond = replace(made, frames=dict.fromkeys(NAMES, SE2(100.0, 0.0, 0.0)))
+    assert not mapped(beyond, dict.fromkeys(NAMES, grid)).answers
 
 
 def test_the_picture_shows_what_went_wrong() -> None:

@@ -12,6 +12,7 @@ from pc2grid_cli.output_files import make_folder
 from pc2grid_cli.simulate import SensorName
 
 if TYPE_CHECKING:
+    from pc2grid.model import OccupancyGrid
     from pc2grid_cli.json_schemas import CompareFloors, FloorRow
     from signature.evaluation.floors import FloorResult, FloorTask
 
@@ -40,7 +41,9 @@ def compare_floors_command(
     floors.png in the folder shows the answers in each house, and one query on the map of each floor.
 
     Wrong up to: what so few queries leave possible, at 95 % (Wilson's interval, as if they were independent).
-    In brackets: 5th and 95th percentile over plans drawn anew (bootstrap), for queries in one plan are not.
+    In the map: queries of which the map of their floor shows half of the walls; the others cannot be found.
+
+    In brackets: 5th and 95th percentile over plans drawn anew (bootstrap), for queries in one plan are alike.
 
     Results of another version of the program are not used.
 
@@ -48,10 +51,9 @@ def compare_floors_command(
     """
     from pc2grid.errors import ConfigError
     from pc2grid_cli.console import of, print_json
-    from pc2grid_cli.floors_report import draw, example_of, floors_table
+    from pc2grid_cli.floors_report import draw, example_of, floors_table, mapped
     from pc2grid_cli.tables import show
-    from signature.database import open_database
-    from signature.evaluation.floors import WAYS, FloorTask, database_file, stored_floors
+    from signature.evaluation.floors import WAYS, FloorTask, stored_floors
     from signature.evaluation.program import program_digest
 
     names = [word.strip() for word in ways.split(",")]
@@ -82,18 +84,20 @@ def compare_floors_command(
             houses.append((task, stored_floors(task, out)))
             advance(done / len(tasks))
     example, picture = example_of(houses), out / "floors.png"
-    with open_database(database_file(example[0], out)) as database:
-        grids = {name: database.grid(name) for name in example[1].floors}
-    draw(picture, houses, grids, example)
+    draw(picture, houses, _grids(*example, out), example)
+    in_the_map = [(task, mapped(result, _grids(task, result, out))) for task, result in houses]
     if as_json:
         document: CompareFloors = {
             "schema_version": 1,
             "program": program_digest(),
-            "rows": [_row(*house) for house in houses],
+            "rows": [
+                _row(task, result, there)
+                for (task, result), (_, there) in zip(houses, in_the_map, strict=True)
+            ],
         }
         print_json(document)
         return
-    show(floors_table(houses), str(picture))
+    show(floors_table(houses, in_the_map), str(picture))
 
 
 def _whole_numbers(text: str, option: str) -> tuple[int, ...]:
@@ -105,7 +109,16 @@ def _whole_numbers(text: str, option: str) -> tuple[int, ...]:
         raise ConfigError(f"{option}: expected whole numbers, found {text!r}") from None
 
 
-def _row(task: FloorTask, result: FloorResult) -> FloorRow:
+def _grids(task: FloorTask, result: FloorResult, out: Path) -> dict[str, OccupancyGrid]:
+    """The maps in the database of a house."""
+    from signature.database import open_database
+    from signature.evaluation.floors import database_file
+
+    with open_database(database_file(task, out)) as database:
+        return {name: database.grid(name) for name in result.floors}
+
+
+def _row(task: FloorTask, result: FloorResult, in_the_map: FloorResult) -> FloorRow:
     return {
         "seed": task.seed,
         "way": task.way,
@@ -122,4 +135,6 @@ def _row(task: FloorTask, result: FloorResult) -> FloorRow:
         "ambiguous": result.count("ambiguous"),
         "not_found": result.count("not_found"),
         "misplaced": result.misplaced,
+        "in_the_map": len(in_the_map.answers),
+        "not_found_in_the_map": in_the_map.count("not_found"),
     }

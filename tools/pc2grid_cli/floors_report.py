@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,8 +31,34 @@ _SHOWN: dict[FloorStatus, str] = {
 }
 
 
-def floors_table(houses: Sequence[Asked]) -> Table:
-    """A row for each way and kind of furniture."""
+_MAPPED = 0.5
+"""A query is in the map if the map of its floor shows so much of what it saw of walls. By hand."""
+
+
+def mapped(result: FloorResult, grids: Mapping[str, OccupancyGrid]) -> FloorResult:
+    """The result without the queries from where the map of their floor shows nothing, or little.
+
+    grids : of the sessions of the house's database.
+    """
+    import numpy as np
+
+    from pc2grid.model import UNKNOWN
+
+    def is_in_the_map(answer: FloorAnswer) -> bool:
+        shares = []
+        for name in (name for name, floor in result.floors.items() if floor == answer.floor):
+            grid, T_map_query = grids[name], result.frames[name].inverse() @ answer.T_house_query
+            cells = grid.to_cell(T_map_query.apply(answer.walls_m))
+            inside = np.all((cells >= 0) & (cells < grid.cells.shape), axis=1)
+            known = grid.cells[tuple(cells[inside].T)] != UNKNOWN
+            shares.append(known.sum() / max(len(cells), 1))
+        return max(shares, default=0.0) >= _MAPPED
+
+    return replace(result, answers=tuple(filter(is_in_the_map, result.answers)))
+
+
+def floors_table(houses: Sequence[Asked], in_the_map: Sequence[Asked]) -> Table:
+    """A row for each way and kind of furniture. in_the_map : the same houses, as `mapped` has them."""
     from scipy.stats import binomtest
 
     from pc2grid_cli.tables import table
@@ -39,13 +66,17 @@ def floors_table(houses: Sequence[Asked]) -> Table:
 
     counts = ("houses", "told apart", "named", *(_SHOWN[status] for status in STATUSES), "misplaced")
     made = table(
-        "floors with one plan", ("by", "furniture"), (*counts, "wrong up to", "right or ambiguous, 5 .. 95 %")
+        "floors with one plan",
+        ("by", "furniture"),
+        (*counts, "wrong up to", "in the map", "right or ambiguous there"),
     )
     for way, alike in dict.fromkeys((task.way, task.alike) for task, _ in houses):
         group = [(task, result) for task, result in houses if (task.way, task.alike) == (way, alike)]
         asked = sum(len(result.answers) for _, result in group)
         wrong = sum(result.count("wrong") for _, result in group)
-        share, low, high = share_of(group, ("right", "ambiguous"))
+        there = [(task, result) for task, result in in_the_map if (task.way, task.alike) == (way, alike)]
+        count = sum(len(result.answers) for _, result in there)
+        share = "{:.3f} [{:.3f}, {:.3f}]".format(*share_of(there, ("right", "ambiguous"))) if count else ""
         made.add_row(
             way,
             _furniture(alike),
@@ -55,7 +86,8 @@ def floors_table(houses: Sequence[Asked]) -> Table:
             *(str(sum(result.count(status) for _, result in group)) for status in STATUSES),
             str(sum(result.misplaced for _, result in group)),
             f"{binomtest(wrong, asked).proportion_ci(method='wilson').high:.1%}",
-            f"{share:.3f} [{low:.3f}, {high:.3f}]",
+            str(count),
+            share,
         )
     return made
 

@@ -420,7 +420,8 @@ class CompareLog(TypedDict):
 
 
 class FloorRow(TypedDict):
-    """A house of `pc2grid compare floors`, and what became of it; see `signature.evaluation.floors`."""
+    """A house of `pc2grid compare floors`, and what became of it; see `signature.evaluation.floors`.
+    in_the_map: queries of which the map of their floor shows half of the walls."""
 
     seed: int
     way: Literal["stairs", "lift", "logs"]
@@ -437,6 +438,8 @@ class FloorRow(TypedDict):
     ambiguous: int
     not_found: int
     misplaced: int
+    in_the_map: int
+    not_found_in_the_map: int
 
 
 class CompareFloors(TypedDict):
