@@ -46,9 +46,10 @@ def compare(folder: Path, quick: bool) -> Iterator[Row]:
             note=f"right {cell.right}, wrong {cell.wrong} of {cell.covered} in the map; elsewhere wrong"
             f" {cell.elsewhere_wrong} of {cell.elsewhere}; {cell.peak_mb:.0f} MB",
         )
-        if peer != "pc2grid":
-            ratio = cells[site, "pc2grid"].cpu_s / cell.cpu_s
-            yield Row(what=f"pc2grid over {titles[peer]}, {site}", measured=ratio, unit="x", goal=1.0)
+        own_s = cells[site, "pc2grid"].cpu_s
+        if peer != "pc2grid" and own_s and cell.cpu_s:
+            what = f"pc2grid over {titles[peer]}, {site}"
+            yield Row(what=what, measured=own_s / cell.cpu_s, unit="x", goal=1.0)
 
 
 def _sites(folder: Path, queries: int) -> Iterator[Site]:

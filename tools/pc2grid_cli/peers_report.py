@@ -17,14 +17,14 @@ def print_table(cells: Sequence[PeerCell], sensors: Mapping[str, str], missing: 
 
     title = "later parts of recordings in a map of an earlier part; of the queries that the map covers:"
     figures = ("covered", "right", "5-95 %", "wrong", "none", "uncovered\nwrong", "elsewhere\nwrong")
-    shown = table(title, ("building", "program"), (*figures, "off by", "CPU", "memory"))
+    shown = table(title, ("building", "program"), (*figures, "off by", "CPU", "CPU\nelsewhere", "memory"))
     by_pair = {(cell.site, cell.peer): cell for cell in cells}
     for site, sensor in sensors.items():
         for kind in PEERS:
             if sensor not in kind.sensors:
                 continue
             cell = by_pair.get((site, kind.name))
-            shown.add_row(f"{site}, {sensor}", kind.title, *(("",) * 10 if cell is None else _figures(cell)))
+            shown.add_row(f"{site}, {sensor}", kind.title, *(("",) * 11 if cell is None else _figures(cell)))
     notes = [f"{name} is not installed: {command}" for name, command in missing.items()]
     show(
         shown,
@@ -44,7 +44,7 @@ def _figures(cell: PeerCell) -> tuple[str, ...]:
         f"{cell.uncovered_wrong} of {cell.uncovered}",
         f"{cell.elsewhere_wrong} of {cell.elsewhere}",
         "" if cell.median_error_m is None else f"{cell.median_error_m:.2f} m",
-        f"{cell.cpu_s:.2f} s",
+        *("" if cpu_s is None else f"{cpu_s:.2f} s" for cpu_s in (cell.cpu_s, cell.elsewhere_cpu_s)),
         f"{cell.peak_mb:.0f} MB",
     )
 

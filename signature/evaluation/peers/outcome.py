@@ -8,7 +8,7 @@ wrong ones, in the own building and in another one. So the comparison is in favo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -101,7 +101,8 @@ class PeerCell:
     threshold: of its score; null if the peer decides by itself. right, wrong, unanswered: of the covered
     queries; right_low, right_high: 5 and 95 % of the share that is right. uncovered_wrong: of the uncovered
     ones. elsewhere_wrong: answers in another building's map, all wrong. median_error_m: of the right answers,
-    null if there are none. cpu_s: median of an answer. peak_mb: largest of its process.
+    null if there are none. cpu_s, elsewhere_cpu_s: median of an answer in the own and in another building's
+    map; null if nothing was asked there. peak_mb: largest of its process.
     """
 
     peer: str
@@ -118,7 +119,8 @@ class PeerCell:
     elsewhere: int
     elsewhere_wrong: int
     median_error_m: float | None
-    cpu_s: float
+    cpu_s: float | None
+    elsewhere_cpu_s: float | None
     peak_mb: float
 
 
@@ -169,9 +171,15 @@ def _cell(trials: Sequence[PeerTrial], threshold: float | None) -> PeerCell:
         elsewhere=sum(t.place == "elsewhere" for t in trials),
         elsewhere_wrong=sum(t.place == "elsewhere" for t in wrong),
         median_error_m=float(np.median(errors)) if errors else None,
-        cpu_s=float(np.median([t.cpu_s for t in trials])),
+        cpu_s=_median_cpu_s(t for t in trials if t.place != "elsewhere"),
+        elsewhere_cpu_s=_median_cpu_s(t for t in trials if t.place == "elsewhere"),
         peak_mb=max(t.peak_mb for t in trials),
     )
+
+
+def _median_cpu_s(trials: Iterable[PeerTrial]) -> float | None:
+    seconds = [trial.cpu_s for trial in trials]
+    return float(np.median(seconds)) if seconds else None
 
 
 def _interval(right: F64) -> tuple[float | None, float | None]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +93,15 @@ def test_cells_count_every_query_once() -> None:
     assert cell.right_low is not None and cell.right_high is not None
     assert 0.0 < cell.right_low < 7 / 10 < cell.right_high < 1.0
     assert cell.median_error_m == pytest.approx(0.05)
+    assert cell.cpu_s == cell.elsewhere_cpu_s == 1.0
+
+
+def test_answers_elsewhere_do_not_count_in_the_time_of_an_answer() -> None:
+    here, there = judged(0.1), judged(None, map_="there")
+    (cell,) = counted([here, replace(there, cpu_s=7.0), replace(there, cpu_s=9.0)])
+    assert (cell.cpu_s, cell.elsewhere_cpu_s) == (1.0, 8.0)
+    (cell,) = counted([here])
+    assert (cell.cpu_s, cell.elsewhere_cpu_s) == (1.0, None)
 
 
 def test_pc2grid_gets_no_threshold() -> None:
