@@ -40,6 +40,8 @@ class CloudParameters:
 
     camera_noise_per_m2 : standard deviation of a depth over its square, as of stereo and structured light
         (Khoshelham and Elberink 2012 give 0.0014 for the Kinect).
+    limit_sigmas : hits so many standard deviations before the farthest depth of a camera, or beyond, are left
+        out; see `pc2grid.clouds.depth_limit`.
     max_gap_bins : bearings without a return between two with one count as seen up to this many.
     """
 
@@ -66,6 +68,7 @@ class CloudParameters:
     max_flatness: float = 0.3
 
     camera_noise_per_m2: float = 0.0015
+    limit_sigmas: float = 2.0
     max_gap_bins: int = 5
 
 

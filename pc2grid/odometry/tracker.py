@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pc2grid.arrays import F32, F64
+from pc2grid.clouds.depth_limit import DepthLimit
 from pc2grid.clouds.deskew import deskew
 from pc2grid.clouds.planar_scan import PlanarScan, project_to_plane
 from pc2grid.clouds.sampling import random_subset
@@ -87,6 +88,7 @@ class Tracker:
         self._maps = MatchingMaps(self._projection.max_range_m, parameters)
         self._camera_on_wheels = False
         self._surfaces: SurfaceMap | None = None
+        self._depth_limit = DepthLimit()
         self._health = HealthJudge(rolling=True, parameters=parameters)
         self.kiss = KissRegistration(registration, parameters=parameters)
 
@@ -274,13 +276,15 @@ class Tracker:
 
     def _project(self, points: F32, scan: Scan, T_level_base: F64) -> PlanarScan:
         """Reduce points (N, 3) of the base frame to the plane."""
+        if scan.sensor == "depth":
+            self._depth_limit.observe(points, scan.T_base_sensor)
         sensor_m, ground = scan.T_base_sensor[:3, 3], self._ground.ground
         if ground is not None:
             R = T_level_base.copy()
             R[:3, 3] = 0.0  # a planar scan keeps the base's own origin; heights are relative to the ground
             points = points @ R[:3, :3].T.astype(np.float32)
             sensor_m, ground = R[:3, :3] @ sensor_m, ground.moved(R)
-        return project_to_plane(
+        planar_scan = project_to_plane(
             points,
             stamp_ns=scan.stamp_ns,
             sensor_m=sensor_m,
@@ -288,6 +292,9 @@ class Tracker:
             config=self._projection,
             sensor=scan.sensor,
         )
+        if scan.sensor != "depth":
+            return planar_scan
+        return self._depth_limit.before(planar_scan, T_level_base @ scan.T_base_sensor)
 
     def _refine(
         self, planar_scan: PlanarScan, guess: SE2, predicted: SE2, prediction: Prediction
