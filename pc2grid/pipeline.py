@@ -40,7 +40,7 @@ from pc2grid.time_span import TimeSpan
 if TYPE_CHECKING:
     from pc2grid.io import Log
     from pc2grid.mapping.keyframes import Keyframe, Keyframes
-    from pc2grid.mapping.loop_closure import LoopParameters, SettledKeyframes
+    from pc2grid.mapping.loop_closure import LoopCloser, SettledKeyframes
     from pc2grid.mapping.place_recognition import PlaceRecognizer
     from pc2grid.odometry.overruled import Disagreement
     from pc2grid.odometry.tracker import Tracked
@@ -334,7 +334,8 @@ def _map(
     """
     from pc2grid.mapping.keyframe_points import KeyframePoints
     from pc2grid.mapping.keyframes import Keyframes
-    from pc2grid.mapping.loop_closure import CAMERA_LOOPS, LOOPS
+    from pc2grid.mapping.local_maps import CAMERA_LOCAL_MAPS, LOCAL_MAPS
+    from pc2grid.mapping.loop_closure import CAMERA_LOOPS, LOOPS, LoopCloser
     from pc2grid.mapping.parts import PARTS
     from pc2grid.odometry.tracker import Tracker
 
@@ -352,8 +353,14 @@ def _map(
         rest = iter(scans)
         begin = [scan for scan in (next(rest, None),) if scan is not None]
         depth = bool(begin) and begin[0].sensor == "depth"
-        loops = CAMERA_LOOPS if depth else LOOPS
-        selection = _KeyframeSelection(keyframes, config.projection, recognizer, loops)
+        closer = LoopCloser(
+            keyframes,
+            recognizer=recognizer,
+            projection=config.projection,
+            parameters=CAMERA_LOOPS if depth else LOOPS,
+            local_map_parameters=CAMERA_LOCAL_MAPS if depth else LOCAL_MAPS,
+        )
+        selection = _KeyframeSelection(keyframes, config.projection, closer)
         for scan in chain(begin, rest):
             tracked = tracker.track(scan)
             selection.add(tracked, index=len(stamps))
@@ -513,13 +520,11 @@ class _KeyframeSelection:
         self,
         keyframes: Keyframes,
         projection: ProjectionConfig,
-        recognizer: PlaceRecognizer | None,
-        loops: LoopParameters,
+        closer: LoopCloser,
     ) -> None:
-        from pc2grid.mapping.loop_closure import LoopCloser
         from pc2grid.mapping.unseen_hits import UnseenHits
 
-        self.closer = LoopCloser(keyframes, recognizer=recognizer, projection=projection, parameters=loops)
+        self.closer = closer
         self._keyframes = keyframes
         self._unseen_hits = UnseenHits(projection.max_range_m, projection.resolution_m)
         self._latest: Keyframe | None = None

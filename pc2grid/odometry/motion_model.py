@@ -39,6 +39,7 @@ class MotionModel:
     """Predicts motions from odometry and from the last poses; all use of odometry is here.
 
     last_pose : (4, 4) T_session_base of the last scan.
+    heading_variance : rad^2, of the heading of that pose against the local map.
     """
 
     def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
@@ -52,6 +53,7 @@ class MotionModel:
         )
         self._last_had_odometry = False
         self.last_pose: F64 = np.eye(4)
+        self.heading_variance = 0.0
 
     def predict(self, scan: Scan) -> Prediction:
         """Predict the motion up to a scan.
@@ -169,6 +171,21 @@ class MotionModel:
             return np.linalg.inv(np.linalg.inv(information) + owed) if owed.any() else information
         p = self._parameters
         return np.diag([p.steady_sigma_m**-2, p.steady_sigma_m**-2, p.steady_sigma_rad**-2])
+
+    def with_heading(self, information: F64) -> F64:
+        """Return the information (3, 3) that a step of `information` leaves on the pose after it.
+
+        The heading before the step is not exact: the variances of both add up (the prediction of a Kalman
+        filter). Otherwise, while a turn shows little but a near wall, every scan would be held to a heading
+        that odometry has turned too far already, as if it were certain.
+        """
+        variances = np.linalg.inv(information)
+        variances[2, 2] += self.heading_variance
+        return np.linalg.inv(variances)
+
+    def observe_heading(self, information: F64) -> None:
+        """Remember how exact the heading of a scan is: `information` (3, 3) by its prior and its points."""
+        self.heading_variance = float(np.linalg.inv(information)[2, 2])
 
     def observe(self, scan: Scan, T_session_base: F64, *, sure: bool) -> None:
         """Remember the final pose (4, 4) of a scan; `sure`: every direction of it was measured."""

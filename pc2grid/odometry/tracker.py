@@ -223,6 +223,7 @@ class Tracker:
     def _restart(self) -> None:
         """Forget the local maps, of the plane and of KISS-ICP; the poses go on from the last one."""
         self._maps.restart()
+        self._motion.heading_variance = 0.0  # the next local map has the heading of the last pose
         self._health.restart()
         self.kiss = self._new_kiss()
         self._surfaces = None if self._surfaces is None else SurfaceMap()
@@ -314,7 +315,9 @@ class Tracker:
             prior = predicted
             if prediction.odometry is None:
                 information = self._motion.information_on_continued(prediction)
+            information = self._motion.with_heading(information)
             match = self._maps.refine(planar_scan, [predicted], prior, information)
+            self._motion.observe_heading(information + (0.0 if match is None else match.information))
             if match is not None and self._is_sure(match):
                 return match.pose, match
         guesses = [guess]

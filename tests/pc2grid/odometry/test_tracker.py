@@ -212,6 +212,30 @@ def test_what_odometry_owes_is_the_difference_between_a_step_and_a_second():
     assert model.predict(scan(5, 1.0)).windowed is None
 
 
+@pytest.mark.parametrize(("remembered", "low_deg", "high_deg"), [(True, 0.3, 0.8), (False, 1.5, 4.0)])
+def test_a_heading_that_scans_show_weakly_is_not_held_to_odometry_alone(remembered, low_deg, high_deg):
+    """A turn before a near wall: each step is 0.14 degrees too long and said to be exact to 0.26; each scan
+    shows the heading without bias, but says that it is exact to 1.1 degrees only."""
+    model = MotionModel()
+    step = np.diag([1e4, 1e4, np.radians(0.26) ** -2])
+    scan = np.diag([1e4, 1e4, np.radians(1.1) ** -2])
+    error_rad = 0.0
+    for _ in range(100):
+        prior = model.with_heading(step) if remembered else step
+        error_rad += np.radians(0.14)
+        error_rad *= prior[2, 2] / (prior[2, 2] + scan[2, 2])
+        model.observe_heading(prior + scan)
+    assert low_deg < np.degrees(error_rad) < high_deg
+
+
+def test_the_heading_before_a_step_adds_to_its_variance_only():
+    model = MotionModel()
+    step = np.diag([4.0, 4.0, 1.0 / 0.02**2])
+    np.testing.assert_allclose(model.with_heading(step), step)
+    model.observe_heading(np.diag([4.0, 4.0, 1.0 / 0.03**2]))
+    np.testing.assert_allclose(model.with_heading(step), np.diag([4.0, 4.0, 1.0 / (0.02**2 + 0.03**2)]))
+
+
 @pytest.mark.parametrize(("every", "odometry"), [(15, True), (4, False)])
 def test_scans_that_lie_far_apart_are_followed(laser, every, odometry):
     sparse = [
