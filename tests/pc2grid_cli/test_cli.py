@@ -54,7 +54,7 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "--sensor",
         "laser",
         "--length",
-        "14",
+        "8",
         "--seed",
         "5",
         "--clutter",
