@@ -293,7 +293,8 @@ class Tracker:
             config=self._projection,
             sensor=scan.sensor,
         )
-        if scan.sensor != "depth":
+        if scan.sensor != "depth" or scan.T_odom_base is None:
+            # Without odometry a far wall, even if it seems too near, is what holds a camera in a corridor.
             return planar_scan
         return self._depth_limit.before(planar_scan, T_level_base @ scan.T_base_sensor)
 
@@ -315,7 +316,8 @@ class Tracker:
             prior = predicted
             if prediction.odometry is None:
                 information = self._motion.information_on_continued(prediction)
-            information = self._motion.with_heading(information)
+            else:
+                information = self._motion.with_heading(information)
             match = self._maps.refine(planar_scan, [predicted], prior, information)
             self._motion.observe_heading(information + (0.0 if match is None else match.information))
             if match is not None and self._is_sure(match):

@@ -84,13 +84,18 @@ def test_an_image_without_depths_says_nothing() -> None:
     assert limit.unbiased_m == pytest.approx(LIMIT_M - 2.0 * NOISE_PER_M2 * LIMIT_M**2, abs=0.005)
 
 
-@pytest.mark.parametrize(("sensor", "left"), [("depth", False), ("lidar", True)])
-def test_the_tracker_asks_it_for_cameras_only(sensor: SensorKind, left: bool) -> None:
+@pytest.mark.parametrize(
+    ("sensor", "odometry", "left"), [("depth", True, False), ("depth", False, True), ("lidar", True, True)]
+)
+def test_the_tracker_asks_it_for_cameras_with_odometry_only(
+    sensor: SensorKind, odometry: bool, left: bool
+) -> None:
     scan = Scan(
         stamp_ns=0,
         points_m=image_of_wall(LIMIT_M + 0.02),
         T_base_sensor=CAMERA,
         sensor=sensor,
+        T_odom_base=np.eye(4) if odometry else None,
     )
     hits_m = Tracker(RegistrationConfig()).track(scan).planar_scan.hits_m
     assert bool((hits_m[:, 0] > LIMIT_M - 0.08).any()) is left
