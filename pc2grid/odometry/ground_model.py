@@ -26,6 +26,7 @@ class GroundModel:
         self.rolling = rolling
         self._parameters = parameters
         self._scans = 0
+        self._looks = int(ground is not None and ground.seen)  # that have shown the floor
 
     @classmethod
     def start(
@@ -47,14 +48,18 @@ class GroundModel:
     def follow_fixed(self, points_m: F32, scan: Scan) -> None:
         """Update a floor that is fixed to the robot by the points (N, 3) of a scan.
 
-        It is looked for only in some of the scans, before they are registered, as `remove` needs it. A floor
-        that is not fixed stays as it is.
+        It is looked for only in some of the scans, before they are registered, as `remove` needs it. The
+        floor is the mean of what was seen: wheels do not tilt against it, and a ramp ahead soon passes. A
+        floor that is not fixed stays as it is.
         """
         if self.ground is None or not self.rolling:
             return
         self._scans += 1
         if self._scans % self._parameters.rolling_every == 0:
-            self._update(self.ground, points_m, scan, self._parameters.rolling_gain)
+            found = find_ground(points_m, scan.T_base_sensor[:3, 3], self.ground)
+            if found is not None:
+                self._looks += 1
+                self.ground = self.ground.toward(found, max(1.0 / self._looks, self._parameters.rolling_gain))
 
     def follow_moving(self, points_m: F32, scan: Scan, motion: F64) -> None:
         """Update the floor under a sensor in the hand by the points (N, 3) of a scan after a motion (4, 4)
@@ -66,11 +71,8 @@ class GroundModel:
         if self.ground is None or self.rolling:
             return
         expected = self.ground.moved(invert_pose(motion))
-        self._update(expected, points_m, scan, self._parameters.carried_gain)
-
-    def _update(self, expected: Ground, points_m: F32, scan: Scan, gain: float) -> None:
         found = find_ground(points_m, scan.T_base_sensor[:3, 3], expected)
-        self.ground = expected if found is None else expected.toward(found, gain)
+        self.ground = expected if found is None else expected.toward(found, self._parameters.carried_gain)
 
     def remove(self, points_m: F32) -> F32:
         """Return the points (N, 3) that KISS-ICP is given: a sample, without floor and ceiling.

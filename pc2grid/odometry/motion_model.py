@@ -163,7 +163,10 @@ class MotionModel:
         return np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
 
     def information(self, prediction: Prediction) -> F64:
-        """Return the information (3, 3) on x, y, yaw: of odometry, else of the pose that KISS-ICP found."""
+        """Return the information (3, 3) on x, y, yaw: of odometry, else of the pose that KISS-ICP found.
+
+        Odometry counts less by what it owes.
+        """
         if prediction.odometry is not None:
             information = self._trust.information(prediction.odometry)
             owed_m, owed_rad = self.owed(prediction)
@@ -186,6 +189,16 @@ class MotionModel:
     def observe_heading(self, information: F64) -> None:
         """Remember how exact the heading of a scan is: `information` (3, 3) by its prior and its points."""
         self.heading_variance = float(np.linalg.inv(information)[2, 2])
+
+    def information_if_punctual(self, prediction: Prediction) -> F64 | None:
+        """Return the information (3, 3) of odometry that owes a motion, if it owed none; None if it does not.
+
+        Where the scan does not tell, the poses must follow odometry all the same. Else odometry that was once
+        overruled is owed ever more, counts ever less, and the robot seems to stand still.
+        """
+        if prediction.odometry is None or not any(self.owed(prediction)):
+            return None
+        return self._trust.information(prediction.odometry)
 
     def observe(self, scan: Scan, T_session_base: F64, *, sure: bool) -> None:
         """Remember the final pose (4, 4) of a scan; `sure`: every direction of it was measured."""

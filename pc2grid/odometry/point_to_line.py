@@ -11,6 +11,7 @@ Biber and Strasser's normal distributions transform (2003).
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -36,6 +37,18 @@ class Match:
     overlap: float
     residual_m: float
     measured: bool
+
+    def measures_more_than(self, information: F64) -> bool:
+        """Whether the points say more of every direction of the position than `information` (3, 3) does."""
+        weakest, direction = _weakest(self.information)
+        return weakest > float(direction @ information[:2, :2] @ direction)
+
+    def held_along_weakest(self, prior: SE2) -> Match:
+        """The same with the position of a prior T_map_points where the points measure least."""
+        _, direction = _weakest(self.information)
+        off = direction @ (prior.x - self.pose.x, prior.y - self.pose.y) * direction
+        pose = SE2(self.pose.x + float(off[0]), self.pose.y + float(off[1]), self.pose.yaw)
+        return dataclasses.replace(self, pose=pose)
 
 
 class PointGrid:
@@ -138,15 +151,17 @@ class PointGrid:
             information,
             found / max(len(points), 1),
             distance / max(found, 1),
-            _weakest(information) > unit * p.least_points,
+            _weakest(information)[0] > unit * p.least_points,
         )
 
 
-def _weakest(information: F64) -> float:
-    """Information on the position in its weakest direction, the yaw eliminated (Schur complement)."""
+def _weakest(information: F64) -> tuple[float, F64]:
+    """Information on the position in its weakest direction, the yaw eliminated (Schur complement), and that
+    direction (2,)."""
     J = information
     across = J[:2, :2] - np.outer(J[:2, 2], J[2, :2]) / max(J[2, 2], 1e-9)
-    return float(np.linalg.eigvalsh(across)[0])
+    values, directions = np.linalg.eigh(across)
+    return float(values[0]), directions[:, 0]
 
 
 def sector_of(normal_rad: F64, sectors: int) -> NDArray[np.int64]:

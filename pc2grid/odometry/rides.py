@@ -19,6 +19,7 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.upright import CAMERA_UPRIGHT, UPRIGHT, vertical_of
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.model import Scan, SensorKind, Storey
+from pc2grid.odometry.floor_ahead import FloorAhead
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,7 +151,7 @@ class RideWatch:
             return Ride()
         if self._slope is None:
             self._slope = _Slope(scan.sensor, self._parameters)
-        ended = self._slope.observe(points_m, forward_m, ground)
+        ended = self._slope.observe(points_m, forward_m, place.yaw, ground)
         return Ride(
             self._slope.riding, ended is not None and self._arrives(ended), tilting=self._slope.tilting
         )
@@ -189,6 +190,7 @@ class _Slope:
         self._factor = parameters.camera_factor if sensor == "depth" else 1.0
         self._upright = CAMERA_UPRIGHT if sensor == "depth" else UPRIGHT
         self._latest: deque[tuple[float, float]] = deque(maxlen=parameters.measurements)
+        self._ahead = FloorAhead() if sensor == "depth" else None
         self._vertical: F64 | None = None
         self._unmeasured_m = math.inf
         self._tilted = False
@@ -215,16 +217,21 @@ class _Slope:
         tilts_rad = [tilt_rad for _, tilt_rad in self._latest]
         return abs(tilts_rad[-1] - float(np.median(tilts_rad))) > self._factor * self._parameters.begin_rad
 
-    def observe(self, points_m: F32, forward_m: float, ground: Ground) -> _Ended | None:
+    def observe(self, points_m: F32, forward_m: float, yaw_rad: float, ground: Ground) -> _Ended | None:
         """Take in a scan; returns the slope that it shows to be over."""
         p = self._parameters
         self._unmeasured_m += abs(forward_m)
         self._forward_m += forward_m
         self._unknown_m += abs(forward_m)
         measured = False
-        if self._unmeasured_m >= (p.level_every_m if self._is_level and not self.underway else p.every_m):
+        due = self._unmeasured_m >= (p.level_every_m if self._is_level and not self.underway else p.every_m)
+        if due:
             self._unmeasured_m = 0.0
             measured = self._measure(points_m, ground)
+        if self._ahead is not None:
+            self._ahead.move(forward_m, yaw_rad)
+            measured = measured or self._foresee(due)
+            self._ahead.look(points_m, ground, self._latest[-1][0] if self._latest else 0.0)
         if len(self._latest) < p.measurements:
             return None
         pitch_rad, tilt_rad = np.median(np.array(self._latest), axis=0).tolist()
@@ -245,6 +252,14 @@ class _Slope:
             return None
         self.underway = False
         return _Ended(self._rise_m, self._steepest_rad)
+
+    def _foresee(self, due: bool) -> bool:
+        """Where no scan shows the vertical, take the pitch from the floor that was seen ahead."""
+        pitch_rad = self._ahead.pitch_rad if due and self._ahead is not None else None
+        if pitch_rad is None:
+            return False
+        self._latest.append((pitch_rad, abs(pitch_rad)))
+        return True
 
     def _rise_between(self, pitch_rad: float) -> float:
         """The rise from the place of one median of the pitch to that of this one.

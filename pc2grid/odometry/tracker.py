@@ -312,13 +312,15 @@ class Tracker:
         p = self._parameters
         prior = guess if prediction.odometry is None else predicted
         information = self._motion.information(prediction)
+        punctual = self._motion.information_if_punctual(prediction)
         if self._camera_on_wheels:
             prior = predicted
             if prediction.odometry is None:
                 information = self._motion.information_on_continued(prediction)
             else:
                 information = self._motion.with_heading(information)
-            match = self._maps.refine(planar_scan, [predicted], prior, information)
+                punctual = None if punctual is None else self._motion.with_heading(punctual)
+            match = self._match(planar_scan, [predicted], prior, information, punctual)
             self._motion.observe_heading(information + (0.0 if match is None else match.information))
             if match is not None and self._is_sure(match):
                 return match.pose, match
@@ -328,7 +330,7 @@ class Tracker:
             guesses.append(predicted)
         if prediction.windowed is not None and any(self._motion.owed(prediction)):
             guesses.append(SE2.from_matrix(self._motion.last_pose @ prediction.windowed))
-        match = self._maps.refine(planar_scan, guesses, prior, information)
+        match = self._match(planar_scan, guesses, prior, information, punctual)
         if match is None:
             return predicted, None
         if not self._is_sure(match):
@@ -339,6 +341,29 @@ class Tracker:
                 if searched is not None and self._maps.quality(searched) > self._maps.quality(match):
                     match = searched
         return (match.pose if match.overlap >= p.min_overlap else prior), match
+
+    def _match(
+        self,
+        planar_scan: PlanarScan,
+        guesses: list[SE2],
+        prior: SE2,
+        information: F64,
+        punctual: F64 | None,
+    ) -> Match | None:
+        """Match a planar scan from some guesses, held to a prior by its information (3, 3).
+
+        Against odometry that owes a motion, only a scan decides that measures the position better than
+        odometry would if it owed none, which is `punctual` (3, 3). A direction that the scan does not measure
+        at all, such as along a corridor, is that of the prior.
+        """
+        match = self._maps.refine(planar_scan, guesses, prior, information)
+        if match is None or punctual is None:
+            return match
+        if not match.measured:
+            return match.held_along_weakest(prior)
+        if match.measures_more_than(punctual):
+            return match
+        return self._maps.refine(planar_scan, [prior], prior, punctual)
 
 
 def _split(pose: F64) -> tuple[SE2, F64]:

@@ -59,3 +59,24 @@ def test_the_floor_of_a_robot_on_wheels_does_not_follow_its_motion() -> None:
     before = ground.ground
     ground.follow_moving(scan.points_m, scan, pose_from_rotation_vector((0.2, 0.0, 0.0)))
     assert ground.ground is before
+
+
+def shaft(slope_deg: float) -> F64:
+    """Points (N, 3) that a camera sees of the floor of a narrow shaft, which rises from x = 1.2 m on, and of
+    its side walls."""
+    x, across = np.meshgrid(np.linspace(0.7, 5.0, 80), np.linspace(-0.7, 0.7, 30))
+    z = np.maximum(x - 1.2, 0.0) * math.tan(math.radians(slope_deg))
+    floor = np.column_stack((x.ravel(), across.ravel(), z.ravel()))
+    up = (across.ravel() + 0.7) * 1.2
+    walls = [np.column_stack((x.ravel(), np.full(x.size, side), up)) for side in (-0.7, 0.7)]
+    return np.concatenate((floor, *walls))
+
+
+def test_the_floor_of_a_robot_on_wheels_does_not_follow_a_ramp_ahead() -> None:
+    level, ramp = (scan_of(shaft(slope_deg), mounted_m=0.6) for slope_deg in (0.0, 4.8))
+    ground = GroundModel.start(level.points_m, level)
+    for scan, scans in ((level, 200), (ramp, 80)):  # before the ramp for eight seconds
+        for _ in range(scans):
+            ground.follow_fixed(scan.points_m, scan)
+    assert ground.ground is not None
+    assert math.acos(ground.ground.normal[2]) < math.radians(1.0)

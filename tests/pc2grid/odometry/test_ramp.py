@@ -7,8 +7,14 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+import pytest
 
+from pc2grid.clouds.ground import Ground
+from pc2grid.config import RegistrationConfig
+from pc2grid.geometry import SE2
 from pc2grid.model import Scan
+from pc2grid.odometry.floor_ahead import FloorAhead
+from pc2grid.odometry.tracker import Tracker
 from pc2grid.pipeline import map_scans
 from pc2grid.simulate.scene import Mesh, Scene, prism, quads
 from signature.config import Config
@@ -72,3 +78,87 @@ def test_a_ramp_that_was_driven_up_is_free() -> None:
     assert inside.sum() > 0.95 * (2.0 * (LENGTH_M - 0.4)) / grid.resolution_m**2
     assert grid.free[tuple(cells[inside].T)].mean() > 0.995
     assert not grid.occupied[tuple(cells[inside].T)].any()
+
+
+SHAFT_M = np.array([(0.0, 0.0), (6.0, 0.0), (16.0, 10.0 * math.tan(math.radians(7.6))), (20.0, 1.334)])
+"""Of the floor of a shaft without a door, x and z: as steep as is usual in old buildings."""
+
+
+def shaft() -> Scene:
+    """1.35 m wide, so that a camera sees nothing but two smooth walls."""
+    faces = []
+    for (x0, z0), (x1, z1) in itertools.pairwise(SHAFT_M):
+        y, h = 0.675, 2.6
+        faces += [[(x0, -y, z0 + up), (x1, -y, z1 + up), (x1, y, z1 + up), (x0, y, z0 + up)] for up in (0, h)]
+        faces += [[(x0, s, z0), (x1, s, z1), (x1, s, z1 + h), (x0, s, z0 + h)] for s in (-y, y)]
+    ends = [[(x, -y, z), (x, y, z), (x, y, z + h), (x, -y, z + h)] for x, z in (SHAFT_M[0], SHAFT_M[-1])]
+    return Scene(quads(np.array(faces + ends)))
+
+
+def camera_drive() -> Iterator[tuple[float, Scan]]:
+    """Scans of a camera 0.6 m above the wheels, each with the distance that these have travelled."""
+    scene, rng = shaft(), np.random.default_rng(0)
+    across, up = np.meshgrid(np.tan(np.radians(np.linspace(-44, 44, 60))), np.linspace(-0.57, 0.57, 120))
+    rays = np.stack((np.ones_like(across), across, up), axis=-1).reshape(-1, 3)
+    mount = np.eye(4)
+    mount[:3, 3] = 0.2, 0.0, 0.6
+    travel_m, before = 0.0, (1.0, 0.0)
+    for k, x in enumerate(np.arange(1.0, 15.0, 0.06)):
+        low, high = (float(np.interp(at, *SHAFT_M.T)) for at in (x - 0.25, x + 0.25))
+        pitch = math.atan2(high - low, 0.5)
+        here = (float(x), (low + high) / 2)
+        travel_m += math.dist(here, before)
+        before = here
+        c, s = math.cos(pitch), math.sin(pitch)
+        R = np.array([(c, 0, -s), (0, 1, 0), (s, 0, c)])
+        eye = np.array([here[0], 0.0, here[1]]) + R @ mount[:3, 3]
+        lines = np.concatenate((np.tile(eye, (len(rays), 1)), rays @ R.T), axis=1)
+        depth = scene.cast(lines.astype(np.float32))
+        depth = depth + 0.0015 * depth**2 * rng.standard_normal(len(depth))
+        points = mount[:3, 3] + rays * depth[:, None]
+        yield (
+            travel_m,
+            Scan(
+                stamp_ns=int(k * 1e8),
+                points_m=points[depth < 6.0].astype(np.float32),
+                T_base_sensor=mount,
+                sensor="depth",
+                T_odom_base=SE2(travel_m, 0.0, 0.0).lift(),
+            ),
+        )
+
+
+def test_a_camera_does_not_stand_still_on_a_ramp_between_smooth_walls() -> None:
+    tracker = Tracker(RegistrationConfig())
+    for travel_m, scan in camera_drive():
+        at_m = tracker.track(scan).registered.T_session_base[0, 3]
+        assert abs(at_m - travel_m) < 0.05 * travel_m + 0.2
+
+
+def test_the_pitch_follows_the_floor_that_was_seen_ahead() -> None:
+    ground = Ground(np.array([0.0, 0.0, 1.0]), 0.0)
+    ahead, before_m, errors_rad = FloorAhead(), 0.0, []
+    for travel_m, scan in camera_drive():
+        ahead.move(travel_m - before_m, 0.0)
+        before_m = travel_m
+        pitch_rad = ahead.pitch_rad
+        if pitch_rad is not None and 4.0 < travel_m < 13.0:
+            true_rad = math.radians(7.6) if travel_m > 5.3 else 0.0
+            if abs(travel_m - 5.0) > 0.8:  # the bend, over which a measurement takes the mean
+                errors_rad.append(pitch_rad - true_rad)
+        ahead.look(scan.points_m, ground, pitch_rad or 0.0)
+    assert len(errors_rad) > 100
+    assert np.abs(errors_rad).max() < math.radians(1.5)
+
+
+def test_a_floor_that_the_robot_turned_away_from_says_nothing() -> None:
+    ground = Ground(np.array([0.0, 0.0, 1.0]), 0.0)
+    ahead = FloorAhead()
+    x, y = (at.ravel() for at in np.meshgrid(np.arange(1.0, 3.0, 0.05), np.arange(-0.4, 0.4, 0.05)))
+    points_m = np.column_stack((x, y, np.zeros_like(x))).astype(np.float32)
+    for _ in range(30):
+        ahead.move(0.1, 0.0)
+        ahead.look(points_m, ground, 0.0)
+    assert ahead.pitch_rad == pytest.approx(0.0, abs=1e-6)
+    ahead.move(0.0, math.radians(30.0))
+    assert ahead.pitch_rad is None
