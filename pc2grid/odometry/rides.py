@@ -57,7 +57,7 @@ class RideParameters:
         most that are far, around a robot that stood in what may be the cabin of a lift, whose door it did not
         look at. From half a metre before it, the door of a cabin spans 100 degrees.
     car_m : what is near around a robot that stands lies in a rectangle, whose longer side is no longer than
-    this in a lift. The longest cars, for beds, are 2.7 m deep (ISO 8100-30).
+        this in a lift. The longest cars, for beds, are 2.7 m deep (ISO 8100-30).
     """
 
     level_every_m: float = 0.3
@@ -218,7 +218,11 @@ class _Slope:
         return abs(tilts_rad[-1] - float(np.median(tilts_rad))) > self._factor * self._parameters.begin_rad
 
     def observe(self, points_m: F32, forward_m: float, yaw_rad: float, ground: Ground) -> _Ended | None:
-        """Take in a scan; returns the slope that it shows to be over."""
+        """Take in a scan; returns the slope that it shows to be over.
+
+        points_m, ground : as in `RideWatch.observe`. forward_m : travel along the base's own x axis since the
+        last scan. yaw_rad : heading of the base in the session frame.
+        """
         p = self._parameters
         self._unmeasured_m += abs(forward_m)
         self._forward_m += forward_m
@@ -230,7 +234,8 @@ class _Slope:
             measured = self._measure(points_m, ground)
         if self._ahead is not None:
             self._ahead.move(forward_m, yaw_rad)
-            measured = measured or self._foresee(due)
+            if due and not measured:
+                measured = self._foresee(self._ahead)
             self._ahead.look(points_m, ground, self._latest[-1][0] if self._latest else 0.0)
         if len(self._latest) < p.measurements:
             return None
@@ -253,9 +258,9 @@ class _Slope:
         self.underway = False
         return _Ended(self._rise_m, self._steepest_rad)
 
-    def _foresee(self, due: bool) -> bool:
-        """Where no scan shows the vertical, take the pitch from the floor that was seen ahead."""
-        pitch_rad = self._ahead.pitch_rad if due and self._ahead is not None else None
+    def _foresee(self, ahead: FloorAhead) -> bool:
+        """Where no scan shows the vertical, take the pitch from the floor that was seen ahead, if it was."""
+        pitch_rad = ahead.pitch_rad
         if pitch_rad is None:
             return False
         self._latest.append((pitch_rad, abs(pitch_rad)))
