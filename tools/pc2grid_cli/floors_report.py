@@ -109,14 +109,20 @@ def draw(path: Path, houses: Sequence[Asked], grids: Mapping[str, OccupancyGrid]
     ways = list(dict.fromkeys(task.way for task, _ in houses))
     task, result = example
     answer = example_answer(result)
-    figure = Figure(figsize=(11.0, 2.0 * len(ways) + 5.2), dpi=110, constrained_layout=True)
+    of_way = {way: [house for house in houses if house[0].way == way] for way in ways}
+    bars_in = 1.2 + 0.22 * max(map(len, of_way.values()))
+    figure = Figure(figsize=(11.0, bars_in + 4.2), dpi=110, constrained_layout=True)
     FigureCanvasAgg(figure)
-    parts: Any = figure.subfigures(2, 1, height_ratios=(2.0 * len(ways), 5.2))
+    parts: Any = figure.subfigures(2, 1, height_ratios=(bars_in, 4.2))
     bars, maps = parts
-    panels = bars.subplots(len(ways), 1, squeeze=False)[:, 0]
+    panels = bars.subplots(1, len(ways), squeeze=False)[0]
     for ax, way in zip(panels, ways, strict=True):
-        _draw_answers(ax, way, [house for house in houses if house[0].way == way])
-    panels[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, fontsize=8, frameon=False)
+        _draw_answers(ax, way, of_way[way])
+    bars.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
+    bars.suptitle(
+        "answers in each house, furniture alike (a) or different (d) on each floor; x: floors not told apart",
+        fontsize=10,
+    )
     floors = maps.subplots(1, len(task.floors), squeeze=False, sharex=True, sharey=True)[0]
     for ax, floor in zip(floors, task.floors, strict=True):
         _draw_floor(ax, floor, result, answer, grids)
@@ -150,22 +156,18 @@ _BY_INTEREST: tuple[FloorStatus, ...] = ("wrong", "ambiguous", "right", "not_fou
 def _draw_answers(ax: Any, way: str, houses: Sequence[Asked]) -> None:
     """A bar for each house."""
     names = [f"{task.seed}{'a' if task.alike else 'd'}" for task, _ in houses]
-    below = [0] * len(houses)
+    rows, before = range(len(houses)), [0] * len(houses)
     for status, colour in _COLOURS.items():
         counts = [result.count(status) for _, result in houses]
-        ax.bar(range(len(houses)), counts, bottom=below, color=colour, width=0.8, label=_SHOWN[status])
-        below = [a + b for a, b in zip(below, counts, strict=True)]
-    for at, (_, result) in enumerate(houses):
+        ax.barh(rows, counts, left=before, color=colour, height=0.8, label=_SHOWN[status])
+        before = [a + b for a, b in zip(before, counts, strict=True)]
+    for row, (_, result) in enumerate(houses):
         if not result.told_apart:
-            ax.plot(at, below[at] + 0.5, "x", color=VERMILLION, ms=6)
-    ax.set_xticks(range(len(houses)), names, fontsize=7)
-    ax.set_xlim(-0.6, max(len(houses), 12) - 0.4)
-    ax.set_ylabel("queries", fontsize=8)
-    ax.set_title(
-        f"{way}; houses with furniture alike (a) or different (d) on each floor; x: floors not told apart",
-        fontsize=9,
-        loc="left",
-    )
+            ax.plot(before[row] + 0.5, row, "x", color=VERMILLION, ms=6)
+    ax.set_yticks(rows, names, fontsize=7)
+    ax.invert_yaxis()
+    ax.set_xlabel("queries", fontsize=8)
+    ax.set_title(way, fontsize=9)
     ax.tick_params(labelsize=7)
 
 
