@@ -321,6 +321,8 @@ class Tracker:
                 information = self._motion.with_heading(information)
                 punctual = None if punctual is None else self._motion.with_heading(punctual)
             match = self._match(planar_scan, [predicted], prior, information, punctual)
+            if match is not None and prediction.odometry is None:
+                match = self._without_leap(match, predicted, prediction)
             self._motion.observe_heading(information + (0.0 if match is None else match.information))
             if match is not None and self._is_sure(match):
                 return match.pose, match
@@ -341,6 +343,16 @@ class Tracker:
                 if searched is not None and self._maps.quality(searched) > self._maps.quality(match):
                     match = searched
         return (match.pose if match.overlap >= p.min_overlap else prior), match
+
+    def _without_leap(self, match: Match, predicted: SE2, prediction: Prediction) -> Match:
+        """The match with the predicted position where the scan measures least, if it leaps there.
+
+        Along a wall a scan may fit half a metre off, and as the motion before continues, a single leap would
+        go on for many scans.
+        """
+        held = match.held_along_weakest(predicted)
+        leap_m = math.hypot(held.pose.x - match.pose.x, held.pose.y - match.pose.y)
+        return held if leap_m > self._motion.leap_m(prediction) else match
 
     def _match(
         self,

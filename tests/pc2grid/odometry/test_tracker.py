@@ -11,6 +11,7 @@ from pc2grid.clouds.sampling import random_subset
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.geometry import SE2, invert_pose, transform_points, wrap_angle
 from pc2grid.model import Health, Scan
+from pc2grid.odometry.matching_maps import MatchingMaps
 from pc2grid.odometry.motion_model import MotionModel
 from pc2grid.odometry.registration import KissRegistration
 from pc2grid.odometry.tracker import Tracker
@@ -352,3 +353,30 @@ def test_kiss_icp_without_points_returns_the_prediction():
     kiss = KissRegistration(RegistrationConfig())
     motion = SE2(0.1, 0.0, 0.05).lift()
     assert np.allclose(kiss.register(np.zeros((3, 3)), np.eye(4), motion, 0.1), motion)
+
+
+@pytest.mark.parametrize(("leap_m", "believed"), [(0.41, False), (0.05, True)])
+def test_a_camera_without_odometry_does_not_leap_along_a_wall(leap_m, believed, monkeypatch):
+    """A single leap would go on for many scans, as the motion before continues."""
+    depth = [blind(scan) for scan, _ in session("depth", length_m=2.0, seed=3)[:30]]
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    for scan in depth[:-1]:
+        tracker.track(scan)
+    refined = MatchingMaps.refine
+
+    def leaping(self, planar_scan, guesses, prior, information):
+        match = refined(self, planar_scan, guesses, prior, information)
+        # The points know everything but x, and say that it is elsewhere.
+        return dataclasses.replace(
+            match,
+            pose=SE2(prior.x + leap_m, prior.y, prior.yaw),
+            information=np.diag([2000.0, 40000.0, 40000.0]),
+            overlap=1.0,
+            residual_m=0.0,
+            measured=True,
+        )
+
+    before = SE2.from_matrix(tracker._motion.last_pose @ tracker._motion.predict(depth[-1]).motion)
+    monkeypatch.setattr(MatchingMaps, "refine", leaping)
+    pose = SE2.from_matrix(tracker.track(depth[-1]).registered.T_session_base)
+    assert pose.x - before.x == pytest.approx(leap_m if believed else 0.0, abs=1e-6)
