@@ -293,8 +293,7 @@ class Tracker:
             config=self._projection,
             sensor=scan.sensor,
         )
-        if scan.sensor != "depth" or scan.T_odom_base is None:
-            # Without odometry a far wall, even if it seems too near, is what holds a camera in a corridor.
+        if scan.sensor != "depth":
             return planar_scan
         return self._depth_limit.before(planar_scan, T_level_base @ scan.T_base_sensor)
 

@@ -85,11 +85,9 @@ def test_an_image_without_depths_says_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sensor", "odometry", "left"), [("depth", True, False), ("depth", False, True), ("lidar", True, True)]
+    ("sensor", "odometry", "left"), [("depth", True, False), ("depth", False, False), ("lidar", True, True)]
 )
-def test_the_tracker_asks_it_for_cameras_with_odometry_only(
-    sensor: SensorKind, odometry: bool, left: bool
-) -> None:
+def test_the_tracker_asks_it_for_cameras_only(sensor: SensorKind, odometry: bool, left: bool) -> None:
     scan = Scan(
         stamp_ns=0,
         points_m=image_of_wall(LIMIT_M + 0.02),
