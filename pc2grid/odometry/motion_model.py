@@ -162,10 +162,9 @@ class MotionModel:
         sigma_m, sigma_rad = p.unsteady_mps * seconds, p.unsteady_radps * seconds
         return np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
 
-    def leap_m(self, prediction: Prediction) -> float:
-        """Return how far from where the motion before leads a robot is not, without odometry."""
-        p = self._parameters
-        return p.leap_sigmas * p.unsteady_mps * prediction.seconds
+    def leap_m(self, information: F64) -> float:
+        """Return how far from the predicted position a robot hardly is, by `information` (3, 3) on it."""
+        return self._parameters.leap_sigmas / math.sqrt(float(information[0, 0]))
 
     def information(self, prediction: Prediction) -> F64:
         """Return the information (3, 3) on x, y, yaw: of odometry, else of the pose that KISS-ICP found.

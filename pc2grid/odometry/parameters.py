@@ -97,7 +97,8 @@ class TrackingParameters:
     search_hits : hits that are searched with, at most, evenly chosen.
     unsteady_mps, unsteady_radps : without odometry, the standard deviation of the motion is this times the
         time since the last scan: a robot indoors starts, stops and turns.
-    leap_sigmas : a camera without odometry that seems to be off by more is not believed where it sees least.
+    leap_sigmas, firm : a camera that seems to be off the predicted position by more, where it sees least, is
+        matched again there, held by so many times the information; without odometry it is not believed.
 
     Local maps and keyframes:
 
@@ -175,6 +176,7 @@ class TrackingParameters:
     unsteady_mps: float = 0.4
     unsteady_radps: float = 0.4
     leap_sigmas: float = 2.0
+    firm: float = 100.0
 
     keyframe_travel_m: float = 0.2
     keyframe_turn_rad: float = math.radians(10.0)

@@ -320,8 +320,8 @@ class Tracker:
                 information = self._motion.with_heading(information)
                 punctual = None if punctual is None else self._motion.with_heading(punctual)
             match = self._match(planar_scan, [predicted], prior, information, punctual)
-            if match is not None and prediction.odometry is None:
-                match = self._without_leap(match, predicted, prediction)
+            if match is not None:
+                match = self._without_leap(match, planar_scan, predicted, information, prediction)
             self._motion.observe_heading(information + (0.0 if match is None else match.information))
             if match is not None and self._is_sure(match):
                 return match.pose, match
@@ -343,15 +343,23 @@ class Tracker:
                     match = searched
         return (match.pose if match.overlap >= p.min_overlap else prior), match
 
-    def _without_leap(self, match: Match, predicted: SE2, prediction: Prediction) -> Match:
-        """The match with the predicted position where the scan measures least, if it leaps there.
+    def _without_leap(
+        self, match: Match, planar_scan: PlanarScan, predicted: SE2, information: F64, prediction: Prediction
+    ) -> Match:
+        """The match or, if it leaps where the scan measures least, one at the predicted position there.
 
-        Along a wall a scan may fit half a metre off, and as the motion before continues, a single leap would
-        go on for many scans.
+        Along a wall a scan may seem to fit half a metre off. With odometry that counts only if it fits better
+        there. Without, it never counts: as the motion before continues, a single leap would go on for many
+        scans.
         """
         held = match.held_along_weakest(predicted)
         leap_m = math.hypot(held.pose.x - match.pose.x, held.pose.y - match.pose.y)
-        return held if leap_m > self._motion.leap_m(prediction) else match
+        if leap_m <= self._motion.leap_m(information):
+            return match
+        if prediction.odometry is None:
+            return held
+        firm = self._maps.refine(planar_scan, [held.pose], predicted, self._parameters.firm * information)
+        return match if firm is None else max(firm, match, key=self._maps.quality)
 
     def _match(
         self,

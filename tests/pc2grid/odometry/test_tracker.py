@@ -380,3 +380,30 @@ def test_a_camera_without_odometry_does_not_leap_along_a_wall(leap_m, believed, 
     monkeypatch.setattr(MatchingMaps, "refine", leaping)
     pose = SE2.from_matrix(tracker.track(depth[-1]).registered.T_session_base)
     assert pose.x - before.x == pytest.approx(leap_m if believed else 0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("residual_m", "believed"), [(0.05, False), (0.0, True)])
+def test_a_camera_leaps_against_odometry_only_where_it_fits_better(residual_m, believed, monkeypatch):
+    depth = [scan for scan, _ in session("depth", length_m=2.0, seed=3)[:30]]
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    for scan in depth[:-1]:
+        tracker.track(scan)
+    refined = MatchingMaps.refine
+    asked = []
+
+    def leaping(self, planar_scan, guesses, prior, information):
+        """The first time the scan seems to fit elsewhere in x; held firmly, it fits as it does."""
+        match = refined(self, planar_scan, guesses, prior, information)
+        asked.append(information[0, 0])
+        if len(asked) > 1:
+            return match
+        pose, known = SE2(prior.x + 0.41, prior.y, prior.yaw), np.diag([2000.0, 40000.0, 40000.0])
+        return dataclasses.replace(
+            match, pose=pose, information=known, overlap=1.0, residual_m=residual_m, measured=True
+        )
+
+    before = SE2.from_matrix(tracker._motion.last_pose @ tracker._motion.predict(depth[-1]).motion)
+    monkeypatch.setattr(MatchingMaps, "refine", leaping)
+    pose = SE2.from_matrix(tracker.track(depth[-1]).registered.T_session_base)
+    assert len(asked) == 2 and asked[1] > 10.0 * asked[0]
+    assert (abs(pose.x - before.x) > 0.3) is believed
