@@ -31,8 +31,8 @@ class CloudParameters:
 
     Slopes:
 
-    steepest_floor_rad : what rises by more is an obstacle. The same as `RideParameters.steep_rad`: what is
-        less steep is followed.
+    steepest_floor_rad : what rises by more is an obstacle, and no slope that is mapped like level ground
+        (`RideParameters.steep_rad`).
     floor_noise_m : a point of the floor may be higher by so much, as depths are noisy.
     floor_gap_m : between two points of a floor along a bearing, at most. A camera with 120 rows, 0.6 m above
         the floor, has a row every 0.4 m at 5 m.

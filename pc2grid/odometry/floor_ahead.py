@@ -14,6 +14,7 @@ import numpy as np
 
 from pc2grid.arrays import F32
 from pc2grid.clouds.ground import Ground
+from pc2grid.clouds.parameters import CLOUD_PARAMETERS
 from pc2grid.geometry import wrap_angle
 
 
@@ -33,7 +34,7 @@ class FloorAheadParameters:
     near_m: float = 1.3
     far_m: float = 2.3
     half_width_m: float = 0.4
-    steepest_rad: float = math.radians(12.0)
+    steepest_rad: float = CLOUD_PARAMETERS.steepest_floor_rad
     noise_m: float = 0.03
     least_points: int = 40
     most_rms_m: float = 0.03

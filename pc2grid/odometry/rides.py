@@ -15,6 +15,7 @@ import numpy as np
 
 from pc2grid.arrays import F32, F64, I64
 from pc2grid.clouds.ground import Ground
+from pc2grid.clouds.parameters import CLOUD_PARAMETERS
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.upright import CAMERA_UPRIGHT, UPRIGHT, vertical_of
 from pc2grid.geometry import SE2, wrap_angle
@@ -70,7 +71,7 @@ class RideParameters:
     known_m: float = 1.0
     storey_m: float = 1.5
     same_m: float = 1.0
-    steep_rad: float = math.radians(12.0)
+    steep_rad: float = CLOUD_PARAMETERS.steepest_floor_rad
     brief_m: float = 0.3
 
     sectors: int = 72
@@ -360,7 +361,7 @@ class _Cabin:
         self._stood = False
         self._far: I64 = np.full(self._parameters.sectors, -1)  # 1: far, 0: near, -1: not seen yet
         self._at_once = 0  # most sectors that one scan has shown
-        # How far the near hits reach in each direction, from where the robot stood until it was sure to stand
+        # How far the near hits reach in each direction, until the robot has stood for `shut_s`.
         self._reach_m: F64 = np.zeros(self._parameters.sectors)
 
     def observe(self, planar_scan: PlanarScan, yaw_rad: float, forward_m: float) -> int | None:
