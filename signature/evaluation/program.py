@@ -1,26 +1,35 @@
-"""Which program computed a stored result."""
+"""Which program computed a stored result.
+
+The number of a release stays the same while the program is developed, so it does not tell whether a result
+that was computed before is still what the program would compute. Its sources do.
+"""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+"""The folder of the packages `pc2grid` and `signature`."""
 
 
 @cache
 def program_digest() -> str:
     """Twelve hexadecimal digits that change with any source file of `pc2grid` and `signature`.
 
-    The number of a release stays the same while the program is developed, so it does not tell whether a
-    result that was computed before is still what the program would compute.
-
     >>> len(program_digest())
     12
     """
-    root = Path(__file__).parents[2]
+    return digest_of_sources((ROOT / "pc2grid", ROOT / "signature"))
+
+
+def digest_of_sources(paths: Iterable[Path]) -> str:
+    """The same of these files, and of the Python files in these folders."""
     found = hashlib.sha256()
-    for package in ("pc2grid", "signature"):
-        for file in sorted((root / package).rglob("*.py")):
-            found.update(file.relative_to(root).as_posix().encode() + b"\0")
+    for path in paths:
+        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+            found.update(file.name.encode() + b"\0")
             found.update(hashlib.sha256(file.read_bytes()).digest())
     return found.hexdigest()[:12]

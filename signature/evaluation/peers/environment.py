@@ -16,9 +16,10 @@ from pathlib import Path
 from pc2grid.errors import Pc2GridError
 from pc2grid.model import SensorKind
 from signature.evaluation.peers import particle_filter
-from signature.evaluation.peers.asked import MATCHERS, OWN, digest, digest_of_sources
+from signature.evaluation.peers.asked import MATCHERS, OWN, digest
 from signature.evaluation.peers.particle_filter import PROGRAMS, ParticleFilter
 from signature.evaluation.peers.peer_process import Peer, PeerProcess
+from signature.evaluation.program import digest_of_sources
 
 PINS = ("map-closures==2.2.0", "kiss-matcher==1.0.2")
 """The versions that the parameters of `cloud_matchers` were chosen for."""

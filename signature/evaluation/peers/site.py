@@ -34,7 +34,8 @@ from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind, Trajectory
 from pc2grid.odometry.tracker import Tracker
 from signature.config import Config
-from signature.evaluation.peers.asked import PREPARES, digest, digest_of_sources
+from signature.evaluation.peers.asked import PREPARES, digest
+from signature.evaluation.program import digest_of_sources
 from signature.evaluation.registered_session import register
 from signature.evaluation.sensor_matrix import query_start
 from signature.sessions import digest_of
