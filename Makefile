@@ -38,12 +38,12 @@ test: $(READY)
 check: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	MYPYPATH=tools $(BIN)/mypy -p pc2grid -p signature -p pc2grid_cli
+	MYPYPATH=tools $(BIN)/mypy -p pc2grid -p signature -p pc2grid_cli -p pc2grid_lab
 	$(BIN)/lint-imports
 
 bench: $(READY)
 	$(BIN)/python -m pip install -q -c constraints.txt -e '.[bench,postgres]'
-	$(ONE_THREAD) $(BIN)/python tools/bench/run.py $(BENCH_ARGS)
+	$(ONE_THREAD) $(BIN)/python -m pc2grid_lab.bench.run $(BENCH_ARGS)
 
 # Half a million small files: in memory, where there is a place for that.
 FUZZ_FOLDER = $(shell test -w /dev/shm && echo --basetemp=/dev/shm/pc2grid-fuzz -o tmp_path_retention_policy=failed)

@@ -16,9 +16,9 @@ import typer
 
 import pc2grid
 from pc2grid.config import PartitionConfig
-from signature.baselines import make_methods
-from signature.evaluation.noise import NOISE_LEVELS
-from signature.evaluation.paper_experiment import Experiment, evaluate
+from pc2grid_lab.baselines import make_methods
+from pc2grid_lab.experiments.noise import NOISE_LEVELS
+from pc2grid_lab.experiments.paper_experiment import Experiment, evaluate
 
 
 class WallDistances:

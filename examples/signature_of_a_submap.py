@@ -20,10 +20,10 @@ from pc2grid.io.nav2_map import load_map
 from pc2grid.model import OccupancyGrid, Submap
 from pc2grid.submaps.junction_graph import junction_graph, map_skeleton
 from pc2grid.submaps.partition import partition
+from pc2grid_lab.experiments.noise import NOISE_LEVELS, add_noise
 from signature.boundary import boundary_edges, boundary_histogram, boundary_points
 from signature.config import SignatureConfig
 from signature.describe import describe
-from signature.evaluation.noise import NOISE_LEVELS, add_noise
 from signature.freespace import freespace_graph, freespace_histogram, shortest_paths
 from signature.symmetry import blurred, line_segments, symmetry_axes
 

@@ -42,7 +42,7 @@ def test_the_wheel_holds_the_examples_that_readme_names(wheel: zipfile.ZipFile) 
 def test_the_wheel_holds_the_packages_and_no_tests(wheel: zipfile.ZipFile) -> None:
     tops = {name.partition("/")[0] for name in wheel.namelist()}
     version = pc2grid.__version__
-    wanted = {"pc2grid", "signature", "pc2grid_cli"}
+    wanted = {"pc2grid", "signature", "pc2grid_cli", "pc2grid_lab"}
     assert tops == {*wanted, f"pc2grid-{version}.dist-info", f"pc2grid-{version}.data"}
     for package in wanted:
         assert f"{package}/py.typed" in wheel.namelist()

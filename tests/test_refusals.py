@@ -18,9 +18,9 @@ from pc2grid.geometry import SE2
 from pc2grid.io.atomic import replace_file
 from pc2grid.model import Health, Loop, OccupancyGrid, Scan, SessionMap, Trajectory
 from pc2grid.settings import load_settings
+from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
 from signature.config import Config
 from signature.describe import Signature
-from signature.evaluation.slam_relations import read_relations, relation_error
 from signature.relocalization.lazy_maps import LazySequence
 from signature.similarity import SignatureTable
 

@@ -17,8 +17,9 @@ from xml.sax.saxutils import escape
 import grimp
 import networkx as nx
 
-BANDS = {"pc2grid_cli": "#B0568A", "signature": "#00805C", "pc2grid": "#0066A6"}
+BANDS = {"pc2grid_lab": "#8A6D00", "pc2grid_cli": "#B0568A", "signature": "#00805C", "pc2grid": "#0066A6"}
 ABOUT = {
+    "pc2grid_lab": "the laboratory: experiments, peers, benchmarks",
     "pc2grid_cli": "the program: one file for each command",
     "signature": "submaps to signatures, database, relocalization",
     "pc2grid": "recordings to clouds, trajectories, maps, submaps",

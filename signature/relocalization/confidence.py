@@ -26,7 +26,7 @@ wrong places alike, so a poor agreement needs a longer lead, and can be made up 
 Whether the query lies in the map at all, at the best or at another hypothesis, is asked separately: with the
 same terms and other coefficients, and without the tie.
 
-`signature.evaluation.calibration` fits the coefficients to answers whose truth is known and judges them.
+`pc2grid_lab.experiments.calibration` fits the coefficients to answers whose truth is known and judges them.
 """
 
 from __future__ import annotations

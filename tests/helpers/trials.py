@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from signature.evaluation.ablation import COMBINATIONS
-from signature.evaluation.trial import Trial
+from pc2grid_lab.experiments.ablation import COMBINATIONS
+from pc2grid_lab.experiments.trial import Trial
 
 
 def trial(**changes: Any) -> Trial:

@@ -21,7 +21,7 @@ from pc2grid.simulate import HouseConfig, SimulationConfig, prepare_session, sim
 from pc2grid.simulate.config import LaserConfig
 from pc2grid.simulate.session import Session
 from pc2grid.time_span import TimeSpan
-from signature.evaluation.slam_relations import read_relations, relation_error
+from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
 
 Mapped = tuple[Session, list[tuple[Scan, SE2]], OccupancyGrid, Trajectory]
 

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from pc2grid.io.nav2_map import save_map
 from pc2grid.settings import dump_settings
 from pc2grid_cli.console import print_json
-from pc2grid_cli.json_schemas import DOCUMENTS, schema
+from pc2grid_cli.json_schemas import documents, schema
 from pc2grid_cli.main import app
 from signature.config import Config
 from tests.helpers.json_schema import closed
@@ -85,22 +85,22 @@ def test_documents_are_as_their_schema_says(
 
 def test_every_document_is_validated_by_a_test() -> None:
     elsewhere = {
-        "compare-paper": "pc2grid_cli/test_compare_paper.py",
-        "compare-floors": "pc2grid_cli/test_compare_floors.py",
-        "compare-maps": "signature/evaluation/test_map_quality.py",
-        "compare-peers": "signature/evaluation/test_peers.py",
-        "compare-real": "signature/evaluation/test_real_sensors.py",
-        "compare-sensors": "signature/evaluation/test_sensor_matrix.py",
-        "compare-signatures": "signature/evaluation/test_selection.py",
+        "compare-paper": "pc2grid_lab/compare/test_paper.py",
+        "compare-floors": "pc2grid_lab/compare/test_floors.py",
+        "compare-maps": "pc2grid_lab/experiments/test_map_quality.py",
+        "compare-peers": "pc2grid_lab/experiments/test_peers.py",
+        "compare-real": "pc2grid_lab/experiments/test_real_sensors.py",
+        "compare-sensors": "pc2grid_lab/experiments/test_sensor_matrix.py",
+        "compare-signatures": "pc2grid_lab/experiments/test_selection.py",
         "watch": "pc2grid_cli/test_watch.py",
         "watch-check": "pc2grid_cli/test_known_pose.py",
     }
     for name, file in elsewhere.items():
         assert f'schema("{name}")' in (Path(__file__).parents[1] / file).read_text()
-    assert {name for name, _, _ in COMMANDS} | set(elsewhere) == set(DOCUMENTS)
+    assert {name for name, _, _ in COMMANDS} | set(elsewhere) == set(documents())
 
 
-@pytest.mark.parametrize("name", ["settings", *DOCUMENTS])
+@pytest.mark.parametrize("name", ["settings", *documents()])
 def test_schemas_are_sound_and_explained(name: str) -> None:
     done = CliRunner().invoke(app, ["config", "schema", name], catch_exceptions=False)
     document = json.loads(done.stdout)
@@ -141,7 +141,7 @@ def test_every_command_shows_an_example_that_parses(name: str, command: Any) -> 
 def test_json_is_offered_where_there_is_a_schema_and_only_there() -> None:
     for name, command in commands(get_command(app)):
         has_json = any("--json" in option.opts for option in command.params)
-        assert has_json == (name.replace(" ", "-") in DOCUMENTS), name
+        assert has_json == (name.replace(" ", "-") in documents()), name
 
 
 def test_what_is_not_known_is_null(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 import pc2grid_cli
-from pc2grid_cli import compare_maps, tables
+from pc2grid_cli import tables
 from pc2grid_cli.tables import show, table
+from pc2grid_lab.compare import maps as compare_maps
 
 
 def test_a_table_has_a_title_on_the_left_and_numbers_on_the_right(capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,14 +6,21 @@ stand without a value, for which typer has no notation.
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, Literal
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from pc2grid_cli.console import Console
 from pc2grid_cli.rerun_target import VIEWER, names_target
+
+# Colours and boxes cost a tenth of a second at every --help; they are for terminals that want them.
+_FANCY = sys.stderr.isatty() and sys.stdout.isatty() and not os.environ.get("NO_COLOR")
+MARKUP: Literal["rich"] | None = "rich" if _FANCY else None
+"""How typer prints help."""
 
 _WITHOUT_VALUE: dict[str, tuple[str, Callable[[str], bool]]] = {
     "--dask": ("local", lambda word: "://" in word),

@@ -19,9 +19,9 @@ def config_schema_command(
     Example: pc2grid config schema relocalize
     """
     from pc2grid.errors import ConfigError
-    from pc2grid_cli.json_schemas import DOCUMENTS, schema
+    from pc2grid_cli.json_schemas import documents, schema
 
-    names = ["settings", *DOCUMENTS]
+    names = ["settings", *documents()]
     if name is None:
         print("\n".join(names))
     elif name in names:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from typing import Annotated
 
@@ -10,15 +9,7 @@ import typer
 
 import pc2grid
 from pc2grid_cli import console
-from pc2grid_cli.command_line import Command, Group
-from pc2grid_cli.compare_floors import compare_floors_command
-from pc2grid_cli.compare_log import compare_log_command
-from pc2grid_cli.compare_maps import compare_maps_command
-from pc2grid_cli.compare_paper import compare_paper_command
-from pc2grid_cli.compare_peers import compare_peers_command
-from pc2grid_cli.compare_real import compare_real_command
-from pc2grid_cli.compare_sensors import compare_sensors_command
-from pc2grid_cli.compare_signatures import compare_signatures_command
+from pc2grid_cli.command_line import MARKUP, Command, Group
 from pc2grid_cli.config_dump import config_dump_command
 from pc2grid_cli.config_schema import config_schema_command
 from pc2grid_cli.convert import convert_command
@@ -32,19 +23,17 @@ from pc2grid_cli.db_split import db_split_command
 from pc2grid_cli.demo import demo_command
 from pc2grid_cli.export import export_command
 from pc2grid_cli.info import info_command
+from pc2grid_cli.laboratory import Compare
 from pc2grid_cli.relocalize import relocalize_command
 from pc2grid_cli.simulate import simulate_command
 from pc2grid_cli.view import view_command
 from pc2grid_cli.watch import watch_command
 
-# Colours and boxes cost a tenth of a second at every --help; they are for terminals that want them.
-_FANCY = sys.stderr.isatty() and sys.stdout.isatty() and not os.environ.get("NO_COLOR")
-
 app = typer.Typer(
     cls=Group,
     help="Recordings to a submap database, and where in it a later recording was made.",
     no_args_is_help=True,
-    rich_markup_mode="rich" if _FANCY else None,
+    rich_markup_mode=MARKUP,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -86,15 +75,11 @@ app.command("watch", cls=Command)(watch_command)
 app.command("export", cls=Command)(export_command)
 app.command("view", cls=Command)(view_command)
 
-compare = typer.Typer(cls=Group, help="The paper's tables, sensors against sensors.", no_args_is_help=True)
-compare.command("paper", cls=Command)(compare_paper_command)
-compare.command("sensors", cls=Command)(compare_sensors_command)
-compare.command("signatures", cls=Command)(compare_signatures_command)
-compare.command("log", cls=Command)(compare_log_command)
-compare.command("maps", cls=Command)(compare_maps_command)
-compare.command("floors", cls=Command)(compare_floors_command)
-compare.command("real", cls=Command)(compare_real_command)
-compare.command("peers", cls=Command)(compare_peers_command)
+compare = typer.Typer(
+    cls=Compare,
+    help="Logs, maps, sensors, floors, signatures, peers, the paper: measured against the truth.",
+    no_args_is_help=True,
+)
 app.add_typer(compare, name="compare")
 
 db = typer.Typer(

@@ -132,8 +132,8 @@ def test_a_room_alone_is_found() -> None:
 
 @pytest.mark.skipif(not (DATA / "maps").is_dir(), reason="no real maps: set PC2GRID_DATA")
 def test_number_of_submaps_is_near_table_1_with_one_set_of_parameters() -> None:
-    from signature.evaluation.paper_tables import SUBMAPS
-    from signature.evaluation.paper_task import read_map
+    from pc2grid_lab.experiments.paper_tables import SUBMAPS
+    from pc2grid_lab.experiments.paper_task import read_map
 
     for name, published in SUBMAPS.items():
         found = len(partition(read_map(DATA / "maps" / f"{name}.yaml", "paper"), PAPER))

@@ -1,0 +1,174 @@
+"""`pc2grid compare paper`: cells, resuming, tables, JSON, pictures."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from pc2grid.errors import ConfigError, MapFileError
+from pc2grid.io.nav2_map import save_map
+from pc2grid_cli import console
+from pc2grid_cli.json_schemas import schema
+from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES
+from pc2grid_lab.compare.paper import compare_paper_command
+from pc2grid_lab.compare.paper_report import published, verdicts
+from pc2grid_lab.experiments.paper_experiment import BestMatches
+from pc2grid_lab.experiments.paper_tables import MAPS, TABLE_3, TABLE_4
+from pc2grid_lab.experiments.paper_task import ABLATION, OPEN_CHOICES, load_result, paper_tasks, run_task
+from tests.helpers.rooms import cross, grid_of, l_shape, rectangle
+
+app = typer.Typer()
+app.command()(compare_paper_command)
+runner = CliRunner()
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("maps")
+    save_map(grid_of(np.hstack([cross(6.0, 2.0), rectangle(8.0, 5.0), l_shape()])), folder / "intel")
+    return folder
+
+
+def test_published_tables_are_whole() -> None:
+    assert all(set(row) == set(MAPS) for level in TABLE_3 for row in level.values())
+    assert [len(level) for level in TABLE_3] == [7, 7, 7]
+    # The row for 8 m of Table IV is the proposed method's row at noise level 1 of Table III.
+    assert TABLE_4[8] == TABLE_3[1]["proposed"]
+    assert TABLE_3[2]["sdf"]["killian"] == (0.531, 0.218, 0.456)
+
+
+def test_published_f1_shows_what_recall_is_of() -> None:
+    """With recall of all queries AUC could not exceed the true share, nor F1 fall below it; it does."""
+    cells = [cell for level in TABLE_3 for row in level.values() for cell in row.values()]
+    assert sum(cell.auc > cell.f1 for cell in cells) > len(cells) / 2
+
+
+def test_a_run_writes_its_cells_and_the_next_one_only_reads_them(
+    maps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console, "_LINE_EVERY_S", 0.0)
+    arguments = ["--maps", str(maps), "--out", str(tmp_path), "--queries", "4", "--jobs", "1"]
+    arguments += ["--offset", "0.5", "--methods", "proposed", "--methods", "shape_context"]
+    first = runner.invoke(app, [*arguments, "--json"])
+    assert first.exit_code == 0, first.output
+    assert re.search(r"^pc2grid: \d+ cells of the tables: \d+%", first.stderr, re.MULTILINE)
+    document = json.loads(first.stdout)
+    jsonschema.validate(document, schema("compare-paper"))
+    assert len(document["cells"]) == 8  # 2 methods x 3 levels, and 2 radii
+    assert {cell["paper_auc"] for cell in document["cells"] if cell["radius_m"] == 6.0} == {0.935}
+    assert json.loads((tmp_path / "results.json").read_text()) == document
+    assert len(list(csv.DictReader((tmp_path / "results.csv").open()))) == 8
+    for name in ("figure-9-offset-0.5.png", "figure-10-offset-0.5.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+    written = {path: path.stat().st_mtime_ns for path in (tmp_path / "cells").iterdir()}
+    second = runner.invoke(app, arguments)
+    assert second.exit_code == 0, second.output
+    assert written == {path: path.stat().st_mtime_ns for path in (tmp_path / "cells").iterdir()}
+    assert "Table III, AUC" in second.stdout and "Table IV" in second.stdout
+    assert "AUC within 0.03" in second.stdout
+
+
+def test_a_damaged_or_outdated_cell_is_run_again(maps: Path, tmp_path: Path) -> None:
+    task = next(iter(paper_tasks([maps / "intel.yaml"], methods=["proposed"], queries=2)))
+    run_task(task, tmp_path)
+    result = load_result(task, "proposed", tmp_path)
+    assert result is not None and 0.0 <= result.auc <= 1.0
+    path = task.result_path(tmp_path, "proposed")
+    whole = path.read_text()
+    path.write_text(whole[: len(whole) // 2])
+    assert load_result(task, "proposed", tmp_path) is None
+    run_task(task, tmp_path)
+    again = load_result(task, "proposed", tmp_path)
+    assert again is not None and np.array_equal(again.matches.similarity, result.matches.similarity)
+    path.write_text(whole.replace('"fingerprint": "', '"fingerprint": "0'))
+    assert load_result(task, "proposed", tmp_path) is None
+
+
+def test_open_choices_change_the_proposed_method_only(maps: Path) -> None:
+    choices = (*ABLATION, *OPEN_CHOICES)
+    tasks = list(paper_tasks([maps / "intel.yaml"], methods=["proposed", "sdf"], choices=choices))
+    changed = [task for task in tasks if task.overrides]
+    assert changed and all(task.methods == ("proposed",) for task in changed)
+    paths = [task.result_path(Path(), method) for task in tasks for method in task.methods]
+    assert len(set(paths)) == len(paths)
+
+
+def test_verdicts_and_published_cells(maps: Path, tmp_path: Path) -> None:
+    task = next(iter(paper_tasks([maps / "intel.yaml"], methods=["proposed"], queries=2)))
+    run_task(task, tmp_path)
+    result = load_result(task, "proposed", tmp_path)
+    assert result is not None
+    assert published(result) == TABLE_3[0]["proposed"]["intel"]
+    lines = verdicts([result])
+    near = abs(result.auc - 0.965) <= 0.03
+    assert "published F1" in lines[0]
+    assert f"on {int(near)} (" in lines[1]
+    assert "intel proposed" in lines[2]
+
+
+def test_the_ablation_and_any_floor(tmp_path: Path) -> None:
+    """A floor that the paper does not have gets its own column, without published figures."""
+    save_map(grid_of(np.hstack([cross(6.0, 2.0), rectangle(8.0, 5.0), l_shape()])), tmp_path / "depot")
+    arguments = ["--maps", str(tmp_path / "depot.yaml"), "--out", str(tmp_path / "out"), "--queries", "3"]
+    arguments += [
+        "--jobs",
+        "1",
+        "--offset",
+        "1.0",
+        "--methods",
+        "proposed",
+        "--ablation",
+        "--speckles",
+        "0.25",
+    ]
+    run = runner.invoke(app, arguments)
+    assert run.exit_code == 0, run.output
+    assert "depot" in run.stdout and "boundary alone" in run.stdout and "R@1" in run.stdout
+    cells = json.loads((tmp_path / "out" / "results.json").read_text())["cells"]
+    assert {cell["paper_auc"] for cell in cells} == {None}
+    assert {cell["speckle_sigma_m"] for cell in cells} == {0.25}
+    assert len(cells) == 3 + 2 + 2 * len(ABLATION)
+
+
+def test_intervals_hold_the_measure_and_shrink_with_more_queries() -> None:
+    rng = np.random.default_rng(4)
+    widths = []
+    for count in (100, 1600):
+        correct = rng.random(count) < 0.8
+        matches = BestMatches(similarity=rng.normal(correct, 0.7), correct=correct)
+        low, high = matches.intervals()
+        assert low.auc < matches.measures().auc < high.auc
+        assert low.r_at_1 < correct.mean() < high.r_at_1
+        widths.append(high.r_at_1 - low.r_at_1)
+    # A share of n draws has the standard deviation sqrt(p (1 - p) / n): a quarter with 16 times as many.
+    assert 3.0 < widths[0] / widths[1] < 5.3
+    assert abs(widths[0] - 2 * 1.645 * np.sqrt(0.8 * 0.2 / 100)) < 0.04
+
+
+@pytest.mark.parametrize(
+    ("options", "kind", "words"),
+    [
+        (["--methods", "orb"], ConfigError, "orb"),
+        (["--offset", "-1"], ConfigError, "above 0"),
+        (["--maps", "."], MapFileError, "no map is here"),
+    ],
+)
+def test_wrong_arguments_say_what_is_wrong(
+    options: list[str], kind: type[Exception], words: str, maps: Path, tmp_path: Path
+) -> None:
+    error = runner.invoke(app, ["--maps", str(maps), "--out", str(tmp_path), *options]).exception
+    assert isinstance(error, kind) and words in str(error)
+
+
+@pytest.mark.parametrize("method", METHOD_NAMES + EXTRA_METHOD_NAMES)
+def test_every_method_that_can_be_asked_for_is_run(method: str) -> None:
+    tasks = list(paper_tasks([Path("intel.yaml")], methods=[method], offsets_m=[1.0]))
+    assert {m for task in tasks for m in task.methods} == {method}

@@ -1,0 +1,171 @@
+"""The paper's experiment (paper IV-B): queries, noise, precision and recall."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.metrics import precision_recall_curve
+
+from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
+from pc2grid.submaps.partition import submap_at
+from pc2grid_lab.baselines import make_methods
+from pc2grid_lab.experiments.noise import NOISE_LEVELS, Noise, add_noise
+from pc2grid_lab.experiments.paper_experiment import (
+    Experiment,
+    draw_queries,
+    evaluate,
+    precision_recall,
+    rotated_submap,
+)
+from pc2grid_lab.experiments.paper_task import halved
+from tests.helpers.rooms import canvas, cross, disc, grid_of, l_shape, random_rooms, rectangle, submap_of
+
+SILENT = NOISE_LEVELS[0]
+
+
+def floor() -> OccupancyGrid:
+    """Four different rooms side by side, 16 m apart."""
+    return grid_of(np.hstack([rectangle(8.0, 5.0), disc(4.0), cross(6.0, 2.0), l_shape()]))
+
+
+def centers() -> np.ndarray:
+    return np.array([[-24.075, 0.0], [-8.025, 0.0], [8.025, 0.0], [21.0, -3.0]])
+
+
+def test_precision_and_recall_by_hand() -> None:
+    curve = precision_recall(np.array([0.9, 0.8, 0.7, 0.6, 0.5]), np.array([True, True, False, True, False]))
+    assert curve.recall.tolist() == pytest.approx([1 / 3, 2 / 3, 2 / 3, 1, 1])
+    assert curve.precision.tolist() == pytest.approx([1, 1, 2 / 3, 3 / 4, 3 / 5])
+    assert curve.auc == pytest.approx(2 / 3 + (2 / 3 + 3 / 4) / 2 / 3)
+    assert curve.recall_at_90 == pytest.approx(2 / 3)
+    assert curve.f1 == pytest.approx(2 * 0.75 / 1.75)
+
+
+def test_equal_similarities_pass_together() -> None:
+    curve = precision_recall(np.array([1.0, 1.0, 1.0]), np.array([True, False, False]))
+    assert curve.recall.tolist() == [1.0] and curve.precision.tolist() == pytest.approx([1 / 3])
+    assert curve.recall_at_90 == 0.0
+
+
+def test_nothing_true_has_no_area() -> None:
+    curve = precision_recall(np.array([0.5, 0.4]), np.array([False, False]))
+    assert (curve.auc, curve.recall_at_90, curve.f1) == (0.0, 0.0, 0.0)
+
+
+@given(seed=st.integers(0, 10_000), count=st.integers(2, 80))
+@settings(max_examples=40, deadline=None)
+def test_curve_is_that_of_scikit_learn(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    similarity, correct = rng.integers(0, 20, count) / 20.0, rng.random(count) < 0.6
+    correct[0] = True
+    ours = precision_recall(similarity, correct)
+    precision, recall, _ = precision_recall_curve(correct, similarity)
+    assert ours.recall[::-1] == pytest.approx(recall[:-1])
+    assert ours.precision[::-1] == pytest.approx(precision[:-1])
+
+
+def test_queries_lie_near_centres_on_free_cells_and_repeat() -> None:
+    grid, experiment = floor(), Experiment(queries=60, offset_m=0.5, seed=3)
+    queries = list(draw_queries(grid, centers(), 8.0, experiment, SILENT))
+    places = np.array([q.center_m for q in queries])
+    nearest = np.linalg.norm(places[:, None] - centers()[None], axis=2).min(axis=1)
+    assert nearest.max() <= 0.5 and nearest.max() > 0.4
+    cells = grid.to_cell(places)
+    assert (grid.cells[cells[:, 0], cells[:, 1]] == FREE).all()
+    for one, other in zip(queries, draw_queries(grid, centers(), 8.0, experiment, SILENT), strict=True):
+        assert one.center_m == other.center_m and np.array_equal(one.grid.cells, other.grid.cells)
+    other_seed = next(draw_queries(grid, centers(), 8.0, Experiment(seed=4), SILENT))
+    assert other_seed.center_m != queries[0].center_m
+
+
+def test_noise_changes_the_cells_but_not_the_place() -> None:
+    experiment = Experiment(queries=5)
+    still = list(draw_queries(floor(), centers(), 8.0, experiment, SILENT))
+    noisy = list(draw_queries(floor(), centers(), 8.0, experiment, NOISE_LEVELS[2]))
+    for a, b in zip(still, noisy, strict=True):
+        assert a.center_m == b.center_m
+        assert (b.grid.occupied & ~a.grid.occupied).sum() > 500
+        assert not (a.grid.occupied & ~b.grid.occupied).any()
+
+
+def test_a_plan_without_a_free_place_is_refused() -> None:
+    with pytest.raises(ValueError, match="no free cell"):
+        next(draw_queries(grid_of(canvas()), np.zeros((1, 2)), 8.0, Experiment(), SILENT))
+
+
+def test_a_query_that_is_not_turned_is_the_submap() -> None:
+    grid = grid_of(random_rooms(2))
+    assert np.array_equal(
+        rotated_submap(grid, (0.0, 0.0), 5.0, 0.0).grid.cells, submap_at(grid, (0.0, 0.0), 5.0).grid.cells
+    )
+
+
+def test_a_quarter_turn_turns_the_other_way() -> None:
+    # Someone who looks along the map's y axis sees what lies at +y ahead of him, at +x.
+    cells = np.full((321, 321), FREE, np.int8)
+    cells[240, 160] = OCCUPIED  # 4 m at +y
+    query = rotated_submap(grid_of(cells), (0.0, 0.0), 8.0, np.pi / 2)
+    assert np.argwhere(query.grid.occupied).tolist() == [[160, 240]]
+    assert query.grid.to_point(np.array([[160, 240]])) == pytest.approx(np.array([[4.0, 0.0]]), abs=1e-6)
+
+
+def test_noise_has_the_given_counts_and_places() -> None:
+    submap = submap_of(rectangle(10.0, 10.0))
+    noisy = add_noise(submap, Noise(boundary=0, freespace=4), np.random.default_rng(0))
+    added = noisy.grid.occupied & ~submap.grid.occupied
+    # Four obstacles of a circle's or a square's area, less where they overlap each other or the wall.
+    area = added.sum() * 0.05**2
+    assert 0.5 * 4 * np.pi * 0.25**2 < area <= 4 * 0.55**2
+    speckled = add_noise(submap, Noise(boundary=30, freespace=0), np.random.default_rng(0))
+    added = np.argwhere(speckled.grid.occupied & ~submap.grid.occupied)
+    walls = np.argwhere(submap.grid.occupied)
+    reach = np.linalg.norm(added[:, None] - walls[None], axis=2).min(axis=1) * 0.05
+    assert 0 < reach.max() < 0.6
+    assert 100 < len(added) <= 300
+
+
+def test_noise_stays_inside_the_disc_and_needs_something_to_stand_on() -> None:
+    full = submap_of(np.full((321, 321), FREE, np.int8))
+    noisy = add_noise(full, Noise(boundary=50, freespace=200), np.random.default_rng(1))
+    assert np.array_equal(noisy.grid.cells == -1, full.grid.cells == -1)
+    empty = submap_of(canvas())
+    assert np.array_equal(
+        add_noise(empty, NOISE_LEVELS[2], np.random.default_rng(1)).grid.cells, empty.grid.cells
+    )
+
+
+def test_the_paper_method_finds_rooms_that_differ() -> None:
+    grid = floor()
+    submaps = [submap_at(grid, (float(x), float(y)), 8.0, submap_id=i) for i, (x, y) in enumerate(centers())]
+    outcomes = evaluate(make_methods(["proposed"]), grid, submaps, Experiment(queries=40), SILENT)
+    assert outcomes["proposed"].correct.mean() > 0.95
+    again = evaluate(make_methods(["proposed"]), grid, submaps, Experiment(queries=40), SILENT)
+    assert np.array_equal(outcomes["proposed"].similarity, again["proposed"].similarity)
+
+
+def test_a_match_elsewhere_is_false() -> None:
+    grid = floor()
+    submaps = [submap_at(grid, (float(x), float(y)), 8.0) for x, y in centers()]
+
+    class Stubborn:
+        def fit(self, _submaps: object) -> Stubborn:
+            return self
+
+        def similarities(self, _query: object) -> np.ndarray:
+            return np.array([1.0, 0.0, 0.0, 0.0])
+
+    outcome = evaluate({"stubborn": Stubborn()}, grid, submaps, Experiment(queries=100), SILENT)["stubborn"]
+    assert outcome.correct.mean() == pytest.approx(0.25, abs=0.12)
+    with pytest.raises(ValueError, match="without submaps"):
+        evaluate({"stubborn": Stubborn()}, grid, [], Experiment(queries=1), SILENT)
+
+
+def test_halving_keeps_walls() -> None:
+    cells = np.full((6, 6), -1, np.int8)
+    cells[0:4, 0:4] = 0
+    cells[3, 2] = 100
+    found = halved(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(1.0, 2.0)))
+    assert found.cells.tolist() == [[0, 0, -1], [0, 100, -1], [-1, -1, -1]]
+    assert found.resolution_m == 0.05

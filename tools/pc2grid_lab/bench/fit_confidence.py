@@ -1,0 +1,169 @@
+"""Fits the confidence to answers whose truth is known, and judges it on buildings that were left out.
+
+    python -m pc2grid_lab.bench.fit_confidence EVIDENCE.json ...
+
+Each file is one that `real_queries` has written, or the document of `pc2grid compare sensors`,
+`compare real` or `compare log --json`. Prints the coefficients for `signature.relocalization.confidence`, the
+log loss, and by kind of pair and distance how many answers are right, and how many would be located by the
+coefficients in use and by those fitted without the building, rightly and wrongly.
+
+Right and wrong answers weigh the same in the fit, however many of each there are. Queries whose place is not
+in the map of their building, and the likeness of a query to itself, judge the fit and take no part in it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pc2grid_lab.experiments.calibration import Known, fit, left_out, log_loss, roc_area, share_by_session
+from signature.config import Config
+from signature.relocalization.confidence import CALIBRATION, Evidence
+
+RIGHT_M, RIGHT_RAD = 0.5, math.radians(5.0)
+"""Errors of answers to real logs at the right place. How precise they are is not the question here; the poses
+that count as true are good to some centimetres."""
+NEAR_M = 1.0
+"""Answers so near to the place of a query that is not in the map are left out: neither right nor wrong."""
+SHARE_RIGHT = 0.5
+"""Weight of the right answers together. So the probability holds for queries half of which lie in the map."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """An answer of a kind of pair of sensors, after some metres."""
+
+    kind: str
+    travel_m: float
+    known: Known
+    blanked: bool = False
+
+
+def of_rows(rows: list[dict[str, Any]]) -> Iterator[Answered]:
+    """Answers to real logs, without those to queries whose true pose is not known."""
+    for row in rows:
+        own, blanked = row["log"] == row["map"], row["place"] == "blanked"
+        if not row["errors"] or (own and not math.isfinite(row["errors"][0][0])):
+            continue
+        error_m, error_rad = row["errors"][0]
+        if blanked and error_m < NEAR_M:
+            continue
+        where = "its own building" if own else "another building"
+        yield Answered(
+            f"laser log in {where}{', place blanked' if blanked else ''}",
+            row["travel_m"],
+            Known(
+                group=row["log"],
+                session=f"{row['log']} {row['start']}",
+                evidence=Evidence(**row["evidence"]),
+                right=own and not blanked and error_m <= RIGHT_M and error_rad <= RIGHT_RAD,
+            ),
+            blanked,
+        )
+
+
+def of_trials(trials: list[dict[str, Any]]) -> Iterator[Answered]:
+    """Answers of the `compare` commands."""
+    names = ("forward", "walls", "backward", "looked_at", "lead", "likeness")
+    for trial in trials:
+        if trial.get("likeness") is None:
+            raise SystemExit("results of an earlier version, without all evidence; measure them again")
+        where = "" if trial["in_building"] else " in another building"
+        yield Answered(
+            f"{trial['query_sensor']} in a map by {trial['map_sensor']}{where}",
+            trial["travel_m"],
+            Known(
+                group=trial["building"],
+                session=f"{trial['building']} {trial['query_sensor']} {trial['seed']}",
+                evidence=Evidence(**{name: trial[name] for name in names}),
+                right=trial["right"],
+            ),
+        )
+
+
+def read(file: Path) -> list[Answered]:
+    """The answers of one file. Raises SystemExit for results of an earlier version."""
+    document = json.loads(file.read_text())
+    if isinstance(document, dict):
+        return list(of_trials(document["trials"]))
+    if any("place" not in row for row in document):
+        raise SystemExit(f"{file}: evidence of an earlier version; collect it again by real_queries.py")
+    return list(of_rows(document))
+
+
+def fitted_to(answered: list[Answered]) -> list[Known]:
+    """The answers that the coefficients are fitted to: not those of blanked places, and as if no query were
+    like itself.
+
+    Otherwise larger coefficients make up for what the likeness takes from a lead, also where nothing is
+    alike, and blanked places, which are rare, lower the confidence everywhere. Both judge the fit.
+    """
+    return [
+        replace(a.known, evidence=replace(a.known.evidence, likeness=0.0)) for a in answered if not a.blanked
+    ]
+
+
+@dataclass(slots=True)
+class Count:
+    """Answers, right ones, and those located [in use, refitted], rightly and wrongly."""
+
+    answers: int = 0
+    right: int = 0
+    located_right: list[int] = field(default_factory=lambda: [0, 0])
+    located_wrong: list[int] = field(default_factory=lambda: [0, 0])
+
+
+def main() -> None:
+    """Fit, judge and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("files", type=Path, nargs="+")
+    answered = [a for file in parser.parse_args().files for a in read(file)]
+    known = [a.known for a in answered]
+    if len({k.group for k in known}) < 2:
+        raise SystemExit(
+            "the fit is judged by leaving buildings out, and this evidence is of one building only"
+        )
+    in_use = np.array([CALIBRATION.probability(k.evidence) for k in known])
+    refitted = left_out(known, SHARE_RIGHT, fitted_to=fitted_to(answered))
+    accept = Config().relocalize.accept
+    counts: dict[tuple[str, int], Count] = {}
+    for a, *probabilities in zip(answered, in_use, refitted, strict=True):
+        count = counts.setdefault((a.kind, math.floor(a.travel_m)), Count())
+        count.answers += 1
+        count.right += a.known.right
+        for i, probability in enumerate(probabilities):
+            if probability >= accept:
+                (count.located_right if a.known.right else count.located_wrong)[i] += 1
+    print(f"{'kind':50} {'m':>3} answers right | in use: right wrong | left out: right wrong")
+    for (kind, metres), c in sorted(counts.items()):
+        print(
+            f"{kind:50} {metres:3d} {c.answers:7d} {c.right:5d}"
+            f" | {c.located_right[0]:13d} {c.located_wrong[0]:5d} |"
+            f" {c.located_right[1]:15d} {c.located_wrong[1]:5d}"
+        )
+    right = np.array([k.right for k in known])
+    sessions = [k.session for k in known]
+    for name, probabilities in (("in use", in_use), ("fitted without the building", refitted)):
+        loss, area = log_loss(known, probabilities), roc_area(known, probabilities)
+        located = probabilities >= accept
+        wrong, low, high = share_by_session(sessions, located & ~right)
+        print(
+            f"{name}: log loss {loss:.4f}, area under the ROC curve {area:.4f}, located"
+            f" {np.count_nonzero(located & right)} of {np.count_nonzero(right)} right ones,"
+            f" {np.count_nonzero(located & ~right)} of {np.count_nonzero(~right)} wrong ones"
+            f" ({wrong:.2%} of all answers; 5 to 95 %, by drive: {low:.2%} to {high:.2%})"
+        )
+    print(fit(fitted_to(answered), SHARE_RIGHT))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,140 @@
+"""Counts the answers to real laser logs in maps of their own earlier part, or of other buildings.
+
+    python -m pc2grid_lab.bench.real_answers DATA FOLDER [--logs fr079,intel] [--queries 24]
+    python -m pc2grid_lab.bench.real_answers DATA FOLDER --elsewhere [--logs fr079,intel] [--queries 24]
+
+The experiment of `real_queries`, but asked as a user asks: standing (six scans), after 3 m and
+after 10 m. A query is covered if half of its last scan lies within 0.2 m of a wall of the map at its true
+pose, be it the other side of that wall, seen from another room; and known if the map also knows half of the
+ground that it has seen. An answer is right within 0.3 m and 5 degrees of the ground truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.model import OccupancyGrid
+from pc2grid_lab.bench.real_queries import STANDING_SCANS, index_of, read
+from pc2grid_lab.experiments.registered_session import RegisteredSession
+from signature.config import Config
+from signature.relocalization.map_index import MapIndex, share_known
+from signature.relocalization.relocalizer import localize
+
+TRAVEL_M = (0.0, 3.0, 10.0)
+ELSEWHERE_M = (1.0, 3.0, 5.0, 8.0)
+RIGHT_M, RIGHT_RAD = 0.3, math.radians(5.0)
+NEAR_M = 0.2
+KNOWN = 0.5
+
+
+def covered(grid: OccupancyGrid, driven: RegisteredSession, scan: int, T_world_base: SE2) -> bool:
+    """Whether half of a scan lies near a wall of the map."""
+    hits = T_world_base.apply(driven.planar_scans[scan].hits_m)
+    walls = grid.to_point(np.argwhere(grid.occupied))
+    distance_m, _ = cKDTree(walls).query(hits)
+    return bool(len(hits)) and float(np.mean(distance_m <= NEAR_M)) >= 0.5
+
+
+def scans_after(driven: RegisteredSession, travel_m: tuple[float, ...]) -> list[int]:
+    """The numbers of scans after which the query has driven so far, as far as it goes."""
+    path_m = driven.path_m()
+    return [max(int(np.searchsorted(path_m, m)) + 1, STANDING_SCANS) for m in travel_m if m <= path_m[-1]]
+
+
+def count(name: str, grid: OccupancyGrid, queries: list[RegisteredSession], index: MapIndex) -> None:
+    """Print the answer to each query, and how many are right."""
+    counts: dict[float, Counter[str]] = {travel_m: Counter() for travel_m in TRAVEL_M}
+    for number, driven in enumerate(queries):
+        spent_ms = 0.0
+        after = scans_after(driven, TRAVEL_M)
+        scans = ((registered, planar_scan) for registered, planar_scan, _ in driven.scans())
+        for travel_m, asked in zip(TRAVEL_M, localize(scans, [index], after=set(after)), strict=False):
+            (answer,) = asked.answers
+            scan = asked.scans - 1
+            truth = driven.true_pose(scan)
+            if truth is None:
+                continue
+            kind = "covered" if covered(grid, driven, scan, truth) else "uncovered"
+            share = share_known(grid, asked.query.grid, truth @ asked.query.T_odom_base.inverse())
+            if kind == "covered" and share >= KNOWN:
+                kind = "covered, known"
+            error = ""
+            if answer.hypotheses:
+                e = truth.inverse() @ answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base
+                distance = math.hypot(e.x, e.y)
+                right = distance <= RIGHT_M and abs(wrap_angle(e.yaw)) <= RIGHT_RAD
+                error = f"{distance:.2f} m {math.degrees(e.yaw):.1f} deg"
+                if answer.status == "located":
+                    counts[travel_m][f"{kind} {'right' if right else 'wrong'}"] += 1
+                elif right:
+                    counts[travel_m][f"{kind} right but {answer.status}"] += 1
+            counts[travel_m][kind] += 1
+            by_last = answer.timing_ms.get("last_metres", 0.0) > spent_ms and answer.status == "located"
+            spent_ms = answer.timing_ms.get("last_metres", 0.0)
+            note = "by the last metres" if by_last else ""
+            print(
+                name,
+                number,
+                travel_m,
+                kind,
+                answer.status,
+                f"{answer.confidence:.3f}",
+                f"knows {share:.2f}",
+                error,
+                note,
+                flush=True,
+            )
+    for travel_m, counted in counts.items():
+        print(name, f"{travel_m:g} m:", dict(sorted(counted.items())), flush=True)
+
+
+def count_elsewhere(name: str, queries: list[RegisteredSession], others: dict[str, MapIndex]) -> None:
+    """Print how many answers in maps of other buildings are located, and by how many of the queries."""
+    answers: Counter[float] = Counter()
+    located: list[tuple[int, str, float, float]] = []
+    for number, driven in enumerate(queries):
+        scans = ((registered, planar_scan) for registered, planar_scan, _ in driven.scans())
+        after = set(scans_after(driven, ELSEWHERE_M))
+        for travel_m, asked in zip(
+            ELSEWHERE_M, localize(scans, list(others.values()), after=after), strict=False
+        ):
+            for other, answer in zip(others, asked.answers, strict=True):
+                answers[travel_m] += 1
+                if answer.status == "located":
+                    located.append((number, other, travel_m, answer.confidence))
+        print(name, number, dict(answers), located, flush=True)
+
+
+def main() -> None:
+    """Ask and count."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", type=Path)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--logs", default="fr079,intel")
+    parser.add_argument("--queries", type=int, default=24)
+    parser.add_argument("--elsewhere", action="store_true", help="ask in maps of other buildings only")
+    options = parser.parse_args()
+    config = Config()
+    kept = options.folder / "drives"
+    kept.mkdir(parents=True, exist_ok=True)
+    logs = {name: read(options.data, name, options.queries, kept, config) for name in options.logs.split(",")}
+    indexes = {name: index_of(name, grid, config) for name, (grid, _) in logs.items()}
+    for name, (grid, driven) in logs.items():
+        if options.elsewhere:
+            others = {other: index for other, index in indexes.items() if other != name}
+            count_elsewhere(name, driven, others)
+        else:
+            count(name, grid, driven, indexes[name])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,188 @@
+"""Real laser logs asked in maps of their own earlier part and of other buildings.
+
+The map of a building is drawn from the first part of its log at the poses of the ground truth, so that only
+the decision is measured, not mapping. Later parts of every log, registered as a user would, are the queries.
+Each is asked in its own map once more with all that it sees there made unknown ("blanked"): a place that the
+map lacks, in a building that it knows.
+
+    python -m pc2grid_lab.bench.real_queries DATA OUT.json [--logs fr079,intel] [--queries 24]
+
+DATA holds `laser/NAME.mcap` and `laser/NAME_corrected.tum`; the registered queries are kept beside OUT.
+`real_answers` counts what is answered, `fit_confidence` fits the confidence.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.io import open_log
+from pc2grid.io.trajectory import read_tum
+from pc2grid.mapping.occupancy import GridBuilder
+from pc2grid.model import OccupancyGrid
+from pc2grid.odometry.tracker import Tracker
+from pc2grid.submaps.partition import partition
+from pc2grid_lab.experiments.registered_session import RegisteredSession, register
+from pc2grid_lab.experiments.replay import Replay
+from signature.config import Config
+from signature.describe import describe
+from signature.relocalization.confidence import Evidence
+from signature.relocalization.map_index import MapIndex, unseen_by
+from signature.relocalization.query_map import QueryMap, QueryWindow
+from signature.similarity import SignatureTable
+from signature.verification.two_way_score import score_fit
+
+MAPPED_S = {"fr079": 600.0, "intel": 900.0, "csail": 250.0, "killian": 900.0}
+"""Seconds of each log that become the map."""
+DISTANCES_M = (0.0, 1.0, 3.0, 5.0, 8.0, 10.0)
+STANDING_SCANS = 6
+WINDOWS_M = (15.0, 8.0, 4.0)
+
+
+def read(
+    data: Path, name: str, queries: int, kept: Path, config: Config
+) -> tuple[OccupancyGrid, list[RegisteredSession]]:
+    """The map of the first part of a log, and its later parts as registered queries."""
+    with open_log(data / "laser" / f"{name}.mcap") as log:
+        truth = read_tum(data / "laser" / f"{name}_corrected.tum")
+        replay = Replay(log, truth, config)
+        builder, last = GridBuilder(config.projection), None
+        for scan in log.scans(0.0, MAPPED_S[name]):
+            pose = replay.truth(scan.stamp_ns)
+            if pose is None:
+                continue
+            step = pose if last is None else last.inverse() @ pose
+            if last is None or math.hypot(step.x, step.y) > 0.15 or abs(step.yaw) > 0.1:
+                tracker = Tracker(config.registration, config.projection)
+                builder.add(tracker.start(scan).planar_scan, pose)
+                last = pose
+        end_s = (log.info.end_ns - log.info.start_ns) * 1e-9
+        driven = []
+        for start_s in np.linspace(MAPPED_S[name] + 2.0, end_s - 60.0, queries).tolist():
+            file = kept / f"{name}.{start_s:.1f}.npz"
+            if not file.exists():
+                scans = ((scan, replay.truth(scan.stamp_ns)) for scan in log.scans(start_s, 60.0))
+                register(scans, config, sensor="laser", until_m=DISTANCES_M[-1] + 0.5).save(file)
+            driven.append(RegisteredSession.load(file))
+    return builder.grid(), driven
+
+
+def index_of(name: str, grid: OccupancyGrid, config: Config) -> MapIndex:
+    """A database of one map."""
+    submaps = partition(grid, config.partition)
+    table = SignatureTable.of([describe(s, config.signature) for s in submaps], [s.center_m for s in submaps])
+    return MapIndex({name: grid}, table, config, config)
+
+
+def moments(
+    driven: RegisteredSession, config: Config
+) -> Iterator[tuple[float, dict[float, QueryMap], SE2 | None]]:
+    """The query after each of `DISTANCES_M`: one map for each of `WINDOWS_M`, and the true pose."""
+    windows = {
+        m: QueryWindow(config.projection, config.relocalize.model_copy(update={"window_m": m}))
+        for m in WINDOWS_M
+    }
+    want = list(DISTANCES_M)
+    for i, (registered, planar_scan, _) in enumerate(driven.scans()):
+        if driven.lost[i]:
+            return
+        T_odom_base = SE2.from_matrix(registered.T_session_base)
+        for window in windows.values():
+            window.add(planar_scan, T_odom_base)
+        if i + 1 < STANDING_SCANS or not want or windows[WINDOWS_M[0]].path_m < want[0]:
+            continue
+        truth = driven.true_pose(i)
+        travel_m = want.pop(0)
+        maps = {
+            m: w.query(config.partition, config.signature)
+            for m, w in windows.items()
+            if m == WINDOWS_M[0] or m < travel_m
+        }
+        yield travel_m, maps, truth
+
+
+def evidence_rows(
+    name: str, start: int, driven: RegisteredSession, indexes: dict[str, MapIndex], config: Config
+) -> Iterator[dict[str, Any]]:
+    """The evidence for one query in each map, after each distance and for each window, and all errors."""
+    for travel_m, maps, truth in moments(driven, config):
+        for map_name, index in indexes.items():
+            own = map_name == name
+            for window_m, query in maps.items():
+                row = {
+                    "log": name,
+                    "map": map_name,
+                    "start": start,
+                    "travel_m": travel_m,
+                    "window_m": window_m,
+                    "covered": 0.0,
+                }
+                if not own or truth is None:
+                    yield from _looks(
+                        index, query, None, row | {"place": "in the map" if own else "elsewhere"}
+                    )
+                    continue
+                T_map_query = truth @ query.T_odom_base.inverse()
+                row["covered"] = score_fit(index.maps[0].walls, query.walls, T_map_query, np.eye(3)).overlap
+                yield from _looks(index, query, truth, row | {"place": "in the map"})
+                blanked = unseen_by(query, index.grids[0], T_map_query)
+                without = MapIndex({name: blanked}, index.places.table, config, config)
+                yield from _looks(without, query, truth, row | {"place": "blanked"})
+
+
+def _looks(
+    index: MapIndex, query: QueryMap, truth: SE2 | None, row: dict[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """As in `MapIndex.decide`, two answers: by what is proposed, and by a search of the whole map."""
+    proposed = index.look_up(query)
+    for stage, found in (("proposed", proposed), ("everywhere", index.look_everywhere(query, proposed))):
+        poses = [h.fit.T_map_query @ query.T_odom_base for h in found]
+        yield row | {
+            "stage": stage,
+            "evidence": asdict(Evidence.of(found, query)),
+            "errors": [_error(pose, truth) for pose in poses],
+        }
+
+
+def _error(pose: SE2, truth: SE2 | None) -> tuple[float, float]:
+    """Metres and radians from the true pose; without one, as in another building, nothing is near it."""
+    if truth is None:
+        return math.inf, math.pi
+    e = truth.inverse() @ pose
+    return math.hypot(e.x, e.y), abs(wrap_angle(e.yaw))
+
+
+def main() -> None:
+    """Collect the evidence."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--logs", default=",".join(MAPPED_S))
+    parser.add_argument("--queries", type=int, default=24)
+    options = parser.parse_args()
+    config = Config()
+    kept = options.out.parent / "drives"
+    kept.mkdir(parents=True, exist_ok=True)
+    names = options.logs.split(",")
+    logs = {name: read(options.data, name, options.queries, kept, config) for name in names}
+    indexes = {name: index_of(name, grid, config) for name, (grid, _) in logs.items()}
+    rows: list[dict[str, Any]] = []
+    for name, (_, driven) in logs.items():
+        for start, d in enumerate(driven):
+            rows.extend(evidence_rows(name, start, d, indexes, config))
+            options.out.write_text(json.dumps(rows))
+            print(name, start, len(rows), flush=True)
+
+
+if __name__ == "__main__":
+    main()

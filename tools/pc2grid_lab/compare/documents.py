@@ -1,0 +1,220 @@
+"""The JSON documents of the `compare` commands as types; see `pc2grid_cli.json_schemas`."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+# Before Python 3.12 pydantic, which makes the schemas, does not take the TypedDict of typing.
+from typing_extensions import TypedDict
+
+from pc2grid_lab.experiments.metrics import ConfidenceError, MatrixCell, QueryCounts
+from pc2grid_lab.experiments.real_sensors import RealCell
+from pc2grid_lab.experiments.trial import Trial
+from pc2grid_lab.peers.outcome import PeerCell, PeerTrial
+from signature.relocalization.answer_json import Version
+
+
+class CompareLog(TypedDict):
+    """`pc2grid compare log --json`. map_s: from and to, seconds of the recording. tally: counts of the
+    queries."""
+
+    schema_version: Version
+    log: str
+    map_s: list[float]
+    length_s: float
+    without_truth: int
+    tally: QueryCounts
+    trials: list[Trial]
+
+
+class FloorRow(TypedDict):
+    """A house of `pc2grid compare floors`, and what became of it; see `pc2grid_lab.experiments.floors`.
+    in_the_map: queries of which the map of their floor shows half of the walls."""
+
+    seed: int
+    way: Literal["stairs", "lift", "logs"]
+    alike: bool
+    sensor: str
+    visits: list[int]
+    length_m: float
+    query_m: float
+    queries: int
+    told_apart: bool
+    named: bool
+    right: int
+    wrong: int
+    ambiguous: int
+    not_found: int
+    misplaced: int
+    in_the_map: int
+    not_found_in_the_map: int
+
+
+class CompareFloors(TypedDict):
+    """`pc2grid compare floors --json`: a row a house. program: changes with any of its source files."""
+
+    schema_version: Version
+    program: str
+    rows: list[FloorRow]
+
+
+class CompareMaps(TypedDict):
+    """`pc2grid compare maps --json`: a row a session, with the errors of its trajectory and of its cells."""
+
+    schema_version: Version
+    rows: list[dict[str, Any]]
+
+
+class ComparePaper(TypedDict):
+    """`pc2grid compare paper --json`: a cell a map, method and noise level, measured beside published."""
+
+    schema_version: Version
+    version: str
+    queries: int
+    seed: int
+    cells: list[dict[str, Any]]
+
+
+class ComparePeers(TypedDict):
+    """`pc2grid compare peers --json`, and its peers.json.
+
+    setting: the options, the seed of the intervals, and by name the seconds that `--mapped` gives.
+    not_installed: by peer, the command that installs it.
+    """
+
+    schema_version: Version
+    recordings: list[str]
+    setting: dict[str, float]
+    not_installed: dict[str, str]
+    cells: list[PeerCell]
+    trials: list[PeerTrial]
+
+
+class CompareReal(TypedDict):
+    """`pc2grid compare real --json`, and its real.json.
+
+    T_floor_log: x, y, yaw of the log's frame in the 3D scan's, null if no two answers agree. across: answers
+    across the two; agreeing: whose first place agrees with it.
+    """
+
+    schema_version: Version
+    floor: str
+    log: str
+    T_floor_log: list[float] | None
+    agreeing: int
+    across: int
+    setting: dict[str, float]
+    cells: list[RealCell]
+    trials: list[Trial]
+
+
+class Elsewhere(TypedDict):
+    """What was answered to queries from another building."""
+
+    trials: int
+    not_found: int
+    located: int
+
+
+class Apart(TypedDict):
+    """How well distances separate one place seen by two sensors from two places; auc is null if nothing was
+    compared."""
+
+    auc: float | None
+    same: int
+    other: int
+
+
+class Ablation(TypedDict):
+    """Recall after travel_m metres by query sensor, by what is used, and by how many are retrieved."""
+
+    travel_m: float
+    recall: dict[str, dict[str, dict[str, float | None]]]
+
+
+class SelectionRow(TypedDict):
+    """One way to select places, in one building or a city of many, after travel_m metres.
+
+    found, right: share of the queries whose place is selected, and that are located rightly, each with its
+    5th and 95th percentile by session; right and wrong, the share located wrongly, are null if not tried.
+    places, looked_at: how many there are and how many are selected; processor_ms: median processor time
+    of the selection and the comparison of isovists.
+    """
+
+    scope: str
+    selector: str
+    travel_m: float
+    queries: int
+    sessions: int
+    places: int
+    looked_at: int
+    found: list[float]
+    right: list[float] | None
+    wrong: float | None
+    processor_ms: float
+
+
+class ScaleRow(TypedDict):
+    """Selection among very many places, by all signatures of what was seen: share of the queries whose place
+    is selected, with its 5th and 95th percentile by session, and median processor time of the selection."""
+
+    places: int
+    selector: str
+    share: float
+    travel_m: float
+    query_sensor: str
+    queries: int
+    found: list[float]
+    processor_ms: float
+
+
+class SeenApart(TypedDict):
+    """How well signatures of what was seen separate one place seen by two sensors from two places: area under
+    the curve, its 5th and 95th percentile, and pairs compared."""
+
+    auc: float
+    low: float
+    high: float
+    same: int
+    other: int
+
+
+class CompareSignatures(TypedDict):
+    """`pc2grid compare signatures --json`, and its signatures.json."""
+
+    schema_version: Version
+    plans: list[str]
+    setting: dict[str, float]
+    rows: list[SelectionRow]
+    scale: list[ScaleRow]
+    independence: dict[str, SeenApart]
+
+
+class CompareSensors(TypedDict):
+    """`pc2grid compare sensors --json`, and its matrix.json. outside_the_map: trials where the map has not
+    been. change: by plan, what differs in a session from the plan, mean of some sessions."""
+
+    schema_version: Version
+    plans: list[str]
+    queries: int
+    setting: dict[str, float]
+    change: dict[str, dict[str, float]]
+    cells: list[MatrixCell]
+    confidence: dict[str, ConfidenceError]
+    outside_the_map: int
+    elsewhere: Elsewhere
+    independence: dict[str, Apart]
+    ablation: Ablation
+
+
+DOCUMENTS: dict[str, type] = {
+    "compare-floors": CompareFloors,
+    "compare-log": CompareLog,
+    "compare-maps": CompareMaps,
+    "compare-paper": ComparePaper,
+    "compare-peers": ComparePeers,
+    "compare-real": CompareReal,
+    "compare-sensors": CompareSensors,
+    "compare-signatures": CompareSignatures,
+}
+"""By command."""

@@ -1,0 +1,201 @@
+"""Table and picture of `pc2grid compare floors`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pc2grid_cli.picture import BLUE, GREEN, GREY, ORANGE, VERMILLION
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from pc2grid.model import OccupancyGrid
+    from pc2grid_lab.experiments.floors import FloorAnswer, FloorResult, FloorStatus, FloorTask
+
+    Asked = tuple[FloorTask, FloorResult]
+
+_COLOURS: dict[FloorStatus, str] = {
+    "right": GREEN,
+    "ambiguous": BLUE,
+    "not_found": GREY,
+    "wrong": VERMILLION,
+}
+_SHOWN: dict[FloorStatus, str] = {
+    "right": "right floor",
+    "ambiguous": "ambiguous",
+    "not_found": "not found",
+    "wrong": "wrong floor",
+}
+
+
+_MAPPED = 0.5
+"""A query is in the map if the map of its floor shows so much of what it saw of walls. By hand."""
+
+
+def mapped(result: FloorResult, grids: Mapping[str, OccupancyGrid]) -> FloorResult:
+    """The result without the queries from where the map of their floor shows nothing, or little.
+
+    grids : of the sessions of the house's database.
+    """
+    import numpy as np
+
+    from pc2grid.model import UNKNOWN
+
+    def is_in_the_map(answer: FloorAnswer) -> bool:
+        shares = []
+        for name in (name for name, floor in result.floors.items() if floor == answer.floor):
+            grid, T_map_query = grids[name], result.frames[name].inverse() @ answer.T_house_query
+            cells = grid.to_cell(T_map_query.apply(answer.walls_m))
+            inside = np.all((cells >= 0) & (cells < grid.cells.shape), axis=1)
+            known = grid.cells[tuple(cells[inside].T)] != UNKNOWN
+            shares.append(known.sum() / max(len(cells), 1))
+        return max(shares, default=0.0) >= _MAPPED
+
+    return replace(result, answers=tuple(filter(is_in_the_map, result.answers)))
+
+
+def floors_table(houses: Sequence[Asked], in_the_map: Sequence[Asked]) -> Table:
+    """A row for each way and kind of furniture. in_the_map : the same houses, as `mapped` has them."""
+    from scipy.stats import binomtest
+
+    from pc2grid_cli.tables import table
+    from pc2grid_lab.experiments.floors import STATUSES, share_of
+
+    counts = ("houses", "told apart", "named", *(_SHOWN[status] for status in STATUSES), "misplaced")
+    made = table(
+        "floors with one plan",
+        ("by", "furniture"),
+        (*counts, "wrong up to", "in the map", "right or ambiguous there"),
+    )
+    for way, alike in dict.fromkeys((task.way, task.alike) for task, _ in houses):
+        group = [(task, result) for task, result in houses if (task.way, task.alike) == (way, alike)]
+        asked = sum(len(result.answers) for _, result in group)
+        wrong = sum(result.count("wrong") for _, result in group)
+        there = [(task, result) for task, result in in_the_map if (task.way, task.alike) == (way, alike)]
+        count = sum(len(result.answers) for _, result in there)
+        share = "{:.3f} [{:.3f}, {:.3f}]".format(*share_of(there, ("right", "ambiguous"))) if count else ""
+        made.add_row(
+            way,
+            _furniture(alike),
+            str(len(group)),
+            str(sum(result.told_apart for _, result in group)),
+            str(sum(result.named for _, result in group)),
+            *(str(sum(result.count(status) for _, result in group)) for status in STATUSES),
+            str(sum(result.misplaced for _, result in group)),
+            f"{binomtest(wrong, asked).proportion_ci(method='wilson').high:.1%}",
+            str(count),
+            share,
+        )
+    return made
+
+
+def _furniture(alike: bool) -> str:
+    return "alike" if alike else "differs"
+
+
+def draw(path: Path, houses: Sequence[Asked], grids: Mapping[str, OccupancyGrid], example: Asked) -> None:
+    """The answers in each house, a panel for each way, and below them one query on the map of each floor.
+
+    example : the house of that query. grids : of the sessions of its database.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from pc2grid.io.atomic import replace_file
+
+    ways = list(dict.fromkeys(task.way for task, _ in houses))
+    task, result = example
+    answer = example_answer(result)
+    of_way = {way: [house for house in houses if house[0].way == way] for way in ways}
+    bars_in = 1.2 + 0.22 * max(map(len, of_way.values()))
+    figure = Figure(figsize=(11.0, bars_in + 4.2), dpi=110, constrained_layout=True)
+    FigureCanvasAgg(figure)
+    parts: Any = figure.subfigures(2, 1, height_ratios=(bars_in, 4.2))
+    bars, maps = parts
+    panels = bars.subplots(1, len(ways), squeeze=False)[0]
+    for ax, way in zip(panels, ways, strict=True):
+        _draw_answers(ax, way, of_way[way])
+    bars.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
+    bars.suptitle(
+        "answers in each house, furniture alike (a) or different (d) on each floor; x: floors not told apart",
+        fontsize=10,
+    )
+    floors = maps.subplots(1, len(task.floors), squeeze=False, sharex=True, sharey=True)[0]
+    for ax, floor in zip(floors, task.floors, strict=True):
+        _draw_floor(ax, floor, result, answer, grids)
+    drawn = f"house {task.seed} by {task.way}, furniture {_furniture(task.alike)}: a query made on floor"
+    maps.suptitle(
+        f"{drawn} {answer.floor}, answered: {_SHOWN[answer.status]}, confidence {answer.confidence:.3f}",
+        fontsize=10,
+    )
+    with replace_file(path) as draft:
+        figure.savefig(draft, format="png", metadata={"Software": "pc2grid"})
+
+
+def example_of(houses: Sequence[Asked]) -> Asked:
+    """The house that says most: the first with a wrong answer, else the first with an ambiguous one, else
+    the first."""
+    for status in _BY_INTEREST:
+        for house in houses:
+            if house[1].count(status):
+                return house
+    return houses[0]
+
+
+def example_answer(result: FloorResult) -> FloorAnswer:
+    """The answer that is drawn: the most telling status and, of these, the one that fits on most maps."""
+    return min(result.answers, key=lambda answer: (_BY_INTEREST.index(answer.status), -len(answer.poses)))
+
+
+_BY_INTEREST: tuple[FloorStatus, ...] = ("wrong", "ambiguous", "right", "not_found")
+
+
+def _draw_answers(ax: Any, way: str, houses: Sequence[Asked]) -> None:
+    """A bar for each house."""
+    names = [f"{task.seed}{'a' if task.alike else 'd'}" for task, _ in houses]
+    rows, before = range(len(houses)), [0] * len(houses)
+    for status, colour in _COLOURS.items():
+        counts = [result.count(status) for _, result in houses]
+        ax.barh(rows, counts, left=before, color=colour, height=0.8, label=_SHOWN[status])
+        before = [a + b for a, b in zip(before, counts, strict=True)]
+    for row, (_, result) in enumerate(houses):
+        if not result.told_apart:
+            ax.plot(before[row] + 0.5, row, "x", color=VERMILLION, ms=6)
+    ax.set_yticks(rows, names, fontsize=7)
+    ax.invert_yaxis()
+    ax.set_xlabel("queries", fontsize=8)
+    ax.set_title(way, fontsize=9)
+    ax.tick_params(labelsize=7)
+
+
+def _draw_floor(
+    ax: Any, floor: int, result: FloorResult, answer: FloorAnswer, grids: Mapping[str, OccupancyGrid]
+) -> None:
+    """The maps of a floor in the frame of the house, and the query where it fits on them."""
+    import numpy as np
+
+    sessions = [name for name, other in result.floors.items() if other == floor]
+    for name in sessions:
+        T_house_map, grid = result.frames[name], grids[name]
+        for cells, colour, size in ((grid.free, "0.9", 2.2), (grid.occupied, "0.2", 1.6)):
+            points = T_house_map.apply(grid.to_point(np.argwhere(cells)))
+            ax.plot(*points.T, "s", color=colour, ms=size, mew=0)
+    if floor == answer.floor:
+        true = answer.T_house_query.apply(answer.walls_m)
+        ax.plot(*true.T, ".", color=GREEN, ms=6.0, mew=0, alpha=0.4, label="query, true place")
+    for name in sessions:
+        if name in answer.poses:
+            walls = (result.frames[name] @ answer.poses[name]).apply(answer.walls_m)
+            colour = VERMILLION if name == answer.session and answer.status == "wrong" else ORANGE
+            ax.plot(*walls.T, ".", color=colour, ms=2.5, mew=0, label="query, where it fits")
+    called = ", ".join(f"{name} ({result.names[name]})" for name in sessions)
+    ax.set_title(f"floor {floor}: {called or 'no map'}", fontsize=8)
+    ax.set_aspect("equal")
+    ax.tick_params(labelsize=7)
+    handles, labels = ax.get_legend_handles_labels()
+    if handles:
+        shown = dict(zip(labels, handles, strict=True))
+        ax.legend(shown.values(), shown.keys(), fontsize=7, loc="upper left", markerscale=2.0)

@@ -1,0 +1,159 @@
+"""`pc2grid compare log`: a real recording cut into a map and queries, against its ground truth."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pc2grid.display import probability
+from pc2grid_cli import console
+from pc2grid_cli import options as options
+
+if TYPE_CHECKING:
+    from pc2grid_lab.experiments.metrics import QueryCounts
+    from pc2grid_lab.experiments.trial import Trial
+
+_MAP_S, _QUERY_S = 600.0, 40.0
+"""Longest map and query that are chosen by default; chosen on fr079 and intel."""
+
+
+def compare_log_command(
+    context: typer.Context,
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="the recording")],
+    truth: Annotated[Path, typer.Option("--truth", metavar="TUM", help="its true poses, stamped alike")],
+    of_base: Annotated[
+        bool, typer.Option("--of-base", help="the poses are of the base, not of the sensor")
+    ] = False,
+    map_: Annotated[
+        str | None,
+        typer.Option(
+            "--map",
+            metavar="FROM..TO",
+            help="seconds that become the map; default: the first half of the log, at most 0..600",
+        ),
+    ] = None,
+    queries: Annotated[
+        int, typer.Option("--queries", min=1, help="parts to locate, spread over what comes after the map")
+    ] = 10,
+    length: Annotated[
+        float | None,
+        typer.Option(
+            "--length",
+            min=1.0,
+            help="seconds each of them lasts; default: half of what comes after the map, at most 40",
+        ),
+    ] = None,
+    topic: options.Topic = None,
+    odometry: options.OdometryTopic = None,
+    config: options.ConfigFile = None,
+    set_: options.Assignments = None,
+    json: options.AsJson = False,
+) -> None:
+    """Locate later parts of a recording in a map made of an earlier part, and judge the answers.
+
+    Example: pc2grid compare log fr079.mcap --truth fr079_corrected.tum --map 0..600 --queries 10
+    """
+    from pc2grid.errors import ConfigError
+    from pc2grid.io import open_log
+    from pc2grid.io.trajectory import read_tum
+    from pc2grid.time_span import TimeSpan
+    from pc2grid_lab.experiments.metrics import QueryCounts
+    from pc2grid_lab.experiments.replay import Replay, spread
+
+    settings = options.make_config(config, set_, topic=topic, odometry=odometry)
+    asked = None if map_ is None else _seconds(map_)
+    _refuse_relations(truth)
+    with open_log(log, settings.read) as opened:
+        end_s = (opened.info.end_ns - opened.info.start_ns) * 1e-9
+        from_s, to_s = asked or (0.0, min(_MAP_S, end_s / 2))
+        if to_s >= end_s:
+            raise ConfigError(
+                f"--map {from_s:g}..{to_s:g}: nothing is left to locate, the log lasts {end_s:.1f} s",
+                hint=f"for example --map 0..{end_s / 2:.0f}",
+            )
+        length_s = length or min(_QUERY_S, (end_s - to_s) / 2)
+        console.of(context).note(f"map: {from_s:.1f}..{to_s:.1f} s; queries last {length_s:.1f} s")
+        replay = Replay(opened, read_tum(truth), settings, of_base=of_base)
+        observer = console.of(context).observer()
+        with observer.step("map"):
+            part = replay.map(TimeSpan(from_s, to_s - from_s), observer)
+        trials = []
+        with console.of(context).progress("locate") as advance:
+            spans = spread(to_s, end_s, queries, length_s)
+            for done, span in enumerate(spans, start=1):
+                trials.append(replay.locate(span, part))
+                advance(done / len(spans))
+    judged = [trial for trial in trials if trial is not None]
+    counts = QueryCounts.of(judged)
+    if json:
+        document = {
+            "schema_version": 1,
+            "log": log.name,
+            "map_s": [from_s, to_s],
+            "length_s": length_s,
+            "without_truth": len(trials) - len(judged),
+            "tally": asdict(counts),
+            "trials": [asdict(trial) for trial in judged],
+        }
+        console.print_json(document)
+    else:
+        _print(judged, counts, len(trials) - len(judged))
+
+
+def _refuse_relations(truth: Path) -> None:
+    """Raises ConfigError for a list of relations, which has no pose of a single scan."""
+    from pc2grid.errors import ConfigError
+
+    if truth.suffix == ".relations":
+        raise ConfigError(
+            f"{truth}: relations between poses, but poses are needed (TUM)",
+            hint="`pc2grid compare maps --log LOG --truth FILE.relations` takes relations",
+        )
+
+
+def _seconds(text: str) -> tuple[float, float]:
+    """The two numbers of `FROM..TO`. Raises ConfigError."""
+    from pc2grid.errors import ConfigError
+
+    first, _, last = text.partition("..")
+    try:
+        from_s, to_s = float(first), float(last)
+    except ValueError:
+        raise ConfigError(f"--map {text}: not a span of seconds", hint="for example --map 0..600") from None
+    if not 0 <= from_s < to_s:
+        raise ConfigError(f"--map {text}: ends before it begins", hint="for example --map 0..600")
+    return from_s, to_s
+
+
+def _print(trials: list[Trial], counts: QueryCounts, unknown: int) -> None:
+    from pc2grid_cli.tables import show, table
+
+    title = "later parts of the recording in the map of the earlier one"
+    found = table(title, ["from", "answer"], ["driven", "covered", "confidence", "off by", "map bent by"])
+    for trial in trials:
+        found.add_row(
+            f"{trial.seed} s",
+            trial.status.replace("_", " "),
+            f"{trial.travel_m:.1f} m",
+            f"{trial.mapped:.2f}",
+            probability(trial.confidence),
+            "" if trial.error_m is None or trial.status != "located" else f"{trial.error_m:.2f} m",
+            "" if trial.map_bent_m is None else f"{trial.map_bent_m:.2f} m",
+        )
+    share = f", {counts.right / counts.inside:.2f}" if counts.inside else ""
+    show(
+        found,
+        "off by: against the map around, which as a whole may be bent by what the last column says",
+        f"where the map covers what the query saw: {counts.right} of {counts.inside} located and right"
+        f"{share}, {counts.wrong} wrong, {counts.unsure} without an answer",
+    )
+    if counts.outside:
+        show(
+            f"elsewhere: {counts.refused} of {counts.outside} without an answer, as it should be,"
+            f" {counts.wrong_outside} wrong"
+        )
+    if unknown:
+        show(f"{unknown} queries could not be judged: the truth has no pose of them")

@@ -1,0 +1,224 @@
+"""`pc2grid compare paper`: the paper's Tables III and IV on the paper's maps, published beside measured."""
+
+from __future__ import annotations
+
+import csv
+import multiprocessing
+import os
+from collections.abc import Iterable, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pc2grid_cli.options import OUTPUT_FOLDER
+from pc2grid_cli.output_files import make_folder
+
+if TYPE_CHECKING:
+    from pc2grid_cli.console import Console
+    from pc2grid_lab.experiments.paper_task import PaperCell, PaperTask
+
+_COSTS = {
+    "proposed": 1.0,
+    "shape_context": 1.0,
+    "sdf": 14.0,
+    "sift_bow": 8.0,
+    "surf_bow": 14.0,
+    "opencv_shape_context": 150.0,
+    "proposed_centres": 4.0,
+    "boundary_centres": 4.0,
+    "shape_context_centres": 4.0,
+}
+
+
+def compare_paper_command(
+    context: typer.Context,
+    maps: Annotated[
+        Path,
+        typer.Option(
+            "--maps",
+            help="Folder with fr079.yaml, intel.yaml, ... of the paper; or a map, or a folder of maps.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="Folder for results; run again to go on.")] = Path(
+        "paper-tables"
+    ),
+    queries: Annotated[
+        int, typer.Option("--queries", min=1, help="Queries a map. 2000 take hours; 200 for a quick look.")
+    ] = 2000,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--methods",
+            help="Only these; repeatable. Extras: point_contexts, shape_rings, opencv_shape_context, "
+            "verified, proposed_centres, boundary_centres, shape_context_centres.",
+        ),
+    ] = None,
+    offset: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--offset", help="Farthest a query lies from a submap centre, m; repeatable. [1.0 and 0.5]"
+        ),
+    ] = None,
+    open_choices: Annotated[
+        bool,
+        typer.Option("--open-choices", help="Also what each departure and open parameter moves."),
+    ] = False,
+    ablation: Annotated[
+        bool, typer.Option("--ablation", help="Also the proposed method without some of its signatures.")
+    ] = False,
+    speckles: Annotated[
+        float,
+        typer.Option("--speckles", min=0.0, help="Spread of the boundary noise, m; the paper gives none."),
+    ] = 0.1,
+    jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="Processes. [one a core]")] = None,
+    seed: Annotated[int, typer.Option("--seed", help="Of the queries and their noise.")] = 1,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document instead of tables.")
+    ] = False,
+) -> None:
+    """Reproduce the paper's tables and figures 9 and 10, each number beside the published one.
+
+    Example: pc2grid compare paper --maps maps/ --queries 200 --ablation
+    """
+    from pc2grid.errors import ConfigError, MapFileError
+    from pc2grid_cli.console import of, print_json
+    from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES
+    from pc2grid_lab.compare import paper_report
+    from pc2grid_lab.experiments.paper_task import ABLATION, OPEN_CHOICES, known_maps, paper_tasks
+
+    chosen = tuple(methods or METHOD_NAMES)
+    known = METHOD_NAMES + EXTRA_METHOD_NAMES
+    for name in chosen:
+        if name not in known:
+            raise ConfigError(f"--methods: no method {name!r}", hint=f"one of {', '.join(known)}")
+    offsets_m = tuple(offset or (1.0, 0.5))
+    if min(offsets_m) <= 0:
+        raise ConfigError("--offset: expected a distance above 0 m")
+    map_paths = known_maps(maps)
+    if not map_paths:
+        raise MapFileError(
+            f"{maps}: no map is here", hint="a map.yaml, or a folder with intel.yaml, fr079.yaml, ..."
+        )
+    cells = out / "cells"
+    make_folder(out)
+    make_folder(cells)
+    tasks = list(
+        paper_tasks(
+            map_paths,
+            methods=chosen,
+            offsets_m=offsets_m,
+            queries=queries,
+            seed=seed,
+            choices=(*(ABLATION if ablation else ()), *(OPEN_CHOICES if open_choices else ())),
+            speckle_sigma_m=speckles,
+        )
+    )
+    run_tasks(tasks, cells, jobs or os.cpu_count() or 1, of(context))
+    results = _results(tasks, cells)
+    document = _write(results, out, queries, seed)
+    pictures = paper_report.draw_figures(results, out)
+    if as_json:
+        print_json(document)
+    else:
+        paper_report.print_tables(results, chosen)
+        print(f"written: {out / 'results.json'}, {out / 'results.csv'}, {', '.join(map(str, pictures))}")
+
+
+def run_tasks(tasks: Sequence[PaperTask], cells: Path, jobs: int, terminal: Console) -> None:
+    """Run the tasks that have no result yet in `jobs` processes, and show the progress on `terminal`."""
+    from pc2grid_lab.experiments.paper_task import load_result
+
+    open_tasks = [t for t in tasks if any(load_result(t, m, cells) is None for m in t.methods)]
+    if not open_tasks:
+        return
+    # One thread in each process, because the processes run in parallel; libraries read this when loaded.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    spawn = multiprocessing.get_context("spawn")
+    done_shares = spawn.SimpleQueue()
+    with (
+        terminal.progress(f"{len(open_tasks)} cells of the tables") as advance,
+        ProcessPoolExecutor(
+            jobs, mp_context=spawn, initializer=_start_worker, initargs=(done_shares,)
+        ) as pool,
+    ):
+        shares = dict.fromkeys(range(len(open_tasks)), 0.0)
+        costs = [_cost(task) for task in open_tasks]
+        pending = {pool.submit(_run, index, task, cells) for index, task in enumerate(open_tasks)}
+        try:
+            while pending:
+                finished, pending = wait(pending, timeout=0.5, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    shares[future.result()] = 1.0
+                while not done_shares.empty():
+                    index, share = done_shares.get()
+                    shares[index] = max(shares[index], share)
+                advance(sum(costs[i] * share for i, share in shares.items()) / sum(costs))
+        except BaseException:
+            # Finished cells are kept; tasks that wait must not start after the user has stopped the program.
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _cost(task: PaperTask) -> float:
+    """Approximate relative time of a task, for an even progress bar."""
+    return _COSTS.get(task.methods[0], 10.0) * (5.0 if task.reading == "true" else 1.0)
+
+
+_shares: Any = None
+
+
+def _start_worker(shares: Any) -> None:
+    global _shares
+    import cv2
+
+    _shares = shares
+    cv2.setNumThreads(1)
+
+
+def _run(index: int, task: PaperTask, cells: Path) -> int:
+    from pc2grid_lab.experiments.paper_task import run_task
+
+    reported = 0.0
+
+    def report(share: float) -> None:
+        nonlocal reported
+        if share >= reported + 0.05:
+            reported = share
+            _shares.put((index, share))
+
+    run_task(task, cells, report)
+    return index
+
+
+def _results(tasks: Iterable[PaperTask], cells: Path) -> list[PaperCell]:
+    from pc2grid_lab.experiments.paper_task import load_result
+
+    found = (load_result(task, method, cells) for task in tasks for method in task.methods)
+    return [result for result in found if result is not None]
+
+
+def _write(results: Sequence[PaperCell], out: Path, queries: int, seed: int) -> dict[str, Any]:
+    """results.json and results.csv; returns the JSON document."""
+    from pc2grid import __version__
+    from pc2grid.io.atomic import replace_file
+    from pc2grid_cli.console import json_text
+    from pc2grid_lab.compare.paper_report import published
+
+    rows = []
+    for result in results:
+        paper = published(result)
+        rows.append(
+            result.summary()
+            | {f"paper_{key}": None if paper is None else getattr(paper, key) for key in ("auc", "rp9", "f1")}
+        )
+    document = {"schema_version": 1, "version": __version__, "queries": queries, "seed": seed, "cells": rows}
+    with replace_file(out / "results.json") as temporary:
+        temporary.write_text(json_text(document) + "\n", encoding="utf-8")
+    with replace_file(out / "results.csv") as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]) if rows else ["map_name"])
+        writer.writeheader()
+        writer.writerows(rows)
+    return document

@@ -1,0 +1,161 @@
+"""`pc2grid compare peers`: other programs that locate a robot, asked with the same maps and queries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pc2grid_cli.options import OUTPUT_FOLDER
+from pc2grid_cli.output_files import make_folder
+
+if TYPE_CHECKING:
+    from pc2grid_lab.peers.environment import PeerEnvironment
+    from pc2grid_lab.peers.outcome import PeerTrial
+    from pc2grid_lab.peers.site import Site
+
+
+def compare_peers_command(
+    context: typer.Context,
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="LOG|SCAN.ply...",
+            help="recordings of a laser or lidar, true poses beside them (NAME.tum or NAME_corrected.tum);"
+            " and 3D scans, in which a lidar is simulated",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="folder for results; run again to go on")] = Path(
+        "peers"
+    ),
+    queries: Annotated[int, typer.Option("--queries", min=1, help="queries of each building")] = 24,
+    travel: Annotated[float, typer.Option("--travel", min=0.0, help="metres that each drives")] = 10.0,
+    mapped: Annotated[
+        list[str] | None,
+        typer.Option("--mapped", metavar="NAME=S", help="seconds of a recording that become the map [55 %]"),
+    ] = None,
+    of_base: Annotated[
+        bool, typer.Option("--of-base", help="the true poses are of the base, not of the sensor")
+    ] = False,
+    environment: Annotated[
+        Path | None,
+        typer.Option("--environment", help="virtual environment of the peers [peers/ in that of pc2grid]"),
+    ] = None,
+    install: Annotated[
+        bool, typer.Option("--install", help="make that environment if it does not exist: 100 MB")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print one JSON document, not a table")] = False,
+) -> None:
+    """Other programs and pc2grid locate later parts of real recordings in maps of earlier parts.
+
+    MRPT's particle filter gets recordings of a laser; KISS-Matcher, MapClosures and Open3D's FPFH + RANSAC
+    those of a lidar. Each query is also asked in another building, where every answer is wrong.
+
+    Example: pc2grid compare peers intel.mcap fr079.mcap hall.mcap --mapped intel=900 --mapped fr079=600
+    """
+    from pc2grid.io.atomic import replace_file
+    from pc2grid_cli.console import json_text, of, print_json, warn
+    from pc2grid_lab.compare.peers_report import draw, print_table
+    from pc2grid_lab.peers.environment import PEERS
+    from pc2grid_lab.peers.experiment import run, tasks
+    from pc2grid_lab.peers.outcome import OUTCOME, counted
+
+    seconds = _seconds(mapped or [], recordings)
+    where = _environment(environment, install)
+    missing = {kind.name: command for kind in PEERS if (command := where.missing(kind)) is not None}
+    for name, command in missing.items():
+        warn(f"{name} is not installed: {command}")
+    for folder in ("sites", "trials"):
+        make_folder(out / folder)
+    sites: list[Site] = []
+    with of(context).progress("prepare") as advance:
+        for done, recording in enumerate(recordings, start=1):
+            mapped_s = seconds.get(recording.stem)
+            sites.append(_site(recording, out / "sites", queries, travel, mapped_s, of_base))
+            advance(done / len(recordings))
+    trials: list[PeerTrial] = []
+    with of(context).progress("locate") as advance:
+        doing = tasks(sites, where)
+        for done, task in enumerate(doing, start=1):
+            trials += run(task, where, out / "trials")
+            advance(done / len(doing))
+    cells = counted(trials)
+    document = {
+        "schema_version": 1,
+        "recordings": [recording.name for recording in recordings],
+        "setting": {"queries": queries, "travel": travel, "seed": OUTCOME.seed, **seconds},
+        "not_installed": missing,
+        "cells": [asdict(cell) for cell in cells],
+        "trials": [asdict(trial) for trial in trials],
+    }
+    with replace_file(out / "peers.json") as draft:
+        draft.write_text(json_text(document) + "\n", encoding="utf-8")
+    sensors = {site.name: site.sensor for site in sites}
+    draw(out / "peers.png", cells, sensors)
+    if as_json:
+        print_json(document)
+        return
+    print_table(cells, sensors, missing)
+    print("\n".join(str(out / name) for name in ("peers.json", "peers.png")))
+
+
+def _site(
+    recording: Path, folder: Path, queries: int, travel_m: float, mapped_s: float | None, of_base: bool
+) -> Site:
+    """The building of a recording, or of a 3D scan; what was prepared from the same before is used again."""
+    from pc2grid.errors import LogNotFound
+    from pc2grid.io.building_file import is_building_file
+    from pc2grid_lab.peers.site import recorded_site, simulated_site, site_name
+    from signature.config import Config
+
+    if not recording.exists():
+        raise LogNotFound(f"{recording}: no such file")
+    config = Config()
+    made = folder / site_name(
+        recording, config, queries=queries, travel_m=travel_m, mapped_s=mapped_s, of_base=of_base
+    )
+    if is_building_file(recording):
+        return simulated_site(recording, made, config, queries=queries, travel_m=travel_m)
+    return recorded_site(
+        recording,
+        made,
+        config,
+        queries=queries,
+        travel_m=travel_m,
+        mapped_s=mapped_s,
+        of_base=of_base,
+    )
+
+
+def _environment(folder: Path | None, install: bool) -> PeerEnvironment:
+    import sys
+
+    from pc2grid_lab.peers.environment import PEERS, PeerEnvironment
+
+    environment = PeerEnvironment(folder=(folder or Path(sys.prefix) / "peers").absolute())
+    if install and any("pip install" in (environment.missing(kind) or "") for kind in PEERS):
+        environment.install()
+    return environment
+
+
+def _seconds(mapped: Sequence[str], recordings: Sequence[Path]) -> dict[str, float]:
+    """The values of `--mapped`, by name. Raises ConfigError."""
+    from pc2grid.errors import ConfigError
+
+    names, seconds = [recording.stem for recording in recordings], {}
+    if len(set(names)) != len(names):
+        raise ConfigError(f"two recordings share a name: {', '.join(names)}", hint="rename one of the files")
+    for text in mapped:
+        name, _, value = text.partition("=")
+        try:
+            seconds[name] = float(value)
+        except ValueError:
+            seconds[name] = 0.0
+        if name not in names or seconds[name] <= 0.0:
+            raise ConfigError(
+                f"--mapped {text}: not seconds of one of the recordings", hint=f"for example {names[0]}=600"
+            )
+    return seconds

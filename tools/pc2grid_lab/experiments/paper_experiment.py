@@ -1,0 +1,228 @@
+"""The paper's experiment: queries cut from the map, matched against its submaps (paper IV-B)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.arrays import F64
+from pc2grid.model import UNKNOWN, OccupancyGrid, Submap
+from pc2grid_lab.baselines import Method
+from pc2grid_lab.experiments.noise import Noise, add_noise
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Experiment:
+    """How queries are drawn and judged.
+
+    queries : number of queries per map (paper IV-B: 2000).
+    offset_m : largest distance of a query's centre from the nearest submap's centre. The paper does not give
+        it, and the results depend on it. Its F1 rules out 0.5 (`largest_right_share`); 1.0 fits best.
+    correct_m : a match is true if the matched submap's centre is this near (paper IV-B).
+    seed : of everything random. Query i of a seed does not depend on the number of queries, and lies at the
+        same place at every noise level.
+    """
+
+    queries: int = 2000
+    offset_m: float = 1.0
+    correct_m: float = 1.0
+    seed: int = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BestMatches:
+    """Best match of every query.
+
+    similarity : (Q,) of the best match; larger is more similar, on a scale of the method's own.
+    correct : (Q,) bool, whether the best match is true.
+    """
+
+    similarity: F64
+    correct: NDArray[np.bool_]
+
+    def curve(self) -> PrecisionRecall:
+        """Precision and recall as functions of the similarity threshold."""
+        return precision_recall(self.similarity, self.correct)
+
+    def measures(self) -> MatchMeasures:
+        """All measures of these matches."""
+        curve = self.curve()
+        return MatchMeasures(curve.auc, curve.recall_at_90, curve.f1, float(self.correct.mean()))
+
+    def intervals(self, resamples: int = 300, seed: int = 0) -> tuple[MatchMeasures, MatchMeasures]:
+        """5 and 95 % quantiles of each measure when the queries are drawn again (bootstrap)."""
+        rng = np.random.default_rng(seed)
+        drawn = np.array(
+            [
+                BestMatches(similarity=self.similarity[rows], correct=self.correct[rows]).measures()
+                for rows in rng.integers(len(self.correct), size=(resamples, len(self.correct)))
+            ]
+        )
+        low, high = np.quantile(drawn, (0.05, 0.95), axis=0).tolist()
+        return MatchMeasures(*low), MatchMeasures(*high)
+
+
+class MatchMeasures(NamedTuple):
+    """Area under the precision-recall curve, recall at a precision of 0.9, F1, and the share of the queries
+    whose best match is true (R@1); each 0 .. 1.
+    """
+
+    auc: float
+    rp9: float
+    f1: float
+    r_at_1: float
+
+
+def largest_right_share(f1: float) -> float:
+    """The largest share of true best matches with which F1 can come out as given.
+
+    Of all queries a share p is matched right. With every match accepted precision is p and recall 1, so that
+    the best F1 is at least 2 p / (1 + p); therefore p <= F1 / (2 - F1).
+
+    >>> round(largest_right_share(0.943), 3)
+    0.892
+    """
+    return f1 / (2.0 - f1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrecisionRecall:
+    """A precision-recall curve, from the highest threshold to the lowest.
+
+    recall, precision : (T,), one point for each distinct similarity.
+
+    Recall is the share of the true matches that pass the threshold, so that it ends at 1. The paper does not
+    define it, but its Table III shows it: if recall were a share of all queries, the area could not exceed
+    the share of true matches, and F1 is at least that share; in most rows, however, AUC exceeds F1.
+    """
+
+    recall: F64
+    precision: F64
+
+    @property
+    def auc(self) -> float:
+        """Area under the curve (AUPRC), trapezoids from (0, precision of the first point)."""
+        if len(self.recall) == 0:
+            return 0.0
+        recall = np.concatenate(([0.0], self.recall))
+        precision = np.concatenate((self.precision[:1], self.precision))
+        return float(np.sum(np.diff(recall) * (precision[1:] + precision[:-1]) / 2))
+
+    @property
+    def recall_at_90(self) -> float:
+        """RP9: largest recall at a precision of at least 0.9; 0 if there is none."""
+        return float(self.recall[self.precision >= 0.9].max(initial=0.0))
+
+    @property
+    def f1(self) -> float:
+        """Largest F1 score over the thresholds."""
+        total = self.precision + self.recall
+        scores = np.divide(2 * self.precision * self.recall, total, out=np.zeros_like(total), where=total > 0)
+        return float(scores.max(initial=0.0))
+
+
+def precision_recall(similarity: F64, correct: NDArray[np.bool_]) -> PrecisionRecall:
+    """The curve of best matches with similarity (Q,) and truth (Q,); empty if no match is true."""
+    if not correct.any():
+        return PrecisionRecall(recall=np.empty(0), precision=np.empty(0))
+    order = np.argsort(-similarity, kind="stable")
+    hits = np.cumsum(correct[order])
+    # Matches of equal similarity pass a threshold together.
+    last = np.append(np.diff(similarity[order]) != 0, True)
+    return PrecisionRecall(
+        recall=(hits / hits[-1])[last], precision=(hits / np.arange(1, len(hits) + 1))[last]
+    )
+
+
+def draw_queries(
+    grid: OccupancyGrid, centers_m: F64, radius_m: float, experiment: Experiment, noise: Noise
+) -> Iterator[Submap]:
+    """Query submaps: cut at a free place near a submap's centre, turned at random, with noise (IV-B).
+
+    centers_m : (N, 2) of the submaps. `center_m` of a query is the place where it was cut; its grid is
+    centred on (0, 0) of a turned frame of its own, so that nothing in it shows the place.
+    """
+    for index in range(experiment.queries):
+        rng = np.random.default_rng([experiment.seed, index])
+        center_m = _free_place(grid, centers_m, experiment.offset_m, rng)
+        turned = rotated_submap(grid, center_m, radius_m, float(rng.uniform(-math.pi, math.pi)), index)
+        # The noise has a random stream of its own, so that its amount does not change the next query.
+        yield add_noise(turned, noise, np.random.default_rng([experiment.seed, index, noise.boundary]))
+
+
+def _free_place(
+    grid: OccupancyGrid, centers_m: F64, offset_m: float, rng: np.random.Generator
+) -> tuple[float, float]:
+    """A place drawn from the disc of `offset_m` around a random centre, until its cell is free."""
+    for _ in range(1000):
+        angle, reach = rng.uniform(0, 2 * math.pi), offset_m * math.sqrt(rng.random())
+        place = centers_m[rng.integers(len(centers_m))] + reach * np.array([math.cos(angle), math.sin(angle)])
+        if grid.is_free(float(place[0]), float(place[1])):
+            return float(place[0]), float(place[1])
+    raise ValueError(f"no free cell within {offset_m} m of any submap centre")
+
+
+def rotated_submap(
+    grid: OccupancyGrid, center_m: tuple[float, float], radius_m: float, angle_rad: float, submap_id: int = 0
+) -> Submap:
+    """The disc around a place, in a frame turned by `angle_rad`; cells are copied from the nearest ones."""
+    resolution = grid.resolution_m
+    n = round(radius_m / resolution)
+    # A square that contains every rotation is cut first, because warpAffine reads its whole input.
+    around = grid.crop(center_m, radius_m + 2 * resolution)
+    x, y = (np.asarray(center_m) - around.origin_m) / resolution - 0.5
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    to_map = np.array([[c, -s, x - c * n + s * n], [s, c, y - s * n - c * n]])
+    cells = cv2.warpAffine(
+        np.ascontiguousarray(around.cells).view(np.uint8),
+        to_map,
+        (2 * n + 1, 2 * n + 1),
+        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=255,
+    ).view(np.int8)
+    steps = np.arange(-n, n + 1) ** 2
+    cells = np.where(steps[:, None] + steps <= (radius_m / resolution) ** 2 + 1e-9, cells, np.int8(UNKNOWN))
+    half_m = (n + 0.5) * resolution
+    return Submap(
+        submap_id=submap_id,
+        center_m=center_m,
+        radius_m=radius_m,
+        grid=OccupancyGrid(cells=cells, resolution_m=resolution, origin_m=(-half_m, -half_m)),
+    )
+
+
+def evaluate(
+    methods: Mapping[str, Method],
+    grid: OccupancyGrid,
+    submaps: Sequence[Submap],
+    experiment: Experiment,
+    noise: Noise,
+    progress: Callable[[float], None] | None = None,
+) -> dict[str, BestMatches]:
+    """Cells of Table III: the methods on one map at one noise level, all on the same queries.
+
+    submaps : the map's partition, all of one radius. progress : called with the share that is done, 0..1.
+    Raises ValueError if there are no submaps.
+    """
+    if not submaps:
+        raise ValueError("a map without submaps cannot be evaluated")
+    centers_m = np.array([submap.center_m for submap in submaps])
+    matchers = {name: method.fit(submaps) for name, method in methods.items()}
+    similarity = {name: np.empty(experiment.queries) for name in methods}
+    correct = {name: np.empty(experiment.queries, np.bool_) for name in methods}
+    for i, query in enumerate(draw_queries(grid, centers_m, submaps[0].radius_m, experiment, noise)):
+        for name, matcher in matchers.items():
+            scores = matcher.similarities(query)
+            best = int(np.argmax(scores))
+            similarity[name][i] = scores[best]
+            correct[name][i] = math.dist(centers_m[best], query.center_m) <= experiment.correct_m
+        if progress is not None:
+            progress((i + 1) / experiment.queries)
+    return {name: BestMatches(similarity=similarity[name], correct=correct[name]) for name in methods}

@@ -1,0 +1,219 @@
+"""MRPT's particle filter, as Debian installs it (`apt-get install mrpt-apps`).
+
+`ros-map-yaml2mrpt` converts the map, `carmen2rawlog` the scans with the odometry, and `pf-localization` tells
+the mean pose and its spread after each scan on its standard output. It seeds itself by the clock, so its
+answers differ a little from run to run.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pc2grid.arrays import F32, F64
+from pc2grid.geometry import SE2
+from pc2grid.io.nav2_map import load_map
+from pc2grid_lab.experiments.registered_session import RegisteredSession
+from pc2grid_lab.peers.peer_process import PeerAnswer, PeerFailed
+
+PROGRAMS = ("pf-localization", "carmen2rawlog", "ros-map-yaml2mrpt")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParticleFilterParameters:
+    """Settings of `pf-localization`; others are those of its demonstration of global localization.
+
+    per_m2, least, most : particles at the start for each square metre of free floor. 27 on 376 m2 found
+        nothing, and 60,000 take 43 s a query.
+    step_m, step_rad : a scan is used after this motion, as particle filters of robots do.
+    std_m, std_deg : least noise of the odometry between two such scans. The odometry is registered.
+    max_range_m : beams that are as long came back from nothing.
+    """
+
+    per_m2: float = 80.0
+    least: int = 30_000
+    most: int = 60_000
+    step_m: float = 0.2
+    step_rad: float = 0.2
+    std_m: float = 0.05
+    std_deg: float = 2.0
+    max_range_m: float = 40.0
+
+
+PARTICLE_FILTER = ParticleFilterParameters()
+
+_ESTIMATE = re.compile(r"PDF estimation: \(([^,]+),([^,]+),([^)]+?)deg\).*tr\(cov\): (\S+)")
+
+_CONFIG = """\
+[KLD_options]
+KLD_binSize_PHI_deg=10
+KLD_binSize_XY=0.10
+KLD_delta=0.01
+KLD_epsilon=0.01
+KLD_maxSampleSize={particles}
+KLD_minSampleSize=500
+KLD_minSamplesPerBin=0
+[PF_options]
+PF_algorithm=0
+resamplingMethod=0
+adaptiveSampleSize=1
+BETA=0.5
+sampleSize=1
+[DummyOdometryParams]
+minStdXY={std_m}
+minStdPHI={std_deg}
+[LocalizationExperiment]
+use_3D_poses=false
+map_file={map_file}
+rawlog_file={rawlog}
+logOutput_dir={log}
+3DSceneFrequency=-1
+experimentRepetitions=1
+particles_count={particles}
+init_PDF_mode=0
+init_PDF_min_x={x0}
+init_PDF_max_x={x1}
+init_PDF_min_y={y0}
+init_PDF_max_y={y1}
+SHOW_PROGRESS_3D_REAL_TIME=false
+[MetricMap]
+occupancyGrid_count=1
+gasGrid_count=0
+landmarksMap_count=0
+pointsMap_count=0
+beaconMap_count=0
+likelihoodMapSelection=-1
+[MetricMap_occupancyGrid_00_creationOpts]
+resolution={resolution_m}
+[MetricMap_occupancyGrid_00_likelihoodOpts]
+likelihoodMethod=4
+LF_decimation={decimation}
+LF_stdHit=0.40
+LF_maxCorrsDistance=0.30
+LF_zHit=0.95
+LF_zRandom=0.05
+LF_maxRange=80
+LF_alternateAverageMethod=0
+"""
+
+
+class ParticleFilter:
+    """The particle filter in one map. Score: minus the spread of the particles (see `locate`)."""
+
+    def __init__(self, map_stem: Path) -> None:
+        grid = load_map(map_stem.with_suffix(".yaml"))
+        corner = np.array(grid.cells.shape[::-1]) * grid.resolution_m + grid.origin_m
+        self._bounds_m = (*grid.origin_m, float(corner[0]), float(corner[1]))
+        self._resolution_m = grid.resolution_m
+        p = PARTICLE_FILTER
+        free_m2 = float(np.count_nonzero(grid.free)) * grid.resolution_m**2
+        self._particles = round(min(max(p.per_m2 * free_m2, p.least), p.most))
+        self._folder = tempfile.TemporaryDirectory(prefix="particle-filter-")
+        self._map = Path(self._folder.name) / "map.gridmap.gz"
+        _run(["ros-map-yaml2mrpt", "-q", "-w", "-i", map_stem.with_suffix(".yaml"), "-d", self._folder.name])
+
+    def locate(self, query: Path) -> PeerAnswer:
+        """The mean of the particles at the last scan.
+
+        The score is minus the root of the trace of their covariance, metres and radians: particles in
+        several places are far from each other.
+
+        Raises PeerFailed if one of the programs fails.
+        """
+        folder = Path(self._folder.name)
+        log, rawlog, config = folder / "query.log", folder / "query.rawlog", folder / "query.ini"
+        session = RegisteredSession.load(query.with_suffix(".npz"))
+        with np.load(query.with_suffix(".ranges.npz")) as file:
+            ranges_m, fov_rad, T_base_middle = file["ranges_m"], float(file["fov_rad"]), file["T_base_middle"]
+        log.write_text(carmen_log(session, ranges_m, fov_rad, SE2.from_matrix(T_base_middle)))
+        _run(["carmen2rawlog", "-q", "-w", "-i", log, "-o", rawlog])
+        p, (x0, y0, x1, y1) = PARTICLE_FILTER, self._bounds_m
+        config.write_text(
+            _CONFIG.format(
+                particles=self._particles,
+                std_m=p.std_m,
+                std_deg=p.std_deg,
+                map_file=self._map,
+                rawlog=rawlog,
+                log=folder / "log",
+                x0=x0,
+                x1=x1,
+                y0=y0,
+                y1=y1,
+                resolution_m=self._resolution_m,
+                decimation=max(ranges_m.shape[1] // 36, 1),
+            )
+        )
+        output, cpu_s, peak_mb = _run(["pf-localization", config])
+        found = _ESTIMATE.findall(output)
+        if not found:
+            raise PeerFailed(f"pf-localization: no estimate for {query}", hint=output[-300:])
+        x, y, yaw_deg, spread = (float(value) for value in found[-1])
+        return PeerAnswer(pose=(x, y, math.radians(yaw_deg)), score=-spread, cpu_s=cpu_s, peak_mb=peak_mb)
+
+    def close(self) -> None:
+        """Remove the temporary files."""
+        self._folder.cleanup()
+
+
+def carmen_log(session: RegisteredSession, ranges_m: F32, fov_rad: float, T_base_middle: SE2) -> str:
+    """The scans after each step of motion as a CARMEN log: a ROBOTLASER1 line each, with the odometry.
+
+    ranges_m (N, B) of all scans; `T_base_middle` looks at the middle of `fov_rad`.
+    """
+    p = PARTICLE_FILTER
+    ranges_m = np.where(np.isfinite(ranges_m), np.minimum(ranges_m, p.max_range_m), p.max_range_m)
+    beams = ranges_m.shape[1]
+    step_rad = fov_rad / (beams - 1)
+    lines = []
+    start_ns = session.planar_scans[0].stamp_ns
+    for k in _after_motion(session.T_odom_base):
+        T_odom_base = SE2(*session.T_odom_base[k].tolist())
+        T_odom_middle = T_odom_base @ T_base_middle
+        seconds = (session.planar_scans[k].stamp_ns - start_ns) * 1e-9
+        lines.append(
+            f"ROBOTLASER1 0 {-fov_rad / 2:.6f} {fov_rad:.6f} {step_rad:.6f} {p.max_range_m:g} 0.01 0 {beams} "
+            + " ".join(f"{r:.3f}" for r in ranges_m[k])
+            + f" 0 {T_odom_middle.x:.4f} {T_odom_middle.y:.4f} {T_odom_middle.yaw:.5f}"
+            + f" {T_odom_base.x:.4f} {T_odom_base.y:.4f} {T_odom_base.yaw:.5f}"
+            + f" 0 0 0 0 0 {seconds:.6f} robot {seconds:.6f}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _after_motion(T_odom_base: F64) -> list[int]:
+    """The first scan, those after each step of motion, and the last."""
+    kept = [0]
+    for k in range(1, len(T_odom_base)):
+        step = SE2(*T_odom_base[kept[-1]].tolist()).inverse() @ SE2(*T_odom_base[k].tolist())
+        moved = (
+            math.hypot(step.x, step.y) >= PARTICLE_FILTER.step_m or abs(step.yaw) >= PARTICLE_FILTER.step_rad
+        )
+        if moved or k == len(T_odom_base) - 1:
+            kept.append(k)
+    return kept
+
+
+def _run(command: list[str | Path]) -> tuple[str, float, float]:
+    """Run a program to its end: its output, processor seconds, and peak of memory in megabytes.
+
+    Raises PeerFailed if it fails.
+    """
+    with tempfile.TemporaryFile("w+") as output:
+        process = subprocess.Popen(
+            [*map(str, command)], stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        output.seek(0)
+        text = output.read()
+    if process.returncode:
+        raise PeerFailed(f"{command[0]} ended with {process.returncode}", hint=text[-300:])
+    return text, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1000.0

@@ -1,0 +1,388 @@
+"""A building as all peers get it: a map of one part of a recording, and later parts as queries.
+
+The map is drawn at the true poses, so that the decision is measured and not mapping. The queries are
+registered as a user's would be; every peer gets the registered poses as its odometry, which is better than
+that of wheels.
+
+A site is a folder: `map.yaml` and `map.png` (nav2), `map.npz` (clouds along the path, of a lidar only) and
+`queries/NN.*`: `.json` (the truth), `.npz` (registered planar scans), `.ranges.npz` (the beams of a laser) or
+`.cloud.npz` (the points of a lidar).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pc2grid.arrays import F32, F64
+from pc2grid.errors import ConfigError, LogNotFound
+from pc2grid.geometry import SE2, transform_points
+from pc2grid.io import open_log
+from pc2grid.io.atomic import replace_file
+from pc2grid.io.building_file import is_building_file
+from pc2grid.io.nav2_map import load_map, save_map
+from pc2grid.io.trajectory import read_tum
+from pc2grid.mapping.occupancy import GridBuilder
+from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind, Trajectory
+from pc2grid.odometry.tracker import Tracker
+from pc2grid_lab.experiments.program import digest_of_sources
+from pc2grid_lab.experiments.registered_session import register
+from pc2grid_lab.experiments.sensor_matrix import query_start
+from pc2grid_lab.peers.asked import PREPARES, digest
+from signature.config import Config
+from signature.sessions import digest_of
+
+if TYPE_CHECKING:
+    from pc2grid.io import Log
+    from pc2grid.simulate import SimulationConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiteParameters:
+    """How maps and queries are cut from recordings. All chosen by hand, before any peer was run.
+
+    mapped : share of a recording that becomes the map, unless its seconds are given.
+    query_s : a query lasts at most so long, and at most this share (`query_share`) of what is not mapped.
+    gap : seconds between map and first query, as a share of the longest query.
+    keyframe_m, keyframe_rad : a scan of the map is used if the robot has moved or turned so far; of a lidar,
+        which sees all around, after `lidar_keyframe_m`.
+    cloud_voxel_m : edge of the voxels that clouds are thinned to; each matcher thins further as it needs.
+    same_ns : a true pose belongs to a scan if their stamps differ by no more than this.
+    near_m, covered : a query is covered if this share of its last planar scan lies so near to a wall of the
+        map. Only for covered queries an answer is asked for.
+    map_length_m, rate_hz, columns, clutter : of the lidar that is simulated in a 3D scan, as in
+        `compare real`.
+    map_seed : of its mapping drive; queries have 1, 2, ...
+    """
+
+    mapped: float = 0.55
+    query_s: float = 60.0
+    query_share: float = 0.25
+    gap: float = 1.0 / 30.0
+    keyframe_m: float = 0.15
+    lidar_keyframe_m: float = 0.5
+    keyframe_rad: float = 0.1
+    cloud_voxel_m: float = 0.1
+    same_ns: int = 1_000_000
+    near_m: float = 0.2
+    covered: float = 0.5
+    map_length_m: float = 150.0
+    rate_hz: float = 5.0
+    columns: int = 720
+    clutter: int = 15
+    map_seed: int = 1000
+
+
+SITE = SiteParameters()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiteQuery:
+    """What a query is judged by.
+
+    pose : true x, y, yaw of the base in the map at the last scan. covered : the map shows what was seen
+        there. travel_m : metres driven.
+    """
+
+    pose: tuple[float, float, float]
+    covered: bool
+    travel_m: float
+
+    @property
+    def T_map_base(self) -> SE2:
+        """The true pose."""
+        return SE2(*self.pose)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Site:
+    """A prepared building. folder : where its files are."""
+
+    name: str
+    sensor: SensorKind
+    folder: Path
+
+    @property
+    def map_stem(self) -> Path:
+        """`map.yaml`, `map.png` and, of a lidar, `map.npz` without their suffixes."""
+        return self.folder / "map"
+
+    def stem(self, number: int) -> Path:
+        """The files of a query without their suffixes."""
+        return self.folder / "queries" / f"{number:02d}"
+
+    def queries(self) -> dict[int, SiteQuery]:
+        """All queries by their numbers."""
+        files = sorted((self.folder / "queries").glob("*.json"))
+        return {int(file.stem): SiteQuery(**json.loads(file.read_text())) for file in files}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TruePoses:
+    """Poses that another program has computed, of the sensor or, with `of_base`, of the base.
+
+    Not every scan needs to have one.
+    """
+
+    trajectory: Trajectory
+    of_base: bool = False
+
+    def at(self, scan: Scan) -> F64 | None:
+        """T_world_base (4, 4) at a scan; None where it is not known."""
+        stamps_ns = self.trajectory.stamps_ns
+        i = int(np.searchsorted(stamps_ns, scan.stamp_ns - SITE.same_ns))
+        if i == len(stamps_ns) or stamps_ns[i] > scan.stamp_ns + SITE.same_ns:
+            return None
+        T_world: F64 = self.trajectory.T_session_base[i]
+        return T_world if self.of_base else T_world @ np.linalg.inv(scan.T_base_sensor)
+
+
+PosedScan = tuple[Scan, F64 | None]
+"""A scan with its true pose T_world_base (4, 4)."""
+
+
+def truth_file(log: Path) -> Path:
+    """The true poses beside a recording: `NAME.tum` or `NAME_corrected.tum`.
+
+    Raises LogNotFound if there is neither.
+    """
+    for name in (f"{log.stem}.tum", f"{log.stem}_corrected.tum"):
+        if (log.parent / name).is_file():
+            return log.parent / name
+    raise LogNotFound(
+        f"{log}: no true poses beside it", hint=f"put them into {log.stem}.tum, stamped as the scans"
+    )
+
+
+def site_name(
+    source: Path, config: Config, *, queries: int, travel_m: float, mapped_s: float | None, of_base: bool
+) -> str:
+    """A name for the folder of a site, that differs where anything differs that the site is made from.
+
+    source : a recording with true poses beside it, or a 3D scan of a building. Raises what `digest_of` and
+    `truth_file` do.
+    """
+    truth = "" if is_building_file(source) else hashlib.sha256(truth_file(source).read_bytes()).hexdigest()
+    settings = (queries, travel_m, mapped_s, of_base, config.model_dump(mode="json"))
+    made = digest(digest_of(source, config), truth, settings, digest_of_sources(PREPARES))
+    return f"{source.stem}.{made}"
+
+
+def recorded_site(
+    log: Path,
+    folder: Path,
+    config: Config,
+    *,
+    queries: int,
+    travel_m: float,
+    mapped_s: float | None = None,
+    of_base: bool = False,
+) -> Site:
+    """The site of a recording with true poses beside it. What exists in `folder` is not made again.
+
+    queries : how many, evenly spread over what is not mapped; fewer where it has fewer scans.
+    mapped_s : seconds from the start that become the map; None: `SiteParameters.mapped` of all.
+    of_base : the true poses are of the base, not of the sensor.
+
+    Raises ConfigError if nothing is left to locate, and what `open_log` and `read_tum` do.
+    """
+    with open_log(log, config.read) as opened:
+        truth = TruePoses(trajectory=read_tum(truth_file(log)), of_base=of_base)
+        end_s = (opened.info.end_ns - opened.info.start_ns) * 1e-9
+        mapped_s = mapped_s if mapped_s is not None else SITE.mapped * end_s
+        longest_s = min(SITE.query_s, SITE.query_share * (end_s - mapped_s))
+        if longest_s <= 0.0:
+            raise ConfigError(
+                f"{log}: nothing is left to locate after {mapped_s:g} s; it lasts {end_s:.1f} s",
+                hint=f"for example --mapped {log.stem}={end_s / 2:.0f}",
+            )
+        site = Site(name=log.stem, sensor=opened.choose().sensor, folder=folder)
+        if not _has_map(site):
+            _save_map(site, _posed(opened, truth, 0.0, mapped_s), config)
+        starts_s = np.linspace(mapped_s + SITE.gap * longest_s, end_s - longest_s, queries)
+        for number, start_s in enumerate(_distinct(opened, starts_s)):
+            _save_query(site, number, _posed(opened, truth, start_s, longest_s), config, travel_m)
+    return site
+
+
+def simulated_site(
+    building_file: Path, folder: Path, config: Config, *, queries: int, travel_m: float
+) -> Site:
+    """The site of a lidar that is simulated in a real 3D scan of a building (PLY, PCD or a mesh)."""
+    from pc2grid.simulate import iter_session, load_building
+
+    building = load_building(building_file)
+    site = Site(name=building_file.stem, sensor="lidar", folder=folder)
+    mapping = _simulation(SITE.map_length_m, SITE.map_seed)
+
+    def drive(simulation: SimulationConfig) -> Iterator[PosedScan]:
+        for scan, truth in iter_session(sensor="lidar", grid=building, config=simulation):
+            yield scan, truth.lift()
+
+    if not _has_map(site):
+        _save_map(site, drive(mapping), config)
+    for number in range(queries):
+        if not site.stem(number).with_suffix(".json").exists():
+            start_m = query_start(building, mapping, number + 1)
+            simulation = _simulation(travel_m + 3.0, number + 1, start_m)
+            _save_query(site, number, drive(simulation), config, travel_m)
+    return site
+
+
+def _simulation(length_m: float, seed: int, start_m: tuple[float, float] | None = None) -> SimulationConfig:
+    from pc2grid.simulate import SimulationConfig
+
+    lidar = {"rate_hz": SITE.rate_hz, "columns": SITE.columns}
+    return SimulationConfig.model_validate(
+        {"length_m": length_m, "seed": seed, "clutter": SITE.clutter, "start_m": start_m, "lidar": lidar}
+    )
+
+
+def _posed(log: Log, truth: TruePoses, start_s: float, duration_s: float) -> Iterator[PosedScan]:
+    for scan in log.scans(start_s, duration_s):
+        yield scan, truth.at(scan)
+
+
+def _distinct(log: Log, starts_s: F64) -> list[float]:
+    """The starts, without those that begin with the same scan as the one before."""
+    first_ns = [next(iter(log.scans(float(start_s)))).stamp_ns for start_s in starts_s]
+    return [
+        float(starts_s[k]) for k in sorted({ns: k for k, ns in reversed(list(enumerate(first_ns)))}.values())
+    ]
+
+
+def _has_map(site: Site) -> bool:
+    return site.map_stem.with_suffix(".yaml").exists()
+
+
+def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
+    """Draw the grid at the true poses and, of a lidar, keep the clouds."""
+    step_m = SITE.keyframe_m if site.sensor == "laser" else SITE.lidar_keyframe_m
+    builder, last = GridBuilder(config.projection), None
+    path, clouds = [], []
+    for scan, T_world_base in scans:
+        if T_world_base is None:
+            continue
+        pose = SE2.from_matrix(T_world_base)
+        step = pose if last is None else last.inverse() @ pose
+        if (
+            last is not None
+            and math.hypot(step.x, step.y) < step_m
+            and (abs(step.yaw) < SITE.keyframe_rad or site.sensor != "laser")
+        ):
+            continue
+        last = pose
+        tracked = Tracker(config.registration, config.projection).start(scan)
+        builder.add(tracked.planar_scan, pose)
+        if site.sensor != "laser":
+            path.append(T_world_base)
+            clouds.append(_thinned(transform_points(T_world_base, tracked.registered.scan.points_m)))
+    site.folder.mkdir(parents=True, exist_ok=True)
+    if clouds:
+        with replace_file(site.map_stem.with_suffix(".npz")) as draft, draft.open("wb") as file:
+            np.savez(
+                file,
+                T_map_base=np.array(path),
+                points_m=np.concatenate(clouds),
+                count=[len(c) for c in clouds],
+            )
+    save_map(builder.grid(), site.map_stem, image_format="png")  # last: it says that the map is complete
+
+
+def _save_query(
+    site: Site,
+    number: int,
+    scans: Iterable[PosedScan],
+    config: Config,
+    travel_m: float,
+) -> None:
+    """Register a query and keep what the peers need of it, unless it exists; without a true pose, nothing."""
+    stem = site.stem(number)
+    if stem.with_suffix(".json").exists():
+        return
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    seen: list[RegisteredScan] = []
+    planar = ((scan, None if T is None else SE2.from_matrix(T)) for scan, T in scans)
+    session = register(planar, config, sensor=site.sensor, until_m=travel_m, see=seen.append)
+    if np.isnan(session.T_world_base[:, 0]).all():
+        return
+    truth = session.T_world_odom() @ SE2(*session.T_odom_base[-1].tolist())
+    session.save(stem.with_suffix(".npz"))
+    if site.sensor == "laser":
+        save_beams(stem.with_suffix(".ranges.npz"), [registered.scan for registered in seen])
+    else:
+        T_odom_query = seen[-1].T_session_base
+        cloud = [
+            transform_points(np.linalg.inv(T_odom_query) @ r.T_session_base, r.scan.points_m) for r in seen
+        ]
+        with replace_file(stem.with_suffix(".cloud.npz")) as draft, draft.open("wb") as file:
+            np.savez(file, points_m=_thinned(np.concatenate(cloud)))
+    query = SiteQuery(
+        pose=(truth.x, truth.y, truth.yaw),
+        covered=is_covered(
+            load_map(site.map_stem.with_suffix(".yaml")), hits_of(seen[-1].scan, config), truth
+        ),
+        travel_m=float(session.path_m()[-1]),
+    )
+    with replace_file(stem.with_suffix(".json")) as draft:  # last: it says that the query is complete
+        draft.write_text(json.dumps(asdict(query)))
+
+
+def hits_of(scan: Scan, config: Config) -> F32:
+    """(M, 2) obstacles of a scan by itself, as if a query began with it.
+
+    What registration made of the scans before must not decide which queries count.
+    """
+    return Tracker(config.registration, config.projection).start(scan).planar_scan.hits_m
+
+
+def is_covered(grid: OccupancyGrid, planar_hits_m: F32, T_map_base: SE2) -> bool:
+    """Whether the map shows what the last scan of a query has seen (M, 2), by the true pose."""
+    hits_m = T_map_base.apply(planar_hits_m)
+    walls_m = grid.to_point(np.argwhere(grid.occupied))
+    if not len(hits_m) or not len(walls_m):
+        return False
+    distance_m, _ = cKDTree(walls_m).query(hits_m)
+    return float(np.mean(distance_m <= SITE.near_m)) >= SITE.covered
+
+
+def save_beams(path: Path, scans: list[Scan]) -> None:
+    """Write the ranges of a 2D laser, one row a scan, for beams that are evenly spread.
+
+    `ranges_m` (N, B), infinite where nothing came back; `fov_rad` from the first beam to the last;
+    `T_base_middle` (4, 4), a frame in the sensor whose x axis is in the middle of them. The
+    bearings of the beams are found from the points that a `Scan` holds.
+    """
+    T_base_sensor = scans[0].T_base_sensor
+    T_sensor_base = np.asarray(np.linalg.inv(T_base_sensor), np.float64)
+    points_m = [transform_points(T_sensor_base, scan.points_m) for scan in scans]
+    bearings_rad = [np.arctan2(p[:, 1], p[:, 0]) for p in points_m]
+    step_rad = float(np.median(np.diff(np.sort(max(bearings_rad, key=len)))))
+    first_rad, last_rad = (f(np.concatenate(bearings_rad)) for f in (np.min, np.max))
+    beams = round((last_rad - first_rad) / step_rad) + 1
+    rows = np.full((len(scans), beams), np.inf, np.float32)
+    for row, bearing_rad, p in zip(rows, bearings_rad, points_m, strict=True):
+        row[np.rint((bearing_rad - first_rad) / step_rad).astype(int)] = np.hypot(p[:, 0], p[:, 1])
+    T_sensor_middle = SE2(0.0, 0.0, float(first_rad + last_rad) / 2.0).lift()
+    with replace_file(path) as draft, draft.open("wb") as file:
+        np.savez(
+            file,
+            ranges_m=rows,
+            fov_rad=float(last_rad - first_rad),
+            T_base_middle=T_base_sensor @ T_sensor_middle,
+        )
+
+
+def _thinned(points_m: F64) -> F32:
+    """One point for each voxel."""
+    voxels = np.floor(points_m / SITE.cloud_voxel_m).astype(np.int32)
+    _, first = np.unique(voxels, axis=0, return_index=True)
+    return points_m[np.sort(first)].astype(np.float32)
