@@ -5,24 +5,19 @@ Nothing here is fitted to recordings of real sensors; numbers whose origin is no
 """
 
 from pc2grid.simulate.building import Building, load_building
-from pc2grid.simulate.config import ChangeConfig, SimulationConfig
+from pc2grid.simulate.config import SimulationConfig
 from pc2grid.simulate.floorplan import office_floorplan
-from pc2grid.simulate.house import HouseConfig, HouseSession, prepare_house_session
 from pc2grid.simulate.record import SimulatedSession, simulate_session
 from pc2grid.simulate.session import Session, iter_session, prepare_session
 
 __all__ = [
     "Building",
-    "ChangeConfig",
-    "HouseConfig",
-    "HouseSession",
     "Session",
     "SimulatedSession",
     "SimulationConfig",
     "iter_session",
     "load_building",
     "office_floorplan",
-    "prepare_house_session",
     "prepare_session",
     "simulate_session",
 ]

@@ -35,35 +35,6 @@ class OdometryConfig(Section):
     veer_rpm: float = Field(default=0.001, ge=0, description="standard deviation, radians per metre")
 
 
-class ChangeConfig(Section):
-    """What differs from the building as it was drawn or scanned. Shares are 0..1; nothing by default.
-
-    Doors and furniture change from session to session; glass, mirrors and relief are part of the building.
-    """
-
-    doors: float = Field(default=0.0, ge=0, le=1, description="share of the doorways with a door leaf")
-    closed: float = Field(
-        default=0.5, ge=0, le=1, description="share of these that are shut; others stand ajar"
-    )
-    furniture: float = Field(
-        default=0.0, ge=0, le=1, description="share of the free-standing furniture moved or exchanged"
-    )
-    exchanged: float = Field(default=0.3, ge=0, le=1, description="share of this that is exchanged")
-    relief_per_m: float = Field(
-        default=0.0, ge=0, le=2, description="radiators, pilasters and cases on a metre of wall"
-    )
-    glass: float = Field(default=0.0, ge=0, le=1, description="share of the visible walls that is glass")
-    mirrors: float = Field(default=0.0, ge=0, le=0.5, description="share of the visible walls that is mirror")
-    glass_return: float = Field(
-        default=0.1, ge=0, le=1, description="share of the rays that glass returns at an angle"
-    )
-
-    @classmethod
-    def of_share(cls, share: float) -> ChangeConfig:
-        """Doors and furniture changed by a share."""
-        return cls(doors=share, furniture=share)
-
-
 class LidarConfig(Section):
     """A spinning lidar like a VLP-16."""
 
@@ -118,11 +89,9 @@ class SimulationConfig(Section):
     length_m: float = Field(default=40.0, gt=0, le=20_000, description="distance to drive")
     seed: int = Field(default=0, ge=0, description="route, clutter, noise and odometry")
     clutter: int = Field(default=30, ge=0, le=10_000, description="movable objects, placed by the seed")
-    walkers: int = Field(default=0, ge=0, le=1000, description="people who walk about during the drive")
     start_m: tuple[float, float] | None = Field(default=None, description="x, y in the map; null: anywhere")
     building_seed: int = Field(default=0, ge=0, description="the procedural office, when no map is given")
     wall_height_m: float = Field(default=2.5, gt=0.5, le=20)
-    change: ChangeConfig = ChangeConfig()
     drive: DriveConfig = DriveConfig()
     odometry: OdometryConfig = OdometryConfig()
     lidar: LidarConfig = LidarConfig()

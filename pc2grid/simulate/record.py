@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
-from pc2grid.errors import ConfigError
+from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.io.atomic import refuse_existing
 from pc2grid.io.export.mcap import LogWriter
 from pc2grid.io.trajectory import write_tum
 from pc2grid.model import OccupancyGrid, SensorKind, Trajectory
 from pc2grid.simulate.building import Building
-from pc2grid.simulate.change import Change
 from pc2grid.simulate.config import DepthConfig, LaserConfig, SimulationConfig
-from pc2grid.simulate.house import HouseConfig, HouseSession, prepare_house_session
-from pc2grid.simulate.sensors import depth_intrinsics, laser_angle_min, laser_time_increment
-from pc2grid.simulate.session import EPOCH_NS, Reading, Session, prepare_session
+from pc2grid.simulate.odometry import Odometry
+from pc2grid.simulate.sensors import Sensor, depth_intrinsics, laser_angle_min, laser_time_increment
+from pc2grid.simulate.session import EPOCH_NS, Reading, prepare_session
 
 BASE_FRAME, ODOM_FRAME = "base_link", "odom"
 TOPICS: dict[SensorKind, str] = {
@@ -37,7 +37,6 @@ class SimulatedSession:
 
     path : the MCAP. truth_path : TUM file of true base poses in the floor plan's map frame, one per scan.
     scans : their number. duration_s, length_m : of the drive. clutter : how many objects could be placed.
-    change : what differs from the building as drawn.
     """
 
     path: Path
@@ -47,7 +46,52 @@ class SimulatedSession:
     duration_s: float
     length_m: float
     clutter: int
-    change: Change
+
+
+class Motion(Protocol):
+    """A drive, of which only time and length are recorded as such."""
+
+    @property
+    def duration_s(self) -> float:
+        """From start to end."""
+
+    @property
+    def length_m(self) -> float:
+        """In the plan."""
+
+
+class Recordable(Protocol):
+    """A session as it is recorded: what determines the readings, and the readings."""
+
+    @property
+    def sensor(self) -> Sensor:
+        """What the robot carries."""
+
+    @property
+    def clutter(self) -> Sequence[object]:
+        """The movable objects that could be placed."""
+
+    @property
+    def drive(self) -> Motion:
+        """The true motion."""
+
+    @property
+    def odometry(self) -> Odometry | None:
+        """What the wheels measure."""
+
+    @property
+    def config(self) -> SimulationConfig:
+        """The settings."""
+
+    @property
+    def scan_count(self) -> int:
+        """Whole scans of the drive."""
+
+    def readings(self) -> Iterator[Reading]:
+        """The scans."""
+
+    def pose(self, time_s: float) -> F64:
+        """The true T_map_base (4, 4)."""
 
 
 def simulate_session(
@@ -55,7 +99,6 @@ def simulate_session(
     *,
     sensor: SensorKind,
     grid: OccupancyGrid | Building | None = None,
-    house: HouseConfig | None = None,
     config: SimulationConfig | None = None,
     progress: Callable[[float], None] | None = None,
     force: bool = False,
@@ -65,8 +108,6 @@ def simulate_session(
     out : MCAP to write; the ground truth is written beside it as `.tum`. Existing files are refused without
         `force`.
     grid : the floor plan, or a real building; None for the procedural office of `config.building_seed`.
-    house : drive through several floors with the plan of that office, `config.length_m` on each; not with a
-        grid. The ground truth has z = 0 on floor 0.
     progress : called with the share that is done, 0..1.
 
     Topics: the sensor's (TOPICS; a camera has INFO_TOPIC too), /tf_static base_link -> sensor and, unless
@@ -77,23 +118,33 @@ def simulate_session(
     >>> made.truth_path.name, made.scans > 10
     ('drive.tum', True)
     """
+    refuse_existing_recording(out, force)
+    session = prepare_session(sensor=sensor, grid=grid, config=config)
+    return record_session(out, session, progress=progress, force=force)
+
+
+def refuse_existing_recording(out: str | Path, force: bool) -> None:
+    """Raises OutputError if the recording or its truth exists, unless `force`."""
+    for path in (Path(out), Path(out).with_suffix(".tum")):
+        refuse_existing(path, force)
+
+
+def record_session(
+    out: str | Path,
+    session: Recordable,
+    *,
+    progress: Callable[[float], None] | None = None,
+    force: bool = False,
+) -> SimulatedSession:
+    """Record a prepared session; see `simulate_session`."""
     out = Path(out)
     truth_path = out.with_suffix(".tum")
-    refuse_existing(out, force)
-    refuse_existing(truth_path, force)
-    session: Session | HouseSession
-    if house is not None:
-        if grid is not None:
-            raise ConfigError(
-                "a house has the plan of an office", hint="leave out the building, or the floors"
-            )
-        session = prepare_house_session(sensor=sensor, house=house, config=config)
-    else:
-        session = prepare_session(sensor=sensor, grid=grid, config=config)
+    refuse_existing_recording(out, force)
     count = session.scan_count
     stamps, poses = [], []
     with LogWriter(out, force=force) as log:
-        log.metadata("pc2grid.simulation", {"sensor": sensor, "config": session.config.model_dump_json()})
+        about = {"sensor": session.sensor.kind, "config": session.config.model_dump_json()}
+        log.metadata("pc2grid.simulation", about)
         log.tf_static(EPOCH_NS, BASE_FRAME, session.sensor.frame, session.sensor.T_base_sensor)
         odometry_sent = 0
         for reading in session.readings():
@@ -108,16 +159,15 @@ def simulate_session(
     return SimulatedSession(
         path=out,
         truth_path=truth_path,
-        sensor=sensor,
+        sensor=session.sensor.kind,
         scans=count,
         duration_s=session.drive.duration_s,
         length_m=session.drive.length_m,
         clutter=len(session.clutter),
-        change=session.change,
     )
 
 
-def _write_odometry(log: LogWriter, session: Session | HouseSession, sent: int, until_s: float) -> int:
+def _write_odometry(log: LogWriter, session: Recordable, sent: int, until_s: float) -> int:
     """Write the odometry up to a time, from message `sent` on; returns how many messages are written then."""
     odometry = session.odometry
     if odometry is None:
@@ -131,7 +181,7 @@ def _write_odometry(log: LogWriter, session: Session | HouseSession, sent: int, 
     return end
 
 
-def _write_reading(log: LogWriter, session: Session | HouseSession, reading: Reading) -> None:
+def _write_reading(log: LogWriter, session: Recordable, reading: Reading) -> None:
     """Write one scan as the driver of its sensor publishes it."""
     sensor, values, stamp_ns = session.sensor, reading.values_m, reading.stamp_ns
     topic, config = TOPICS[sensor.kind], sensor.config

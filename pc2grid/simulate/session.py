@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,17 +11,14 @@ from pc2grid.arrays import F32, F64
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid, Scan, SensorKind
 from pc2grid.simulate.building import Building
-from pc2grid.simulate.change import NO_CHANGE, Change, change_building
 from pc2grid.simulate.clutter import Furniture, covered, place_clutter
 from pc2grid.simulate.config import SimulationConfig
 from pc2grid.simulate.drive import Drive, drive_along
 from pc2grid.simulate.floorplan import office_floorplan
 from pc2grid.simulate.odometry import Odometry, odometry_of
-from pc2grid.simulate.panes import Panes
 from pc2grid.simulate.route import plan_route
 from pc2grid.simulate.scene import Mesh, Scene, extrude
 from pc2grid.simulate.sensors import Sensor, make_sensor
-from pc2grid.simulate.walkers import Walker, send_walkers
 
 EPOCH_NS = 1_700_000_000_000_000_000
 """Stamp of the start of every session; constant, so that the same seed gives the same bytes."""
@@ -29,8 +26,11 @@ EPOCH_NS = 1_700_000_000_000_000_000
 RAYS_PER_CAST = 300_000  # bounds the memory of one call of the ray caster
 
 # Each purpose has its own stream of random numbers, so that more clutter does not change the noise.
-_CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE, _WALKERS, _CHANGE, _PANES = range(8)
-_BUILDING = 0xB011D  # stream of what belongs to the building, whatever the session
+_CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE = range(5)
+
+Cast = Callable[[F32, F64, F64, int], F32]
+"""Ranges (S, R) of rays (S, R, 6) that are cast at times (S, R) from base poses (S, R, 3); the last argument
+is the number of the first of these scans."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,27 +55,26 @@ class Reading:
 class Session:
     """Everything that the seed of a session determines, before the first ray is cast.
 
-    grid : the true floor plan. clutter : movable objects in it. walkers : people who walk.
+    grid : the true floor plan. clutter : movable objects in it.
     drive : true motion in the plan's map frame.
     odometry : None when switched off. scan_count : scans of the sensor during the drive.
     shell : geometry of a real building; None where the plan is extruded.
-    change : what differs from the building as drawn; `grid` is the plan after the change.
+    added : further objects that the plan does not show.
     """
 
     sensor: Sensor
     grid: OccupancyGrid
     clutter: tuple[Furniture, ...]
-    walkers: tuple[Walker, ...]
     drive: Drive
     odometry: Odometry | None
     config: SimulationConfig
     shell: Mesh | None = None
-    change: Change = NO_CHANGE
+    added: tuple[Furniture, ...] = ()
 
     @property
     def objects(self) -> tuple[Furniture, ...]:
-        """All that stands in the plan: the clutter, and what the change has added."""
-        return (*self.clutter, *self.change.added)
+        """All that stands in the plan."""
+        return (*self.clutter, *self.added)
 
     @property
     def scan_count(self) -> int:
@@ -87,12 +86,19 @@ class Session:
         shell = extrude(self.grid, self.config.wall_height_m) if self.shell is None else self.shell
         return Mesh.join([shell, *(furniture.mesh() for furniture in self.objects)])
 
+    def caster(self) -> Cast:
+        """What casts the rays of this session."""
+        scene = Scene(self.mesh())
+
+        def cast(rays: F32, times_s: F64, poses: F64, first: int) -> F32:
+            return scene.cast(rays.reshape(-1, 6)).reshape(times_s.shape)
+
+        return cast
+
     def readings(self) -> Iterator[Reading]:
         """Cast all scans, several in a call; each ray starts at the robot's pose at the time of the ray."""
         sensor = self.sensor
-        scene = Scene(self.mesh())
-        kind = self.change.kind
-        panes = None if kind is None else Panes(scene, self.grid, kind, self.config.change.glass_return)
+        cast = self.caster()
         T = sensor.T_base_sensor
         directions = sensor.directions @ T[:3, :3].T
         batch = max(RAYS_PER_CAST // len(directions), 1)
@@ -101,14 +107,7 @@ class Session:
             times_s = indices[:, None] / sensor.rate_hz + sensor.offsets_s
             poses = self.drive.at(times_s)
             rays = _rays(poses, T[:3, 3], directions)
-            flat = rays.reshape(-1, 6)
-            if panes is None:
-                true_m = scene.cast(flat).reshape(times_s.shape)
-            else:
-                pane_rng = np.random.default_rng([self.config.seed, _PANES, first])
-                true_m = panes.cast(flat, pane_rng).reshape(times_s.shape)
-            for walker in self.walkers:
-                true_m = np.minimum(true_m, walker.hits(rays, times_s, poses[:, 0, :2]))
+            true_m = cast(rays, times_s, poses, first)
             for index, ranges in zip(indices, true_m, strict=True):
                 rng = np.random.default_rng([self.config.seed, _NOISE, int(index)])
                 yield Reading(int(index), float(index) / sensor.rate_hz, sensor.measure(ranges, rng))
@@ -179,19 +178,21 @@ def prepare_session(
     config = config or SimulationConfig()
     building = office_floorplan(config.building_seed) if grid is None else grid
     plan, shell = (building, None) if isinstance(building, OccupancyGrid) else (building.plan, building.shell)
+    return plan_session(sensor, plan, shell, config)
+
+
+def plan_session(
+    sensor: SensorKind,
+    plan: OccupancyGrid,
+    shell: Mesh | None,
+    config: SimulationConfig,
+    added: tuple[Furniture, ...] = (),
+) -> Session:
+    """A session in a plan, or in a real building (`shell`) of that plan. added : objects that stand there."""
 
     def stream(number: int) -> np.random.Generator:
         return np.random.default_rng([config.seed, number])
 
-    plan, shell, change = change_building(
-        plan,
-        shell,
-        config.change,
-        stream(_CHANGE),
-        np.random.default_rng([config.building_seed, _BUILDING]),
-        robot_m=config.drive.clearance_m,
-        start_m=config.start_m,
-    )
     clutter = place_clutter(
         plan,
         config.clutter,
@@ -199,16 +200,13 @@ def prepare_session(
         robot_m=config.drive.clearance_m,
         keep_free_m=() if config.start_m is None else (config.start_m,),
     )
-    blocked, clearance_m = covered(plan, (*clutter, *change.added)), config.drive.clearance_m
+    blocked, clearance_m = covered(plan, (*clutter, *added)), config.drive.clearance_m
     route = plan_route(
         plan, blocked, config.length_m, start_m=config.start_m, least_m=clearance_m, rng=stream(_ROUTE)
     )
     drive = drive_along(route, config.drive, stream(_DRIVE))
-    walkers = send_walkers(plan, blocked, config.walkers, drive.duration_s, stream(_WALKERS))
     odometry = odometry_of(drive, config.odometry, stream(_ODOMETRY)) if config.odometry.enabled else None
-    return Session(
-        make_sensor(sensor, config), plan, clutter, walkers, drive, odometry, config, shell, change
-    )
+    return Session(make_sensor(sensor, config), plan, clutter, drive, odometry, config, shell, added)
 
 
 def iter_session(

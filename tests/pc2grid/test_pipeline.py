@@ -17,10 +17,11 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.pipeline import build_map, build_maps, check_followed, follow, map_scans
-from pc2grid.simulate import HouseConfig, SimulationConfig, prepare_session, simulate_session
+from pc2grid.simulate import SimulationConfig, prepare_session, simulate_session
 from pc2grid.simulate.config import LaserConfig
 from pc2grid.simulate.session import Session
 from pc2grid.time_span import TimeSpan
+from pc2grid_lab import worlds
 from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
 
 Mapped = tuple[Session, list[tuple[Scan, SE2]], OccupancyGrid, Trajectory]
@@ -142,11 +143,11 @@ def test_a_robot_that_was_carried_elsewhere_makes_two_maps(
 
 def test_a_laser_that_goes_upstairs_contradicts_itself_there(tmp_path: Path) -> None:
     """It shows no slope, so both floors and the stairs are drawn into one map."""
-    house = HouseConfig(visits=(0, 1), alike=True)
+    house = worlds.HouseConfig(visits=(0, 1), alike=True)
     config = SimulationConfig(
         length_m=3.0, seed=3, building_seed=3, laser=LaserConfig(rate_hz=5.0, step_deg=1.0)
     )
-    simulate_session(tmp_path / "house.mcap", sensor="laser", house=house, config=config)
+    worlds.simulate_session(tmp_path / "house.mcap", sensor="laser", house=house, config=config)
     with open_log(tmp_path / "house.mcap") as log:
         (made,) = build_maps(log, session="house")
     (warning,) = made.report.warnings

@@ -388,21 +388,6 @@ class Export(TypedDict):
     written: list[str]
 
 
-class Simulate(TypedDict):
-    """`pc2grid simulate --json`; clutter: objects that could be placed. change: what differs from the
-    building as drawn, counts and metres, and the share of its visible walls."""
-
-    schema_version: Version
-    recording: str
-    truth: str
-    sensor: str
-    scans: int
-    duration_s: float
-    length_m: float
-    clutter: int
-    change: dict[str, float]
-
-
 DOCUMENTS: dict[str, type] = {
     "convert": Convert,
     "db-check": DbCheck,
@@ -417,7 +402,6 @@ DOCUMENTS: dict[str, type] = {
     "info-map": InfoMap,
     "relocalize": Relocalize,
     "relocalize-check": RelocalizeCheck,
-    "simulate": Simulate,
     "watch": Watch,
     "watch-check": WatchCheck,
 }
@@ -426,7 +410,7 @@ DOCUMENTS: dict[str, type] = {
 
 def documents() -> dict[str, type]:
     """All documents by command: those above, and those of the laboratory."""
-    return {**DOCUMENTS, **laboratory("compare.documents").DOCUMENTS}
+    return {**DOCUMENTS, **laboratory("documents").DOCUMENTS}
 
 
 def schema(name: str) -> dict[str, Any]:

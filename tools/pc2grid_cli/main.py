@@ -23,9 +23,8 @@ from pc2grid_cli.db_split import db_split_command
 from pc2grid_cli.demo import demo_command
 from pc2grid_cli.export import export_command
 from pc2grid_cli.info import info_command
-from pc2grid_cli.laboratory import Compare
+from pc2grid_cli.laboratory import Compare, laboratory
 from pc2grid_cli.relocalize import relocalize_command
-from pc2grid_cli.simulate import simulate_command
 from pc2grid_cli.view import view_command
 from pc2grid_cli.watch import watch_command
 
@@ -67,7 +66,7 @@ def options(
 
 
 app.command("demo", cls=Command)(demo_command)
-app.command("simulate", cls=Command)(simulate_command)
+app.command("simulate", cls=Command)(laboratory("simulate").simulate_command)
 app.command("info", cls=Command)(info_command)
 app.command("convert", cls=Command)(convert_command)
 app.command("relocalize", cls=Command)(relocalize_command)

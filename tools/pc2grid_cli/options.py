@@ -20,6 +20,14 @@ Assignments = Annotated[
 ]
 
 
+class SensorName(str, enum.Enum):
+    """The three kinds of sensor."""
+
+    lidar = "lidar"
+    depth = "depth"
+    laser = "laser"
+
+
 class PresetName(str, enum.Enum):
     """Named settings."""
 

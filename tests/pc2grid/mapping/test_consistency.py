@@ -18,7 +18,7 @@ from pc2grid.mapping.keyframes import Keyframe
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import Consistency, OccupancyGrid, SensorKind, Trajectory
 from pc2grid.pipeline import build_map
-from pc2grid.simulate import SimulationConfig, simulate_session
+from pc2grid_lab.worlds import WorldConfig, simulate_session
 
 LENGTH_M, WIDTH_M = 20.0, 2.0
 IN_PLACE = SE2()
@@ -144,8 +144,8 @@ def test_nothing_to_compare() -> None:
 
 @pytest.mark.parametrize("sensor", ["laser", "depth"])
 def test_a_simulated_drive_among_people_is_consistent(sensor: SensorKind, tmp_path: Path) -> None:
-    simulation = SimulationConfig(length_m=12.0, seed=4, clutter=20, walkers=5)
-    session = simulate_session(tmp_path / "people.mcap", sensor=sensor, config=simulation)
+    simulation = WorldConfig(length_m=12.0, seed=4, clutter=20, walkers=5)
+    session, _ = simulate_session(tmp_path / "people.mcap", sensor=sensor, config=simulation)
     with open_log(session.path) as log:
         built = build_map(log, session="people")
     assert built.consistency is not None

@@ -20,8 +20,9 @@ from pc2grid.model import Scan, SensorKind, Storey
 from pc2grid.odometry.rides import RIDES, RideWatch
 from pc2grid.odometry.tracker import Tracker
 from pc2grid.pipeline import floor_heights, floor_names
-from pc2grid.simulate import HouseConfig, HouseSession, SimulationConfig, prepare_house_session
+from pc2grid.simulate import SimulationConfig
 from pc2grid.simulate.config import DepthConfig, LidarConfig
+from pc2grid_lab.worlds import HouseConfig, HouseSession, prepare_house_session
 
 UP = np.array([0.0, 0.0, 1.0])
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))

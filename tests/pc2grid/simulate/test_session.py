@@ -171,33 +171,6 @@ def test_clutter_is_seen() -> None:
     assert np.mean(np.concatenate(away) > 0.2) > 0.005
 
 
-def test_walkers_are_seen_where_they_walk() -> None:
-    exact = {"lidar": LidarConfig(noise_m=0, dropout=0), "seed": 8}
-    alone = prepare_session(sensor="lidar", config=brief(**exact))
-    among = prepare_session(sensor="lidar", config=brief(**exact, walkers=6))
-    assert np.array_equal(alone.drive.poses, among.drive.poses)
-    seen = 0
-    for a, b in zip(alone.readings(), among.readings(), strict=True):
-        nearer = np.flatnonzero(np.isfinite(b.values_m) & (a.values_m != b.values_m))
-        assert (b.values_m[nearer] < a.values_m[nearer]).all()
-        rays = among.sensor.directions[nearer] * b.values_m[nearer, None]
-        time_s = b.time_s + among.sensor.offsets_s[nearer]
-        T = among.sensor.T_base_sensor
-        points = rays @ T[:3, :3].T + T[:3, 3]
-        pose = among.drive.at(time_s)
-        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        x = pose[:, 0] + c * points[:, 0] - s * points[:, 1]
-        y = pose[:, 1] + s * points[:, 0] + c * points[:, 1]
-        for walker in among.walkers:
-            at = walker.walk.at(time_s)
-            on_it = np.abs(np.hypot(x - at[:, 0], y - at[:, 1]) - walker.radius_m) < 1e-3
-            seen += int(on_it.sum())
-            nearer = nearer[~on_it]
-            x, y, time_s, points = x[~on_it], y[~on_it], time_s[~on_it], points[~on_it]
-        assert len(nearer) == 0
-    assert seen > 500
-
-
 def test_readings_do_not_depend_on_how_rays_are_batched(monkeypatch: pytest.MonkeyPatch) -> None:
     session = prepare_session(sensor="depth", config=brief(length_m=1.0))
     together = [reading.values_m for reading in session.readings()]
@@ -316,7 +289,7 @@ def test_command_line(tmp_path: Path) -> None:
     from typer.testing import CliRunner
 
     from pc2grid.io.nav2_map import save_map
-    from pc2grid_cli.simulate import simulate_command
+    from pc2grid_lab.simulate import simulate_command
 
     cells = np.full((120, 160), 100, np.int8)
     cells[20:100, 20:140] = 0

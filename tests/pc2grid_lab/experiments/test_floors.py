@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2
-from pc2grid.simulate import HouseConfig, SimulationConfig, prepare_house_session
+from pc2grid.simulate import SimulationConfig
 from pc2grid.simulate.config import LaserConfig
 from pc2grid.simulate.session import EPOCH_NS
 from pc2grid_lab.experiments.floors import FloorAnswer, FloorResult, FloorTask, cut_queries, share_of
+from pc2grid_lab.worlds import HouseConfig, prepare_house_session
 
 ANSWER = FloorAnswer(
     floor=1,

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pc2grid_cli.options import OUTPUT_FOLDER
+from pc2grid_cli.options import OUTPUT_FOLDER, SensorName
 from pc2grid_cli.output_files import make_folder
-from pc2grid_cli.simulate import SensorName
 
 if TYPE_CHECKING:
     from pc2grid.model import OccupancyGrid
-    from pc2grid_lab.compare.documents import CompareFloors, FloorRow
+    from pc2grid_lab.documents import CompareFloors, FloorRow
     from pc2grid_lab.experiments.floors import FloorResult, FloorTask
 
 

@@ -153,13 +153,13 @@ def _of_plan(task: dict[str, Any]) -> Row:
     from dataclasses import asdict
 
     from pc2grid.io.nav2_map import load_map
-    from pc2grid.simulate import SimulationConfig, prepare_session
     from pc2grid.simulate.config import OdometryConfig
     from pc2grid_lab.experiments.map_quality import map_simulated
     from pc2grid_lab.experiments.trajectory_error import trajectory_error
+    from pc2grid_lab.worlds import WorldConfig, prepare_session
     from signature.config import Config
 
-    simulation = SimulationConfig(
+    simulation = WorldConfig(
         length_m=task["length_m"], seed=task["seed"], odometry=OdometryConfig(enabled=task["odometry"])
     )
     session = prepare_session(sensor=task["sensor"], grid=load_map(Path(task["plan"])), config=simulation)

@@ -22,10 +22,11 @@ from pc2grid_cli.output_files import make_folder
 
 if TYPE_CHECKING:
     from pc2grid.model import SensorKind, Trajectory
-    from pc2grid.simulate import Building, SimulationConfig
+    from pc2grid.simulate import Building
     from pc2grid_lab.experiments.real_sensors import RealQuery
     from pc2grid_lab.experiments.replay import Replay
     from pc2grid_lab.experiments.sensor_map import MapKind, SensorMap
+    from pc2grid_lab.worlds import WorldConfig
 
 MAP_SEED = 1000
 """Map sessions and query sessions never share a seed: other clutter, start, direction and noise."""
@@ -77,11 +78,11 @@ class Setting:
 
     def simulation(
         self, length_m: float, seed: int, start_m: tuple[float, float] | None = None
-    ) -> SimulationConfig:
+    ) -> WorldConfig:
         """Of one drive through the scan."""
-        from pc2grid.simulate import SimulationConfig
+        from pc2grid_lab.worlds import WorldConfig
 
-        return SimulationConfig.model_validate(
+        return WorldConfig.model_validate(
             {
                 "length_m": length_m,
                 "seed": seed,
@@ -324,10 +325,10 @@ def _without_lost(trajectory: Trajectory) -> Trajectory:
 def _register(setting: Setting, sensor: SensorKind, seed: int) -> None:
     """Drive and register one query session, or a window of the log, unless it was done before."""
     from pc2grid.io import open_log
-    from pc2grid.simulate import iter_session
     from pc2grid.time_span import TimeSpan
     from pc2grid_lab.experiments.registered_session import register
     from pc2grid_lab.experiments.sensor_matrix import query_start
+    from pc2grid_lab.worlds import iter_session
     from signature.config import Config
 
     target, config = setting.session_file(sensor, seed), Config()

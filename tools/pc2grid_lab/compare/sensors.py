@@ -19,10 +19,10 @@ from pc2grid_cli.output_files import make_folder
 
 if TYPE_CHECKING:
     from pc2grid.model import SensorKind
-    from pc2grid.simulate import SimulationConfig
     from pc2grid_lab.experiments.ablation import Independence
     from pc2grid_lab.experiments.sensor_map import SensorMap
     from pc2grid_lab.experiments.trial import Trial
+    from pc2grid_lab.worlds import WorldConfig
 
 Setting = dict[str, float]
 
@@ -183,10 +183,10 @@ def _document(
     }
 
 
-def _mean_change(plan: Path, sessions: Sequence[SimulationConfig]) -> dict[str, float]:
+def _mean_change(plan: Path, sessions: Sequence[WorldConfig]) -> dict[str, float]:
     """What differs in a session from the plan, and its clutter: mean of some sessions."""
     from pc2grid.io.nav2_map import load_map
-    from pc2grid.simulate import prepare_session
+    from pc2grid_lab.worlds import prepare_session
 
     grid = load_map(plan)
     prepared = [prepare_session(sensor="laser", grid=grid, config=config) for config in sessions]
@@ -233,17 +233,17 @@ def _tag(setting: Setting) -> str:
     return ".".join(f"{key}{value:g}" for key, value in sorted(setting.items()))
 
 
-def _mapping(setting: Setting) -> SimulationConfig:
+def _mapping(setting: Setting) -> WorldConfig:
     return _simulation(setting, setting["map_length"], MAP_SEED)
 
 
 def _simulation(
     setting: Setting, length_m: float, seed: int, start_m: tuple[float, float] | None = None
-) -> SimulationConfig:
-    from pc2grid.simulate import SimulationConfig
+) -> WorldConfig:
+    from pc2grid_lab.worlds import WorldConfig
 
     rate = {"rate_hz": setting["rate"]}
-    return SimulationConfig.model_validate(
+    return WorldConfig.model_validate(
         {
             "length_m": length_m,
             "seed": seed,

@@ -16,10 +16,10 @@ from pc2grid_cli.output_files import make_folder
 if TYPE_CHECKING:
     from pc2grid.geometry import SE2
     from pc2grid.model import OccupancyGrid, SensorKind
-    from pc2grid.simulate import SimulationConfig
     from pc2grid_lab.experiments.registered_session import RegisteredSession
     from pc2grid_lab.experiments.selection import Recalled, Selected
     from pc2grid_lab.experiments.sensor_map import SensorMap
+    from pc2grid_lab.worlds import WorldConfig
     from signature.config import Config
     from signature.relocalization.map_index import MapIndex
     from signature.relocalization.query_map import QueryMap
@@ -237,10 +237,10 @@ def _tag(setting: dict[str, float]) -> str:
 
 def _simulation(
     setting: dict[str, float], length_m: float, seed: int, start_m: tuple[float, float] | None = None
-) -> SimulationConfig:
-    from pc2grid.simulate import SimulationConfig
+) -> WorldConfig:
+    from pc2grid_lab.worlds import WorldConfig
 
-    return SimulationConfig.model_validate(
+    return WorldConfig.model_validate(
         {
             "length_m": length_m,
             "seed": seed,

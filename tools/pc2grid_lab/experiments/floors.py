@@ -23,12 +23,12 @@ from pc2grid.geometry import SE2
 from pc2grid.io.atomic import replace_file
 from pc2grid.model import Scan, SensorKind, Trajectory
 from pc2grid.pipeline import follow
-from pc2grid.simulate import HouseConfig, SimulationConfig, prepare_house_session, simulate_session
+from pc2grid.simulate import SimulationConfig
 from pc2grid.simulate.config import DepthConfig, LaserConfig, LidarConfig
-from pc2grid.simulate.house import HouseSession
 from pc2grid.simulate.session import EPOCH_NS
 from pc2grid_lab.experiments.calibration import share_by_session
 from pc2grid_lab.experiments.program import program_digest
+from pc2grid_lab.worlds import HouseConfig, HouseSession, prepare_house_session, simulate_session
 from signature.config import Config
 from signature.database import Label, open_database
 from signature.files import convert, query_config

@@ -23,7 +23,8 @@ from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, SensorKin
 from pc2grid.pipeline import follow
 
 if TYPE_CHECKING:
-    from pc2grid.simulate import Building, SimulationConfig
+    from pc2grid.simulate import Building
+    from pc2grid_lab.worlds import WorldConfig
 
 _FITTED_M = 3.0  # length of the path that the true frame is fitted over; chosen by hand
 
@@ -183,13 +184,13 @@ def register(
 def simulate_and_register(
     plan: OccupancyGrid | Building,
     sensor: SensorKind,
-    simulation: SimulationConfig,
+    simulation: WorldConfig,
     config: Config,
     *,
     until_m: float = math.inf,
 ) -> RegisteredSession:
     """Simulate a session in a floor plan and register it."""
-    from pc2grid.simulate import iter_session
+    from pc2grid_lab.worlds import iter_session
 
     scans = iter_session(sensor=sensor, grid=plan, config=simulation)
     return register(scans, config, sensor=sensor, until_m=until_m)

@@ -24,7 +24,8 @@ from signature.config import Config
 from signature.relocalization.relocalizer import Asked, localize
 
 if TYPE_CHECKING:
-    from pc2grid.simulate import Building, SimulationConfig
+    from pc2grid.simulate import Building
+    from pc2grid_lab.worlds import WorldConfig
 
 SENSORS: tuple[SensorKind, ...] = ("lidar", "laser", "depth")
 TRAVELS_M = (1.0, 3.0, 5.0, 8.0, 10.0, 15.0)
@@ -35,7 +36,7 @@ def map_building(
     name: str,
     plan: OccupancyGrid | Building,
     sensor: SensorKind,
-    simulation: SimulationConfig,
+    simulation: WorldConfig,
     config: Config,
 ) -> tuple[SessionMap, SE2]:
     """The map of a simulated session in a floor plan, and T_plan_map, the frame of the map in the plan.
@@ -43,7 +44,7 @@ def map_building(
     The frame is fitted over the whole trajectory, as for an absolute trajectory error: if it rested on the
     heading of the first scan alone, an error of that heading would move distant places by much.
     """
-    from pc2grid.simulate import iter_session
+    from pc2grid_lab.worlds import iter_session
 
     true_m: list[tuple[float, float]] = []
 
@@ -64,12 +65,12 @@ def map_building(
     return session_map, SE2.fit(trajectory.planar()[:, :2], np.array(true_m))
 
 
-def query_start(plan: OccupancyGrid | Building, mapping: SimulationConfig, seed: int) -> tuple[float, float]:
+def query_start(plan: OccupancyGrid | Building, mapping: WorldConfig, seed: int) -> tuple[float, float]:
     """(x, y) in the plan where query session `seed` starts, drawn from the path of the mapping session.
 
     A query from where the mapping robot has never been has no right answer.
     """
-    from pc2grid.simulate import prepare_session
+    from pc2grid_lab.worlds import prepare_session
 
     path = prepare_session(sensor="laser", grid=plan, config=mapping).drive
     rng = np.random.default_rng([seed, mapping.seed])

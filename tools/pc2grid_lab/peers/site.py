@@ -42,7 +42,7 @@ from signature.sessions import digest_of
 
 if TYPE_CHECKING:
     from pc2grid.io import Log
-    from pc2grid.simulate import SimulationConfig
+    from pc2grid_lab.worlds import WorldConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -217,13 +217,14 @@ def simulated_site(
     building_file: Path, folder: Path, config: Config, *, queries: int, travel_m: float
 ) -> Site:
     """The site of a lidar that is simulated in a real 3D scan of a building (PLY, PCD or a mesh)."""
-    from pc2grid.simulate import iter_session, load_building
+    from pc2grid.simulate import load_building
+    from pc2grid_lab.worlds import iter_session
 
     building = load_building(building_file)
     site = Site(name=building_file.stem, sensor="lidar", folder=folder)
     mapping = _simulation(SITE.map_length_m, SITE.map_seed)
 
-    def drive(simulation: SimulationConfig) -> Iterator[PosedScan]:
+    def drive(simulation: WorldConfig) -> Iterator[PosedScan]:
         for scan, truth in iter_session(sensor="lidar", grid=building, config=simulation):
             yield scan, truth.lift()
 
@@ -237,11 +238,11 @@ def simulated_site(
     return site
 
 
-def _simulation(length_m: float, seed: int, start_m: tuple[float, float] | None = None) -> SimulationConfig:
-    from pc2grid.simulate import SimulationConfig
+def _simulation(length_m: float, seed: int, start_m: tuple[float, float] | None = None) -> WorldConfig:
+    from pc2grid_lab.worlds import WorldConfig
 
     lidar = {"rate_hz": SITE.rate_hz, "columns": SITE.columns}
-    return SimulationConfig.model_validate(
+    return WorldConfig.model_validate(
         {"length_m": length_m, "seed": seed, "clutter": SITE.clutter, "start_m": start_m, "lidar": lidar}
     )
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from pc2grid.arrays import F32, U8
 from pc2grid.model import OccupancyGrid
-from pc2grid.simulate.change import GLASS, MIRROR
 from pc2grid.simulate.scene import Scene
+from pc2grid_lab.worlds.change import GLASS, MIRROR
 
 _SEEN_COS = math.cos(math.radians(5.0))  # glass is seen within this of its normal
 _HEIGHT_M = (0.05, 2.1)  # of a pane above the floor

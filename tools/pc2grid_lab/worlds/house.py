@@ -21,7 +21,6 @@ from pc2grid.config import Section
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import transform_points
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, Scan, SensorKind
-from pc2grid.simulate.change import NO_CHANGE, Change
 from pc2grid.simulate.clutter import Furniture, covered, place_clutter
 from pc2grid.simulate.config import SimulationConfig
 from pc2grid.simulate.drive import RATE_HZ, Drive, drive_along
@@ -326,7 +325,6 @@ class HouseSession:
     drive: SpatialDrive
     odometry: Odometry | None
     config: SimulationConfig
-    change: Change = NO_CHANGE
 
     @property
     def scan_count(self) -> int:

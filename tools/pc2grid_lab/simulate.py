@@ -9,18 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pc2grid_cli import console
-from pc2grid_cli.options import AsJson, Force
+from pc2grid_cli.options import AsJson, Force, SensorName
 
 if TYPE_CHECKING:
-    from pc2grid_cli.json_schemas import Simulate
-
-
-class SensorName(str, enum.Enum):
-    """The three kinds of sensor."""
-
-    lidar = "lidar"
-    depth = "depth"
-    laser = "laser"
+    from pc2grid_lab.documents import Simulate
 
 
 class RideName(str, enum.Enum):
@@ -79,8 +71,9 @@ def simulate_command(
 
     from pc2grid.errors import ConfigError
     from pc2grid.io.atomic import require_writable
-    from pc2grid.simulate import HouseConfig, SimulationConfig, load_building, simulate_session
-    from pc2grid.simulate.config import ChangeConfig, OdometryConfig
+    from pc2grid.simulate import load_building
+    from pc2grid.simulate.config import OdometryConfig
+    from pc2grid_lab.worlds import ChangeConfig, HouseConfig, WorldConfig, simulate_session
 
     if len(files) > 2:
         raise typer.BadParameter(f"expected [BUILDING] OUT.mcap, got {len(files)} files")
@@ -90,7 +83,7 @@ def simulate_command(
         require_writable(path, force)
     grid = load_building(files[0]) if len(files) == 2 else None
     try:
-        config = SimulationConfig(
+        config = WorldConfig(
             length_m=length,
             seed=seed,
             clutter=clutter,
@@ -114,7 +107,7 @@ def simulate_command(
             raise typer.BadParameter("--glass, --mirrors and --start are for a single floor")
         house = HouseConfig(visits=tuple(range(floors)), ride=ride.value, slope=slope, alike=alike)
     with console.of(context).progress(f"simulate {sensor.value}") as update:
-        made = simulate_session(
+        made, differs = simulate_session(
             files[-1],
             sensor=sensor.value,
             grid=grid,
@@ -135,11 +128,11 @@ def simulate_command(
             "duration_s": made.duration_s,
             "length_m": made.length_m,
             "clutter": made.clutter,
-            "change": made.change.counts(),
+            "change": differs.counts(),
         }
         console.print_json(document)
         return
     print(f"{made.path}: {made.scans} {made.sensor} scans, {made.length_m:.1f} m in {made.duration_s:.1f} s")
     if change or relief or glass or mirrors:
-        print(f"against the building as drawn: {made.change.describe()}")
+        print(f"against the building as drawn: {differs.describe()}")
     print(f"{made.truth_path}: {made.scans} true poses of base_link in the map frame")

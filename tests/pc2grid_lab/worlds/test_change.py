@@ -10,11 +10,12 @@ import pytest
 
 from pc2grid.arrays import F32
 from pc2grid.model import OCCUPIED, OccupancyGrid
-from pc2grid.simulate import Building, ChangeConfig, SimulationConfig, office_floorplan, prepare_session
-from pc2grid.simulate.change import GLASS, MIRROR, NO_CHANGE, Change, change_building
-from pc2grid.simulate.doors import find_doorways
-from pc2grid.simulate.panes import Panes
+from pc2grid.simulate import Building, office_floorplan
 from pc2grid.simulate.scene import Mesh, Scene, extrude
+from pc2grid_lab.worlds import ChangeConfig, WorldConfig, prepare_session
+from pc2grid_lab.worlds.change import GLASS, MIRROR, NO_CHANGE, Change, change_building
+from pc2grid_lab.worlds.doors import find_doorways
+from pc2grid_lab.worlds.panes import Panes
 from tests.helpers.building_clouds import ROOM_M, room_cloud
 from tests.helpers.simulated_drives import office, plan
 
@@ -49,7 +50,7 @@ def test_nothing_changes_unless_asked_for() -> None:
     grid = office()
     same, shell, change = changed(grid)
     assert same is grid and shell is None and change is NO_CHANGE
-    session = prepare_session(sensor="laser", grid=grid, config=SimulationConfig(length_m=2.0))
+    session = prepare_session(sensor="laser", grid=grid, config=WorldConfig(length_m=2.0))
     assert session.objects == session.clutter
 
 
@@ -67,9 +68,7 @@ def test_doors_differ_from_session_to_session() -> None:
 
 def test_closed_doors_leave_the_robot_room() -> None:
     for seed in range(3):
-        config = SimulationConfig(
-            length_m=4.0, clutter=0, seed=seed, change=ChangeConfig(doors=1.0, closed=1.0)
-        )
+        config = WorldConfig(length_m=4.0, clutter=0, seed=seed, change=ChangeConfig(doors=1.0, closed=1.0))
         session = prepare_session(sensor="laser", grid=office(), config=config)
         assert session.change.closed > 0
         leaves = [f for f in session.change.added if f.kind == "door"]
@@ -106,9 +105,7 @@ def test_relief_belongs_to_the_building() -> None:
         prepare_session(
             sensor="laser",
             grid=grid,
-            config=SimulationConfig(
-                length_m=2.0, seed=seed, clutter=0, change=ChangeConfig(relief_per_m=0.3)
-            ),
+            config=WorldConfig(length_m=2.0, seed=seed, clutter=0, change=ChangeConfig(relief_per_m=0.3)),
         )
         for seed in (1, 2)
     )
@@ -153,7 +150,7 @@ def test_panes_cover_about_the_share_asked_for() -> None:
     _, _, change = changed(grid, glass=0.1, mirrors=0.02)
     assert change.kind is not None
     assert change.glass_m > 3 * change.mirror_m > 0
-    config = SimulationConfig(length_m=2.0, clutter=0, change=ChangeConfig(glass=0.3))
+    config = WorldConfig(length_m=2.0, clutter=0, change=ChangeConfig(glass=0.3))
     session = prepare_session(sensor="lidar", grid=grid, config=config)
     first = [scan.points_m for scan, _ in session.scans()]
     again = [scan.points_m for scan, _ in session.scans()]

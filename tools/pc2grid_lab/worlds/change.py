@@ -17,10 +17,10 @@ from pc2grid.arrays import F64, U8, BoolGrid
 from pc2grid.geometry import SE2
 from pc2grid.model import FREE, OccupancyGrid
 from pc2grid.simulate.clutter import KINDS, Furniture, Prism
-from pc2grid.simulate.config import ChangeConfig
-from pc2grid.simulate.doors import find_doorways, open_angle
 from pc2grid.simulate.passage import clearance_m, outline_mask
 from pc2grid.simulate.scene import Mesh
+from pc2grid_lab.worlds.config import ChangeConfig
+from pc2grid_lab.worlds.doors import find_doorways, open_angle
 
 OPAQUE, GLASS, MIRROR = 0, 1, 2
 

@@ -1,4 +1,4 @@
-"""The JSON documents of the `compare` commands as types; see `pc2grid_cli.json_schemas`."""
+"""The JSON documents of the commands of the laboratory as types; see `pc2grid_cli.json_schemas`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,21 @@ from pc2grid_lab.experiments.real_sensors import RealCell
 from pc2grid_lab.experiments.trial import Trial
 from pc2grid_lab.peers.outcome import PeerCell, PeerTrial
 from signature.relocalization.answer_json import Version
+
+
+class Simulate(TypedDict):
+    """`pc2grid simulate --json`; clutter: objects that could be placed. change: what differs from the
+    building as drawn, counts and metres, and the share of its visible walls."""
+
+    schema_version: Version
+    recording: str
+    truth: str
+    sensor: str
+    scans: int
+    duration_s: float
+    length_m: float
+    clutter: int
+    change: dict[str, float]
 
 
 class CompareLog(TypedDict):
@@ -216,5 +231,6 @@ DOCUMENTS: dict[str, type] = {
     "compare-real": CompareReal,
     "compare-sensors": CompareSensors,
     "compare-signatures": CompareSignatures,
+    "simulate": Simulate,
 }
 """By command."""
