@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, I64, BoolGrid
+from pc2grid.arrays import F32, I64, BoolGrid, cells_of
 from pc2grid.model import Submap
 from pc2grid.submaps.sampling import sample_evenly
-from pc2grid.submaps.skeleton import cells_of, thin
+from pc2grid.submaps.skeleton import thin
 from signature.config import SignatureConfig
 
 ROUNDING_BINS = 1e-6

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64, BoolGrid
+from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
 from pc2grid.model import OccupancyGrid, Submap
 from pc2grid.submaps.sampling import sample_evenly
-from pc2grid.submaps.skeleton import cells_of, skeleton_of
+from pc2grid.submaps.skeleton import skeleton_of
 from signature.boundary import ROUNDING_BINS, normalized
 from signature.config import SignatureConfig
 

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pc2grid.arrays import F32, F64, I64, BoolGrid
-from pc2grid.submaps.skeleton import cells_of
+from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
 from signature.config import SignatureConfig
 
 _DIRECTIONS = 180

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pc2grid.arrays import F64, BoolGrid
+from pc2grid.arrays import F64, BoolGrid, cells_of
 from pc2grid.config import PartitionConfig
 from pc2grid.model import UNKNOWN, OccupancyGrid, Submap
 from pc2grid.submaps.junction_graph import graph_of_skeleton, map_skeleton
 from pc2grid.submaps.sampling import sample_evenly
-from pc2grid.submaps.skeleton import cells_of, clearance_of
+from pc2grid.submaps.skeleton import clearance_of
 
 if TYPE_CHECKING:
     import networkx as nx

@@ -167,8 +167,3 @@ def pixel_steps(skeleton: BoolGrid) -> tuple[I64, I64, F64]:
         lengths.append(np.full(len(firsts[-1]), length))
     steps = np.column_stack((np.concatenate(firsts), np.concatenate(seconds)))
     return np.column_stack(np.divmod(at, width)) - 1, steps, np.concatenate(lengths)
-
-
-def cells_of(mask: BoolGrid) -> I64:
-    """Set cells (N, 2) of a mask as (row, column), row by row: `np.argwhere`, ten times as fast."""
-    return np.column_stack(np.divmod(np.flatnonzero(mask), max(mask.shape[1], 1)))

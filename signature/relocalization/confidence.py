@@ -15,7 +15,7 @@
   score for this very query. The score is a mean over wall points, so by chance it varies as 1 / sqrt(n), and
   t is the lead in units of that. However well two equal places fit, each is right with a probability of at
   most one half: that is the factor "tie".
-- like, how well the query fits onto itself, slid along (`signature.verification.self_likeness`): walls of a
+- like, how well the query fits onto itself, slid along (`pc2grid.matching.self_likeness`): walls of a
   bare corridor fit at many places along it and in other corridors, and tell none of them from another. So
   they are not counted among the wall points that make a lead surer; like^2 is the share of them, as the
   square of a correlation is the share of a variance that it explains.
@@ -83,13 +83,13 @@ LIMITS = EvidenceParameters()
 class Evidence:
     """What the decision is made from.
 
-    forward : of the best hypothesis, `signature.verification.two_way_score.Fit.known_agreement`.
+    forward : of the best hypothesis, `pc2grid.matching.two_way_score.Fit.known_agreement`.
     walls : wall points (0.1 m apart) of the query that lie on ground known to it, weighted by
-        `signature.verification.walls.steadiness`; `forward` rests on them.
+        `pc2grid.matching.walls.steadiness`; `forward` rests on them.
     backward : the agreement the other way round. looked_at : wall points of the map that it rests on.
     lead : two-way score of the best hypothesis less that of the best one at another place;
         if there is no other, what an unreported one may lie behind (`EvidenceParameters.unreported`).
-    likeness : `signature.verification.self_likeness` of the query.
+    likeness : `pc2grid.matching.self_likeness` of the query.
     """
 
     forward: float

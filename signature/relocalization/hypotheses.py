@@ -10,14 +10,14 @@ import numpy as np
 
 from pc2grid.arrays import F32, F64
 from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.matching.refinement import refine
+from pc2grid.matching.two_way_score import Fit, score_fit
+from pc2grid.matching.walls import thin_evenly
+from pc2grid.matching.window_search import SearchMap, SearchParameters, search_windows
 from signature.config import RelocalizeConfig
 from signature.relocalization.query_map import QueryMap
 from signature.retrieval.viewpoints import Places
 from signature.retrieval.vote import Proposal
-from signature.verification.refinement import refine
-from signature.verification.two_way_score import Fit, score_fit
-from signature.verification.walls import thin_evenly
-from signature.verification.window_search import SearchMap, SearchParameters, search_windows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

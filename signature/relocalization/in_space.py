@@ -17,13 +17,13 @@ import numpy as np
 from pc2grid.arrays import F64
 from pc2grid.clouds.voxel_cloud import VoxelCloud
 from pc2grid.geometry import SE2, transform_points
+from pc2grid.matching.icp_in_space import RAYS, SpatialFit, SpatialView, register_in_space
 from pc2grid.model import Health, PointMap, RegisteredScan
 from signature.database.protocol import SubmapDatabase
 from signature.relocalization.answer import Answer
 from signature.relocalization.confidence import LIMITS
 from signature.relocalization.hypotheses import Hypothesis
 from signature.relocalization.pose_in_space import PoseInSpace, SpaceStatus
-from signature.verification.registration import RAYS, SpatialFit, SpatialView, register_in_space
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,6 +14,10 @@ import numpy as np
 from pc2grid.arrays import F64, I64, BoolGrid
 from pc2grid.errors import ConfigError, DatabaseCorrupt
 from pc2grid.geometry import SE2
+from pc2grid.matching.refinement import refine
+from pc2grid.matching.two_way_score import Fit, score_fit
+from pc2grid.matching.walls import Walls
+from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import UNKNOWN, OccupancyGrid, same_recording
 from pc2grid.observer import Observer
 from signature.config import Config
@@ -37,10 +41,6 @@ from signature.retrieval.viewpoints import AT_ONCE_M2, Places
 from signature.retrieval.vote import retrieve
 from signature.seen_places import SeenPlaces
 from signature.similarity import SignatureTable
-from signature.verification.refinement import refine
-from signature.verification.two_way_score import Fit, score_fit
-from signature.verification.walls import Walls
-from signature.verification.window_search import SearchMap
 
 if TYPE_CHECKING:
     from signature.database import SubmapDatabase

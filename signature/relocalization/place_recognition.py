@@ -19,6 +19,7 @@ import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.mapping.place_recognition import Recognition, Stretch
+from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
 from signature.relocalization.confidence import SAME_PLACE
@@ -27,7 +28,6 @@ from signature.relocalization.query_map import QueryMap, query_of
 from signature.retrieval.viewpoints import Places
 from signature.retrieval.vote import retrieve
 from signature.similarity import SignatureTable
-from signature.verification.window_search import SearchMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

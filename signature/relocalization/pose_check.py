@@ -19,6 +19,7 @@ import numpy as np
 
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import RegisteredScan
 from signature.relocalization.answer import Answer
 from signature.relocalization.confidence import LIMITS
@@ -27,7 +28,6 @@ from signature.relocalization.map_index import MapIndex
 from signature.relocalization.prior import Prior
 from signature.relocalization.query_map import QueryMap
 from signature.relocalization.relocalizer import Query, Search
-from signature.verification.two_way_score import score_fit
 
 if TYPE_CHECKING:
     from signature.relocalization.relocalizer import Watch

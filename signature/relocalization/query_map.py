@@ -13,22 +13,22 @@ from functools import cached_property
 
 import numpy as np
 
-from pc2grid.arrays import F64
+from pc2grid.arrays import F64, cells_of
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import PartitionConfig, ProjectionConfig
 from pc2grid.geometry import SE2
 from pc2grid.mapping.occupancy import GridBuilder
+from pc2grid.matching.self_likeness import self_likeness
+from pc2grid.matching.walls import Walls
 from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.isovist import HIDDEN, isovist, look_around
 from pc2grid.submaps.partition import view_at
 from pc2grid.submaps.sampling import sample_evenly
-from pc2grid.submaps.skeleton import cells_of, skeleton_of
+from pc2grid.submaps.skeleton import skeleton_of
 from signature.config import RelocalizeConfig, SignatureConfig
 from signature.describe import describe
 from signature.retrieval.view import View
 from signature.seen_places import PROFILE_BEARINGS
-from signature.verification.self_likeness import self_likeness
-from signature.verification.walls import Walls
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +78,7 @@ class QueryMap:
 
     @cached_property
     def likeness(self) -> float:
-        """`signature.verification.self_likeness` of the walls."""
+        """`pc2grid.matching.self_likeness` of the walls."""
         return self_likeness(self.walls)
 
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from pc2grid.matching.agreement import Agreement
     from signature.database import SubmapDatabase
     from signature.relocalization.answer import Answer
-    from signature.verification.agreement import Agreement
 
 
 def agreements(answer: Answer, database: SubmapDatabase) -> tuple[Agreement, ...]:
     """For each hypothesis of an answer, best first, what supports and what contradicts it."""
-    from signature.verification.agreement import agreement
-    from signature.verification.walls import Walls
+    from pc2grid.matching.agreement import agreement
+    from pc2grid.matching.walls import Walls
 
     query = Walls.of(answer.local_map)
     indices = {hypothesis.session_index for hypothesis in answer.hypotheses}

@@ -16,17 +16,17 @@ from pc2grid_cli.plural import counted
 if TYPE_CHECKING:
     from pc2grid.arrays import F64, U8
     from pc2grid.geometry import SE2
+    from pc2grid.matching.agreement import Agreement
     from pc2grid.model import OccupancyGrid, Trajectory
     from signature.database import SubmapDatabase
     from signature.relocalization.answer import Answer
     from signature.relocalization.hypotheses import Hypothesis
-    from signature.verification.agreement import Agreement
 
 BLUE, ORANGE, GREEN, VERMILLION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
 YELLOW = "#F0E442"
 GREY = "#777777"
 SUPPORT_COLOURS = {"FITS": GREEN, "CONTRADICTED": VERMILLION, "UNKNOWN": BLUE}
-"""Of the query's wall points, by the name of their `signature.verification.agreement.Support`."""
+"""Of the query's wall points, by the name of their `pc2grid.matching.agreement.Support`."""
 MISSED_COLOUR = ORANGE
 """Of the map's wall points where the query saw free ground."""
 _SUPPORT_LABELS = {
@@ -148,7 +148,7 @@ def draw_answer(
 
 def _title(answer: Answer, session: str, compared: Agreement | None) -> str:
     """The answer, and what it rests on."""
-    from signature.verification.agreement import Support
+    from pc2grid.matching.agreement import Support
 
     said = {"located": f"located in {session}", "ambiguous": "ambiguous", "not_found": "not found"}
     title = f"{said[answer.status]}, confidence {probability(answer.confidence)}"
@@ -248,7 +248,7 @@ def _draw_way(axes: Any, database: SubmapDatabase, session: str) -> None:
 
 def _draw_agreement(axes: Any, best: Hypothesis, compared: Agreement, *, point_size: float) -> None:
     """The query's walls at a hypothesis, and the map's walls that it should have seen."""
-    from signature.verification.agreement import Support
+    from pc2grid.matching.agreement import Support
 
     points_m = best.fit.T_map_query.apply(compared.points_m)
     for kind in (Support.FITS, Support.CONTRADICTED, Support.UNKNOWN):

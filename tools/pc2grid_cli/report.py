@@ -18,11 +18,11 @@ import numpy as np
 
 from pc2grid._version import __version__
 from pc2grid.io.atomic import replace_file
+from pc2grid.matching.agreement import Support
 from pc2grid_cli.deviation import deviation
 from pc2grid_cli.evidence import agreements
 from pc2grid_cli.picture import shades
 from pc2grid_cli.submap_sources import similar_places, sources
-from signature.verification.agreement import Support
 
 if TYPE_CHECKING:
     import networkx as nx

@@ -181,7 +181,7 @@ class Search:
 
     def _show_evidence(self, answer: Answer, session: str) -> None:
         """Per hypothesis in this session, best first, what supports and what contradicts it."""
-        from signature.verification.agreement import Support
+        from pc2grid.matching.agreement import Support
 
         rr = require_rerun()
         colours = {int(kind): _rgb(SUPPORT_COLOURS[kind.name])[0] for kind in Support}

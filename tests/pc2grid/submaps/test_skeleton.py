@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from pc2grid.arrays import cells_of
 from pc2grid.submaps.sampling import sample_evenly
 from pc2grid.submaps.skeleton import (
     _DELETABLE,
     Thinning,
-    cells_of,
     clearance_of,
     junctions_and_ends,
     pixel_steps,

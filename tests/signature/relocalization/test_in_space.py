@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2, invert_pose
+from pc2grid.matching.icp_in_space import register_in_space
+from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import Health, OccupancyGrid, PointMap
 from signature.database import Label
 from signature.relocalization.answer import Answer
 from signature.relocalization.confidence import NO_EVIDENCE
 from signature.relocalization.hypotheses import Hypothesis
 from signature.relocalization.in_space import QueryInSpace, settle_in_space
-from signature.verification.registration import register_in_space
-from signature.verification.two_way_score import Fit
 from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, furnished_map, twin_map
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
+from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import FREE, Health, OccupancyGrid, RegisteredScan
 from signature.config import Config
 from signature.database import Label
@@ -23,7 +24,6 @@ from signature.relocalization.confidence import NO_EVIDENCE
 from signature.relocalization.hypotheses import Hypothesis, fitted
 from signature.relocalization.query_map import QueryMap, QueryWindow
 from signature.relocalization.relocalizer import Answer, MapIndex, Query, Relocalizer, Search, localize
-from signature.verification.two_way_score import Fit
 from tests.helpers.simulated_drives import building, drive, office, plan
 
 OFFICE = building({"office": office()})

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from pc2grid.arrays import F32, F64
+from pc2grid.arrays import F32, F64, cells_of
 from pc2grid.errors import ConfigError
 from pc2grid.model import Submap
 from pc2grid.submaps.sampling import sample_evenly
-from pc2grid.submaps.skeleton import cells_of, thin
+from pc2grid.submaps.skeleton import thin
 
 _FARTHEST = 1e6
 """Distance of a shape with too few points to be compared; OpenCV's are below some 10,000."""

@@ -19,10 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64
+from pc2grid.arrays import F32, F64, cells_of
 from pc2grid.model import Submap
 from pc2grid.submaps.sampling import sample_evenly
-from pc2grid.submaps.skeleton import cells_of, thin
+from pc2grid.submaps.skeleton import thin
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -17,9 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pc2grid.arrays import F32, F64, I64, BoolGrid
+from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
 from pc2grid.model import Submap
-from pc2grid.submaps.skeleton import cells_of
 
 _GRID, _ORIENTATIONS = 4, 8
 """SIFT's layout (Lowe 2004): 4 x 4 fields with 8 directions each."""

@@ -13,14 +13,14 @@ import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
+from pc2grid.matching.refinement import refine
+from pc2grid.matching.two_way_score import score_fit
+from pc2grid.matching.walls import Walls, thin_evenly
+from pc2grid.matching.window_search import SearchMap, SearchParameters, search_windows
 from pc2grid.model import Submap
 from pc2grid_lab.baselines import Matcher
 from pc2grid_lab.baselines.proposed import Proposed
 from signature.config import SignatureConfig
-from signature.verification.refinement import refine
-from signature.verification.two_way_score import score_fit
-from signature.verification.walls import Walls, thin_evenly
-from signature.verification.window_search import SearchMap, SearchParameters, search_windows
 
 _HALF_T_M, _HALF_A_RAD = 0.5, math.radians(7.5)
 

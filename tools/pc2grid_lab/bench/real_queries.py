@@ -27,6 +27,7 @@ from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
+from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import OccupancyGrid
 from pc2grid.odometry.tracker import Tracker
 from pc2grid.submaps.partition import partition
@@ -38,7 +39,6 @@ from signature.relocalization.confidence import Evidence
 from signature.relocalization.map_index import MapIndex, unseen_by
 from signature.relocalization.query_map import QueryMap, QueryWindow
 from signature.similarity import SignatureTable
-from signature.verification.two_way_score import score_fit
 
 MAPPED_S = {"fr079": 600.0, "intel": 900.0, "csail": 250.0, "killian": 900.0}
 """Seconds of each log that become the map."""

@@ -16,6 +16,7 @@ from pc2grid.clouds.voxel_cloud import VoxelCloud
 from pc2grid.geometry import SE2, invert_pose, rotation_vector, transform_points
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
+from pc2grid.matching.icp_in_space import SpatialView, register_in_space
 from pc2grid.model import PointMap, Scan, SensorKind
 from pc2grid.pipeline import follow
 from pc2grid.simulate import SimulationConfig, iter_session, office_floorplan, simulate_session
@@ -27,7 +28,6 @@ from signature.database import open_database
 from signature.relocalization.in_space import QueryInSpace, winner
 from signature.relocalization.relocalizer import relocalize
 from signature.sessions import add_sessions, build_session
-from signature.verification.registration import SpatialView, register_in_space
 
 VOXEL_M = 0.05
 _NEAR_M = 4.0

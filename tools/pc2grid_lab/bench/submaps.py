@@ -12,6 +12,9 @@ import numpy as np
 from pc2grid.arrays import F32, F64
 from pc2grid.config import PartitionConfig
 from pc2grid.geometry import SE2
+from pc2grid.matching.refinement import refine
+from pc2grid.matching.two_way_score import Fit, score_fit
+from pc2grid.matching.window_search import SearchMap, SearchParameters, search_windows
 from pc2grid.simulate import office_floorplan
 from pc2grid.submaps.isovist import HIDDEN, Isovist, isovist
 from pc2grid.submaps.partition import submap_centers, view_at
@@ -22,9 +25,6 @@ from signature.describe import describe
 from signature.relocalization.hypotheses import coarse_points
 from signature.relocalization.query_map import QueryMap
 from signature.retrieval.likeness import rotate_and_compare
-from signature.verification.refinement import refine
-from signature.verification.two_way_score import Fit, score_fit
-from signature.verification.window_search import SearchMap, SearchParameters, search_windows
 
 _ONE = SearchParameters(most=1)
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import SensorKind
 from pc2grid_lab.experiments.ablation import ranks
 from pc2grid_lab.experiments.sensor_map import SensorMap
@@ -14,7 +15,6 @@ from pc2grid_lab.experiments.trial import JUDGEMENT, Trial
 from signature.relocalization.query_map import QueryMap
 from signature.relocalization.relocalizer import Answer
 from signature.retrieval.vote import retrieve
-from signature.verification.two_way_score import score_fit
 
 
 def judge(

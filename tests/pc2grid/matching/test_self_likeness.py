@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pc2grid.matching.self_likeness import self_likeness
+from pc2grid.matching.walls import Walls
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from signature.verification.self_likeness import self_likeness
-from signature.verification.walls import Walls
 
 RESOLUTION_M = 0.05
 

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, I64, BoolGrid
-from pc2grid.mapping.likelihood_field import LikelihoodField, padded_grid
+from pc2grid.arrays import F32, I64, BoolGrid, cells_of
+from pc2grid.matching.likelihood_field import LikelihoodField, padded_grid
 from pc2grid.model import OccupancyGrid
-from pc2grid.submaps.skeleton import cells_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2
-from pc2grid.mapping.likelihood_field import LIKELIHOOD
+from pc2grid.matching.likelihood_field import LIKELIHOOD
+from pc2grid.matching.refinement import refine
+from pc2grid.matching.two_way_score import score_fit
+from pc2grid.matching.walls import Walls
+from pc2grid.matching.window_search import SearchMap, search_windows
 from pc2grid.model import UNKNOWN, OccupancyGrid
-from signature.verification.refinement import refine
-from signature.verification.two_way_score import score_fit
-from signature.verification.walls import Walls
-from signature.verification.window_search import SearchMap, search_windows
 from tests.helpers.simulated_drives import office, office_part
 
 OFFICE = office()

@@ -13,7 +13,7 @@ import numpy as np
 
 from pc2grid.arrays import F32, F64, U8
 from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.mapping.likelihood_field import LikelihoodField
+from pc2grid.matching.likelihood_field import LikelihoodField
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,7 +94,7 @@ def gauss_newton(
 
     values : (H, W) uint8 likelihood field.
     """
-    from signature.verification._kernels import normal_equations
+    from pc2grid.matching._kernels import normal_equations
 
     pose, misfit = pose.copy(), 1.0
     hessian = np.zeros((3, 3))

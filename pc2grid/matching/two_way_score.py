@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
-from pc2grid.mapping.likelihood_field import LIKELIHOOD, LikelihoodField
-from signature.verification.walls import Walls
+from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField
+from pc2grid.matching.walls import Walls
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -27,9 +27,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pc2grid.arrays import F32, F64, I64, U8
-from pc2grid.mapping.likelihood_field import LikelihoodField
+from pc2grid.matching.likelihood_field import LikelihoodField
+from pc2grid.matching.walls import Walls
 from pc2grid.model import OccupancyGrid
-from signature.verification.walls import Walls
 
 MARGIN_M = 4.6
 """Unknown cells around a map that is searched. Points farther outside are taken to lie on its edge, which
@@ -92,7 +92,7 @@ class SearchMap:
         """Prepare a map. Everything outside it counts as unknown."""
         import cv2
 
-        from signature.verification._kernels import BLOCK_LEVELS, LANES
+        from pc2grid.matching._kernels import BLOCK_LEVELS, LANES
 
         walls = Walls.of(grid, margin_m=MARGIN_M)
         field = walls.field.values
@@ -169,7 +169,7 @@ def _bounds(target: SearchMap, points: F64, boxes: F64, half_t: float, half_a_ra
 
     A point that a box moves farther than the last of the sliding maxima covers may be on a wall.
     """
-    from signature.verification._kernels import box_bounds
+    from pc2grid.matching._kernels import box_bounds
 
     res = target.field.resolution_m
     reach = 2 * math.ceil(half_t / 2) + np.hypot(points[:, 0], points[:, 1]) * half_a_rad
@@ -190,7 +190,7 @@ def _best(
     keep: float,
 ) -> F64:
     """The best pose (B, 4) of each box, see `plain_best_of_boxes`; score -1 if it is left out."""
-    from signature.verification._kernels import best_of_boxes
+    from pc2grid.matching._kernels import best_of_boxes
 
     res = target.field.resolution_m
     turns = headings(half_a_rad, parameters.step_rad)
@@ -229,7 +229,7 @@ def levels_for(reach_cells: F64, resolution_m: float) -> I64:
 def with_blocks(level: I64, resolution_m: float) -> I64:
     """(N, 2) the sliding maxima `level` (N,), and the first in `SearchMap.blocks` that covers each of them
     from all cells of a block of 2 x 2; -1 if there is none."""
-    from signature.verification._kernels import BLOCK_LEVELS
+    from pc2grid.matching._kernels import BLOCK_LEVELS
 
     reaches = np.ceil(np.asarray(REACHES_M) / resolution_m - 1e-6)
     cover = np.searchsorted(reaches, reaches[level] + 1.0)

@@ -11,13 +11,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pc2grid.geometry import SE2
-from pc2grid.mapping.likelihood_field import LIKELIHOOD
-from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
-from signature.verification._kernels import best_of_boxes, box_bounds
-from signature.verification.refinement import refine
-from signature.verification.two_way_score import score_fit
-from signature.verification.walls import Walls
-from signature.verification.window_search import (
+from pc2grid.matching._kernels import best_of_boxes, box_bounds
+from pc2grid.matching.likelihood_field import LIKELIHOOD
+from pc2grid.matching.refinement import refine
+from pc2grid.matching.two_way_score import score_fit
+from pc2grid.matching.walls import Walls
+from pc2grid.matching.window_search import (
     MARGIN_M,
     MOST_POINTS,
     REACHES_M,
@@ -30,6 +29,7 @@ from signature.verification.window_search import (
     search_windows,
     with_blocks,
 )
+from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
 from tests.helpers.simulated_drives import office, office_part
 
 MAP = SearchMap.of(office())

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, U8
 from pc2grid.geometry import SE2
-from pc2grid.mapping.likelihood_field import LIKELIHOOD
-from signature.verification.walls import Walls
+from pc2grid.matching.likelihood_field import LIKELIHOOD
+from pc2grid.matching.walls import Walls
 
 
 class Support(enum.IntEnum):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pc2grid.arrays import F64
-from signature.verification.walls import Walls
+from pc2grid.matching.walls import Walls
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

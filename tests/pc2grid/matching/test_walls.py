@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
+from pc2grid.matching.walls import WALLS, Walls, steadiness, thin_evenly
 from pc2grid.model import OccupancyGrid
-from signature.verification.walls import WALLS, Walls, steadiness, thin_evenly
 
 
 def test_a_wall_point_counts_by_the_size_of_its_object() -> None:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2
+from pc2grid.matching.agreement import Support, agreement
+from pc2grid.matching.two_way_score import score_fit
+from pc2grid.matching.walls import Walls
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from signature.verification.agreement import Support, agreement
-from signature.verification.two_way_score import score_fit
-from signature.verification.walls import Walls
 from tests.helpers.simulated_drives import office, office_part
 
 OFFICE = office()

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2
-from pc2grid.mapping.likelihood_field import LIKELIHOOD
-from pc2grid.model import OccupancyGrid
-from signature.verification._kernels import normal_equations
-from signature.verification.refinement import (
+from pc2grid.matching._kernels import normal_equations
+from pc2grid.matching.likelihood_field import LIKELIHOOD
+from pc2grid.matching.refinement import (
     REFINEMENT,
     RefinementParameters,
     gauss_newton,
     plain_normal_equations,
     refine,
 )
-from signature.verification.walls import WallParameters, Walls
-from signature.verification.window_search import SearchMap
+from pc2grid.matching.walls import WallParameters, Walls
+from pc2grid.matching.window_search import SearchMap
+from pc2grid.model import OccupancyGrid
 from tests.helpers.simulated_drives import office, office_part, plan
 
 MAP = SearchMap.of(office())
