@@ -71,6 +71,7 @@ def helps(command: Any, name: str, parent: Any) -> Iterator[str]:
     # The width of --help where no terminal says another one.
     context = command.make_context(word, [], parent=parent, resilient_parsing=True, terminal_width=80)
     yield f"## {name}"
+    command = context.command
     yield f"```text\n{command.get_help(context)}\n```"
     for inner in command.list_commands(context) if hasattr(command, "list_commands") else ():
         yield from helps(command.get_command(context, inner), f"{name} {inner}", context)

@@ -102,10 +102,10 @@ def test_the_output_of_a_command_has_the_same_option_everywhere() -> None:
     folders = [group.commands["demo"]]
     folders += [group.commands["compare"].commands[name] for name in ("paper", "sensors", "maps")]
     for command in folders:
-        (option,) = [param for param in command.params if "--output" in param.opts]
+        (option,) = [param for param in command.command.params if "--output" in param.opts]
         assert {"-o", "--output", "--out"} <= set(option.opts), command.name
     databases = [group.commands["convert"], group.commands["relocalize"]]
     databases += [group.commands["db"].commands[name] for name in ("copy", "merge")]
     for command in databases:
-        (option,) = [param for param in command.params if "--output" in param.opts]
+        (option,) = [param for param in command.command.params if "--output" in param.opts]
         assert "-o" in option.opts, command.name

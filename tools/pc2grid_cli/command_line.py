@@ -1,18 +1,22 @@
 """How the words of a command are read, in addition to what typer does.
 
 Global options are understood behind the command as well, where people put them. `--dask` and `--rerun` may
-stand without a value, for which typer has no notation.
+stand without a value, for which typer has no notation. The module of a command is imported when it is used:
+here alone the program imports late, so that every other import stands at the top of its file.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable
-from typing import Any, Literal
+from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property
+from importlib import import_module
+from typing import Any, ClassVar, Literal
 
 import typer
 from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
 
 from pc2grid_cli.console import Console
 from pc2grid_cli.rerun_target import VIEWER, names_target
@@ -37,12 +41,45 @@ class Command(TyperCommand):
         return super().parse_args(ctx, _read(self.params, ctx, args, until_command=False))
 
 
+class LateCommand(TyperCommand):
+    """A command that is known by its name and one sentence until it is used."""
+
+    def __init__(self, name: str, function: str, sentence: str) -> None:
+        """function : "package.module:function". sentence : what lists of commands say of it."""
+        super().__init__(name, help=sentence)
+        self._function = function
+
+    @cached_property
+    def command(self) -> Any:
+        """The command itself."""
+        module, _, function = self._function.partition(":")
+        app = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)
+        app.command(self.name, cls=Command)(getattr(import_module(module), function))
+        return get_command(app)
+
+    def make_context(self, *arguments: Any, **more: Any) -> Any:
+        """The context of the command itself."""
+        return self.command.make_context(*arguments, **more)
+
+
 class Group(TyperGroup):
     """A group of commands that takes the global options."""
+
+    late: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    """By name: "package.module:function", and one sentence about the command."""
+
+    def __init__(self, **about: Any) -> None:
+        super().__init__(**about)
+        self.commands = {**{name: LateCommand(name, *of) for name, of in self.late.items()}, **self.commands}
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Apply the global options that stand before the command."""
         return super().parse_args(ctx, _read(self.params, ctx, args, until_command=True))
+
+
+def group(commands: Mapping[str, tuple[str, str]]) -> type[Group]:
+    """A group of commands, which are imported when they are used; see `Group.late`."""
+    return type("Group", (Group,), {"late": commands})
 
 
 def _read(params: Iterable[Any], ctx: typer.Context, words: list[str], *, until_command: bool) -> list[str]:

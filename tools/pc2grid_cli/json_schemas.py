@@ -7,12 +7,12 @@ a reader must ignore keys that it does not know.
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any, Literal
 
 # Before Python 3.12 pydantic, which makes the schemas, does not take the TypedDict of typing.
 from typing_extensions import TypedDict
 
-from pc2grid_cli.laboratory import laboratory
 from signature.relocalization.answer_json import (
     Pose,
     PoseInSpace,
@@ -410,7 +410,7 @@ DOCUMENTS: dict[str, type] = {
 
 def documents() -> dict[str, type]:
     """All documents by command: those above, and those of the laboratory."""
-    return {**DOCUMENTS, **laboratory("documents").DOCUMENTS}
+    return {**DOCUMENTS, **import_module("pc2grid_lab.documents").DOCUMENTS}
 
 
 def schema(name: str) -> dict[str, Any]:

@@ -9,27 +9,52 @@ import typer
 
 import pc2grid
 from pc2grid_cli import console
-from pc2grid_cli.command_line import MARKUP, Command, Group
-from pc2grid_cli.config_dump import config_dump_command
-from pc2grid_cli.config_schema import config_schema_command
-from pc2grid_cli.convert import convert_command
-from pc2grid_cli.db_check import db_check_command
-from pc2grid_cli.db_copy import db_copy_command
-from pc2grid_cli.db_info import db_info_command
-from pc2grid_cli.db_merge import db_merge_command
-from pc2grid_cli.db_remove import db_remove_command
-from pc2grid_cli.db_rename import db_rename_command
-from pc2grid_cli.db_split import db_split_command
-from pc2grid_cli.demo import demo_command
-from pc2grid_cli.export import export_command
-from pc2grid_cli.info import info_command
-from pc2grid_cli.laboratory import Compare, laboratory
-from pc2grid_cli.relocalize import relocalize_command
-from pc2grid_cli.view import view_command
-from pc2grid_cli.watch import watch_command
+from pc2grid_cli.command_line import MARKUP, group
+
+# Name, "package.module:function", and what lists of commands say of it.
+COMMANDS = {
+    "demo": ("pc2grid_cli.demo:demo_command", "Map a simulated office, and find another robot in it."),
+    "simulate": ("pc2grid_lab.simulate:simulate_command", "Drive a robot through a building and record it."),
+    "info": ("pc2grid_cli.info:info_command", "Say what is in a recording, a map or a database."),
+    "convert": ("pc2grid_cli.convert:convert_command", "Make a submap database from recordings or maps."),
+    "relocalize": ("pc2grid_cli.relocalize:relocalize_command", "Find where a recording was made."),
+    "watch": ("pc2grid_cli.watch:watch_command", "Find where a running robot is, while it drives."),
+    "export": ("pc2grid_cli.export:export_command", "Write a session's map, trajectory, picture or page."),
+    "view": ("pc2grid_cli.view:view_command", "Look into a database in the browser, and locate there."),
+}
+DB = {
+    "info": ("pc2grid_cli.db_info:db_info_command", "Show the sessions of a database."),
+    "check": ("pc2grid_cli.db_check:db_check_command", "Read everything and list all damage."),
+    "merge": ("pc2grid_cli.db_merge:db_merge_command", "Put the sessions of several databases into one."),
+    "copy": ("pc2grid_cli.db_copy:db_copy_command", "Write a compact copy of a database."),
+    "split": ("pc2grid_cli.db_split:db_split_command", "Copy sessions into a database of their own."),
+    "rename": ("pc2grid_cli.db_rename:db_rename_command", "Give a session another name."),
+    "remove": ("pc2grid_cli.db_remove:db_remove_command", "Remove sessions from a database."),
+}
+CONFIG = {
+    "dump": ("pc2grid_cli.config_dump:config_dump_command", "Print every setting as TOML."),
+    "schema": ("pc2grid_cli.config_schema:config_schema_command", "Print the JSON Schema of a document."),
+}
+# Commands of the laboratory. No module of the product imports it: it is loaded by name when it is asked for.
+COMPARE = {
+    "log": ("pc2grid_lab.compare.log:compare_log_command", "Later parts of a log in a map of its beginning."),
+    "maps": ("pc2grid_lab.compare.maps:compare_maps_command", "Maps and trajectories against the truth."),
+    "real": ("pc2grid_lab.compare.real:compare_real_command", "Three sensors on one real floor."),
+    "sensors": ("pc2grid_lab.compare.sensors:compare_sensors_command", "Each sensor in the maps of each."),
+    "signatures": (
+        "pc2grid_lab.compare.signatures:compare_signatures_command",
+        "What each signature contributes, beside chance.",
+    ),
+    "floors": ("pc2grid_lab.compare.floors:compare_floors_command", "Houses whose floors have one plan."),
+    "peers": (
+        "pc2grid_lab.compare.peers:compare_peers_command",
+        "Other programs, the same maps and queries.",
+    ),
+    "paper": ("pc2grid_lab.compare.paper:compare_paper_command", "The paper's tables and figures 9 and 10."),
+}
 
 app = typer.Typer(
-    cls=Group,
+    cls=group(COMMANDS),
     help="Recordings to a submap database, and where in it a later recording was made.",
     no_args_is_help=True,
     rich_markup_mode=MARKUP,
@@ -65,38 +90,26 @@ def options(
     terminal.debug = terminal.debug or debug
 
 
-app.command("demo", cls=Command)(demo_command)
-app.command("simulate", cls=Command)(laboratory("simulate").simulate_command)
-app.command("info", cls=Command)(info_command)
-app.command("convert", cls=Command)(convert_command)
-app.command("relocalize", cls=Command)(relocalize_command)
-app.command("watch", cls=Command)(watch_command)
-app.command("export", cls=Command)(export_command)
-app.command("view", cls=Command)(view_command)
-
-compare = typer.Typer(
-    cls=Compare,
-    help="Logs, maps, sensors, floors, signatures, peers, the paper: measured against the truth.",
-    no_args_is_help=True,
+app.add_typer(
+    typer.Typer(
+        cls=group(COMPARE),
+        help="Measure: log, maps, real, sensors, signatures, floors, peers, and the paper's tables.",
+        no_args_is_help=True,
+    ),
+    name="compare",
 )
-app.add_typer(compare, name="compare")
-
-db = typer.Typer(
-    cls=Group, help="Look into databases, check, change, merge, split and copy them.", no_args_is_help=True
+app.add_typer(
+    typer.Typer(
+        cls=group(DB),
+        help="Look into databases, check, change, merge, split and copy them.",
+        no_args_is_help=True,
+    ),
+    name="db",
 )
-db.command("info", cls=Command)(db_info_command)
-db.command("check", cls=Command)(db_check_command)
-db.command("merge", cls=Command)(db_merge_command)
-db.command("copy", cls=Command)(db_copy_command)
-db.command("split", cls=Command)(db_split_command)
-db.command("rename", cls=Command)(db_rename_command)
-db.command("remove", cls=Command)(db_remove_command)
-app.add_typer(db, name="db")
-
-config = typer.Typer(cls=Group, help="Settings, and schemas of JSON documents.", no_args_is_help=True)
-config.command("dump", cls=Command)(config_dump_command)
-config.command("schema", cls=Command)(config_schema_command)
-app.add_typer(config, name="config")
+app.add_typer(
+    typer.Typer(cls=group(CONFIG), help="Settings, and schemas of JSON documents.", no_args_is_help=True),
+    name="config",
+)
 
 
 def main() -> None:
