@@ -66,6 +66,7 @@ def evidence_files(folder: Path) -> list[Path]:
         trials.append(
             {
                 "building": "c",
+                "query_building": "c",
                 "in_building": True,
                 "query_sensor": "laser",
                 "map_sensor": "lidar",
@@ -106,8 +107,20 @@ def test_one_command_fits_and_judges(tmp_path: Path) -> None:
 def test_old_evidence_and_a_single_building_are_refused(tmp_path: Path) -> None:
     real, sensors = evidence_files(tmp_path)
     alone = run(sensors)
-    assert alone.returncode != 0 and "one building only" in alone.stderr
+    assert alone.returncode != 0 and "without c there are no right and wrong answers" in alone.stderr
     old = [{k: v for k, v in one.items() if k != "place"} for one in json.loads(real.read_text())[:3]]
     real.write_text(json.dumps(old))
     refused = run(real)
     assert refused.returncode != 0 and "real_queries.py" in refused.stderr
+
+
+def test_a_scan_and_a_log_of_one_building_are_left_out_together(tmp_path: Path) -> None:
+    real, sensors = evidence_files(tmp_path)
+    log = {"log": "fr079", "map": "fr079"}
+    rows = [one | log for one in json.loads(real.read_text()) if one["log"] == "b"]
+    floor = {"building": "floor", "query_building": "floor"}
+    trials = [one | floor for one in json.loads(sensors.read_text())["trials"]]
+    real.write_text(json.dumps(rows))
+    sensors.write_text(json.dumps(trials))  # a list, as `compare sensors` keeps them for each drive
+    refused = run(real, sensors)
+    assert refused.returncode != 0 and "without fr079 there are no right and wrong answers" in refused.stderr

@@ -1,5 +1,7 @@
 """The fit finds the model that made the answers, and is judged on what was left out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -22,7 +24,8 @@ def answers(count: int) -> list[Known]:
             likeness=float(rng.uniform(0.0, 1.0)),
         )
         right = bool(rng.random() < TRUTH.probability(evidence))
-        made.append(Known(group="abc"[i % 3], session=str(i // 4), evidence=evidence, right=right))
+        buildings = frozenset("abc"[i % 3])
+        made.append(Known(buildings=buildings, session=str(i // 4), evidence=evidence, right=right))
     return made
 
 
@@ -49,6 +52,20 @@ def test_answers_are_judged_by_a_fit_without_their_group() -> None:
     assert log_loss(some, held_out) == pytest.approx(log_loss(some, own), abs=0.02)
     assert roc_area(some, held_out) == pytest.approx(roc_area(some, own), abs=0.02)
     assert roc_area(some, np.zeros(len(some))) == 0.5
+
+
+def test_no_answer_of_a_building_takes_part_in_the_fit_that_judges_it() -> None:
+    """Here the queries of a in the map of b would teach a fit that nothing is ever right."""
+    some = [replace(a, buildings=frozenset("ab"), right=False) for a in answers(900)]
+    known = [a for a in answers(1500) if a.buildings != frozenset("b")] + some
+    held_out = left_out(known)
+    for name in "ac":
+        here = np.array([a.buildings == frozenset(name) for a in known])
+        without = fit([a for a in known if name not in a.buildings])
+        wanted = [without.probability(a.evidence) for a in known if a.buildings == frozenset(name)]
+        assert held_out[here] == pytest.approx(wanted)
+    only_c = fit([a for a in known if a.buildings == frozenset("c")])
+    assert held_out[-1] == pytest.approx(only_c.probability(some[-1].evidence))
 
 
 def test_a_fit_needs_both_kinds() -> None:

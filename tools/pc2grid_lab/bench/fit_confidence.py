@@ -2,10 +2,11 @@
 
     python -m pc2grid_lab.bench.fit_confidence EVIDENCE.json ...
 
-Each file is one that `real_queries` has written, or the document of `pc2grid compare sensors`,
-`compare real` or `compare log --json`. Prints the coefficients for `signature.relocalization.confidence`, the
-log loss, and by kind of pair and distance how many answers are right, and how many would be located by the
-coefficients in use and by those fitted without the building, rightly and wrongly.
+Each file is one that `real_queries` has written, one of the folder trials/ of `pc2grid compare sensors`, or
+the document of `compare real` or `compare log --json`. An answer is judged by a fit without all answers whose
+query or map is of one of its buildings. Prints the coefficients for `signature.relocalization.confidence`,
+the log loss, and by kind of pair and distance how many answers are right, and how many would be located by
+the coefficients in use and by those fitted without the building, rightly and wrongly.
 
 Right and wrong answers weigh the same in the fit, however many of each there are. Queries whose place is not
 in the map of their building, and the likeness of a query to itself, judge the fit and take no part in it.
@@ -34,6 +35,8 @@ NEAR_M = 1.0
 """Answers so near to the place of a query that is not in the map are left out: neither right nor wrong."""
 SHARE_RIGHT = 0.5
 """Weight of the right answers together. So the probability holds for queries half of which lie in the map."""
+PARTS_OF = {"floor": "fr079", "fr079_floor": "fr079"}
+"""Physical building of what `compare real` and the data call otherwise: the 3D scan is one floor of fr079."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +47,11 @@ class Answered:
     travel_m: float
     known: Known
     blanked: bool = False
+
+
+def physical(*names: str) -> frozenset[str]:
+    """The buildings that the logs, scans and plans of these names are of."""
+    return frozenset(PARTS_OF.get(name, name) for name in names)
 
 
 def of_rows(rows: list[dict[str, Any]]) -> Iterator[Answered]:
@@ -60,7 +68,7 @@ def of_rows(rows: list[dict[str, Any]]) -> Iterator[Answered]:
             f"laser log in {where}{', place blanked' if blanked else ''}",
             row["travel_m"],
             Known(
-                group=row["log"],
+                buildings=physical(row["log"], row["map"]),
                 session=f"{row['log']} {row['start']}",
                 evidence=Evidence(**row["evidence"]),
                 right=own and not blanked and error_m <= RIGHT_M and error_rad <= RIGHT_RAD,
@@ -73,15 +81,15 @@ def of_trials(trials: list[dict[str, Any]]) -> Iterator[Answered]:
     """Answers of the `compare` commands."""
     names = ("forward", "walls", "backward", "looked_at", "lead", "likeness")
     for trial in trials:
-        if trial.get("likeness") is None:
+        if trial.get("likeness") is None or trial.get("query_building") is None:
             raise SystemExit("results of an earlier version, without all evidence; measure them again")
         where = "" if trial["in_building"] else " in another building"
         yield Answered(
             f"{trial['query_sensor']} in a map by {trial['map_sensor']}{where}",
             trial["travel_m"],
             Known(
-                group=trial["building"],
-                session=f"{trial['building']} {trial['query_sensor']} {trial['seed']}",
+                buildings=physical(trial["building"], trial["query_building"]),
+                session=f"{trial['query_building']} {trial['query_sensor']} {trial['seed']}",
                 evidence=Evidence(**{name: trial[name] for name in names}),
                 right=trial["right"],
             ),
@@ -93,6 +101,8 @@ def read(file: Path) -> list[Answered]:
     document = json.loads(file.read_text())
     if isinstance(document, dict):
         return list(of_trials(document["trials"]))
+    if document and "in_building" in document[0]:
+        return list(of_trials(document))
     if any("place" not in row for row in document):
         raise SystemExit(f"{file}: evidence of an earlier version; collect it again by real_queries.py")
     return list(of_rows(document))
@@ -128,10 +138,12 @@ def main() -> None:
     parser.add_argument("files", type=Path, nargs="+")
     answered = [a for file in parser.parse_args().files for a in read(file)]
     known = [a.known for a in answered]
-    if len({k.group for k in known}) < 2:
-        raise SystemExit(
-            "the fit is judged by leaving buildings out, and this evidence is of one building only"
-        )
+    for buildings in {k.buildings for k in known}:
+        if len({k.right for k in known if not k.buildings & buildings}) < 2:
+            raise SystemExit(
+                "the fit is judged by leaving buildings out, and without"
+                f" {' and '.join(sorted(buildings))} there are no right and wrong answers"
+            )
     in_use = np.array([CALIBRATION.probability(k.evidence) for k in known])
     refitted = left_out(known, SHARE_RIGHT, fitted_to=fitted_to(answered))
     accept = Config().relocalize.accept

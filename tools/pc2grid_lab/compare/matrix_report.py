@@ -54,8 +54,17 @@ def tables(cells: Sequence[MatrixCell], elsewhere: Sequence[Trial]) -> None:
         show(f"queries from another building: {right} of {len(elsewhere)} answered not_found")
 
 
-def draw(path: Path, cells: Sequence[MatrixCell], reliability: Sequence[tuple[float, float, int]]) -> None:
-    """One picture: share located and right by metres for each map sensor; calibration of confidence."""
+def draw(
+    path: Path,
+    cells: Sequence[MatrixCell],
+    reliability: Sequence[tuple[float, float, int]],
+    *,
+    fitted_on: bool,
+) -> None:
+    """One picture: share located and right by metres for each map sensor; calibration of confidence.
+
+    fitted_on : the reliability is that in buildings that the confidence was fitted on.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -85,12 +94,14 @@ def draw(path: Path, cells: Sequence[MatrixCell], reliability: Sequence[tuple[fl
     if reliability:
         confidence, right, count = zip(*reliability, strict=True)
         axes[3].scatter(confidence, right, s=[20 + 2 * min(n, 200) for n in count], color=BLUE, alpha=0.7)
-    axes[3].set(title="confidence on plans not tuned on", xlabel="confidence", ylabel="share that was right")
+    axes[3].set(title=_RELIABILITY[fitted_on], xlabel="confidence", ylabel="share that was right")
     axes[3].grid(alpha=0.3)
     with replace_file(path) as draft:
         figure.savefig(draft, format="png", dpi=130)
     plt.close(figure)
 
+
+_RELIABILITY = {True: "confidence, buildings of its fit", False: "confidence, other buildings"}
 
 Recalls = Mapping[str, Mapping[str, Mapping[int, float | None]]]
 """Recall by query sensor, by what is used, and by the number of retrieved places."""

@@ -135,7 +135,7 @@ def compare_sensors_command(
     }
     with replace_file(out / "matrix.json") as draft:
         draft.write_text(json_text(document) + "\n", encoding="utf-8")
-    draw(out / "matrix.png", cells, reliability(others or trials))
+    draw(out / "matrix.png", cells, reliability(others or trials), fitted_on=not others)
     draw_signatures(out / "signatures.png", independent, contributions)
     if as_json:
         print_json(document)
@@ -144,7 +144,7 @@ def compare_sensors_command(
         for name, counts in changed.items():
             print(f"{name}: between sessions {_change_text(counts)}")
         contribution_table(independent, contributions, described_m)
-        for name, some in (("plans it was tuned on", tuned), ("other plans", others)):
+        for name, some in (("plans it was fitted on", tuned), ("other plans", others)):
             if some:
                 errors = ConfidenceError.of(some)
                 print(
@@ -213,10 +213,10 @@ def _elsewhere(trials: Sequence[Trial]) -> list[Trial]:
 
 def _by_tuning(trials: Sequence[Trial]) -> tuple[list[Trial], list[Trial]]:
     """The trials in plans that the confidence was fitted on, and the other ones."""
-    from signature.relocalization.confidence import TUNED_ON
+    from signature.relocalization.confidence import FITTED_ON
 
-    tuned = [t for t in trials if t.building in TUNED_ON]
-    return tuned, [t for t in trials if t.building not in TUNED_ON]
+    tuned = [t for t in trials if FITTED_ON.intersection(t.buildings)]
+    return tuned, [t for t in trials if not FITTED_ON.intersection(t.buildings)]
 
 
 def _map_file(plan: str, sensor: str, out: str, setting: Setting) -> Path:

@@ -16,12 +16,12 @@ from signature.relocalization.confidence import Calibration, Evidence
 class Known:
     """An answer whose truth is known.
 
-    group : the building that it is left out with when the fit is judged, with the sensors if these differ.
+    buildings : of the query and of the map; the answer is judged by a fit without any answer of these.
     right : whether the best hypothesis is where the query truly was. session : the drive it belongs to;
     answers of one drive depend on each other. weight : of the answer in a fit.
     """
 
-    group: str
+    buildings: frozenset[str]
     session: str
     evidence: Evidence
     right: bool
@@ -62,18 +62,16 @@ def fit(answers: Sequence[Known], share_right: float | None = None) -> Calibrati
 def left_out(
     answers: Sequence[Known], share_right: float | None = None, *, fitted_to: Sequence[Known] | None = None
 ) -> F64:
-    """(N,) probability of each answer by the coefficients fitted (see `fit`) to all other groups.
+    """(N,) probability of each answer by the coefficients fitted (see `fit`) to the answers in which neither
+    query nor map is of one of its buildings.
 
-    fitted_to : answers that the coefficients are fitted to, of the same groups; None: `answers`.
+    fitted_to : answers that the coefficients are fitted to; None: `answers`.
     """
-    groups = np.array([answer.group for answer in answers])
-    probabilities = np.zeros(len(answers))
-    for group in np.unique(groups):
-        others = [answer for answer in fitted_to or answers if answer.group != group]
-        model = fit(others, share_right)
-        for i in np.flatnonzero(groups == group).tolist():
-            probabilities[i] = model.probability(answers[i].evidence)
-    return probabilities
+    models = {
+        buildings: fit([a for a in fitted_to or answers if not a.buildings & buildings], share_right)
+        for buildings in {answer.buildings for answer in answers}
+    }
+    return np.array([models[answer.buildings].probability(answer.evidence) for answer in answers])
 
 
 def log_losses(answers: Sequence[Known], probabilities: F64) -> F64:

@@ -72,6 +72,7 @@ def judge(
         backward=answer.evidence.backward,
         looked_at=answer.evidence.looked_at,
         likeness=answer.evidence.likeness,
+        query_building=building,
     )
 
 

@@ -42,7 +42,8 @@ class Trial:
     backward, looked_at, lead, likeness: the evidence of the decision, see
     `signature.relocalization.confidence`; agreement: the better one of forward and backward. In the results
     of earlier versions, forward, backward, looked_at and likeness are null. map_bent_m: how far the map
-    around the true place lies from where the map as a whole puts it; null in simulation.
+    around the true place lies from where the map as a whole puts it; null in simulation. query_building: of
+    the query; null in the results of earlier versions.
     """
 
     building: str
@@ -68,6 +69,12 @@ class Trial:
     looked_at: float | None = None
     likeness: float | None = None
     map_bent_m: float | None = None
+    query_building: str | None = None
+
+    @property
+    def buildings(self) -> frozenset[str]:
+        """The buildings of the map and of the query, as far as they are known."""
+        return frozenset({self.building, self.query_building or self.building})
 
     @property
     def in_map(self) -> bool:
