@@ -180,7 +180,9 @@ def draw_answer(axis: Any, session: SessionMap, answer: pc2grid.Answer, path: np
     axis.plot(*way[-1], "o", color=PURPLE, markersize=11, markeredgewidth=0)
 
 
-def same_place(session: SessionMap, answer: pc2grid.Answer, config: signature.Config) -> tuple[Submap, Submap]:
+def same_place(
+    session: SessionMap, answer: pc2grid.Answer, config: signature.Config
+) -> tuple[Submap, Submap]:
     """A submap of the map, and one of what the query has seen, whose centres are at one place: of all such
     pairs the one of which the query has seen most."""
     assert answer.T_map_odom is not None
@@ -218,7 +220,9 @@ def draw(
     cloud = cloud_of(scans)
     inside = np.logical_and(cloud[:, :2] > box[:2], cloud[:, :2] < box[2:]).all(axis=1)
     draw_cloud(steps[1], cloud[inside], size=1.0)
-    steps[1].plot(*from_above(path_of(scans) + [0.0, 0.0, HEAD_ROOM_M]).T, color=VERMILLION, linewidth=2)
+    steps[1].plot(
+        *from_above(path_of(scans) + np.array((0.0, 0.0, HEAD_ROOM_M))).T, color=VERMILLION, linewidth=2
+    )
     draw_grid(steps[2], session.grid, box)
     draw_grid(steps[3], session.grid, box)
     draw_graph(steps[3], session)

@@ -1,6 +1,6 @@
 """A ROS 2 node that tells nav2 where the robot is, for those who have rclpy and want no bridge.
 
-    pip install pc2grid                                       # into the Python of the sourced ROS 2
+    pip install .                                             # a clone of the sources, into ROS 2's Python
     python3 nav2_node.py building.submaps                     # publishes /initialpose once
     python3 nav2_node.py building.submaps --topic /scan_front
 
