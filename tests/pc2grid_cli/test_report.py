@@ -356,12 +356,51 @@ def test_a_browser_has_nothing_to_complain_about(
 ) -> None:
     write_report(tmp_path / "page.html", database, found=found)
     shown = looked_at(tmp_path / "page.html", tmp_path, size)
-    for words in ("part.yaml in two.submaps", "submap centres", "query's wall: fits the map", "Submap "):
+    for words in ("part.yaml in two.submaps", "submap centres", "query's wall: fits the map", ">Submaps<"):
         assert words in shown
     assert "of the query's walls 100" in shown
     # Of the three loops that the first session came back by, off until they are wanted.
     assert re.search(r"<label><input type=\"checkbox\">.*?2 loops closed</label>", shown)
     assert "1 loop doubted</label>" in shown
+
+
+@needs_chromium
+@pytest.mark.parametrize("size", ["1280,900", "390,844"])
+def test_nothing_is_cut_at_the_side(
+    database: SubmapDatabase, found: Found, tmp_path: Path, size: str
+) -> None:
+    """A table that is wider than its section can be scrolled, but nobody sees that there is more of it."""
+    write_report(tmp_path / "page.html", database, found=found)
+    act = (
+        'document.body.dataset.cut = [document.documentElement, ...document.querySelectorAll(".scroll")]'
+        ".filter(e => e.scrollWidth > e.clientWidth).map(e => e.innerHTML).join();"
+        'document.body.dataset.sessions = document.querySelectorAll("#sessions tr").length - 1;'
+    )
+    shown = looked_at(tmp_path / "page.html", tmp_path, size, act)
+    assert 'data-cut=""' in shown and 'data-sessions="2"' in shown
+    assert ">overlap<" in shown and "complete" in shown
+
+
+@needs_chromium
+def test_an_answer_is_shown_without_a_submap_until_the_reader_chooses_one(
+    database: SubmapDatabase, found: Found, tmp_path: Path
+) -> None:
+    write_report(tmp_path / "page.html", database, found=found)
+    assert '<g id="mark"></g>' in looked_at(tmp_path / "page.html", tmp_path)
+    shown = looked_at(tmp_path / "page.html", tmp_path, act="$('next').click();")
+    assert '<g id="mark"><circle' in shown and ">Submap 0<" in shown
+
+
+@needs_chromium
+def test_each_warning_is_a_line_of_its_own(tmp_path: Path) -> None:
+    made = session("office", office(), way())
+    warned = replace(made, report=replace(made.report, warnings=("first <warning>", "second")))
+    row = (warned, provenance(Path("office.mcap"), "a" * 64, Config()))
+    add_sessions(tmp_path / "warned.submaps", [row], Config(), keep=False)
+    with open_database(tmp_path / "warned.submaps") as database:
+        write_report(tmp_path / "page.html", database)
+    shown = looked_at(tmp_path / "page.html", tmp_path)
+    assert "<li>office: first &lt;warning&gt;</li><li>office: second</li>" in shown
 
 
 def points_drawn(shown: str) -> int:

@@ -454,7 +454,10 @@ def test_the_command_prints_its_address_and_stops_with_ctrl_c(desk: Path, tmp_pa
 @pytest.mark.slow
 @pytest.mark.timeout(600)  # some seconds of work; on a busy machine many times as long
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
-def test_a_browser_shows_what_happens(desk: Path, serve: Callable[..., Served], tmp_path: Path) -> None:
+@pytest.mark.parametrize("end", [None, "located", "ambiguous", "error"])
+def test_a_browser_shows_what_happens(
+    desk: Path, serve: Callable[..., Served], tmp_path: Path, end: str | None
+) -> None:
     with open_database(desk / "office.submaps") as database:
         events = Events()
         served = serve(events=events)
@@ -465,13 +468,17 @@ def test_a_browser_shows_what_happens(desk: Path, serve: Callable[..., Served], 
             "moment",
             {
                 "path_m": 2.0,
-                "status": "located",
+                "status": "ambiguous" if end in ("ambiguous", "error") else "located",
                 "session": "office",
                 "confidence": 0.97,
                 "pose": [5.0, 7.0, 0.0],
                 "base": [2.0, 0.0, 0.0],
             },
         )
+        if end == "error":
+            events.publish("end", {"source": "run.mcap", "error": "stopped", "hint": None})
+        elif end:
+            events.publish("end", {"source": "run.mcap", "status": end, "confidence": 0.97})
         browser = [
             *("chromium", "--headless", "--no-sandbox", "--disable-gpu"),
             *(f"--user-data-dir={tmp_path / 'browser'}", "--virtual-time-budget=1000", "--dump-dom"),
@@ -481,7 +488,11 @@ def test_a_browser_shows_what_happens(desk: Path, serve: Callable[..., Served], 
             wait_until(lambda: events.looking_on > 0)
             events.close()  # the virtual time of the browser stands still while a request is going on
             page, _ = run.communicate(timeout=500)
-    assert "after 2.0 m: located, confidence 0.97; best place: office, x 5.00 m, y 7.00 m" in page
+    if end in ("ambiguous", "error"):
+        assert 'id="trace"' not in page, "an arrow at a place that is no answer"
+        return
+    if end is None:
+        assert "after 2.0 m: located, confidence 0.97; best place: office, x 5.00 m, y 7.00 m" in page
     # The path of the query, laid on the map: it began 2 m to the left of where the robot is.
     trace = re.search(r'<g id="trace".*?</g></g>', page, re.S)
     assert trace is not None and re.search(r"M3 7 4 7 5 7", trace[0]), trace
