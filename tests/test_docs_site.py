@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -73,6 +74,24 @@ def test_nothing_is_loaded_from_elsewhere(site: Path) -> None:
     for page in site.rglob("*.html"):
         tags = re.findall(r"<(?:script|link|img)\b[^>]*>", page.read_text("utf-8"))
         assert [tag for tag in tags if re.search(r"(?:src|href)=\"?https?:", tag)] == [], page.name
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+def test_the_site_can_be_searched_without_a_server(site: Path, tmp_path: Path) -> None:
+    page = (site / "docs" / "method.html").read_text("utf-8")
+    typed = (
+        'addEventListener("load", () => setTimeout(() => {'
+        'const box = document.querySelector("[data-md-component=search-query]");'
+        'box.focus(); box.value = "pgvector"; box.dispatchEvent(new Event("keyup")); }, 500));'
+    )
+    (site / "docs" / "searched.html").write_text(page.replace("</body>", f"<script>{typed}</script></body>"))
+    done = subprocess.run(
+        ["chromium", "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}",
+         "--virtual-time-budget=20000", "--dump-dom", f"file://{site / 'docs' / 'searched.html'}"],
+        capture_output=True, text=True, check=True, timeout=120,
+    )  # fmt: skip
+    found = re.findall(r'<a href="([^"]*)" class="md-search-result__link"', done.stdout)
+    assert any("examples/fleet.html" in link for link in found), found
 
 
 def test_every_page_is_in_the_navigation() -> None:
