@@ -43,7 +43,7 @@ def show(axis: Any, grid: OccupancyGrid, title: str) -> None:
     x, y = grid.origin_m
     height, width = np.array(grid.cells.shape) * grid.resolution_m
     axis.imshow(picture(grid), origin="lower", extent=(x, x + width, y, y + height), interpolation="nearest")
-    axis.set_title(title, fontsize=10, loc="left")
+    axis.set_title(title, fontsize=13, loc="left")
     axis.set_xticks([])
     axis.set_yticks([])
 
@@ -54,7 +54,7 @@ def draw_partition(axis: Any, grid: OccupancyGrid, submaps: tuple[Submap, ...], 
     show(
         axis,
         grid,
-        f"The map: its skeleton, {len(submaps)} clustered junctions (dots), one submap each (III-A)",
+        f"The map, its skeleton, and {len(submaps)} junctions (dots),\none submap each (III-A)",
     )
     skeleton = grid.to_point(np.argwhere(map_skeleton(grid, config)))
     axis.plot(*skeleton.T, ",", color=BLUE)
@@ -81,7 +81,7 @@ def draw_boundary(axes: Any, submap: Submap, config: SignatureConfig) -> None:
 def draw_freespace(axes: Any, submap: Submap, config: SignatureConfig) -> None:
     """Figures 4 and 5: the free-space graph, its path lengths, and the effect of obstacles."""
     graph = freespace_graph(submap, config)
-    show(axes[0], submap.grid, f"Free space: {len(graph)} nodes, an edge for each line of sight (III-C)")
+    show(axes[0], submap.grid, f"Free space: {len(graph)} nodes (III-C)")
     places = {node: data["center_m"] for node, data in graph.nodes(data=True)}
     lines = [(places[a], places[b]) for a, b in graph.edges]
     axes[0].add_collection(LineCollection(lines, colors=GREEN, linewidths=0.4, alpha=0.25))
@@ -103,9 +103,9 @@ def draw_freespace(axes: Any, submap: Submap, config: SignatureConfig) -> None:
         where="mid",
         color=WALL,
         linewidth=1,
-        label="with 10 obstacles and 50 speckles (Figure 5)",
+        label="with 10 obstacles (Figure 5)",
     )
-    axes[1].legend(fontsize=8, frameon=False)
+    axes[1].legend(fontsize=11, frameon=False)
 
 
 def path_histogram(submap: Submap, config: SignatureConfig) -> np.ndarray:
@@ -134,7 +134,7 @@ def draw_symmetry(axes: Any, submap: Submap, config: SignatureConfig) -> None:
             color=color,
             label=f"{name}: score {score:.1f}",
         )
-    axes[0].legend(fontsize=8, loc="lower right")
+    axes[0].legend(fontsize=11, loc="lower right")
     field = blurred(edges, grid.resolution_m, config)
     # Eq. 5 averages these values: the blurred image at the walls mirrored at the axis alpha.
     middle = (np.array(edges.shape) - 1) / 2
@@ -150,7 +150,7 @@ def draw_symmetry(axes: Any, submap: Submap, config: SignatureConfig) -> None:
     places = (mirrored[:, ::-1] + 0.5) * grid.resolution_m + grid.origin_m
     dots = axes[1].scatter(*places.T, c=values, s=2, cmap="plasma", vmin=0, vmax=config.symmetry_peak)
     axes[1].figure.colorbar(dots, ax=axes[1], shrink=0.8, label="brightness (Eq. 5 is its mean)")
-    axes[1].set_title("Walls mirrored at α (dots) over the blurred walls (grey)", fontsize=10, loc="left")
+    axes[1].set_title("Walls mirrored at α (dots) over blurred walls", fontsize=13, loc="left")
     axes[1].set_xlim(extent[:2])
     axes[1].set_ylim(extent[2:])
     axes[1].set_xticks([])
@@ -160,7 +160,7 @@ def draw_symmetry(axes: Any, submap: Submap, config: SignatureConfig) -> None:
 def bars(axis: Any, histogram: np.ndarray, bin_m: float, color: str, title: str) -> None:
     """A histogram over metres."""
     axis.bar(np.arange(len(histogram)) * bin_m, histogram, width=bin_m, align="edge", color=color, alpha=0.7)
-    axis.set_title(title, fontsize=10, loc="left")
+    axis.set_title(title, fontsize=13, loc="left")
     axis.set_xlabel("metres")
     axis.set_ylabel("share of pairs")
     filled = np.flatnonzero(histogram)
@@ -171,14 +171,14 @@ def bars(axis: Any, histogram: np.ndarray, bin_m: float, color: str, title: str)
 def draw(grid: OccupancyGrid, submaps: tuple[Submap, ...], chosen: Submap, name: str) -> Figure:
     """The whole picture."""
     config = SignatureConfig()
-    figure = Figure(figsize=(17, 14), layout="constrained")
-    top, bottom = figure.subfigures(2, 1, height_ratios=(1.0, 1.9))
-    draw_partition(top.subplots(), grid, submaps, chosen)
-    axes = bottom.subplots(2, 3)
+    figure = Figure(figsize=(20, 9.5), layout="constrained")
+    left, right = figure.subfigures(1, 2, width_ratios=(1.0, 3.0))
+    draw_partition(left.subplots(), grid, submaps, chosen)
+    axes = right.subplots(2, 3)
     draw_boundary(axes[:, 0], chosen, config)
     draw_freespace(axes[:, 1], chosen, config)
     draw_symmetry(axes[:, 2], chosen, config)
-    figure.suptitle(f"{name}, submap {chosen.submap_id}: its three signatures", fontsize=14)
+    figure.suptitle(f"{name}, submap {chosen.submap_id}: its three signatures", fontsize=16)
     return figure
 
 

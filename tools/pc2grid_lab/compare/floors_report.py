@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pc2grid_cli.picture import BLUE, GREEN, GREY, ORANGE, VERMILLION
+from pc2grid_cli.picture import GREEN, GREY, ORANGE, VERMILLION
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 
     Asked = tuple[FloorTask, FloorResult]
 
+_LIGHT_BLUE = "#A6CBE6"
 _COLOURS: dict[FloorStatus, str] = {
     "right": GREEN,
-    "ambiguous": BLUE,
+    "ambiguous": _LIGHT_BLUE,
     "not_found": GREY,
     "wrong": VERMILLION,
 }
@@ -29,6 +30,7 @@ _SHOWN: dict[FloorStatus, str] = {
     "not_found": "not found",
     "wrong": "wrong floor",
 }
+_EXPLAINED: dict[FloorStatus, str] = {**_SHOWN, "ambiguous": "ambiguous: several places fit"}
 
 
 _MAPPED = 0.5
@@ -115,20 +117,14 @@ def draw(path: Path, houses: Sequence[Asked], grids: Mapping[str, OccupancyGrid]
     FigureCanvasAgg(figure)
     parts: Any = figure.subfigures(2, 1, height_ratios=(bars_in, 4.2))
     bars, maps = parts
-    panels = bars.subplots(1, len(ways), squeeze=False)[0]
-    for ax, way in zip(panels, ways, strict=True):
-        _draw_answers(ax, way, of_way[way])
-    bars.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
-    bars.suptitle(
-        "answers in each house, furniture alike (a) or different (d) on each floor; x: floors not told apart",
-        fontsize=10,
-    )
+    _draw_bars(bars, of_way)
     floors = maps.subplots(1, len(task.floors), squeeze=False, sharex=True, sharey=True)[0]
     for ax, floor in zip(floors, task.floors, strict=True):
         _draw_floor(ax, floor, result, answer, grids)
-    drawn = f"house {task.seed} by {task.way}, furniture {_furniture(task.alike)}: a query made on floor"
     maps.suptitle(
-        f"{drawn} {answer.floor}, answered: {_SHOWN[answer.status]}, confidence {answer.confidence:.3f}",
+        f"a query made on floor {answer.floor} of house {task.seed} (by {task.way}, furniture"
+        f" {_furniture(task.alike)}) fits on {len(answer.poses)} floors: {_SHOWN[answer.status]},"
+        f" confidence {answer.confidence:.3f}",
         fontsize=10,
     )
     with replace_file(path) as draft:
@@ -153,13 +149,29 @@ def example_answer(result: FloorResult) -> FloorAnswer:
 _BY_INTEREST: tuple[FloorStatus, ...] = ("wrong", "ambiguous", "right", "not_found")
 
 
+def _draw_bars(figure: Any, of_way: Mapping[str, Sequence[Asked]]) -> None:
+    """A panel for each way, and above them how many answers name a wrong floor."""
+    panels = figure.subplots(1, len(of_way), squeeze=False)[0]
+    for ax, (way, houses) in zip(panels, of_way.items(), strict=True):
+        _draw_answers(ax, way, houses)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
+    results = [result for houses in of_way.values() for _, result in houses]
+    wrong = sum(result.count("wrong") for result in results)
+    asked = sum(result.count(status) for result in results for status in _COLOURS)
+    figure.suptitle(
+        f"floors with one plan: {wrong} of {asked} answers name a wrong floor"
+        " (houses with furniture alike (a) or different (d) on each floor; x: floors not told apart)",
+        fontsize=10,
+    )
+
+
 def _draw_answers(ax: Any, way: str, houses: Sequence[Asked]) -> None:
     """A bar for each house."""
     names = [f"{task.seed}{'a' if task.alike else 'd'}" for task, _ in houses]
     rows, before = range(len(houses)), [0] * len(houses)
     for status, colour in _COLOURS.items():
         counts = [result.count(status) for _, result in houses]
-        ax.barh(rows, counts, left=before, color=colour, height=0.8, label=_SHOWN[status])
+        ax.barh(rows, counts, left=before, color=colour, height=0.8, label=_EXPLAINED[status])
         before = [a + b for a, b in zip(before, counts, strict=True)]
     for row, (_, result) in enumerate(houses):
         if not result.told_apart:

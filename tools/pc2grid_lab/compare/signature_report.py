@@ -143,20 +143,35 @@ def _draw_scale(ax: Any, rows: Sequence[Mapping[str, Any]]) -> None:
     chosen = [row for row in rows if row["places"] == most and row["query_sensor"] == "all"]
     travels_m = sorted({row["travel_m"] for row in chosen})
     selectors = sorted({row["selector"] for row in chosen}, reverse=True)
-    for selector, line in zip(selectors, ("-", ":"), strict=False):
-        for travel_m, colour in zip(travels_m, (VERMILLION, ORANGE, BLUE), strict=False):
-            some = [r for r in chosen if (r["selector"], r["travel_m"]) == (selector, travel_m)]
-            some.sort(key=lambda row: row["share"])
-            percent = [100 * row["share"] for row in some]
-            found, low, high = zip(*(row["found"] for row in some), strict=True)
-            label = selector if travel_m == travels_m[-1] else None
-            ax.plot(percent, found, line, color=colour, marker="o", markersize=3, label=label)
-            if line == "-":
-                ax.fill_between(percent, low, high, color=colour, alpha=0.12)
-    ax.set(xscale="log", ylim=(0, 1.02), xlabel="% of the places looked at")
-    ax.set_xticks(sorted({100 * row["share"] for row in chosen}))
-    ax.xaxis.set_major_formatter("{x:g}")
-    ax.minorticks_off()
-    ax.grid(alpha=0.3)
+    shares = sorted({row["share"] for row in chosen})
+    # Side by side, as several of them agree: lines would hide each other.
+    series = [(selector, travel_m) for selector in selectors for travel_m in travels_m]
+    width = 0.8 / max(len(series), 1)
+    colours = dict(zip(travels_m, (VERMILLION, ORANGE, BLUE), strict=False))
+    for number, (selector, travel_m) in enumerate(series):
+        some = {
+            r["share"]: r["found"] for r in chosen if (r["selector"], r["travel_m"]) == (selector, travel_m)
+        }
+        at = [shares.index(share) + (number - (len(series) - 1) / 2) * width for share in some]
+        found, low, high = zip(*some.values(), strict=True)
+        around = [
+            [f - a for f, a in zip(found, low, strict=True)],
+            [b - f for f, b in zip(found, high, strict=True)],
+        ]
+        colour = colours[travel_m]
+        ax.errorbar(
+            at,
+            found,
+            yerr=around,
+            fmt="o",
+            color=colour,
+            markerfacecolor=colour if selector == selectors[0] else "white",
+            markersize=6,
+            elinewidth=1,
+            label=selector if travel_m == travels_m[-1] else None,
+        )
+    ax.set(ylim=(0, 1.02), xlabel="% of the places looked at")
+    ax.set_xticks(range(len(shares)), [f"{100 * share:g}" for share in shares])
+    ax.grid(axis="y", alpha=0.3)
     ax.legend(loc="lower right", fontsize=8)
     ax.set_title(f"right place selected\nof {most:,} places", fontsize=10)
