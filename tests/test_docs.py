@@ -266,6 +266,17 @@ def test_links_lead_somewhere(name: str) -> None:
         assert (ROOT / target).exists(), target
 
 
+def test_the_first_screen_says_what_this_is() -> None:
+    """Before anything is installed: the paper, its three signatures, and how an answer comes about."""
+    first = " ".join((ROOT / "README.md").read_text().partition("\n## ")[0].split())
+    abstract = " ".join(yaml.safe_load((ROOT / "CITATION.cff").read_text())["abstract"].split())
+    (title,) = re.findall(r'"(.+)"', abstract)
+    assert f'the paper "{title}"' in first and "examples/how_it_works.png" in first
+    for name in ("Boundary distances", "Free-space path lengths", "Reflection symmetry"):
+        assert f"- **{name}**: " in first
+    assert len(first) < 2500
+
+
 # --- examples/ --------------------------------------------------------------------------------------------
 
 
@@ -357,6 +368,19 @@ def test_example_own_floor_plan(run: Run) -> None:
 def test_example_signature_of_a_submap(run: Run) -> None:
     run("signature_of_a_submap.py", "map.yaml", "--out", "submap.png")
     assert Path("submap.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_example_how_it_works(run: Run) -> None:
+    """The picture shows what was computed from these recordings: another query makes another one."""
+    drawn = set()
+    for query in ("tuesday.mcap", "monday.mcap"):
+        assert run("how_it_works.py", "monday.mcap", query, "--out", "how.png") == ["wrote how.png"]
+        image = cv2.imread("how.png")
+        height, width = image.shape[:2]
+        upper, answer = image[: height * 3 // 10], image[height * 3 // 10 :, width * 3 // 4 :]
+        drawn.add((upper.tobytes(), answer.tobytes()))
+    (upper, answer), (upper_again, another) = drawn
+    assert upper == upper_again and answer != another
 
 
 def test_the_picture_of_the_architecture_shows_every_module(folder: Path) -> None:

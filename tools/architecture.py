@@ -29,8 +29,8 @@ PAPER = ("boundary", "freespace", "symmetry", "describe", "similarity", "seen", 
 STAGES = ("pipeline",)
 """Files of `pc2grid` beside the folders that have a box of their own; the others share the box "types"."""
 
-WIDTH, GAP, LINE, TITLE = 1180, 26, 15, 20
-CHARACTER = 6.3  # mean width of a character, pixels
+WIDTH, GAP, LINE, TITLE = 820, 24, 16, 20  # as wide as a page, so that the text is not shrunk
+CHARACTER = 6.6  # mean width of a character, pixels
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def lines(package: str, name: str, modules: list[str]) -> tuple[str, ...]:
     for module in modules:
         *folders, file = module.removeprefix(f"{package}.").removeprefix(f"{name}.").split(".")
         by_folder["/".join(folders)].append(file)
-    most = 150 if package == "pc2grid_cli" else 64 if len(by_folder) > 2 else 34
+    most = 112 if package == "pc2grid_cli" else 64 if len(by_folder) > 2 else 44 if len(modules) > 10 else 30
     found: list[str] = []
     for folder, files in sorted(by_folder.items()):
         line = f"{folder}/ " if folder else ""
@@ -178,7 +178,7 @@ def text_box(box: Box, x: float, y: float, color: str) -> str:
     ]
     for k, line in enumerate(box.lines):
         parts.append(
-            f'<text x="{left + 10:.0f}" y="{y + TITLE + 12 + LINE * k:.0f}" font-size="11" fill="#444" '
+            f'<text x="{left + 10:.0f}" y="{y + TITLE + 12 + LINE * k:.0f}" font-size="12" fill="#333" '
             f'xml:space="preserve">{escape(line)}</text>'
         )
     return "".join(parts)
@@ -196,7 +196,7 @@ def draw() -> str:
         parts.append(
             f'<rect x="2" y="{top + 4:.0f}" width="{WIDTH - 4}" height="{bottom - top - 6:.0f}" rx="10" '
             f'fill="{color}" fill-opacity="0.07" stroke="{color}"/>'
-            f'<text x="16" y="{top + 26:.0f}" font-size="15" font-weight="bold" fill="{color}">'
+            f'<text x="16" y="{top + 26:.0f}" font-size="16" font-weight="bold" fill="{color}">'
             f"{package}</text>"
             f'<text x="{WIDTH - 16}" y="{top + 26:.0f}" text-anchor="end" fill="#555">{ABOUT[package]}</text>'
         )
@@ -208,7 +208,7 @@ def draw() -> str:
         top = bottom
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {top + 4:.0f}" '
-        'font-family="sans-serif" font-size="13">'
+        'font-family="sans-serif" font-size="14">'
         '<defs><marker id="head" viewBox="0 0 6 6" refX="5" refY="3" markerWidth="6" markerHeight="6" '
         'orient="auto"><path d="M0 0 L6 3 L0 6 z" fill="#666"/></marker></defs>'
         f'<rect width="{WIDTH}" height="{top + 4:.0f}" fill="#fff"/>\n' + "\n".join(parts) + "\n</svg>\n"
