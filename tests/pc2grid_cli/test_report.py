@@ -382,6 +382,21 @@ def test_nothing_is_cut_at_the_side(
 
 
 @needs_chromium
+def test_the_place_under_the_pointer_is_named(database: SubmapDatabase, tmp_path: Path) -> None:
+    write_report(tmp_path / "page.html", database)
+    place = contents(database)["sessions"][0]["submaps"][3]["xy"]
+    act = (
+        "addEventListener('load', () => setTimeout(() => {"
+        f" const at = new DOMPoint({place[0]}, -({place[1]}))"
+        ".matrixTransform($('map').getScreenCTM()); $('map').dispatchEvent(new PointerEvent('pointermove',"
+        " { clientX: at.x, clientY: at.y, pointerId: 1 })); }, 200));"
+    )
+    shown = looked_at(tmp_path / "page.html", tmp_path, act=act)
+    x, y = (float(v) for v in re.findall(r'id="pointed"[^>]*>x (-?[\d.]+) m, y (-?[\d.]+) m<', shown)[0])
+    assert math.hypot(x - place[0], y - place[1]) < 0.05
+
+
+@needs_chromium
 def test_an_answer_is_shown_without_a_submap_until_the_reader_chooses_one(
     database: SubmapDatabase, found: Found, tmp_path: Path
 ) -> None:

@@ -204,8 +204,8 @@ class FoxgloveWebsocket:
             from websockets.typing import Subprotocol
         except ModuleNotFoundError as error:
             raise LiveError(
-                "ws:// needs the package `websockets`",
-                hint="pip install 'pc2grid[live]'; it is not installed",
+                "ws:// needs the package `websockets`, which is not installed",
+                hint="pip install websockets",
             ) from error
         p = self._parameters
         problem: Exception | None = None

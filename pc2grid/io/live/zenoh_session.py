@@ -306,7 +306,7 @@ def _open(url: str, endpoint: str) -> Any:
     except ModuleNotFoundError as error:
         raise LiveError(
             "zenoh:// needs the package `eclipse-zenoh`, which is not installed",
-            hint="pip install 'pc2grid[zenoh]'",
+            hint="pip install eclipse-zenoh",
         ) from error
     config = zenoh.Config()
     for key, value in (

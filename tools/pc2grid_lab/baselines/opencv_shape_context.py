@@ -8,7 +8,7 @@ off by default there; without it turned queries are not found at all, so it is o
 The class is in the module `shape` of opencv-contrib 4. That package and opencv-python-headless exclude each
 other, so the method runs in an environment of its own:
 
-    pip install pc2grid && pip uninstall opencv-python-headless
+    pip install . && pip uninstall opencv-python-headless
     pip install 'opencv-contrib-python-headless<5'
 """
 
