@@ -149,7 +149,7 @@ def example_answer(result: FloorResult) -> FloorAnswer:
 _BY_INTEREST: tuple[FloorStatus, ...] = ("wrong", "ambiguous", "right", "not_found")
 
 
-def _draw_bars(figure: Any, of_way: Mapping[str, Sequence[Asked]]) -> None:
+def _draw_bars(figure: Any, of_way: Mapping[Any, Sequence[Asked]]) -> None:
     """A panel for each way, and above them how many answers name a wrong floor."""
     panels = figure.subplots(1, len(of_way), squeeze=False)[0]
     for ax, (way, houses) in zip(panels, of_way.items(), strict=True):
