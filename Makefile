@@ -57,6 +57,7 @@ picture: $(READY)
 	PYTHONPATH=tools $(BIN)/python tools/architecture.py examples/architecture.svg
 
 docs: $(READY)
+	@$(BIN)/python -c "from pc2grid.extras import require; require({'docs': 'make docs'})"
 	$(BIN)/python -m mkdocs build
 
 clean:

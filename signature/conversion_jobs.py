@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from pc2grid import extras
 from pc2grid._version import __version__
 from pc2grid.errors import ClusterError, DatabaseError
 from pc2grid.observer import Observer
@@ -191,12 +192,8 @@ class _LostWorkers:
 @contextlib.contextmanager
 def _connected(address: str, processes: int) -> Iterator[Any]:
     """Connects to a scheduler that has at least one worker."""
-    try:
-        import distributed
-    except ImportError as error:
-        raise ClusterError(
-            f"a cluster needs an extra that is not installed ({error})", hint="pip install dask distributed"
-        ) from None
+    extras.require({"cluster": "a cluster"})
+    import distributed
 
     class Client(distributed.Client):
         """A client that closes itself if it cannot connect.

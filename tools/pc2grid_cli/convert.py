@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pc2grid import extras
 from pc2grid.errors import ConfigError, DatabaseError, one_line
 from pc2grid.observer import Observer, Observers
 from pc2grid.time_span import TimeSpan
@@ -19,6 +20,7 @@ from pc2grid_cli import console, data_loss
 from pc2grid_cli import options as options
 from pc2grid_cli.output_files import check_database, check_database_name
 from pc2grid_cli.plural import counted
+from pc2grid_cli.rerun_target import require_target, url_of
 
 if TYPE_CHECKING:
     from pc2grid.model import SessionMap
@@ -85,6 +87,14 @@ def convert_command(
     from signature.conversion_jobs import LOCAL
     from signature.database import Label, maintenance
 
+    parallel = dask is not None or jobs is not None
+    if rerun is not None:
+        _check_rerun(rerun, several=len(inputs) > 1, parallel=parallel)
+    extras.require(
+        ({} if rerun is None else {"viz": "--rerun"})
+        | ({} if not parallel else {"cluster": "--dask" if jobs is None else "--jobs"})
+        | extras.of_addresses(output)
+    )
     settings = options.make_config(
         config,
         set_,
@@ -95,9 +105,7 @@ def convert_command(
         preset=preset,
     )
     if rerun is not None:
-        _check_rerun(
-            rerun, several=len(inputs) > 1, parallel=dask is not None or jobs is not None, force=force
-        )
+        require_target(rerun, force)
     span, label = TimeSpan(start, duration), Label(building=building, floor=floor)
     wanted = _jobs(inputs, name, settings, span=span, recover=recover, label=label)
     stored = _stored(output, wanted, add=add, force=force)
@@ -130,10 +138,8 @@ def convert_command(
         raise typer.Exit(console.LOSSY)
 
 
-def _check_rerun(target: str, *, several: bool, parallel: bool, force: bool) -> None:
-    """Raises ConfigError or OutputError if the conversion cannot be streamed to this target."""
-    from pc2grid_cli.rerun_target import require_target, url_of
-
+def _check_rerun(target: str, *, several: bool, parallel: bool) -> None:
+    """Raises ConfigError if such a conversion cannot be streamed to this target."""
     if parallel:
         raise ConfigError("--rerun shows what is done in this process: not with --dask or --jobs")
     if several and url_of(target) is None:
@@ -141,7 +147,6 @@ def _check_rerun(target: str, *, several: bool, parallel: bool, force: bool) -> 
             "--rerun writes one recording to a file, but there are several inputs",
             hint="watch them in the viewer: --rerun, or --rerun HOST:PORT",
         )
-    require_target(target, force)
 
 
 def _jobs(

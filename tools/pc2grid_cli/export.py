@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from pc2grid import extras
 from pc2grid_cli import console
 from pc2grid_cli.options import AsJson, Database, Force, Rerun
 from pc2grid_cli.output_files import check_file, map_stem
@@ -94,6 +95,7 @@ def export_command(
         report=report,
         force=force,
     )
+    extras.require(({} if rerun is None else {"viz": "--rerun"}) | extras.of_addresses(database))
     outputs.check()
     with open_database(database) as opened:
         where = opened.location

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pc2grid import extras
 from pc2grid.display import probability
 from pc2grid.errors import one_line
 from pc2grid.time_span import TimeSpan
@@ -137,6 +138,7 @@ def relocalize_command(
     from pc2grid.io.nav2_map import is_map_file
     from signature.database import open_database
 
+    extras.require(({} if rerun is None else {"viz": "--rerun"}) | extras.of_addresses(database))
     outputs = _Outputs(
         trajectory=trajectory,
         initialpose=initialpose,

@@ -9,7 +9,8 @@ import sys
 from typing import Any
 from urllib.parse import urlsplit
 
-from pc2grid.errors import ConfigError, OutputError
+from pc2grid import extras
+from pc2grid.errors import OutputError
 
 VIEWER = "viewer"
 """In place of an address or a file: the viewer of this machine, which is started if necessary."""
@@ -18,10 +19,9 @@ _PORT = 9876  # the default of the viewer
 
 def require_rerun() -> Any:
     """The rerun module. Raises ConfigError if it is not installed."""
-    try:
-        import rerun
-    except ImportError:
-        raise ConfigError("--rerun needs the package rerun-sdk", hint="pip install rerun-sdk") from None
+    extras.require({"viz": "--rerun"})
+    import rerun
+
     return rerun
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pc2grid import extras
 from pc2grid.errors import OutputError
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
@@ -66,6 +67,7 @@ def view_command(
     """
     from signature.database import open_database
 
+    extras.require(extras.of_addresses(source, database))
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
     )

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar, cast
 
 import typer
 
+from pc2grid import extras
 from pc2grid.display import probability
 from pc2grid.errors import ConfigError, one_line
 from pc2grid_cli import console
@@ -118,6 +119,7 @@ def watch_command(
     from pc2grid.io.live.targets import open_live
     from signature.database import open_database
 
+    extras.require(extras.of_addresses(source, database))
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
     )

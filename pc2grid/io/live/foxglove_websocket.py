@@ -14,6 +14,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from pc2grid import extras
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LiveError
 from pc2grid.io import topics
@@ -65,7 +66,8 @@ class FoxgloveWebsocket:
         parameters: ConnectionParameters = CONNECTION,
         inbox: InboxParameters = INBOX,
     ) -> None:
-        """Raises LiveError if the first connection fails, ConfigError without the package `websockets`."""
+        """Raises LiveError if the first connection fails, or without the package `websockets`."""
+        extras.require({"live": "ws://"})
         self.name = url
         self.counts, self.news = FeedCounts(), News()
         self._url, self._config, self._parameters = url, config, parameters
@@ -198,15 +200,10 @@ class FoxgloveWebsocket:
             time.sleep(self._parameters.least_pause_s)
 
     def _connect(self) -> ClientConnection:
-        try:
-            from websockets.exceptions import InvalidHandshake, InvalidURI
-            from websockets.sync.client import connect
-            from websockets.typing import Subprotocol
-        except ModuleNotFoundError as error:
-            raise LiveError(
-                "ws:// needs the package `websockets`, which is not installed",
-                hint="pip install websockets",
-            ) from error
+        from websockets.exceptions import InvalidHandshake, InvalidURI
+        from websockets.sync.client import connect
+        from websockets.typing import Subprotocol
+
         p = self._parameters
         problem: Exception | None = None
         for subprotocol in SUBPROTOCOLS:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
+from pc2grid import extras
 from pc2grid.config import ReadConfig
 from pc2grid.errors import ConfigError, LiveError
 from pc2grid.io import topics
@@ -301,13 +302,9 @@ def _address(url: str) -> tuple[str, int]:
 
 
 def _open(url: str, endpoint: str) -> Any:
-    try:
-        import zenoh
-    except ModuleNotFoundError as error:
-        raise LiveError(
-            "zenoh:// needs the package `eclipse-zenoh`, which is not installed",
-            hint="pip install eclipse-zenoh",
-        ) from error
+    extras.require({"zenoh": "zenoh://"})
+    import zenoh
+
     config = zenoh.Config()
     for key, value in (
         ("mode", '"client"'),

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+from pc2grid import extras
 from pc2grid.errors import (
     DatabaseBusy,
     DatabaseCorrupt,
@@ -261,15 +262,10 @@ def _exists(connection: Connection[Any]) -> bool:
 
 def driver() -> Any:
     """The module psycopg. Raises DatabaseError with what to install if it is missing."""
-    try:
-        import pgvector  # noqa: F401
-        import psycopg
-        import psycopg.conninfo
-    except ImportError as error:
-        raise DatabaseError(
-            f"postgresql:// databases need an extra that is not installed ({error})",
-            hint="pip install 'psycopg[binary]' pgvector",
-        ) from None
+    extras.require({"postgres": "postgresql://"})
+    import psycopg
+    import psycopg.conninfo
+
     return psycopg
 
 

@@ -5,9 +5,10 @@ A method is fitted to the submaps of a map. Then it compares queries with each o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
+from pc2grid import extras
 from pc2grid.arrays import F64
 from pc2grid.model import Submap
 
@@ -55,6 +56,17 @@ EXTRA_METHOD_NAMES = (
 )
 """Beyond the paper: three other readings of the shape context, its own method with alignment, and places
 described from several centres: by Eq. 6, by its boundary alone, and by the shape context."""
+
+
+def require_packages(names: Collection[str]) -> None:
+    """Raise ConfigError if packages are missing that the methods with these names need."""
+    wanted = [name for name in names if name.startswith("surf")]
+    if wanted:
+        extras.require({"paper": ", ".join(wanted)})
+    if "opencv_shape_context" in names:
+        from pc2grid_lab.baselines.opencv_shape_context import require_shapes
+
+        require_shapes()
 
 
 def make_methods(names: Iterable[str]) -> dict[str, Method]:

@@ -45,15 +45,7 @@ class OpenCvShapeContext:
 
     def fit(self, submaps: Sequence[Submap]) -> _Shapes:
         """Sample every submap. Raises ConfigError if OpenCV has no module `shape`."""
-        import cv2
-
-        make = getattr(cv2, "createShapeContextDistanceExtractor", None)
-        if make is None:
-            raise ConfigError(
-                "opencv_shape_context: this OpenCV has no Shape Context",
-                hint="in an environment of its own: pip install 'opencv-contrib-python-headless<5'",
-            )
-        extractor = make(self.angular_bins, self.radial_bins)
+        extractor = require_shapes()(self.angular_bins, self.radial_bins)
         extractor.setRotationInvariant(True)
         return _Shapes(self, extractor, [self.sample(submap) for submap in submaps])
 
@@ -62,6 +54,19 @@ class OpenCvShapeContext:
         cells = sample_evenly(cells_of(thin(submap.grid.occupied)), self.spacing_m / submap.grid.resolution_m)
         chosen = np.linspace(0, len(cells) - 1, min(self.points, len(cells))).astype(np.int64)
         return cells[chosen][:, None, ::-1].astype(np.float32)
+
+
+def require_shapes() -> Any:
+    """What makes OpenCV's shape contexts. Raises ConfigError if OpenCV has no module `shape`."""
+    import cv2
+
+    make = getattr(cv2, "createShapeContextDistanceExtractor", None)
+    if make is None:
+        raise ConfigError(
+            "opencv_shape_context: this OpenCV has no Shape Context",
+            hint="in an environment of its own: pip install 'opencv-contrib-python-headless<5'",
+        )
+    return make
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,8 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from pc2grid.errors import Pc2GridError
+from pc2grid.extras import require
 from pc2grid_lab.bench import large_database, live, locating, peers, points, reading, space, submaps
 from pc2grid_lab.bench.measure import ROOT, Row, machine, table
 
@@ -54,6 +56,8 @@ MEASURES: dict[str, Measure] = {
     "fleet": fleet_search,
 }
 
+_EXTRAS = {"retrieve": "bench", "fleet": "postgres"}
+
 
 def main() -> None:
     """Run the measures and print the table."""
@@ -66,10 +70,15 @@ def main() -> None:
         "--out", type=Path, default=ROOT / "results", help="folder for bench.md and bench.json"
     )
     arguments = parser.parse_args()
+    chosen = arguments.only or MEASURES
+    try:
+        require({name: what for what, name in _EXTRAS.items() if what in chosen})
+    except Pc2GridError as error:
+        parser.error(str(error))
     facts = {"command": " ".join(["python -m pc2grid_lab.bench.run", *sys.argv[1:]]), **machine()}
     facts["data"] = "with PC2GRID_DATA" if os.environ.get("PC2GRID_DATA") else "simulated only"
     rows: list[Row] = []
-    for name in arguments.only or MEASURES:
+    for name in chosen:
         begin = time.perf_counter()
         with tempfile.TemporaryDirectory(prefix="bench-") as folder:
             try:

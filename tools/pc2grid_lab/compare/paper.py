@@ -84,7 +84,7 @@ def compare_paper_command(
     """
     from pc2grid.errors import ConfigError, MapFileError
     from pc2grid_cli.console import of, print_json
-    from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES
+    from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES, require_packages
     from pc2grid_lab.compare import paper_report
     from pc2grid_lab.experiments.paper_task import ABLATION, OPEN_CHOICES, known_maps, paper_tasks
 
@@ -93,6 +93,7 @@ def compare_paper_command(
     for name in chosen:
         if name not in known:
             raise ConfigError(f"--methods: no method {name!r}", hint=f"one of {', '.join(known)}")
+    require_packages(chosen)
     offsets_m = tuple(offset or (1.0, 0.5))
     if min(offsets_m) <= 0:
         raise ConfigError("--offset: expected a distance above 0 m")

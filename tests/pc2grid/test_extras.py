@@ -1,0 +1,156 @@
+"""What is not installed is said before any work, all of it at once, with the command that installs it."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pc2grid.errors import ClusterError, ConfigError, DatabaseError, LiveError, Pc2GridError
+from pc2grid.extras import EXTRAS, of_addresses, require
+from pc2grid.io.live.targets import open_live
+from pc2grid_cli.main import app
+from tests.helpers.rooms import cross, grid_of
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parents[2]
+
+
+def missing(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """As if the packages of these extras were not installed."""
+    for name in names:
+        for module in EXTRAS[name].modules:
+            monkeypatch.setitem(sys.modules, module, None)
+
+
+def test_the_table_is_that_of_the_project() -> None:
+    """Every extra but the developers', and the packages that pip would install for it."""
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    declared = tomllib.loads(text)["project"]["optional-dependencies"]
+    assert set(EXTRAS) == set(declared) - {"dev"}
+    for name, extra in EXTRAS.items():
+        packages = {re.split("[>;<=]", requirement)[0] for requirement in declared[name]}
+        assert {package.strip("'") for package in extra.packages} == packages, name
+
+
+@pytest.mark.parametrize("name", EXTRAS)
+def test_each_extra_is_named_with_what_needs_it(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    missing(monkeypatch, name)
+    with pytest.raises(EXTRAS[name].error) as caught:
+        require({name: "this command"})
+    assert caught.value.message.startswith(f"the extra `{name}`, for this command, is not installed (")
+    assert caught.value.hint == f"pip install {' '.join(EXTRAS[name].packages)}"
+
+
+def test_a_package_that_is_broken_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """psycopg without its library can be found, but not imported; the reason is told."""
+    (tmp_path / "mahotas.py").write_text("raise ImportError('libfoo.so.5: cannot open')")
+    monkeypatch.delitem(sys.modules, "mahotas", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError, match=r"libfoo\.so\.5"):
+        require({"paper": "surf_bow"})
+
+
+@pytest.mark.parametrize(
+    ("command", "blocked", "error", "hint"),
+    [
+        ("compare paper --maps {0} -o {0}/new", ("paper",), ConfigError, "pip install mahotas"),
+        (
+            "convert a.mcap -o {0}/b.submaps --jobs 2",
+            ("cluster",),
+            ClusterError,
+            "pip install dask distributed",
+        ),
+        (
+            "convert a.mcap -o postgresql://u:secret@h/d --rerun",
+            ("viz", "postgres"),
+            ConfigError,
+            "pip install rerun-sdk 'psycopg[binary]' pgvector",
+        ),
+        (
+            "relocalize a.mcap -d postgres://h/d --rerun {0}/x.rrd",
+            ("viz", "postgres"),
+            ConfigError,
+            "pip install rerun-sdk 'psycopg[binary]' pgvector",
+        ),
+        (
+            "export postgresql://h/d --rerun {0}/x.rrd",
+            ("viz", "postgres"),
+            ConfigError,
+            "pip install rerun-sdk 'psycopg[binary]' pgvector",
+        ),
+        (
+            "watch ws://robot -d postgresql://h/d",
+            ("live", "postgres"),
+            LiveError,
+            "pip install websockets 'psycopg[binary]' pgvector",
+        ),
+        ("watch zenoh://robot -d {0}/no.submaps", ("zenoh",), LiveError, "pip install eclipse-zenoh"),
+        ("view {0}/no.submaps wss://robot", ("live",), LiveError, "pip install websockets"),
+        ("db info postgresql://h/d", ("postgres",), DatabaseError, "pip install 'psycopg[binary]' pgvector"),
+    ],
+)
+def test_commands_say_all_that_is_missing_before_any_work(
+    command: str,
+    blocked: tuple[str, ...],
+    error: type[Pc2GridError],
+    hint: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Neither the recording nor the database exists: nothing was looked at before."""
+    from pc2grid.io.nav2_map import save_map
+
+    save_map(grid_of(cross(6.0, 2.0)), tmp_path / "intel")
+    before = sorted(tmp_path.iterdir())
+    missing(monkeypatch, *blocked)
+    done = CliRunner().invoke(app, command.format(tmp_path).split())
+    assert type(done.exception) is error and done.exception.hint == hint
+    assert all(f"`{name}`" in done.exception.message for name in blocked)
+    assert "secret" not in str(done.exception)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_methods_that_need_no_extra_run_without_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pc2grid_lab.baselines import require_packages
+
+    missing(monkeypatch, *EXTRAS)
+    require_packages(["proposed", "shape_context", "sift_bow", "sdf"])
+    require(of_addresses(tmp_path / "b.submaps", "monday.mcap", "-", None))
+    with pytest.raises(ConfigError, match="for surf_bow, surf_tfidf, is"):
+        require_packages(["surf_bow", "proposed", "surf_tfidf"])
+
+
+def test_a_robot_is_not_waited_for_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    missing(monkeypatch, "live")
+    with pytest.raises(LiveError, match="`live`"):
+        open_live("ws://127.0.0.1:1")
+
+
+def test_the_benchmark_says_so_before_it_measures(tmp_path: Path) -> None:
+    """As `make bench` runs it."""
+    (tmp_path / "faiss.py").write_text("raise ImportError('no faiss here')")
+    arguments = [
+        "-m",
+        "pc2grid_lab.bench.run",
+        "--only",
+        "help",
+        "--only",
+        "retrieve",
+        "--out",
+        tmp_path / "r",
+    ]
+    environment = {"PYTHONPATH": f"{tmp_path}:{ROOT}:{ROOT / 'tools'}", "PATH": "/usr/bin:/bin"}
+    done = subprocess.run(
+        [sys.executable, *arguments], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2 and "pip install faiss-cpu" in done.stderr and "Traceback" not in done.stderr
+    assert not (tmp_path / "r").exists()
