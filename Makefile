@@ -51,7 +51,8 @@ FUZZ = $(ONE_THREAD) PC2GRID_FUZZ=20000 $(BIN)/python -m pytest -q -n auto --dis
 
 fuzz: $(READY)
 	$(FUZZ) $(FUZZ_FOLDER) tests/pc2grid/io/test_fuzz.py tests/test_fuzz_inputs.py
-	$(FUZZ) tests/signature/database/test_faults.py tests/signature/database/test_durability.py -k fuzz
+	$(FUZZ) tests/signature/database/test_faults.py tests/signature/database/test_durability.py \
+		tests/pc2grid_cli/test_view.py -k fuzz
 
 picture: $(READY)
 	PYTHONPATH=tools $(BIN)/python tools/architecture.py examples/architecture.svg

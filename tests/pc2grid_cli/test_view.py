@@ -8,6 +8,7 @@ import http.client
 import json
 import os
 import queue
+import random
 import re
 import shutil
 import signal
@@ -207,8 +208,8 @@ def test_errors_are_told_with_their_advice_and_leave_nothing(
         raise ZeroDivisionError
 
     broken = serve(break_down)
-    with pytest.raises((http.client.RemoteDisconnected, ConnectionError, urllib.error.URLError)):
-        broken.post(b"abc")
+    status, told = broken.post(b"abc")
+    assert status == 500 and "terminal" in told["hint"]
     assert "ZeroDivisionError" in capfd.readouterr().err
     assert broken.get()[0] == 200  # it goes on, and takes the next recording
     assert not broken.server.busy.locked()
@@ -233,6 +234,124 @@ def test_what_is_too_large_or_has_no_size_is_refused_before_it_is_read(serve: Ca
     connection.endheaders()
     reply = connection.getresponse()
     assert reply.status == 507 and "TMPDIR" in json.loads(reply.read())["hint"]
+
+
+def say(served: Served, request: bytes) -> bytes:
+    """All that is answered to the bytes of a request, which ends behind them."""
+    with socket.create_connection(("127.0.0.1", served.server.server_port), timeout=60) as connection:
+        connection.sendall(request)
+        connection.shutdown(socket.SHUT_WR)
+        answer = b""
+        while block := connection.recv(1 << 16):
+            answer += block
+    return answer
+
+
+@pytest.mark.parametrize("target", ["//[", "http://[", "//[::1", "//]/", "//[v1.x]/", "http://\u2100/"])
+def test_an_address_that_is_none_is_refused(
+    serve: Callable[..., Served], capfd: pytest.CaptureFixture[str], target: str
+) -> None:
+    """Such a line printed a traceback, and was not answered."""
+    served = serve()
+    for method in ("GET", "POST"):
+        answer = say(served, f"{method} {target} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+        assert re.match(rb"HTTP/1\.0 40[03] ", answer), answer
+        assert json.loads(answer.partition(b"\r\n\r\n")[2])["error"]
+    assert capfd.readouterr() == ("", "")
+
+
+def test_fuzzed_requests_are_answered_and_nothing_is_printed(
+    serve: Callable[..., Served], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Requests with bytes changed, left out, inserted, doubled; in the line, the headers and the body."""
+    served = serve(lambda path, options, check: {"size": path.stat().st_size, "near": options.get("near")})
+    served.server.events.close()  # otherwise pages would wait for them
+    own, token = f"127.0.0.1:{served.server.server_port}", served.server.token
+    page = f"GET /{token}/ HTTP/1.1\r\nHost: {own}\r\nOrigin: http://{own}\r\nAccept: */*\r\n\r\n".encode()
+    upload = (
+        f"POST /{token}/locate?name=a%20b.mcap&near=1,2,3 HTTP/1.1\r\nHost: {own}\r\n"
+        "Content-Type: application/octet-stream\r\nContent-Length: 20\r\n\r\n01234567890123456789"
+    ).encode()
+    assert b" 200 " in say(served, page).splitlines()[0]
+    assert json.loads(say(served, upload).partition(b"\r\n\r\n")[2]) == {"size": 20, "near": "1,2,3"}
+    rng = random.Random(1)
+    pieces = [
+        b"\0",
+        b"\r\n",
+        b"\n",
+        b" ",
+        b":",
+        b"%",
+        b"[",
+        b"//",
+        b"\xff\xfe",
+        b"\xe2\x84\x80",
+        b"9" * 30,
+        b"-1",
+    ]
+    pieces += [
+        b"A" * 70_000,
+        b"X: y\r\n" * 200,
+        b"HTTP/9.9",
+        b"HEAD ",
+        b"Expect: 100-continue\r\n",
+        b"\r\n\r\n",
+    ]
+    pieces += [
+        b"Transfer-Encoding: chunked\r\n",
+        b"Content-Length: 99\r\n",
+        b"HTTP/1.\xb2",
+        b"&" * 2000,
+        b";=%zz",
+    ]
+    statuses = set()
+    for _ in range(int(os.environ.get("PC2GRID_FUZZ", "400"))):
+        request = bytearray(rng.choice((page, upload)))
+        for _ in range(rng.randint(1, 4)):
+            # Half of the changes are in the first line, where most is read.
+            end = len(request) if rng.random() < 0.5 else request.find(b"\n") + 1
+            at = rng.randrange(max(1, end))
+            change = rng.randrange(5)
+            if change == 0:
+                request[at : at + 1] = bytes([rng.randrange(256)])
+            elif change == 1:
+                del request[at : at + rng.randint(1, 30)]
+            elif change == 2:
+                request[at:at] = rng.choice(pieces)
+            elif change == 3:
+                request[at:at] = request[at : at + rng.randint(1, 60)]
+            else:
+                del request[at:]
+        if not request.partition(b"\n")[0].decode("latin-1").split():
+            continue  # an empty line asks for nothing
+        answer = say(served, bytes(request))
+        status = re.match(rb"HTTP/1\.0 (\d+) ", answer)
+        assert status or b"error" in answer.lower() or b"first page" in answer, bytes(
+            request
+        )  # HTTP/0.9 has none
+        statuses |= {int(status[1])} if status else set()
+    assert capfd.readouterr() == ("", "")
+    assert {200, 400, 403, 404, 411, 422, 501} <= statuses and 500 not in statuses
+    assert served.get()[0] == 200 and not served.server.busy.locked()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_refusal_arrives_although_the_recording_was_not_read(serve: Callable[..., Served]) -> None:
+    """Unread bytes reset a connection, and take the answer with them."""
+    served = serve(most_bytes=1000)
+    for _ in range(5):
+        status, told = served.post(b"x" * 8_000_000)
+        assert status == 413 and "--most-gb" in told["hint"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full disk here")
+def test_a_disk_that_fills_up_is_told(
+    serve: Callable[..., Served], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run.mcap").symlink_to("/dev/full")
+    status, told = serve().post(b"abc")
+    assert status == 422 and "No space left" in told["error"] and "TMPDIR" in told["hint"]
+    assert capfd.readouterr() == ("", "") and list(tmp_path.iterdir()) == []
 
 
 class Slow:

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from pc2grid.errors import Pc2GridError
+from pc2grid.errors import LogTruncated, OutputError, Pc2GridError
 from pc2grid_cli.view_events import Events
 
 _ADDRESS = "127.0.0.1"
@@ -34,6 +34,9 @@ _POLL_S = 0.2
 """How often the server looks whether it is to stop."""
 _SILENCE_S = 60.0
 """A client that sends nothing for so long is gone."""
+_LINGER_S = 1.0
+_MOST_UNREAD_BYTES = 16 << 20
+"""So long, and so much, is read of a request that was refused."""
 _HEARTBEAT_S = 5.0
 """After so long without an event a comment is sent, which shows whether the page is still there."""
 _POLICY = (
@@ -99,6 +102,17 @@ class ViewServer(http.server.ThreadingHTTPServer):
         """Serve until the process is interrupted."""
         self.serve_forever(_POLL_S)
 
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection. What the client still sends is read first: unread, it would reset the
+        connection, and the answer would be lost."""
+        with contextlib.suppress(OSError):
+            request.shutdown(socket.SHUT_WR)
+            request.settimeout(_LINGER_S)
+            left = _MOST_UNREAD_BYTES
+            while left > 0 and (block := request.recv(min(left, 1 << 16))):
+                left -= len(block)
+        self.close_request(request)
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client that went away is no error of ours; anything else is printed."""
         if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):
@@ -110,12 +124,33 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     server_version = "pc2grid"
     sys_version = ""
     timeout = _SILENCE_S
+    _begun = False
+    """Whether an answer was begun. A connection carries one request: HTTP/1.0."""
 
     def log_message(self, format: str, *args: Any) -> None:
         """Requests are not printed."""
 
     def do_GET(self) -> None:
         """A page, or the events."""
+        self._answered(self._get)
+
+    def do_POST(self) -> None:
+        """Locate the recording in the body of the request."""
+        self._answered(self._post)
+
+    def _answered(self, answer: Callable[[], None]) -> None:
+        """Answer a request; an error of the program is printed, and the client is told that there was one."""
+        try:
+            answer()
+        except (ConnectionError, TimeoutError):
+            raise  # nobody is there to be answered
+        except Exception:
+            self.server.handle_error(self.request, self.client_address)
+            if not self._begun:
+                status = HTTPStatus.INTERNAL_SERVER_ERROR
+                self._refuse(status, "internal error", "the terminal of pc2grid view shows it")
+
+    def _get(self) -> None:
         name = self._allowed()
         if name is None:
             return
@@ -126,8 +161,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         else:
             self._refuse(HTTPStatus.NOT_FOUND, "there is no such page")
 
-    def do_POST(self) -> None:
-        """Locate the recording in the body of the request."""
+    def _post(self) -> None:
         name = self._allowed()
         if name is None:
             return
@@ -152,7 +186,12 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         port = self.server.server_port
         hosts = {f"{host}:{port}" for host in (_ADDRESS, "localhost")}
         origin = self.headers.get("Origin")
-        _, token, name = f"{urlsplit(self.path).path}//".split("/", 2)
+        try:
+            path = urlsplit(self.path).path
+        except ValueError as error:  # a host in brackets that is no address
+            self._refuse(HTTPStatus.BAD_REQUEST, f"not an address: {error}")
+            return None
+        _, token, name = f"{path}//".split("/", 2)
         ours = secrets.compare_digest(token.encode(), self.server.token.encode())
         from_here = self.headers.get("Host") in hosts and (
             origin is None or origin in {f"http://{host}" for host in hosts}
@@ -177,6 +216,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     # --- answers --------------------------------------------------------------------------------------
 
     def _begin(self, status: HTTPStatus, kind: str, size: int | None = None) -> None:
+        self._begun = True
         self.send_response(status)
         self.send_header("Content-Type", kind)
         if size is not None:
@@ -261,16 +301,23 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         return None
 
     def _receive(self, path: Path, size: int) -> None:
-        with path.open("wb") as file:
+        with path.open("wb", buffering=0) as file:
             while size:
                 self._stop_if_stopping()
-                with contextlib.suppress(ConnectionError, TimeoutError):
+                try:
                     block = self.rfile.read(min(size, _BLOCK_BYTES))
+                except (ConnectionError, TimeoutError):
+                    raise Cancelled from None
+                if not block:
+                    raise LogTruncated(f"{path.name}: {size} bytes of it were not sent")
+                try:
                     file.write(block)
-                    size -= len(block)
-                    if block:
-                        continue
-                raise Cancelled
+                except OSError as error:
+                    raise OutputError(
+                        f"the recording cannot be copied: {error.strerror or error}",
+                        hint="set TMPDIR to a larger disk, or use pc2grid relocalize, which needs no copy",
+                    ) from error
+                size -= len(block)
 
     def _stop_if_stopping(self) -> None:
         if self.server.stopping.is_set():
