@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
 import math
-import os
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -104,20 +104,26 @@ def test_settings_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 def test_what_a_killed_writer_left_is_swept_and_nothing_else(tmp_path: Path) -> None:
-    dead = os.spawnlp(os.P_NOWAIT, "true", "true")
-    os.waitpid(dead, 0)
-    swept = [f".a.pc2grid-{dead}.tmp", f".a.pc2grid-{os.getpid()}.tmp"]
+    swept = [".a.pc2grid-0123abcd.tmp", ".a.pc2grid-1.tmp"]
     kept = [
-        f".a.pc2grid-{os.getppid()}.tmp",  # that process is at it
-        f".a.pc2grid-{10**30}.tmp",  # no process of ours
+        ".a.pc2grid-fedc9876.tmp",  # somebody is at it
         ".a.pc2grid-x.tmp",
-        f".a.pc2grid-{dead}",
-        f".b.pc2grid-{dead}.tmp",
+        ".a.pc2grid-0123abcd",
+        ".b.pc2grid-0123abcd.tmp",
+        ".a.pc2grid-00.tmp",  # a link to somebody's file
     ]
-    for name in (*swept, *kept):
+    for name in (*swept, *kept[:-1]):
         (tmp_path / name).touch()
-    with replace_file(tmp_path / "a") as temporary:
-        temporary.write_text("new")
+    (tmp_path / kept[-1]).symlink_to(kept[0])
+    with (tmp_path / kept[0]).open() as busy, replace_file(tmp_path / "b") as other:
+        other.write_text("b")
+        fcntl.flock(busy, fcntl.LOCK_EX)
+        for content in ("new", "newer"):
+            with replace_file(tmp_path / "a") as temporary:
+                temporary.write_text(content)
+            assert (tmp_path / "a").read_text() == content
+    (tmp_path / "b").unlink()
+    kept.remove(".b.pc2grid-0123abcd.tmp")  # by the writer of b
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(["a", *kept])
 
 

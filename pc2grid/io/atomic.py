@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
+import re
+import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,24 +21,31 @@ _MARK = ".pc2grid-"
 
 
 @contextlib.contextmanager
-def replace_file(path: str | Path) -> Iterator[Path]:
+def replace_file(path: str | Path, *, alone: bool = False) -> Iterator[Path]:
     """Give the body a temporary path; when it ends well, that file becomes `path`.
 
     The body may open, write and close the temporary file as it likes. If the body raises, or the process
     dies, `path` keeps its old content; the temporary is removed (after a kill: by the next writer of the
     same target). A symbolic link is followed, not replaced.
 
+    Whether the writer of a temporary file still works is told by its lock on that file. Its number tells
+    nothing: processes of two containers that share a folder may both be number 1.
+
+    alone : the caller keeps all other writers of `path` away. Then every other temporary file was left over,
+        and this one is not locked: on NFS, SQLite could not lock it.
+
     Raises OutputError if the folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
     target = Path(os.path.realpath(path))
-    temporary = _temporary(target)
     if target.is_dir():
         raise OutputError(f"{path}: is a folder", hint="name a file to write to")
-    _remove_left_over(target)
+    _remove_left_over(target, alone)
     try:
-        # Not mkstemp, which ignores the user's umask.
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        temporary, descriptor = _create(target, lock=not alone)
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+    try:
         yield temporary
         with temporary.open("rb+") as written:
             os.fsync(written.fileno())
@@ -46,9 +56,10 @@ def replace_file(path: str | Path) -> Iterator[Path]:
         # On a full disk shutil.copyfile raises an error with both names, the source first.
         if error.filename not in ours and error.filename2 not in ours[1:]:
             raise  # the body failed on another file
-        raise OutputError(f"{path}: cannot write: {error.strerror or error}", hint=_advice(error)) from error
+        raise _cannot_write(path, error) from error
     finally:
         temporary.unlink(missing_ok=True)
+        os.close(descriptor)
 
 
 def refuse_existing(path: str | Path, force: bool) -> None:
@@ -71,26 +82,49 @@ def require_writable(path: str | Path, force: bool) -> None:
         if path.is_dir():
             raise OutputError(f"{path}: is a folder", hint="name a file to write to")
         refuse_existing(path, force)
-        temporary = _temporary(Path(os.path.realpath(path)))
-        if not temporary.parent.is_dir():
-            raise OutputError(
-                f"{path}: cannot write: no folder {path.parent}", hint="create the folder first"
-            )
-        os.close(os.open(temporary, os.O_CREAT | os.O_WRONLY, 0o666))
-        temporary.unlink()
+        target = Path(os.path.realpath(path))
+        temporary, descriptor = _create(target, lock=True)
+        os.close(descriptor)
+        temporary.unlink(missing_ok=True)  # the next writer may have seen that nobody locks it
     except OSError as error:
-        raise OutputError(f"{path}: cannot write: {error.strerror or error}", hint=_advice(error)) from error
+        raise _cannot_write(path, error) from error
 
 
-def _temporary(target: Path) -> Path:
-    return target.with_name(f".{target.name}{_MARK}{os.getpid()}.tmp")
+def _create(target: Path, *, lock: bool) -> tuple[Path, int]:
+    """A new, empty file beside `target` and a descriptor of it, which may hold a lock on it."""
+    while True:
+        temporary = target.with_name(f".{target.name}{_MARK}{secrets.token_hex(4)}.tmp")
+        try:
+            # Not mkstemp, which ignores the user's umask.
+            descriptor = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+        except FileExistsError:
+            continue
+        if not lock:
+            return temporary, descriptor
+        with contextlib.suppress(OSError):  # some network file systems have no locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        if is_at(descriptor, temporary):
+            return temporary, descriptor
+        os.close(descriptor)  # another writer found it before it was locked
+
+
+def is_at(descriptor: int, path: Path) -> bool:
+    """Whether `path` still names the open file."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def _cannot_write(path: Path, error: OSError) -> OutputError:
+    if error.errno == errno.ENOENT and not path.parent.is_dir():
+        return OutputError(f"{path}: cannot write: no folder {path.parent}", hint="create the folder first")
+    return OutputError(f"{path}: cannot write: {error.strerror or error}", hint=_advice(error))
 
 
 def _advice(error: OSError) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return "free some space, or write to another disk"
-    if error.errno == errno.ENOENT:
-        return "create the folder first"
     return "choose a folder you may write to"
 
 
@@ -103,23 +137,26 @@ def _fsync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def _remove_left_over(target: Path) -> None:
-    """Remove the temporary files of `target` whose process does not exist any more."""
-    prefix = f".{target.name}{_MARK}"
+def _remove_left_over(target: Path, alone: bool) -> None:
+    """Remove the temporary files of `target` that nobody writes any more."""
+    name = re.compile(re.escape(f".{target.name}{_MARK}") + r"[0-9a-f]+\.tmp")
     with contextlib.suppress(OSError):
         for left_over in target.parent.iterdir():
-            name = left_over.name
-            if name.startswith(prefix) and name.endswith(".tmp"):
-                pid = name[len(prefix) : -len(".tmp")]
-                if pid.isdecimal() and not _alive(int(pid)):
-                    left_over.unlink(missing_ok=True)
+            if name.fullmatch(left_over.name) and (alone or _is_unlocked(left_over)):
+                left_over.unlink(missing_ok=True)
 
 
-def _alive(pid: int) -> bool:
+def _is_unlocked(path: Path) -> bool:
+    """Whether nobody holds a lock on the file; not, if that cannot be told."""
     try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
+        descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError:
         return False
-    except (PermissionError, OverflowError):
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    else:
         return True
-    return pid != os.getpid()
+    finally:
+        os.close(descriptor)

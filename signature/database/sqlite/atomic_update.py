@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pc2grid.errors import DatabaseBusy, OutputError
-from pc2grid.io.atomic import replace_file
+from pc2grid.io.atomic import is_at, replace_file
 from signature.database import migrations, serialize
 from signature.database.protocol import BUSY_TIMEOUT_S
 from signature.database.sqlite import schema
@@ -45,7 +45,7 @@ def rewrite(path: Path, *, keep: bool, timeout_s: float = BUSY_TIMEOUT_S) -> Ite
     be kept.
     """
     target = Path(os.path.realpath(path))
-    with hold(target, timeout_s), replace_file(target) as copy:
+    with hold(target, timeout_s), replace_file(target, alone=True) as copy:
         kept = keep and target.exists() and target.stat().st_size > 0
         if kept:
             schema.inspect_header(target)
@@ -120,7 +120,7 @@ def hold(target: Path, timeout_s: float) -> Iterator[None]:
                 ) from None
             time.sleep(_POLL_S)
             continue
-        if _is_at(descriptor, lock_path):
+        if is_at(descriptor, lock_path):
             break
         os.close(descriptor)  # the previous holder removed this file: lock the new one
     try:
@@ -131,11 +131,3 @@ def hold(target: Path, timeout_s: float) -> Iterator[None]:
     finally:
         lock_path.unlink(missing_ok=True)
         os.close(descriptor)
-
-
-def _is_at(descriptor: int, path: Path) -> bool:
-    """Whether `path` still names the open file."""
-    try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    except FileNotFoundError:
-        return False
