@@ -16,6 +16,7 @@ import pytest
 
 from pc2grid.io.nav2_map import save_map
 from pc2grid.model import OccupancyGrid
+from tests.helpers.interruptible import interruptible
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -246,8 +247,7 @@ def test_interrupted_convert_leaves_nothing(house: Path, tmp_path: Path, number:
         [sys.executable, "-c", "from pc2grid_cli.main import main; main()", "convert",
          str(house / "drive.mcap"), "-o", "x.submaps"],
         cwd=tmp_path, stderr=subprocess.PIPE, text=True,
-        # A shell that runs the tests in the background lets its children ignore Ctrl-C.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        preexec_fn=interruptible,
         env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"},
     )  # fmt: skip
     time.sleep(1.0)

@@ -16,6 +16,7 @@ import pytest
 import pc2grid
 from pc2grid.io.nav2_map import save_map
 from pc2grid_cli import console, main
+from tests.helpers.interruptible import interruptible
 from tests.helpers.simulated_drives import office
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -246,6 +247,12 @@ def command():
 sys.exit(Console().run(command))
 """
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"}
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        env=environment,
+        preexec_fn=interruptible,
+    )
     assert done.returncode == code, done.stderr
     assert "internal error" not in done.stderr

@@ -19,6 +19,7 @@ from pc2grid.model import OccupancyGrid
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli import rerun_stream, rerun_target
 from pc2grid_cli.main import app
+from tests.helpers.interruptible import interruptible
 from tests.helpers.simulated_drives import office
 
 
@@ -179,7 +180,9 @@ def test_a_viewer_sees_it_as_it_happens(folder: Path, tmp_path: Path) -> None:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     kept = tmp_path / "kept.rrd"
-    viewer = subprocess.Popen([*COMMAND, "--port", str(port), "--save", kept], stderr=subprocess.DEVNULL)
+    viewer = subprocess.Popen(
+        [*COMMAND, "--port", str(port), "--save", kept], stderr=subprocess.DEVNULL, preexec_fn=interruptible
+    )
     try:
         for _ in range(100):
             with socket.socket() as knock:

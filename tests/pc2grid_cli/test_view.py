@@ -36,6 +36,7 @@ from pc2grid_cli.view_events import Events
 from pc2grid_cli.view_server import Options, ViewServer, safe_name
 from signature.config import Config
 from signature.database import open_database
+from tests.helpers.interruptible import interruptible
 from tests.helpers.simulated_drives import office
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -550,6 +551,7 @@ def test_the_command_prints_its_address_and_stops_with_ctrl_c(desk: Path, tmp_pa
         stderr=subprocess.PIPE,
         text=True,
         env=environment,
+        preexec_fn=interruptible,
     )  # fmt: skip
     try:
         assert view.stdout is not None

@@ -22,6 +22,7 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app, main
+from tests.helpers.interruptible import interruptible
 from tests.helpers.json_schema import closed
 from tests.helpers.robot import Recorded, Robot, ZenohRobot
 from tests.helpers.simulated_drives import office
@@ -166,6 +167,7 @@ def test_map_to_odom_is_published_until_the_program_is_stopped(here: Path) -> No
             [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *words],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
+            preexec_fn=interruptible,
         )
         try:
             end_s = time.monotonic() + 100.0

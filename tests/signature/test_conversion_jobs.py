@@ -30,6 +30,7 @@ from signature.conversion_jobs import Job, Outcome, on_cluster
 from signature.database import maintenance, open_database
 from signature.sessions import build_sessions
 from tests.helpers import postgresql
+from tests.helpers.interruptible import interruptible
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
 ROOT = Path(__file__).resolve().parents[2]
@@ -277,8 +278,7 @@ def test_an_interrupted_conversion_keeps_finished_jobs_and_continues(folder: Pat
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        # A process that a shell has started in the background ignores Ctrl-C, and its children would too.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        preexec_fn=interruptible,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
     while not asleep.exists():
