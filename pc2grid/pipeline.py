@@ -611,6 +611,9 @@ def _division_warning(
         + f"from {begin_s(part):.0f} s ({part.trajectory.length_m:.0f} m)"
         for k, part in enumerate(kept)
     )
+    advice = "come back to known places more often, to keep them together"
+    if not any(part.odometry.compared for part in parts):
+        advice = f"record with odometry, or {advice}"
     short = len(parts) - len(kept)
     dropped = f"; {short} shorter than {PARTS.least_travel_m:.0f} m left out" if short else ""
     if len({part.storey for part in parts}) == len(parts):
@@ -618,8 +621,7 @@ def _division_warning(
     return (
         f"the recording falls into {len(parts)} parts whose places relative to each other are not known, "
         "because tracking was lost, stairs or a lift lay between, or the map would contradict itself: "
-        f"{named}{dropped}; record with odometry, or come back to known places more often, to keep them "
-        "together"
+        f"{named}{dropped}; {advice}"
     )
 
 
@@ -703,7 +705,12 @@ def _with_warnings(report: ReadReport, part: _Mapped, *, slopes_unseen: bool) ->
             f"{weak} of {total} scans did not fix the pose in every direction: there it rests on odometry "
             "or on the motion before"
         )
-    bent = consistency_warning(part.consistency, trajectory, slopes_unseen=slopes_unseen)
+    bent = consistency_warning(
+        part.consistency,
+        trajectory,
+        slopes_unseen=slopes_unseen,
+        with_odometry=part.odometry.compared > 0,
+    )
     if bent is not None:
         warnings.append(bent)
     loose = precision_warning(part.precision, trajectory)

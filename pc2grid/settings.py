@@ -114,6 +114,8 @@ def _validated(model: type[T], tree: dict[str, Any], preset: T | None, origin: s
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
+            if "." not in key and isinstance(first["input"], dict) and len(first["input"]) == 1:
+                key = f"{key}.{next(iter(first['input']))}"
             closest = _closest(model, key)
             hint = f"did you mean {closest}?" if closest else "`pc2grid config dump` lists all settings"
             raise ConfigError(f"{origin}: unknown setting {key}", hint=hint) from None
@@ -134,15 +136,15 @@ def _over(preset: Section, tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def _closest(model: type[Section], key: str) -> str | None:
-    """The known setting whose name is nearest, or whose last part is the same in another section."""
-    known = []
+    """The known setting whose name is nearest, or whose last part is the same in another section; of a
+    section, the section."""
+    known = [] if "." in key else list(model.model_fields)
     for section, field in model.model_fields.items():
-        known.append(section)
         if isinstance(field.annotation, type) and issubclass(field.annotation, Section):
             known += [f"{section}.{name}" for name in field.annotation.model_fields]
     last = key.rpartition(".")[2]
     same = [name for name in known if name.rpartition(".")[2] == last]
-    near = same or difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    near = same or difflib.get_close_matches(key, known, n=1)
     return near[0] if near else None
 
 

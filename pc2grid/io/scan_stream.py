@@ -346,7 +346,11 @@ class Stream:
             raise PointCloudError("stamp is a duplicate")
         if stamp_ns < self._last_ns:
             self.out_of_time += 1
-            raise PointCloudError("stamp goes back in time")
+            raise PointCloudError(
+                "stamp goes back in time",
+                hint="the stamps in the headers must increase: a topic for each sensor, and a clock that is "
+                "not set while it is recorded; a part in which they do: --start and --duration",
+            )
         ahead_ns = (stamp_ns - self._last_ns) - (log_time_ns - self._last_log_ns)
         if ahead_ns > self._parameters.clock_jump_ns:
             # If the next scan is near this stamp, too, the clock was set; else this one stamp is wrong.

@@ -42,6 +42,9 @@ def scan_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicIn
     if fitting and not full:
         raise NoScans(f"{_listed(fitting)}: no message in the log")
     if not full:
+        for image in topics:
+            if SENSORS.get(image.type) == "depth" and "depth" in image.topic.lower():
+                camera_info_topic(image, topics)
         there = _listed(topics) if topics else "the log has no topics at all"
         raise NoScans(
             f"no topic with scans; there is: {there}",

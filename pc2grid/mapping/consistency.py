@@ -103,11 +103,16 @@ def measure_consistency(
 
 
 def consistency_warning(
-    consistency: Consistency, trajectory: Trajectory, *, slopes_unseen: bool = False
+    consistency: Consistency,
+    trajectory: Trajectory,
+    *,
+    slopes_unseen: bool = False,
+    with_odometry: bool = False,
 ) -> str | None:
     """One sentence that says where a map is bent and what to do; None if it is not bent.
 
-    slopes_unseen : the sensor shows no slope, so stairs or a ramp may be what bends the map.
+    slopes_unseen : the sensor shows no slope, so stairs or a ramp may be what bends the map. with_odometry :
+    the recording has odometry, so that it need not be advised.
     """
     if not consistency.bent or not consistency.stretches:
         return None
@@ -122,8 +127,8 @@ def consistency_warning(
         f"the map contradicts itself along {consistency.contradicted:.0%} of the travel and is probably "
         f"bent: near x {longest.x_m:.1f}, y {longest.y_m:.1f} m, {from_s:.0f} to {to_s:.0f} s after the "
         "first scan, walls stand on ground that other scans saw free; look there in the report, and record "
-        "that part again with odometry, or leave it out with --start and --duration"
-        + (slope if slopes_unseen else "")
+        f"that part again{'' if with_odometry else ' with odometry'}, or leave it out with --start and "
+        "--duration" + (slope if slopes_unseen else "")
     )
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +16,9 @@ from pc2grid.errors import NoScans, TrackingLost
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
-from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, Trajectory
+from pc2grid.model import Health, OccupancyGrid, OdometryCheck, RegisteredScan, Scan, Trajectory
 from pc2grid.observer import Observer
-from pc2grid.pipeline import build_map, build_maps, check_followed, follow, map_scans
+from pc2grid.pipeline import _division_warning, build_map, build_maps, check_followed, follow, map_scans
 from pc2grid.simulate import SimulationConfig, prepare_session, simulate_session
 from pc2grid.simulate.config import LaserConfig
 from pc2grid.simulate.session import Session
@@ -137,7 +139,11 @@ def test_a_robot_that_was_carried_elsewhere_makes_two_maps(
     apart = alone.trajectory.planar()[-1] - maps[1].trajectory.planar()[-1]
     assert np.hypot(*apart[:2]) < 0.1
     (said, *_) = [w for w in maps[0].report.warnings if "falls into 2 parts" in w]
-    assert "robot#2 from 3" in said and "record with odometry" in said
+    assert "robot#2 from 3" in said and "come back to known places" in said
+    assert "odometry" not in said  # it has that
+    parts: Any = [SimpleNamespace(trajectory=m.trajectory, odometry=OdometryCheck(), storey=0) for m in maps]
+    said = _division_warning("robot", parts, parts, [None, None])
+    assert "record with odometry, or come back to known places" in said
     assert longest.session == "robot" and "is used here, without" in longest.report.warnings[-1]
 
 

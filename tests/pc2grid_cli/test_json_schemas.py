@@ -69,7 +69,7 @@ COMMANDS = [
     ("db-merge", "db merge b.submaps -o out.submaps", 0),
     ("db-split", "db split b.submaps office -o out.submaps", 0),
     ("db-rename", "db rename b.submaps office plan", 0),
-    ("db-remove", "db remove b.submaps office", 0),
+    ("db-remove", "db remove b.submaps office --force", 0),
 ]
 
 

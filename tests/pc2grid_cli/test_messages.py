@@ -3,20 +3,33 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from pc2grid.display import probability
-from pc2grid.errors import LogNotFound, MapFileError, NotALog, OutputError, Pc2GridError
+from pc2grid.errors import (
+    ConfigError,
+    DatabaseError,
+    LogNotFound,
+    MapFileError,
+    NoScans,
+    NotADatabase,
+    NotALog,
+    OutputError,
+    Pc2GridError,
+)
 from pc2grid.io.nav2_map import save_map
 from pc2grid_cli import console
 from pc2grid_cli.main import app
 from signature.database.protocol import APPLICATION_ID
 from signature.database.sqlite.database import store
 from tests.helpers.databases import make_entry
-from tests.helpers.recordings import drive, write_mcap
+from tests.helpers.recordings import STEP, T0, drive, ros, write_mcap
 from tests.helpers.simulated_drives import office
 
 
@@ -65,6 +78,109 @@ def test_the_error_says_what_to_do(
     assert isinstance(error, kind), error
     assert words in error.message
     assert error.hint is not None and hint in error.hint
+
+
+@pytest.mark.parametrize(
+    ("command", "hint"),
+    [
+        ("relocalize q.mcap b.submaps", "pc2grid relocalize q.mcap -d b.submaps"),
+        ("relocalize --json q.mcap 'my b.submaps'", "pc2grid relocalize --json q.mcap -d 'my b.submaps'"),
+        ("relocalize q.mcap postgresql://h/d", "pc2grid relocalize q.mcap -d postgresql://h/d"),
+        ("watch ws://robot:8765 b.submaps", "pc2grid watch ws://robot:8765 -d b.submaps"),
+        ("convert l.mcap x.submaps", "pc2grid convert l.mcap -o x.submaps"),
+        ("convert l.mcap m.mcap --add x.submaps", "pc2grid convert l.mcap m.mcap --add -o x.submaps"),
+        ("db copy a.submaps b.submaps", "pc2grid db copy a.submaps -o b.submaps"),
+        ("convert l.mcap", "pc2grid convert --help"),
+        ("relocalize q.mcap b.sqlite", "pc2grid relocalize --help"),
+        ("relocalize q.mcap --topic b.submaps", "pc2grid relocalize --help"),
+        ("compare log l.mcap t.submaps", "pc2grid compare log --help"),
+    ],
+)
+def test_a_database_without_its_option_gets_it(
+    command: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    terminal = console.Console()
+    words = shlex.split(command)
+    code = terminal.run(lambda: app(words, prog_name="pc2grid", standalone_mode=False, obj=terminal))
+    said = capsys.readouterr().err.splitlines()
+    assert code == console.USAGE and said[0].startswith("pc2grid: error: Missing option")
+    assert said[1] == f"hint: {hint}" and len(said) == 2
+
+
+@pytest.mark.parametrize("name", ["office.yaml", "a.mcap", "cloud.ply"])
+def test_what_would_become_a_database_says_how(name: str, folder: Path) -> None:
+    (folder / "cloud.ply").write_bytes(b"ply\n")
+    error = CliRunner().invoke(app, ["relocalize", "a.mcap", "-d", name]).exception
+    assert isinstance(error, NotADatabase) and error.message == f"{name}: not a pc2grid database"
+    stem = name.partition(".")[0]
+    assert error.hint == f"make one of it: pc2grid convert {name} -o {stem}.submaps"
+    other = CliRunner().invoke(app, ["relocalize", "a.mcap", "-d", "office.pgm"]).exception
+    assert isinstance(other, NotADatabase) and other.hint is not None and "convert LOG -o" in other.hint
+
+
+def test_depth_images_without_their_camera_info_say_so(folder: Path) -> None:
+    to, pixels = ros(), np.full((4, 6), 1000, np.uint16)
+    images = [to.image("/camera/depth/image", T0 + i * STEP, pixels, "16UC1") for i in range(3)]
+    write_mcap(folder / "d.mcap", images)
+    for topic in ((), ("--topic", "/camera/depth/image")):
+        error = CliRunner().invoke(app, ["convert", "d.mcap", "-o", "x.submaps", *topic]).exception
+        assert isinstance(error, NoScans)
+        assert error.message == "d.mcap: /camera/depth/image: a depth image without a CameraInfo topic"
+        assert error.hint == "record the camera_info topic next to the image"
+
+
+def test_scans_out_of_order_get_a_hint(folder: Path) -> None:
+    """Their headers count down, while the log is in order; more than wait to be sorted."""
+    to = ros()
+    scans = [
+        to.laser("/scan", T0 - i * STEP, [1.0] * 10)._replace(log_time_ns=T0 + i * STEP) for i in range(400)
+    ]
+    write_mcap(folder / "s.mcap", scans)
+    error = CliRunner().invoke(app, ["convert", "s.mcap", "-o", "x.submaps"]).exception
+    assert isinstance(error, Pc2GridError) and "stamp goes back in time" in error.message
+    assert error.hint is not None and "must increase" in error.hint and "--start" in error.hint
+
+
+@pytest.mark.parametrize(
+    ("assignment", "hint"),
+    [
+        ("grid.x=1", "`pc2grid config dump` lists all settings"),
+        ("grid.resolution_m=1", "did you mean projection.resolution_m?"),
+        ("red.topic=/a", "did you mean read.topic?"),
+        ("partition.radius=5", "did you mean partition.radius_m?"),
+    ],
+)
+def test_a_setting_that_is_not_known(assignment: str, hint: str) -> None:
+    words = ["convert", "a.mcap", "-o", "b.submaps", "--set", assignment]
+    error = CliRunner().invoke(app, words).exception
+    assert isinstance(error, ConfigError) and error.hint == hint
+    assert error.message == f"--set: unknown setting {assignment.partition('=')[0]}"
+
+
+def test_the_last_session_is_not_removed_unasked(folder: Path) -> None:
+    store(folder / "b.submaps", [make_entry("tuesday", 2)], keep=True)
+    remove = ["db", "remove", "b.submaps"]
+    before = (folder / "b.submaps").read_bytes()
+    for names in (["monday", "tuesday"], ["tuesday", "monday", "monday"]):
+        error = CliRunner().invoke(app, [*remove, *names]).exception
+        assert isinstance(error, DatabaseError) and "no session would be left" in error.message
+        assert error.hint is not None and "--force" in error.hint
+        assert (folder / "b.submaps").read_bytes() == before
+    assert CliRunner().invoke(app, [*remove, "monday"]).exit_code == 0
+    left = (folder / "b.submaps").read_bytes()
+    assert isinstance(CliRunner().invoke(app, [*remove, "tuesday"]).exception, DatabaseError)
+    assert isinstance(CliRunner().invoke(app, [*remove, "monday"]).exception, DatabaseError)  # is not there
+    assert (folder / "b.submaps").read_bytes() == left
+    done = CliRunner().invoke(app, [*remove, "tuesday", "--force"])
+    assert done.exit_code == 0 and "0 sessions left" in done.stdout
+
+
+def test_the_help_of_a_group_names_all_its_commands() -> None:
+    from typer.main import get_command
+
+    group = get_command(app).commands["compare"]  # type: ignore[attr-defined]
+    for name in group.commands:
+        assert re.search(rf"\b{name}\b", group.help) or (name == "paper" and "the paper's" in group.help)
 
 
 def test_the_mark_of_a_database_is_the_one_that_is_written(folder: Path) -> None:

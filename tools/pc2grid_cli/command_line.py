@@ -8,6 +8,7 @@ here alone the program imports late, so that every other import stands at the to
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
@@ -19,6 +20,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from pc2grid_cli.console import Console
+from pc2grid_cli.options import DATABASE
 from pc2grid_cli.rerun_target import VIEWER, names_target
 
 # Colours and boxes cost a tenth of a second at every --help; they are for terminals that want them.
@@ -38,7 +40,13 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Apply the global options, and complete options that stand without a value."""
-        return super().parse_args(ctx, _read(self.params, ctx, args, until_command=False))
+        words = _read(self.params, ctx, args, until_command=False)
+        try:
+            return super().parse_args(ctx, list(words))
+        except Exception as error:  # its class is not public
+            if type(error).__name__ == "MissingParameter":
+                error.suggestion = _with_option(self.params, ctx, getattr(error, "param", None), words)  # type: ignore[attr-defined]
+            raise
 
 
 class LateCommand(TyperCommand):
@@ -80,6 +88,19 @@ class Group(TyperGroup):
 def group(commands: Mapping[str, tuple[str, str]]) -> type[Group]:
     """A group of commands, which are imported when they are used; see `Group.late`."""
     return type("Group", (Group,), {"late": commands})
+
+
+def _with_option(params: Iterable[Any], ctx: typer.Context, missing: Any, words: list[str]) -> str | None:
+    """The command with the missing option in front of its last word, if that names a database; else None."""
+    options = [name for name in getattr(missing, "opts", ()) if name.startswith("-")]
+    if not options or getattr(missing, "metavar", None) != DATABASE or not words:
+        return None
+    *before, last = words
+    if not last.endswith(".submaps") and not last.startswith(("postgresql://", "postgres://")):
+        return None
+    if any(before[-1:] == [name] and not param.is_flag for param in params for name in param.opts):
+        return None  # it is the value of another option
+    return shlex.join([*ctx.command_path.split(), *before, min(options, key=len), last])
 
 
 def _read(params: Iterable[Any], ctx: typer.Context, words: list[str], *, until_command: bool) -> list[str]:

@@ -15,6 +15,7 @@ from pc2grid_cli.plural import counted
 def db_remove_command(
     database: Database,
     sessions: Annotated[list[str], typer.Argument(metavar="SESSION...", help="which to remove")],
+    force: Annotated[bool, typer.Option("--force", help="also if no session is left")] = False,
     json: AsJson = False,
 ) -> None:
     """Remove sessions from a database, all or none; they cannot be brought back.
@@ -23,9 +24,25 @@ def db_remove_command(
     """
     from signature.database.maintenance import remove
 
+    if not force:
+        _refuse_all(database, sessions)
     remove(database, sessions)
     document = written(database)
     if json:
         console.print_json(document)
     else:
         print(f"{document['database']}: {counted(document['sessions'], 'session')} left")
+
+
+def _refuse_all(database: str, sessions: list[str]) -> None:
+    """Raises DatabaseError if no session of the database would be left."""
+    from pc2grid.errors import DatabaseError
+    from signature.database import open_database
+
+    with open_database(database) as opened:
+        known = {info.name for info in opened.sessions()}
+        if known and known <= set(sessions):
+            raise DatabaseError(
+                f"{opened.location}: no session would be left, and they cannot be brought back",
+                hint="--force removes them all the same; `pc2grid db copy` keeps a copy",
+            )

@@ -10,6 +10,7 @@ from signature.database.migrations import FORMAT, tables_of
 from signature.database.protocol import APPLICATION_ID
 from signature.database.serialize import SALVAGE
 
+_CONVERTED = (".mcap", ".bag", ".db3", ".yaml", ".yml", ".pcd", ".ply", ".obj", ".stl")
 CONVERT = "make one with `pc2grid convert LOG -o BUILDING.submaps`"
 
 DAMAGE = (sqlite3.Error, UnicodeDecodeError)
@@ -106,7 +107,12 @@ def inspect_header(path: Path) -> None:
     if not header:
         raise NotADatabase(f"{path}: empty file, a database that was never filled", hint=CONVERT)
     if not header.startswith(b"SQLite format 3\0"):
-        raise NotADatabase(f"{path}: not a pc2grid database", hint=CONVERT)
+        raise NotADatabase(
+            f"{path}: not a pc2grid database",
+            hint=f"make one of it: pc2grid convert {path} -o {path.with_suffix('.submaps')}"
+            if path.suffix.lower() in _CONVERTED
+            else CONVERT,
+        )
     if len(header) < 100:
         raise DatabaseCorrupt(f"{path}: truncated to {size} bytes, not even the header is whole")
     application_id = int.from_bytes(header[68:72], "big")

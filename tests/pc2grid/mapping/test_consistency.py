@@ -99,6 +99,8 @@ def test_the_warning_is_one_line_that_names_place_and_time() -> None:
     by_laser = consistency_warning(found, trajectory, slopes_unseen=True)
     assert by_laser is not None and by_laser.startswith(text) and "stairs" in by_laser
     assert consistency_warning(Consistency(), trajectory, slopes_unseen=True) is None
+    has_it = consistency_warning(found, trajectory, with_odometry=True)
+    assert "odometry" in text and has_it is not None and "odometry" not in has_it and "--start" in has_it
 
 
 def test_people_who_pass_do_not_bend_a_map() -> None:
