@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import pytest
@@ -14,21 +15,27 @@ from pc2grid.time_span import TimeSpan
 from pc2grid_cli.main import app
 from pc2grid_lab.compare import matrix_report
 from pc2grid_lab.experiments import replay
+from pc2grid_lab.experiments.trial import Trial
 from tests.helpers.recordings import STEP, T0, ros, write_mcap
+from tests.helpers.trials import trial
 
 
 class Asked:
     """In place of `Replay`: keeps what it is asked, and knows no truth."""
 
     spans: ClassVar[list[TimeSpan]] = []
+    trials: ClassVar[list[Trial]] = []
+    up = "z"
 
     def __init__(self, *_: Any, **__: Any) -> None: ...
 
-    def map(self, span: TimeSpan, _: Any) -> None:
+    def map(self, span: TimeSpan, _: Any) -> Any:
         self.spans.append(span)
+        return SimpleNamespace(warnings=("it is bent",))
 
-    def locate(self, span: TimeSpan, _: Any) -> None:
+    def locate(self, span: TimeSpan, _: Any) -> Trial | None:
         self.spans.append(span)
+        return self.trials.pop() if self.trials else None
 
 
 @pytest.fixture
@@ -58,6 +65,42 @@ def test_the_default_fits_the_length_of_the_log(log: Path) -> None:
         pytest.approx(pair) for pair in ((0.0, 8.75), (8.75, 4.375), (13.125, 4.375))
     ]
     assert "map: 0.0..8.8 s; queries last 4.4 s" in done.stderr
+    assert "warning: map: it is bent" in done.stderr and "points up" not in done.stderr
+
+
+def test_each_row_says_what_it_counts_as_and_the_sums_agree(
+    log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A row that is 5 cm off may lie outside of the map, and is not among those that had a right answer."""
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(Asked, "up", "-y")
+    Asked.trials = [
+        trial(seed=1),
+        trial(seed=2, right=False),
+        trial(seed=3, status="ambiguous"),
+        trial(seed=4, mapped=0.1, status="not_found", right=False),
+        trial(seed=5, mapped=0.1, right=False),
+        trial(seed=6, mapped=0.4),
+    ]
+    words = ["compare", "log", str(log), "--truth", str(log.with_name("a.tum")), "--queries", "6"]
+    done = CliRunner().invoke(app, words, catch_exceptions=False)
+    text = " ".join(done.stdout.split())
+    rows = ["right", "wrong", "no answer", "outside, no answer", "outside, wrong", "outside, right"]
+    for seed, (verdict, status) in enumerate(
+        zip(rows, ["located", "located", "ambiguous", "not found", "located", "located"], strict=True),
+        start=1,
+    ):
+        assert f"{seed} s {status} {verdict} 10.0 m" in text
+    assert (
+        "inside, where the map covers 0.50 or more of what the query saw: 1 of 3 located and right, 0.33,"
+        " 1 wrong, 1 without an answer"
+    ) in text
+    assert "outside, where the map covers less than 0.50 of it and no answer is the right one:" in text
+    assert (
+        "1 of 3 without an answer, 1 located and wrong, 1 located and right all the same, at its edge" in text
+    )
+    assert "as it should be" not in text
+    assert "warning: a.tum: -y points up in it" in done.stderr
 
 
 def test_a_map_that_leaves_nothing_to_locate_is_refused_before_any_work(log: Path) -> None:

@@ -13,13 +13,14 @@ import pytest
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
+from pc2grid.io.sensors.depth import T_BODY_OPTICAL
 from pc2grid.io.trajectory import read_tum, write_tum
 from pc2grid.model import Trajectory
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.compare import log as compare_log
 from pc2grid_lab.experiments.metrics import QueryCounts
-from pc2grid_lab.experiments.replay import MappedPart, Replay, spread
+from pc2grid_lab.experiments.replay import MappedPart, Replay, spread, with_z_up
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from signature.config import Config
 from tests.helpers.simulated_drives import office
@@ -71,6 +72,41 @@ def test_later_parts_are_located_in_the_map_of_the_earlier(recorded: Path) -> No
     assert found.status == "located" and found.right
     assert found.error_m is not None and found.error_m < 0.15
     assert found.map_bent_m is not None and found.map_bent_m < 0.05
+
+
+@pytest.mark.parametrize("up", ["y", "-y", "x", "-x"])
+def test_a_truth_in_another_world_gives_the_same_poses(recorded: Path, up: str) -> None:
+    """With y up, as phones record it, and with y down, as cameras do; in any heading."""
+    truth = read_tum(recorded / "round.tum")
+    axis, sign = "xyz".index(up[-1]), -1.0 if up[0] == "-" else 1.0
+    other = np.eye(4)
+    other[:3, 2] = sign * np.eye(3)[axis]  # where z comes to lie
+    other[:3, 0] = np.eye(3)[(axis + 1) % 3]
+    other[:3, 1] = np.cross(other[:3, 2], other[:3, 0])
+    turned = Trajectory(stamps_ns=truth.stamps_ns, T_session_base=other @ truth.T_session_base)
+    with open_log(recorded / "round.mcap", Config().read) as log:
+        replays = [Replay(log, poses, Config(), of_base=True) for poses in (truth, turned)]
+    assert [replay.up for replay in replays] == ["z", up]
+    first = [replay.truth(int(truth.stamps_ns[0])) for replay in replays]
+    for stamp_ns in truth.stamps_ns[::20].tolist():
+        now = [replay.truth(stamp_ns) for replay in replays]
+        a, b = (begin.inverse() @ pose for begin, pose in zip(first, now, strict=True))
+        assert (a.x, a.y, a.yaw) == pytest.approx((b.x, b.y, b.yaw), abs=1e-6)
+
+
+def test_the_poses_of_a_camera_are_turned_by_its_own_axes() -> None:
+    """Its world is its first frame, z forward and y down; the base is level in it."""
+    to_the_right = np.eye(4)
+    to_the_right[:3, 3] = 1.0, 0.0, 2.0  # 2 m forward, 1 m to the right
+    truth = Trajectory(stamps_ns=np.arange(2), T_session_base=np.stack([np.eye(4), to_the_right]))
+    turned, up = with_z_up(truth, T_BODY_OPTICAL)
+    assert up == "-y"
+    base = [
+        SE2.from_matrix(pose) @ SE2.from_matrix(T_BODY_OPTICAL).inverse() for pose in turned.T_session_base
+    ]
+    ahead = base[0].inverse() @ base[1]
+    assert (ahead.x, ahead.y, ahead.yaw) == pytest.approx((2.0, -1.0, 0.0), abs=1e-9)
+    assert with_z_up(truth, np.eye(4)) == (truth, "z")
 
 
 def test_an_answer_is_judged_by_the_map_around_it() -> None:

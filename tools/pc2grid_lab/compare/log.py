@@ -77,9 +77,13 @@ def compare_log_command(
         length_s = length or min(_QUERY_S, (end_s - to_s) / 2)
         console.of(context).note(f"map: {from_s:.1f}..{to_s:.1f} s; queries last {length_s:.1f} s")
         replay = Replay(opened, read_tum(truth), settings, of_base=of_base)
+        if replay.up != "z":
+            console.warn(f"{truth.name}: {replay.up} points up in it; its poses are turned so that z does")
         observer = console.of(context).observer()
         with observer.step("map"):
             part = replay.map(TimeSpan(from_s, to_s - from_s), observer)
+        for warning in part.warnings:
+            console.warn(f"map: {warning}")
         trials = []
         with console.of(context).progress("locate") as advance:
             spans = spread(to_s, end_s, queries, length_s)
@@ -130,13 +134,16 @@ def _seconds(text: str) -> tuple[float, float]:
 
 def _print(trials: list[Trial], counts: QueryCounts, unknown: int) -> None:
     from pc2grid_cli.tables import show, table
+    from pc2grid_lab.experiments.trial import JUDGEMENT
 
     title = "later parts of the recording in the map of the earlier one"
-    found = table(title, ["from", "answer"], ["driven", "covered", "confidence", "off by", "map bent by"])
+    numbers = ["driven", "covered", "confidence", "off by", "map bent by"]
+    found = table(title, ["from", "answer", "judged"], numbers)
     for trial in trials:
         found.add_row(
             f"{trial.seed} s",
             trial.status.replace("_", " "),
+            _verdict(trial),
             f"{trial.travel_m:.1f} m",
             f"{trial.mapped:.2f}",
             probability(trial.confidence),
@@ -147,13 +154,22 @@ def _print(trials: list[Trial], counts: QueryCounts, unknown: int) -> None:
     show(
         found,
         "off by: against the map around, which as a whole may be bent by what the last column says",
-        f"where the map covers what the query saw: {counts.right} of {counts.inside} located and right"
+        f"inside, where the map covers {JUDGEMENT.mapped:.2f} or more of what the query saw:"
+        f" {counts.right} of {counts.inside} located and right"
         f"{share}, {counts.wrong} wrong, {counts.unsure} without an answer",
     )
     if counts.outside:
+        at_the_edge = counts.outside - counts.refused - counts.wrong_outside
         show(
-            f"elsewhere: {counts.refused} of {counts.outside} without an answer, as it should be,"
-            f" {counts.wrong_outside} wrong"
+            f"outside, where the map covers less than {JUDGEMENT.mapped:.2f} of it and no answer is the right"
+            f" one: {counts.refused} of {counts.outside} without an answer, {counts.wrong_outside} located"
+            f" and wrong, {at_the_edge} located and right all the same, at its edge"
         )
     if unknown:
         show(f"{unknown} queries could not be judged: the truth has no pose of them")
+
+
+def _verdict(trial: Trial) -> str:
+    """What an answer counts as, in a word or two."""
+    verdict = "no answer" if trial.status != "located" else "right" if trial.right else "wrong"
+    return verdict if trial.in_map else f"outside, {verdict}"

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pc2grid.arrays import F64
 from pc2grid.errors import ConfigError
@@ -47,12 +48,13 @@ class MappedPart:
     """The map of one part of a recording, and the true poses of its scans.
 
     sensor_map : with the frame that fits best over the whole part. mapped_xy, true_xy : (N, 2) positions of
-        the scans in the map and in the world, of all that have a true pose.
+        the scans in the map and in the world, of all that have a true pose. warnings : of the conversion.
     """
 
     sensor_map: SensorMap
     mapped_xy: F64
     true_xy: F64
+    warnings: tuple[str, ...] = ()
 
     def around(self, T_world_base: SE2) -> SensorMap:
         """The map, with the frame that fits best around a true pose.
@@ -80,16 +82,41 @@ def spread(first_s: float, last_s: float, count: int, duration_s: float) -> tupl
     return tuple(TimeSpan(float(start_s), duration_s) for start_s in starts_s)
 
 
+def with_z_up(truth: Trajectory, T_base_sensor: F64) -> tuple[Trajectory, str]:
+    """True poses in a world whose z is vertical, and the axis that pointed up before: `z` if none was turned.
+
+    Only x, y and the heading of true poses are used, and phones, motion capture and cameras record them in
+    worlds whose y is vertical. The base is level most of the time: its z, on average, is near the vertical.
+
+    truth : poses T_world_sensor.
+    """
+    up = (truth.T_session_base[:, :3, :3] @ T_base_sensor[2, :3]).mean(axis=0)
+    axis = int(np.argmax(np.abs(up)))
+    if axis == 2:
+        return truth, "z"
+    downward = bool(up[axis] < 0)
+    quarter = -90.0 if (axis == 0) != downward else 90.0
+    T_turned_world = np.eye(4)
+    T_turned_world[:3, :3] = Rotation.from_euler("yx"[axis], quarter, degrees=True).as_matrix()
+    turned = replace(truth, T_session_base=T_turned_world @ truth.T_session_base)
+    return turned, f"{'-' if downward else ''}{'xy'[axis]}"
+
+
 class Replay:
     """A recording with its true poses, of which parts are mapped and located."""
 
     def __init__(self, log: Log, truth: Trajectory, config: Config, *, of_base: bool = False) -> None:
-        """truth : poses of the sensor, as ground truths of lasers are; with `of_base` poses of the base."""
+        """truth : poses of the sensor, as ground truths of lasers are; with `of_base` poses of the base.
+
+        up : the axis of their world that points up; if it is not z, they are turned.
+        """
         self._log, self._config = log, config
         self.name, self.sensor = log.info.path.stem, log.choose().sensor
-        T_base_sensor = SE2() if of_base else SE2.from_matrix(next(iter(log.scans())).T_base_sensor)
+        T_base_sensor = np.eye(4) if of_base else next(iter(log.scans())).T_base_sensor
+        truth, self.up = with_z_up(truth, T_base_sensor)
         self._stamps_ns = truth.stamps_ns
-        self._T_world_base = [pose @ T_base_sensor.inverse() for pose in truth.poses()]
+        T_sensor_base = SE2.from_matrix(T_base_sensor).inverse()
+        self._T_world_base = [pose @ T_sensor_base for pose in truth.poses()]
 
     def truth(self, stamp_ns: int) -> SE2 | None:
         """True pose T_world_base of the scan with that stamp; None if it is not known."""
@@ -116,7 +143,7 @@ class Replay:
             T_plan_map=SE2.fit(mapped_xy, true_xy),
             index=MapIndex({self.name: made.grid}, table, self._config, self._config),
         )
-        return MappedPart(sensor_map, mapped_xy, true_xy)
+        return MappedPart(sensor_map, mapped_xy, true_xy, made.report.warnings)
 
     def T_world_map(self, trajectory: Trajectory) -> SE2:
         """The frame of a map in the world of the true poses, fitted over the trajectory of the map.
