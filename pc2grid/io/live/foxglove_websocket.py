@@ -309,8 +309,10 @@ class FoxgloveWebsocket:
                 self._introduced.set()
             elif operation == "status" and document.get("level", 0) >= 1:
                 self.news.tell(f"{self.name} says: {str(document.get('message', ''))[:500]}")
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            self.news.tell(f"{self.name}: a message that is not understood ({type(error).__name__}: {error})")
+        # RecursionError: lists in lists without end. OverflowError: infinity as a number of a channel.
+        except (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+            reason = f"{type(error).__name__}: {str(error)[:100]}"
+            self.news.tell(f"{self.name}: a message that is not understood ({reason})")
 
     def _take_channels(self, channels: Sequence[dict[str, Any]]) -> None:
         with self._lock:

@@ -7,6 +7,7 @@ connects again by itself when the connection is lost.
 
 from __future__ import annotations
 
+import re
 import secrets
 import struct
 import threading
@@ -35,6 +36,9 @@ _RELIABLE = "::,10:,:,:,,"  # rmw_qos_profile_default
 _TRANSIENT_LOCAL = ":1:,1:,:,:,,"  # durability 1 (rmw/types.h), the last message kept
 _BEST_EFFORT = "2"
 _STAMP = b"source_timestamp"
+# https://design.ros2.org/articles/topic_and_service_names.html
+_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_TYPE = re.compile(r"[A-Za-z0-9_]+(::[A-Za-z0-9_]+)+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,13 +55,16 @@ class Token:
 
     @staticmethod
     def of(key: str) -> Token | None:
-        """The token with this key; None for those of nodes and services, and of other programs."""
+        """The token with this key; None for those of nodes and services, of other programs, and with names
+        that ROS 2 does not allow, which would be no keys of zenoh either."""
         parts = key.split("/")
         if len(parts) < 13 or parts[0] != _TOKENS or parts[5] not in ("MP", "MS"):
             return None
         namespace, name = parts[7].replace("%", "/"), parts[8]
-        node = f"{namespace.rstrip('/')}/{name}"
-        return Token(parts[5], node, parts[9].replace("%", "/"), parts[10], parts[11], parts[12])
+        node, topic = f"{namespace.rstrip('/')}/{name}", parts[9].replace("%", "/")
+        if not _TOPIC.fullmatch(topic) or not _TYPE.fullmatch(parts[10]):
+            return None
+        return Token(parts[5], node, topic, parts[10], parts[11], parts[12])
 
     @property
     def info(self) -> TopicInfo:

@@ -1,0 +1,257 @@
+"""Robots that send garbage among their messages: what is good comes through, and nothing else happens.
+
+The peers run on this machine; each test sends a few hundred messages.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pc2grid.config import ReadConfig
+from pc2grid.errors import Pc2GridError
+from pc2grid.io import open_log
+from pc2grid.io.live.foxglove_websocket import ConnectionParameters, FoxgloveWebsocket
+from pc2grid.io.live.inbox import InboxParameters
+from pc2grid.io.live.live_log import LiveLog
+from pc2grid.io.live.zenoh_session import Token, ZenohSession
+from pc2grid.model import Scan
+from tests.helpers.growing import laser_drive
+from tests.helpers.memory import bounded_memory
+from tests.helpers.recordings import STEP, T0, ros, write_mcap
+from tests.helpers.robot import Recorded, Robot, ZenohRobot, attachment
+
+PATIENT = InboxParameters(most_lag_s=1e6)
+QUICK = ConnectionParameters(first_s=0.3, least_pause_s=0.001, most_pause_s=0.01)
+MOST_BYTES = 512 << 20
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_mcap(tmp_path_factory.mktemp("robot") / "a.mcap", laser_drive())
+
+
+@pytest.fixture(scope="module")
+def expected(recording: Path) -> list[Scan]:
+    with open_log(recording) as log:
+        return list(log.scans())[:-1]  # the last one waits for odometry that does not come
+
+
+def channel(**changes: object) -> str:
+    known = {"id": 900, "topic": "/rude", "encoding": "cdr", "schemaName": "sensor_msgs/msg/LaserScan"}
+    return json.dumps({"op": "advertise", "channels": [known | {"schema": ""} | changes]})
+
+
+# What is not understood, or of no use.
+FRAMES: list[str | bytes] = [
+    "", "null", "[]", "{", "17", '"op"', "{}", '{"op": 1}', '{"op": "advertise"}', '{"op": ["advertise"]}',
+    '{"op": "advertise", "channels": 5}', '{"op": "advertise", "channels": [5, null]}',
+    '{"op": "unadvertise", "channelIds": [{}, [], "x", -1, 1e999]}', '{"op": "status", "level": "high"}',
+    '{"op": "status", "level": 2, "message": {"a": [1, 2]}}', '{"op": "serverInfo", "capabilities": 5}',
+    "[" * 100_000, '{"op": ' + '{"a": ' * 50_000, "9" * 50_000, "\0\0\0", "\ud7ff\uffff",
+    '{"op": "advertise", "channels": [{"id": 1e999, "topic": "/x", "encoding": "cdr", "schemaName": "a/b"}]}',
+    channel(id=None), channel(id=[1]), channel(id="many " * 100_000), channel(id=-1, topic="/other"),
+    channel(id=10**400, topic="/huge"), channel(topic="/\ud800"), channel(schemaName="\ud800"),
+    channel(encoding="protobuf", schema="no base64"),
+    channel(encoding="protobuf", schemaName="foxglove.PointCloud"),
+    channel(schemaName="sensor_msgs/msg/PointCloud2"), channel(encoding="json", schema="{"),
+    channel(topic={"a": 1}, schema=[1, 2]), channel(schemaEncoding="ros2idl", schema="module {"),
+    b"", b"\x01", b"\x01\0\0", b"\x02" * 40, b"\xff" * 1000, struct.pack("<BIQ", 1, 2**32 - 1, 2**64 - 1),
+]  # fmt: skip
+
+
+def lying_clouds() -> Iterator[bytes]:
+    """Payloads for a topic of laser scans: cut, random, and of billions of beams."""
+    rng = random.Random(1)
+    whole = ros().laser("/scan", T0, np.ones(20)).data
+    yield b""
+    yield whole[:30]
+    yield bytes(rng.randrange(256) for _ in range(300))
+    for size in (10**9, 2**31, 2**32 - 1):
+        at = len(whole) - 4 - 20 * 4 - 4
+        assert struct.unpack_from("<I", whole, at) == (20,)
+        yield whole[:at] + struct.pack("<I", size) + whole[at + 4 :]
+
+
+class Rude(Robot):
+    """Says all of `FRAMES` before it introduces itself, and again among its messages."""
+
+    def _serve(self, connection: Any) -> None:
+        for frame in FRAMES:
+            connection.send(frame)
+        super()._serve(connection)
+
+    def _subscribe(self, connection: Any, number: int, channel_id: int) -> None:
+        known = next((c for c in self.recorded.channels if c.id == channel_id), None)
+        if known is None:  # a channel of `FRAMES`
+            return
+        super()._subscribe(connection, number, channel_id)
+        if known.topic != self.begin_topic:
+            return
+
+        def bother() -> None:
+            payloads = list(lying_clouds())
+            for k in range(200):
+                if self._stop.wait(0.005):
+                    return
+                try:
+                    connection.send(FRAMES[k % len(FRAMES)])
+                    # The first good scans come before: bad ones alone end the search for scans.
+                    if k > 60 and k % 20 == 0:
+                        stamp_ns = random.Random(k).choice((0, T0, 2**63, 2**64 - 1))
+                        connection.send(
+                            struct.pack("<BIQ", 1, number, stamp_ns) + payloads[k // 20 % len(payloads)]
+                        )
+                except Exception:
+                    return
+
+        threading.Thread(target=bother, daemon=True).start()
+
+
+def test_a_websocket_that_sends_garbage(
+    recording: Path, expected: list[Scan], capfd: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("websockets", reason="needs the extra [live]")
+    found: list[Scan] = []
+    end_s = time.monotonic() + 60.0
+    with bounded_memory(MOST_BYTES), Rude(Recorded.read(recording), speed=3.0).running() as robot:
+        feed = FoxgloveWebsocket(robot.url, ReadConfig(), QUICK, PATIENT)
+        with LiveLog(feed, ReadConfig()) as live:
+            live.on_poll = lambda: len(found) >= len(expected) or time.monotonic() > end_s
+            while not live.ended:
+                found.extend(live.scans())
+            said = feed.news.take()
+            report = live.report()
+        assert feed.counts.reconnected == 0 and feed.counts.dropped == 0
+    assert [scan.stamp_ns for scan in found] == [scan.stamp_ns for scan in expected]
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(a.points_m, b.points_m)
+    assert sum(report.scans_skipped.values()) > 0
+    assert any("not understood" in sentence for sentence in said)
+    assert max(map(len, said)) < 1000 and len(said) < 3 * len(FRAMES)
+    assert "Traceback" not in capfd.readouterr().err
+
+
+TOKENS = [
+    "@ros2_lv/0", "@ros2_lv/0/a/b/c/MP/%/%/n/%scan", "@ros2_lv/0/a/0/0/XX/%/%/n/%scan/t/h/q/more",
+    "@ros2_lv/0/a/0/1/MP/%/%/n/%/sensor_msgs::msg::dds_::LaserScan_/h/::,10:,:,:,,",
+    "@ros2_lv/0/a/0/2/MP/%/%/n/%%%rude/sensor_msgs::msg::dds_::LaserScan_/h/::,10:,:,:,,",
+    "@ros2_lv/0/a/0/3/MP/%/%/n/%a%%b/sensor_msgs::msg::dds_::PointCloud2_/h/::,10:,:,:,,",
+    "@ros2_lv/0/a/0/4/MP/%/%/n/%rude%/sensor_msgs::msg::dds_::LaserScan_/h/2:9:x",
+    "@ros2_lv/0/a/0/5/MP/%/%/n/%odd/::::/h/q",
+    "@ros2_lv/0/a/0/6/MS/%/%/n/%initialpose/::/h/2",
+    "@ros2_lv/0/a/0/7/MP/%/%/n/%tf/tf2_msgs::msg::dds_::TFMessage_/h/::",
+    "@ros2_lv/0/" + "/".join("x" * 200 for _ in range(40)),
+]  # fmt: skip
+
+
+def test_tokens_that_are_none_are_left_alone() -> None:
+    rng = random.Random(1)
+    letters = "@ros2_lv/0MPS%:_ax" + "/" * 12
+    for key in [*TOKENS, *("".join(rng.choices(letters, k=rng.randint(0, 80))) for _ in range(2000))]:
+        token = Token.of(key)
+        if token is not None:
+            assert isinstance(token.info.topic, str) and token.best_effort in (True, False)
+
+
+def test_a_token_that_is_none_does_not_hide_the_others(recording: Path) -> None:
+    """Each in turn comes first: a key that zenoh does not take ended the subscription to all."""
+    zenoh = pytest.importorskip("zenoh", reason="needs the extra [zenoh]")
+    with ZenohRobot(Recorded.read(recording)).running() as robot:
+        feed = ZenohSession(robot.url, ReadConfig())
+        try:
+            for key in [*TOKENS, "@ros2_lv/0/a/0/8/MP/%/%/n/%rude/a::msg::dds_::PointCloud2_/h/::"]:
+                feed._take_token(SimpleNamespace(key_expr=key, kind=zenoh.SampleKind.PUT))
+            end_s = time.monotonic() + 30.0
+            while not {"/scan", "/tf_static"} <= set(feed._subscribers) and time.monotonic() < end_s:
+                time.sleep(0.01)
+            assert {"/scan", "/tf_static", "/tf"} <= set(feed._subscribers)
+            assert {topic.topic for topic in feed.topics()} >= {"/scan", "/odom", "/rude"}
+        finally:
+            feed.close()
+
+
+def test_a_zenoh_router_with_garbage(
+    recording: Path, expected: list[Scan], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Tokens of topics that are none come before those of the robot, and its scans among lies."""
+    zenoh = pytest.importorskip("zenoh", reason="needs the extra [zenoh]")
+    found: list[Scan] = []
+    end_s = time.monotonic() + 60.0
+    robot = ZenohRobot(Recorded.read(recording), speed=3.0)
+    payloads = [b"", b"\0" * 40, *lying_clouds()]
+    attachments = [b"", b"source_timestamp", b"\xff" * 30, attachment(-(2**63)), attachment(2**63 - 1)]
+    with bounded_memory(2 * MOST_BYTES), robot.running():
+        config = zenoh.Config()
+        for key, value in (
+            ("mode", '"client"'),
+            ("connect/endpoints", f'["tcp/127.0.0.1:{robot.port}"]'),
+            ("scouting/multicast/enabled", "false"),
+        ):
+            config.insert_json5(key, value)
+        with zenoh.open(config) as rude:
+            kept = []
+            for token in TOKENS:
+                try:
+                    kept.append(rude.liveliness().declare_token(token))
+                except zenoh.ZError:
+                    continue  # zenoh itself refuses it
+            assert len(kept) > 5
+            feed = ZenohSession(robot.url, ReadConfig(), PATIENT)
+            with LiveLog(feed, ReadConfig()) as live:
+                count = 0
+
+                def poll() -> bool:
+                    nonlocal count
+                    count += 1
+                    if len(found) > 20 and count % 3 == 0:
+                        key = f"0/scan/sensor_msgs::msg::dds_::LaserScan_/RIHS01_{'0' * 64}"
+                        k = count // 3
+                        lie = attachments[k % len(attachments)]
+                        rude.put(key, payloads[k % len(payloads)], attachment=lie)
+                    return len(found) >= len(expected) or time.monotonic() > end_s
+
+                live.on_poll = poll
+                while not live.ended:
+                    found.extend(live.scans())
+                report = live.report()
+    assert {scan.stamp_ns for scan in expected} <= {scan.stamp_ns for scan in found}
+    assert sum(report.scans_skipped.values()) > 0
+    said = capfd.readouterr().err
+    assert "Traceback" not in said and "ZError" not in said, said
+
+
+@pytest.mark.parametrize("kind", ["laser", "cloud"])
+def test_bad_scans_alone_end_with_an_error_of_ours(tmp_path: Path, kind: str) -> None:
+    """Nothing but clouds and scans that announce more points than they have."""
+    pytest.importorskip("websockets", reason="needs the extra [live]")
+    to = ros()
+    if kind == "laser":
+        bad = list(lying_clouds())
+        messages = [to.laser("/scan", T0 + k * STEP, np.ones(20)) for k in range(60)]
+    else:
+        whole = to.cloud("/scan", T0, np.ones((5, 3))).data
+        at = whole.index(struct.pack("<II", 1, 5))  # height, width
+        bad = [whole[: at + 4] + struct.pack("<I", 10**9) + whole[at + 8 :], whole[:70]]
+        messages = [to.cloud("/scan", T0 + k * STEP, np.ones((5, 3))) for k in range(60)]
+    messages = [m._replace(data=bad[k % len(bad)]) for k, m in enumerate(messages)]
+    found: list[Scan] = []
+    end_s = time.monotonic() + 30.0
+    recorded = Recorded.read(write_mcap(tmp_path / "bad.mcap", messages))
+    with bounded_memory(MOST_BYTES), Robot(recorded, speed=20.0).running() as robot:
+        feed = FoxgloveWebsocket(robot.url, ReadConfig(), QUICK, PATIENT)
+        with LiveLog(feed, ReadConfig()) as live:
+            live.on_poll = lambda: time.monotonic() > end_s
+            with pytest.raises(Pc2GridError):
+                found.extend(live.scans())
+    assert not found and time.monotonic() < end_s
