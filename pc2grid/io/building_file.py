@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -60,10 +61,15 @@ def kind_of(path: Path) -> Kind:
     return "mesh" if suffix not in CLOUD_SUFFIXES or _has_faces(path) else "cloud"
 
 
-def building_points(path: Path, config: ReadConfig) -> Iterator[F64]:
+def building_points(
+    path: Path, config: ReadConfig, check: Callable[[F64], None] = lambda vertices_m: None
+) -> Iterator[F64]:
     """The points (N, 3) of a building, metres, z up, in blocks; those of a mesh are spread evenly over it.
 
     `config.unit_m` and `config.up` say how the file's numbers are meant.
+
+    check : gets the vertices (V, 3) of a mesh, metres, z up, before it is sampled; may raise. A mesh in
+        millimetres has a million times as many points.
 
     Raises MapFileError if there is no such file, or it cannot be read or is damaged.
 
@@ -75,8 +81,13 @@ def building_points(path: Path, config: ReadConfig) -> Iterator[F64]:
     turn = _UP[config.up] * config.unit_m
     for file in _files(path):
         try:
-            blocks = sampled(*load_mesh(file)) if kind_of(file) == "mesh" else _cloud_blocks(file)
-            for block in blocks:
+            if kind_of(file) == "mesh":
+                vertices, triangles = load_mesh(file)
+                vertices = vertices @ turn.T
+                check(vertices)
+                yield from sampled(vertices, triangles)
+                continue
+            for block in _cloud_blocks(file):
                 yield block if config.up == "z" and config.unit_m == 1.0 else block @ turn.T
         except LogError as error:  # of the reader of clouds, which also reads recordings
             raise MapFileError(f"{file}: {error.message}", hint=error.hint) from error
@@ -95,10 +106,11 @@ def digest_of_building(path: Path) -> str:
 def load_mesh(path: Path) -> tuple[F64, I64]:
     """Vertices (V, 3) and triangles (T, 3), rows of the vertices, as they stand in a file.
 
-    Raises MapFileError if it holds no triangles or a vertex is not finite.
+    Raises MapFileError if it holds no triangles, a vertex is not finite, or a triangle has none.
     """
     from pc2grid.open3d_core import o3d
 
+    _check_counts(path)
     with _quietly():
         found = o3d.io.read_triangle_mesh(path)
     triangles = np.array(found.triangles, np.int64)
@@ -107,7 +119,29 @@ def load_mesh(path: Path) -> tuple[F64, I64]:
     vertices = np.array(found.vertices, np.float64)
     if not np.isfinite(vertices).all():
         raise MapFileError(f"{path}: a vertex is not a finite number")
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise MapFileError(f"{path}: a triangle has a corner that is none of the {len(vertices)} vertices")
     return vertices, triangles
+
+
+def _check_counts(path: Path) -> None:
+    """Raise MapFileError if a .ply or .off announces more vertices and faces than it has bytes.
+
+    Open3D takes memory for all that are announced, and more than there is ends the process.
+    """
+    with _opened(path) as content:
+        head: bytes = content.read(_HEADER_BYTES)
+    suffix, counts = path.suffix.lower(), []
+    if suffix == ".ply":
+        counts = re.findall(rb"^element\s+\S+\s+(\d+)", head.partition(b"end_header")[0], re.MULTILINE)
+    elif suffix == ".off":
+        counts = re.findall(rb"\d+", re.sub(rb"#.*", b"", head))[:2]
+    size = path.stat().st_size
+    if sum(int(count[:20]) for count in counts) > size:
+        named = " and ".join(count[:20].decode() for count in counts)
+        raise MapFileError(
+            f"{path}: ends in the middle: {named} vertices and faces in {size} bytes", hint="copy it again"
+        )
 
 
 def _files(path: Path) -> list[Path]:

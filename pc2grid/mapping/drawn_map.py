@@ -14,7 +14,7 @@ from pc2grid.errors import MapFileError
 from pc2grid.geometry import transform_points
 from pc2grid.io.building_file import building_points, digest_of_building, is_building_file, kind_of
 from pc2grid.io.nav2_map import is_map_file, load_map
-from pc2grid.mapping.cloud_map import level_cloud, map_cloud, voxel_cloud
+from pc2grid.mapping.cloud_map import check_plausible, level_cloud, map_cloud, voxel_cloud
 from pc2grid.model import OccupancyGrid
 
 _SPARSE_M = 0.12
@@ -72,7 +72,7 @@ def load_drawn_map(path: str | Path, config: Config = Config()) -> DrawnMap:
         )
     kind = kind_of(path)
     try:
-        points = voxel_cloud(building_points(path, config.read), config.projection)
+        points = voxel_cloud(building_points(path, config.read, check_plausible), config.projection)
         T_map_file = level_cloud(points)
         level = transform_points(T_map_file, points)
         # `drivable_plan(level)` would be the other way. Of 21 windows of a real laser log in a 3D scan of the

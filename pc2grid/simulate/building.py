@@ -19,7 +19,7 @@ from pc2grid.errors import MapFileError
 from pc2grid.geometry import transform_points
 from pc2grid.io.building_file import building_points, is_building_file, kind_of, load_mesh, sampled
 from pc2grid.io.nav2_map import is_map_file, load_map
-from pc2grid.mapping.cloud_map import drivable_plan, level_cloud, voxel_cloud
+from pc2grid.mapping.cloud_map import check_plausible, drivable_plan, level_cloud, voxel_cloud
 from pc2grid.model import OccupancyGrid
 from pc2grid.simulate.scene import Mesh, quads
 
@@ -72,6 +72,7 @@ def load_building(path: str | Path) -> OccupancyGrid | Building:
     try:
         if is_building_file(path) and kind_of(path) == "mesh":
             vertices, triangles = load_mesh(path)
+            check_plausible(vertices)
             return Building.of_mesh(Mesh(vertices.astype(np.float32), triangles.astype(np.uint32)))
         return Building.of_cloud(np.concatenate([np.empty((0, 3)), *building_points(path, ReadConfig())]))
     except MapFileError as error:

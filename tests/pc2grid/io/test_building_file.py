@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,14 @@ from pc2grid.errors import MapFileError
 from pc2grid.io import building_file
 from pc2grid.io.building_file import building_points, digest_of_building, is_building_file, kind_of
 from pc2grid.io.export.cloud import write_cloud
+from pc2grid.mapping.drawn_map import load_drawn_map
+from pc2grid.simulate.building import load_building
+from tests.helpers.memory import bounded_memory
 
+PCD = (
+    b"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 2000000000\nHEIGHT 1\n"
+    b"POINTS 2000000000\n"
+)
 CLOUD = np.random.default_rng(0).uniform(-5, 5, (1000, 3)).astype(np.float32)
 
 
@@ -100,3 +108,68 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
     (tmp_path / "no.obj").write_text("v 0 0 0\n")
     with pytest.raises(MapFileError, match="neither points nor triangles"):
         points(tmp_path / "no.obj")
+
+
+def ply(vertices: int, faces: object, body: bytes, form: str = "binary_little_endian") -> bytes:
+    head = f"ply\nformat {form} 1.0\nelement vertex {vertices}\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    return (
+        head + f"element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
+    ).encode() + body
+
+
+CORNERS = struct.pack("<9f", 0, 0, 0, 4, 0, 0, 0, 4, 0)
+MANY = 2_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("faces.ply", ply(3, MANY, CORNERS + bytes(99)), "3 and 2000000000 vertices and faces in"),
+        ("vertices.ply", ply(MANY, 1, bytes(600)), "ends in the middle"),
+        ("text.ply", ply(3, MANY, b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "ascii"), "ends in the middle"),
+        ("digits.ply", ply(3, "9" * 5000, CORNERS), "ends in the middle"),
+        ("far.ply", ply(3, 1, CORNERS + b"\x03" + struct.pack("<3i", 0, 1, 2**30)), "none of the 3 vertices"),
+        ("below.ply", ply(3, 1, CORNERS + b"\x03" + struct.pack("<3i", 0, 1, -5)), "none of the 3 vertices"),
+        (
+            "vertices.off",
+            b"OFF\n# two billions\n2000000000 1 0\n0 0 0\n",
+            "2000000000 and 1 vertices and faces in",
+        ),
+        ("faces.off", b"OFF 3 2000000000 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "ends in the middle"),
+        ("far.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 77777\n", "none of the 3 vertices"),
+        ("far.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 999999999\n", "neither points nor triangles"),
+        ("many.stl", bytes(80) + struct.pack("<I", 2**32 - 1) + bytes(500), "neither points nor triangles"),
+        ("many.pts", b"2000000000\n1 2 3\n", "neither points nor triangles"),
+        (
+            "many.glb",
+            b"glTF" + struct.pack("<III", 2, 2**32 - 1, 2**32 - 1) + b"JSON{}",
+            "neither points nor",
+        ),
+        ("many.pcd", PCD + b"DATA binary\n" + bytes(600), "600 bytes where 24000000000 are declared"),
+    ],
+)
+def test_headers_that_claim_too_much(tmp_path: Path, name: str, content: bytes, words: str) -> None:
+    """Open3D takes memory for all that is announced; some of these ended the whole process."""
+    path = tmp_path / name
+    path.write_bytes(content)
+    with bounded_memory(1 << 30), pytest.raises(MapFileError, match=words) as caught:
+        load_drawn_map(path)
+    assert str(path) in caught.value.message
+
+
+def test_a_mesh_in_millimetres_is_refused_before_it_is_sampled(tmp_path: Path) -> None:
+    """A million times as many points as in metres: it went on for hours, also with the right unit."""
+    path = tmp_path / "hall.obj"
+    corners = [(x, y, z) for z in (0, 3000) for x, y in ((0, 0), (20_000, 0), (20_000, 10_000), (0, 10_000))]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners]
+    for a, b, c, d in ((1, 2, 3, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 4, 8, 7), (4, 1, 5, 8)):
+        lines += [f"f {a} {b} {c}", f"f {a} {c} {d}"]
+    path.write_text("\n".join(lines))
+    for load in (load_drawn_map, load_building):
+        with pytest.raises(MapFileError, match="too high for a building in metres") as caught:
+            load(path)
+        assert caught.value.hint is not None and "unit_m=0.001 says millimetres" in caught.value.hint
+    found = points(path, unit_m=0.001)
+    assert len(found) == pytest.approx(1600 * (20 * 10 + 60 * 3), abs=2)
+    assert np.ptp(found, axis=0) == pytest.approx((20.0, 10.0, 3.0), abs=0.05)
