@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,19 @@ def test_a_recording_gives_the_same_database_again(
     first = convert(tmp_path / "drive.mcap", tmp_path / "a.submaps", threads=1, hash_seed=1)
     again = convert(tmp_path / "drive.mcap", tmp_path / "b.submaps", threads=2, hash_seed=2)
     assert first == again
+
+
+def test_two_processes_at_once_give_the_same_database(tmp_path: Path) -> None:
+    """Each is slowed down by the other, at another place each time."""
+    config = SimulationConfig(length_m=1.0, seed=3, clutter=2)
+    simulate_session(tmp_path / "drive.mcap", sensor="lidar", grid=small_house(), config=config)
+    with ThreadPoolExecutor(2) as pool:
+        outputs = [tmp_path / "a.submaps", tmp_path / "b.submaps"]
+        first, second = pool.map(
+            lambda output: convert(tmp_path / "drive.mcap", output, threads=2, hash_seed=1), outputs
+        )
+    assert first == second
+    assert sorted(path.name for path in tmp_path.glob(".*")) == []
 
 
 def test_a_map_gives_the_same_database_wherever_it_lies(tmp_path: Path) -> None:

@@ -499,3 +499,18 @@ def test_foxglove_shows_what_the_layout_names(folder: Path) -> None:
     with signature.open_database("building.submaps") as database:
         spheres = next(told for topic, _, told in answer if topic == "/submaps").markers[0].points
         assert len(spheres) == len(database.signatures())
+
+
+def test_every_row_of_what_was_tried_names_a_test_that_exists() -> None:
+    text = (ROOT / "docs" / "robustness.md").read_text("utf-8")
+    rows = [
+        line
+        for line in text.splitlines()
+        if line.startswith("|") and not re.match(r"\|(-|\s*what was)", line)
+    ]
+    assert len(rows) > 40
+    for row in rows:
+        named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", row)
+        assert len(named) == 1, row
+        (file, name), *_ = named
+        assert re.search(rf"^def {name}\(", (ROOT / file).read_text("utf-8"), re.MULTILINE), row

@@ -173,6 +173,27 @@ def test_fuzz_kill_at_random_moments_of_convert(inputs: Path, tmp_path: Path, pa
 
 
 @pytest.mark.fault(40)
+def test_kill_at_random_moments_of_adding(inputs: Path, tmp_path: Path) -> None:
+    """The database is the old one or the new one, whole, and what was left over is swept by the next run."""
+    rng = np.random.default_rng(41)
+    output = tmp_path / "x.submaps"
+    old, new = ((inputs / f"{name}.submaps").read_bytes() for name in ("drive", "both"))
+    for turn in range(6):
+        output.write_bytes(old)
+        convert = Convert(inputs / "house.yaml", "-o", output, "--add", cwd=tmp_path)
+        while convert.process.is_alive() and len(list(tmp_path.iterdir())) < 2:
+            time.sleep(0.001)
+        time.sleep(float(rng.uniform(0.0, 0.03 if turn % 2 else 0.003)))
+        convert.process.kill()
+        convert.wait()
+        assert output.read_bytes() in (old, new)
+        again = Convert(inputs / "house.yaml", "-o", output, "--add", cwd=tmp_path)
+        assert again.wait() == 0, again.said()
+        assert output.read_bytes() == new
+        assert list(tmp_path.iterdir()) == [output]
+
+
+@pytest.mark.fault(40)
 def test_fuzz_kill_at_every_line_of_the_writer(tmp_path: Path) -> None:
     """Exact where the clock is not: a forked writer kills itself before the N-th line it would run."""
     path = tmp_path / "x.submaps"
