@@ -14,9 +14,13 @@ from signature.database import Label
 from signature.sessions import add_sessions, build_sessions, on_floors
 
 if TYPE_CHECKING:
+    from pc2grid.io.recording import Log
+    from pc2grid.model import RegisteredScan
     from signature.database import SubmapDatabase
-    from signature.relocalization.answer import Answer
+    from signature.relocalization.answer import Answer, Moment
+    from signature.relocalization.map_index import MapIndex
     from signature.relocalization.prior import Prior
+    from signature.relocalization.relocalizer import Watch
 
 
 def convert(
@@ -109,9 +113,8 @@ def relocalize(
     """
     from pc2grid.io.recording import open_log
     from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
-    from pc2grid.pipeline import follow
     from signature.database import open_database
-    from signature.relocalization.relocalizer import MapIndex, Relocalizer, locate_map
+    from signature.relocalization.relocalizer import MapIndex, locate_map
 
     with open_database(database) as opened:
         settings = query_config(opened, config)
@@ -122,19 +125,45 @@ def relocalize(
             return locate_map(load_drawn_map(query, settings).grid, index)
         if prior is not None:
             index = index.within(prior)
-        relocalizer = Relocalizer(index)
         with open_log(query, settings.read, recover=recover) as log:
-            start_ns, end_ns = log.info.start_ns, log.info.end_ns
-            with observer.step("locate", span.length_ns(start_ns, end_ns) * 1e-9):
-                for registered, planar_scan in follow(log.scans(span.start_s, span.duration_s), settings):
-                    moment = relocalizer.add(registered, planar_scan)
-                    observer.on_scan(registered)
-                    observer.on_progress(span.share_done(registered.scan.stamp_ns, start_ns, end_ns))
-                    if until_located and moment is not None:
-                        answer = relocalizer.answer()
-                        if answer.status == "located":
-                            return answer
-        return relocalizer.answer()
+            return locate_log(log, index, settings, span=span, until_located=until_located, observer=observer)
+
+
+def locate_log(
+    log: Log,
+    index: MapIndex,
+    config: Config,
+    *,
+    span: TimeSpan = TimeSpan(),
+    until_located: bool = False,
+    watch: Watch | None = None,
+    ask: bool = False,
+    observer: Observer = Observer(),
+) -> Answer:
+    """Find where an open recording, or the part of it that `span` names, was made.
+
+    config : see `query_config`. until_located, watch, ask : as in
+    `signature.relocalization.relocalizer.localize`. observer : as in `relocalize`.
+
+    Raises NoScans if no scan can be used.
+    """
+    from pc2grid.pipeline import follow
+    from signature.relocalization.relocalizer import localize
+
+    ends_ns = log.info.start_ns, log.info.end_ns
+
+    def see(registered: RegisteredScan, moment: Moment | None) -> None:
+        observer.on_scan(registered)
+        observer.on_progress(span.share_done(registered.scan.stamp_ns, *ends_ns))
+        if watch is not None:
+            watch(registered, moment)
+
+    with observer.step("locate", span.length_ns(*ends_ns) * 1e-9):
+        scans = follow(log.scans(span.start_s, span.duration_s), config)
+        (asked,) = localize(
+            scans, [index], until_located=until_located, watch=see, ask=ask and watch is not None
+        )
+    return asked.answers[0]
 
 
 def query_config(database: SubmapDatabase, config: Config) -> Config:

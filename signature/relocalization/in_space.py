@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from pc2grid.geometry import SE2, transform_points
 from pc2grid.matching.icp_in_space import RAYS, SpatialFit, SpatialView, register_in_space
 from pc2grid.model import Health, PointMap, RegisteredScan
 from signature.database.protocol import SubmapDatabase
-from signature.relocalization.answer import Answer
+from signature.relocalization.answer import Answer, Moment
 from signature.relocalization.confidence import LIMITS
 from signature.relocalization.hypotheses import Hypothesis
 from signature.relocalization.pose_in_space import PoseInSpace, SpaceStatus
@@ -210,6 +211,7 @@ def _pose(fit: SpatialFit, T_odom_base: F64) -> PoseInSpace:
 
 def _refused(answer: Answer, in_space: PoseInSpace) -> Answer:
     """A located answer that the points contradict: nothing was found."""
+    confidence = min(answer.confidence, in_space.on)
     return replace(
         answer,
         status="not_found",
@@ -217,9 +219,15 @@ def _refused(answer: Answer, in_space: PoseInSpace) -> Answer:
         T_map_base=None,
         covariance=None,
         T_map_odom=None,
-        confidence=min(answer.confidence, in_space.on),
+        confidence=confidence,
+        history=_ending(answer.history, status="not_found", confidence=confidence),
         in_space=in_space,
     )
+
+
+def _ending(history: tuple[Moment, ...], **changed: Any) -> tuple[Moment, ...]:
+    """A history whose last moment, that of the answer, is changed."""
+    return (*history[:-1], *(replace(moment, **changed) for moment in history[-1:]))
 
 
 def _located(
@@ -227,8 +235,8 @@ def _located(
 ) -> Answer:
     """The answer at one of its hypotheses, with the pose that its points give."""
     in_space = _pose(fit, T_odom_base)
-    T_map_base = SE2.from_matrix(in_space.T_map_base)
-    T_map_odom = T_map_base @ answer.T_odom_base.inverse()
+    T_map_odom = SE2.from_matrix(in_space.T_map_base) @ answer.T_odom_base.inverse()
+    T_map_base = T_map_odom @ answer.T_odom_base
     planar = np.ix_((0, 1, 5), (0, 1, 5))
     refined = replace(
         hypothesis,
@@ -238,16 +246,20 @@ def _located(
     order = [row, *(k for k in range(len(answer.hypotheses)) if k != row)]
     places = [answer.places[k] for k in order]
     numbers = {known: number for number, known in enumerate(dict.fromkeys(places))}
+    session = answer.sessions[hypothesis.session_index]
     hypotheses = tuple(refined if k == row else answer.hypotheses[k] for k in order)
     return replace(
         answer,
         status="located",
-        session=answer.sessions[hypothesis.session_index],
+        session=session,
         T_map_base=T_map_base,
         covariance=in_space.covariance[planar],
         T_map_odom=T_map_odom,
         confidence=confidence,
         hypotheses=hypotheses,
+        history=_ending(
+            answer.history, status="located", session=session, pose=T_map_base, confidence=confidence
+        ),
         places=tuple(numbers[known] for known in places),
         submap_ids=tuple(answer.submap_ids[k] for k in order),
         in_space=in_space,

@@ -34,6 +34,7 @@ from signature.relocalization.hypotheses import (
     search_everywhere,
     verify,
 )
+from signature.relocalization.in_space import PointsOf, points_reader
 from signature.relocalization.lazy_maps import DatabaseGrids, LazySequence
 from signature.relocalization.prior import PRIOR, Prior
 from signature.relocalization.query_map import QueryMap, query_of
@@ -96,10 +97,12 @@ class MapIndex:
     Each map is prepared (in tens of milliseconds) when it first matters to a query, and kept.
 
     prior : what is known of the pose beforehand, see `within`. whole : the index without the prior.
+    points_of : the points of the maps, which answers are refined and checked with; None if they have none.
     """
 
     prior: Prior | None = None
     whole: MapIndex | None = None
+    points_of: PointsOf | None = None
 
     def __init__(
         self,
@@ -153,7 +156,7 @@ class MapIndex:
         """Everything that is in a database.
 
         If that is more than `signature.retrieval.viewpoints.AT_ONCE_M2` of free floor, maps are read when
-        they first matter, so the database must stay open as long as the index is used.
+        they first matter, and points always are, so the database must stay open as long as the index is used.
 
         observer : gets the progress where places have to be selected and the database, which is of an older
             format, lacks what is seen from them.
@@ -179,9 +182,13 @@ class MapIndex:
         if is_large and not by_paper:
             table = table.without_histograms()
         made_with = database.config()
-        if by_paper or not (is_large or len(table) > config.relocalize.all_places):
-            return MapIndex(grids, table, made_with, config, labels, areas_m2)
-        index = MapIndex(grids, table, made_with, config, labels, areas_m2, stored)
+        selects = not by_paper and (is_large or len(table) > config.relocalize.all_places)
+        index = MapIndex(
+            grids, table, made_with, config, labels, areas_m2, stored if selects else lambda name: None
+        )
+        index.points_of = points_reader(database)
+        if not selects:
+            return index
         with observer.step("prepare places"):
             index.places.index(observer.on_progress)
         if lacking:

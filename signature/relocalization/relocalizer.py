@@ -25,6 +25,7 @@ from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from signature.config import Config
 from signature.relocalization.answer import Answer, Moment, Verdict
 from signature.relocalization.hypotheses import Hypothesis
+from signature.relocalization.in_space import QueryInSpace, settle_in_space
 from signature.relocalization.map_index import MapIndex
 from signature.relocalization.prior import Prior
 from signature.relocalization.query_map import QUERY, QueryMap, QueryWindow, query_of
@@ -58,34 +59,43 @@ class Search:
 
     def look(self, query: QueryMap) -> Moment:
         """Ask the database with what the query has seen so far."""
-        verdict = self._look_up(query, self.index.judge)
+        verdict = self._verdict(query, self.index.judge)
+        self._hypotheses = verdict.hypotheses
         self._history.append(_moment(self.index, query, verdict))
         return self._history[-1]
 
     def answer(
-        self, query: QueryMap, last_metres: Iterable[QueryMap] = (), *, look_outside: bool = True
+        self,
+        query: QueryMap,
+        last_metres: Iterable[QueryMap] = (),
+        in_space: QueryInSpace | None = None,
+        *,
+        look_outside: bool = True,
     ) -> Answer:
-        """Where the query is by all that it has seen or, if that does not settle it, by the last metres.
+        """Where the query is by all that it has seen or, if that does not settle it, by the last metres;
+        refined and checked in space where both sides have points.
+
+        The search goes on as if it had not been asked.
 
         last_metres : the query again, each time with less of its travel; made only when they are needed.
+        in_space : the scans of the query in space; None: the answer is of the plane.
         look_outside : find the best place that a prior excludes, if none that it allows is certain.
         """
-        verdict = self._look_up(query, self.index.decide)
+        index = self.index
+        verdict = self._verdict(query, index.decide)
         if verdict.status != "located":
             query, verdict = self._by_last_metres(query, verdict, last_metres)
         answer = self._answer(query, verdict)
-        return answer if self.index.whole is None else self._with_prior(answer, query, look_outside)
+        if index.whole is not None:
+            answer = self._with_prior(answer, query, look_outside)
+        if in_space is not None and index.points_of is not None:
+            self._clock.start()
+            answer = settle_in_space(answer, in_space, index.points_of, index.config.accept)
+            self._clock.lap("in_space")
+        return replace(answer, timing_ms=dict(self._clock.total_ms))
 
     def _answer(self, query: QueryMap, verdict: Verdict) -> Answer:
-        return _answer(self.index, query, verdict, tuple(self._history), dict(self._clock.total_ms))
-
-    def ask(self, query: QueryMap, last_metres: Iterable[QueryMap] = ()) -> Moment:
-        """What `answer` would say now, which may be more than `look` says, because it searches whole maps and
-        shorter queries, too. The search goes on as if it had not been asked."""
-        before = self._hypotheses, self._part
-        moment = self.answer(query, last_metres).history[-1]
-        self._hypotheses, self._part = before
-        return moment
+        return _answer(self.index, query, verdict, tuple(self._history))
 
     def _with_prior(self, answer: Answer, query: QueryMap, look_outside: bool) -> Answer:
         """The answer with what became of the prior.
@@ -137,7 +147,7 @@ class Search:
         self._clock.lap("last_metres")
         return query, verdict
 
-    def _look_up(
+    def _verdict(
         self, query: QueryMap, judge: Callable[[QueryMap, tuple[Hypothesis, ...]], Verdict]
     ) -> Verdict:
         self._clock.start()
@@ -146,13 +156,13 @@ class Search:
         found = self.index.look_up(query, self._hypotheses)
         self._clock.lap("look_up")
         verdict = judge(query, found)
-        self._hypotheses = verdict.hypotheses
         self._clock.lap("decide")
         return verdict
 
 
 class Query:
-    """A recording, scan by scan, as what is asked for: its last metres, and when to ask again.
+    """A recording, scan by scan, as what is asked for: its last metres, in the plane and, if the index has
+    points, in space; and when to ask again.
 
     Scans on which registration was lost are not used, and nothing seen before them is kept, because the
     motion between the two parts is unknown. If registration was lost on
@@ -169,6 +179,7 @@ class Query:
         self._clock = _Clock()
         self._part = -1
         self._lost: tuple[PlanarScan, SE2] | None = None  # the last scan, if registration was lost on it
+        self._in_space = None if index.points_of is None else QueryInSpace()
         self._restart()
 
     def _restart(self) -> None:
@@ -191,6 +202,8 @@ class Query:
         """Take in the next scan. Returns whether the database is to be asked again: after every
         `relocalize.step_m` of travel."""
         self._clock.lap("register")
+        if self._in_space is not None:
+            self._in_space.add(registered)
         pose = SE2.from_matrix(registered.T_session_base)
         if registered.health is Health.LOST:
             self._restart()
@@ -242,6 +255,11 @@ class Query:
                 shorter = self._window.query(made_with.partition, made_with.signature, last_m)
                 yield self._placed(shorter)
 
+    def answer(self, search: Search) -> Answer:
+        """What a search says now. Raises NoScans if no scan could be used."""
+        answer = search.answer(self.map(), self.last_metres(), self._in_space)
+        return replace(answer, timing_ms={**self.timing_ms, **answer.timing_ms})
+
     def resume(self) -> None:
         """The work on the query map is done; from now on, time counts as registration."""
         self._clock.start()
@@ -289,9 +307,9 @@ class Relocalizer:
 
     def answer(self) -> Answer:
         """Where the query is by all that it has seen. Raises NoScans if no scan could be used."""
-        answer = self._search.answer(self._query.map(), self._query.last_metres())
+        answer = self._query.answer(self._search)
         self._query.resume()
-        return replace(answer, timing_ms={**self._query.timing_ms, **answer.timing_ms})
+        return answer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -309,6 +327,7 @@ def localize(
     indexes: Sequence[MapIndex],
     *,
     after: Collection[int] | None = None,
+    until_located: bool = False,
     watch: Watch | None = None,
     ask: bool = False,
 ) -> Iterator[Asked]:
@@ -317,9 +336,9 @@ def localize(
     scans : with their planar scans, from `pc2grid.pipeline.follow`, in any frame of their own.
     indexes : at least one, of databases made with the same settings; of priors for a time, that of the first.
     after : numbers of scans after which the answers are wanted; by default after the last scan.
+    until_located : ask after every metre of travel, and end with the first answers that are `located`.
     watch : called after each scan, with the state of the answer in the first index.
-    ask : that state is what the answer would be then (`Search.ask`), which takes longer than the looks of
-        `Answer.history`.
+    ask : that state is what the answer would be then, which takes longer than the looks of `Answer.history`.
 
     Raises NoScans if an answer is due and no scan could be used.
     """
@@ -332,9 +351,8 @@ def localize(
         answers, elapsed_ms = [], []
         for search in searches:
             begin = time.perf_counter()
-            answer = search.answer(seen, query.last_metres())
+            answers.append(query.answer(search))
             elapsed_ms.append(describe_ms + 1000.0 * (time.perf_counter() - begin))
-            answers.append(replace(answer, timing_ms={**query.timing_ms, **answer.timing_ms}))
         query.resume()
         return Asked(scans=count, query=seen, answers=tuple(answers), elapsed_ms=tuple(elapsed_ms))
 
@@ -342,15 +360,19 @@ def localize(
     for count, (registered, planar_scan) in enumerate(scans, start=1):
         moments: list[Moment] = []
         if query.add(registered, planar_scan):
-            seen = query.map()
-            moments = [search.look(seen) for search in searches]
+            moments = [search.look(query.map()) for search in searches]
             if ask and watch is not None:
-                moments[0] = searches[0].ask(seen, query.last_metres())
+                moments[0] = query.answer(searches[0]).history[-1]
             query.resume()
         if watch is not None:
             watch(registered, moments[0] if moments else None)
         if after is not None and count in after:
             yield asked(count)
+        if until_located and moments:
+            so_far = asked(count)
+            if all(answer.status == "located" for answer in so_far.answers):
+                yield so_far
+                return
     if after is None:
         yield asked(count)
 
@@ -384,26 +406,8 @@ def relocalize(
     ('located', 'monday', (3, 3))
     """
     index = MapIndex.of(database, config)
-    if prior is not None:
-        index = index.within(prior)
-    from signature.relocalization.in_space import QueryInSpace, points_reader, settle_in_space
-
-    points = points_reader(database)
-    if points is None:
-        (asked,) = localize(query, [index], watch=watch, ask=ask)
-        return asked.answers[0]
-    in_space = QueryInSpace()
-
-    def see(registered: RegisteredScan, moment: Moment | None) -> None:
-        in_space.add(registered)
-        if watch is not None:
-            watch(registered, moment)
-
-    (asked,) = localize(query, [index], watch=see, ask=ask)
-    begin = time.perf_counter()
-    answer = settle_in_space(asked.answers[0], in_space, points, config.relocalize.accept)
-    elapsed_ms = 1000.0 * (time.perf_counter() - begin)
-    return replace(answer, timing_ms={**answer.timing_ms, "in_space": elapsed_ms})
+    (asked,) = localize(query, [index if prior is None else index.within(prior)], watch=watch, ask=ask)
+    return asked.answers[0]
 
 
 def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
@@ -442,7 +446,8 @@ def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
     clock.lap("decide")
     at_origin = tuple(_at_origin(h, query.T_odom_base) for h in verdict.hypotheses)
     verdict = replace(verdict, hypotheses=at_origin)
-    return _answer(index, replace(query, T_odom_base=SE2()), verdict, (), clock.total_ms)
+    answer = _answer(index, replace(query, T_odom_base=SE2()), verdict, ())
+    return replace(answer, timing_ms=clock.total_ms)
 
 
 def _at_origin(hypothesis: Hypothesis, at: SE2) -> Hypothesis:
@@ -467,13 +472,7 @@ def _moment(index: MapIndex, query: QueryMap, verdict: Verdict) -> Moment:
     )
 
 
-def _answer(
-    index: MapIndex,
-    query: QueryMap,
-    verdict: Verdict,
-    history: tuple[Moment, ...],
-    timing_ms: dict[str, float],
-) -> Answer:
+def _answer(index: MapIndex, query: QueryMap, verdict: Verdict, history: tuple[Moment, ...]) -> Answer:
     located = verdict.hypotheses[0] if verdict.status == "located" else None
     table = index.places.table
     T_map_query = located.fit.T_map_query if located else None
@@ -495,7 +494,6 @@ def _answer(
         submap_ids=tuple(int(table.submap_id[h.row]) if h.row >= 0 else -1 for h in verdict.hypotheses),
         evidence=verdict.evidence,
         local_map=query.grid,
-        timing_ms=timing_ms,
     )
 
 

@@ -19,7 +19,6 @@ from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, RegisteredScan
 from signature.relocalization.answer import Answer
-from signature.relocalization.in_space import PointsOf, QueryInSpace, settle_in_space
 from signature.relocalization.map_index import MapIndex
 from signature.relocalization.relocalizer import Relocalizer
 
@@ -81,11 +80,11 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """A place in a map: the map, the frame of the registered scans in it, and metres driven when it was
-    found."""
+    """A place in a map: the map, the base in it and in the frame of the registered scans, and metres driven
+    when it was found."""
 
     session: str
-    T_map_session: SE2
+    T_map_base: SE2
     T_session_base: SE2
     driven_m: float
 
@@ -95,7 +94,6 @@ class Watcher:
 
     index : where to look. A prior (`MapIndex.within`) is about the first scan, unless it has a stamp, and
     counts until the robot is lost or the scans do not go on.
-    points_of : the points of the maps in space (`in_space.points_reader`), if they have any.
     located : whether the last looks agree on where the robot is.
     """
 
@@ -104,11 +102,8 @@ class Watcher:
         index: MapIndex,
         parameters: WatchParameters = WATCH,
         clock: Callable[[], float] = time.perf_counter,
-        *,
-        points_of: PointsOf | None = None,
     ) -> None:
         self._index, self._parameters, self._clock = index, parameters, clock
-        self._points_of, self._in_space = points_of, QueryInSpace()
         self._relocalizer = Relocalizer(index, _MOMENTS)
         self._place: _Place | None = None
         self._candidate: _Place | None = None
@@ -121,7 +116,7 @@ class Watcher:
     @property
     def uses_points(self) -> bool:
         """Whether scans must be given with their points."""
-        return self._points_of is not None
+        return self._index.points_of is not None
 
     @property
     def located(self) -> bool:
@@ -131,7 +126,7 @@ class Watcher:
     def restart(self) -> None:
         """The scans do not go on from those before: what comes next is a search of its own, everywhere."""
         self._index = self._index.whole or self._index  # what was known beforehand was about the first search
-        self._relocalizer, self._in_space = Relocalizer(self._index, _MOMENTS), QueryInSpace()
+        self._relocalizer = Relocalizer(self._index, _MOMENTS)
         self._place = self._candidate = None
         self._doubtful = self._lost_scans = 0
         self._path_m = 0.0
@@ -151,8 +146,6 @@ class Watcher:
         self._lost_scans = self._lost_scans + 1 if lost else 0
         begin = self._clock()
         self._due = self._relocalizer.take(registered, planar_scan) or (self._due and not lost)
-        if self._points_of is not None:
-            self._in_space.add(registered)
         path_m = self._relocalizer.path_m
         self._driven_m += max(path_m - self._path_m, 0.0)
         self._path_m = path_m
@@ -168,7 +161,7 @@ class Watcher:
         try:
             if self._due:
                 self._relocalizer.look()
-            answer = self._answer()
+            answer = self._relocalizer.answer()
         except NoScans:  # the scans since the start, or since registration was lost, show nothing
             return None
         self._due = False
@@ -178,16 +171,10 @@ class Watcher:
             state=state,
             answer=answer,
             session=None if found is None else found.session,
-            T_map_base=None if found is None else found.T_map_session @ found.T_session_base,
+            T_map_base=None if found is None else found.T_map_base,
             registered=registered,
             elapsed_s=self._clock() - begin,
         )
-
-    def _answer(self) -> Answer:
-        answer = self._relocalizer.answer()
-        if self._points_of is None:
-            return answer
-        return settle_in_space(answer, self._in_space, self._points_of, self._index.config.accept)
 
     def _begin(self, stamp_ns: int) -> None:
         """Take the prior, if there is one without a stamp, for one of the first scan."""
@@ -238,16 +225,16 @@ class Watcher:
             here = [h for h, place in same if place == answer.places[0]]
             best = next((h for h in here if answer.sessions[h.session_index] == known.session), best)
         T_session_base = SE2.from_matrix(registered.T_session_base)
-        T_map_session = best.fit.T_map_query @ answer.T_odom_base @ T_session_base.inverse()
-        return _Place(answer.sessions[best.session_index], T_map_session, T_session_base, self._driven_m)
+        T_map_base = best.fit.T_map_query @ answer.T_odom_base
+        return _Place(answer.sessions[best.session_index], T_map_base, T_session_base, self._driven_m)
 
     def _agree(self, before: _Place, now: _Place) -> bool:
         """Whether two places are one, by the motion between them."""
         if before.session != now.session:
             return False
         p = self._parameters
-        expected = before.T_map_session @ now.T_session_base
-        apart = expected.inverse() @ (now.T_map_session @ now.T_session_base)
+        expected = before.T_map_base @ before.T_session_base.inverse() @ now.T_session_base
+        apart = expected.inverse() @ now.T_map_base
         limit_m = p.same_m + p.same_share * (now.driven_m - before.driven_m)
         return math.hypot(apart.x, apart.y) <= limit_m and abs(apart.yaw) <= p.same_rad
 

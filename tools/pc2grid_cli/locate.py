@@ -147,32 +147,33 @@ def locate(
     import numpy as np
 
     from pc2grid.model import Trajectory
-    from pc2grid.pipeline import follow
-    from signature.files import query_config
-    from signature.relocalization.relocalizer import MapIndex, localize
+    from signature.files import locate_log, query_config
+    from signature.relocalization.map_index import MapIndex
 
     config = query_config(database, config)
     index = index or MapIndex.of(database, config, observer)
     seen: list[RegisteredScan] = []
-    ends_ns = query.info.start_ns, query.info.end_ns
-    with observer.step("locate", span.length_ns(*ends_ns) * 1e-9):
 
-        def see(registered: RegisteredScan, moment: Moment | None) -> None:
-            seen.append(_without_points(registered))
-            observer.on_scan(registered)
-            observer.on_progress(span.share_done(registered.scan.stamp_ns, *ends_ns))
-            if watch is not None:
-                watch(registered, moment)
+    def see(registered: RegisteredScan, moment: Moment | None) -> None:
+        seen.append(_without_points(registered))
+        if watch is not None:
+            watch(registered, moment)
 
-        scans = follow(query.scans(span.start_s, span.duration_s), config)
-        index = index if prior is None else index.within(prior)
-        (asked,) = localize(scans, [index], watch=see, ask=ask)
+    answer = locate_log(
+        query,
+        index if prior is None else index.within(prior),
+        config,
+        span=span,
+        watch=see,
+        ask=ask,
+        observer=observer,
+    )
     poses = Trajectory(
         stamps_ns=np.array([s.scan.stamp_ns for s in seen], np.int64),
         T_session_base=np.array([s.T_session_base for s in seen]).reshape(-1, 4, 4),
         health=tuple(s.health for s in seen),
     )
-    return asked.answers[0], poses
+    return answer, poses
 
 
 def in_map(poses: Trajectory, answer: Answer) -> Trajectory | None:

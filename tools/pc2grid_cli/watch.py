@@ -197,16 +197,13 @@ def _search(
 
     prior : where the robot is at the beginning, as far as it is known. forever : go on when it is located.
     """
-    from signature.relocalization.in_space import points_reader
     from signature.relocalization.looking import Looking
     from signature.relocalization.map_index import MapIndex
     from signature.relocalization.watcher import Watcher
 
     live, config = following.live, following.config
     index = MapIndex.of(following.database, config, following.terminal.observer())
-    watcher = Watcher(
-        index if prior is None else index.within(prior), points_of=points_reader(following.database)
-    )
+    watcher = Watcher(index if prior is None else index.within(prior))
     located = False
     with Looking(watcher, beside=live.feed.realtime, step_m=config.relocalize.step_m) as looking:
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Mapping
 
 import pytest
 
 from pc2grid.model import PointMap
 from signature.database import Label
 from signature.relocalization.looking import Looking
+from signature.relocalization.map_index import MapIndex
 from signature.relocalization.watcher import Look, Watcher
 from tests.helpers.simulated_drives import building, office
 from tests.helpers.tall_offices import lidar_drive, points
@@ -20,6 +23,12 @@ TWINS = building(
 ALONE = building({"high": office()})
 
 
+def with_points(index: MapIndex, maps: Mapping[str, PointMap]) -> MapIndex:
+    index = copy.copy(index)
+    index.points_of = maps.get
+    return index
+
+
 @pytest.fixture(scope="module")
 def maps() -> dict[str, PointMap]:
     return {"low": points(LOW_M), "high": points(HIGH_M)}
@@ -27,7 +36,7 @@ def maps() -> dict[str, PointMap]:
 
 @pytest.mark.parametrize(("height_m", "name"), [(LOW_M, "low"), (HIGH_M, "high")])
 def test_twins_that_differ_in_height_only(height_m: float, name: str, maps: dict[str, PointMap]) -> None:
-    plain, spatial = Watcher(TWINS), Watcher(TWINS, points_of=maps.get)
+    plain, spatial = Watcher(TWINS), Watcher(with_points(TWINS, maps))
     answers: list[Look] = []
     for registered, planar_scan, _ in lidar_drive(height_m):
         in_plane = plain.add(registered, planar_scan)
@@ -42,7 +51,7 @@ def test_twins_that_differ_in_height_only(height_m: float, name: str, maps: dict
 
 def test_a_thread_refines_a_located_robot(maps: dict[str, PointMap]) -> None:
     """The thread gets the points of a scan every 0.2 m; the pose is that of space."""
-    watcher = Watcher(ALONE, points_of=maps.get)
+    watcher = Watcher(with_points(ALONE, maps))
     truth, errors_m = {}, []
     with Looking(watcher, beside=True) as looking:
         for registered, planar_scan, T_map_base in lidar_drive(HIGH_M):
@@ -59,9 +68,9 @@ def test_a_thread_refines_a_located_robot(maps: dict[str, PointMap]) -> None:
     assert errors_m and max(errors_m) < 0.04
 
 
-def test_without_points_nothing_is_done_in_space(maps: dict[str, PointMap]) -> None:
+def test_without_points_nothing_is_done_in_space() -> None:
     assert not Watcher(ALONE).uses_points
-    watcher = Watcher(ALONE, points_of=lambda _: None)
+    watcher = Watcher(with_points(ALONE, {}))
     looks = [watcher.add(registered, planar_scan) for registered, planar_scan, _ in lidar_drive(LOW_M)]
     located = [look for look in looks if look is not None and look.state == "located"]
     assert located and all(look.answer.in_space is None for look in located)
