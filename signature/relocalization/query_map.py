@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from pc2grid.submaps.partition import view_at
 from pc2grid.submaps.sampling import sample_evenly
 from pc2grid.submaps.skeleton import skeleton_of
 from signature.config import RelocalizeConfig, SignatureConfig
-from signature.describe import describe
+from signature.describe import Signature, describe
 from signature.retrieval.view import View
 from signature.seen_places import PROFILE_BEARINGS
 
@@ -162,7 +162,7 @@ def query_of(
         View(
             center_m=center,
             profile=isovist(grid, center, partition.radius_m, bearings=PROFILE_BEARINGS),
-            signature=describe(view_at(grid, center, partition), signature),
+            describe=partial(_signature_at, grid, center, partition, signature),
         )
         for center in centers
     )
@@ -175,6 +175,12 @@ def query_of(
         walls=Walls.of(grid),
         center_m=(T_odom_base.x, T_odom_base.y),
     )
+
+
+def _signature_at(
+    grid: OccupancyGrid, center_m: tuple[float, float], partition: PartitionConfig, config: SignatureConfig
+) -> Signature:
+    return describe(view_at(grid, center_m, partition), config)
 
 
 def best_observed(

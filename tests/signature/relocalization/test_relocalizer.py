@@ -16,9 +16,11 @@ import pytest
 from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
 from pc2grid.matching.two_way_score import Fit
-from pc2grid.model import FREE, Health, OccupancyGrid, RegisteredScan
-from signature.config import Config
+from pc2grid.model import FREE, Health, OccupancyGrid, RegisteredScan, Submap
+from signature.config import Config, SignatureConfig
 from signature.database import Label
+from signature.describe import Signature, describe
+from signature.relocalization import query_map
 from signature.relocalization.answer import Moment, Verdict
 from signature.relocalization.confidence import NO_EVIDENCE
 from signature.relocalization.hypotheses import Hypothesis, fitted
@@ -313,3 +315,23 @@ def test_the_last_metres_are_drawn_from_the_newest_scans_alone() -> None:
     last = window.query(Config().partition, Config().signature, 2.0)
     assert last.T_odom_base == whole.T_odom_base and last.path_m == whole.path_m
     assert 0 < last.walls.weight < 0.7 * whole.walls.weight
+
+
+@pytest.mark.parametrize("select_by", ["seen", "paper"])
+def test_views_are_described_by_signatures_only_where_these_select(
+    select_by: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    described = []
+
+    def counted(submap: Submap, config: SignatureConfig) -> Signature:
+        described.append(submap)
+        return describe(submap, config)
+
+    monkeypatch.setattr(query_map, "describe", counted)
+    config = Config()
+    few = {"all_places": 10, "shortlist": 5, "select_by": select_by}
+    settings = config.model_copy(update={"relocalize": config.relocalize.model_copy(update=few)})
+    index = MapIndex({"office": office()}, OFFICE.places.table, config, settings)
+    answer, _ = ask(index, office(), ROUTE)
+    assert answer.status == "located"
+    assert bool(described) == (select_by == "paper")
