@@ -67,9 +67,6 @@ class DecisionParameters:
     seen_there : where two floors look alike, and the map of the other one shows less than this share of what
         the query has seen, the query may have been made there as well; and so it may if what is known there
         agrees with it as well as here, by `equal`.
-    clearly_better : before an answer is certain, the maps are searched for places with a coarse score so many
-        times that of the best hypothesis. By hand: with 1 the search takes twice as long, and finds what the
-        refinement makes no better.
     same, same_labelled : least probability, by what surrounds them, that two places that fit the query are
         one; the second applies if the labels of their sessions say that they are of one floor.
     """
@@ -83,7 +80,6 @@ class DecisionParameters:
     alike_agreement: float = 0.8
     alike_overlap: float = 0.35
     seen_there: float = 0.6
-    clearly_better: float = 1.1
     same: float = 0.5
     same_labelled: float = 0.1
 
@@ -411,15 +407,15 @@ class MapIndex:
         """The final verdict: where the proposals did not settle it, all maps are searched as a whole, so that
         neither the right place nor a rival is left out.
 
-        Where they did, only for what fits clearly better, which is faster: a wrong place among few proposals
-        may lead by far, if the right one was not proposed.
+        Where they did, only for what the coarse search scores as high as the best one, which is faster: a
+        wrong place among few proposals may lead by far, if the right one was not proposed.
         """
         verdict = self.judge(query, hypotheses)
         if verdict.status != "located":
             return self.judge_everywhere(query, hypotheses)
         best = verdict.hypotheses[0]
         score = coarse_score(query, self.maps[best.session_index], best.fit.T_map_query)
-        return self.judge(query, self.look_everywhere(query, hypotheses, DECISION.clearly_better * score))
+        return self.judge(query, self.look_everywhere(query, hypotheses, score))
 
     def judge_everywhere(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> Verdict:
         """What the hypotheses amount to, together with all that fits anywhere on the maps."""
