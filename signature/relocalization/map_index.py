@@ -318,7 +318,8 @@ class MapIndex:
             for k, h in zip(dict.fromkeys(places), best, strict=True)
             if kept and k != kept[0][1] and (k in numbers or not same_score(h.fit, kept[0][0].fit))
         ]
-        evidence = Evidence.of(rivals, query)
+        field = self.maps[rivals[0].session_index].field if rivals else None
+        evidence = Evidence.of(rivals, query, field)
         confidence = CALIBRATION.probability(evidence)
         status: Status = "not_found"
         if confidence >= self.config.accept:

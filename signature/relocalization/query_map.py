@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -53,6 +53,15 @@ class QueryParameters:
 QUERY = QueryParameters()
 
 
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A planar scan of a query, in the base frame, and the base there; path_m : metres driven until then."""
+
+    planar_scan: PlanarScan
+    T_odom_base: SE2
+    path_m: float
+
+
 @dataclass(frozen=True, kw_only=True)  # no slots, for what is computed once
 class QueryMap:
     """The query at one moment of its travel.
@@ -63,6 +72,7 @@ class QueryMap:
     part : number of times that registration was lost before; each part has an odom frame of its own.
     T_odom_prior : the base at the time that a prior is about; None if it is not known in this odom frame.
     since_prior_m : metres driven since that time.
+    keyframes : the scans that it was drawn from, oldest first, and the last scan; none of a drawn map.
     """
 
     stamp_ns: int
@@ -75,18 +85,12 @@ class QueryMap:
     part: int = 0
     T_odom_prior: SE2 | None = None
     since_prior_m: float = 0.0
+    keyframes: tuple[Keyframe, ...] = ()
 
     @cached_property
     def likeness(self) -> float:
         """`pc2grid.matching.self_likeness` of the walls."""
         return self_likeness(self.walls)
-
-
-@dataclass(frozen=True, slots=True)
-class _Keyframe:
-    planar_scan: PlanarScan
-    T_odom_base: SE2
-    path_m: float
 
 
 class QueryWindow:
@@ -95,25 +99,25 @@ class QueryWindow:
     def __init__(self, projection: ProjectionConfig, config: RelocalizeConfig) -> None:
         self._projection = projection
         self._config = config
-        self._keyframes: deque[_Keyframe] = deque()
+        self._keyframes: deque[Keyframe] = deque()
         self.path_m = 0.0
         self.stamp_ns = 0
         self.T_odom_base = SE2()
-        self._started = False
+        self._newest: Keyframe | None = None
 
     def add(self, planar_scan: PlanarScan, T_odom_base: SE2) -> None:
         """Take in the next planar scan and its pose; forgets what lies more than `window_m` of travel
         back."""
-        if self._started:
+        if self._newest is not None:
             step = self.T_odom_base.inverse() @ T_odom_base
             self.path_m += math.hypot(step.x, step.y)
-        self._started = True
         self.stamp_ns, self.T_odom_base = planar_scan.stamp_ns, T_odom_base
+        self._newest = Keyframe(planar_scan, T_odom_base, self.path_m)
         if self._keyframes:
             last = self._keyframes[-1].T_odom_base.inverse() @ T_odom_base
             if math.hypot(last.x, last.y) < QUERY.keyframe_m and abs(last.yaw) < QUERY.keyframe_rad:
                 return
-        self._keyframes.append(_Keyframe(planar_scan, T_odom_base, self.path_m))
+        self._keyframes.append(self._newest)
         while self.path_m - self._keyframes[0].path_m > self._config.window_m:
             self._keyframes.popleft()
 
@@ -130,7 +134,7 @@ class QueryWindow:
         for keyframe in keyframes:
             builder.add(keyframe.planar_scan, keyframe.T_odom_base)
         path = np.array([(k.T_odom_base.x, k.T_odom_base.y) for k in keyframes])
-        return query_of(
+        query = query_of(
             builder.grid(),
             path,
             partition=partition,
@@ -140,6 +144,9 @@ class QueryWindow:
             stamp_ns=self.stamp_ns,
             path_m=self.path_m,
         )
+        assert self._newest is not None
+        newest = () if self._newest is keyframes[-1] else (self._newest,)
+        return replace(query, keyframes=(*keyframes, *newest))
 
 
 def query_of(

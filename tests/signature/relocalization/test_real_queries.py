@@ -73,3 +73,21 @@ def test_a_place_that_the_proposals_lack_is_found_before_the_answer_is_certain()
     pose = answer.T_map_base
     assert math.dist((pose.x, pose.y), (expected.x, expected.y)) < 0.1
     assert abs(math.remainder(pose.yaw - expected.yaw, 2.0 * math.pi)) < math.radians(2.0)
+
+
+@pytest.mark.parametrize("first", [16, 20])
+def test_a_query_in_which_tracking_slips_is_not_located(first: int) -> None:
+    """A lidar at 1 Hz: turns of more than 40 degrees between its last scans. Of a drive without such turns,
+    before it, each query is located."""
+    truth = read_tum(data("lidar/hall.tum"))
+    with open_log(data("lidar/hall.mcap")) as log:
+        scans = list(log.scans())
+    index = map_of(iter(scans), truth)
+    for start in (4, first):
+        query = scans[start : start + 12 : 2]
+        answer = ask(list(follow(iter(query), CONFIG)), index)
+        expected = true_pose(truth, query[-1])
+        assert expected is not None
+        pose = answer.T_map_base
+        right = pose is not None and math.dist((pose.x, pose.y), (expected.x, expected.y)) < 0.2
+        assert right if start == 4 else right or answer.status != "located"

@@ -335,3 +335,20 @@ def test_views_are_described_by_signatures_only_where_these_select(
     answer, _ = ask(index, office(), ROUTE)
     assert answer.status == "located"
     assert bool(described) == (select_by == "paper")
+
+
+@pytest.mark.parametrize("slip_deg", [0.0, 40.0])
+def test_a_query_whose_last_scans_contradict_the_others_is_not_located(slip_deg: float) -> None:
+    """Tracking slips by a turn; all but the last two metres fit the map."""
+    scans = list(drive(office(), ROUTE))
+    slip = SE2(0.0, 0.0, math.radians(slip_deg))
+    turn_at = SE2.from_matrix(scans[-10][0].T_session_base)
+    relocalizer = Relocalizer(OFFICE)
+    for k, (registered, planar_scan, _) in enumerate(scans):
+        T = SE2.from_matrix(registered.T_session_base)
+        if k >= len(scans) - 10:
+            T = turn_at @ slip @ turn_at.inverse() @ T
+        relocalizer.add(replace(registered, T_session_base=T.lift()), planar_scan)
+    answer = relocalizer.answer()
+    assert (answer.status == "located") == (slip_deg == 0.0)
+    assert (answer.evidence.worst_scan < -1.5) == (slip_deg != 0.0)
