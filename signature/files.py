@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -137,13 +138,15 @@ def locate_log(
     span: TimeSpan = TimeSpan(),
     until_located: bool = False,
     watch: Watch | None = None,
-    ask: bool = False,
+    ask: int = 0,
     observer: Observer = Observer(),
 ) -> Answer:
     """Find where an open recording, or the part of it that `span` names, was made.
 
-    config : see `query_config`. until_located, watch, ask : as in
+    config : see `query_config`. until_located, watch : as in
     `signature.relocalization.relocalizer.localize`. observer : as in `relocalize`.
+    ask : at so many moments at most, spread evenly over the time of the recording, `watch` gets what the
+        answer would have been there, and nothing at others; 0: what each look says.
 
     Raises NoScans if no scan can be used.
     """
@@ -151,6 +154,15 @@ def locate_log(
     from signature.relocalization.relocalizer import localize
 
     ends_ns = log.info.start_ns, log.info.end_ns
+    asked_about = 0
+
+    def due(registered: RegisteredScan) -> bool:
+        nonlocal asked_about
+        part = math.floor(ask * span.share_done(registered.scan.stamp_ns, *ends_ns))
+        if part < asked_about:
+            return False
+        asked_about = part + 1
+        return part < ask
 
     def see(registered: RegisteredScan, moment: Moment | None) -> None:
         observer.on_scan(registered)
@@ -160,9 +172,7 @@ def locate_log(
 
     with observer.step("locate", span.length_ns(*ends_ns) * 1e-9):
         scans = follow(log.scans(span.start_s, span.duration_s), config)
-        (asked,) = localize(
-            scans, [index], until_located=until_located, watch=see, ask=ask and watch is not None
-        )
+        (asked,) = localize(scans, [index], until_located=until_located, watch=see, ask=due if ask else None)
     return asked.answers[0]
 
 

@@ -329,7 +329,7 @@ def localize(
     after: Collection[int] | None = None,
     until_located: bool = False,
     watch: Watch | None = None,
-    ask: bool = False,
+    ask: Callable[[RegisteredScan], bool] | None = None,
 ) -> Iterator[Asked]:
     """Ask where a registered recording was made, in each of several indexes separately.
 
@@ -338,7 +338,9 @@ def localize(
     after : numbers of scans after which the answers are wanted; by default after the last scan.
     until_located : ask after every metre of travel, and end with the first answers that are `located`.
     watch : called after each scan, with the state of the answer in the first index.
-    ask : that state is what the answer would be then, which takes longer than the looks of `Answer.history`.
+    ask : whether, at a scan after which the database is asked, the answer itself is wanted, which takes
+        longer than the looks of `Answer.history`; `watch` then gets what the answer would be, and no other
+        state.
 
     Raises NoScans if an answer is due and no scan could be used.
     """
@@ -358,17 +360,18 @@ def localize(
 
     count = 0
     for count, (registered, planar_scan) in enumerate(scans, start=1):
-        moments: list[Moment] = []
-        if query.add(registered, planar_scan):
-            moments = [search.look(query.map()) for search in searches]
-            if ask and watch is not None:
-                moments[0] = query.answer(searches[0]).history[-1]
+        moment: Moment | None = None
+        due = query.add(registered, planar_scan)
+        if due:
+            moment, *_ = [search.look(query.map()) for search in searches]
+            if ask is not None:
+                moment = query.answer(searches[0]).history[-1] if ask(registered) else None
             query.resume()
         if watch is not None:
-            watch(registered, moments[0] if moments else None)
+            watch(registered, moment)
         if after is not None and count in after:
             yield asked(count)
-        if until_located and moments:
+        if until_located and due:
             so_far = asked(count)
             if all(answer.status == "located" for answer in so_far.answers):
                 yield so_far
@@ -384,7 +387,7 @@ def relocalize(
     watch: Watch | None = None,
     *,
     prior: Prior | None = None,
-    ask: bool = False,
+    ask: Callable[[RegisteredScan], bool] | None = None,
 ) -> Answer:
     """Find where a registered recording was made.
 

@@ -41,7 +41,7 @@ def demo_command(
     from pc2grid.io.trajectory import read_tum
     from pc2grid.simulate import SimulationConfig, simulate_session
     from pc2grid.simulate.config import LidarConfig
-    from pc2grid_cli.locate import Found, about_log, locate
+    from pc2grid_cli.locate import ASKED, Found, about_log, locate
     from pc2grid_cli.picture import draw_answer
     from pc2grid_cli.relocalize import as_text
     from pc2grid_cli.report import write_report
@@ -87,7 +87,7 @@ def demo_command(
             if moment is not None:
                 asked.append(moment)
 
-        answer, poses = locate(query, opened, config, observer=terminal.observer(), watch=watch, ask=True)
+        answer, poses = locate(query, opened, config, observer=terminal.observer(), watch=watch, ask=ASKED)
         # The frame of the database is the first pose of the lidar robot; the truth is in that of the plan.
         T_map_plan = next(truth_map.poses()).inverse()
         true_poses = [T_map_plan @ pose for pose in truth_query.poses()]

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli.known_pose import KnownPose
 
 if TYPE_CHECKING:
+    from pc2grid.arrays import F64, I64
+    from pc2grid.geometry import SE2
     from pc2grid.io import Log
     from pc2grid.model import OccupancyGrid, ReadReport, RegisteredScan, Trajectory
     from pc2grid_cli.json_schemas import Query
@@ -22,14 +26,19 @@ if TYPE_CHECKING:
     from signature.relocalization.relocalizer import Answer, Watch
 
 
+ASKED = 8
+"""At so many moments on the way the page and rerun say what the answer would have been. Chosen by hand: each
+takes as long as the answer, so that a page takes a few times as long as the answer alone."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Found:
     """An answer and the query it is about.
 
-    poses : the query in its own frame; empty for a map. drawn : the query if it is a map.
+    poses : the query in its own frame, see `followed`; empty for a map. drawn : the query if it is a map.
     about : the description of the query in the JSON document.
     report : what was read of a recording, and what was lost; None for a map.
-    asked : what the answer would have been after every metre or so; empty if this was not wanted.
+    asked : what the answer would have been on the way; empty if this was not wanted.
     """
 
     answer: Answer
@@ -50,12 +59,13 @@ def find_log(
     observer: Observer = Observer(),
     watch: Watch | None = None,
     known: KnownPose = KnownPose(),
-    ask: bool = False,
+    ask: int = 0,
     index: MapIndex | None = None,
 ) -> Found:
     """Locate a recording, or the part of it that `span` names.
 
-    ask : find out, too, what the answer would have been on the way (`Found.asked`, and what `watch` gets).
+    ask : find out, too, what the answer would have been at so many moments on the way (`Found.asked`, and
+        what `watch` gets), see `signature.files.locate_log`.
     index : of the database, if it is prepared.
     """
     from pc2grid.io import open_log
@@ -133,13 +143,13 @@ def locate(
     observer: Observer = Observer(),
     watch: Watch | None = None,
     prior: Prior | None = None,
-    ask: bool = False,
+    ask: int = 0,
     index: MapIndex | None = None,
 ) -> tuple[Answer, Trajectory]:
-    """The answer for a recording, and its poses in its own odometry frame.
+    """The answer for a recording, and its poses in its own odometry frame, as `followed` corrects them.
 
     watch : called with each scan, and with the state of the answer if the database was asked after it.
-    prior : what is known of the pose beforehand. ask : see `signature.relocalization.relocalizer.localize`.
+    prior : what is known of the pose beforehand. ask : see `signature.files.locate_log`.
     index : of the database, if it is prepared.
 
     config : see `query_config`.
@@ -173,7 +183,7 @@ def locate(
         T_session_base=np.array([s.T_session_base for s in seen]).reshape(-1, 4, 4),
         health=tuple(s.health for s in seen),
     )
-    return answer, poses
+    return answer, followed(poses, answer)
 
 
 def in_map(poses: Trajectory, answer: Answer) -> Trajectory | None:
@@ -183,6 +193,89 @@ def in_map(poses: Trajectory, answer: Answer) -> Trajectory | None:
     if answer.T_map_odom is None:
         return None
     return replace(poses, T_session_base=answer.T_map_odom.lift() @ poses.T_session_base)
+
+
+def followed(poses: Trajectory, answer: Answer) -> Trajectory:
+    """The query's poses (odometry frame of its last scan), corrected by where it was located on the way.
+
+    Between two located moments the correction is interpolated along the travel, in position and heading of
+    the base; before the first one it is that of the first. Where registration was lost the motion is not
+    known, so nothing is interpolated across. A moment counts if the one before or after it agrees with it, by
+    the motion between them as `pc2grid watch` judges it.
+
+    Without an answer: as they are.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    from pc2grid.geometry import SE2, wrap_angle
+    from pc2grid.model import Health
+
+    if answer.T_map_odom is None:
+        return poses
+    planar = poses.planar()
+    travel_m = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(planar[:, :2], axis=0).T))))
+    # Scans of a robot that stands are told apart, too.
+    travel_m += 1e-9 * np.arange(len(travel_m))
+    health = poses.health or (Health.FINE,) * len(poses)
+    part = np.cumsum([h is Health.LOST for h in health])
+    at, moments = _located_moments(poses, travel_m, part, answer)
+    T_odom_map = answer.T_map_odom.inverse()
+    corrections = [T_odom_map @ pose @ SE2(*planar[k]).inverse() for k, pose in zip(at, moments, strict=True)]
+    corrected = poses.T_session_base.copy()
+    for k in range(len(poses)):
+        same = [i for i in range(len(at)) if part[at[i]] == part[k]]
+        before = next((i for i in reversed(same) if at[i] <= k), None)
+        after = next((i for i in same if at[i] > k), None)
+        if before is None and after is None:
+            before = min(range(len(at)), key=lambda i: abs(at[i] - k))
+        first = corrections[before if before is not None else cast("int", after)]
+        last = corrections[after if after is not None else cast("int", before)]
+        share = 0.0
+        if before is not None and after is not None:
+            share = (travel_m[k] - travel_m[at[before]]) / (travel_m[at[after]] - travel_m[at[before]])
+        turn = first.yaw + share * wrap_angle(last.yaw - first.yaw)
+        x, y = (
+            (1.0 - share) * first.apply(planar[k : k + 1, :2]) + share * last.apply(planar[k : k + 1, :2])
+        )[0]
+        z = corrected[k, 2, 3]
+        corrected[k] = SE2(0.0, 0.0, turn).lift() @ corrected[k]
+        corrected[k, :3, 3] = x, y, z
+    return replace(poses, T_session_base=corrected)
+
+
+def _located_moments(
+    poses: Trajectory, travel_m: F64, part: I64, answer: Answer
+) -> tuple[list[int], list[SE2]]:
+    """The scans at which the query was located in the session of the answer, and the base in its map."""
+    import numpy as np
+
+    from pc2grid.geometry import SE2, wrap_angle
+    from signature.relocalization.watcher import WATCH
+
+    planar = poses.planar()
+    found = [
+        (int(np.searchsorted(poses.stamps_ns, moment.stamp_ns)), moment.pose)
+        for moment in answer.history
+        if moment.status == "located" and moment.session == answer.session and moment.pose is not None
+    ]
+
+    def agree(a: tuple[int, SE2], b: tuple[int, SE2]) -> bool:
+        if part[a[0]] != part[b[0]]:
+            return False
+        expected = a[1] @ SE2(*planar[a[0]]).inverse() @ SE2(*planar[b[0]])
+        apart_m = math.hypot(expected.x - b[1].x, expected.y - b[1].y)
+        limit_m = WATCH.same_m + WATCH.same_share * (travel_m[b[0]] - travel_m[a[0]])
+        return apart_m <= limit_m and abs(wrap_angle(expected.yaw - b[1].yaw)) <= WATCH.same_rad
+
+    agrees = [agree(a, b) for a, b in itertools.pairwise(found)]
+    kept = [
+        here
+        for here, before, after in zip(found, [False, *agrees], [*agrees, True], strict=True)
+        if before or after  # the last one is the answer
+    ]
+    return [k for k, _ in kept], [pose for _, pose in kept]
 
 
 def _without_points(registered: RegisteredScan) -> RegisteredScan:

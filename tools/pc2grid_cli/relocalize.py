@@ -17,7 +17,7 @@ from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
 from pc2grid_cli import options as options
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import Found, find_log, find_map, in_map
+from pc2grid_cli.locate import ASKED, Found, find_log, find_map, in_map
 from pc2grid_cli.nav2_pose import write_initialpose
 from pc2grid_cli.output_files import check_file
 
@@ -189,7 +189,7 @@ def relocalize_command(
             terminal=console.of(context),
             known=known,
             # Only these show it, and it takes time.
-            ask=report is not None or rerun is not None,
+            ask=ASKED if report is not None or rerun is not None else 0,
         )
         # Printed first: a file that cannot be written must not cost the answer.
         _print(found, where, left_out, map_sigma_m(found.answer, opened), as_json=json)
@@ -245,11 +245,11 @@ def _find(
     rerun: str | None,
     terminal: console.Console,
     known: KnownPose,
-    ask: bool,
+    ask: int,
 ) -> tuple[Found, Trajectory | None]:
     """The answer, and the query's poses in the map; both are streamed to `rerun` meanwhile.
 
-    ask : find out, too, what the answer would have been on the way.
+    ask : find out, too, what the answer would have been at so many moments on the way.
     """
     from pc2grid.mapping.drawn_map import is_drawn_map
 

@@ -98,7 +98,7 @@ def test_asking_on_the_way_says_what_the_answer_would_be_and_changes_nothing() -
 
     registered = [(scan, planar_scan) for scan, planar_scan, _ in scans]
     (quiet,) = localize(registered, [OFFICE])
-    (told,) = localize(registered, [OFFICE], watch=watch, ask=True)
+    (told,) = localize(registered, [OFFICE], watch=watch, ask=lambda _: True)
     assert told.answers[0].to_json()["history"] == quiet.answers[0].to_json()["history"]
     assert told.answers[0].confidence == quiet.answers[0].confidence
     assert len(asked) == len(quiet.answers[0].history) - 1
