@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -122,7 +123,7 @@ class Tracker:
         self._surfaces = SurfaceMap() if scan.sensor == "depth" and not self._ground.rolling else None
         self._started = True
         pose = self._ground.start_pose()
-        self._register(scan, points, pose, np.eye(4), 0.0)
+        self._register(scan, points, pose, Prediction(motion=np.eye(4), seconds=0.0))
         planar_scan = self._project(points, scan, _split(pose)[1])
         return self._finish(scan, points, planar_scan, pose, Health.FINE)
 
@@ -142,7 +143,7 @@ class Tracker:
         # 3. Follow a floor that is fixed to the robot: KISS-ICP is not given its points.
         self._ground.follow_fixed(points, scan)
         # 4. Let KISS-ICP bring the scan near, in space; a camera in the hand on to the surfaces seen before.
-        pose = self._register(scan, points, last_pose, prediction.motion, prediction.seconds)
+        pose = self._register(scan, points, last_pose, prediction)
         self._ground.follow_moving(points, scan, invert_pose(last_pose) @ pose)
         planar, T_level_base = _split(self._ground.hold(pose))
         # 5. Reduce the scan to the plane.
@@ -153,7 +154,7 @@ class Tracker:
             refined, match = self._refine(planar_scan, planar, predicted, prediction)
             planar = refined if self._ground.rolling else planar
             # 7. Judge the pose.
-            health = self._health.judge(match, prediction.odometry is not None)
+            health = self._health.judge(match if self.kiss.fits else None, prediction.odometry is not None)
         if not prediction.credible:
             health = Health.LOST
         # 8. Start again if nothing fits any more, else extend the local maps.
@@ -229,13 +230,38 @@ class Tracker:
         self._surfaces = None if self._surfaces is None else SurfaceMap()
         self._restarted = True
 
-    def _register(self, scan: Scan, points: F32, last_pose: F64, motion: F64, seconds: float) -> F64:
-        """The pose (4, 4) in space of the points (N, 3) of a scan, `motion` (4, 4) after the last pose."""
+    def _register(self, scan: Scan, points: F32, last_pose: F64, prediction: Prediction) -> F64:
+        """The pose (4, 4) in space of the points (N, 3) of a scan after the last pose (4, 4)."""
         kept = self._ground.remove(points)
-        pose = self.kiss.register(kept, last_pose, motion, seconds)
+        others = None
+        window = self._search_window(prediction) if self._maps and not self._ground.rolling else None
+        if window is not None:
+            others = partial(self._placements, scan, points, last_pose @ prediction.motion, window[0])
+        pose = self.kiss.register(kept, last_pose, prediction.motion, prediction.seconds, others)
         if self._surfaces is None:
             return pose
         return self._surfaces.refine(kept, scan.T_base_sensor[:3, 3], pose)
+
+    def _placements(self, scan: Scan, points: F32, predicted: F64, window_m: float) -> list[F64]:
+        """Poses (4, 4) near a predicted one at which the points (N, 3) of a carried scan may lie.
+
+        They are searched for in the plane, in all headings: a hand turns faster than any prediction. Tilt
+        and height are those of the prediction.
+        """
+        planar, T_level_base = _split(predicted)
+        planar_scan = self._project(points, scan, T_level_base)
+        if not len(planar_scan.hits_m):
+            return []
+        found = self._maps.search(planar_scan, planar, window_m, math.pi)
+        return [pose.lift() @ T_level_base for pose in found]
+
+    def _search_window(self, prediction: Prediction) -> tuple[float, float] | None:
+        """How far (m, rad) a scan is searched for around the predicted pose; None if little is open."""
+        p = self._parameters
+        window_m, window_rad = self._motion.search_window(prediction)
+        if window_m > p.search_above_m or window_rad > p.search_above_rad:
+            return window_m, window_rad
+        return None
 
     def _is_sure(self, match: Match) -> bool:
         """Whether a placement alone decides between odometry and the motion before."""
@@ -335,9 +361,9 @@ class Tracker:
         if match is None:
             return predicted, None
         if not self._is_sure(match):
-            window_m, window_rad = self._motion.search_window(prediction)
-            if window_m > p.search_above_m or window_rad > p.search_above_rad:
-                found = self._maps.search(planar_scan, predicted, window_m, window_rad)
+            window = self._search_window(prediction)
+            if window is not None:
+                found = self._maps.search(planar_scan, predicted, *window)
                 searched = self._maps.refine(planar_scan, found, prior, information) if found else None
                 if searched is not None and self._maps.quality(searched) > self._maps.quality(match):
                     match = searched

@@ -2,6 +2,8 @@
 
 import dataclasses
 import itertools
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,13 +12,20 @@ from pc2grid.clouds.deskew import deskew
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.geometry import SE2, invert_pose, transform_points, wrap_angle
+from pc2grid.io import open_log
+from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Health, Scan
 from pc2grid.odometry.matching_maps import MatchingMaps
 from pc2grid.odometry.motion_model import MotionModel
 from pc2grid.odometry.registration import KissRegistration
 from pc2grid.odometry.tracker import Tracker
+from pc2grid.odometry.wheel_odometry import motion_size
 from pc2grid.simulate import SimulationConfig, iter_session
 from pc2grid.simulate.config import LidarConfig, OdometryConfig
+
+HALL = Path(
+    os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data")
+) / ("lidar/hall.mcap")
 
 
 def session(sensor, *, length_m=6.0, seed=4):
@@ -38,6 +47,58 @@ def errors(pairs, poses):
     first = pairs[0][1].inverse()
     truth = np.array([((first @ p).x, (first @ p).y) for _, p in pairs[: len(poses)]])
     return np.linalg.norm(np.array([T[:2, 3] for T in poses]) - truth, axis=1)
+
+
+def relative_errors(poses, truth):
+    """Error (m, rad) of each motion from one pose (4, 4) to the next."""
+    wrong = [
+        invert_pose(invert_pose(a) @ b) @ invert_pose(s) @ t
+        for (a, b), (s, t) in zip(itertools.pairwise(poses), itertools.pairwise(truth), strict=True)
+    ]
+    return np.array([motion_size(T) for T in wrong]).T
+
+
+def carried_at_2_hz(turn_rad):
+    """A lidar in the hand, two scans a second, each with its true pose (4, 4).
+
+    It turns left, right or not at all by so much from scan to scan.
+    """
+    config = SimulationConfig(length_m=12.0, seed=4, lidar=LidarConfig(beams=64, elevation_deg=35.0))
+    rng, yaw_rad, chosen, last = np.random.default_rng(2), 0.0, [], None
+    for scan, pose in iter_session(sensor="lidar", config=config):
+        if last is not None and np.hypot(pose.x - last.x, pose.y - last.y) < 0.7:
+            continue
+        points = deskew(scan.points_m, scan.offsets_s, scan.T_first_last, float(np.ptp(scan.offsets_s)))
+        T_base_held = scan.T_base_sensor @ SE2(0.0, 0.0, yaw_rad).lift()
+        points = transform_points(invert_pose(T_base_held), points).astype(np.float32)
+        stamp_ns = len(chosen) * 500_000_000
+        held = Scan(stamp_ns=stamp_ns, points_m=points, T_base_sensor=np.eye(4), sensor="lidar")
+        chosen.append((held, pose.lift() @ T_base_held))
+        yaw_rad += turn_rad * rng.integers(-1, 2)
+        last = pose
+    return chosen
+
+
+def test_a_lidar_in_the_hand_is_followed_through_turns_of_40_degrees_between_scans():
+    pairs = carried_at_2_hz(np.radians(40.0))
+    registered = follow(scan for scan, _ in pairs)
+    assert not any(r.health is Health.LOST for r in registered)
+    distance_m, turn_rad = relative_errors([r.T_session_base for r in registered], [T for _, T in pairs])
+    assert distance_m.max() < 0.25 and np.degrees(turn_rad.max()) < 6.0  # 0.13 m, 4.0 degrees
+
+
+@pytest.mark.skipif(not HALL.is_file(), reason="no real lidar: set PC2GRID_DATA")
+@pytest.mark.parametrize(("every", "first"), [(2, 0), (2, 1), (3, 0), (3, 2), (4, 0)])
+def test_a_hall_of_which_scans_are_dropped_is_followed_or_lost(every, first):
+    """At one scan in two seconds and less the sensor turns by up to 110 degrees from one to the next."""
+    true = read_tum(HALL.with_suffix(".tum")).T_session_base
+    with open_log(HALL) as log:
+        scans = list(log.scans())[first::every]
+    pairs = list(zip(follow(scans), true[first::every], strict=True))
+    found = [(r.T_session_base, T) for r, T in pairs if r.health is not Health.LOST]
+    assert len(found) >= 0.7 * len(scans)
+    distance_m, _ = relative_errors([pose for pose, _ in found], [T for _, T in found])
+    assert distance_m.max() < 0.1
 
 
 def blind(scan):
@@ -84,7 +145,7 @@ def facing_a_wall(scans, apart_ns=100_000_000):
 def test_a_camera_without_odometry_does_not_follow_kiss_icp_along_a_wall(monkeypatch):
     """KISS-ICP, which knows a quarter of the surroundings, slides by up to half a metre a scan."""
 
-    def sliding(self, points, T_session_last, predicted_motion, period_s):
+    def sliding(self, points, T_session_last, predicted_motion, period_s, other_guesses):
         return SE2(0.0, 0.3, 0.0).lift() @ T_session_last @ predicted_motion
 
     monkeypatch.setattr(KissRegistration, "register", sliding)
