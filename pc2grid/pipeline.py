@@ -306,8 +306,8 @@ class _Track:
     """What tracking says of all scans of a session.
 
     trajectory : before loops are closed. disagreements : of odometry, at each scan. riding : (N,) scans on a
-    ride from floor to floor. storey : (N,) number of the floor of each in `storeys`. cabins_ns, carried :
-    see `Tracker`.
+    ride from floor to floor. storey : (N,) number of the floor of each in `storeys`. carried : see
+    `Tracker`.
     """
 
     trajectory: Trajectory
@@ -315,7 +315,6 @@ class _Track:
     riding: NDArray[np.bool_]
     storey: I64
     storeys: tuple[Storey, ...]
-    cabins_ns: tuple[int, ...] = ()
     carried: bool = False
 
 
@@ -385,7 +384,6 @@ def _map(
             np.array(riding, dtype=bool),
             np.array(storeys, dtype=np.int64),
             tracker.storeys,
-            tracker.cabins_ns,
             tracker.carried,
         )
         closed = selection.closer.finish()
@@ -636,12 +634,6 @@ def _ride_warnings(track: _Track) -> list[str]:
     stamps_ns, heights_m = track.trajectory.stamps_ns, track.trajectory.T_session_base[:, 2, 3]
     advice = "the map shows two floors as one: convert each by itself, with --start, --duration and --floor"
     warnings = []
-    if track.cabins_ns:
-        times = ", ".join(f"{(stamp_ns - stamps_ns[0]) * 1e-9:.0f} s" for stamp_ns in track.cabins_ns)
-        warnings.append(
-            f"the robot stood in a room as small as a lift, its door out of sight, {times} after the first "
-            f"scan; if it left on another floor, {advice}"
-        )
     if len(track.riding) and track.riding[-1]:
         last = int(np.flatnonzero(~track.riding)[-1]) if not track.riding.all() else -1
         begin_s = (stamps_ns[last + 1] - stamps_ns[0]) * 1e-9

@@ -121,7 +121,7 @@ class KissRegistration:
         T_session_last: F64,
         period_s: float,
     ) -> F64:
-        """Of a pose (4, 4) and those from other guesses, that where most points of `frame` meet the local map.
+        """Of a pose (4, 4) and those from other guesses, that where most points of `frame` meet the map.
 
         A point meets the map if a point of the map is nearer than half a voxel.
         """

@@ -18,7 +18,7 @@ from pc2grid.clouds.ground import Ground
 from pc2grid.clouds.parameters import CLOUD_PARAMETERS
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.upright import CAMERA_UPRIGHT, UPRIGHT, vertical_of
-from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.geometry import SE2
 from pc2grid.model import Scan, SensorKind, Storey
 from pc2grid.odometry.floor_ahead import FloorAhead
 
@@ -54,11 +54,6 @@ class RideParameters:
     shut_s, still_m : least time for which it is shut, and how far the robot moves meanwhile, and until the
         door is open, at most.
     door : neighbouring sectors that are open when the door is.
-    turned_rad : a robot that turns by more does not stand. around, opening : least sectors that are near, and
-        most that are far, around a robot that stood in what may be the cabin of a lift, whose door it did not
-        look at. From half a metre before it, the door of a cabin spans 100 degrees.
-    car_m : what is near around a robot that stands lies in a rectangle, whose longer side is no longer than
-        this in a lift. The longest cars, for beds, are 2.7 m deep (ISO 8100-30).
     """
 
     level_every_m: float = 0.3
@@ -83,10 +78,6 @@ class RideParameters:
     shut_s: float = 3.0
     still_m: float = 0.1
     door: int = 4
-    turned_rad: float = 0.1
-    around: int = 28
-    opening: int = 24
-    car_m: float = 3.0
 
 
 RIDES = RideParameters()
@@ -111,16 +102,13 @@ class RideWatch:
     """Follows the rides of a session, scan by scan.
 
     storeys : the floors so far, in the order in which they were first reached. storey : number of the
-    present one. cabins_ns : stamps at which the robot began to stand in what may have been a lift, whose door
-    was out of sight.
+    present one.
     """
 
     def __init__(self, parameters: RideParameters = RIDES) -> None:
         self._parameters = parameters
         self._slope: _Slope | None = None
         self._lift = _Lift(parameters)
-        self._cabin = _Cabin(parameters)
-        self.cabins_ns: list[int] = []
         self.storeys: list[Storey] = [Storey(group=0, height_m=0.0)]
         self.storey = 0
 
@@ -140,11 +128,8 @@ class RideWatch:
         """
         on_slope = self._slope is not None and self._slope.underway  # where landings are as small as cabins
         place = SE2.from_matrix(pose)
-        stood_ns = self._cabin.observe(planar_scan, place.yaw, forward_m)
-        if stood_ns is not None and not on_slope:
-            self.cabins_ns.append(stood_ns)
         if not on_slope and self._lift.observe(planar_scan, place, forward_m):
-            self._slope, self._cabin = None, _Cabin(self._parameters)
+            self._slope = None
             self.storeys.append(Storey(group=self.storeys[-1].group + 1, height_m=0.0))
             self.storey = len(self.storeys) - 1
             return Ride(arrived=True)
@@ -345,75 +330,6 @@ class _Lift:
             return False
         self._shut_ns = 0
         return True
-
-
-class _Cabin:
-    """Watches for a robot that stands and turns in a room as small as the cabin of a lift, and that sees too
-    little at a time to notice a door behind it."""
-
-    def __init__(self, parameters: RideParameters) -> None:
-        self._parameters = parameters
-        self._start(None, 0.0)
-
-    def _start(self, stamp_ns: int | None, yaw_rad: float) -> None:
-        self._since_ns, self._yaw_rad = stamp_ns, yaw_rad
-        self._travel_m = 0.0
-        self._stood = False
-        self._far: I64 = np.full(self._parameters.sectors, -1)  # 1: far, 0: near, -1: not seen yet
-        self._at_once = 0  # most sectors that one scan has shown
-        # How far the near hits reach in each direction, until the robot has stood for `shut_s`.
-        self._reach_m: F64 = np.zeros(self._parameters.sectors)
-
-    def observe(self, planar_scan: PlanarScan, yaw_rad: float, forward_m: float) -> int | None:
-        """Take in a scan; returns, when the robot has left such a room, since when it stood.
-
-        yaw_rad : heading of the base in the session frame. forward_m : travel since the last scan.
-        """
-        p, stamp_ns = self._parameters, planar_scan.stamp_ns
-        self._travel_m += forward_m
-        left_ns = None
-        if self._since_ns is None:
-            self._start(stamp_ns, yaw_rad)
-        elif self._stood and abs(self._travel_m) > p.stands_m:
-            left_ns = self._since_ns if self._was_cabin else None
-            self._start(stamp_ns, yaw_rad)
-        elif not self._stood:
-            turned = abs(wrap_angle(yaw_rad - self._yaw_rad)) > p.turned_rad
-            if turned or abs(self._travel_m) > p.still_m:
-                self._start(stamp_ns, yaw_rad)
-            else:
-                self._stood = stamp_ns - self._since_ns >= p.shut_s * 1e9
-        near_m, far_m = _ranges(planar_scan, p.sectors, yaw_rad)
-        far, near = far_m >= p.far_m, (near_m < p.near_m) & (far_m < p.far_m)
-        self._far[near] = 0
-        self._far[far] = 1
-        self._at_once = max(self._at_once, int((near | far).sum()))
-        if not self._stood:
-            self._reach_m = np.maximum(self._reach_m, _reach(planar_scan, p.sectors, p.near_m))
-        return left_ns
-
-    @property
-    def _was_cabin(self) -> bool:
-        p = self._parameters
-        near, far = int((self._far == 0).sum()), int((self._far == 1).sum())
-        if self._at_once >= p.seen or near < p.around or far > p.opening:
-            return False
-        # Every wall is near in the middle of a room that is twice as wide, too.
-        widths_m = self._reach_m + np.roll(self._reach_m, p.sectors // 2)
-        across_m = np.roll(widths_m, p.sectors // 4)
-        smallest = int((widths_m * across_m).argmin())
-        return max(float(widths_m[smallest]), float(across_m[smallest])) <= p.car_m
-
-
-def _reach(planar_scan: PlanarScan, directions: int, near_m: float) -> F64:
-    """How far the hits that are nearer than `near_m` reach in each direction (directions,), metres, in the
-    base frame; never less than 0, the sensor itself."""
-    away = planar_scan.hits_m - planar_scan.origin_m
-    away = away[np.linalg.norm(away, axis=1) < near_m]
-    bearing = np.arange(directions) * (2.0 * math.pi / directions)
-    along_m = away @ np.array((np.cos(bearing), np.sin(bearing)))
-    reach_m: F64 = along_m.max(axis=0, initial=0.0)
-    return reach_m
 
 
 def _ranges(planar_scan: PlanarScan, sectors: int, yaw_rad: float) -> tuple[F64, F64]:

@@ -99,11 +99,6 @@ class Tracker:
         return tuple(self._rides.storeys)
 
     @property
-    def cabins_ns(self) -> tuple[int, ...]:
-        """Stamps at which the robot began to stand in what may have been a lift, its door out of sight."""
-        return tuple(self._rides.cabins_ns)
-
-    @property
     def carried(self) -> bool:
         """Whether the sensor is in the hand, so that tilts and heights say nothing of a slope."""
         return not self._ground.rolling

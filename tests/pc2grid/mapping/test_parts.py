@@ -217,7 +217,5 @@ def test_rides_that_did_not_divide_a_recording_are_named() -> None:
     assert not _ride_warnings(track)
     (by_hand,) = _ride_warnings(replace(track, carried=True))
     assert "3.0 m above" in by_hand and "from 10 s" in by_hand
-    (cabin,) = _ride_warnings(replace(track, cabins_ns=(4 * 10**9,)))
-    assert "4 s after the first scan" in cabin and "--floor" in cabin
     (unfinished,) = _ride_warnings(replace(track, riding=np.arange(20) >= 15))
     assert "from 15 s" in unfinished and "these 5 scans" in unfinished
