@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,3 +81,27 @@ def test_the_floor_of_a_robot_on_wheels_does_not_follow_a_ramp_ahead() -> None:
             ground.follow_fixed(scan.points_m, scan)
     assert ground.ground is not None
     assert math.acos(ground.ground.normal[2]) < math.radians(1.0)
+
+
+@pytest.mark.parametrize(
+    ("height_m", "pitch_deg", "rolling"),
+    [
+        (0.0, 0.0, True),
+        (0.01, 0.0, True),  # base_link above base_footprint, TurtleBot3
+        (0.0, 0.3, True),  # pitch of an EKF
+        (0.01, 0.3, True),
+        (0.02, 5.2, False),  # depth/room, room_a
+        (0.33, 1.4, False),  # room_b
+        (0.02, 0.84, False),
+    ],
+)
+def test_a_base_that_is_a_little_off_its_footprint_is_on_wheels(
+    height_m: float, pitch_deg: float, rolling: bool
+) -> None:
+    floor, walls = hall()
+    points = np.concatenate((floor, walls)) + np.array((0.0, 0.0, 1.0 - height_m))
+    T_odom_base = pose_from_rotation_vector((0.0, math.radians(pitch_deg), 0.0), (0.0, 0.0, height_m))
+    scan = replace(scan_of(points, mounted_m=1.0 - height_m), T_odom_base=T_odom_base)
+    ground = GroundModel.start(scan.points_m, scan)
+    assert ground.rolling is rolling
+    assert ground.ground is not None
