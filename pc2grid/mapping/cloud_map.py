@@ -88,16 +88,28 @@ _SCANS_OF_A_VIEW = 2
 """Scans of the same that make a cell free in a `GridBuilder`."""
 
 
-def level_cloud(points_m: NDArray[np.floating], parameters: CloudMapParameters = CLOUD_MAP) -> F64:
+def level_cloud(
+    points_m: NDArray[np.floating],
+    parameters: CloudMapParameters = CLOUD_MAP,
+    *,
+    floor_z: float | None = None,
+) -> F64:
     """Return T_level_cloud (4, 4): it makes the floor of a cloud (N, 3) level and puts it at z = 0.
 
     x and y stay as they are but for the small tilt. The z axis of the cloud must point up within 35
     degrees. Of several storeys the lowest is taken.
 
+    floor_z : height of the floor in the cloud, metres, where that is known: nothing is looked for, and the
+        cloud is not turned.
+
     Raises MapFileError if the cloud shows no floor.
     """
     points = np.asarray(points_m, np.float64)
     check_plausible(points, parameters)
+    if floor_z is not None:
+        lowered = np.eye(4)
+        lowered[2, 3] = -floor_z
+        return lowered
     # A cloud may lie far from its origin, in coordinates of a country: it is turned about its middle.
     middle = np.median(points, axis=0)
     points = points - middle
@@ -105,7 +117,8 @@ def level_cloud(points_m: NDArray[np.floating], parameters: CloudMapParameters =
     if ground is None:
         raise MapFileError(
             "the cloud shows no floor: no large level plane lies below its other points",
-            hint="if another axis points up: --set read.up=y; else cut off what lies below the floor",
+            hint="if another axis points up: --set read.up=y; if the floor is uneven, its height: "
+            "--set read.floor_z=-0.4 (metres); else cut off what lies below it",
         )
     ground = _refined(points, ground, parameters)
     T_level_cloud = ground.leveling()

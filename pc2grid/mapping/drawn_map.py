@@ -73,7 +73,7 @@ def load_drawn_map(path: str | Path, config: Config = Config()) -> DrawnMap:
     kind = kind_of(path)
     try:
         points = voxel_cloud(building_points(path, config.read, check_plausible), config.projection)
-        T_map_file = level_cloud(points)
+        T_map_file = level_cloud(points, floor_z=config.read.floor_z)
         level = transform_points(T_map_file, points)
         # `drivable_plan(level)` would be the other way. Of 21 windows of a real laser log in a 3D scan of the
         # same floor, the map by viewpoints located 15 (the right place first for 19, off by 6.7 cm), the plan

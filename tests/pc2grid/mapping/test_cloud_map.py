@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pc2grid.config import Config, ReadConfig
 from pc2grid.errors import MapFileError
 from pc2grid.geometry import transform_points
+from pc2grid.io.export.cloud import write_cloud
 from pc2grid.mapping.cloud_map import (
     CLOUD_MAP,
     CloudMapParameters,
@@ -18,6 +20,7 @@ from pc2grid.mapping.cloud_map import (
     map_cloud,
     voxel_cloud,
 )
+from pc2grid.mapping.drawn_map import load_drawn_map
 from pc2grid.model import OccupancyGrid
 from tests.helpers.building_clouds import ROOM_M, box_surface, room_cloud
 
@@ -153,3 +156,22 @@ def test_real_floor() -> None:
     grid = drivable_plan(level)
     # The corridor of 39 x 3 m and what can be seen of the rooms.
     assert 115 < grid.free.sum() * CLOUD_MAP.resolution_m**2 < 140
+
+
+def test_an_uneven_floor_is_where_the_user_says(tmp_path: Path) -> None:
+    """The floor of a room goes up and down by 0.3 m, so that no level plane is large."""
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(0.0, 5.0, (2, 20_000))
+    floor = np.column_stack((x, y, -0.4 + rng.uniform(-0.15, 0.15, 20_000)))
+    along, up = rng.uniform(0.0, 5.0, 20_000), rng.uniform(-0.4, 2.0, 20_000)
+    walls = [np.column_stack((along, np.full(20_000, at), up)) for at in (0.0, 5.0)]
+    walls += [wall[:, [1, 0, 2]] for wall in walls]
+    below = np.column_stack((rng.uniform(0.0, 5.0, (300, 2)), rng.uniform(-1.5, -0.6, 300)))  # mirrored in it
+    file = tmp_path / "room.ply"
+    write_cloud(file, np.concatenate((floor, *walls, below)))
+    with pytest.raises(MapFileError, match="no floor") as refused:
+        load_drawn_map(file)
+    assert "read.floor_z" in (refused.value.hint or "")
+    drawn = load_drawn_map(file, Config(read=ReadConfig(floor_z=-0.4)))
+    assert drawn.T_map_file[2, 3] == pytest.approx(0.4)
+    assert drawn.grid.free.sum() * drawn.grid.resolution_m**2 > 15.0
