@@ -13,6 +13,13 @@ from pc2grid.geometry import SE2, invert_pose
 from pc2grid.model import Scan
 from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
 
+_UPRIGHT_HEIGHT_M, _UPRIGHT_TILT_RAD = 0.05, math.radians(0.5)
+"""A base on wheels keeps its height and its tilt within these, as its odometry reports them: an EKF in three
+dimensions says a few tenths of a degree; a phone in the hand (depth/room) 0.8 to 6.5 degrees within a second.
+Without odometry, a sensor that is mounted lower than this above its base is in the hand."""
+DECIDING_SCANS = 20
+"""So many scans decide whether a base is on wheels; what tilts and rises later is on a ramp. By hand."""
+
 
 class GroundModel:
     """Follows the floor from scan to scan, in the base frame.
@@ -32,12 +39,18 @@ class GroundModel:
 
     @classmethod
     def start(
-        cls, points_m: F32, scan: Scan, parameters: TrackingParameters = TRACKING_PARAMETERS
+        cls,
+        points_m: F32,
+        scan: Scan,
+        parameters: TrackingParameters = TRACKING_PARAMETERS,
+        *,
+        rolling: bool | None = None,
     ) -> GroundModel:
         """Find the floor in the first scan.
 
         It is looked for where the mounting of the sensor puts it, then as the lowest level plane; else it
-        is assumed. points_m : (N, 3) points of the scan that are used, base frame.
+        is assumed. points_m : (N, 3) points of the scan that are used, base frame. rolling : by default what
+        `is_rolling` says.
         """
         if scan.sensor == "laser":
             return cls(None, rolling=True, parameters=parameters)
@@ -45,7 +58,7 @@ class GroundModel:
         assumed = assumed_ground(scan.T_base_sensor)
         found = find_ground(points_m, sensor_m, assumed) if assumed.offset_m == 0.0 else None
         ground = found or find_ground(points_m, sensor_m) or assumed
-        return cls(ground, rolling=is_rolling(scan), parameters=parameters)
+        return cls(ground, rolling=is_rolling(scan) if rolling is None else rolling, parameters=parameters)
 
     def follow_fixed(self, points_m: F32, scan: Scan) -> None:
         """Update a floor that is fixed to the robot by the points (N, 3) of a scan.
@@ -112,17 +125,17 @@ class GroundModel:
         return held
 
 
-_UPRIGHT_TILT_RAD = math.radians(0.5)
-"""A robot on wheels whose odometry tilts by less stands upright. EKFs report 0.1 to 0.3 degrees; phones and
-cameras in the hand tilted by 0.8 to 6.5 degrees (real recordings)."""
-_UPRIGHT_HEIGHT_M = 0.05
-"""A base that odometry puts lower than this stands on the floor: base_link is 1 cm above base_footprint on a
-TurtleBot3. A sensor without odometry that is mounted higher than this is on a robot. Chosen by hand."""
+def is_rolling(scan: Scan, first: Scan | None = None) -> bool:
+    """Whether the base stays upright: by its odometry, or without odometry by the mounting.
 
-
-def is_rolling(scan: Scan) -> bool:
-    """Whether the base stays upright: by its odometry, or without odometry by the mounting."""
+    first : the first scan; a base on wheels has its height still, whatever that is. A planar laser is taken
+    to be on wheels.
+    """
     T = scan.T_odom_base
+    if scan.sensor == "laser":
+        return True
     if T is None:
         return float(scan.T_base_sensor[2, 3]) > _UPRIGHT_HEIGHT_M
-    return abs(float(T[2, 3])) < _UPRIGHT_HEIGHT_M and float(T[2, 2]) > math.cos(_UPRIGHT_TILT_RAD)
+    before = T if first is None or first.T_odom_base is None else first.T_odom_base
+    level = float(T[2, 2]) > math.cos(_UPRIGHT_TILT_RAD)
+    return level and abs(float(T[2, 3] - before[2, 3])) < _UPRIGHT_HEIGHT_M

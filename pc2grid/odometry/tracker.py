@@ -23,7 +23,7 @@ from pc2grid.clouds.sampling import random_subset
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.geometry import SE2, invert_pose
 from pc2grid.model import Health, RegisteredScan, Scan, Storey
-from pc2grid.odometry.ground_model import GroundModel
+from pc2grid.odometry.ground_model import DECIDING_SCANS, GroundModel, is_rolling
 from pc2grid.odometry.health import HealthJudge
 from pc2grid.odometry.matching_maps import MatchingMaps
 from pc2grid.odometry.motion_model import MotionModel, Prediction, not_credible
@@ -80,7 +80,8 @@ class Tracker:
         self._config = registration
         self._projection = projection or ProjectionConfig()
         self._parameters = parameters
-        self._started = False
+        self._first: Scan | None = None
+        self._scans = 0  # since the first one
         self._motion = MotionModel(parameters)
         self._rides = RideWatch()
         self._restarted = False  # no keyframe has been reported since tracking started again
@@ -105,8 +106,13 @@ class Tracker:
 
     def start(self, scan: Scan) -> Tracked:
         """Begin with the first scan: find the floor, and put the base at the origin of the session frame."""
+        self._first, self._scans = scan, 0
+        return self._begin(scan, SE2(), rolling=is_rolling(scan))
+
+    def _begin(self, scan: Scan, at: SE2, *, rolling: bool) -> Tracked:
+        """Begin with a scan whose base is at a place of the session frame, on wheels or in the hand."""
         points = self._deskewed(scan, *self._motion.within(scan, None))
-        self._ground = GroundModel.start(points, scan, self._parameters)
+        self._ground = GroundModel.start(points, scan, self._parameters, rolling=rolling)
         self._camera_on_wheels = scan.sensor == "depth" and self._ground.rolling
         self._maps = MatchingMaps(
             self._projection.max_range_m,
@@ -116,18 +122,21 @@ class Tracker:
         self._health = HealthJudge(rolling=self._ground.rolling, parameters=self._parameters)
         self.kiss = self._new_kiss()
         self._surfaces = SurfaceMap() if scan.sensor == "depth" and not self._ground.rolling else None
-        self._started = True
-        pose = self._ground.start_pose()
+        pose = at.lift() @ self._ground.start_pose()
         self._register(scan, points, pose, Prediction(motion=np.eye(4), seconds=0.0))
         planar_scan = self._project(points, scan, _split(pose)[1])
         return self._finish(scan, points, planar_scan, pose, Health.FINE)
 
     def track(self, scan: Scan) -> Tracked:
         """Track the next scan; stamps must increase."""
-        if not self._started:
+        if self._first is None:
             return self.start(scan)
         # 1. Predict the motion, by odometry or as it was before. Implausible odometry is tested on the map.
         prediction = self._motion.predict(scan)
+        self._scans += 1
+        if self._ground.rolling and self._scans < DECIDING_SCANS and not is_rolling(scan, self._first):
+            at = SE2.from_matrix(self._motion.last_pose @ prediction.motion)
+            return self._begin(scan, at, rolling=False)
         if self._maps and not self._motion.is_plausible(prediction):
             prediction = self._examine(scan, prediction)
             self._motion.forget_window()

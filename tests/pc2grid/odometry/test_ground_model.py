@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pc2grid.arrays import F64
+from pc2grid.config import RegistrationConfig
 from pc2grid.geometry import pose_from_rotation_vector
 from pc2grid.model import Scan
 from pc2grid.odometry.ground_model import GroundModel
+from pc2grid.odometry.tracker import Tracker
+from pc2grid.simulate import SimulationConfig, iter_session
+from pc2grid.simulate.config import LidarConfig
 
 
 def hall() -> tuple[F64, F64]:
@@ -105,3 +110,32 @@ def test_a_base_that_is_a_little_off_its_footprint_is_on_wheels(
     ground = GroundModel.start(scan.points_m, scan)
     assert ground.rolling is rolling
     assert ground.ground is not None
+
+
+def moved(scan: Scan, height_m: float, pitch_deg: float) -> Scan:
+    """A scan whose odometry reports the base at a height and a pitch, as an EKF in three dimensions does."""
+    assert scan.T_odom_base is not None
+    tilted = pose_from_rotation_vector((0.0, math.radians(pitch_deg), 0.0), (0.0, 0.0, height_m))
+    return replace(scan, T_odom_base=scan.T_odom_base @ tilted)
+
+
+@pytest.mark.parametrize(
+    ("height_m", "pitch_deg", "carried"),
+    [
+        (lambda k: 0.25, lambda k: 0.0, False),  # base_link stands high above base_footprint
+        (lambda k: 0.01, lambda k: 0.3 * math.sin(k), False),  # pitch of an EKF
+        (lambda k: 0.01, lambda k: 0.0 if k < 5 else 4.0, True),  # a hand that begins level
+        (lambda k: 0.02 * k, lambda k: 0.0, True),  # and one that lifts the sensor
+        (lambda k: 0.0, lambda k: 0.0 if k < 25 else 7.0, False),  # a ramp after some seconds
+    ],
+)
+def test_several_scans_decide_whether_a_robot_is_on_wheels(
+    height_m: Callable[[int], float], pitch_deg: Callable[[int], float], carried: bool
+) -> None:
+    small = LidarConfig(rate_hz=5.0, columns=300)
+    config = SimulationConfig(length_m=4.0, seed=3, clutter=0, lidar=small)
+    tracker, k = Tracker(RegistrationConfig()), -1
+    for k, (scan, _) in enumerate(iter_session(sensor="lidar", config=config)):
+        tracker.track(moved(scan, height_m(k), pitch_deg(k)))
+    assert k > 25
+    assert tracker.carried == carried
