@@ -253,7 +253,6 @@ class _Pace:
     def __init__(self, recorded_s: float | None) -> None:
         self._recorded_s = recorded_s
         self._first: tuple[float, float] | None = None
-        self._least_left_s = math.inf
 
     def restart(self) -> None:
         """Measure from the next share on."""
@@ -263,7 +262,7 @@ class _Pace:
         """Pace and time left in words; nothing while too little is done to estimate them.
 
         The pace is measured from the first share reported, because the preparations before are not part of
-        it. The time left never goes up: an estimate that is higher than the one before is not shown.
+        it. The time left goes up where the work turns out to be slower than before.
         """
         now = time.monotonic()
         begin, done_before = self._first = self._first or (now, share)
@@ -271,8 +270,7 @@ class _Pace:
         if spent_s < _LEAST_S or done < _LEAST_SHARE:
             return ""
         rate = f"{done * self._recorded_s / spent_s:.1f}x real time, " if self._recorded_s else ""
-        self._least_left_s = min(self._least_left_s, spent_s * (1.0 - share) / done)
-        return f"{rate}{_duration(self._least_left_s)} left"
+        return f"{rate}{_duration(spent_s * (1.0 - share) / done)} left"
 
 
 def _duration(seconds: float) -> str:
