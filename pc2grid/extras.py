@@ -31,7 +31,7 @@ EXTRAS = {
     "cluster": Extra(("dask", "distributed"), ("dask", "distributed"), ClusterError),
     "live": Extra(("websockets",), ("websockets",), LiveError),
     "zenoh": Extra(("zenoh",), ("eclipse-zenoh",), LiveError),
-    "postgres": Extra(("pgvector", "psycopg"), ("'psycopg[binary]'", "pgvector"), DatabaseError),
+    "postgres": Extra(("psycopg",), ("'psycopg[binary]'",), DatabaseError),
     "bench": Extra(("faiss",), ("faiss-cpu",)),
     "docs": Extra(("mkdocs", "material", "mkdocstrings"), ("mkdocs-material", "'mkdocstrings[python]'")),
 }

@@ -59,7 +59,7 @@ def convert(
     """
     from pc2grid.io.atomic import require_writable
     from signature.database.maintenance import exists
-    from signature.database.postgres.schema import is_url
+    from signature.database.postgres.server import is_url
 
     if not (add or force) and exists(database):
         raise OutputError(f"{database}: exists already", hint="force=True replaces it, add=True adds to it")

@@ -42,8 +42,7 @@ from pc2grid import errors
 from pc2grid.errors import Pc2GridError
 from pc2grid_cli import console
 from signature.database import open_database
-from signature.database.maintenance import check
-from signature.database.sqlite.database import store
+from signature.database.maintenance import check, store
 from tests.helpers.databases import make_entry
 from tests.helpers.memory import Peak
 from tests.helpers.recordings import (
@@ -638,7 +637,7 @@ for _command in (*USES, CONVERT + " --add"):
         database(lambda d: bytes(reversed(d)), _command)
     )
     fault(43, 1, errors.NotADatabase, "another program's SQLite file")(database(header(68, 0), _command))
-    fault(44, 1, errors.DatabaseVersion, "database format 8; this pc2grid reads up to", "a newer pc2grid")(
+    fault(44, 1, errors.DatabaseVersion, "database format 8; this pc2grid reads format 1", "a newer pc2grid")(
         database(header(60, 8), _command)
     )
 for _command in USES:

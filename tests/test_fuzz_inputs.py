@@ -23,8 +23,7 @@ from pc2grid.errors import DatabaseError, MapFileError, Pc2GridError
 from pc2grid.io.nav2_map import load_map, save_map
 from pc2grid.model import OccupancyGrid
 from signature.database import SubmapDatabase, open_database
-from signature.database.maintenance import check, copy
-from signature.database.sqlite.database import store
+from signature.database.maintenance import check, copy, store
 from tests.helpers import foxglove_messages as foxglove
 from tests.helpers.databases import make_entry
 from tests.helpers.memory import bounded_memory

@@ -1,20 +1,18 @@
 """The submap database: sessions, their grids and submaps, and the signatures to search in.
 
-`open_database` and `create_database` return an object with the protocol `SubmapDatabase`: one SQLite file for
-a path, a PostgreSQL database with pgvector for a postgresql:// URL.
+`open_database` and `create_database` return a `SubmapDatabase`: one SQLite file for a path, a PostgreSQL
+database for a postgresql:// URL.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from pc2grid.errors import DatabaseError
-from signature.database.postgres.schema import is_url
-from signature.database.protocol import Label, Neighbour, Problem, Provenance, SessionInfo, SubmapDatabase
+from pc2grid.errors import OutputError
+from signature.database.database import SubmapDatabase
+from signature.database.postgres.server import is_url, location
+from signature.database.protocol import Label, Place, Problem, Provenance, SessionInfo
 
 __all__ = [
     "Label",
-    "Neighbour",
     "Problem",
     "Provenance",
     "SessionInfo",
@@ -24,7 +22,7 @@ __all__ = [
 ]
 
 
-def open_database(path_or_url: str | Path, *, writable: bool = False) -> SubmapDatabase:
+def open_database(path_or_url: Place, *, writable: bool = False) -> SubmapDatabase:
     """Open an existing database; only with `writable` can it be changed, and only by `add`.
 
     Raises NotADatabase, DatabaseCorrupt, DatabaseVersion, DatabaseUnreachable for a server that does not
@@ -35,16 +33,10 @@ def open_database(path_or_url: str | Path, *, writable: bool = False) -> SubmapD
     ...     session, database.grid(session).resolution_m, len(database.signatures()) > 10
     ('monday', 0.05, True)
     """
-    if is_url(path_or_url):
-        from signature.database.postgres.database import PostgresDatabase
-
-        return PostgresDatabase(str(path_or_url), writable=writable)
-    from signature.database.sqlite.database import SqliteDatabase
-
-    return SqliteDatabase(_local(path_or_url), writable=writable)
+    return engine_of(path_or_url).open(path_or_url, writable=writable)
 
 
-def create_database(path_or_url: str | Path, *, force: bool = False) -> SubmapDatabase:
+def create_database(path_or_url: Place, *, force: bool = False) -> SubmapDatabase:
     """Make an empty database and open it for writing; an existing one is replaced only with `force`.
 
     Raises OutputError if the file is there already or cannot be written, DatabaseBusy if another
@@ -54,21 +46,24 @@ def create_database(path_or_url: str | Path, *, force: bool = False) -> SubmapDa
     ...     database.sessions()
     ()
     """
-    if is_url(path_or_url):
+    refuse_existing(path_or_url, force)
+    engine_of(path_or_url).change(path_or_url, lambda rows: None, keep=False, create=True)
+    return open_database(path_or_url, writable=True)
+
+
+def refuse_existing(place: Place, force: bool) -> None:
+    """Raise OutputError if there is something already, and `force` is not set."""
+    if not force and engine_of(place).exists(place):
+        where = location(str(place)) if is_url(place) else str(place)
+        raise OutputError(f"{where}: exists already", hint="--force replaces it")
+
+
+def engine_of(place: Place) -> type[SubmapDatabase]:
+    """The engine of a path or URL."""
+    if is_url(place):
         from signature.database.postgres.database import PostgresDatabase
 
-        return PostgresDatabase.create(str(path_or_url), force=force)
+        return PostgresDatabase
     from signature.database.sqlite.database import SqliteDatabase
 
-    return SqliteDatabase.create(_local(path_or_url), force=force)
-
-
-def _local(path_or_url: str | Path) -> Path:
-    """The path of a file. Raises DatabaseError for a URL of an unknown engine."""
-    scheme, separator, _ = str(path_or_url).partition("://")
-    if isinstance(path_or_url, str) and separator:
-        raise DatabaseError(
-            f"{scheme}:// databases are not supported by this version",
-            hint="give the path of a .submaps file, or postgresql://user@host/database",
-        )
-    return Path(path_or_url)
+    return SqliteDatabase

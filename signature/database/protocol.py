@@ -1,34 +1,30 @@
-"""The methods that every engine of the submap database has, and the types they use."""
+"""What a submap database says of its sessions, and its format."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pc2grid.display import short
-from pc2grid.errors import DatabaseError
+from pc2grid.errors import DatabaseError, DatabaseVersion
 from pc2grid.io.containers.detect import SUBMAPS_ID
 from pc2grid.model import (
     Consistency,
-    Loop,
-    OccupancyGrid,
     OdometryCheck,
-    PointMap,
     Precision,
     ReadReport,
     SessionMap,
-    Submap,
-    Trajectory,
 )
+from signature.config import Config
 
 if TYPE_CHECKING:
-    import networkx as nx
-
-    from signature.config import Config
     from signature.describe import Signature
-    from signature.seen_places import SeenPlaces
-    from signature.similarity import SignatureTable
+
+
+Place = str | Path
+"""Path of a `*.submaps` file, or URL of a PostgreSQL database."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,15 +108,13 @@ class SessionInfo:
     duration_s : time between first and last pose.
     scans : poses in its trajectory.
     report : what was read, and what was lost while reading.
-    consistency : how well its map agrees with its own scans; None for an imported map, and for a session that
-        was stored before this was measured.
+    consistency : how well its map agrees with its own scans; None for an imported map.
     odometry : how well odometry agrees with its scans; None likewise.
     precision : how exactly its places lie to each other; None likewise.
     """
 
     name: str
     sensor: str
-    digest: str
     submaps: int
     resolution_m: float
     area_m2: float
@@ -141,6 +135,11 @@ class SessionInfo:
         )
 
     @property
+    def digest(self) -> str:
+        """sha256 of the recording, hex."""
+        return self.provenance.digest
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """The warnings of reading and mapping."""
         return self.report.warnings
@@ -149,6 +148,26 @@ class SessionInfo:
     def lossy(self) -> bool:
         """Whether data was lost while reading."""
         return self.report.lossy
+
+
+def refused_version(location: object, version: int) -> DatabaseError:
+    """The error for a database of another format."""
+    if version < FORMAT:
+        return DatabaseVersion(
+            f"{location}: of a format older than {FORMAT}, which this pc2grid does not read",
+            hint="convert the recordings again",
+        )
+    return DatabaseVersion(
+        f"{location}: database format {version}; this pc2grid reads format {FORMAT}",
+        hint="use a newer pc2grid",
+    )
+
+
+def no_utf8(location: str) -> DatabaseError:
+    """The error for a name that is asked for and that no database can hold."""
+    return DatabaseError(
+        f"{location}: holds UTF-8 only, and a name is none", hint="rename the recording, or use --name"
+    )
 
 
 def none_there(where: str, building: str | None, floor: str | None, labels: Sequence[Label]) -> DatabaseError:
@@ -160,146 +179,19 @@ def none_there(where: str, building: str | None, floor: str | None, labels: Sequ
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One finding of `check`: where (table and session) and what."""
+    """One finding of `check`: where (array and session) and what."""
 
     where: str
     what: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Neighbour:
-    """A submap that is similar to a query.
-
-    center_m : (x, y) in the map frame of its session. score : Eq. 6, smaller is more similar.
-    """
-
-    session: str
-    submap_id: int
-    center_m: tuple[float, float]
-    score: float
-
-    def __repr__(self) -> str:
-        x, y = self.center_m
-        where = f"{self.submap_id} of {short(self.session)} at ({x:.2f}, {y:.2f}) m"
-        return f"Neighbour({where}, score {self.score:.4f})"
-
-
+FORMAT = 1
+"""The format that is written and read."""
 APPLICATION_ID = int.from_bytes(SUBMAPS_ID, "big")
 """Marks a file, and the lock of a server, as pc2grid's."""
+OLDER_ID = int.from_bytes(b"pc2g", "big")
+"""Marks files that were written before the first format was fixed."""
 BUSY_TIMEOUT_S = 30.0
 """How long a writer waits for another one; chosen by hand."""
 Entry = tuple[SessionMap, "Sequence[Signature]", Provenance]
 """Everything that is stored of one session: the map, the signature of each submap, the provenance."""
-
-
-class SubmapDatabase(Protocol):
-    """Sessions and their submaps. Reading never changes it; `add` changes all or nothing.
-
-    Every read raises DatabaseCorrupt where a row does not match its checksum.
-    """
-
-    @property
-    def location(self) -> str:
-        """Path or URL, for messages."""
-        ...
-
-    def sessions(self, names: Collection[str] | None = None) -> tuple[SessionInfo, ...]:
-        """All sessions, or those of `names`, in the order they were added."""
-        ...
-
-    def config(self) -> Config:
-        """The configuration of the first session, whose signature and partition settings all sessions share.
-
-        The default configuration if there is no session.
-        """
-        ...
-
-    def signatures(self, session: str | None = None) -> SignatureTable:
-        """All signatures, or those of one session; `session_index` counts in the order of `sessions()`."""
-        ...
-
-    def nearest(
-        self,
-        query: Signature,
-        count: int,
-        *,
-        building: str | None = None,
-        floor: str | None = None,
-        session: str | None = None,
-    ) -> tuple[Neighbour, ...]:
-        """The `count` most similar submaps by Eq. 6, best first, of this building, floor and session."""
-        ...
-
-    def grid(self, session: str) -> OccupancyGrid:
-        """Whole occupancy grid of a session."""
-        ...
-
-    def trajectory(self, session: str) -> Trajectory:
-        """Poses of the base in the session's map frame; empty for an imported map."""
-        ...
-
-    def loops(self, session: str) -> tuple[Loop, ...]:
-        """The loops of a session; their `older` and `newer` are indices of poses of its trajectory."""
-        ...
-
-    def graph(self, session: str) -> nx.Graph:
-        """The junction graph of a session's free space (`pc2grid.submaps.junction_graph`).
-
-        Made again from the grid if none was stored, as in databases of formats 1 and 2.
-        """
-        ...
-
-    def points(self, session: str) -> PointMap | None:
-        """The points of a session in space; None if none were stored."""
-        ...
-
-    def seen_places(self, session: str) -> SeenPlaces | None:
-        """What is seen from the centre of each submap of a session, by id; None if it was not stored, as in
-        databases of formats 1 to 4."""
-        ...
-
-    def submap(self, session: str, submap_id: int) -> Submap:
-        """One submap."""
-        ...
-
-    def submaps(self, session: str) -> Iterable[Submap]:
-        """All submaps of a session, by id."""
-        ...
-
-    def add(
-        self,
-        session_map: SessionMap,
-        signatures: Sequence[Signature],
-        provenance: Provenance,
-        *,
-        force: bool = False,
-    ) -> None:
-        """Store a session in one transaction. The same session again changes nothing; another one of the
-        same name is refused with DatabaseError, or replaced with `force`."""
-        ...
-
-    def check(self) -> tuple[Problem, ...]:
-        """All damage; empty if there is none."""
-        ...
-
-    def keep_only(self, *, building: str | None = None, floor: str | None = None) -> None:
-        """From now on, know only the sessions of this building and floor; None: any.
-
-        Raises DatabaseError if there are none.
-        """
-        ...
-
-    def leave_out_damaged(self) -> tuple[Problem, ...]:
-        """From now on, leave out the sessions that cannot be searched because they are damaged.
-
-        Returns what is wrong with each of them. Raises DatabaseCorrupt if none is left.
-        """
-        ...
-
-    def close(self) -> None:
-        """Close the file or connection."""
-        ...
-
-    def __enter__(self) -> SubmapDatabase: ...
-
-    def __exit__(self, *_: Any) -> None: ...

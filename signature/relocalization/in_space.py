@@ -20,7 +20,7 @@ from pc2grid.clouds.voxel_cloud import VoxelCloud
 from pc2grid.geometry import SE2, transform_points
 from pc2grid.matching.icp_in_space import RAYS, SpatialFit, SpatialView, register_in_space
 from pc2grid.model import Health, PointMap, RegisteredScan
-from signature.database.protocol import SubmapDatabase
+from signature.database import SubmapDatabase
 from signature.relocalization.answer import Answer, Moment
 from signature.relocalization.confidence import LIMITS
 from signature.relocalization.hypotheses import Hypothesis

@@ -154,8 +154,8 @@ class MapIndex:
         If that is more than `signature.retrieval.viewpoints.AT_ONCE_M2` of free floor, maps are read when
         they first matter, and points always are, so the database must stay open as long as the index is used.
 
-        observer : gets the progress where places have to be selected and the database, which is of an older
-            format, lacks what is seen from them.
+        observer : gets the progress where places have to be selected, and a warning if what is seen from them
+            is damaged and has to be computed.
         """
         infos = {info.name: info for info in database.sessions()}
         areas_m2 = {name: info.area_m2 for name, info in infos.items()}
@@ -169,8 +169,7 @@ class MapIndex:
         def stored(name: str) -> SeenPlaces | None:
             # What is seen from a place follows from the map, so damage to it costs time and no answer.
             with contextlib.suppress(DatabaseCorrupt):
-                if (seen := database.seen_places(name)) is not None:
-                    return seen
+                return database.seen_places(name)
             lacking.append(name)
             return None
 
@@ -190,7 +189,7 @@ class MapIndex:
         if lacking:
             observer.on_warning(
                 f"{database.location}: lacks what is seen from the places of {len(lacking)} of its"
-                f" {len(infos)} sessions, so it was computed now; a copy by `pc2grid db copy` holds it"
+                f" {len(infos)} sessions, so it was computed now; `pc2grid db copy --recover` makes it whole"
             )
         return index
 

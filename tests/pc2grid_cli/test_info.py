@@ -14,7 +14,7 @@ from pc2grid.io.export.cloud import write_cloud
 from pc2grid.io.nav2_map import save_map
 from pc2grid_cli.info import describe
 from pc2grid_cli.main import app
-from signature.database.sqlite.database import store
+from signature.database.maintenance import store
 from tests.helpers.building_clouds import room_cloud
 from tests.helpers.databases import make_entry
 from tests.helpers.recordings import STEP, T0, drive, read, ros, write_mcap

@@ -26,8 +26,8 @@ from pc2grid.errors import (
 from pc2grid.io.nav2_map import save_map
 from pc2grid_cli import console
 from pc2grid_cli.main import app
+from signature.database.maintenance import store
 from signature.database.protocol import APPLICATION_ID
-from signature.database.sqlite.database import store
 from tests.helpers.databases import make_entry
 from tests.helpers.recordings import STEP, T0, drive, ros, write_mcap
 from tests.helpers.simulated_drives import office
@@ -184,7 +184,7 @@ def test_the_help_of_a_group_names_all_its_commands() -> None:
 
 
 def test_the_mark_of_a_database_is_the_one_that_is_written(folder: Path) -> None:
-    assert (folder / "b.submaps").read_bytes()[68:72] == APPLICATION_ID.to_bytes(4, "big") == b"pc2g"
+    assert (folder / "b.submaps").read_bytes()[68:72] == APPLICATION_ID.to_bytes(4, "big") == b"pcsm"
 
 
 def test_another_label_is_named(folder: Path) -> None:

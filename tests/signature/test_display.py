@@ -11,7 +11,7 @@ from pc2grid.geometry import SE2
 from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import OccupancyGrid
 from signature.database import Label, open_database
-from signature.database.sqlite.database import store
+from signature.database.maintenance import store
 from signature.relocalization.answer import Answer
 from signature.relocalization.confidence import NO_EVIDENCE
 from signature.relocalization.hypotheses import Hypothesis

@@ -314,7 +314,7 @@ def _stored(output: str, jobs: list[Job], *, add: bool, force: bool) -> dict[str
     from pc2grid.errors import OutputError
     from pc2grid.model import is_part_of
     from signature.database import maintenance, open_database
-    from signature.database.postgres.schema import is_url
+    from signature.database.postgres.server import is_url
 
     where = maintenance.shown(output)
     there = maintenance.exists(output)

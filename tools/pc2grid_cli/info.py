@@ -64,7 +64,7 @@ def info_command(
 def is_database(name: str) -> bool:
     """Whether this is the URL or the file of a submap database."""
     from pc2grid.io.containers.detect import is_submap_database
-    from signature.database.postgres.schema import is_url
+    from signature.database.postgres.server import is_url
 
     if is_url(name):
         return True

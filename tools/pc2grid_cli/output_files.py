@@ -74,7 +74,7 @@ def check_database_name(output: str) -> None:
 def check_database(output: str) -> None:
     """Raises OutputError if the file of a database cannot be written; a server is asked later."""
     from pc2grid.io.atomic import require_writable
-    from signature.database.postgres.schema import is_url
+    from signature.database.postgres.server import is_url
 
     if not is_url(output):
         require_writable(output, force=True)

@@ -14,7 +14,7 @@ from pc2grid.io.message_source import MessageSource
 _MCAP = b"\x89MCAP0\r\n"
 _BAG = b"#ROSBAG V2.0\n"
 _SQLITE = b"SQLite format 3\0"
-SUBMAPS_ID = b"pc2g"
+SUBMAPS_ID = b"pcsm"
 """The application id in the header of a submap database."""
 _RECORDED = "of a running robot, or a recording that comes through a pipe: pc2grid watch"
 

@@ -1,1 +1,1 @@
-"""A PostgreSQL server with pgvector as the database."""
+"""A PostgreSQL server as the database."""

@@ -20,11 +20,10 @@ from pathlib import Path
 
 from pc2grid.errors import DatabaseBusy, OutputError
 from pc2grid.io.atomic import is_at, replace_file
-from signature.database import migrations, serialize
+from signature.database.codec import Damage
 from signature.database.protocol import BUSY_TIMEOUT_S
 from signature.database.sqlite import schema
 from signature.database.sqlite.connection import BoundedConnection
-from signature.database.sqlite.file import migrate
 
 _POLL_S = 0.05
 # SQLite's primary result codes (https://www.sqlite.org/rescode.html) for a medium that does not take writes.
@@ -33,19 +32,17 @@ _CANNOT_WRITE = {_READONLY: "readonly", _IOERR: "disk I/O", _FULL: "is full", _C
 
 
 @contextlib.contextmanager
-def rewrite(path: Path, *, keep: bool, timeout_s: float = BUSY_TIMEOUT_S) -> Iterator[sqlite3.Connection]:
+def rewrite(path: Path, *, keep: bool) -> Iterator[sqlite3.Connection]:
     """Give the body a connection to change; when it ends without an error, `path` holds the result.
 
-    keep : start from the content of `path`; otherwise, or if there is none yet, from an empty database. A
-        file of an older format becomes one of the present format; the old file stays beside it, as
-        `NAME.format1` for format 1.
+    keep : start from the content of `path`; otherwise, or if there is none yet, from an empty database.
 
-    Raises DatabaseBusy if another writer does not finish within `timeout_s`, OutputError if the file
+    Raises DatabaseBusy if another writer does not finish within `BUSY_TIMEOUT_S`, OutputError if the file
     cannot be written, and NotADatabase, DatabaseVersion or DatabaseCorrupt if the content of `path` cannot
     be kept.
     """
     target = Path(os.path.realpath(path))
-    with hold(target, timeout_s), replace_file(target, alone=True) as copy:
+    with hold(target, BUSY_TIMEOUT_S), replace_file(target, alone=True) as copy:
         kept = keep and target.exists() and target.stat().st_size > 0
         if kept:
             schema.inspect_header(target)
@@ -60,14 +57,9 @@ def rewrite(path: Path, *, keep: bool, timeout_s: float = BUSY_TIMEOUT_S) -> Ite
                 schema.inspect_tables(connection, path)
             else:
                 schema.initialise(connection)
-            version = schema.version_of(connection)
             connection.execute("BEGIN")
-            migrate(connection)
             yield connection
             connection.execute("COMMIT")
-            if version < migrations.FORMAT:
-                with replace_file(target.with_name(f"{target.name}.format{version}")) as before:
-                    shutil.copyfile(target, before)
         except schema.DAMAGE as error:
             raise _explained(error, path, kept) from error
         finally:
@@ -79,7 +71,7 @@ def _explained(error: Exception, path: Path, kept: bool) -> Exception:
     if isinstance(error, sqlite3.OperationalError) and (not kept or _cannot_write(error)):
         return OutputError(f"{path}: cannot write: {error}", hint="free some space, or write to another disk")
     if kept:
-        return serialize.corrupt(path, "file", str(error))
+        return Damage(path, "file", str(error))
     return error  # what this process wrote itself is not damaged: an error of the program
 
 

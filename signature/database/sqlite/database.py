@@ -3,334 +3,171 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sqlite3
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
-import numpy as np
-
-from pc2grid.errors import DatabaseError
-from pc2grid.io.atomic import refuse_existing
-from pc2grid.model import SessionMap, Submap
-from signature.database import serialize, validation
-from signature.database.protocol import (
-    BUSY_TIMEOUT_S,
-    Entry,
-    Neighbour,
-    Problem,
-    Provenance,
-    SessionInfo,
-    none_there,
-)
-from signature.database.reader import RowReader
-from signature.database.serialize import Row
-from signature.database.sqlite import rows, schema
+from pc2grid.errors import DatabaseCorrupt, DatabaseError
+from signature.database.codec import Damage
+from signature.database.database import SubmapDatabase
+from signature.database.protocol import Place, Problem, no_utf8
+from signature.database.rows import Rows
+from signature.database.sqlite import schema
 from signature.database.sqlite.atomic_update import rewrite
-from signature.database.sqlite.file import (
-    check,
-    connect,
-    connect_damaged,
-    damaged_sessions,
-    iter_sessions,
-    read_sizes,
-)
+from signature.database.sqlite.connection import BoundedConnection
 
 if TYPE_CHECKING:
-    from signature.config import Config
-    from signature.describe import Signature
-    from signature.similarity import SignatureTable
+    from typing_extensions import Self
+
+_MAPPED_BYTES = 1 << 30
+"""How much of a file SQLite maps into memory at most; chosen by hand."""
 
 
-def store(
-    path: Path,
-    entries: Iterable[Entry],
-    *,
-    keep: bool,
-    force: bool = False,
-    drop: Collection[str] = (),
-    timeout_s: float = BUSY_TIMEOUT_S,
-) -> None:
-    """Write sessions to a file, all or none.
+class SqliteRows(Rows):
+    """The rows of a file."""
 
-    keep : add them to the sessions of the file; otherwise they become its whole content.
-    force : replace a session of the same name instead of refusing the new one.
-    drop : names of sessions that are removed before.
+    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+        super().__init__(str(path))
+        self.connection = connection
 
-    Raises DatabaseError for a session of that name with other content, or with signatures that cannot be
-    compared with those of the other sessions; DatabaseBusy; OutputError.
-    """
-    with rewrite(path, keep=keep, timeout_s=timeout_s) as connection:
-        present = {info.name: (number, info) for number, info in iter_sessions(connection, path)}
-        for name in drop:
-            _remove(connection, present.pop(name)[0])
-        for session_map, signatures, provenance in map(serialize.storable, entries):
-            name, resolution_m = session_map.session, session_map.grid.resolution_m
-            other = next((info for _, info in present.values() if info.name != name), None)
-            if other is not None:
-                serialize.refuse_other_settings(other, provenance.config, resolution_m, path)
-            content = serialize.rows_of(session_map, provenance)
-            (session,) = content["session"]
-            number = max((number for number, _ in present.values()), default=0) + 1
-            if name in present:
-                number = present[name][0]
-                if not force and _document(connection, number) == session["document"]:
-                    continue
-                if not force:
-                    raise serialize.refuse_same_name(name, path)
-                _remove(connection, number)
-            content["signature"] = [rows.signature_row(session_map.submaps, signatures)]
-            _insert(connection, number, content)
-            scans = len(session_map.trajectory)
-            present[name] = number, serialize.read_info(session, resolution_m, scans, path)
+    def select(self, statement: str, *values: Any) -> Iterator[tuple[Any, ...]]:
+        """The rows of a query. Raises DatabaseCorrupt where SQLite finds the file damaged."""
+        try:
+            # `yield from` would close the cursor of an unfinished generator, perhaps after the connection.
+            for row in self.connection.execute(statement, values):  # noqa: UP028
+                yield row
+        except UnicodeEncodeError:
+            raise no_utf8(self.location) from None
+        except sqlite3.ProgrammingError:
+            raise  # the use of a closed database is a mistake of the caller, not damage
+        except schema.DAMAGE as error:
+            raise Damage(self.location, "file", f"{type(error).__name__}: {error}") from error
+
+    def execute(self, statement: str, *values: Any) -> None:
+        """Change rows. Raises sqlite3.Error, which `rewrite` explains."""
+        self.connection.execute(statement, values)
+
+    def new_id(self) -> int:
+        """A number for a further session."""
+        ((largest,),) = self.select("SELECT coalesce(max(id), 0) FROM session")
+        return int(largest) + 1
 
 
-def remove(path: Path, names: Sequence[str], *, timeout_s: float = BUSY_TIMEOUT_S) -> None:
-    """Remove sessions from a file, all or none; the file becomes smaller.
-
-    Raises DatabaseError for a name that no session has, and as `store`.
-    """
-    with _changed(path, timeout_s) as (connection, known):
-        for name in dict.fromkeys(names):
-            if name not in known:
-                raise serialize.no_session(name, known, path)
-            _remove(connection, known[name])
-        # The copy that is worked on is nobody else's: the change may end before the file is made compact.
-        connection.execute("COMMIT")
-        connection.execute("VACUUM")
-        connection.execute("BEGIN")
-
-
-def rename(path: Path, old: str, new: str, *, timeout_s: float = BUSY_TIMEOUT_S) -> None:
-    """Give a session of a file another name; all else stays as it is.
-
-    Raises DatabaseError if there is no session `old`, or if there is another session `new`; and as `store`.
-    """
-    new = serialize.stored_name(new)
-    with _changed(path, timeout_s) as (connection, known):
-        if old not in known:
-            raise serialize.no_session(old, known, path)
-        if new != old and new in known:
-            raise serialize.name_is_taken(new, path)
-        ((row, _),) = rows.select(connection, path, "session", "id = ?", known[old])
-        connection.execute("DELETE FROM session WHERE id = ?", (known[old],))
-        rows.insert(connection, "session", {**row, "name": new})
-
-
-@contextlib.contextmanager
-def _changed(path: Path, timeout_s: float) -> Iterator[tuple[sqlite3.Connection, dict[str, int]]]:
-    """A connection to change an existing file by, and the numbers of its sessions by name."""
-    schema.inspect_header(path)
-    with rewrite(path, keep=True, timeout_s=timeout_s) as connection:
-        yield connection, {info.name: number for number, info in iter_sessions(connection, path)}
-
-
-def _document(connection: sqlite3.Connection, session_id: int) -> str:
-    """All that is known of a stored session besides its data: equal if it was made in the same way."""
-    (stored,) = connection.execute("SELECT document FROM session WHERE id = ?", (session_id,)).fetchone()
-    return str(stored)
-
-
-def _insert(connection: sqlite3.Connection, session_id: int, content: dict[str, list[Row]]) -> None:
-    """Store the rows of one session: table -> rows."""
-    for table in schema.TABLES:
-        key = "id" if table == "session" else "session_id"
-        for row in content[table]:
-            rows.insert(connection, table, {key: session_id, **row})
-
-
-def _remove(connection: sqlite3.Connection, session_id: int) -> None:
-    """Delete all rows of a session."""
-    for table in schema.TABLES:
-        key = "id" if table == "session" else "session_id"
-        connection.execute(f"DELETE FROM {table} WHERE {key} = ?", (session_id,))
-
-
-class SqliteDatabase(RowReader):
+class SqliteDatabase(SubmapDatabase):
     """A `*.submaps` file. See `SubmapDatabase` for what the methods promise.
 
     An open handle sees the file as it was when it was opened; `add` lets its own handle see the new file.
     """
 
-    def __init__(self, path: Path, *, writable: bool = False, damaged: bool = False) -> None:
-        """damaged : open a file in whatever state it is, and know only the sessions that can be read."""
-        self._path = path
-        self._writable = writable
-        self._damaged = damaged
-        self._left_out: Collection[int] = ()
-        self._connection = connect_damaged(path) if damaged else connect(path)
+    @classmethod
+    def open(cls, place: Place, *, writable: bool = False, damaged: bool = False) -> Self:
+        """See `SubmapDatabase.open`. Raises NotADatabase, DatabaseVersion, DatabaseCorrupt."""
+        path = local(place)
+        rows = SqliteRows(path, _open(path, "&immutable=1") if damaged else _connect(path))
+        return cls(path, rows, writable=writable, damaged=damaged)
 
     @classmethod
-    def create(cls, path: Path, *, force: bool = False) -> SqliteDatabase:
-        """See `create_database`."""
-        if not (path.exists() and path.stat().st_size == 0):
-            refuse_existing(path, force)
-        store(path, (), keep=False)
-        return cls(path, writable=True)
-
-    @property
-    def location(self) -> str:
-        """Path of the file."""
-        return str(self._path)
-
-    def sessions(self, names: Collection[str] | None = None) -> tuple[SessionInfo, ...]:
-        """All sessions, or those of `names`, in the order they were added."""
-        return tuple(info for _, info in self._sessions() if names is None or info.name in names)
-
-    def config(self) -> Config:
-        """The configuration of the first session; the default if there is none."""
-        from signature.config import Config
-
-        first = next(self._sessions(), None)
-        return first[1].provenance.config if first else Config()
-
-    def signatures(self, session: str | None = None) -> SignatureTable:
-        """All signatures, or those of one session; `session_index` counts in the order of `sessions()`."""
-        from signature.similarity import SignatureTable
-
-        index = {session_id: i for i, session_id in enumerate(self._ids().values())}
-        only = ("1",) if session is None else ("session_id = ?", self._id(session))
-        table: dict[str, Any] = {}
-        filled, config = 0, self.config()
-        # Not from the column `count`, in which a damaged row may state any number.
-        statement = f"SELECT coalesce(sum(length(submap_id)), 0) FROM signature WHERE {only[0]}"
-        ((bytes_of_ids,),) = rows.query(self._connection, self._path, statement, *only[1:])
-        capacity = int(bytes_of_ids) // 4
-        found = False
-        for row, sound in rows.select(self._connection, self._path, "signature", *only):
-            found = True
-            if row["session_id"] in self._left_out:
-                continue
-            where = f"signatures of session {row['session_id']}"
-            if not sound:
-                raise serialize.corrupt(self._path, where, "wrong checksum")
-            if not row["count"]:
-                continue
-            with rows.explained(self._path, where):
-                arrays = rows.read_signature_arrays(row)
-                validation.check_bins(row["boundary_bins"], row["freespace_bins"], config)
-                arrays["session_index"] = np.full(row["count"], index[row["session_id"]], np.int32)
-            # Copied into the table row by row, so that only one session is in memory twice.
-            for name, values in arrays.items():
-                if name not in table:
-                    table[name] = np.empty((capacity, *values.shape[1:]), values.dtype)
-                table[name][filled : filled + len(values)] = values
-            filled += row["count"]
-        if session is not None and not found:
-            raise serialize.corrupt(self._path, f"signatures of session {session!r}", "missing")
-        if not table:
-            return SignatureTable.of((), np.empty((0, 2)))
-        return SignatureTable(**{name: values[:filled] for name, values in table.items()})
-
-    def nearest(
-        self,
-        query: Signature,
-        count: int,
-        *,
-        building: str | None = None,
-        floor: str | None = None,
-        session: str | None = None,
-    ) -> tuple[Neighbour, ...]:
-        """The `count` most similar submaps by Eq. 6; see `SubmapDatabase.nearest`."""
-        from signature.database.nearest_rows import rank
-
-        table, sessions = self.signatures(session), self.sessions()
-        wanted = [info.provenance.label.fits(building, floor) for info in sessions]
-        among = np.asarray(wanted, np.bool_)[table.session_index]
-        names = [info.name for info in sessions]
-        return rank(query, table, names, count, self.config().signature, among)
-
-    def submaps(self, session: str) -> Iterator[Submap]:
-        """All submaps of a session, by id."""
-        session_id = self._id(session)
-        statement = "SELECT count FROM signature WHERE session_id = ?"
-        stored = next(rows.query(self._connection, self._path, statement, session_id), None)
-        if stored is None:
-            raise serialize.corrupt(self._path, f"signature of session {session!r}", "missing")
-        with rows.explained(self._path, f"signature of session {session!r}"):
-            missing = validation.count(stored[0], "count")
-        sizes = read_sizes(self._connection, self._path, session_id)
-        for row, sound in rows.select(self._connection, self._path, "submap", "session_id = ?", session_id):
-            where = f"submap {row['submap_id']} of session {session!r}"
-            yield self._decoded(row, sound, where, sizes, serialize.read_submap)
-            missing -= 1
-        # A row whose damaged session_id names another session is missed only by counting.
-        if missing:
-            raise serialize.corrupt(self._path, f"submaps of session {session!r}", f"{missing} missing")
-
-    def add(
-        self,
-        session_map: SessionMap,
-        signatures: Sequence[Signature],
-        provenance: Provenance,
-        *,
-        force: bool = False,
+    def change(
+        cls, place: Place, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
     ) -> None:
-        """Store a session in one transaction; see `SubmapDatabase.add`."""
-        if not self._writable:
-            raise DatabaseError(f"{self._path}: opened for reading only")
-        store(self._path, [(session_map, signatures, provenance)], keep=True, force=force)
-        self.close()
-        self._connection = connect(self._path)
+        """See `SubmapDatabase.change`. What was deleted takes no place in the new file."""
+        path = local(place)
+        if not create:
+            schema.inspect_header(path)
+        with rewrite(path, keep=keep) as connection:
+            action(SqliteRows(path, connection))
+            # The copy that is worked on is nobody else's: the change may end before the file is made compact.
+            connection.execute("COMMIT")
+            if connection.execute("PRAGMA freelist_count").fetchone() != (0,):
+                connection.execute("VACUUM")
+            connection.execute("BEGIN")
 
-    def keep_only(self, *, building: str | None = None, floor: str | None = None) -> None:
-        """From now on, know only some sessions; see `SubmapDatabase.keep_only`."""
-        # The labels of damaged sessions are unknown: they stay, so that leave_out_damaged() reports them.
-        damaged = damaged_sessions(self._connection, self._path)
-        known = iter_sessions(self._connection, self._path, {*self._left_out, *damaged})
-        labels = {number: info.provenance.label for number, info in known}
-        others = {number for number, label in labels.items() if not label.fits(building, floor)}
-        if len(others) == len(labels):
-            raise none_there(self.location, building, floor, list(labels.values()))
-        self._left_out = {*self._left_out, *others}
+    @classmethod
+    def exists(cls, place: Place) -> bool:
+        """Whether there is a file, other than an empty one."""
+        path = local(place)
+        return path.exists() and not (path.is_file() and path.stat().st_size == 0)
 
-    def leave_out_damaged(self) -> tuple[Problem, ...]:
-        """From now on, leave out the sessions that cannot be searched because they are damaged.
-
-        Returns what is wrong with each of them. Raises DatabaseCorrupt if none is left, or if the file
-        itself cannot be read.
-        """
-        found = damaged_sessions(self._connection, self._path)
-        damaged = {number: problem for number, problem in found.items() if number not in self._left_out}
-        problems = tuple(damaged.values())
-        self._left_out = {*self._left_out, *damaged}
-        if problems and not self._ids():
-            raise serialize.corrupt(self._path, problems[0].where, problems[0].what)
-        return problems
-
-    def check(self) -> tuple[Problem, ...]:
-        """Everything that is wrong with the file."""
-        return check(self._path)
+    @classmethod
+    def problems_of(cls, place: Place) -> tuple[Problem, ...]:
+        """All damage of a file, in whatever state it is; see `SubmapDatabase.problems_of`."""
+        problems: list[Problem] = []
+        try:
+            schema.inspect_header(local(place))
+        except DatabaseCorrupt as error:
+            problems.append(Problem("file", error.message))
+        with cls.open(place, damaged=True) as database:
+            try:
+                problems += database._damaged_structure()
+                problems += database._damaged_rows()
+            except Damage as error:
+                problems.append(error.problem)
+        return tuple(dict.fromkeys(problems))
 
     def close(self) -> None:
         """Close the file."""
         self._connection.close()
 
-    def __enter__(self) -> SqliteDatabase:
-        return self
+    def _renew(self) -> None:
+        self.close()
+        self._rows = SqliteRows(local(self._place), _connect(local(self._place)))
 
-    def _sessions(self) -> Iterator[tuple[int, SessionInfo]]:
-        return iter_sessions(self._connection, self._path, self._left_out, sound_only=self._damaged)
+    @property
+    def _connection(self) -> sqlite3.Connection:
+        assert isinstance(self._rows, SqliteRows)
+        return self._rows.connection
 
-    def _ids(self) -> dict[str, int]:
-        """Name -> number of the sessions that are known, in their order."""
-        if self._damaged:
-            return {info.name: number for number, info in self._sessions()}
-        found = rows.query(self._connection, self._path, "SELECT name, id FROM session ORDER BY id")
-        return {name: number for name, number in found if number not in self._left_out}
+    def _damaged_structure(self) -> Iterator[Problem]:
+        """What SQLite itself finds wrong, and tables that are not those of the format."""
+        try:
+            schema.inspect_tables(self._connection, local(self._place))
+            for (message,) in self._connection.execute("PRAGMA integrity_check"):
+                yield from (Problem("file", line) for line in str(message).splitlines() if line != "ok")
+        except DatabaseCorrupt as error:
+            yield Problem("file", error.message)
+        except schema.DAMAGE as error:
+            yield Problem("file", str(error))
 
-    def _id(self, session: str) -> int:
-        ids = self._ids()
-        if session not in ids:
-            there = ", ".join(map(repr, ids)) or "none"
-            raise DatabaseError(f"{self._path}: no session {session!r}", hint=f"there are: {there}")
-        return ids[session]
 
-    def _found(self, table: str, session: str, submap_id: int | None) -> tuple[Row, bool] | None:
-        condition, values = "session_id = ?", [self._id(session)]
-        if submap_id is not None:
-            condition, values = f"{condition} AND submap_id = ?", [*values, submap_id]
-        return next(rows.select(self._connection, self._path, table, condition, *values), None)
+def local(place: Place) -> Path:
+    """The path of a file. Raises DatabaseError for a URL of an unknown engine."""
+    scheme, separator, _ = str(place).partition("://")
+    if isinstance(place, str) and separator:
+        raise DatabaseError(
+            f"{scheme}:// databases are not supported by this version",
+            hint="give the path of a .submaps file, or postgresql://user@host/database",
+        )
+    return Path(place)
 
-    def _sizes(self, session: str) -> validation.Sizes | None:
-        return read_sizes(self._connection, self._path, self._id(session))
+
+def _connect(path: Path) -> sqlite3.Connection:
+    """A connection that cannot change the file. Raises NotADatabase, DatabaseVersion, DatabaseCorrupt."""
+    schema.inspect_header(path)
+    # Finished files are never written again, so readers need no locks. Only a journal that another
+    # program left beside the file calls for them.
+    real = os.path.realpath(path)
+    journals = [Path(real + suffix) for suffix in ("-wal", "-journal")]
+    with contextlib.ExitStack() as undo:
+        try:
+            connection = _open(path, "" if any(journal.exists() for journal in journals) else "&immutable=1")
+            undo.callback(connection.close)
+            connection.execute("PRAGMA trusted_schema = OFF")
+            connection.execute(f"PRAGMA mmap_size = {_MAPPED_BYTES}")
+            schema.inspect_tables(connection, path)
+        except schema.DAMAGE as error:
+            raise Damage(path, "header", f"{type(error).__name__}: {error}") from error
+        undo.pop_all()
+    return connection
+
+
+def _open(path: Path, options: str) -> sqlite3.Connection:
+    return sqlite3.connect(
+        f"file:{quote(os.path.realpath(path))}?mode=ro{options}",
+        uri=True,
+        isolation_level=None,
+        check_same_thread=False,
+        factory=BoundedConnection,
+    )

@@ -1,82 +1,23 @@
-"""The tables of a `*.submaps` file, and the checks of a file before anything is read from it."""
+"""What makes a file a `*.submaps` file: its header and tables, examined before anything else is read."""
 
 from __future__ import annotations
 
 import sqlite3
 from pathlib import Path
 
-from pc2grid.errors import DatabaseCorrupt, DatabaseVersion, NotADatabase
-from signature.database.migrations import FORMAT, tables_of
-from signature.database.protocol import APPLICATION_ID
-from signature.database.serialize import SALVAGE
+from pc2grid.errors import DatabaseCorrupt, NotADatabase
+from signature.database.codec import SALVAGE
+from signature.database.protocol import APPLICATION_ID, FORMAT, OLDER_ID, refused_version
+from signature.database.rows import definitions
 
 _CONVERTED = (".mcap", ".bag", ".db3", ".yaml", ".yml", ".pcd", ".ply", ".obj", ".stl")
 CONVERT = "make one with `pc2grid convert LOG -o BUILDING.submaps`"
 
+TABLES = definitions("blob", "id integer PRIMARY KEY")
+"""The statement that creates each table: table -> SQL."""
+
 DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 """What SQLite raises for damaged content: the second where its message would quote bytes that are no text."""
-
-# Every row ends with the crc32 of its other columns: SQLite itself does not notice a flipped bit in a blob.
-# Units are in the names; *_m metres, *_ns nanoseconds. Arrays are little-endian, row by row.
-TABLES = {
-    "session": "id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, sensor TEXT NOT NULL,"
-    " document TEXT NOT NULL, crc32 INTEGER NOT NULL",
-    "grid": "session_id INTEGER PRIMARY KEY REFERENCES session(id), height INTEGER NOT NULL,"
-    " width INTEGER NOT NULL, resolution_m REAL NOT NULL, origin_x_m REAL NOT NULL, origin_y_m REAL NOT NULL,"
-    " cells BLOB NOT NULL, crc32 INTEGER NOT NULL",
-    "trajectory": "session_id INTEGER PRIMARY KEY REFERENCES session(id), count INTEGER NOT NULL,"
-    " stamps_ns BLOB NOT NULL, poses BLOB NOT NULL, health BLOB NOT NULL, crc32 INTEGER NOT NULL",
-    "loop": "session_id INTEGER PRIMARY KEY REFERENCES session(id), count INTEGER NOT NULL,"
-    " pairs BLOB NOT NULL, measured BLOB NOT NULL, information BLOB NOT NULL, accepted BLOB NOT NULL,"
-    " crc32 INTEGER NOT NULL",
-    # The junction graph as `pc2grid.submaps.junction_graph.GraphArrays`; without nodes, none was stored.
-    "graph": "session_id INTEGER PRIMARY KEY REFERENCES session(id), nodes INTEGER NOT NULL,"
-    " edges INTEGER NOT NULL, points INTEGER NOT NULL, center_m BLOB NOT NULL, kind BLOB NOT NULL,"
-    " pixels BLOB NOT NULL, ends BLOB NOT NULL, length_m BLOB NOT NULL, path_start BLOB NOT NULL,"
-    " path_m BLOB NOT NULL, crc32 INTEGER NOT NULL",
-    # The points in space (`pc2grid.model.PointMap`); a session without any has a row of none.
-    "points": "session_id INTEGER PRIMARY KEY REFERENCES session(id), count INTEGER NOT NULL,"
-    " voxel_m REAL NOT NULL, origin_x_m REAL NOT NULL, origin_y_m REAL NOT NULL, origin_z_m REAL NOT NULL,"
-    " voxels BLOB NOT NULL, within BLOB NOT NULL, crc32 INTEGER NOT NULL",
-    # What is seen from each place (`signature.seen_places.SeenPlaces`); without places, none was stored.
-    "isovist": "session_id INTEGER PRIMARY KEY REFERENCES session(id), count INTEGER NOT NULL,"
-    " bearings INTEGER NOT NULL, columns INTEGER NOT NULL, sight_m REAL NOT NULL, ranges BLOB NOT NULL,"
-    " seen BLOB NOT NULL, crc32 INTEGER NOT NULL",
-    "submap": "id INTEGER PRIMARY KEY, session_id INTEGER NOT NULL REFERENCES session(id),"
-    " submap_id INTEGER NOT NULL, center_x_m REAL NOT NULL, center_y_m REAL NOT NULL, radius_m REAL NOT NULL,"
-    " height INTEGER NOT NULL, width INTEGER NOT NULL, resolution_m REAL NOT NULL,"
-    " origin_x_m REAL NOT NULL, origin_y_m REAL NOT NULL, cells BLOB NOT NULL, crc32 INTEGER NOT NULL,"
-    " UNIQUE (session_id, submap_id)",
-    # One row holds all signatures of a session: a search reads all of them.
-    "signature": "session_id INTEGER PRIMARY KEY REFERENCES session(id), count INTEGER NOT NULL,"
-    " boundary_bins INTEGER NOT NULL, freespace_bins INTEGER NOT NULL, submap_id BLOB NOT NULL,"
-    " center_m BLOB NOT NULL, boundary BLOB NOT NULL, freespace BLOB NOT NULL, symmetry BLOB NOT NULL,"
-    " crc32 INTEGER NOT NULL",
-}
-ONE_EACH = ("grid", "trajectory", "loop", "graph", "points", "isovist", "signature")
-"""The tables in which every session has exactly one row."""
-
-# What the checksum covers: all columns except itself and the row's own number.
-COLUMNS = {
-    name: tuple(
-        column.split()[0]
-        for column in columns.split(", ")
-        if column.split()[0] not in ("crc32", "UNIQUE", "submap_id)")
-        and not (name == "submap" and column[:3] == "id ")
-    )
-    for name, columns in TABLES.items()
-}
-
-
-def statements(version: int = FORMAT) -> dict[str, str]:
-    """The statement that creates each table of a format: table -> SQL."""
-    return {name: f"CREATE TABLE {name} ({columns})" for name, columns in tables_of(version, TABLES).items()}
-
-
-def version_of(connection: sqlite3.Connection) -> int:
-    """The format of the file that is open."""
-    (version,) = connection.execute("PRAGMA user_version").fetchone()
-    return int(version)
 
 
 def initialise(connection: sqlite3.Connection) -> None:
@@ -84,7 +25,7 @@ def initialise(connection: sqlite3.Connection) -> None:
     connection.execute("PRAGMA page_size = 4096")
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     connection.execute(f"PRAGMA user_version = {FORMAT}")
-    for statement in statements().values():
+    for statement in TABLES.values():
         connection.execute(statement)
 
 
@@ -115,21 +56,19 @@ def inspect_header(path: Path) -> None:
         )
     if len(header) < 100:
         raise DatabaseCorrupt(f"{path}: truncated to {size} bytes, not even the header is whole")
-    application_id = int.from_bytes(header[68:72], "big")
+    application_id, version = (int.from_bytes(header[at : at + 4], "big") for at in (68, 60))
+    if application_id == OLDER_ID:
+        raise refused_version(path, 0)
     if application_id != APPLICATION_ID:
         raise NotADatabase(
             f"{path}: not a pc2grid database, but another program's SQLite file (application id"
             f" {application_id:#x})",
             hint=CONVERT,
         )
-    version = int.from_bytes(header[60:64], "big")
-    if version > FORMAT:
-        raise DatabaseVersion(
-            f"{path}: database format {version}; this pc2grid reads up to {FORMAT}",
-            hint="use a newer pc2grid",
-        )
     if version < 1:
         raise DatabaseCorrupt(f"{path}: database format {version} never existed", hint=SALVAGE)
+    if version != FORMAT:
+        raise refused_version(path, version)
     page_size = int.from_bytes(header[16:18], "big")
     page_size = 65536 if page_size == 1 else page_size
     if size != page_size * int.from_bytes(header[28:32], "big"):
@@ -141,7 +80,7 @@ def inspect_header(path: Path) -> None:
 
 
 def inspect_tables(connection: sqlite3.Connection, path: Path) -> None:
-    """Compare the tables with those of the file's format: no views or triggers of others, no damage.
+    """Compare the tables with those of the format: no views or triggers of others, no damage.
 
     Raises DatabaseCorrupt.
     """
@@ -149,11 +88,9 @@ def inspect_tables(connection: sqlite3.Connection, path: Path) -> None:
         str(name): str(sql)
         for name, sql in connection.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL")
     }
-    version = version_of(connection)
-    wanted = statements(version)
-    if found != wanted:
-        odd = sorted(name for name in found.keys() | wanted if found.get(name) != wanted.get(name))
+    if found != TABLES:
+        odd = sorted(name for name in found.keys() | TABLES if found.get(name) != TABLES.get(name))
         raise DatabaseCorrupt(
-            f"{path}: its tables are not those of format {version} ({', '.join(map(repr, odd))})",
+            f"{path}: its tables are not those of format {FORMAT} ({', '.join(map(repr, odd))})",
             hint=SALVAGE,
         )

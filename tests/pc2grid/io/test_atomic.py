@@ -35,7 +35,7 @@ import os, sys
 os.getpid = lambda: 1
 from pathlib import Path
 from pc2grid_cli.output_files import check_database
-from signature.database.sqlite.database import store
+from signature.database.maintenance import store
 from tests.helpers.databases import make_entry
 
 database, name = sys.argv[1:]

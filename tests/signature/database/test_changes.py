@@ -9,7 +9,7 @@ import pytest
 
 from pc2grid.errors import DatabaseError, NotADatabase, OutputError
 from signature.database import maintenance, open_database
-from signature.database.sqlite import atomic_update
+from signature.database.sqlite.database import SqliteRows
 from tests.helpers import postgresql
 from tests.helpers.databases import assert_holds, everything, make_entry
 
@@ -100,7 +100,7 @@ def test_a_file_is_changed_as_a_whole_or_not_at_all(tmp_path: Path, monkeypatch:
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(atomic_update, "migrate", killed)
+    monkeypatch.setattr(SqliteRows, "execute", killed)
     for act in (
         lambda: maintenance.rename(path, "monday", "friday"),
         lambda: maintenance.remove(path, ["monday"]),

@@ -27,13 +27,11 @@ from pc2grid.errors import (
 from pc2grid.model import Trajectory
 from signature.config import Config
 from signature.database import Label, create_database, maintenance, open_database
-from signature.database.maintenance import check, copy, merge
-from signature.database.maintenance import store as store_anywhere
+from signature.database.maintenance import check, copy, merge, store
+from signature.database.sqlite import atomic_update
 from signature.database.sqlite.atomic_update import hold
-from signature.database.sqlite.database import store
-from signature.similarity import distances
 from tests.helpers import postgresql
-from tests.helpers.databases import assert_holds, digest_of, everything, make_entry
+from tests.helpers.databases import assert_holds, digest_of, everything, make_entry, sql
 
 
 @pytest.fixture
@@ -54,7 +52,7 @@ def empty(request, tmp_path: Path) -> str | Path:
 
 @pytest.fixture
 def filled(empty: str | Path) -> str | Path:
-    store_anywhere(empty, [make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)], keep=False)
+    store(empty, [make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)], keep=False)
     return empty
 
 
@@ -90,10 +88,10 @@ def test_a_session_is_summed_up(filled: str | Path) -> None:
     assert info.odometry == session_map.odometry is not None
 
 
-def test_a_session_that_was_stored_before_consistency_was_measured(filled: str | Path) -> None:
+def test_a_session_of_which_nothing_was_measured(filled: str | Path) -> None:
     session_map, signatures, origin = make_entry("old", 5)
     entry = replace(session_map, consistency=None, odometry=None, precision=None), signatures, origin
-    store_anywhere(filled, [entry], keep=True)
+    store(filled, [entry], keep=True)
     with open_database(filled) as database:
         assert database.sessions(["old"])[0].consistency is None
         assert database.sessions(["old"])[0].precision is None
@@ -105,17 +103,16 @@ def test_sessions_without_submaps_or_poses(filled: str | Path) -> None:
     session_map, signatures, origin = make_entry("empty", 5, submaps=0)
     nowhere = Trajectory(stamps_ns=np.empty(0), T_session_base=np.empty((0, 4, 4)))
     entry = replace(session_map, trajectory=nowhere, loops=()), signatures, origin
-    query = make_entry("q", 99)[1][0]
     for keep in (True, False):
-        store_anywhere(filled, [entry], keep=keep)
+        store(filled, [entry], keep=keep)
         with open_database(filled) as database:
             assert_holds(database, entry)
             info = database.sessions(["empty"])[0]
             assert (info.path_m, info.duration_s, info.scans, info.submaps) == (0.0, 0.0, 0, 0)
             assert database.check() == ()
             assert len(database.signatures("empty")) == 0
-            assert database.nearest(query, 3, session="empty") == ()
-            assert len(database.nearest(query, 3)) == (3 if keep else 0)
+            assert len(database.signatures()) == (8 if keep else 0)
+            assert len(database.seen_places("empty")) == 0
 
 
 def test_nothing_there_is_no_database(empty: str | Path) -> None:
@@ -136,46 +133,44 @@ def test_a_handle_sees_what_was_there_when_it_was_opened(empty: str | Path) -> N
         assert_holds(first, make_entry("tuesday", 1, submaps=5))
 
 
-def test_nearest_are_the_best_of_eq_6_and_filters_hold(empty: str | Path) -> None:
+def test_a_database_can_be_narrowed_to_a_building_or_floor(empty: str | Path) -> None:
     labels = {"a": Label(building="north", floor="1"), "b": Label(building="north"), "c": Label()}
     entries = []
     for seed, (name, label) in enumerate(labels.items()):
         session_map, signatures, origin = make_entry(name, seed, submaps=30)
         entries.append((session_map, signatures, replace(origin, label=label)))
-    store_anywhere(empty, entries, keep=False)
-    query = make_entry("q", 99)[1][0]
+    store(empty, entries, keep=False)
+    filters = [
+        {},
+        {"building": "north"},
+        {"floor": "1"},
+        {"building": "north", "floor": ""},
+        {"building": ""},
+    ]
+    for wanted, sessions in zip(filters, ["abc", "ab", "a", "b", "c"], strict=True):
+        with open_database(empty) as database:
+            database.keep_only(**wanted)
+            assert "".join(info.name for info in database.sessions()) == sessions
+            assert len(database.signatures()) == 30 * len(sessions)
+            assert database.leave_out_damaged() == ()
     with open_database(empty) as database:
-        table = database.signatures()
-        scores = distances(query, table)
-        best = [
-            ("abc"[table.session_index[row]], table.submap_id[row], scores[row])
-            for row in np.argsort(scores, kind="stable")
-        ]
-        filters = [
-            {},
-            {"building": "north"},
-            {"floor": "1"},
-            {"building": "north", "floor": ""},
-            {"session": "c"},
-        ]
-        for wanted, sessions in zip(filters, ["abc", "ab", "a", "b", "c"], strict=True):
-            found = database.nearest(query, 7, **wanted)
-            expected = [item for item in best if item[0] in sessions][:7]
-            assert [(n.session, n.submap_id, n.score) for n in found] == expected, wanted
-        assert database.nearest(query, 5, building="south") == ()
         with pytest.raises(DatabaseError, match="no session of south") as caught:
             database.keep_only(building="south")
         assert "north, 1" in str(caught.value)
         database.keep_only(building="north")
-        assert [info.name for info in database.sessions()] == ["a", "b"]
-        assert {n.session for n in database.nearest(query, 60)} == {"a", "b"}
-        assert database.nearest(query, 5, building="") == ()
-        assert len(database.signatures()) == 60
-        assert database.leave_out_damaged() == ()
         with pytest.raises(DatabaseError, match="no session 'c'"):
             database.grid("c")
+
+
+def test_submaps_are_cut_from_the_map_as_the_settings_say(empty: str | Path) -> None:
+    config = Config.model_validate({"partition": {"view": "disc"}})
+    entries = [make_entry("monday", 0, submaps=4, config=config)]
+    store(empty, entries, keep=False)
     with open_database(empty) as database:
-        assert found[0].center_m == database.submap("c", found[0].submap_id).center_m
+        assert_holds(database, entries[0])
+        # A disc of 5 m holds all of the map that is known, and an isovist only what is seen.
+        known = (database.grid("monday").cells >= 0).sum()
+        assert (database.submap("monday", 2).grid.cells >= 0).sum() == known
 
 
 @pytest.mark.parametrize("other", ["sqlite", "postgres"])
@@ -283,9 +278,7 @@ def test_failure_in_the_middle_leaves_what_was_there(filled: str | Path) -> None
     session_map, signatures, origin = make_entry("wednesday", 3)
     for keep in (True, False):
         with pytest.raises(ValueError, match="3 submaps but 2 signatures"):
-            store_anywhere(
-                filled, [make_entry("friday", 4), (session_map, signatures[:-1], origin)], keep=keep
-            )
+            store(filled, [make_entry("friday", 4), (session_map, signatures[:-1], origin)], keep=keep)
         assert everything(filled) == before
 
 
@@ -350,7 +343,7 @@ def test_newer_format_is_refused_by_number(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[60:64] = (99).to_bytes(4, "big")
     path.write_bytes(data)
-    with pytest.raises(DatabaseVersion, match="format 99; this pc2grid reads up to 5"):
+    with pytest.raises(DatabaseVersion, match="format 99; this pc2grid reads format 1"):
         open_database(path)
 
 
@@ -364,7 +357,7 @@ def test_truncated_file_is_seen_at_opening(path: Path, share: float) -> None:
 
 def test_strangers_trigger_is_refused(path: Path) -> None:
     connection = sqlite3.connect(path)
-    connection.execute("CREATE TRIGGER t AFTER INSERT ON session BEGIN DELETE FROM submap; END")
+    connection.execute("CREATE TRIGGER t AFTER INSERT ON session BEGIN DELETE FROM session; END")
     connection.commit()
     connection.close()
     with pytest.raises(DatabaseCorrupt, match="tables are not those"):
@@ -372,72 +365,32 @@ def test_strangers_trigger_is_refused(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("table", "column"),
+    "name",
     [
-        ("grid", "cells"),
-        ("trajectory", "poses"),
-        ("loop", "measured"),
-        ("graph", "path_m"),
-        ("points", "within"),
-        ("isovist", "ranges"),
-        ("submap", "cells"),
-        ("signature", "boundary"),
-        ("signature", "center_m"),
+        "grid.cells",
+        "trajectory.T_session_base",
+        "loops.information",
+        "graph.path_m",
+        "points.steps",
+        "seen.ranges",
+        "submaps.boundary",
+        "submaps.center_m",
     ],
 )
-def test_flipped_bit_in_any_blob_is_found_where_integrity_check_is_blind(path: Path, table, column) -> None:
-    connection = sqlite3.connect(path)
-    (blob,) = connection.execute(f"SELECT {column} FROM {table} LIMIT 1").fetchone()
-    connection.close()
+def test_flipped_bit_in_any_array_is_found_where_integrity_check_is_blind(path: Path, name: str) -> None:
+    ((blob,),) = sql(path, 'SELECT data FROM "array" WHERE name = ? LIMIT 1', name)
     data = bytearray(path.read_bytes())
     at = data.find(blob[:64]) + min(len(blob), 64) // 2
     data[at] ^= 4
     path.write_bytes(data)
-    connection = sqlite3.connect(path)
-    assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-    connection.close()
+    assert sql(path, "PRAGMA integrity_check") == [("ok",)]
 
-    problems = check(path)
-    assert len(problems) == 1
-    assert table in problems[0].where
-    assert "checksum" in problems[0].what
+    (problem,) = check(path)
+    assert problem.where.startswith(f"{name} of session ")
+    assert "checksum" in problem.what
     with open_database(path) as database, pytest.raises(DatabaseCorrupt, match="checksum") as caught:
-        for info in database.sessions():
-            database.grid(info.name)
-            database.trajectory(info.name)
-            database.loops(info.name)
-            database.graph(info.name)
-            database.points(info.name)
-            database.seen_places(info.name)
-            list(database.submaps(info.name))
-        database.signatures()
+        digest_of(database)
     assert "db check" in str(caught.value)
-
-
-def test_copy_leaves_damaged_submaps_behind_only_when_told(path: Path, tmp_path: Path) -> None:
-    connection = sqlite3.connect(path)
-    connection.execute("UPDATE submap SET center_x_m = center_x_m + 1 WHERE session_id = 2 AND submap_id = 3")
-    connection.commit()
-    connection.close()
-    target = tmp_path / "good.submaps"
-    with pytest.raises(DatabaseCorrupt, match="submap 3 of session 2"):
-        copy(path, target)
-    assert not target.exists()
-    problems = copy(path, target, recover=True)
-    assert [p.where for p in problems] == ["submap 3 of session 2"]
-    assert check(target) == ()
-    with open_database(target) as database:
-        assert_holds(database, make_entry("monday", 0))
-        assert [s.submap_id for s in database.submaps("tuesday")] == [0, 1, 2, 4]
-        assert list(database.signatures().submap_id) == [0, 1, 2, 0, 1, 2, 4]
-
-
-def test_lost_row_is_found(path: Path) -> None:
-    connection = sqlite3.connect(path)
-    connection.execute("DELETE FROM submap WHERE session_id = 1 AND submap_id = 0")
-    connection.commit()
-    connection.close()
-    assert any("monday" in p.where and "3 were stored" in p.what for p in check(path))
 
 
 # --- merge --------------------------------------------------------------------------------------------
@@ -476,19 +429,23 @@ def _hold_forever(file: str, ready) -> None:
 
 
 @pytest.mark.fault(45)
-def test_a_second_writer_learns_the_holder_and_a_killed_holder_is_no_obstacle(path: Path) -> None:
+def test_a_second_writer_learns_the_holder_and_a_killed_holder_is_no_obstacle(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     context = multiprocessing.get_context("spawn")
     ready = context.Event()
     holder = context.Process(target=_hold_forever, args=(str(path.resolve()), ready))
     holder.start()
     assert ready.wait(30)
+    monkeypatch.setattr(atomic_update, "BUSY_TIMEOUT_S", 0.2)
     with pytest.raises(DatabaseBusy, match=f"being written by process {holder.pid} on "):
-        store(path, [make_entry("friday", 5)], keep=True, timeout_s=0.2)
+        store(path, [make_entry("friday", 5)], keep=True)
     with open_database(path) as database:
         assert len(database.sessions()) == 2
     holder.kill()
     holder.join()
-    store(path, [make_entry("friday", 5)], keep=True, timeout_s=5)
+    monkeypatch.setattr(atomic_update, "BUSY_TIMEOUT_S", 5)
+    store(path, [make_entry("friday", 5)], keep=True)
     assert check(path) == ()
     assert list(path.parent.iterdir()) == [path]
 

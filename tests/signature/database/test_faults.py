@@ -33,35 +33,27 @@ from pc2grid.errors import (
     Pc2GridError,
 )
 from pc2grid.io.nav2_map import save_map
-from pc2grid.model import ReadReport
+from pc2grid.model import ReadReport, SessionMap, Trajectory
+from pc2grid.submaps.partition import divide
 from signature.config import Config
-from signature.database import Label, maintenance, open_database
-from signature.database.maintenance import check, copy, merge
-from signature.database.postgres import schema
-from signature.database.postgres.schema import is_url
-from signature.database.protocol import APPLICATION_ID
-from signature.database.sqlite import atomic_update, rows
+from signature.database import Label, Provenance, maintenance, open_database
+from signature.database.maintenance import check, copy, merge, store
+from signature.database.postgres import server
+from signature.database.protocol import APPLICATION_ID, OLDER_ID
+from signature.database.rows import ARRAY_COLUMNS, SESSION_COLUMNS
+from signature.database.sqlite import atomic_update
 from signature.database.sqlite.atomic_update import hold, rewrite
-from signature.database.sqlite.database import store
-from signature.database.sqlite.schema import COLUMNS
+from signature.database.stored import encode, stored_session
+from signature.describe import describe
 from signature.sessions import add_session, provenance
 from tests.helpers import postgresql
-from tests.helpers.databases import assert_holds, make_entry
+from tests.helpers.databases import assert_holds, make_entry, sql
 from tests.helpers.memory import bounded_memory
 from tests.helpers.rooms import small_house
 
 ROOT = Path(__file__).resolve().parents[3]
 FUZZ = int(os.environ.get("PC2GRID_FUZZ", "0"))
-BLOBS = {
-    "grid": ["cells"],
-    "trajectory": ["stamps_ns", "poses", "health"],
-    "loop": ["pairs", "measured", "information", "accepted"],
-    "graph": ["center_m", "kind", "pixels", "ends", "length_m", "path_start", "path_m"],
-    "points": ["voxels", "within"],
-    "isovist": ["ranges", "seen"],
-    "submap": ["cells"],
-    "signature": ["submap_id", "center_m", "boundary", "freespace", "symmetry"],
-}
+ARRAYS = list(encode(stored_session(make_entry()))[1])
 
 
 @pytest.fixture
@@ -96,7 +88,7 @@ def read_all(file: maintenance.Place) -> dict[str, str]:
             digest.update(repr(database.loops(info.name)).encode())
             digest.update(repr(database.graph(info.name).edges(data=True)).encode())
             seen = database.seen_places(info.name)
-            digest.update(b"" if seen is None else seen.ranges.tobytes() + seen.signatures.tobytes())
+            digest.update(seen.ranges.tobytes() + seen.signatures.tobytes())
             points = database.points(info.name)
             digest.update(b"" if points is None else points.points_m().tobytes())
             for submap in database.submaps(info.name):
@@ -130,17 +122,8 @@ def set_header(offset: int, value: int) -> Callable[[bytes], bytes]:
         (lambda data: data[:100] + bytes(len(data) - 100), DatabaseCorrupt, "x.submaps"),
         (lambda data: bytes(range(256)) * 64, NotADatabase, "not a pc2grid database"),
         (set_header(68, 0), NotADatabase, "another program's SQLite file (application id 0x0)"),
-        (set_header(60, 6), DatabaseVersion, "database format 6; this pc2grid reads up to 5"),
-        (
-            set_header(60, 1),
-            DatabaseCorrupt,
-            "its tables are not those of format 1 ('graph', 'isovist', 'loop', 'points')",
-        ),
-        (
-            set_header(60, 2),
-            DatabaseCorrupt,
-            "its tables are not those of format 2 ('graph', 'isovist', 'points')",
-        ),
+        (set_header(60, 2), DatabaseVersion, "database format 2; this pc2grid reads format 1"),
+        (set_header(68, OLDER_ID), DatabaseVersion, "of a format older than 1, which this pc2grid does not"),
         (set_header(60, 2**31 - 1), DatabaseVersion, "database format 2147483647"),
         (set_header(60, 0), DatabaseCorrupt, "database format 0 never existed"),
     ],
@@ -195,41 +178,52 @@ def test_command_line_refuses_a_newer_format_in_one_line(path: Path) -> None:
     done = pc2grid("db", "info", path.name, cwd=path.parent)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.splitlines() == [
-        "pc2grid: error: x.submaps: database format 7; this pc2grid reads up to 5",
+        "pc2grid: error: x.submaps: database format 7; this pc2grid reads format 1",
         "hint: use a newer pc2grid",
     ]
+
+
+@pytest.mark.fault(44)
+def test_command_line_says_of_an_older_format_what_to_do(path: Path) -> None:
+    path.write_bytes(set_header(68, OLDER_ID)(path.read_bytes()))
+    before = path.read_bytes()
+    for command in (("db", "info"), ("db", "check"), ("db", "copy", "-o", "y.submaps")):
+        done = pc2grid(*command, path.name, cwd=path.parent)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert done.stderr.splitlines() == [
+            "pc2grid: error: x.submaps: of a format older than 1, which this pc2grid does not read",
+            "hint: convert the recordings again",
+        ]
+    assert path.read_bytes() == before and list(path.parent.iterdir()) == [path]
 
 
 # --- fault 43: flipped bits ---------------------------------------------------------------------------
 
 
-def flip(path: Path, table: str, column: str, position: float, bit: int, session: int = 2) -> None:
-    """Flip one bit inside a blob, in the file's bytes."""
+def flip(path: Path, name: str, position: float, bit: int, session: int = 2) -> None:
+    """Flip one bit inside the bytes of an array, in the file's bytes."""
     with sqlite3.connect(path) as connection:
-        query = f"SELECT rowid FROM {table} WHERE session_id = ? ORDER BY rowid DESC"
-        (rowid,) = connection.execute(query, (session,)).fetchone()
-        with connection.blobopen(table, column, rowid) as blob:
+        query = 'SELECT rowid FROM "array" WHERE session_id = ? AND name = ?'
+        (rowid,) = connection.execute(query, (session, name)).fetchone()
+        with connection.blobopen("array", "data", rowid) as blob:
             at = int(position * (len(blob) - 1))
             blob[at] = blob[at] ^ (1 << bit)
     connection.close()
 
 
 @pytest.mark.fault(43)
-def test_fuzz_flipped_bit_anywhere_in_any_blob_is_found(path: Path) -> None:
+def test_fuzz_flipped_bit_anywhere_in_any_array_is_found(path: Path) -> None:
     clean = path.read_bytes()
     rng = np.random.default_rng(43)
     for _ in range(min(FUZZ, 200) or 4):
-        for table, columns in BLOBS.items():
-            for column in columns:
-                path.write_bytes(clean)
-                flip(path, table, column, float(rng.random()), int(rng.integers(8)))
-                problems = check(path)
-                assert len(problems) == 1, problems
-                assert problems[0].where.startswith(table)
-                assert problems[0].what == "wrong checksum"
-                with pytest.raises(DatabaseCorrupt, match=r"damaged: .*wrong checksum") as caught:
-                    read_all(path)
-                assert "--recover" in str(caught.value)
+        for name in ARRAYS:
+            path.write_bytes(clean)
+            flip(path, name, float(rng.random()), int(rng.integers(8)))
+            (problem,) = check(path)
+            assert (problem.where, problem.what) == (f"{name} of session 'tuesday'", "wrong checksum")
+            with pytest.raises(DatabaseCorrupt, match=r"damaged: .*wrong checksum") as caught:
+                read_all(path)
+            assert "--recover" in str(caught.value)
 
 
 def test_pages_that_are_met_again_and_again(path: Path) -> None:
@@ -259,51 +253,54 @@ def test_pages_that_are_met_again_and_again(path: Path) -> None:
             open_database(path) as db,
         ):
             db.sessions()
-        with pytest.raises(DatabaseCorrupt, match="more rows than fit into the file"):
+        with pytest.raises(DatabaseCorrupt, match=r"more rows than fit into the file|malformed"):
             store(path, [make_entry("sunday", 9, submaps=1)], keep=True)
     assert path.read_bytes() == content
 
 
-@pytest.mark.parametrize("table", list(COLUMNS))
+@pytest.mark.parametrize("table", ["session", "array"])
 def test_any_changed_value_of_any_row_is_found(path: Path, table: str) -> None:
-    """Not only blobs: every number, name and document stands under the checksum."""
+    """Not only bytes of arrays: every number, name and document stands under the checksum."""
     clean = path.read_bytes()
-    for column in COLUMNS[table]:
+    for column in {"session": SESSION_COLUMNS, "array": ARRAY_COLUMNS}[table]:
         path.write_bytes(clean)
-        connection = sqlite3.connect(path)
-        (kind,) = connection.execute(f"SELECT typeof({column}) FROM {table} LIMIT 1").fetchone()
+        ((kind,),) = sql(path, f'SELECT typeof({column}) FROM "{table}" LIMIT 1')
         change = {
             "integer": f"{column} + 8",
-            "real": f"{column} + 0.5",
             "text": f"{column} || ' '",
             "blob": f"zeroblob(length({column}))",
         }[kind]
-        connection.execute(f"UPDATE {table} SET {column} = {change} WHERE rowid = 1")
-        connection.commit()
-        connection.close()
-        assert any("wrong checksum" in problem.what for problem in check(path)), column
+        sql(path, f'UPDATE "{table}" SET {column} = {change} WHERE rowid = 1')
+        problems = check(path)
+        assert any(what in problem.what for problem in problems for what in MISSED), (column, problems)
+        if column not in (
+            "building",
+            "id",
+            "session_id",
+            "name",
+        ):  # by which it is found at all
+            assert any("wrong checksum" in problem.what for problem in problems), column
         with pytest.raises(Pc2GridError):
             read_all(path)
 
 
-@pytest.mark.parametrize("table", ["session", "grid", "signature"])
+MISSED = ("wrong checksum", "no part of a session", "belong to no session")
+
+
+@pytest.mark.parametrize("table", ["session", "grid.cells", "submaps.boundary", "submaps.center_m"])
 @pytest.mark.parametrize("how", ["changed", "lost"])
 def test_damaged_session_is_left_out_and_the_others_answer(path: Path, table: str, how: str) -> None:
-    column, number = ("document", "id") if table == "session" else ("crc32", "session_id")
-    connection = sqlite3.connect(path)
-    if how == "changed":
-        connection.execute(f"UPDATE {table} SET {column} = {column} || '1' WHERE {number} = 1")
-    else:
-        connection.execute(f"DELETE FROM {table} WHERE {number} = 1")
-    connection.commit()
-    connection.close()
+    which = "id = 1" if table == "session" else f"session_id = 1 AND name = '{table}'"
+    rows = "session" if table == "session" else '"array"'
+    change = f"DELETE FROM {rows}" if how == "lost" else f"UPDATE {rows} SET crc32 = crc32 + 1"
+    sql(path, f"{change} WHERE {which}")
     before = path.read_bytes()
     with open_database(path) as database:
-        problems = database.leave_out_damaged()
-        assert len(problems) == 1
-        assert "1" in problems[0].where
-        assert table in problems[0].where + problems[0].what
-        assert ("checksum" if how == "changed" else f"no {table}") in problems[0].what
+        (problem,) = database.leave_out_damaged()
+        assert "1" in problem.where or "monday" in problem.where
+        assert table.partition(".")[0] in problem.where + problem.what
+        expected = "checksum" if how == "changed" else "no session" if table == "session" else "missing"
+        assert expected in problem.what
         assert_holds(database, make_entry("tuesday", 1, submaps=5))
         assert [info.name for info in database.sessions()] == ["tuesday"]
         assert set(database.signatures().session_index) == {0}
@@ -318,10 +315,10 @@ def test_sound_database_leaves_nothing_out_and_a_wholly_damaged_one_is_refused(p
         assert database.leave_out_damaged() == ()
         assert len(database.sessions()) == 2
     for session in (1, 2):
-        flip(path, "signature", "boundary", 0.5, 3, session)
+        flip(path, "submaps.boundary", 0.5, 3, session)
     with (
         open_database(path) as database,
-        pytest.raises(DatabaseCorrupt, match="signature 1: wrong checksum"),
+        pytest.raises(DatabaseCorrupt, match=r"submaps\.boundary of session 'monday': wrong"),
     ):
         database.leave_out_damaged()
 
@@ -337,14 +334,17 @@ def test_relocalize_leaves_a_damaged_session_out_with_a_warning(tmp_path: Path) 
     cellar, _ = build_session(yaml, "cellar", config)
     for session in (cellar, house):
         add_session(database, session, config, provenance(yaml, origin.digest, config))
-    flip(database, "signature", "boundary", 0.3, 5, session=1)
+    flip(database, "submaps.boundary", 0.3, 5, session=1)
     damaged = database.read_bytes()
     done = pc2grid("relocalize", "house.yaml", "--database", "x.submaps", "--json", cwd=tmp_path)
     answer = json.loads(done.stdout)
     assert answer["status"] == "located", answer
     assert done.returncode == 3, done.stderr
-    assert answer["database"]["left_out"] == ["signature 1: wrong checksum"]
-    assert "warning: x.submaps: damaged and left out: signature 1: wrong checksum" in done.stderr
+    assert answer["database"]["left_out"] == ["submaps.boundary of session 'cellar': wrong checksum"]
+    assert (
+        "warning: x.submaps: damaged and left out: submaps.boundary of session 'cellar': wrong checksum"
+        in done.stderr
+    )
     assert database.read_bytes() == damaged
 
 
@@ -354,13 +354,11 @@ def test_relocalize_leaves_a_damaged_session_out_with_a_warning(tmp_path: Path) 
 def _write(place: maintenance.Place, mine: str, until: float, results: Any) -> None:
     """Add sessions and replace them with others of the name, as fast as it goes; one of them both write."""
     done = busy = number = 0
-    patience = {} if is_url(place) else {"timeout_s": 0.5}
-    write = maintenance.store if is_url(place) else store
     while time.time() < until:
         number += 1
         name = "both" if number % 5 == 0 else f"{mine}{number % 4}"
         try:
-            write(place, [make_entry(name, 100 + number % 3)], keep=True, force=True, **patience)
+            store(place, [make_entry(name, 100 + number % 3)], keep=True, force=True)
             done += 1
         except DatabaseBusy:
             busy += 1
@@ -385,7 +383,7 @@ def test_fuzz_eight_readers_and_two_writers(path: Path, engine: str, monkeypatch
     place: maintenance.Place = path
     if engine == "postgres":
         place = postgresql.new_database()
-        monkeypatch.setattr(schema, "BUSY_TIMEOUT_S", 1.0)  # whole seconds there
+        monkeypatch.setattr(server, "BUSY_TIMEOUT_S", 1.0)  # whole seconds there
         maintenance.store(place, [make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)], keep=False)
     known: dict[str, set[str]] = {}
     for seed in (100, 101, 102):
@@ -429,17 +427,19 @@ def _hold_until(file: str, ready: Event, leave: Event) -> None:
 
 
 @pytest.mark.fault(45)
-def test_second_writer_waits_for_the_first(path: Path) -> None:
+def test_second_writer_waits_for_the_first(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     context = multiprocessing.get_context("spawn")
     ready, leave = context.Event(), context.Event()
     holder = context.Process(target=_hold_until, args=(str(path.resolve()), ready, leave))
     holder.start()
     assert ready.wait(60)
+    monkeypatch.setattr(atomic_update, "BUSY_TIMEOUT_S", 0.1)
     with pytest.raises(DatabaseBusy, match=f"being written by process {holder.pid} on ") as caught:
-        store(path, [make_entry("friday", 5)], keep=True, timeout_s=0.1)
+        store(path, [make_entry("friday", 5)], keep=True)
     assert caught.value.hint == "try again when it is done"
     leave.set()
-    store(path, [make_entry("friday", 5)], keep=True, timeout_s=60)
+    monkeypatch.setattr(atomic_update, "BUSY_TIMEOUT_S", 60)
+    store(path, [make_entry("friday", 5)], keep=True)
     holder.join(60)
     with open_database(path) as database:
         assert_holds(database, make_entry("friday", 5))
@@ -466,12 +466,9 @@ def test_adding_to_a_damaged_database_names_the_damage(path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        (b"tablegridgrid", b"table\xffridgrid"),  # SQLite's message quotes the name
-        (b"CREATE TABLE grid", b"CREATE \xffABLE grid"),
-        (
-            b"CREATE TABLE grid (session_id INTEGER PRIMARY",
-            b"CREATE TABLE grid (s\xffssion_id INTEGER PRIMARY",
-        ),
+        (b"tablearrayarray", b"table\xffrrayarray"),  # SQLite's message quotes the name
+        (b'CREATE TABLE "array"', b'CREATE \xffABLE "array"'),
+        (b'CREATE TABLE "array" (building', b'CREATE TABLE "array" (b\xffilding'),
     ],
 )
 def test_table_definitions_that_are_no_text(path: Path, before: bytes, after: bytes) -> None:
@@ -491,53 +488,49 @@ def test_table_definitions_that_are_no_text(path: Path, before: bytes, after: by
 # --- what is lost as a whole, and what stands in a writer's way ---------------------------------------
 
 
-def change(path: Path, *statements: str) -> None:
-    with contextlib.closing(sqlite3.connect(path)) as connection:
-        for statement in statements:
-            connection.execute(statement)
-        connection.commit()
+GONE = {
+    "grid.cells": lambda database: database.grid("monday"),
+    "trajectory.stamps_ns": lambda database: database.trajectory("monday"),
+    "loops.T_older_newer.yaw": lambda database: database.loops("monday"),
+    "graph.kind": lambda database: database.graph("monday"),
+    "points.steps": lambda database: database.points("monday"),
+    "seen.ranges": lambda database: database.seen_places("monday"),
+    "submaps.boundary": lambda database: list(database.submaps("monday")),
+}
 
 
-@pytest.mark.parametrize("table", ["grid", "trajectory", "loop", "graph", "points", "isovist", "signature"])
-def test_a_row_that_is_gone_is_missed_by_name(path: Path, tmp_path: Path, table: str) -> None:
-    change(path, f"DELETE FROM {table} WHERE session_id = 1")
-    assert check(path) != ()
-    uses: dict[str, Callable[[Any], object]] = {
-        "grid": lambda database: database.grid("monday"),
-        "trajectory": lambda database: database.trajectory("monday"),
-        "loop": lambda database: database.loops("monday"),
-        "graph": lambda database: database.graph("monday"),
-        "points": lambda database: database.points("monday"),
-        "isovist": lambda database: database.seen_places("monday"),
-        "signature": lambda database: list(database.submaps("monday")),
-    }
-    words = rf"session 1: has no {table}" if table in ("grid", "trajectory") else "missing"
-    with open_database(path) as database, pytest.raises(DatabaseCorrupt, match=words):
-        database.sessions()
-        uses[table](database)
+@pytest.mark.parametrize("name", GONE)
+@pytest.mark.parametrize("engine", ["sqlite", "postgres"])
+def test_an_array_that_is_gone_is_missed_by_name(path: Path, tmp_path: Path, engine: str, name: str) -> None:
+    place: maintenance.Place = path
+    if engine == "postgres":
+        place = postgresql.new_database()
+        maintenance.copy(path, place)
+    sql(place, 'DELETE FROM "array" WHERE session_id = 1 AND name = ?', name)
+    assert [problem.what for problem in check(place)] == [f"{name} is missing"]
+    with open_database(place) as database:
+        assert len(database.sessions()) == 2
+        with pytest.raises(DatabaseCorrupt, match=f"session 'monday': {name} is missing"):
+            GONE[name](database)
     good = tmp_path / "good.submaps"
-    assert copy(path, good, recover=True) != ()
+    assert len(copy(place, good, recover=True)) == 1
     assert check(good) == ()
     with open_database(good) as database:
-        names = [info.name for info in database.sessions()]
-        assert names == (["monday", "tuesday"] if table in ("graph", "points", "isovist") else ["tuesday"])
+        lost = name.partition(".")[0] in ("grid", "trajectory", "loops")
+        assert [info.name for info in database.sessions()] == ["monday", "tuesday"][lost:]
+        assert_holds(database, make_entry("tuesday", 1, submaps=5))
 
 
-def test_a_submap_too_many_or_too_few_is_found(path: Path) -> None:
-    change(path, "DELETE FROM submap WHERE session_id = 2 AND submap_id = 4")
-    (problem,) = check(path)
-    assert problem.where == "session 'tuesday'"
-    assert problem.what == "has 4 submaps and 5 signatures where 5 were stored"
-    with open_database(path) as database, pytest.raises(DatabaseCorrupt, match="'tuesday': 1 missing"):
-        list(database.submaps("tuesday"))
-
-
-@pytest.mark.parametrize("table", ["session", "submap", "loop", "graph", "points"])
-def test_merging_takes_nothing_from_a_damaged_file(path: Path, tmp_path: Path, table: str) -> None:
+@pytest.mark.parametrize("name", ["document", "loops.newer", "graph.kind", "points.steps", "seen.ranges"])
+def test_merging_takes_nothing_from_a_damaged_file(path: Path, tmp_path: Path, name: str) -> None:
     other, target = tmp_path / "other.submaps", tmp_path / "target.submaps"
     store(other, [make_entry("friday", 5)], keep=False)
-    change(path, f"UPDATE {table} SET crc32 = crc32 + 1 WHERE rowid = 2")
-    with pytest.raises(DatabaseCorrupt, match=rf"x\.submaps: damaged: {table} .*wrong checksum"):
+    if name == "document":
+        sql(path, "UPDATE session SET crc32 = crc32 + 1 WHERE id = 2")
+    else:
+        sql(path, 'UPDATE "array" SET crc32 = crc32 + 1 WHERE session_id = 2 AND name = ?', name)
+    where = "session 2" if name == "document" else f"{name} of session 'tuesday'"
+    with pytest.raises(DatabaseCorrupt, match=rf"x\.submaps: damaged: {where}: wrong checksum"):
         merge([other, path], target)
     assert not target.exists()
 
@@ -565,34 +558,51 @@ def test_checking_what_is_no_database_of_ours(path: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("statement", "words"),
     [
-        ("CREATE VIEW more AS SELECT * FROM grid", "its tables are not those of format 5 ('more')"),
-        ("CREATE TRIGGER t AFTER DELETE ON grid BEGIN DELETE FROM loop; END", "format 5 ('t')"),
-        ("DELETE FROM session WHERE id = 2", "belongs to no session"),
+        ('CREATE VIEW more AS SELECT * FROM "array"', "its tables are not those of format 1 ('more')"),
+        ('CREATE TRIGGER t AFTER DELETE ON "array" BEGIN DELETE FROM session; END', "format 1 ('t')"),
+        ("DELETE FROM session WHERE id = 2", "belong to no session"),
     ],
 )
 def test_structure_that_no_row_shows(path: Path, statement: str, words: str) -> None:
-    change(path, statement)
+    sql(path, statement)
     problems = check(path)
     assert any(words in problem.what for problem in problems), problems
 
 
-def test_what_is_not_worth_recovering_is_left_behind(path: Path, tmp_path: Path) -> None:
-    """A damaged submap costs itself, and its signature; a damaged grid the session."""
-    change(
-        path,
-        "UPDATE submap SET crc32 = crc32 + 1 WHERE session_id = 2 AND submap_id = 3",
-        "UPDATE grid SET crc32 = crc32 + 1 WHERE session_id = 1",
+@pytest.mark.parametrize("engine", ["sqlite", "postgres"])
+def test_what_follows_from_the_map_is_made_again(path: Path, tmp_path: Path, engine: str) -> None:
+    """Damaged submaps, signatures, graphs and views cost nothing; a damaged grid costs the session."""
+    place: maintenance.Place = path if engine == "sqlite" else postgresql.new_database()
+    config, grid = Config(), small_house()
+    empty = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
+    graph, submaps = divide(grid, config.partition)
+    house = SessionMap(
+        session="house", sensor="map", grid=grid, submaps=submaps, trajectory=empty, graph=graph
     )
+    signatures = [describe(submap, config.signature) for submap in submaps]
+    entry = house, signatures, Provenance(source="house.yaml", digest="0" * 64, config=config)
+    store(place, [make_entry("monday", 0), entry, make_entry("tuesday", 1, submaps=5)], keep=False)
+    with open_database(place) as database:
+        before = database.seen_places("house")
+    for session, name in (
+        (1, "grid.cells"),
+        (2, "submaps.center_m"),
+        (2, "submaps.boundary"),
+        (2, "graph.edges"),
+        (2, "seen.ranges"),
+        (3, "points.steps"),
+        (3, "seen.signatures"),
+    ):
+        sql(place, 'UPDATE "array" SET crc32 = crc32 + 1 WHERE session_id = ? AND name = ?', session, name)
     good = tmp_path / "good.submaps"
-    assert len(copy(path, good, recover=True)) == 2
+    assert len(copy(place, good, recover=True)) == 7
     assert check(good) == ()
     with open_database(good) as database:
-        (info,) = database.sessions()
-        assert (info.name, info.submaps) == ("tuesday", 4)
-        assert [submap.submap_id for submap in database.submaps("tuesday")] == [0, 1, 2, 4]
-        assert database.signatures().submap_id.tolist() == [0, 1, 2, 4]
-        wanted = make_entry("tuesday", 1, submaps=5)[1]
-        assert np.array_equal(database.signatures().boundary[3], wanted[4].boundary)
+        assert [info.name for info in database.sessions()] == ["house", "tuesday"]
+        assert_holds(database, entry)
+        assert np.array_equal(database.seen_places("house").ranges, before.ranges)
+        tuesday = make_entry("tuesday", 1, submaps=5)
+        assert_holds(database, (dataclasses.replace(tuesday[0], points=None), *tuesday[1:]))
 
 
 def test_a_lock_that_its_holder_took_away_is_not_held(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -622,8 +632,7 @@ def test_a_mistake_of_the_body_stays_its_own(path: Path) -> None:
     target, before = path.with_name("new.submaps"), psutil.Process().num_fds()
     with pytest.raises(sqlite3.IntegrityError, match="UNIQUE"), rewrite(target, keep=False) as connection:
         for number in (1, 2):
-            row = {"id": number, "name": "monday", "sensor": "lidar", "document": "{}"}
-            rows.insert(connection, "session", row)
+            connection.execute("INSERT INTO session VALUES ('', ?, '', 'monday', '{}', 0)", [number])
     assert list(path.parent.iterdir()) == [path]
     assert psutil.Process().num_fds() == before
 
@@ -641,7 +650,7 @@ def test_a_medium_that_refuses_is_told_from_damage(with_code: bool) -> None:
         if with_code:
             error.sqlite_errorcode = code
         found = atomic_update._explained(error, Path("x.submaps"), kept=True)
-        assert type(found) is (DatabaseCorrupt if code == 1 else OutputError), message
+        assert isinstance(found, DatabaseCorrupt if code == 1 else OutputError), message
 
 
 def test_waiting_for_another_writer_keeps_nothing_open(path: Path) -> None:

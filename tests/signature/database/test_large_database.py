@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import sqlite3
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -16,8 +14,7 @@ from pc2grid.model import OccupancyGrid, SessionMap, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.submaps.partition import partition
 from signature.config import Config, RelocalizeConfig
-from signature.database import maintenance, open_database, serialize
-from signature.database.sqlite import rows
+from signature.database import maintenance, open_database
 from signature.relocalization import map_index as building_file
 from signature.relocalization.query_map import query_of
 from signature.relocalization.relocalizer import MapIndex, locate_map
@@ -25,6 +22,7 @@ from signature.retrieval import viewpoints
 from signature.retrieval.view import View
 from signature.seen_places import SeenPlaces
 from signature.sessions import add_session, provenance
+from tests.helpers.databases import sql
 from tests.helpers.simulated_drives import building, office, plan
 
 WALLS = np.random.default_rng(0).uniform(0, 12, (6, 5, 4)).round()
@@ -161,17 +159,12 @@ def test_a_stored_map_is_read_when_it_matters(tmp_path: Path, monkeypatch: pytes
 
 def test_places_are_selected_by_what_is_stored_and_computed_where_it_is_not(tmp_path: Path) -> None:
     """A database of more places than are all compared, of which only a share is selected."""
-    file, copied = tmp_path / "old.submaps", tmp_path / "copied.submaps"
+    file, copied = tmp_path / "damaged.submaps", tmp_path / "copied.submaps"
     store_maps(file, MAPS)
     settings = ALL.made_with.relocalize.model_copy(update={"all_places": 0, "shortlist": 2})
     config = ALL.made_with.model_copy(update={"relocalize": settings})
-    with contextlib.closing(sqlite3.connect(file)) as connection:
-        connection.execute("DELETE FROM isovist")
-        empty = {"session_id": 1, **serialize.isovist_row(None)}
-        for number in range(1, 1 + len(MAPS)):
-            rows.insert(connection, "isovist", {**empty, "session_id": number})
-        connection.commit()
-    maintenance.copy(file, copied)
+    sql(file, "DELETE FROM \"array\" WHERE name LIKE 'seen.%'")
+    maintenance.copy(file, copied, recover=True)
     answers, news = {}, {}
     for path in (file, copied):
         news[path] = News()
@@ -182,16 +175,14 @@ def test_places_are_selected_by_what_is_stored_and_computed_where_it_is_not(tmp_
     assert answers[file].session == answers[copied].session == "office"
     assert answers[file].T_map_base == answers[copied].T_map_base
     (warning,) = news[file].warnings
-    assert "old.submaps: lacks what is seen from the places of 7 of its 7 sessions" in warning
+    assert "damaged.submaps: lacks what is seen from the places of 7 of its 7 sessions" in warning
     assert news[copied].warnings == [] and news[copied].shares[-1] == 1.0
 
 
 def test_damage_to_what_is_seen_costs_no_answer(tmp_path: Path) -> None:
     file = tmp_path / "x.submaps"
     store_maps(file, {"office": MAPS["office"]})
-    with contextlib.closing(sqlite3.connect(file)) as connection:
-        connection.execute("UPDATE isovist SET crc32 = crc32 + 1")
-        connection.commit()
+    sql(file, "UPDATE \"array\" SET crc32 = crc32 + 1 WHERE name LIKE 'seen.%'")
     settings = ALL.made_with.relocalize.model_copy(update={"all_places": 0})
     with open_database(file) as database:
         assert database.leave_out_damaged() == ()

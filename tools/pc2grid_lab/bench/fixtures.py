@@ -21,7 +21,7 @@ from pc2grid.simulate import SimulationConfig, office_floorplan, prepare_session
 from pc2grid.simulate.config import LidarConfig
 from pc2grid.submaps.partition import partition
 from signature.config import Config
-from signature.database.sqlite.database import store
+from signature.database.maintenance import store
 from signature.describe import Signature, describe
 from signature.relocalization.query_map import QueryMap, query_of
 from signature.relocalization.relocalizer import MapIndex
