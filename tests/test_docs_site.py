@@ -82,7 +82,7 @@ def test_the_site_can_be_searched_without_a_server(site: Path, tmp_path: Path) -
     typed = (
         'addEventListener("load", () => setTimeout(() => {'
         'const box = document.querySelector("[data-md-component=search-query]");'
-        'box.focus(); box.value = "pgvector"; box.dispatchEvent(new Event("keyup")); }, 500));'
+        'box.focus(); box.value = "YugabyteDB"; box.dispatchEvent(new Event("keyup")); }, 500));'
     )
     (site / "docs" / "searched.html").write_text(page.replace("</body>", f"<script>{typed}</script></body>"))
     done = subprocess.run(

@@ -26,11 +26,11 @@ from pc2grid_lab.bench.measure import ROOT, Row, machine, table
 Measure = Callable[[Path, bool], Iterator[Row]]
 
 
-def fleet_search(folder: Path, quick: bool) -> Iterator[Row]:
-    """`fleet.fleet_search`, imported only when it runs, because PostgreSQL's libraries are an extra."""
+def fleet_reading(folder: Path, quick: bool) -> Iterator[Row]:
+    """`fleet.fleet_reading`, imported only when it runs, because PostgreSQL's libraries are an extra."""
     from pc2grid_lab.bench import fleet
 
-    yield from fleet.fleet_search(folder, quick)
+    yield from fleet.fleet_reading(folder, quick)
 
 
 MEASURES: dict[str, Measure] = {
@@ -53,7 +53,7 @@ MEASURES: dict[str, Measure] = {
     "live": live.lag,
     "hour": live.memory,
     "peers": peers.compare,
-    "fleet": fleet_search,
+    "fleet": fleet_reading,
 }
 
 _EXTRAS = {"retrieve": "bench", "fleet": "postgres"}
