@@ -11,7 +11,7 @@ BYTE_CODE = PYTHONDONTWRITEBYTECODE=
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 
-.PHONY: help demo test check bench fuzz picture docs clean
+.PHONY: help demo test check bench real fuzz picture docs clean
 .DEFAULT_GOAL = help
 
 help:
@@ -19,6 +19,7 @@ help:
 	@echo 'make test    run the tests (PYTEST_ARGS="-k name" for some of them)'
 	@echo 'make check   lint, format, types, import order'
 	@echo 'make bench   measure against the goals and the peers (BENCH_ARGS="--only convert --quick" for some of it)'
+	@echo 'make real    every real recording, against examples/real.md (QUICK=1: some of them); data: PC2GRID_DATA'
 	@echo 'make fuzz    20,000 mutations of every kind of input; then kill -9 and crowds, 200 times and a minute'
 	@echo 'make picture draw the modules and what they import: examples/architecture.svg'
 	@echo 'make docs    the documentation site: site/index.html'
@@ -44,6 +45,13 @@ check: $(READY)
 bench: $(READY)
 	$(BIN)/python -m pip install -q -c constraints.txt -e '.[bench,postgres]'
 	$(ONE_THREAD) $(BIN)/python -m pc2grid_lab.bench.run $(BENCH_ARGS)
+
+# Real recordings, where there are any. A whole run replaces the table that the next run is compared with.
+REAL_DATA = $(or $(PC2GRID_DATA),../shared/data)
+REAL = $(BIN)/pc2grid compare recordings $(REAL_DATA) --table examples/real.json --out results/real
+
+real: $(READY)
+	$(REAL) $(if $(QUICK),--quick) $(REAL_ARGS)
 
 # Half a million small files: in memory, where there is a place for that.
 FUZZ_FOLDER = $(shell test -w /dev/shm && echo --basetemp=/dev/shm/pc2grid-fuzz -o tmp_path_retention_policy=failed)

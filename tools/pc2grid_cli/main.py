@@ -40,6 +40,10 @@ COMPARE = {
     "log": ("pc2grid_lab.compare.log:compare_log_command", "Later parts of a log in a map of its beginning."),
     "maps": ("pc2grid_lab.compare.maps:compare_maps_command", "Maps and trajectories against the truth."),
     "real": ("pc2grid_lab.compare.real:compare_real_command", "Three sensors on one real floor."),
+    "recordings": (
+        "pc2grid_lab.compare.recordings:compare_recordings_command",
+        "Every real recording, and what changed.",
+    ),
     "sensors": ("pc2grid_lab.compare.sensors:compare_sensors_command", "Each sensor in the maps of each."),
     "signatures": (
         "pc2grid_lab.compare.signatures:compare_signatures_command",

@@ -9,6 +9,8 @@ from typing_extensions import TypedDict
 
 from pc2grid_lab.experiments.metrics import ConfidenceError, MatrixCell, QueryCounts
 from pc2grid_lab.experiments.real_sensors import RealCell
+from pc2grid_lab.experiments.recordings.changes import Change
+from pc2grid_lab.experiments.recordings.rows import MapRow, PairRow
 from pc2grid_lab.experiments.trial import Trial
 from pc2grid_lab.peers.outcome import PeerCell, PeerTrial
 from signature.relocalization.answer_json import Version
@@ -103,6 +105,22 @@ class ComparePeers(TypedDict):
     not_installed: dict[str, str]
     cells: list[PeerCell]
     trials: list[PeerTrial]
+
+
+class CompareRecordings(TypedDict):
+    """`pc2grid compare recordings --json`; without `changes` its real.json. program: changes with any source
+    file of the product and with the catalogue; cpu_s: of all commands together. changes: against the table
+    of the run before; empty if there is none.
+    """
+
+    schema_version: Version
+    program: str
+    commit: str
+    quick: bool
+    cpu_s: float
+    maps: list[MapRow]
+    pairs: list[PairRow]
+    changes: list[Change]
 
 
 class CompareReal(TypedDict):
@@ -229,6 +247,7 @@ DOCUMENTS: dict[str, type] = {
     "compare-paper": ComparePaper,
     "compare-peers": ComparePeers,
     "compare-real": CompareReal,
+    "compare-recordings": CompareRecordings,
     "compare-sensors": CompareSensors,
     "compare-signatures": CompareSignatures,
     "simulate": Simulate,

@@ -1,0 +1,130 @@
+"""`pc2grid compare recordings`: a small run over recordings that are good, broken and missing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from typer.testing import CliRunner
+
+from pc2grid.io.nav2_map import save_map
+from pc2grid.simulate import SimulationConfig, simulate_session
+from pc2grid_cli.json_schemas import schema
+from pc2grid_cli.main import app
+from pc2grid_lab.experiments.recordings import catalogue
+from pc2grid_lab.experiments.recordings.catalogue import Pair, Recording
+from tests.helpers.json_schema import closed
+from tests.helpers.simulated_drives import office, plan
+
+RECORDINGS = (
+    Recording(
+        name="a",
+        file="a.mcap",
+        building="office",
+        sensor="laser",
+        truth="a.tum",
+        poses="a.tum",
+        of_base=True,
+    ),
+    Recording(name="b", file="b.mcap", building="office", sensor="laser"),
+    Recording(name="hall.yaml", file="hall.yaml", building="hall", sensor="map", quick=True),
+    Recording(name="broken", file="broken.mcap", building="office", sensor="laser"),
+    Recording(name="gone", file="gone.mcap", building="office", sensor="laser"),
+)
+PAIRS = (
+    Pair(query="a", map="a", kind="later part", window_s=8.0, windows=2, until_s=30.0),
+    Pair(query="b", map="a", kind="other day", window_s=8.0, windows=4),
+    Pair(query="a", map="broken", kind="other day", window_s=8.0, windows=1),
+    Pair(query="broken", map="a", kind="other day", window_s=8.0, windows=1),
+    Pair(query="a", map="gone", kind="other day", window_s=8.0, windows=1),
+    Pair(query="b", map="hall.yaml", kind="elsewhere", window_s=8.0, windows=2, quick=True),
+)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two drives of a laser through one office, a recording that is none, and the map of another building."""
+    folder = tmp_path_factory.mktemp("data")
+    for name, seed, length_m in (("a", 3, 30.0), ("b", 5, 20.0)):
+        slow: dict[str, Any] = {"laser": {"rate_hz": 4.0}, "length_m": length_m, "seed": seed, "clutter": 2}
+        config = SimulationConfig.model_validate(slow)
+        simulate_session(folder / f"{name}.mcap", sensor="laser", grid=office(), config=config)
+    (folder / "broken.mcap").write_bytes(b"no recording")
+    save_map(plan(12.0, 9.0, [(0, 4, 7, 4), (7, 6, 7, 9), (3, 6, 3, 9)]), folder / "hall")
+    return folder
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(catalogue, "RECORDINGS", RECORDINGS)
+    monkeypatch.setattr(catalogue, "PAIRS", PAIRS)
+
+
+def compare(data: Path, out: Path, *options: str) -> Any:
+    arguments = ["compare", "recordings", str(data), "--out", str(out), *options]
+    done = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done
+
+
+@pytest.mark.usefixtures("small")
+def test_a_small_run(data: Path, tmp_path: Path) -> None:
+    document = json.loads(compare(data, tmp_path, "--json").stdout)
+    jsonschema.validate(document, closed(schema("compare-recordings")))
+    maps = {row["name"]: row for row in document["maps"]}
+    assert maps["a"]["error_m"] < 0.05 and maps["a"]["compared"] > 0.99 and maps["a"]["parts"] == 1
+    assert maps["a"]["cpu_s"] > 0.5 and 25 < maps["a"]["metres"] < 35
+    assert maps["b"]["truth"] == "none" and maps["b"]["error_m"] is None
+    assert "broken.mcap" in maps["broken"]["problem"]
+    assert maps["gone"]["problem"] == "not in the data folder"
+    later, other, no_map, no_query, missing, elsewhere = document["pairs"]
+    assert later["truth"] == "poses" and any(q["covered"] for q in later["queries"])
+    assert all(q["right"] and q["rank"] == 0 for q in later["queries"] if q["covered"])
+    assert other["truth"] == "agreement" and other["agreeing"] == 4
+    assert all(q["right"] and q["covered"] and q["rank"] == 0 for q in other["queries"])
+    assert sum(q["status"] == "located" for q in other["queries"]) >= 3
+    assert max(q["error_m"] for q in other["queries"]) < 0.15
+    assert "no map" in no_map["problem"] and no_query["problem"]
+    assert missing["problem"] == "gone.mcap: not in the data folder"
+    assert [q["status"] for q in elsewhere["queries"]] == ["not_found", "not_found"]
+    assert document["changes"] == []
+
+    page = (tmp_path / "real.md").read_text()
+    assert "| a | office | laser |" in page and "broken.mcap" in page and "No answer is wrong." in page
+    kept = json.loads((tmp_path / "real.json").read_text())
+    assert {**kept, "changes": []} == document
+
+    # The answers are there: the next run computes nothing, and tells what the table had otherwise.
+    kept["maps"][0]["error_m"] = 0.001
+    for query in kept["pairs"][1]["queries"]:
+        query["error_m"], query["right"] = 9.0, False
+    (tmp_path / "before.json").write_text(json.dumps(kept))
+    again = compare(data, tmp_path, "--table", str(tmp_path / "before.json"))
+    assert "- **worse** a: error 0.001 ->" in again.stdout
+    assert "- b in a: right 0 ->" in again.stdout
+    assert json.loads((tmp_path / "before.json").read_text())["maps"] == document["maps"]
+    assert "Changed since the run before" in (tmp_path / "before.md").read_text()
+
+
+@pytest.mark.usefixtures("small")
+def test_a_part_of_a_run_replaces_no_table(data: Path, tmp_path: Path) -> None:
+    done = compare(data, tmp_path, "--quick")
+    assert "| hall.yaml | hall | map |" in done.stdout and "| a | office |" not in done.stdout
+    assert "The quick form" in done.stdout and "there is no" in done.stdout
+    assert [path.name for path in tmp_path.iterdir()] == ["work"]
+
+
+@pytest.mark.usefixtures("small")
+def test_what_cannot_be_run_is_refused(data: Path, tmp_path: Path) -> None:
+    def refused(*arguments: str) -> str:
+        done = CliRunner().invoke(app, ["compare", "recordings", *arguments])
+        assert done.exit_code != 0
+        return str(done.exception)
+
+    assert "no such folder" in refused(str(tmp_path / "nowhere"))
+    assert "--only moon: no recording" in refused(str(data), "--out", str(tmp_path), "--only", "moon")
+    (tmp_path / "real.json").write_text("{}")
+    assert "not a table" in refused(str(data), "--out", str(tmp_path), "--only", "gone")

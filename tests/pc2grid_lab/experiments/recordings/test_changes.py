@@ -1,0 +1,181 @@
+"""What changed between two runs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from pc2grid_lab.experiments.recordings.chance import by_chance, clopper_pearson
+from pc2grid_lab.experiments.recordings.changes import Change, changes
+from pc2grid_lab.experiments.recordings.page import page
+from pc2grid_lab.experiments.recordings.rows import MapRow, PairRow, QueryRow, Table
+from pc2grid_lab.experiments.recordings.warned import warned
+
+BENT = "the map contradicts itself along 6% of the travel and is probably bent: near x 1.0, y 2.0 m"
+LIFT = "the robot stood in a room as small as a lift, its door out of sight, 5 s after the first scan"
+ODD = "something that no one has heard of before"
+
+
+def map_row(name: str = "hall", **changed: Any) -> MapRow:
+    fields: dict[str, Any] = {
+        "name": name,
+        "building": "hall",
+        "sensor": "lidar",
+        "minutes": 1.0,
+        "metres": 30.0,
+        "cpu_s": 10.0,
+        "parts": 1,
+        "lost": 0.0,
+        "truth": "poses",
+        "error_m": 0.03,
+    }
+    return MapRow(**{**fields, **changed})
+
+
+def query(window: int, outcome: str) -> QueryRow:
+    """right, wrong or refused."""
+    return QueryRow(
+        window=window,
+        start_s=10.0 * window,
+        status="ambiguous" if outcome == "refused" else "located",
+        confidence=0.99,
+        covered=True,
+        right=outcome != "wrong",
+        rank=0 if outcome != "wrong" else None,
+        error_m=0.04 if outcome != "wrong" else 5.0,
+        cpu_s=2.0,
+    )
+
+
+def pair_row(*outcomes: str, building: str = "hall", **changed: Any) -> PairRow:
+    fields: dict[str, Any] = {
+        "query": "b",
+        "map": "a",
+        "kind": "other day",
+        "building": building,
+        "sensors": "laser",
+        "truth": "poses",
+        "queries": tuple(query(k, outcome) for k, outcome in enumerate(outcomes)),
+    }
+    return PairRow(**{**fields, **changed})
+
+
+def table(*rows: MapRow | PairRow) -> Table:
+    return Table(
+        program="0123456789ab",
+        commit="abc",
+        quick=False,
+        cpu_s=600.0,
+        maps=tuple(row for row in rows if isinstance(row, MapRow)),
+        pairs=tuple(row for row in rows if isinstance(row, PairRow)),
+    )
+
+
+def test_the_same_again_is_no_change() -> None:
+    same = table(map_row(), pair_row("right", "wrong", "refused"))
+    assert changes(same, same) == []
+    assert changes(Table.from_json(json.loads(json.dumps(same.to_json()))), same) == []
+
+
+@pytest.mark.parametrize(
+    ("now", "text", "worse"),
+    [
+        ({"error_m": 0.73}, "error 0.030 -> 0.730 m", True),
+        ({"error_m": 0.010}, "error 0.030 -> 0.010 m", False),
+        ({"parts": 3}, "parts 1 -> 3", True),
+        ({"lost": 0.2}, "scans lost 0 -> 20 %", True),
+        ({"problem": "internal error: KeyError"}, "mapped -> internal error: KeyError", True),
+    ],
+)
+def test_a_map_that_changed_is_told(now: dict[str, Any], text: str, worse: bool) -> None:
+    found = changes(table(map_row()), table(map_row(**now)))
+    assert found == [Change(row="hall", text=text, worse=worse)]
+
+
+@pytest.mark.parametrize("now", [{"error_m": 0.036}, {"error_m": 0.032}, {"cpu_s": 11.0}])
+def test_a_small_change_is_not_told(now: dict[str, Any]) -> None:
+    assert changes(table(map_row()), table(map_row(**now))) == []
+
+
+def test_a_slower_machine_is_no_change_but_a_slower_row_is() -> None:
+    before = table(*(map_row(str(k)) for k in range(5)))
+    slower = table(*(map_row(str(k), cpu_s=20.0) for k in range(5)))
+    assert changes(before, slower) == []
+    one = table(*(map_row(str(k), cpu_s=60.0 if k == 3 else 20.0) for k in range(5)))
+    (change,) = changes(before, one)
+    assert change.row == "3" and change.worse and "10.0 -> 60.0 s (3.00" in change.text
+
+
+def test_warnings_that_come_and_go() -> None:
+    old = map_row(warnings=warned([BENT], storeys=False, error_m=0.4), error_m=0.4)
+    new = map_row(warnings=warned([LIFT, ODD], storeys=False, error_m=0.4), error_m=0.4)
+    assert {(c.text, c.worse) for c in changes(table(old), table(new))} == {
+        ("new warning: lift (false)", True),
+        ("new warning: something that no one has (unknown)", False),
+        ("no longer warned of: bent (right)", True),
+    }
+
+
+@pytest.mark.parametrize(
+    ("error_m", "verdict"), [(0.03, "false"), (0.4, "right"), (0.17, "unknown"), (None, "unknown")]
+)
+def test_whether_a_bent_map_is_bent(error_m: float | None, verdict: str) -> None:
+    (warning,) = warned([BENT], storeys=False, error_m=error_m)
+    assert (warning.about, warning.verdict) == ("bent", verdict)
+
+
+def test_a_new_wrong_answer_is_named() -> None:
+    before, after = table(pair_row("right", "refused")), table(pair_row("right", "wrong"))
+    texts = [(c.row, c.text, c.worse) for c in changes(before, after)]
+    assert ("b in a", "wrong 0 -> 1 of 2", False) in texts
+    assert any("newly wrong: the window from 10.0 s, 5.00 m off at 0.990" in t and w for _, t, w in texts)
+
+
+def test_worse_by_more_than_chance_needs_five_windows() -> None:
+    before = table(pair_row(*["right"] * 6))
+    four = changes(before, table(pair_row(*["refused"] * 4, "right", "right")))
+    assert not any(change.worse for change in four)
+    five = changes(before, table(pair_row(*["refused"] * 5, "right")))
+    assert [c.row for c in five if c.worse] == ["building hall", "all queries"]
+    assert "0 windows more are located and right, 5 are no longer (p 0.031)" in five[-1].text
+    better = changes(table(pair_row(*["refused"] * 6)), before)
+    assert not any(change.worse for change in better)
+
+
+def test_only_windows_of_both_runs_are_compared() -> None:
+    """The quick form asks for some of them."""
+    before = table(pair_row(*["right"] * 6), map_row("gone"))
+    some = pair_row(*["right"] * 6)
+    after = table(replace(some, queries=some.queries[::2]), map_row("new"))
+    assert changes(before, after) == []
+
+
+def test_the_page_shows_each_row() -> None:
+    rows = (
+        map_row(warnings=warned([BENT], storeys=False, error_m=0.03)),
+        map_row("wean|3", problem="internal error: KeyError", error_m=None),
+        pair_row("right", "wrong", "refused"),
+        pair_row(problem="laser/x.mcap: not in the data folder", query="x"),
+        pair_row("wrong", kind="elsewhere", truth="elsewhere", building="intel"),
+    )
+    text = page(table(*rows), [Change(row="hall", text="error 0.030 -> 0.730 m", worse=True)])
+    (bent,) = [line for line in text.splitlines() if line.startswith("| hall | hall | lidar")]
+    assert "bent (false)" in bent and "| 0.030 |" in bent
+    assert "| wean\\|3 |" in text and "internal error: KeyError |" in text
+    assert "| b | a | laser | 3 | 3 | 2 | 1 | **1** | 1 | 1 of 3 [0.01, 0.91] | 0 | 0.040 |" in text
+    assert "not in the data folder" in text
+    assert "the window from 10.0 s, 5.00 m off, confidence 0.990" in text
+    assert "- **worse** hall: error 0.030 -> 0.730 m" in text
+    assert "2 of 2 [0.16, 1.00] (hall, intel)" in text
+    widths = {line.count("|") - line.count("\\|") for line in text.splitlines() if line.startswith("| b |")}
+    assert widths == {15}
+
+
+def test_intervals_are_exact() -> None:
+    low, high = clopper_pearson(5, 10)
+    assert (low, high) == pytest.approx((0.187, 0.813), abs=1e-3)
+    assert clopper_pearson(10, 10) == pytest.approx((0.692, 1.0), abs=1e-3)
+    assert by_chance(0, 3) == 1.0

@@ -1,0 +1,117 @@
+"""`pc2grid compare recordings`: every real recording as a map, and located in the maps of others."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pc2grid_cli import console
+from pc2grid_cli import options as options
+from pc2grid_cli.options import OUTPUT_FOLDER
+from pc2grid_cli.output_files import make_folder
+
+if TYPE_CHECKING:
+    from pc2grid_lab.experiments.recordings.rows import Table
+
+
+def compare_recordings_command(
+    context: typer.Context,
+    data: Annotated[Path, typer.Argument(metavar="DATA", help="the folder of real recordings")],
+    out: Annotated[
+        Path, typer.Option(*OUTPUT_FOLDER, metavar="FOLDER", help="for maps and answers; run again to go on")
+    ] = Path("real-recordings"),
+    table: Annotated[
+        Path | None,
+        typer.Option(
+            "--table",
+            metavar="FILE.json",
+            help="what is compared with, and replaced by a whole run, with the page beside it; default: "
+            "real.json in the folder",
+        ),
+    ] = None,
+    only: Annotated[
+        str | None,
+        typer.Option(
+            "--only", metavar="PATTERN", help="of recordings, buildings, sensors or kinds, such as 'wean*'"
+        ),
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="a small part of all, always the same")] = False,
+    jobs: Annotated[int, typer.Option("--jobs", min=1, help="processes at a time")] = 2,
+    as_json: options.AsJson = False,
+) -> None:
+    """Map every real recording, locate parts of it in other maps, and tell what changed since the last time.
+
+    Example: pc2grid compare recordings data --output real-recordings --quick
+    """
+    from pc2grid.errors import ConfigError
+    from pc2grid.io.atomic import replace_file
+    from pc2grid_lab.experiments.recordings.catalogue import Catalogue
+    from pc2grid_lab.experiments.recordings.changes import changes
+    from pc2grid_lab.experiments.recordings.judging import judged_table
+    from pc2grid_lab.experiments.recordings.page import change_lines, page
+    from pc2grid_lab.experiments.recordings.program import commit, digest
+    from pc2grid_lab.experiments.recordings.run import Folder, run_all
+
+    if not data.is_dir():
+        raise ConfigError(f"{data}: no such folder", hint="give the folder of recordings")
+    catalogue = Catalogue.of(only=only, quick=quick)
+    if not catalogue.mapped and not catalogue.pairs:
+        raise ConfigError(f"--only {only}: no recording, building, sensor or kind is named so")
+    work = out / "work" / digest()
+    make_folder(work)
+    _remove_others(work)
+    folder = Folder(data.absolute(), work.absolute())
+    terminal = console.of(context)
+    with terminal.progress("recordings") as advance:
+        run_all(catalogue, folder, jobs=jobs, advance=advance)
+    with terminal.progress("judge") as advance:
+        found = judged_table(catalogue, folder, program=digest(), commit=commit(), advance=advance)
+    kept = table or out / "real.json"
+    before = _read(kept)
+    changed = [] if before is None else changes(before, found)
+    if only is None and not quick:
+        for file, text in ((kept, _json(found)), (kept.with_suffix(".md"), page(found, changed))):
+            with replace_file(file) as draft:
+                draft.write_text(text, encoding="utf-8")
+    if as_json:
+        console.print_json({**found.to_json(), "changes": [asdict(change) for change in changed]})
+        return
+    print(page(found))
+    if before is None:
+        print(f"nothing to compare with: there is no {kept}")
+    else:
+        print(f"changed since {before.commit} ({kept}):", *(change_lines(changed) or ["- nothing"]), sep="\n")
+
+
+def _json(table: Table) -> str:
+    import json
+
+    return json.dumps(table.to_json(), indent=1) + "\n"
+
+
+def _read(file: Path) -> Table | None:
+    """The table of an earlier run; None if there is none. Raises ConfigError if it cannot be read."""
+    import json
+
+    from pc2grid.errors import ConfigError
+    from pc2grid_lab.experiments.recordings.rows import Table
+
+    if not file.exists():
+        return None
+    try:
+        return Table.from_json(json.loads(file.read_text(encoding="utf-8")))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"{file}: not a table of this command ({error})", hint="remove it, or name another by --table"
+        ) from error
+
+
+def _remove_others(work: Path) -> None:
+    """Remove what other versions of the program made: their results are not used again."""
+    for other in work.parent.iterdir():
+        if other.name != work.name and other.is_dir():
+            shutil.rmtree(other)

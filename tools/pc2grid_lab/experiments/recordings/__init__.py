@@ -1,0 +1,1 @@
+"""`pc2grid compare recordings`: what is asked, how it is judged, what changed, and the page."""

@@ -1,0 +1,60 @@
+"""Processor time and error of bare KISS-ICP on a recording: `python -m ...bare_kiss LOG [TRUTH.tum]`."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+
+def main() -> None:
+    """Print one JSON document: scans, cpu_s, and ate_m or null.
+
+    cpu_s is the processor time of `register_frame` alone, over all points of each scan, with the voxel and
+    the range that pc2grid chooses for the recording. ate_m is the error with KISS-ICP's own settings.
+    """
+    import numpy as np
+    from kiss_icp.config import KISSConfig
+    from kiss_icp.kiss_icp import KissICP
+
+    from pc2grid.io import open_log
+    from pc2grid.io.trajectory import read_tum
+    from pc2grid.model import Trajectory
+    from pc2grid.odometry.registration import BareKissIcp
+    from pc2grid.odometry.tracker import Tracker
+    from pc2grid_lab.experiments.trajectory_error import trajectory_error
+    from signature.config import Config
+
+    log, truth = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None
+    with open_log(log) as opened:
+        tracker = Tracker(Config().registration)
+        for scan in islice(opened.scans(), 3):
+            tracker.track(scan)
+        config: Any = KISSConfig()
+        voxel_and_range_m: Any = tracker.kiss.voxel_and_range_m
+        config.mapping.voxel_size, config.data.max_range = voxel_and_range_m
+        config.data.deskew = False
+        config.registration.max_num_threads = 1
+        kiss, own = KissICP(config), BareKissIcp()
+        stamps, poses, cpu_s = [], [], 0.0
+        for scan in opened.scans():
+            points_m = np.asarray(scan.points_m, np.float64)
+            begin = time.process_time()
+            kiss.register_frame(points_m, np.empty(0))
+            cpu_s += time.process_time() - begin
+            last_s = 0.0 if scan.offsets_s is None or not len(scan.offsets_s) else float(scan.offsets_s.max())
+            stamps.append(scan.stamp_ns + round(last_s * 1e9))
+            if truth is not None:
+                poses.append(own.register(scan))
+    ate_m = None
+    if truth is not None:
+        trajectory = Trajectory(stamps_ns=np.array(stamps, np.int64), T_session_base=np.array(poses))
+        ate_m = trajectory_error(trajectory, read_tum(Path(truth))).ate_m
+    print(json.dumps({"scans": len(stamps), "cpu_s": cpu_s, "ate_m": ate_m}))
+
+
+if __name__ == "__main__":
+    main()

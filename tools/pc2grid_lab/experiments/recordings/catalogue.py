@@ -1,0 +1,329 @@
+"""Which real recordings are mapped, and which are located in which maps.
+
+The files are those of the data folder that the README there describes. A row here is all that is known of a
+recording: another recording is another row, and no other file changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from typing import Literal
+
+from pc2grid.time_span import TimeSpan
+from pc2grid_lab.experiments.replay import spread
+
+Kind = Literal["later part", "fewer scans", "other day", "other sensor", "published map", "elsewhere"]
+"""How the query of a pair differs from what its map was made from. "elsewhere": it is of another building."""
+KINDS: tuple[Kind, ...] = (
+    "later part",
+    "fewer scans",
+    "other day",
+    "other sensor",
+    "published map",
+    "elsewhere",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording:
+    """A recording, or a map, as one run of `pc2grid convert` takes it.
+
+    file : below the data folder. building : recordings of one building are one group of the statistics.
+    options : of `convert` and of `relocalize`. every : only every nth of its scans is used.
+    truth : what its trajectory is compared with, relations or poses; None: there is none.
+    poses : true poses that place its windows, in one frame for all recordings that name the same `poses`.
+    of_base : whether these are poses of the base, not of the sensor.
+    storeys : whether it goes over several floors, so that a warning of stairs and lifts is right.
+    quick : whether it belongs to the quick form.
+    scans_s : seconds after its begin between which there are scans; given where another message lies days
+        apart from them.
+    """
+
+    name: str
+    file: str
+    building: str
+    sensor: Literal["lidar", "depth", "laser", "map"]
+    options: tuple[str, ...] = ()
+    every: int = 1
+    truth: str | None = None
+    poses: str | None = None
+    of_base: bool = False
+    storeys: bool = False
+    quick: bool = False
+    scans_s: tuple[float, float] | None = None
+
+    def span_s(self, length_s: float) -> tuple[float, float]:
+        """From when to when there are scans, in a recording of `length_s`."""
+        return self.scans_s or (0.0, length_s)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pair:
+    """Windows of one recording that are located in the map of another, or of its own beginning.
+
+    query, map : names of recordings. until_s : only so many seconds of `map` become the map; None: all of it.
+    window_s : length of a window. windows : how many, evenly spread over the recording, in the map of its own
+        beginning over what comes after it.
+    """
+
+    query: str
+    map: str
+    kind: Kind
+    window_s: float
+    windows: int
+    until_s: float | None = None
+    quick: bool = False
+
+    @property
+    def map_name(self) -> str:
+        """The map, with the part of the recording that it is made from."""
+        return self.map if self.until_s is None else f"{self.map} 0..{self.until_s:g} s"
+
+
+def _laser(name: str, building: str, *, file: str | None = None, **known: object) -> Recording:
+    path = file or f"laser/{name}.mcap"
+    return Recording(name=name, file=path, building=building, sensor="laser", **known)  # type: ignore[arg-type]
+
+
+def _map(name: str, file: str, building: str, *, quick: bool = False) -> Recording:
+    return Recording(name=name, file=file, building=building, sensor="map", quick=quick)
+
+
+def _corrected(name: str, building: str, *, relations: bool = True, quick: bool = False) -> Recording:
+    """A log of the SLAM benchmark, with gmapping's poses of its laser."""
+    poses = f"laser/{name}_corrected.tum"
+    return _laser(
+        name, building, truth=f"laser/{name}.relations" if relations else poses, poses=poses, quick=quick
+    )
+
+
+def _sparse(name: str) -> Recording:
+    poses = f"laser/sparse/{name}.tum"
+    return _laser(name, name, file=f"laser/sparse/{name}.mcap", truth=poses, poses=poses)
+
+
+def _jarvis(lasers: str, *, quick: bool = False) -> Recording:
+    poses = "laser/jarvis/circular_path_fast.tum"
+    return _laser(
+        f"jarvis {lasers}",
+        "jarvis",
+        file="laser/jarvis/circular_path_fast.mcap",
+        options=("--topic", f"/{lasers}_scan"),
+        truth=poses,
+        poses=poses,
+        of_base=True,
+        quick=quick,
+    )
+
+
+def _phone(name: str, *, odometry: bool = True, quick: bool = False) -> Recording:
+    poses = f"depth/room/{name}.tum"
+    return Recording(
+        name=name if odometry else f"{name} without odometry",
+        file=f"depth/room/{name}.mcap",
+        building="room",
+        sensor="depth",
+        options=() if odometry else ("--odometry", "none"),
+        truth=poses,
+        poses=poses,
+        of_base=True,
+        quick=quick,
+    )
+
+
+def _kidnap(name: str, file: str, scans_s: tuple[float, float], *, quick: bool = False) -> Recording:
+    return _laser(name, "kidnap", file=f"laser/kidnap/{file}", scans_s=scans_s, quick=quick)
+
+
+def _hall(every: int, name: str, *, quick: bool = False) -> Recording:
+    return Recording(
+        name=name,
+        file="lidar/hall.mcap",
+        building="hall",
+        sensor="lidar",
+        every=every,
+        truth="lidar/hall.tum",
+        poses="lidar/hall.tum",
+        quick=quick,
+    )
+
+
+RECORDINGS: tuple[Recording, ...] = (
+    _hall(1, "hall", quick=True),
+    _hall(2, "hall, every 2nd scan", quick=True),
+    _hall(3, "hall, every 3rd scan", quick=True),
+    Recording(
+        name="e1r_office_a",
+        file="lidar/e1r_office_a.mcap",
+        building="e1r office",
+        sensor="lidar",
+        truth="lidar/e1r_office_a.tum",
+        poses="lidar/e1r_office_a.tum",
+    ),
+    _phone("room_a"),
+    _phone("room_a", odometry=False),
+    _phone("room_b", quick=True),
+    _phone("room_b", odometry=False, quick=True),
+    Recording(
+        name="kitchen",
+        file="depth/kitchen.mcap",
+        building="kitchen",
+        sensor="depth",
+        truth="depth/kitchen.tum",
+        poses="depth/kitchen.tum",
+    ),
+    _corrected("fr079", "fr079"),
+    _corrected("intel", "intel"),
+    _corrected("csail", "csail", quick=True),
+    _corrected("killian", "killian", relations=False),
+    _laser(
+        "csail without odometry",
+        "csail",
+        file="laser/csail.mcap",
+        options=("--odometry", "none"),
+        truth="laser/csail.relations",
+        poses="laser/csail_corrected.tum",
+    ),
+    _laser("aces", "aces", file="laser/aces_ros1.bag"),
+    _sparse("acapulco"),
+    _sparse("belgioioso"),
+    _sparse("orebro"),
+    _laser("workshop_1", "workshop", file="laser/workshop/workshop_1.mcap"),
+    _laser("workshop_1_changed", "workshop", file="laser/workshop/workshop_1_changed.mcap"),
+    _laser("wean 1", "wean", file="laser/wean/robotdata1.mcap", quick=True),
+    _laser("wean 2", "wean", file="laser/wean/robotdata2.mcap"),
+    _laser("wean 3", "wean", file="laser/wean/robotdata3.mcap"),
+    _kidnap("kidnap dec13 before", "dec13_before.mcap", (0.0, 86.1), quick=True),
+    _kidnap("kidnap dec13 after", "dec13_after.mcap", (0.0, 73.3), quick=True),
+    _kidnap("kidnap dec14 before", "dec14_before.mcap", (0.0, 48.3)),
+    _kidnap("kidnap may9 before", "may9_before.mcap", (40.1, 117.3)),
+    _kidnap("kidnap may9 after", "may9_after.mcap", (22.4, 83.1)),
+    _laser("birmingham", "birmingham", file="laser/birmingham/lgfloor2.mcap"),
+    _jarvis("nav", quick=True),
+    _jarvis("safety", quick=True),
+    _map("fr079_floor.ply", "lidar/fr079_floor.ply", "fr079"),
+    _map("fr079.yaml", "maps/fr079.yaml", "fr079"),
+    _map("intel.yaml", "maps/intel.yaml", "intel"),
+    _map("csail.yaml", "maps/csail.yaml", "csail"),
+    _map("aces.yaml", "maps/aces.yaml", "aces"),
+    _map("killian.yaml", "maps/killian.yaml", "killian"),
+    _map("workshop_1.yaml", "maps/workshop_1.yaml", "workshop", quick=True),
+    _map("wean.yaml", "laser/wean/wean.yaml", "wean", quick=True),
+    _map("lgfloor.yaml", "laser/birmingham/lgfloor.yaml", "birmingham"),
+)
+"""Everything that becomes a map, in the order of the page."""
+
+
+def _later(name: str, until_s: float, window_s: float, windows: int, *, quick: bool = False) -> Pair:
+    return Pair(
+        query=name,
+        map=name,
+        kind="later part",
+        window_s=window_s,
+        windows=windows,
+        until_s=until_s,
+        quick=quick,
+    )
+
+
+def _pair(kind: Kind, query: str, map_: str, window_s: float, windows: int, *, quick: bool = False) -> Pair:
+    return Pair(query=query, map=map_, kind=kind, window_s=window_s, windows=windows, quick=quick)
+
+
+PAIRS: tuple[Pair, ...] = (
+    # Windows of 3 to 8 m of travel, or 20 s where the robot hardly moves.
+    _later("hall", 10.0, 4.0, 4),
+    _pair("fewer scans", "hall, every 2nd scan", "hall", 6.0, 6, quick=True),
+    _pair("fewer scans", "hall, every 3rd scan", "hall", 9.0, 4),
+    _later("fr079", 600.0, 20.0, 10),
+    _later("intel", 900.0, 25.0, 10),
+    _later("csail", 250.0, 6.0, 10, quick=True),
+    _later("killian", 900.0, 8.0, 10),
+    _later("aces", 700.0, 15.0, 10),
+    _pair("other day", "wean 1", "wean 2", 20.0, 8),
+    _pair("other day", "wean 3", "wean 2", 20.0, 8),
+    _pair("other day", "wean 2", "wean 1", 20.0, 8, quick=True),
+    _pair("other day", "kidnap dec13 after", "kidnap dec13 before", 10.0, 8, quick=True),
+    _pair("other day", "kidnap may9 after", "kidnap may9 before", 10.0, 8),
+    _pair("other day", "kidnap may9 before", "kidnap dec13 before", 10.0, 8),
+    _pair("other day", "kidnap dec14 before", "kidnap dec13 before", 10.0, 6),
+    _pair("other day", "kidnap dec13 before", "kidnap may9 before", 10.0, 8),
+    _pair("other day", "workshop_1_changed", "workshop_1", 4.0, 8),
+    _pair("other day", "room_b", "room_a", 5.0, 4, quick=True),
+    _pair("other day", "room_a", "room_b", 5.0, 8),
+    _pair("other sensor", "jarvis safety", "jarvis nav", 6.0, 6, quick=True),
+    _pair("other sensor", "jarvis nav", "jarvis safety", 6.0, 6, quick=True),
+    _pair("other sensor", "fr079", "fr079_floor.ply", 25.0, 10),
+    _pair("published map", "wean 1", "wean.yaml", 20.0, 8, quick=True),
+    _pair("published map", "wean 3", "wean.yaml", 20.0, 8),
+    _pair("published map", "birmingham", "lgfloor.yaml", 15.0, 10),
+    _pair("published map", "workshop_1", "workshop_1.yaml", 3.0, 10, quick=True),
+    _pair("published map", "workshop_1_changed", "workshop_1.yaml", 3.0, 10),
+    _pair("published map", "fr079", "fr079.yaml", 20.0, 8),
+    _pair("published map", "intel", "intel.yaml", 25.0, 8),
+    _pair("published map", "csail", "csail.yaml", 6.0, 8),
+    _pair("published map", "killian", "killian.yaml", 8.0, 6),
+    _pair("published map", "aces", "aces.yaml", 15.0, 8),
+    _pair("elsewhere", "csail", "fr079", 10.0, 4),
+    _pair("elsewhere", "fr079", "intel", 20.0, 4),
+    _pair("elsewhere", "intel", "aces", 25.0, 4),
+    _pair("elsewhere", "wean 2", "kidnap dec13 before", 20.0, 4, quick=True),
+    _pair("elsewhere", "kidnap dec13 before", "wean 2", 10.0, 4),
+    _pair("elsewhere", "birmingham", "wean 2", 15.0, 4),
+    _pair("elsewhere", "hall", "fr079", 6.0, 2),
+    _pair("elsewhere", "room_b", "kitchen", 5.0, 2),
+    _pair("elsewhere", "jarvis nav", "room_a", 6.0, 2),
+)
+"""All pairs, in the order of the page."""
+
+
+_QUICK_EVERY = 2
+"""The quick form asks for every second window."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Catalogue:
+    """The recordings and pairs of one run.
+
+    recordings : by name, in the order of the page. mapped : those whose map is a row of the page; the others
+        are only needed for pairs. pairs : in the order of the page. quick : of each pair every second window.
+    """
+
+    recordings: dict[str, Recording]
+    mapped: tuple[Recording, ...]
+    pairs: tuple[Pair, ...]
+    quick: bool = False
+
+    @staticmethod
+    def of(*, only: str | None = None, quick: bool = False) -> Catalogue:
+        """What the quick form holds, or all; of it what `only` names.
+
+        only : a pattern of the shell for names of recordings, buildings or kinds of pairs.
+        """
+
+        def wanted(*names: str) -> bool:
+            return only is None or any(fnmatch(name, only) for name in names)
+
+        known = {recording.name: recording for recording in RECORDINGS}
+        return Catalogue(
+            recordings=known,
+            mapped=tuple(
+                r for r in RECORDINGS if (r.quick or not quick) and wanted(r.name, r.building, r.sensor)
+            ),
+            pairs=tuple(
+                p
+                for p in PAIRS
+                if (p.quick or not quick)
+                and wanted(p.query, p.map, p.kind, known[p.query].building, known[p.map].building)
+            ),
+            quick=quick,
+        )
+
+    def windows(self, pair: Pair, length_s: float) -> list[tuple[int, TimeSpan]]:
+        """The windows of a pair with their numbers, in a recording of `length_s`."""
+        first_s, last_s = self.recordings[pair.query].span_s(length_s)
+        if pair.map == pair.query and pair.until_s is not None:
+            first_s = pair.until_s
+        numbered = list(enumerate(spread(first_s, last_s, pair.windows, pair.window_s)))
+        return numbered[:: _QUICK_EVERY if self.quick else 1]

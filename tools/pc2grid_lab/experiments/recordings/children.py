@@ -1,0 +1,120 @@
+"""Commands of pc2grid as processes of their own, as a user runs them, with their processor time."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[4]
+"""The folder of the packages; `tools/` is below it."""
+_CLI = "from pc2grid_cli.main import main; main()"
+_ANSWERED = (0, 3, 4)
+"""Exit codes of a command that did its work: done, with loss of data, without a confident answer."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finished:
+    """What became of one command.
+
+    code : its exit code, negative if a signal ended it. cpu_s, wall_s : processor time, user and system, of
+        all its processes, and elapsed time. peak_mb : its largest resident memory.
+    document : the JSON document on its standard output; None if there is none. error : the last line of its
+        standard error, if it did not do its work.
+    """
+
+    code: int
+    cpu_s: float
+    wall_s: float
+    peak_mb: float
+    document: Any
+    error: str = ""
+
+    @property
+    def failed(self) -> bool:
+        """Whether there is no result."""
+        return self.code not in _ANSWERED or self.document is None
+
+
+def pc2grid(*arguments: str | Path, limit_s: float = 1800.0) -> Finished:
+    """Run `pc2grid` with these arguments; after `limit_s` of elapsed time it is stopped."""
+    return run((sys.executable, "-c", _CLI, *map(str, arguments)), limit_s=limit_s)
+
+
+def python_module(name: str, *arguments: str | Path, limit_s: float = 1800.0) -> Finished:
+    """Run a module of this laboratory in a process of its own."""
+    return run((sys.executable, "-m", name, *map(str, arguments)), limit_s=limit_s)
+
+
+def run(command: Sequence[str], *, limit_s: float) -> Finished:
+    """Run a command that prints a JSON document; its paths are absolute."""
+    # Byte code is kept, as it is where pc2grid is installed, and one thread is used, so that the processor
+    # time does not depend on the number of cores.
+    environment = {
+        **{name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"},
+        "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tools"))),
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        begin = time.monotonic()
+        # `python -c` imports from the current folder first.
+        child = subprocess.Popen(
+            command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err, env=environment
+        )
+        try:
+            # `wait4` alone tells the time of this child, and not of all that ended so far.
+            while True:
+                pid, status, used = os.wait4(child.pid, os.WNOHANG)
+                if pid:
+                    break
+                if time.monotonic() - begin > limit_s:
+                    child.kill()
+                time.sleep(0.02)
+        except BaseException:
+            child.kill()
+            child.wait()
+            raise
+        child.returncode = code = os.waitstatus_to_exitcode(status)
+        out.seek(0)
+        err.seek(0)
+        text, complaint = out.read(), err.read().decode(errors="replace")
+    try:
+        document = json.loads(text)
+    except ValueError:
+        document = None
+    lines = [line for line in complaint.splitlines() if line.strip()]
+    said = next((line for line in lines if "error:" in line), lines[-1] if lines else "nothing was printed")
+    finished = Finished(
+        code=code,
+        cpu_s=used.ru_utime + used.ru_stime,
+        wall_s=time.monotonic() - begin,
+        peak_mb=used.ru_maxrss / (1024 if sys.platform == "linux" else 1024**2),
+        document=document,
+    )
+    if not finished.failed:
+        return finished
+    ended = f"ended by signal {-code}" if code < 0 else said
+    return Finished(**{**asdict(finished), "error": ended})
+
+
+def kept(file: Path) -> Finished | None:
+    """What `keep` wrote to a file; None if it is not there."""
+    return Finished(**json.loads(file.read_text())) if file.exists() else None
+
+
+def keep(file: Path, finished: Finished) -> Finished:
+    """Write a result to a file, completely or not at all."""
+    from pc2grid.io.atomic import replace_file
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(file) as draft:
+        draft.write_text(json.dumps(asdict(finished)))
+    return finished

@@ -1,0 +1,294 @@
+"""The page `real.md`: two tables and a summary by building."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import groupby
+
+from pc2grid_lab.experiments.recordings.catalogue import KINDS
+from pc2grid_lab.experiments.recordings.chance import clopper_pearson
+from pc2grid_lab.experiments.recordings.changes import Change
+from pc2grid_lab.experiments.recordings.rows import Counts, MapRow, PairRow, Table
+
+_MARKS = {"right": "", "false": " (false)", "unknown": " (?)"}
+_READING = ("no tf", "gaps", "empty scans")
+"""Warnings about the file, that say nothing of the map."""
+
+
+def page(table: Table, changed: Sequence[Change] = ()) -> str:
+    """The page in Markdown. changed : against the run before."""
+    return "\n".join(
+        [
+            "# Real recordings",
+            "",
+            *_about(table),
+            "",
+            "## Maps",
+            "",
+            *_markdown(_MAPS, [_map_cells(row) for row in table.maps]),
+            "",
+            *_notes_on_maps(table),
+            "",
+            "## Places",
+            "",
+            *_places(table),
+            "",
+            "## By building",
+            "",
+            *_by_building(table),
+            "",
+            *_failures(table),
+            *_changed(changed),
+        ]
+    )
+
+
+def _about(table: Table) -> list[str]:
+    form = "The quick form of `make real`" if table.quick else "`make real`"
+    return [
+        f"{form}: every recording of the data folder goes through `convert`, and parts of them through",
+        "`relocalize`, each as a process of its own with one thread. The next run is compared with this page",
+        "(`real.json`). Times are processor time, user and system, with the start of the program.",
+        "",
+        f"Program {table.program} ({table.commit}), {table.cpu_s / 60:.0f} minutes of processor time.",
+    ]
+
+
+_MAPS = (
+    ("recording", "building", "sensor"),
+    (
+        "min",
+        "m",
+        "cpu, s",
+        "over KISS-ICP",
+        "parts",
+        "lost, %",
+        "error, m",
+        "bare KISS-ICP",
+        "truth",
+        "warnings",
+    ),
+)
+
+
+def _map_cells(row: MapRow) -> list[str]:
+    if row.problem:
+        return [row.name, row.building, row.sensor, *[""] * 9, row.problem]
+    return [
+        row.name,
+        row.building,
+        row.sensor,
+        _number(row.minutes, 1) if row.sensor != "map" else "",
+        _number(row.metres, 0) if row.sensor != "map" else "",
+        _number(row.cpu_s, 1),
+        _number(row.over_bare, 1),
+        str(row.parts),
+        "" if row.sensor == "map" else _number(100 * (row.lost or 0.0), 1),
+        _number(row.error_m, 3),
+        _number(row.bare_m, 3),
+        "" if row.sensor == "map" else _truth(row),
+        "; ".join(w.about + _MARKS[w.verdict] for w in row.warnings if w.about not in _READING),
+    ]
+
+
+def _truth(row: MapRow) -> str:
+    if row.truth == "none":
+        return "none"
+    part = "" if row.compared is None or row.compared > 0.995 else f", {100 * row.compared:.0f} %"
+    return row.truth + part
+
+
+def _notes_on_maps(table: Table) -> list[str]:
+    warnings = [w for row in table.maps for w in row.warnings if w.about not in _READING]
+    verdicts = [warning.verdict for warning in warnings]
+    return [
+        "error: of relations the mean over pairs of poses, of poses the RMS distance after alignment (ATE);",
+        "a recording in parts by each part. bare KISS-ICP: with its own settings. over KISS-ICP: `convert`",
+        "from start to end over `register_frame` alone at the same voxel. truth: the share of it that could",
+        "be compared, if not all. lost: scans that are in no map.",
+        f"Of {len(warnings)} warnings {verdicts.count('right')} are right, {verdicts.count('false')} false;",
+        f"of {verdicts.count('unknown')} (?) that is not known.",
+    ]
+
+
+_PLACES = (
+    ("query", "map", "sensor"),
+    (
+        "queries",
+        "covered",
+        "located",
+        "right",
+        "wrong",
+        "refused",
+        "right of covered",
+        "rank",
+        "error, m",
+        "cpu, s",
+        "judged by",
+    ),
+)
+
+
+def _places(table: Table) -> list[str]:
+    lines: list[str] = []
+    for kind in KINDS:
+        rows = [row for row in table.pairs if row.kind == kind]
+        if rows:
+            lines += [f"### {kind.capitalize()}", "", *_markdown(_PLACES, [_pair_cells(r) for r in rows]), ""]
+    return [
+        *lines,
+        "covered: the map knows half of the ground that the last scan sees there. right: within 0.3 m and 3",
+        "degrees. rank: places before the right one, of covered queries that are not located (-: it is not",
+        "among the hypotheses). error: median of the right ones. judged by: true poses of both; or the",
+        "answers themselves, which must lie on one rigid transform of the drive's own trajectory (how many",
+        "do); elsewhere: another building, where every answer is wrong. In brackets the 95 % interval of",
+        "Clopper and Pearson.",
+    ]
+
+
+def _pair_cells(row: PairRow) -> list[str]:
+    if row.problem:
+        return [row.query, row.map, row.sensors, *[""] * 10, row.problem]
+    counts = row.counts
+    judged = {
+        "poses": "poses",
+        "elsewhere": "elsewhere",
+        "agreement": f"{row.agreeing} answers",
+        None: "not judged",
+    }[row.truth]
+    failed = f" ({counts.failed} failed)" if counts.failed else ""
+    known = row.truth is not None
+    seconds = [q.cpu_s for q in row.queries if q.cpu_s is not None]
+    return [
+        row.query,
+        row.map,
+        row.sensors,
+        f"{counts.queries}{failed}",
+        str(counts.covered) if known else "",
+        str(counts.located),
+        str(counts.right) if known else "",
+        _strong(counts.wrong) if known else "",
+        str(counts.refused),
+        _share(counts.covered_right, counts.covered),
+        " ".join("-" if rank is None else str(rank) for rank in row.ranks),
+        _number(row.median_error_m, 3),
+        _number(sorted(seconds)[len(seconds) // 2] if seconds else None, 1),
+        judged,
+    ]
+
+
+def _by_building(table: Table) -> list[str]:
+    """A row a building, over the pairs within it; and those from elsewhere."""
+    inside = [row for row in table.pairs if row.kind != "elsewhere" and not row.problem]
+    outside = [row for row in table.pairs if row.kind == "elsewhere" and not row.problem]
+    heads = (
+        ("building",),
+        (
+            "recordings",
+            "queries",
+            "covered",
+            "right of covered",
+            "wrong of located",
+            "elsewhere: wrong of asked",
+        ),
+    )
+    cells = []
+    for building in dict.fromkeys(row.building for row in table.pairs):
+        rows = [row for row in inside if row.building == building]
+        names = {row.query for row in rows}
+        counts, other = _total(rows), _total([row for row in outside if row.building == building])
+        cells.append(
+            [
+                building,
+                str(len(names)),
+                str(counts.queries),
+                str(counts.covered),
+                _share(counts.covered_right, counts.covered),
+                _share(counts.wrong, counts.right + counts.wrong),
+                _share(other.wrong, other.queries),
+            ]
+        )
+    counts, other = _total(inside), _total(outside)
+    cells.append(
+        [
+            "all queries",
+            str(len({row.query for row in inside})),
+            str(counts.queries),
+            str(counts.covered),
+            _share(counts.covered_right, counts.covered),
+            _share(counts.wrong, counts.right + counts.wrong),
+            _share(other.wrong, other.queries),
+        ]
+    )
+    with_wrong = [b for b, rows in _grouped(inside + outside) if _total(rows).wrong]
+    buildings = len({row.building for row in inside + outside})
+    return [
+        *_markdown(heads, cells),
+        "",
+        "Queries of one building are not independent. By buildings, which are, one at least wrong answer:"
+        f" {_share(len(with_wrong), buildings)}{' (' + ', '.join(with_wrong) + ')' if with_wrong else ''}.",
+    ]
+
+
+def _grouped(rows: Iterable[PairRow]) -> list[tuple[str, list[PairRow]]]:
+    ordered = sorted(rows, key=lambda row: row.building)
+    return [(building, list(group)) for building, group in groupby(ordered, key=lambda row: row.building)]
+
+
+def _failures(table: Table) -> list[str]:
+    """Every wrong answer, with what the next one needs to ask for it again."""
+    lines = [
+        f"- {row.name}, {row.kind}: the window from {query.start_s:.1f} s, "
+        + (f"{query.error_m:.2f} m off, " if query.error_m is not None else "")
+        + f"confidence {query.confidence or 0:.3f}"
+        for row in table.pairs
+        for query in row.queries
+        if query.located and query.right is False
+    ]
+    problems = [
+        f"- {row.name}: the window from {query.start_s:.1f} s: {query.problem}"
+        for row in table.pairs
+        for query in row.queries
+        if query.problem
+    ]
+    found = ["## Wrong answers", "", *lines, ""] if lines else ["No answer is wrong.", ""]
+    return found + (["## Failed", "", *problems, ""] if problems else [])
+
+
+def _changed(changed: Sequence[Change]) -> list[str]:
+    if not changed:
+        return []
+    return ["## Changed since the run before", "", *change_lines(changed), ""]
+
+
+def change_lines(changed: Sequence[Change]) -> list[str]:
+    """A line for each change; what became worse by more than chance is marked."""
+    return [f"- {'**worse** ' if change.worse else ''}{change.row}: {change.text}" for change in changed]
+
+
+def _total(rows: Iterable[PairRow]) -> Counts:
+    return sum((row.counts for row in rows), Counts())
+
+
+def _strong(count: int) -> str:
+    return f"**{count}**" if count else "0"
+
+
+def _share(part: int, whole: int) -> str:
+    if not whole:
+        return ""
+    low, high = clopper_pearson(part, whole)
+    return f"{part} of {whole} [{low:.2f}, {high:.2f}]"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def _markdown(heads: tuple[Sequence[str], Sequence[str]], rows: Sequence[Sequence[str]]) -> list[str]:
+    texts, numbers = heads
+    return [
+        "| " + " | ".join([*texts, *numbers]) + " |",
+        "|" + "|".join(["---"] * len(texts) + ["---:"] * len(numbers)) + "|",
+        *("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows),
+    ]

@@ -1,0 +1,203 @@
+"""What the page says of a map and of the queries in it, as it is kept beside the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from statistics import median
+from typing import Any, Literal
+
+Verdict = Literal["right", "false", "unknown"]
+Truth = Literal["poses", "agreement", "elsewhere"]
+"""How answers are judged: by true poses of query and map, by each other, or as nothing can be right."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Warned:
+    """A warning of `convert`: what it is about, whether it is right, and its sentence."""
+
+    about: str
+    verdict: Verdict
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapRow:
+    """What became of one recording as a map.
+
+    problem : why there is no map; empty if there is one. parts : sessions it became. lost : share of its
+        scans that are in no map. over_bare : processor time over that of bare KISS-ICP; lidar only.
+    error_m, error_deg : of its trajectory, by relations the mean error, by poses the RMS distance. bare_m :
+        the same of bare KISS-ICP. compared : share of the relations or scans that could be compared.
+    """
+
+    name: str
+    building: str
+    sensor: str
+    problem: str = ""
+    minutes: float | None = None
+    metres: float | None = None
+    area_m2: float | None = None
+    cpu_s: float | None = None
+    over_bare: float | None = None
+    parts: int | None = None
+    lost: float | None = None
+    warnings: tuple[Warned, ...] = ()
+    truth: Literal["relations", "poses", "none"] = "none"
+    error_m: float | None = None
+    error_deg: float | None = None
+    bare_m: float | None = None
+    compared: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QueryRow:
+    """One window, and the answer to it.
+
+    window : its number among those of the pair. problem : why there is no answer. covered : whether the map
+        knows the ground that the last scan saw; None if the true place is not known. right : whether the best
+        hypothesis is right; None if that is not known. rank : how many other places come before the right
+        one; None if it is not among the hypotheses. error_m : of the best hypothesis.
+    """
+
+    window: int
+    start_s: float
+    status: str = ""
+    problem: str = ""
+    confidence: float | None = None
+    travel_m: float | None = None
+    covered: bool | None = None
+    right: bool | None = None
+    rank: int | None = None
+    error_m: float | None = None
+    in_space: str | None = None
+    cpu_s: float | None = None
+
+    @property
+    def located(self) -> bool:
+        """Whether one place was answered."""
+        return self.status == "located"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Counts:
+    """The queries of a row, or of several.
+
+    judged : those whose answer can be judged. right, wrong : of those, located and right, located and wrong.
+    refused : not located, of those that the map covers or whose place is not known. covered : judged, and in
+        the map; covered_right : of those, located and right.
+    """
+
+    queries: int = 0
+    judged: int = 0
+    covered: int = 0
+    located: int = 0
+    right: int = 0
+    covered_right: int = 0
+    wrong: int = 0
+    failed: int = 0
+
+    @staticmethod
+    def of(queries: Sequence[QueryRow]) -> Counts:
+        """Counts of queries."""
+        located = [q for q in queries if q.located]
+        return Counts(
+            queries=len(queries),
+            judged=sum(q.right is not None for q in queries),
+            covered=sum(q.covered is True for q in queries),
+            located=len(located),
+            right=sum(q.right is True for q in located),
+            covered_right=sum(q.right is True and q.covered is True for q in located),
+            wrong=sum(q.right is False for q in located),
+            failed=sum(bool(q.problem) for q in queries),
+        )
+
+    def __add__(self, other: Counts) -> Counts:
+        return Counts(**{name: value + getattr(other, name) for name, value in asdict(self).items()})
+
+    @property
+    def refused(self) -> int:
+        """Not located."""
+        return self.queries - self.located - self.failed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairRow:
+    """The windows of one recording in one map. problem : why nothing was asked.
+
+    truth : how they are judged; None if they cannot be. agreeing : answers that agree, if they judge each
+    other.
+    """
+
+    query: str
+    map: str
+    kind: str
+    building: str
+    sensors: str
+    problem: str = ""
+    truth: Truth | None = None
+    agreeing: int | None = None
+    queries: tuple[QueryRow, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of the row."""
+        return f"{self.query} in {self.map}"
+
+    @property
+    def counts(self) -> Counts:
+        """Of its queries."""
+        return Counts.of(self.queries)
+
+    @property
+    def median_error_m(self) -> float | None:
+        """Of the answers that are located and right."""
+        errors = [q.error_m for q in self.queries if q.located and q.right and q.error_m is not None]
+        return median(errors) if errors else None
+
+    @property
+    def ranks(self) -> list[int | None]:
+        """Of the right place, of the covered queries that are not located."""
+        return [q.rank for q in self.queries if not q.located and not q.problem and q.covered]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """All rows of a run, and what made them: program, cpu_s (all commands together), quick."""
+
+    program: str
+    commit: str
+    quick: bool
+    cpu_s: float
+    maps: tuple[MapRow, ...]
+    pairs: tuple[PairRow, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """In plain types; numbers are rounded to what the page could show."""
+        document: dict[str, Any] = _plain({"schema_version": 1, **asdict(self)})
+        return document
+
+    @staticmethod
+    def from_json(document: dict[str, Any]) -> Table:
+        """What `to_json` made."""
+        maps = tuple(
+            MapRow(**{**row, "warnings": tuple(Warned(**w) for w in row["warnings"])})
+            for row in document["maps"]
+        )
+        pairs = tuple(
+            PairRow(**{**row, "queries": tuple(QueryRow(**q) for q in row["queries"])})
+            for row in document["pairs"]
+        )
+        kept = ("program", "commit", "quick", "cpu_s")
+        return Table(maps=maps, pairs=pairs, **{name: document[name] for name in kept})
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _plain(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, float):
+        return round(value, 4) if math.isfinite(value) else None
+    return value

@@ -1,0 +1,191 @@
+"""All recordings become maps and all windows are asked for: what the commands answered, in a folder.
+
+Nothing is judged here. A command that fails is a result like any other, and a result that the folder holds
+already is not computed again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+from pc2grid.errors import Pc2GridError
+from pc2grid.time_span import TimeSpan
+from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
+from pc2grid_lab.experiments.recordings.children import Finished, keep, kept, pc2grid, python_module
+
+_RESULTS = ("maps", "bare", "answers")
+"""Folders of results."""
+_BARE = "pc2grid_lab.experiments.recordings.bare_kiss"
+
+
+@dataclass(frozen=True, slots=True)
+class Folder:
+    """Where the maps and answers of one run are.
+
+    data : the folder of recordings. work : of everything that is made. Both are absolute, as the commands
+        run in another folder.
+    """
+
+    data: Path
+    work: Path
+
+    def source(self, recording: Recording) -> Path:
+        """The file that the commands read; of a thinned recording it is made on the way."""
+        if recording.every == 1:
+            return self.data / recording.file
+        file = Path(recording.file)
+        return self.work / "thinned" / f"{file.stem}_{recording.every}{file.suffix}"
+
+    def map(self, name: str) -> Path:
+        """The database of a map, beside the result of `convert`."""
+        return self.work / "maps" / f"{_plain(name)}.submaps"
+
+    def result(self, name: str) -> Path:
+        """The result of `convert` for a map."""
+        return self.map(name).with_suffix(".json")
+
+    def bare(self, name: str) -> Path:
+        """The result of bare KISS-ICP."""
+        return self.work / "bare" / f"{_plain(name)}.json"
+
+    def answer(self, pair: Pair, window: TimeSpan) -> Path:
+        """The result of `relocalize` for a window."""
+        asked = f"{_plain(pair.query)}.in.{_plain(pair.map_name)}"
+        return self.work / "answers" / f"{asked}.{window.start_s:.2f}s.{window.duration_s:g}s.json"
+
+    def missing(self, recording: Recording) -> bool:
+        """Whether the data folder lacks the recording, so that it is a gap of the page."""
+        return not (self.data / recording.file).exists()
+
+    def cpu_s(self) -> float:
+        """Processor time of all commands whose result is here."""
+        results = (kept(file) for kind in _RESULTS for file in (self.work / kind).glob("*.json"))
+        return sum(done.cpu_s for done in results if done is not None)
+
+    def length_s(self, recording: Recording) -> float:
+        """How long a recording lasts. Raises the errors of `open_log`."""
+        from pc2grid.io import open_log
+
+        with open_log(self.source(recording)) as opened:
+            return (opened.info.end_ns - opened.info.start_ns) * 1e-9
+
+
+def _plain(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "-.+" else "_" for c in name)
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """One command: where its result is kept, what is done, and a guess of its time that orders the tasks."""
+
+    file: Path
+    do: Callable[[], Finished]
+    weight: float
+
+
+def run_all(
+    catalogue: Catalogue,
+    folder: Folder,
+    *,
+    jobs: int = 2,
+    advance: Callable[[float], None] = lambda share: None,
+) -> None:
+    """Run every command whose result the folder does not hold.
+
+    advance : called with the share of the commands that is done.
+    """
+    from pc2grid_lab.experiments.recordings.thinned import write_thinned
+
+    pairs = [p for p in catalogue.pairs if not _gap(catalogue, folder, p)]
+    maps: dict[str, tuple[Recording, float | None]] = {
+        r.name: (r, None) for r in catalogue.mapped if not folder.missing(r)
+    }
+    for pair in pairs:
+        maps[pair.map_name] = (catalogue.recordings[pair.map], pair.until_s)
+        if pair.kind != "elsewhere":  # its windows are placed by the trajectory of the whole recording
+            maps[pair.query] = (catalogue.recordings[pair.query], None)
+    for name in {recording.name for recording, _ in maps.values()} | {pair.query for pair in pairs}:
+        recording = catalogue.recordings[name]
+        if recording.every > 1 and not folder.source(recording).exists():
+            folder.source(recording).parent.mkdir(parents=True, exist_ok=True)
+            write_thinned(folder.data / recording.file, folder.source(recording), recording.every)
+    tasks = [_convert(folder, name, recording, until_s) for name, (recording, until_s) in maps.items()]
+    tasks += [_bare(folder, r) for r in catalogue.mapped if r.sensor == "lidar" and not folder.missing(r)]
+    asked = sum(pair.windows for pair in pairs)
+    for done in _run(tasks, jobs):
+        advance(done / (len(tasks) + asked))
+    questions = [task for pair in pairs for task in _questions(catalogue, folder, pair)]
+    for done in _run(questions, jobs):
+        advance((len(tasks) + done) / (len(tasks) + asked))
+
+
+def _questions(catalogue: Catalogue, folder: Folder, pair: Pair) -> list[_Task]:
+    """A task a window; none where there is no map, or where the recording cannot be opened."""
+    query = catalogue.recordings[pair.query]
+    if not folder.map(pair.map_name).exists():
+        return []
+    try:
+        windows = catalogue.windows(pair, folder.length_s(query))
+    except (Pc2GridError, OSError):
+        return []
+    return [_locate(folder, query, pair, window) for _, window in windows]
+
+
+def _gap(catalogue: Catalogue, folder: Folder, pair: Pair) -> bool:
+    return any(folder.missing(catalogue.recordings[name]) for name in (pair.query, pair.map))
+
+
+def _run(tasks: Sequence[_Task], jobs: int) -> Iterator[int]:
+    """Do the tasks, the longest first, and yield how many are done."""
+    waiting = sorted((task for task in tasks if kept(task.file) is None), key=lambda task: -task.weight)
+    with ThreadPoolExecutor(jobs) as pool:
+        futures = [pool.submit(_do, task) for task in waiting]
+        try:
+            for done, future in enumerate(as_completed(futures), start=1):
+                future.result()
+                yield len(tasks) - len(waiting) + done
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _do(task: _Task) -> None:
+    keep(task.file, task.do())
+
+
+def _convert(folder: Folder, name: str, recording: Recording, until_s: float | None) -> _Task:
+    database, source = folder.map(name), folder.source(recording)
+    options: list[str | Path] = [*recording.options, "--name", "map", "--json", "--force", "-o", database]
+    if until_s is not None:
+        options += ["--duration", f"{until_s:g}"]
+
+    def do() -> Finished:
+        database.parent.mkdir(parents=True, exist_ok=True)
+        database.unlink(missing_ok=True)
+        return pc2grid("-q", "convert", source, *options)
+
+    size = source.stat().st_size if source.exists() else 0
+    return _Task(folder.result(name), do, float(size))
+
+
+def _bare(folder: Folder, recording: Recording) -> _Task:
+    truth = recording.truth
+    poses = () if truth is None or not truth.endswith(".tum") else (folder.data / truth,)
+    return _Task(
+        folder.bare(recording.name), lambda: python_module(_BARE, folder.source(recording), *poses), 0.0
+    )
+
+
+def _locate(folder: Folder, recording: Recording, pair: Pair, window: TimeSpan) -> _Task:
+    span = ("--start", f"{window.start_s:.3f}", "--duration", f"{window.duration_s:g}")
+    arguments: tuple[str | Path, ...] = (
+        folder.source(recording),
+        "-d",
+        folder.map(pair.map_name),
+        *recording.options,
+        *span,
+    )
+    return _Task(folder.answer(pair, window), lambda: pc2grid("-q", "relocalize", *arguments, "--json"), 0.0)
