@@ -20,7 +20,7 @@ def driven(window: int) -> SE2:
 
 def clues(*said: SE2, weight: float = 1.0) -> list[Clue]:
     """An answer a window, each by a transform of its own."""
-    return [Clue(driven(k), T @ driven(k), k, weight) for k, T in enumerate(said)]
+    return [Clue(driven(k), T @ driven(k), ("drive", k), weight) for k, T in enumerate(said)]
 
 
 def scattered(k: int) -> SE2:
@@ -29,7 +29,7 @@ def scattered(k: int) -> SE2:
 
 
 def verdicts(answers: list[Clue], frame: Frame) -> list[bool]:
-    return [is_right(c.T_map_base, *frame.place(c.T_drive_base, without=c.window))[0] for c in answers]
+    return [is_right(c.T_map_base, *frame.place(c.T_drive_base, without=c.query))[0] for c in answers]
 
 
 def test_right_answers_agree_and_wrong_ones_are_told() -> None:
@@ -50,7 +50,7 @@ def test_two_clusters_are_not_judged() -> None:
 
 def test_a_second_cluster_of_unsure_answers_does_not_hide_the_first() -> None:
     sure = clues(TRUE, TRUE, TRUE, TRUE)
-    unsure = [Clue(driven(k), OTHER @ driven(k), k, 0.1) for k in range(4, 8)]
+    unsure = [Clue(driven(k), OTHER @ driven(k), ("drive", k), 0.1) for k in range(4, 8)]
     frame = agreed_frame(sure + unsure)
     assert frame is not None
     assert verdicts(sure + unsure, frame) == [True] * 4 + [False] * 4
@@ -63,7 +63,7 @@ def test_fewer_than_three_answers_are_not_judged(count: int) -> None:
 
 def test_a_robot_that_stands_still_does_not_agree_with_itself() -> None:
     """The same wrong place again and again is one answer."""
-    still = [Clue(SE2(0.1 * k, 0.0, 0.0), OTHER @ SE2(0.1 * k, 0.0, 0.0), k) for k in range(6)]
+    still = [Clue(SE2(0.1 * k, 0.0, 0.0), OTHER @ SE2(0.1 * k, 0.0, 0.0), ("drive", k)) for k in range(6)]
     assert agreed_frame(still) is None
 
 
@@ -71,7 +71,7 @@ def bent(k: int) -> Clue:
     """An answer in the map of a corridor that turns by 1 degree on 8 m: 1.7 m to the side after 40 m."""
     curve, pose = math.radians(1.0) / 8.0, driven(k)
     warped = SE2(pose.x, pose.y + curve * pose.x**2 / 2, pose.yaw + curve * pose.x)
-    return Clue(pose, TRUE @ warped, k)
+    return Clue(pose, TRUE @ warped, ("drive", k))
 
 
 def test_a_bent_map_makes_no_answer_wrong() -> None:
@@ -85,7 +85,7 @@ def test_a_bent_map_makes_no_answer_wrong() -> None:
 
 def test_an_answer_in_a_bent_map_can_be_wrong() -> None:
     answers = [bent(k) for k in range(11)]
-    answers[3] = Clue(answers[3].T_drive_base, answers[3].T_map_base @ SE2(0.0, 0.6, 0.0), 3)
+    answers[3] = Clue(answers[3].T_drive_base, answers[3].T_map_base @ SE2(0.0, 0.6, 0.0), answers[3].query)
     frame = agreed_frame(answers)
     assert frame is not None
     assert verdicts(answers, frame) == [k != 3 for k in range(11)]
@@ -95,7 +95,7 @@ def test_an_answer_is_not_judged_by_itself() -> None:
     """An answer .5 m off moves the transform of few answers to itself; it must not count there."""
     answers = clues(TRUE, TRUE, TRUE @ SE2(0.0, 0.5, 0.0))
     frame = Frame(tuple(answers))
-    (expected, within_m) = frame.place(driven(2), without=2)
+    (expected, within_m) = frame.place(driven(2), without=("drive", 2))
     assert is_right(TRUE @ driven(2), expected, within_m)[0]
     assert not is_right(answers[2].T_map_base, expected, within_m)[0]
 
@@ -104,6 +104,6 @@ def test_a_wrong_heading_is_a_wrong_answer() -> None:
     answers = clues(TRUE, TRUE, TRUE, TRUE)
     frame = agreed_frame(answers)
     assert frame is not None
-    expected, within_m = frame.place(driven(1), without=1)
+    expected, within_m = frame.place(driven(1), without=("drive", 1))
     right, error_m = is_right(expected @ SE2(0.0, 0.0, math.radians(5.0)), expected, within_m)
     assert not right and error_m < 1e-6

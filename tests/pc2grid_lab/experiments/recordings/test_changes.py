@@ -153,6 +153,17 @@ def test_only_windows_of_both_runs_are_compared() -> None:
     assert changes(before, after) == []
 
 
+def test_fewer_answers_of_the_quick_form_judge_less() -> None:
+    """In the quick form too few answers agree to judge them; in the whole one that is a change."""
+    judged, few = pair_row("right", "right", "right"), pair_row("right", "right", "right")
+    few = replace(few, queries=tuple(replace(q, right=None, rank=None) for q in few.queries))
+    assert changes(table(judged), replace(table(few), quick=True)) == []
+    assert [c.text for c in changes(table(judged), table(few))][:2] == [
+        "right 3 -> 0 of 3",
+        "not judged 0 -> 3 of 3",
+    ]
+
+
 def test_the_page_shows_each_row() -> None:
     rows = (
         map_row(warnings=warned([BENT], storeys=False, error_m=0.03)),

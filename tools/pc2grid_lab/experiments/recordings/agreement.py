@@ -47,13 +47,13 @@ AGREEMENT = AgreementParameters()
 class Clue:
     """A place in both frames: where the base was in the recording's own frame, and in the map.
 
-    window : number of the query that it is about; -1 for a scan that the map was made from.
+    query : the recording and the number of the window that it is about; None for a scan of the map.
     weight : of the vote, the confidence of an answer.
     """
 
     T_drive_base: SE2
     T_map_base: SE2
-    window: int = -1
+    query: tuple[str, int] | None = None
     weight: float = 1.0
 
     @property
@@ -71,12 +71,12 @@ class Frame:
 
     clues: tuple[Clue, ...]
 
-    def place(self, T_drive_base: SE2, *, without: int = -2) -> tuple[SE2, float]:
+    def place(self, T_drive_base: SE2, *, without: tuple[str, int] | None = None) -> tuple[SE2, float]:
         """Where a pose of the recording is in the map, and how far from there a right answer may be, metres.
 
-        By the clues around it, or by the nearest ones, leaving out those of one window.
+        By the clues around it, or by the nearest ones, leaving out that of one query.
         """
-        clues = [clue for clue in self.clues if clue.window != without]
+        clues = [clue for clue in self.clues if without is None or clue.query != without]
         away_m = np.array([_apart_m(clue.T_drive_base, T_drive_base) for clue in clues])
         order = np.argsort(away_m, kind="stable")
         near = max(int(np.sum(away_m <= AGREEMENT.around_m)), min(2, len(clues)))

@@ -40,13 +40,15 @@ def changes(before: Table, after: Table) -> list[Change]:
     maps = [(old, new) for new in after.maps for old in before.maps if old.name == new.name]
     pairs = [(old, new) for new in after.pairs for old in before.pairs if _key(old) == _key(new)]
     pace = _pace(maps)
+    same_form = before.quick == after.quick
     found = [change for old, new in maps for change in _map_changes(old, new, pace)]
     for old, new in pairs:
-        found += _pair_changes(new.name, old.problem, new.problem, _same_windows([(old, new)]))
+        windows = _same_windows([(old, new)], same_form=same_form)
+        found += _pair_changes(new.name, old.problem, new.problem, windows)
     for building in dict.fromkeys(new.building for _, new in pairs):
         rows = [(old, new) for old, new in pairs if new.building == building]
-        found += _worse(f"building {building}", _same_windows(rows))
-    found += _worse("all queries", _same_windows(pairs))
+        found += _worse(f"building {building}", _same_windows(rows, same_form=same_form))
+    found += _worse("all queries", _same_windows(pairs, same_form=same_form))
     return found
 
 
@@ -92,14 +94,21 @@ def _map_changes(old: MapRow, new: MapRow, pace: float) -> Iterator[Change]:
         yield Change(row=new.name, text=text, worse=verdicts[about] == "right")
 
 
-def _same_windows(rows: Sequence[tuple[PairRow, PairRow]]) -> list[tuple[QueryRow, QueryRow]]:
-    """The answers of both runs to the same windows."""
+def _same_windows(
+    rows: Sequence[tuple[PairRow, PairRow]], *, same_form: bool
+) -> list[tuple[QueryRow, QueryRow]]:
+    """The answers of both runs to the same windows.
+
+    same_form : whether both runs are quick, or none. If not, fewer answers judge each other in one of them,
+        and what is judged in one only is left out.
+    """
     return [
         (a, b)
         for old, new in rows
         for b in new.queries
         for a in old.queries
         if (a.window, a.start_s) == (b.window, b.start_s)
+        and (same_form or (a.right is None) == (b.right is None))
     ]
 
 

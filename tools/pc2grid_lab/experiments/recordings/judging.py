@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,10 @@ _GAP_NS = 1_000_000_000
 """True poses farther apart are not interpolated; the recording's own trajectory carries on the nearest."""
 _CARRIED_NS = 10_000_000_000
 """For no longer than this."""
+_SESSION = "map"
+"""The first session of a map, see `run`."""
+Frames = dict[tuple[int, str], Frame]
+"""By part of the drive and session of the map."""
 _STEP_M = 0.3
 """Scans of a map place it in the world once on such a distance."""
 
@@ -260,11 +264,12 @@ class Asked:
         the base there at the last scan; of a drive with true poses the part is -1 and the pose the true one.
     """
 
+    query: str
     window: int
     span: TimeSpan
     done: Finished | None
-    where: tuple[int, SE2] | None
-    hits_m: F64
+    where: tuple[int, SE2] | None = None
+    hits_m: F64 = field(default_factory=lambda: np.empty((0, 2)))
 
     @property
     def answer(self) -> dict[str, Any] | None:
@@ -286,6 +291,7 @@ class Judge:
         self._catalogue, self._folder = catalogue, folder
         self._drives: dict[str, Drive] = {}
         self._grids: dict[str, dict[str, OccupancyGrid]] = {}
+        self._windows: dict[Pair, list[Asked]] = {}
 
     def row(self, pair: Pair) -> PairRow:
         """The row of a pair; what cannot be judged is a row that says why."""
@@ -303,14 +309,13 @@ class Judge:
             return PairRow(**row, problem=_said(error))
 
     def _judged(self, pair: Pair, query: Recording, map_: Recording, row: dict[str, Any]) -> PairRow:
-        problem = self._problem(pair, query, map_)
+        problem = self._problem(pair)
         if problem:
             return PairRow(**row, problem=problem)
-        asked = self._asked(pair, query)
         if pair.kind == "elsewhere":
-            queries = tuple(_elsewhere(one) for one in asked)
+            queries = tuple(_elsewhere(one) for one in self._asked(pair))
             return PairRow(**row, truth="elsewhere", queries=queries)
-        truth, frames = self._frames(pair, query, map_, asked)
+        truth, asked, frames = self._frames(pair, query, map_)
         grids = self._grids_of(pair.map_name)
         return PairRow(
             **row,
@@ -319,8 +324,9 @@ class Judge:
             queries=tuple(_judged(one, frames, grids) for one in asked),
         )
 
-    def _problem(self, pair: Pair, query: Recording, map_: Recording) -> str:
-        gaps = [r.file for r in (query, map_) if self._folder.missing(r)]
+    def _problem(self, pair: Pair) -> str:
+        recordings = [self._catalogue.recordings[name] for name in (pair.query, pair.map)]
+        gaps = [recording.file for recording in recordings if self._folder.missing(recording)]
         if gaps:
             return f"{gaps[0]}: {MISSING}"
         done = kept(self._folder.result(pair.map_name))
@@ -328,18 +334,21 @@ class Judge:
             return f"{pair.map_name}: {_NOT_RUN}"
         return f"no map: {done.error}" if done.failed else ""
 
-    def _asked(self, pair: Pair, query: Recording) -> list[Asked]:
+    def _asked(self, pair: Pair) -> list[Asked]:
         """The windows of a pair with their answers."""
-        windows = self._catalogue.windows(pair, self._folder.length_s(query))
-        return [self._one(pair, query, number, span) for number, span in windows]
+        if pair not in self._windows:
+            query = self._catalogue.recordings[pair.query]
+            windows = self._catalogue.windows(pair, self._folder.length_s(query))
+            self._windows[pair] = [self._one(pair, query, number, span) for number, span in windows]
+        return self._windows[pair]
 
     def _one(self, pair: Pair, query: Recording, number: int, span: TimeSpan) -> Asked:
         done = kept(self._folder.answer(pair, span))
         if done is None or done.failed:
-            return Asked(number, span, done, None, np.empty((0, 2)))
+            return Asked(pair.query, number, span, done)
         stamp_ns = int(done.document["query"]["stamp_ns"])
         if pair.kind == "elsewhere":
-            return Asked(number, span, done, None, np.empty((0, 2)))
+            return Asked(pair.query, number, span, done)
         if pair.query not in self._drives:
             self._drives[pair.query] = Drive.of(query, self._folder)
         drive = self._drives[pair.query]
@@ -349,7 +358,7 @@ class Judge:
         else:
             true = drive.true_pose(stamp_ns)
             where = None if true is None else (-1, true)
-        return Asked(number, span, done, where, self._last_hits(query, span, stamp_ns))
+        return Asked(pair.query, number, span, done, where, self._last_hits(query, span, stamp_ns))
 
     def _last_hits(self, query: Recording, span: TimeSpan, stamp_ns: int) -> F64:
         """(N, 2) walls that the last scan of a window shows, in the axes of the base."""
@@ -367,23 +376,58 @@ class Judge:
         return np.asarray(planar_scan.hits_m, np.float64)
 
     def _frames(
-        self, pair: Pair, query: Recording, map_: Recording, asked: Sequence[Asked]
-    ) -> tuple[Truth | None, dict[tuple[int, str], Frame]]:
-        """How the parts of the drive lie in the sessions of the map: by true poses, else by the answers."""
+        self, pair: Pair, query: Recording, map_: Recording
+    ) -> tuple[Truth | None, list[Asked], Frames]:
+        """The windows, and how the parts of the drive lie in the sessions of the map: by true poses, else by
+        the answers.
+        """
+        asked = self._asked(pair)
         if query.poses is not None and query.poses == map_.poses:
-            return "poses", {
-                (-1, session): frame
-                for session, trajectory in folder_sessions(self._folder, pair.map_name).items()
-                if (frame := self._true_frame(pair.query, trajectory)) is not None
-            }
-        groups: dict[tuple[int, str], list[Clue]] = {}
-        for one in asked:
-            if one.where is not None and one.places and one.answer is not None:
-                session, T_map_base, _ = one.places[0]
-                clue = Clue(one.where[1], T_map_base, one.window, float(one.answer["confidence"]))
-                groups.setdefault((one.where[0], session), []).append(clue)
-        frames = {key: frame for key, clues in groups.items() if (frame := agreed_frame(clues)) is not None}
-        return ("agreement" if frames else None), frames
+            return (
+                "poses",
+                asked,
+                {
+                    (-1, session): frame
+                    for session, trajectory in folder_sessions(self._folder, pair.map_name).items()
+                    if (frame := self._true_frame(pair.query, trajectory)) is not None
+                },
+            )
+        shared = self._shared(pair) if map_.sensor == "map" else None
+        asked, frames = shared or (asked, _agreed(asked))
+        return ("agreement" if frames else None), asked, frames
+
+    def _shared(self, pair: Pair) -> tuple[list[Asked], Frames] | None:
+        """The same of several drives in one map, whose answers judge each other: those that are known to lie
+        in the trajectory of one of them, or of another recording of the building.
+
+        None if there are not several.
+        """
+        building = self._catalogue.recordings[pair.map].building
+        in_map = [p for p in self._catalogue.pairs if p.map_name == pair.map_name and p.kind != "elsewhere"]
+        for root in self._catalogue.recordings.values():
+            if root.building != building or len(in_map) < 2:
+                continue
+            drives = {p.query: moved for p in in_map if (moved := self._in_root(p, root.name)) is not None}
+            if pair.query in drives and len(drives) > 1:
+                return drives[pair.query], _agreed([one for asked in drives.values() for one in asked])
+        return None
+
+    def _in_root(self, pair: Pair, root: str) -> list[Asked] | None:
+        """The windows of a pair, in the trajectory of the recording `root`; None if not located there."""
+        if pair.query == root:
+            return self._asked(pair)
+        wanted = (pair.query, root, None)
+        link = next((p for p in self._catalogue.pairs if (p.query, p.map, p.until_s) == wanted), None)
+        if link is None or self._problem(link):
+            return None
+        frame = _agreed(self._asked(link)).get((0, _SESSION))
+        if frame is None:
+            return None
+        return [
+            replace(one, where=(0, frame.place(one.where[1])[0]))
+            for one in self._asked(pair)
+            if one.where is not None and one.where[0] == 0
+        ]
 
     def _true_frame(self, query: str, trajectory: Trajectory) -> Frame | None:
         """The frame of a session of the map in the world, by its own scans, one on each `_STEP_M`."""
@@ -405,6 +449,18 @@ class Judge:
             with open_database(self._folder.map(name)) as database:
                 self._grids[name] = {info.name: database.grid(info.name) for info in database.sessions()}
         return self._grids[name]
+
+
+def _agreed(asked: Iterable[Asked]) -> Frames:
+    """How the parts of drives lie in the sessions of a map, by the best place of every answer."""
+    groups: dict[tuple[int, str], list[Clue]] = {}
+    for one in asked:
+        if one.where is not None and one.places and one.answer is not None:
+            session, T_map_base, _ = one.places[0]
+            clue = Clue(one.where[1], T_map_base, (one.query, one.window), float(one.answer["confidence"]))
+            groups.setdefault((one.where[0], session), []).append(clue)
+    found = ((key, agreed_frame(clues)) for key, clues in groups.items())
+    return {key: frame for key, frame in found if frame is not None}
 
 
 def _config(recording: Recording) -> Config:
@@ -438,16 +494,14 @@ def _elsewhere(one: Asked) -> QueryRow:
     return QueryRow(**_answered(one), right=None if one.answer is None else False, covered=False)
 
 
-def _judged(
-    one: Asked, frames: Mapping[tuple[int, str], Frame], grids: Mapping[str, OccupancyGrid]
-) -> QueryRow:
+def _judged(one: Asked, frames: Frames, grids: Mapping[str, OccupancyGrid]) -> QueryRow:
     """An answer judged by where the query is in the sessions of the map."""
     row = _answered(one)
     if one.answer is None or one.where is None:
         return QueryRow(**row)
     part, T_drive_base = one.where
     expected = {
-        session: frame.place(T_drive_base, without=one.window)
+        session: frame.place(T_drive_base, without=(one.query, one.window))
         for (of_part, session), frame in frames.items()
         if of_part == part
     }
