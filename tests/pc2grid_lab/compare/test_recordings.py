@@ -11,13 +11,14 @@ import pytest
 from typer.testing import CliRunner
 
 from pc2grid.io.nav2_map import save_map
+from pc2grid.model import OccupancyGrid
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app
 from pc2grid_lab.experiments.recordings import catalogue
 from pc2grid_lab.experiments.recordings.catalogue import Pair, Recording
 from tests.helpers.json_schema import closed
-from tests.helpers.simulated_drives import office, plan
+from tests.helpers.simulated_drives import plan
 
 RECORDINGS = (
     Recording(
@@ -35,23 +36,30 @@ RECORDINGS = (
     Recording(name="gone", file="gone.mcap", building="office", sensor="laser"),
 )
 PAIRS = (
-    Pair(query="a", map="a", kind="later part", window_s=8.0, windows=2, until_s=30.0),
-    Pair(query="b", map="a", kind="other day", window_s=8.0, windows=4),
+    Pair(query="a", map="a", kind="later part", window_s=12.0, windows=2, until_s=70.0),
+    Pair(query="b", map="a", kind="other day", window_s=12.0, windows=4),
     Pair(query="a", map="broken", kind="other day", window_s=8.0, windows=1),
     Pair(query="broken", map="a", kind="other day", window_s=8.0, windows=1),
     Pair(query="a", map="gone", kind="other day", window_s=8.0, windows=1),
-    Pair(query="b", map="hall.yaml", kind="elsewhere", window_s=8.0, windows=2, quick=True),
+    Pair(query="b", map="hall.yaml", kind="elsewhere", window_s=8.0, windows=1, quick=True),
 )
+
+
+def rooms() -> OccupancyGrid:
+    """14 x 9 m: three rooms at a corridor, no two alike, that a drive of 40 m sees all of."""
+    inner = [(0, 5, 2, 5), (3, 5, 8, 5), (9, 5, 14, 5), (4, 5, 4, 9), (10, 5, 10, 9)]
+    things = [(6, 7, 7, 7), (7, 7, 7, 8), (1, 2, 1, 3), (5, 1.5, 7, 1.5), (11, 2, 12, 3.5), (12, 7, 13, 7)]
+    return plan(14.0, 9.0, [*inner, *things])
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two drives of a laser through one office, a recording that is none, and the map of another building."""
     folder = tmp_path_factory.mktemp("data")
-    for name, seed, length_m in (("a", 3, 30.0), ("b", 5, 20.0)):
-        slow: dict[str, Any] = {"laser": {"rate_hz": 4.0}, "length_m": length_m, "seed": seed, "clutter": 2}
+    for name, seed, length_m in (("a", 3, 40.0), ("b", 5, 30.0)):
+        slow: dict[str, Any] = {"laser": {"rate_hz": 4.0}, "length_m": length_m, "seed": seed, "clutter": 0}
         config = SimulationConfig.model_validate(slow)
-        simulate_session(folder / f"{name}.mcap", sensor="laser", grid=office(), config=config)
+        simulate_session(folder / f"{name}.mcap", sensor="laser", grid=rooms(), config=config)
     (folder / "broken.mcap").write_bytes(b"no recording")
     save_map(plan(12.0, 9.0, [(0, 4, 7, 4), (7, 6, 7, 9), (3, 6, 3, 9)]), folder / "hall")
     return folder
@@ -76,20 +84,20 @@ def test_a_small_run(data: Path, tmp_path: Path) -> None:
     jsonschema.validate(document, closed(schema("compare-recordings")))
     maps = {row["name"]: row for row in document["maps"]}
     assert maps["a"]["error_m"] < 0.05 and maps["a"]["compared"] > 0.99 and maps["a"]["parts"] == 1
-    assert maps["a"]["cpu_s"] > 0.5 and 25 < maps["a"]["metres"] < 35
+    assert maps["a"]["cpu_s"] > 0.5 and 35 < maps["a"]["metres"] < 45
     assert maps["b"]["truth"] == "none" and maps["b"]["error_m"] is None
     assert "broken.mcap" in maps["broken"]["problem"]
     assert maps["gone"]["problem"] == "not in the data folder"
     later, other, no_map, no_query, missing, elsewhere = document["pairs"]
-    assert later["truth"] == "poses" and any(q["covered"] for q in later["queries"])
-    assert all(q["right"] and q["rank"] == 0 for q in later["queries"] if q["covered"])
-    assert other["truth"] == "agreement" and other["agreeing"] == 4
-    assert all(q["right"] and q["covered"] and q["rank"] == 0 for q in other["queries"])
-    assert sum(q["status"] == "located" for q in other["queries"]) >= 3
-    assert max(q["error_m"] for q in other["queries"]) < 0.15
+    assert later["truth"] == "poses"
+    found = [q for q in later["queries"] if q["status"] == "located"]
+    assert found and all(q["right"] and q["error_m"] < 0.15 for q in found)
+    assert other["truth"] == "agreement" and other["agreeing"] >= 3
+    found = [q for q in other["queries"] if q["status"] == "located"]
+    assert len(found) >= 3 and all(q["covered"] and q["rank"] == 0 and q["error_m"] < 0.15 for q in found)
     assert "no map" in no_map["problem"] and no_query["problem"]
     assert missing["problem"] == "gone.mcap: not in the data folder"
-    assert [q["status"] for q in elsewhere["queries"]] == ["not_found", "not_found"]
+    assert [q["status"] for q in elsewhere["queries"]] == ["not_found"]
     assert document["changes"] == []
 
     page = (tmp_path / "real.md").read_text()
@@ -98,12 +106,12 @@ def test_a_small_run(data: Path, tmp_path: Path) -> None:
     assert {**kept, "changes": []} == document
 
     # The answers are there: the next run computes nothing, and tells what the table had otherwise.
-    kept["maps"][0]["error_m"] = 0.001
+    kept["maps"][0] |= {"error_m": 0.9, "parts": 0}
     for query in kept["pairs"][1]["queries"]:
         query["error_m"], query["right"] = 9.0, False
     (tmp_path / "before.json").write_text(json.dumps(kept))
     again = compare(data, tmp_path, "--table", str(tmp_path / "before.json"))
-    assert "- **worse** a: error 0.001 ->" in again.stdout
+    assert "- a: error 0.900 ->" in again.stdout and "- **worse** a: parts 0 -> 1" in again.stdout
     assert "- b in a: right 0 ->" in again.stdout
     assert json.loads((tmp_path / "before.json").read_text())["maps"] == document["maps"]
     assert "Changed since the run before" in (tmp_path / "before.md").read_text()
