@@ -74,7 +74,7 @@ def compare_recordings_command(
     before = _read(kept)
     changed = [] if before is None else changes(before, found)
     if only is None and not quick:
-        for file, text in ((kept, _json(found)), (kept.with_suffix(".md"), page(found, changed))):
+        for file, text in ((kept, found.to_text()), (kept.with_suffix(".md"), page(found, changed))):
             with replace_file(file) as draft:
                 draft.write_text(text, encoding="utf-8")
     if as_json:
@@ -85,12 +85,6 @@ def compare_recordings_command(
         print(f"nothing to compare with: there is no {kept}")
     else:
         print(f"changed since {before.commit} ({kept}):", *(change_lines(changed) or ["- nothing"]), sep="\n")
-
-
-def _json(table: Table) -> str:
-    import json
-
-    return json.dumps(table.to_json(), indent=1) + "\n"
 
 
 def _read(file: Path) -> Table | None:

@@ -46,6 +46,7 @@ def query(window: int, outcome: str) -> QueryRow:
         right=outcome != "wrong",
         rank=0 if outcome != "wrong" else None,
         error_m=0.04 if outcome != "wrong" else 5.0,
+        in_space={"right": "agrees", "wrong": "contradicts"}.get(outcome),
         cpu_s=2.0,
     )
 
@@ -77,7 +78,8 @@ def table(*rows: MapRow | PairRow) -> Table:
 def test_the_same_again_is_no_change() -> None:
     same = table(map_row(), pair_row("right", "wrong", "refused"))
     assert changes(same, same) == []
-    assert changes(Table.from_json(json.loads(json.dumps(same.to_json()))), same) == []
+    read = Table.from_json(json.loads(same.to_text()))
+    assert json.loads(same.to_text()) == same.to_json() and changes(read, same) == []
 
 
 @pytest.mark.parametrize(
@@ -176,13 +178,13 @@ def test_the_page_shows_each_row() -> None:
     (bent,) = [line for line in text.splitlines() if line.startswith("| hall | hall | lidar")]
     assert "bent (false)" in bent and "| 0.030 |" in bent
     assert "| wean\\|3 |" in text and "internal error: KeyError |" in text
-    assert "| b | a | laser | 3 | 3 | 2 | 1 | **1** | 1 | 1 of 3 [0.01, 0.91] | 0 | 0.040 |" in text
+    assert "| b | a | laser | 3 | 3 | 2 | 1 | **1** | 1 | 1 of 3 [0.01, 0.91] | 0 | 0.040 | 1/0/1 |" in text
     assert "not in the data folder" in text
     assert "the window from 10.0 s, 5.00 m off, confidence 0.990" in text
     assert "- **worse** hall: error 0.030 -> 0.730 m" in text
     assert "2 of 2 [0.16, 1.00] (hall, intel)" in text
     widths = {line.count("|") - line.count("\\|") for line in text.splitlines() if line.startswith("| b |")}
-    assert widths == {15}
+    assert widths == {16}
 
 
 def test_intervals_are_exact() -> None:

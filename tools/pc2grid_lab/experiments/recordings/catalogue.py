@@ -30,7 +30,8 @@ class Recording:
     """A recording, or a map, as one run of `pc2grid convert` takes it.
 
     file : below the data folder. building : recordings of one building are one group of the statistics.
-    options : of `convert` and of `relocalize`. every : only every nth of its scans is used.
+    options : of `convert` and of `relocalize`; map_options : of `convert` only. every : only every nth of
+        its scans is used.
     truth : what its trajectory is compared with, relations or poses; None: there is none.
     poses : true poses that place its windows, in one frame for all recordings that name the same `poses`.
     of_base : whether these are poses of the base, not of the sensor.
@@ -45,6 +46,7 @@ class Recording:
     building: str
     sensor: Literal["lidar", "depth", "laser", "map"]
     options: tuple[str, ...] = ()
+    map_options: tuple[str, ...] = ()
     every: int = 1
     truth: str | None = None
     poses: str | None = None
@@ -136,12 +138,13 @@ def _kidnap(name: str, file: str, scans_s: tuple[float, float], *, quick: bool =
     return _laser(name, "kidnap", file=f"laser/kidnap/{file}", scans_s=scans_s, quick=quick)
 
 
-def _hall(every: int, name: str, *, quick: bool = False) -> Recording:
+def _hall(every: int, name: str, *, map_options: tuple[str, ...] = (), quick: bool = False) -> Recording:
     return Recording(
         name=name,
         file="lidar/hall.mcap",
         building="hall",
         sensor="lidar",
+        map_options=map_options,
         every=every,
         truth="lidar/hall.tum",
         poses="lidar/hall.tum",
@@ -151,6 +154,7 @@ def _hall(every: int, name: str, *, quick: bool = False) -> Recording:
 
 RECORDINGS: tuple[Recording, ...] = (
     _hall(1, "hall", quick=True),
+    _hall(1, "hall with points", map_options=("--points", "0.05")),
     _hall(2, "hall, every 2nd scan", quick=True),
     _hall(3, "hall, every 3rd scan", quick=True),
     Recording(
@@ -235,6 +239,7 @@ PAIRS: tuple[Pair, ...] = (
     # Windows of 3 to 8 m of travel, or 20 s where the robot hardly moves.
     _later("hall", 10.0, 4.0, 4),
     _pair("fewer scans", "hall, every 2nd scan", "hall", 6.0, 6, quick=True),
+    _pair("fewer scans", "hall, every 2nd scan", "hall with points", 6.0, 6),
     _pair("fewer scans", "hall, every 3rd scan", "hall", 9.0, 4),
     _later("fr079", 600.0, 20.0, 10),
     _later("intel", 900.0, 25.0, 10),

@@ -123,6 +123,7 @@ _PLACES = (
         "right of covered",
         "rank",
         "error, m",
+        "in space",
         "cpu, s",
         "judged by",
     ),
@@ -139,7 +140,8 @@ def _places(table: Table) -> list[str]:
         *lines,
         "covered: the map knows half of the ground that the last scan sees there. right: within 0.3 m and 3",
         "degrees. rank: places before the right one, of covered queries that are not located (-: it is not",
-        "among the hypotheses). error: median of the right ones. judged by: true poses of both; or the",
+        "among the hypotheses). error: median of the right ones. in space: answers with which the points of",
+        "the map agree / do not tell / disagree, if it has points. judged by: true poses of both; or the",
         "answers themselves, which must lie on one rigid transform of the drive's own trajectory (how many",
         "do); elsewhere: another building, where every answer is wrong. In brackets the 95 % interval of",
         "Clopper and Pearson.",
@@ -148,7 +150,7 @@ def _places(table: Table) -> list[str]:
 
 def _pair_cells(row: PairRow) -> list[str]:
     if row.problem:
-        return [row.query, row.map, row.sensors, *[""] * 10, row.problem]
+        return [row.query, row.map, row.sensors, *[""] * 11, row.problem]
     counts = row.counts
     judged = {
         "poses": "poses",
@@ -172,9 +174,16 @@ def _pair_cells(row: PairRow) -> list[str]:
         _share(counts.covered_right, counts.covered),
         " ".join("-" if rank is None else str(rank) for rank in row.ranks),
         _number(row.median_error_m, 3),
+        _in_space(row),
         _number(sorted(seconds)[len(seconds) // 2] if seconds else None, 1),
         judged,
     ]
+
+
+def _in_space(row: PairRow) -> str:
+    """How many answers the points of the map confirm, leave open and contradict; empty without points."""
+    said = [query.in_space for query in row.queries if query.in_space is not None]
+    return "/".join(str(said.count(status)) for status in ("agrees", "unsure", "contradicts")) if said else ""
 
 
 def _by_building(table: Table) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -177,6 +178,17 @@ class Table:
         """In plain types; numbers are rounded to what the page could show."""
         document: dict[str, Any] = _plain({"schema_version": 1, **asdict(self)})
         return document
+
+    def to_text(self) -> str:
+        """The same as a JSON text with a line for each row, so that versions can be compared."""
+        document = self.to_json()
+        rows = {name: document.pop(name) for name in ("maps", "pairs")}
+        head = json.dumps(document)[1:-1]
+        lists = (
+            f'"{name}": [\n' + ",\n".join(json.dumps(row) for row in found) + "\n]"
+            for name, found in rows.items()
+        )
+        return "{" + ",\n".join([head, *lists]) + "}\n"
 
     @staticmethod
     def from_json(document: dict[str, Any]) -> Table:

@@ -158,7 +158,16 @@ def _do(task: _Task) -> None:
 
 def _convert(folder: Folder, name: str, recording: Recording, until_s: float | None) -> _Task:
     database, source = folder.map(name), folder.source(recording)
-    options: list[str | Path] = [*recording.options, "--name", "map", "--json", "--force", "-o", database]
+    options: list[str | Path] = [
+        *recording.options,
+        *recording.map_options,
+        "--name",
+        "map",
+        "--json",
+        "--force",
+        "-o",
+        database,
+    ]
     if until_s is not None:
         options += ["--duration", f"{until_s:g}"]
 
