@@ -424,9 +424,8 @@ class Judge:
         if frame is None:
             return None
         return [
-            replace(one, where=(0, frame.place(one.where[1])[0]))
+            replace(one, where=(0, frame.place(one.where[1])[0]) if one.where and one.where[0] == 0 else None)
             for one in self._asked(pair)
-            if one.where is not None and one.where[0] == 0
         ]
 
     def _true_frame(self, query: str, trajectory: Trajectory) -> Frame | None:

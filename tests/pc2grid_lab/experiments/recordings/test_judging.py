@@ -1,0 +1,139 @@
+"""Answers of several drives in one map judge each other; true poses are carried to the scans between."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pc2grid.geometry import SE2
+from pc2grid.model import OccupancyGrid, Trajectory
+from pc2grid.time_span import TimeSpan
+from pc2grid_lab.experiments.recordings import judging
+from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
+from pc2grid_lab.experiments.recordings.children import Finished
+from pc2grid_lab.experiments.recordings.judging import Asked, Drive, Judge, known_share
+from pc2grid_lab.experiments.recordings.run import Folder
+
+T_A_B, T_PLAN_A = SE2(3.0, -1.0, 0.4), SE2(20.0, 8.0, -1.2)
+RECORDINGS = {
+    name: Recording(name=name, file=name, building="x", sensor="map" if name == "plan" else "laser")
+    for name in ("a", "b", "plan")
+}
+B_IN_A = Pair(query="b", map="a", kind="other day", window_s=1.0, windows=4)
+A_IN_PLAN = Pair(query="a", map="plan", kind="published map", window_s=1.0, windows=2)
+B_IN_PLAN = Pair(query="b", map="plan", kind="published map", window_s=1.0, windows=2)
+
+
+def pose(window: int) -> SE2:
+    return SE2(4.0 * window, 1.0 * window, 0.5 * window)
+
+
+def asked(query: str, window: int, found: SE2 | None, *, status: str = "located") -> Asked:
+    """A window that says `found`; None: its scan has no pose in the drive."""
+    said = found or SE2()
+    document = {
+        "status": status,
+        "confidence": 0.9 if status == "located" else 0.2,
+        "query": {"path_m": 3.0, "stamp_ns": window},
+        "hypotheses": [{"session": "map", "place": 0, "x": said.x, "y": said.y, "yaw": said.yaw}],
+    }
+    done = Finished(code=0, cpu_s=1.0, wall_s=1.0, peak_mb=1.0, document=document)
+    where = None if found is None else (0, pose(window))
+    return Asked(query, window, TimeSpan(float(window), 1.0), done, where, np.zeros((1, 2)))
+
+
+class Known(Judge):
+    """A judge who is told the answers."""
+
+    def __init__(self, answers: Mapping[Pair, list[Asked]]) -> None:
+        catalogue = Catalogue(recordings=RECORDINGS, mapped=(), pairs=tuple(answers))
+        super().__init__(catalogue, Folder(Path("/data"), Path("/work")))
+        self._windows.update(answers)
+
+    def _problem(self, pair: Pair) -> str:
+        return ""
+
+    def _grids_of(self, name: str) -> dict[str, OccupancyGrid]:
+        free = np.zeros((400, 400), np.int8)
+        return {"map": OccupancyGrid(cells=free, resolution_m=0.2, origin_m=(-40.0, -40.0))}
+
+
+def answers(*, a: tuple[SE2, ...], b: tuple[SE2, ...]) -> dict[Pair, list[Asked]]:
+    """b is located in a; both are asked in the plan, where they say these transforms."""
+    return {
+        B_IN_A: [asked("b", k, T_A_B @ pose(k)) for k in range(4)],
+        A_IN_PLAN: [asked("a", k, T @ pose(k)) for k, T in enumerate(a)],
+        B_IN_PLAN: [asked("b", k, T @ T_A_B @ pose(k)) for k, T in enumerate(b)],
+    }
+
+
+def test_two_drives_of_two_answers_each_judge_each_other() -> None:
+    wrong = SE2(-5.0, 2.0, 2.0)
+    known = answers(a=(T_PLAN_A, T_PLAN_A), b=(T_PLAN_A, wrong, T_PLAN_A))
+    known[B_IN_PLAN].append(asked("b", 3, None))
+    first, second = Known(known).row(A_IN_PLAN), Known(known).row(B_IN_PLAN)
+    assert (first.truth, first.agreeing) == (second.truth, second.agreeing) == ("agreement", 4)
+    assert [query.right for query in first.queries] == [True, True]
+    assert [query.right for query in second.queries] == [True, False, True, None]
+    assert [query.covered for query in second.queries] == [True, True, True, None]
+
+
+def test_a_drive_alone_has_too_few() -> None:
+    known = answers(a=(T_PLAN_A, T_PLAN_A), b=(T_PLAN_A, T_PLAN_A))
+    del known[B_IN_A]
+    row = Known(known).row(A_IN_PLAN)
+    assert row.truth is None and [query.right for query in row.queries] == [None, None]
+
+
+def test_drives_that_contradict_each_other_are_not_judged() -> None:
+    other = T_PLAN_A @ SE2(6.2, 0.0, 0.0)
+    row = Known(answers(a=(T_PLAN_A,) * 3, b=(other,) * 3)).row(B_IN_PLAN)
+    assert row.truth is None and len(row.queries) == 3
+
+
+def test_elsewhere_nothing_is_right() -> None:
+    pair = Pair(query="b", map="plan", kind="elsewhere", window_s=1.0, windows=2)
+    row = Known({pair: [asked("b", 0, SE2()), asked("b", 1, SE2(), status="not_found")]}).row(pair)
+    assert row.counts.wrong == 1 and row.counts.refused == 1
+
+
+def test_what_cannot_be_judged_is_a_row_that_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any) -> None:
+        raise KeyError("hypotheses")
+
+    monkeypatch.setattr(judging, "_agreed", broken)
+    row = Known(answers(a=(T_PLAN_A,), b=(T_PLAN_A,))).row(B_IN_A)
+    assert row.problem == "KeyError: 'hypotheses'"
+
+
+def trajectory(*stamps_s: float) -> Trajectory:
+    """1 m/s along a line that turns."""
+    poses = np.array([SE2(t, 0.1 * t, 0.05 * t).lift() for t in stamps_s]).reshape(-1, 4, 4)
+    return Trajectory(stamps_ns=(np.array(stamps_s) * 1e9).astype(np.int64), T_session_base=poses)
+
+
+def test_true_poses_are_interpolated_or_carried() -> None:
+    own = trajectory(*np.arange(0.0, 30.0, 0.25))
+    dense = Drive((), trajectory(0.0, 0.5, 1.0), SE2())
+    between = dense.true_pose(250_000_000)
+    assert between is not None and (between.x, between.y) == pytest.approx((0.25, 0.025))
+    sparse = Drive((own,), trajectory(0.0, 8.0), SE2())
+    carried = sparse.true_pose(6_000_000_000)
+    assert carried is not None and (carried.x, carried.yaw) == pytest.approx((6.0, 0.3))
+    assert sparse.true_pose(25_000_000_000) is None  # 17 s from the last true pose
+    assert Drive((), trajectory(0.0, 8.0), SE2()).true_pose(6_000_000_000) is None
+    shifted = Drive((), trajectory(0.0, 0.5), SE2(-0.1, 0.0, 0.0)).true_pose(0)
+    assert shifted is not None and shifted.x == pytest.approx(-0.1)
+
+
+def test_known_ground_is_known_a_little_behind_walls() -> None:
+    cells = np.full((20, 20), -1, np.int8)
+    cells[:, :10] = 0
+    grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0))
+    points = np.array([(0.1, 0.5), (0.6, 0.5), (0.9, 0.5), (9.0, 9.0)])
+    assert known_share(grid, points) == 0.5
+    assert known_share(grid, np.empty((0, 2))) == 0.0
