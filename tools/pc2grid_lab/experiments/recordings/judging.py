@@ -1,41 +1,31 @@
-"""The rows of the page, from what the commands answered."""
+"""The rows of the page about places: each answer judged by true poses, or by the others."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pc2grid.arrays import F64
-from pc2grid.geometry import SE2, interpolate_pose
+from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid, Trajectory
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_frame, is_right
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.children import Finished, kept
-from pc2grid_lab.experiments.recordings.rows import MapRow, PairRow, QueryRow, Table, Truth
+from pc2grid_lab.experiments.recordings.drive import Drive, config_of, sessions
+from pc2grid_lab.experiments.recordings.mapped import MISSING, NOT_RUN, map_row, said
+from pc2grid_lab.experiments.recordings.rows import PairRow, QueryRow, Table, Truth
 from pc2grid_lab.experiments.recordings.run import Folder
-from pc2grid_lab.experiments.recordings.warned import warned
 from pc2grid_lab.experiments.trial import JUDGEMENT
-from signature.config import Config
 
-MISSING = "not in the data folder"
-_NOT_RUN = "was not run"
 _KNOWN_M = 0.2
 """A wall hit lies on known ground if the map knows a cell this near: noise puts hits behind the wall."""
 _LAST_S = 2.0
 """The last scan of a window lies within this of its end."""
-_SAME_NS = 5_000_000
-"""Stamps that differ by no more than this are of one scan."""
-_GAP_NS = 1_000_000_000
-"""True poses farther apart are not interpolated; the recording's own trajectory carries on the nearest."""
-_CARRIED_NS = 10_000_000_000
-"""For no longer than this."""
 _SESSION = "map"
 """The first session of a map, see `run`."""
 Frames = dict[tuple[int, str], Frame]
@@ -66,194 +56,6 @@ def judged_table(
         maps=maps,
         pairs=tuple(rows),
     )
-
-
-def map_row(recording: Recording, folder: Folder) -> MapRow:
-    """The row of a recording as a map; what cannot be judged is a row that says why."""
-    try:
-        return _map_row(recording, folder)
-    except Exception as error:
-        name, building, sensor = recording.name, recording.building, recording.sensor
-        return MapRow(name=name, building=building, sensor=sensor, problem=_said(error))
-
-
-def _said(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
-
-
-def _map_row(recording: Recording, folder: Folder) -> MapRow:
-    row: dict[str, Any] = {
-        "name": recording.name,
-        "building": recording.building,
-        "sensor": recording.sensor,
-    }
-    if folder.missing(recording):
-        return MapRow(**row, problem=MISSING)
-    done = kept(folder.result(recording.name))
-    if done is None or done.failed:
-        return MapRow(
-            **row, problem=_NOT_RUN if done is None else done.error, cpu_s=done.cpu_s if done else None
-        )
-    sessions = done.document["sessions"]
-    reports = [session["report"] for session in sessions]
-    read = sum(report["scans_read"] for report in reports)
-    skipped = sum(sum(report["scans_skipped"].values()) for report in reports)
-    bare = kept(folder.bare(recording.name))
-    bare_of: dict[str, Any] = {} if bare is None or bare.failed else bare.document
-    error = _error(recording, folder)
-    return MapRow(
-        **row,
-        minutes=sum(session["duration_s"] for session in sessions) / 60.0,
-        metres=sum(session["path_m"] for session in sessions),
-        area_m2=sum(session["area_m2"] for session in sessions),
-        cpu_s=done.cpu_s,
-        over_bare=done.cpu_s / bare_of["cpu_s"] if bare_of else None,
-        parts=len(sessions),
-        lost=skipped / read if read else None,
-        warnings=warned(
-            (text for report in reports for text in report["warnings"]),
-            storeys=recording.storeys,
-            error_m=error.get("error_m"),
-        ),
-        bare_m=bare_of.get("ate_m"),
-        **error,
-    )
-
-
-def _error(recording: Recording, folder: Folder) -> dict[str, Any]:
-    """The error of a trajectory against its truth; of a recording in parts, that of each part by itself."""
-    if recording.truth is None:
-        return {}
-    parts = list(folder_sessions(folder, recording.name).values())
-    truth = folder.data / recording.truth
-    if truth.suffix == ".relations":
-        return {"truth": "relations", **_relation_error(parts, truth, _mount(folder, recording))}
-    return {"truth": "poses", **_pose_error(parts, truth)}
-
-
-def _relation_error(parts: Sequence[Trajectory], truth: Path, T_base_sensor: SE2) -> dict[str, float]:
-    """Mean errors over the relations that lie in one part."""
-    from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
-
-    relations, mount = read_relations(truth), (T_base_sensor.x, T_base_sensor.y)
-    found = [relation_error(part, relations, base_to_reference_m=mount) for part in parts]
-    found = [error for error in found if error.used]
-    if not found:
-        return {"compared": 0.0}
-    used = [error.used for error in found]
-    return {
-        "error_m": float(np.average([error.translation_m for error in found], weights=used)),
-        "error_deg": float(np.average([error.rotation_deg for error in found], weights=used)),
-        "compared": sum(used) / found[0].total,
-    }
-
-
-def _pose_error(parts: Sequence[Trajectory], truth: Path) -> dict[str, float]:
-    """RMS distance from the true poses, each part aligned by itself."""
-    from pc2grid.io.trajectory import read_tum
-    from pc2grid_lab.experiments.trajectory_error import TrajectoryError, trajectory_error
-
-    true = read_tum(truth)
-
-    def errors() -> Iterator[TrajectoryError]:
-        for part in parts:
-            try:
-                yield trajectory_error(part, true)
-            except ValueError:  # fewer than three poses of this part have a true one
-                continue
-
-    found = list(errors())
-    if not found:
-        return {"compared": 0.0}
-    poses = [error.poses for error in found]
-    return {
-        "error_m": float(np.sqrt(np.average([error.ate_m**2 for error in found], weights=poses))),
-        "compared": sum(poses) / max(sum(len(part) for part in parts), 1),
-    }
-
-
-def folder_sessions(folder: Folder, name: str) -> dict[str, Trajectory]:
-    """The trajectories of the sessions of a map, empty if there is none."""
-    from signature.database import open_database
-
-    if not folder.map(name).exists():
-        return {}
-    with open_database(folder.map(name)) as database:
-        return {info.name: database.trajectory(info.name) for info in database.sessions()}
-
-
-def _mount(folder: Folder, recording: Recording) -> SE2:
-    """T_base_sensor of a recording's first scan."""
-    from pc2grid.io import open_log
-
-    with open_log(folder.source(recording), _config(recording).read) as log:
-        return SE2.from_matrix(next(iter(log.scans())).T_base_sensor)
-
-
-@dataclass(frozen=True)
-class Drive:
-    """A recording as it was driven: its own trajectories, and true poses if there are any.
-
-    parts : the sessions of the map of the whole recording; none for a map that is no recording.
-    world : name of the frame of the true poses, None without.
-    """
-
-    parts: tuple[Trajectory, ...]
-    truth: Trajectory | None
-    T_sensor_base: SE2
-
-    @staticmethod
-    def of(recording: Recording, folder: Folder) -> Drive:
-        """Of a recording whose whole map is in the folder."""
-        from pc2grid.io.trajectory import read_tum
-
-        parts = tuple(folder_sessions(folder, recording.name).values())
-        truth = None if recording.poses is None else read_tum(folder.data / recording.poses)
-        mount = SE2() if recording.of_base or truth is None else _mount(folder, recording)
-        return Drive(parts, truth, mount.inverse())
-
-    def own_pose(self, stamp_ns: int) -> tuple[int, SE2] | None:
-        """The part and T_part_base of the scan with that stamp; None if no part has it."""
-        for number, part in enumerate(self.parts):
-            k = _nearest(part.stamps_ns, stamp_ns)
-            if k is not None and abs(int(part.stamps_ns[k]) - stamp_ns) <= _SAME_NS:
-                return number, SE2.from_matrix(part.T_session_base[k])
-        return None
-
-    def true_pose(self, stamp_ns: int) -> SE2 | None:
-        """T_world_base by the true poses; where they are far apart, carried on by the own trajectory."""
-        assert self.truth is not None
-        stamps_ns = self.truth.stamps_ns
-        after = int(np.searchsorted(stamps_ns, stamp_ns - _SAME_NS))
-        if after < len(stamps_ns) and abs(int(stamps_ns[after]) - stamp_ns) <= _SAME_NS:
-            return SE2.from_matrix(self.truth.T_session_base[after]) @ self.T_sensor_base
-        if 0 < after < len(stamps_ns):
-            before_ns, after_ns = int(stamps_ns[after - 1]), int(stamps_ns[after])
-            if after_ns - before_ns <= _GAP_NS:
-                part = (stamp_ns - before_ns) / (after_ns - before_ns)
-                before, behind = self.truth.T_session_base[after - 1 : after + 1]
-                return SE2.from_matrix(interpolate_pose(before, behind, part)) @ self.T_sensor_base
-        return self._carried(stamp_ns)
-
-    def _carried(self, stamp_ns: int) -> SE2 | None:
-        assert self.truth is not None
-        own = self.own_pose(stamp_ns)
-        k = _nearest(self.truth.stamps_ns, stamp_ns)
-        if own is None or k is None or abs(int(self.truth.stamps_ns[k]) - stamp_ns) > _CARRIED_NS:
-            return None
-        there = self.own_pose(int(self.truth.stamps_ns[k]))
-        if there is None or there[0] != own[0]:
-            return None
-        T_world_base = SE2.from_matrix(self.truth.T_session_base[k]) @ self.T_sensor_base
-        return T_world_base @ there[1].inverse() @ own[1]
-
-
-def _nearest(stamps_ns: NDArray[np.int64], stamp_ns: int) -> int | None:
-    if not len(stamps_ns):
-        return None
-    after = min(int(np.searchsorted(stamps_ns, stamp_ns)), len(stamps_ns) - 1)
-    before = max(after - 1, 0)
-    return before if stamp_ns - int(stamps_ns[before]) < int(stamps_ns[after]) - stamp_ns else after
 
 
 @dataclass(frozen=True)
@@ -306,7 +108,7 @@ class Judge:
         try:
             return self._judged(pair, query, map_, row)
         except Exception as error:
-            return PairRow(**row, problem=_said(error))
+            return PairRow(**row, problem=said(error))
 
     def _judged(self, pair: Pair, query: Recording, map_: Recording, row: dict[str, Any]) -> PairRow:
         problem = self._problem(pair)
@@ -331,7 +133,7 @@ class Judge:
             return f"{gaps[0]}: {MISSING}"
         done = kept(self._folder.result(pair.map_name))
         if done is None:
-            return f"{pair.map_name}: {_NOT_RUN}"
+            return f"{pair.map_name}: {NOT_RUN}"
         return f"no map: {done.error}" if done.failed else ""
 
     def _asked(self, pair: Pair) -> list[Asked]:
@@ -365,7 +167,7 @@ class Judge:
         from pc2grid.io import open_log
         from pc2grid.pipeline import follow
 
-        config, end_s = _config(query), span.start_s + (span.duration_s or 0.0)
+        config, end_s = config_of(query), span.start_s + (span.duration_s or 0.0)
         start_s = max(end_s - _LAST_S, span.start_s)
         with open_log(self._folder.source(query), config.read) as log:
             last = None
@@ -388,7 +190,7 @@ class Judge:
                 asked,
                 {
                     (-1, session): frame
-                    for session, trajectory in folder_sessions(self._folder, pair.map_name).items()
+                    for session, trajectory in sessions(self._folder, pair.map_name).items()
                     if (frame := self._true_frame(pair.query, trajectory)) is not None
                 },
             )
@@ -462,19 +264,11 @@ def _agreed(asked: Iterable[Asked]) -> Frames:
     return {key: frame for key, frame in found if frame is not None}
 
 
-def _config(recording: Recording) -> Config:
-    """The settings that the commands read a recording with."""
-    from pc2grid_cli.options import make_config
-
-    given = dict(zip(recording.options[::2], recording.options[1::2], strict=True))
-    return make_config(None, None, topic=given.get("--topic"), odometry=given.get("--odometry"))
-
-
 def _answered(one: Asked) -> dict[str, Any]:
     """What a row says of an answer before it is judged."""
     row: dict[str, Any] = {"window": one.window, "start_s": one.span.start_s}
     if one.done is None:
-        return {**row, "problem": _NOT_RUN}
+        return {**row, "problem": NOT_RUN}
     if one.answer is None:
         return {**row, "problem": one.done.error, "cpu_s": one.done.cpu_s}
     space = one.answer.get("in_space")

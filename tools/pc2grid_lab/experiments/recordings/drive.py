@@ -1,0 +1,113 @@
+"""A recording as it was driven: its own trajectories, true poses, and what its scans are read with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.geometry import SE2, interpolate_pose
+from pc2grid.model import Trajectory
+from pc2grid_lab.experiments.recordings.catalogue import Recording
+from pc2grid_lab.experiments.recordings.run import Folder
+from signature.config import Config
+
+_SAME_NS = 5_000_000
+"""Stamps that differ by no more than this are of one scan."""
+_GAP_NS = 1_000_000_000
+"""True poses farther apart are not interpolated; the recording's own trajectory carries on the nearest."""
+_CARRIED_NS = 10_000_000_000
+"""For no longer than this."""
+
+
+def sessions(folder: Folder, name: str) -> dict[str, Trajectory]:
+    """The trajectories of the sessions of a map, empty if there is none."""
+    from signature.database import open_database
+
+    if not folder.map(name).exists():
+        return {}
+    with open_database(folder.map(name)) as database:
+        return {info.name: database.trajectory(info.name) for info in database.sessions()}
+
+
+def mount(folder: Folder, recording: Recording) -> SE2:
+    """T_base_sensor of a recording's first scan."""
+    from pc2grid.io import open_log
+
+    with open_log(folder.source(recording), config_of(recording).read) as log:
+        return SE2.from_matrix(next(iter(log.scans())).T_base_sensor)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A recording as it was driven: its own trajectories, and true poses if there are any.
+
+    parts : the sessions of the map of the whole recording; none for a map that is no recording.
+    truth : poses of the sensor in the world, None without. T_sensor_base : of the base in its frame.
+    """
+
+    parts: tuple[Trajectory, ...]
+    truth: Trajectory | None
+    T_sensor_base: SE2
+
+    @staticmethod
+    def of(recording: Recording, folder: Folder) -> Drive:
+        """Of a recording whose whole map is in the folder."""
+        from pc2grid.io.trajectory import read_tum
+
+        parts = tuple(sessions(folder, recording.name).values())
+        truth = None if recording.poses is None else read_tum(folder.data / recording.poses)
+        T_base_sensor = SE2() if recording.of_base or truth is None else mount(folder, recording)
+        return Drive(parts, truth, T_base_sensor.inverse())
+
+    def own_pose(self, stamp_ns: int) -> tuple[int, SE2] | None:
+        """The part and T_part_base of the scan with that stamp; None if no part has it."""
+        for number, part in enumerate(self.parts):
+            k = _nearest(part.stamps_ns, stamp_ns)
+            if k is not None and abs(int(part.stamps_ns[k]) - stamp_ns) <= _SAME_NS:
+                return number, SE2.from_matrix(part.T_session_base[k])
+        return None
+
+    def true_pose(self, stamp_ns: int) -> SE2 | None:
+        """T_world_base by the true poses; where they are far apart, carried on by the own trajectory."""
+        assert self.truth is not None
+        stamps_ns = self.truth.stamps_ns
+        after = int(np.searchsorted(stamps_ns, stamp_ns - _SAME_NS))
+        if after < len(stamps_ns) and abs(int(stamps_ns[after]) - stamp_ns) <= _SAME_NS:
+            return SE2.from_matrix(self.truth.T_session_base[after]) @ self.T_sensor_base
+        if 0 < after < len(stamps_ns):
+            before_ns, after_ns = int(stamps_ns[after - 1]), int(stamps_ns[after])
+            if after_ns - before_ns <= _GAP_NS:
+                part = (stamp_ns - before_ns) / (after_ns - before_ns)
+                before, behind = self.truth.T_session_base[after - 1 : after + 1]
+                return SE2.from_matrix(interpolate_pose(before, behind, part)) @ self.T_sensor_base
+        return self._carried(stamp_ns)
+
+    def _carried(self, stamp_ns: int) -> SE2 | None:
+        assert self.truth is not None
+        own = self.own_pose(stamp_ns)
+        k = _nearest(self.truth.stamps_ns, stamp_ns)
+        if own is None or k is None or abs(int(self.truth.stamps_ns[k]) - stamp_ns) > _CARRIED_NS:
+            return None
+        there = self.own_pose(int(self.truth.stamps_ns[k]))
+        if there is None or there[0] != own[0]:
+            return None
+        T_world_base = SE2.from_matrix(self.truth.T_session_base[k]) @ self.T_sensor_base
+        return T_world_base @ there[1].inverse() @ own[1]
+
+
+def _nearest(stamps_ns: NDArray[np.int64], stamp_ns: int) -> int | None:
+    if not len(stamps_ns):
+        return None
+    after = min(int(np.searchsorted(stamps_ns, stamp_ns)), len(stamps_ns) - 1)
+    before = max(after - 1, 0)
+    return before if stamp_ns - int(stamps_ns[before]) < int(stamps_ns[after]) - stamp_ns else after
+
+
+def config_of(recording: Recording) -> Config:
+    """The settings that the commands read a recording with."""
+    from pc2grid_cli.options import make_config
+
+    given = dict(zip(recording.options[::2], recording.options[1::2], strict=True))
+    return make_config(None, None, topic=given.get("--topic"), odometry=given.get("--odometry"))
