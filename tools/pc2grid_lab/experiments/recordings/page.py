@@ -65,9 +65,8 @@ _MAPS = (
         "lost, %",
         "error, m",
         "bare KISS-ICP",
-        "truth",
-        "warnings",
     ),
+    ("truth", "warnings"),
 )
 
 
@@ -125,8 +124,8 @@ _PLACES = (
         "error, m",
         "in space",
         "cpu, s",
-        "judged by",
     ),
+    ("judged by",),
 )
 
 
@@ -200,6 +199,7 @@ def _by_building(table: Table) -> list[str]:
             "wrong of located",
             "elsewhere: wrong of asked",
         ),
+        (),
     )
     cells = []
     for building in dict.fromkeys(row.building for row in table.pairs):
@@ -294,10 +294,14 @@ def _number(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
-def _markdown(heads: tuple[Sequence[str], Sequence[str]], rows: Sequence[Sequence[str]]) -> list[str]:
-    texts, numbers = heads
+def _markdown(
+    heads: tuple[Sequence[str], Sequence[str], Sequence[str]], rows: Sequence[Sequence[str]]
+) -> list[str]:
+    """A table. heads : of columns of text, of columns of numbers, and of further columns of text."""
+    before, numbers, behind = heads
+    sides = ["---"] * len(before) + ["---:"] * len(numbers) + ["---"] * len(behind)
     return [
-        "| " + " | ".join([*texts, *numbers]) + " |",
-        "|" + "|".join(["---"] * len(texts) + ["---:"] * len(numbers)) + "|",
+        "| " + " | ".join([*before, *numbers, *behind]) + " |",
+        "|" + "|".join(sides) + "|",
         *("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows),
     ]
