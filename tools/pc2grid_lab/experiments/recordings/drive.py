@@ -15,10 +15,13 @@ from signature.config import Config
 
 _SAME_NS = 5_000_000
 """Stamps that differ by no more than this are of one scan."""
-_GAP_NS = 1_000_000_000
-"""True poses farther apart are not interpolated; the recording's own trajectory carries on the nearest."""
-_CARRIED_NS = 10_000_000_000
-"""For no longer than this."""
+_GAP_NS = 200_000_000
+"""True poses farther apart are not interpolated, as a robot turns between them."""
+_CARRIED_NS = 5_000_000_000
+"""The own trajectory is laid on the true poses of so long before and after."""
+_AHEAD_M = 3.0
+"""The heading of a pose counts there as much as the position of a point so far ahead; as in
+`RegisteredSession.T_world_odom`."""
 
 
 def sessions(folder: Folder, name: str) -> dict[str, Trajectory]:
@@ -73,9 +76,10 @@ class Drive:
         """T_world_base by the true poses; where they are far apart, carried on by the own trajectory."""
         assert self.truth is not None
         stamps_ns = self.truth.stamps_ns
-        after = int(np.searchsorted(stamps_ns, stamp_ns - _SAME_NS))
-        if after < len(stamps_ns) and abs(int(stamps_ns[after]) - stamp_ns) <= _SAME_NS:
-            return SE2.from_matrix(self.truth.T_session_base[after]) @ self.T_sensor_base
+        nearest = _nearest(stamps_ns, stamp_ns)
+        if nearest is not None and abs(int(stamps_ns[nearest]) - stamp_ns) <= _SAME_NS:
+            return SE2.from_matrix(self.truth.T_session_base[nearest]) @ self.T_sensor_base
+        after = int(np.searchsorted(stamps_ns, stamp_ns))
         if 0 < after < len(stamps_ns):
             before_ns, after_ns = int(stamps_ns[after - 1]), int(stamps_ns[after])
             if after_ns - before_ns <= _GAP_NS:
@@ -85,16 +89,25 @@ class Drive:
         return self._carried(stamp_ns)
 
     def _carried(self, stamp_ns: int) -> SE2 | None:
+        """The own trajectory around a stamp, laid on the true poses there."""
         assert self.truth is not None
         own = self.own_pose(stamp_ns)
-        k = _nearest(self.truth.stamps_ns, stamp_ns)
-        if own is None or k is None or abs(int(self.truth.stamps_ns[k]) - stamp_ns) > _CARRIED_NS:
+        near = np.flatnonzero(np.abs(self.truth.stamps_ns - stamp_ns) <= _CARRIED_NS)
+        if own is None or not len(near):
             return None
-        there = self.own_pose(int(self.truth.stamps_ns[k]))
-        if there is None or there[0] != own[0]:
+        pairs = [
+            (there[1], SE2.from_matrix(self.truth.T_session_base[k]) @ self.T_sensor_base)
+            for k in near.tolist()
+            if (there := self.own_pose(int(self.truth.stamps_ns[k]))) is not None and there[0] == own[0]
+        ]
+        if not pairs:
             return None
-        T_world_base = SE2.from_matrix(self.truth.T_session_base[k]) @ self.T_sensor_base
-        return T_world_base @ there[1].inverse() @ own[1]
+        ahead = np.array([(0.0, 0.0), (_AHEAD_M, 0.0)])
+        T_world_part = SE2.fit(
+            np.concatenate([T_part_base.apply(ahead) for T_part_base, _ in pairs]),
+            np.concatenate([T_world_base.apply(ahead) for _, T_world_base in pairs]),
+        )
+        return T_world_part @ own[1]
 
 
 def _nearest(stamps_ns: NDArray[np.int64], stamp_ns: int) -> int | None:
