@@ -17,8 +17,8 @@ from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_fra
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.children import Finished, kept
 from pc2grid_lab.experiments.recordings.drive import Drive, config_of, sessions
-from pc2grid_lab.experiments.recordings.mapped import MISSING, NOT_RUN, map_row, said
-from pc2grid_lab.experiments.recordings.rows import PairRow, QueryRow, Table, Truth
+from pc2grid_lab.experiments.recordings.mapped import MISSING, map_row, said
+from pc2grid_lab.experiments.recordings.rows import NOT_RUN, PairRow, QueryRow, Table, Truth
 from pc2grid_lab.experiments.recordings.run import Folder
 from pc2grid_lab.experiments.trial import JUDGEMENT
 

@@ -13,12 +13,11 @@ from pc2grid.model import Trajectory
 from pc2grid_lab.experiments.recordings.catalogue import Recording
 from pc2grid_lab.experiments.recordings.children import kept
 from pc2grid_lab.experiments.recordings.drive import mount, sessions
-from pc2grid_lab.experiments.recordings.rows import MapRow
+from pc2grid_lab.experiments.recordings.rows import NOT_RUN, MapRow
 from pc2grid_lab.experiments.recordings.run import Folder
 from pc2grid_lab.experiments.recordings.warned import warned
 
 MISSING = "not in the data folder"
-NOT_RUN = "was not run"
 
 
 def map_row(recording: Recording, folder: Folder) -> MapRow:

@@ -8,7 +8,7 @@ from itertools import groupby
 from pc2grid_lab.experiments.recordings.catalogue import KINDS
 from pc2grid_lab.experiments.recordings.chance import clopper_pearson
 from pc2grid_lab.experiments.recordings.changes import Change
-from pc2grid_lab.experiments.recordings.rows import Counts, MapRow, PairRow, Table
+from pc2grid_lab.experiments.recordings.rows import NOT_RUN, Counts, MapRow, PairRow, Table
 
 _MARKS = {"right": "", "false": " (false)", "unknown": " (?)"}
 _READING = ("no tf", "gaps", "empty scans")
@@ -258,7 +258,7 @@ def _failures(table: Table) -> list[str]:
         f"- {row.name}: the window from {query.start_s:.1f} s: {query.problem}"
         for row in table.pairs
         for query in row.queries
-        if query.problem
+        if query.problem not in ("", NOT_RUN)
     ]
     found = ["## Wrong answers", "", *lines, ""] if lines else ["No answer is wrong.", ""]
     return found + (["## Failed", "", *problems, ""] if problems else [])

@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any, Literal
 
+NOT_RUN = "was not run"
+"""The problem of a row whose commands were not run, because the run ended early."""
 Verdict = Literal["right", "false", "unknown"]
 Truth = Literal["poses", "agreement", "elsewhere"]
 """How answers are judged: by true poses of query and map, by each other, or as nothing can be right."""
