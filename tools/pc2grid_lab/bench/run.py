@@ -20,7 +20,17 @@ from pathlib import Path
 
 from pc2grid.errors import Pc2GridError
 from pc2grid.extras import require
-from pc2grid_lab.bench import large_database, live, locating, peers, points, reading, space, submaps
+from pc2grid_lab.bench import (
+    large_database,
+    live,
+    locating,
+    peers,
+    points,
+    reading,
+    recordings,
+    space,
+    submaps,
+)
 from pc2grid_lab.bench.measure import ROOT, Row, machine, table
 
 Measure = Callable[[Path, bool], Iterator[Row]]
@@ -52,6 +62,7 @@ MEASURES: dict[str, Measure] = {
     "relocalize": locating.relocalize_time,
     "live": live.lag,
     "hour": live.memory,
+    "real": recordings.against_table,
     "peers": peers.compare,
     "fleet": fleet_reading,
 }
