@@ -14,14 +14,12 @@ from __future__ import annotations
 import argparse
 import importlib
 import threading
-from collections.abc import Collection, Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 import pc2grid
 from pc2grid.config import ReadConfig
-from pc2grid.io import topics
-from pc2grid.io.live.feed import Arrived, FeedCounts, News
-from pc2grid.io.live.inbox import Inbox
+from pc2grid.io.live.feed import Feed
 from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.io.message_source import RawMessage, TopicInfo
@@ -38,78 +36,46 @@ except ModuleNotFoundError:
     rclpy = None
 
 
-class RclpyFeed:
-    """The topics of the node's ROS graph as a feed (pc2grid.io.live.feed), and where messages are
-    published."""
+class RclpyFeed(Feed):
+    """The topics of the node's ROS graph as a feed, and where messages are published."""
 
     realtime = True
-    connected = True
-    ended = False
 
     def __init__(self, node: Any, topic: str | None) -> None:
-        self.name = "this robot"
-        self.counts, self.news = FeedCounts(), News()
-        self._node, self._topic = node, topic
-        self._inbox = Inbox(self.counts)
-        self._topics: dict[str, TopicInfo] = {}
-        self._subscriptions: dict[str, Any] = {}
+        super().__init__("this robot", ReadConfig(topic=topic))
+        self._node = node
         self._publishers: dict[str, Any] = {}
         node.create_timer(0.5, self._discover)
 
     def _discover(self) -> None:
         for name, types in self._node.get_topic_names_and_types():
             kind = types[0].replace("/msg/", "/")
-            self._topics.setdefault(name, TopicInfo(topic=name, type=kind, encoding="cdr"))
-        there = self.topics()
-        for info in there:
-            if info.topic not in self._subscriptions and topics.may_be_used(info, there, self._topic):
-                self._subscribe(info)
+            self._offer(name, TopicInfo(topic=name, type=kind, encoding="cdr"))
+        self._refresh()
 
-    def _subscribe(self, info: TopicInfo) -> None:
+    def _subscribe(self, key: Hashable, topic: TopicInfo) -> Any:
         # Best effort takes from every publisher; static transforms are published once and kept for those who
         # ask.
-        latched = info.topic.endswith("tf_static")
+        latched = topic.topic.endswith("tf_static")
         qos = QoSProfile(
             depth=100,
             reliability=ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
         events = SubscriptionEventCallbacks(
-            incompatible_qos=lambda event: self.news.tell(f"{info.topic}: QoS does not fit: {event}")
+            incompatible_qos=lambda event: self.news.tell(f"{topic.topic}: QoS does not fit: {event}")
         )
 
         def take(data: bytes) -> None:
             now_ns = self._node.get_clock().now().nanoseconds
-            self._inbox.put(RawMessage(info, now_ns, bytes(data)))
+            self._inbox.put(RawMessage(topic, now_ns, bytes(data)))
 
-        self._subscriptions[info.topic] = self._node.create_subscription(
-            _type(info.type), info.topic, take, qos, raw=True, event_callbacks=events
+        return self._node.create_subscription(
+            _type(topic.type), topic.topic, take, qos, raw=True, event_callbacks=events
         )
 
-    def topics(self) -> tuple[TopicInfo, ...]:
-        """The topics that are known so far."""
-        return tuple(self._topics.values())
-
-    def want(self, topics: Collection[str]) -> None:
-        """Only these topics are needed from now on."""
-        for name in [name for name in self._subscriptions if name not in topics]:
-            self._node.destroy_subscription(self._subscriptions[name])
-
-    def keep_up(self) -> None:
-        """From now on scans may be dropped."""
-        self._inbox.keep_up()
-
-    def pending(self, topics: Collection[str]) -> Sequence[RawMessage]:
-        """Messages that wait."""
-        return self._inbox.pending(topics)
-
-    def receive(self, timeout_s: float) -> Arrived | None:
-        """The next message."""
-        return self._inbox.get(timeout_s)
-
-    def close(self) -> None:
-        """Let `receive` return."""
-        self._inbox.wake()
+    def _unsubscribe(self, key: Hashable, subscription: Any) -> None:
+        self._node.destroy_subscription(subscription)
 
     def advertise(self, topic: str, type_name: str, definition: str, *, keep_last: bool) -> None:
         """Make a publisher."""

@@ -6,12 +6,12 @@ does not decode its messages: `pc2grid.io.recording` turns the bytes of any sour
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from pc2grid.model import SensorKind
+from pc2grid.model import ReadReport, SensorKind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,6 +105,16 @@ class Tally:
         """Add a sentence for the user, unless it is there already."""
         if sentence not in self.warnings:
             self.warnings.append(sentence)
+
+    def report(self, more_warnings: Iterable[str] = ()) -> ReadReport:
+        """The counts so far."""
+        return ReadReport(
+            scans_read=self.scans_read,
+            points_dropped=self.points_dropped,
+            scans_skipped=dict(self.skipped),
+            bytes_lost=self.bytes_lost,
+            warnings=tuple(dict.fromkeys((*self.warnings, *more_warnings))),
+        )
 
     def skip(self, reason: str) -> None:
         """Count one more scan left out for `reason`."""

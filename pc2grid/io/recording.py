@@ -95,15 +95,7 @@ class Log:
 
     def report(self) -> ReadReport:
         """Counts of what was read and of what was lost, so far."""
-        tally = self._source.tally
-        warnings = dict.fromkeys((*tally.warnings, *self._frames.warnings))
-        return ReadReport(
-            scans_read=tally.scans_read,
-            points_dropped=tally.points_dropped,
-            scans_skipped=dict(tally.skipped),
-            bytes_lost=tally.bytes_lost,
-            warnings=tuple(warnings),
-        )
+        return self._source.tally.report(self._frames.warnings)
 
     def choose(self) -> Choice:
         """The topic that the scans come from, and why.

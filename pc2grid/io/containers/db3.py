@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogError, LogTruncated, NotALog
-from pc2grid.io.containers.decompress import ZSTD_MAGIC, unpacker
+from pc2grid.io.containers.decompress import plain_message
 from pc2grid.io.message_source import LogInfo, RawMessage, Tally, TopicInfo
 from pc2grid.io.messages.ros_definitions import short_name
 
@@ -52,7 +52,7 @@ class Db3Source:
         self._path = path
         self._checked = False
         self._most_bytes = min(config.max_record_bytes, _SQLITE_MAX_BYTES)
-        self._unpack = unpacker("zstd", config.max_chunk_bytes)
+        self._max_chunk_bytes = config.max_chunk_bytes
         unfinished = _is_unfinished(path)
         if not unfinished:
             _check_size(path)
@@ -91,8 +91,7 @@ class Db3Source:
             (*wanted, first_ns, last_ns),
         )
         for key, time_ns, data in rows:
-            plain = self._unpack(data) if data[:4] == ZSTD_MAGIC else data
-            yield RawMessage(self._topic_of[key], time_ns, plain)
+            yield RawMessage(self._topic_of[key], time_ns, plain_message(data, self._max_chunk_bytes))
 
     def _describe(self) -> LogInfo:
         run = self._connection.execute

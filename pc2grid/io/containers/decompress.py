@@ -11,6 +11,14 @@ from pc2grid.errors import LimitExceeded, LogCorrupt
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
+def plain_message(data: bytes | memoryview, limit: int) -> bytes | memoryview:
+    """A message; decompressed if rosbag2 compressed it by itself. No encoding of messages begins like zstd.
+
+    Raises as the function that `unpacker` gives.
+    """
+    return unpacker("zstd", limit)(bytes(data)) if data[:4] == ZSTD_MAGIC else data
+
+
 def unpacker(compression: str, limit: int) -> Callable[[bytes], bytes]:
     """A function that decompresses; it raises LimitExceeded above `limit` bytes, LogCorrupt for damage."""
 

@@ -14,10 +14,11 @@ from __future__ import annotations
 import io
 from collections import Counter
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
+from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message
 from mcap.stream_reader import StreamReader
 
 from pc2grid.config import ReadConfig
@@ -29,12 +30,10 @@ from pc2grid.io.containers.mcap_records import Damage
 from pc2grid.io.containers.mcap_survey import crc_of, survey
 from pc2grid.io.error_translation import RECOVER_HINT
 from pc2grid.io.message_source import LogInfo, RawMessage, Tally, TopicInfo
-from pc2grid.io.messages.ros_definitions import short_name
 
 # Messages of chunks that overlap in time wait to be merged in this much memory (chosen by hand); in a file
 # whose chunks overlap more, they come less well sorted.
 _MAX_PENDING_BYTES = 128 << 20
-_NO_SCHEMA = Schema(id=0, name="", encoding="", data=b"")
 
 
 class _TimeRange(NamedTuple):
@@ -123,22 +122,14 @@ class McapSource:
 
     def _describe(self) -> LogInfo:
         index = self._index
-        schemas, channels = index.definitions.schemas, index.definitions.channels
-        self._topic_of: dict[int, TopicInfo] = {}
         groups: dict[tuple[str, str, str], list[Channel]] = {}
-        for channel in channels.values():
-            name = schemas.get(channel.schema_id, _NO_SCHEMA).name
-            groups.setdefault((channel.topic, name, channel.message_encoding), []).append(channel)
-        for (topic, name, encoding), group in groups.items():
-            schema = schemas.get(group[0].schema_id, _NO_SCHEMA)
-            info = TopicInfo(
-                topic=topic,
-                type=short_name(name),
-                encoding=encoding,
-                schema_encoding=schema.encoding,
-                schema=schema.data,
-                message_count=sum(index.counts.get(c.id, 0) for c in group) if index.counted else None,
-            )
+        for channel in index.definitions.channels.values():
+            topic = index.definitions.topic(channel)
+            groups.setdefault((topic.topic, topic.type, topic.encoding), []).append(channel)
+        self._topic_of: dict[int, TopicInfo] = {}
+        for group in groups.values():
+            count = sum(index.counts.get(c.id, 0) for c in group) if index.counted else None
+            info = replace(index.definitions.topic(group[0]), message_count=count)
             self._topic_of.update((channel.id, info) for channel in group)
         topics = sorted(set(self._topic_of.values()), key=lambda t: (t.topic, t.type))
         encodings = Counter(t.encoding for t in topics)

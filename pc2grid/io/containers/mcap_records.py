@@ -23,11 +23,13 @@ from typing import BinaryIO, NamedTuple, TypeVar
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import RecordLengthLimitExceeded
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, McapRecord, Schema
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import CRCValidationError, breakup_chunk, get_chunk_data_stream
 
 from pc2grid.errors import LimitExceeded, LogCorrupt, Pc2GridError, UnsupportedSchema
 from pc2grid.io.containers.decompress import expand
+from pc2grid.io.message_source import TopicInfo
+from pc2grid.io.messages.ros_definitions import short_name
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD_BYTES = 9  # kind (uint8) and length (uint64)
@@ -90,6 +92,17 @@ class Definitions:
             if found.schema_id and found.schema_id not in self.schemas:
                 raise Damage(offset, f"channel {found.id} names schema {found.schema_id}, which is missing")
 
+    def topic(self, channel: Channel) -> TopicInfo:
+        """The topic of a channel."""
+        schema = self.schemas.get(channel.schema_id)
+        return TopicInfo(
+            topic=channel.topic,
+            type=short_name(schema.name) if schema else "",
+            encoding=channel.message_encoding,
+            schema_encoding=schema.encoding if schema else "",
+            schema=schema.data if schema else b"",
+        )
+
 
 def _essence(channel: Channel) -> tuple[int, str, str]:
     return channel.schema_id, channel.topic, channel.message_encoding
@@ -151,6 +164,14 @@ def parsed(read: Callable[[ReadDataStream], T], record: Record) -> T:
         return read(_Fields(record))
     except UnicodeDecodeError:
         raise Damage(record.offset, "a name is not text") from None
+
+
+def parsed_message(record: Record) -> Message:
+    """The record of a message. Raises Damage."""
+    # A length that is too small would make mcap read a negative number of bytes.
+    length = max(len(record.data), MESSAGE_FIELDS_BYTES)
+    message: Message = parsed(lambda data: Message.read(data, length), record)
+    return message
 
 
 def parsed_chunk(record: Record) -> Chunk:

@@ -137,9 +137,7 @@ class _Surveyor:
             case Opcode.CHANNEL:
                 index.definitions.take(rec.parsed(Channel.read, record), record.offset)
             case Opcode.MESSAGE:
-                # A length that is too small would make mcap read a negative number of bytes.
-                length = max(len(record.data), rec.MESSAGE_FIELDS_BYTES)
-                self._count([rec.parsed(lambda data: Message.read(data, length), record)], record.offset)
+                self._count([rec.parsed_message(record)], record.offset)
                 index.loose.append((record.offset, record.offset + record.size))
             case Opcode.STATISTICS:
                 self._compare(record)

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from pc2grid.io.containers.decompress import ZSTD_MAGIC, unpacker
+from pc2grid.io.containers.decompress import plain_message
 from pc2grid.io.message_source import LogInfo, MessageSource, RawMessage, Tally, TopicInfo
 
 
@@ -25,7 +25,7 @@ class SplitSource:
             for sentence in part.tally.warnings:
                 tally.warn(sentence)
             part.tally = tally
-        self._unpack = unpacker("zstd", max_chunk_bytes)
+        self._max_chunk_bytes = max_chunk_bytes
         self._topics = _merged([t for part in parts for t in part.info.topics])
         spans = [part.info for part in parts if part.info.message_count != 0]
         counts = [part.info.message_count for part in parts]
@@ -55,8 +55,7 @@ class SplitSource:
             if end_ns is not None and part.info.start_ns >= end_ns:
                 continue
             for channel, log_time_ns, data in part.messages(topics, start_ns, end_ns):
-                # rosbag2 may compress each message on its own; no encoding of messages begins like that.
-                plain = self._unpack(bytes(data)) if bytes(data[:4]) == ZSTD_MAGIC else data
+                plain = plain_message(data, self._max_chunk_bytes)
                 yield RawMessage(self._topics[channel], log_time_ns, plain)
 
 

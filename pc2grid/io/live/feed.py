@@ -1,32 +1,16 @@
-"""The interface of everything that messages arrive from."""
+"""What every feed is: topics, the subscriptions to those that are wanted, and the queue of their messages."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import threading
+from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Any
 
+from pc2grid.config import ReadConfig
+from pc2grid.io import topics
+from pc2grid.io.live.inbox import INBOX, Arrived, FeedCounts, Inbox, InboxParameters
 from pc2grid.io.message_source import RawMessage, TopicInfo
-
-
-class Arrived(NamedTuple):
-    """A message, and when it arrived: seconds of `time.monotonic`."""
-
-    message: RawMessage
-    arrived_s: float
-
-
-@dataclass(slots=True)
-class FeedCounts:
-    """What happened to the messages of a feed so far.
-
-    arrived : messages. dropped : scans that waited too long because the computer is too slow, and were left
-    out. reconnected : how often a lost connection was made again.
-    """
-
-    arrived: int = 0
-    dropped: int = 0
-    reconnected: int = 0
 
 
 @dataclass(slots=True)
@@ -48,52 +32,116 @@ class News:
         return taken
 
 
-class Feed(Protocol):
+class Feed:
     """Where messages arrive from.
 
+    A kind of connection derives from it. It calls `_offer` for each topic, `_refresh` when topics came or
+    went, and puts messages into `_inbox`, also from other threads.
+
     name : for the user. realtime : whether messages are lost that are not received in time. counts, news : of
-    what happened. connected : whether messages can arrive now. ended : whether no message will arrive any
-    more; those that have arrived can still be received.
+    what happened. connected : whether messages can arrive now.
     """
 
-    name: str
-    realtime: bool
-    counts: FeedCounts
-    news: News
+    realtime = False
+
+    def __init__(
+        self, name: str, config: ReadConfig, inbox: InboxParameters = INBOX, *, by_log_time: bool = False
+    ) -> None:
+        """by_log_time : as of `Inbox`."""
+        self.name = name
+        self.counts, self.news = FeedCounts(), News()
+        self.connected = True
+        self._over = False
+        self._inbox = Inbox(self.counts, inbox, by_log_time=by_log_time)
+        self._lock = threading.RLock()
+        self._topics: dict[tuple[str, str], TopicInfo] = {}
+        self._offered: dict[Hashable, TopicInfo] = {}
+        self._subscriptions: dict[Hashable, Any] = {}
+        self._wanted: frozenset[str] | None = None
+        self._scans_topic = config.topic
 
     @property
     def ended(self) -> bool:
-        """See above."""
-        ...
-
-    @property
-    def connected(self) -> bool:
-        """See above."""
-        ...
+        """Whether no message will arrive any more, and those that have arrived are received."""
+        return self._over and not len(self._inbox)
 
     def topics(self) -> tuple[TopicInfo, ...]:
         """The topics that are known so far; their message_count is None."""
-        ...
+        with self._lock:
+            return tuple(self._topics.values())
 
     def want(self, topics: Collection[str]) -> None:
         """From now on, only messages of these topics are asked for."""
-        ...
+        with self._lock:
+            self._wanted = frozenset(topics)
+        self._refresh()
 
     def receive(self, timeout_s: float) -> Arrived | None:
         """The next message; None if none arrives within `timeout_s` seconds.
 
         Raises LogError if the feed is damaged or cannot be read any more.
         """
-        ...
+        return self._inbox.get(timeout_s)
 
     def pending(self, topics: Collection[str]) -> Sequence[RawMessage]:
         """Messages of these topics that have arrived and not been received yet."""
-        ...
+        return self._inbox.pending(topics)
 
     def keep_up(self) -> None:
         """From now on scans may be dropped: the messages that arrived during the preparations are used up."""
-        ...
+        self._inbox.keep_up()
 
     def close(self) -> None:
         """Release connections, threads and files."""
-        ...
+        self._over = True
+        self._inbox.wake()
+
+    # --- for the kinds of connections -----------------------------------------------------------------
+
+    def _known(self, topic: TopicInfo) -> TopicInfo:
+        """The topic as it was known first."""
+        with self._lock:
+            return self._topics.setdefault((topic.topic, topic.type), topic)
+
+    def _offer(self, key: Hashable, topic: TopicInfo) -> None:
+        """A topic can be subscribed to, by a key of the connection's own."""
+        with self._lock:
+            self._offered[key] = self._known(topic)
+
+    def _withdraw(self, keys: Collection[Hashable] | None = None) -> None:
+        """These topics cannot be subscribed to any more; None: all, as the connection is lost."""
+        with self._lock:
+            for key in list(self._offered) if keys is None else keys:
+                self._offered.pop(key, None)
+                self._subscriptions.pop(key, None)
+
+    def _refresh(self) -> None:
+        """Subscribe to the topics that are wanted and new, and no longer to those that are not wanted."""
+        with self._lock:
+            there = list(self._offered.values())
+            wanted = {key: topic for key, topic in self._offered.items() if self._is_wanted(topic, there)}
+            for key in [key for key in self._subscriptions if key not in wanted]:
+                self._unsubscribe(key, self._subscriptions.pop(key))
+            for key, topic in wanted.items():
+                if key not in self._subscriptions:
+                    self._subscriptions[key] = self._subscribe(key, topic)
+
+    def _is_wanted(self, topic: TopicInfo, there: Sequence[TopicInfo]) -> bool:
+        if self._wanted is not None:
+            return topic.topic in self._wanted
+        return topics.may_be_used(topic, there, self._scans_topic)
+
+    def _subscribe(self, key: Hashable, topic: TopicInfo) -> Any:
+        """Ask for the messages of a topic; what is returned is given to `_unsubscribe`."""
+        return None
+
+    def _unsubscribe(self, key: Hashable, subscription: Any) -> None:
+        """Ask for them no longer."""
+
+    def _set_connected(self, connected: bool) -> None:
+        """Take note of whether there is a connection, and say so when it is lost."""
+        if self.connected and not connected and not self._over:
+            self.news.tell(f"{self.name}: the connection is lost; trying again", again=True)
+        elif connected and not self.connected:
+            self.counts.reconnected += 1
+        self.connected = connected

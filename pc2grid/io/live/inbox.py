@@ -8,10 +8,30 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from pc2grid.io import topics
-from pc2grid.io.live.feed import Arrived, FeedCounts
 from pc2grid.io.message_source import RawMessage
+
+
+class Arrived(NamedTuple):
+    """A message, and when it arrived: seconds of `time.monotonic`."""
+
+    message: RawMessage
+    arrived_s: float
+
+
+@dataclass(slots=True)
+class FeedCounts:
+    """What happened to the messages of a feed so far.
+
+    arrived : messages. dropped : scans that waited too long because the computer is too slow, and were left
+    out. reconnected : how often a lost connection was made again.
+    """
+
+    arrived: int = 0
+    dropped: int = 0
+    reconnected: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,9 +15,9 @@ _ADDRESSES = "ws://ROBOT:8765, zenoh://ROBOT:7447, a recording, or - for standar
 def open_live(target: str, config: ReadConfig | None = None, *, last_s: float = 30.0) -> LiveLog:
     """Follow a running robot, or a recording that is still being written.
 
-    target : `ws://ROBOT:8765` (foxglove_bridge), `zenoh://ROBOT:7447` (rmw_zenoh), the path of an MCAP, a
-    .db3 or a rosbag2 folder, or `-` for an MCAP on standard input. last_s : seconds before the newest message
-    of a recording with which to begin.
+    target : `ws://ROBOT:8765` (foxglove_bridge), `zenoh://ROBOT:7447` (rmw_zenoh), the path of an MCAP or of
+    a rosbag2 folder of MCAP files, or `-` for an MCAP on standard input. last_s : seconds before the newest
+    message of a recording with which to begin.
 
     Raises LiveError if the robot cannot be reached, LogNotFound, NotALog, LogCorrupt, LimitExceeded.
 

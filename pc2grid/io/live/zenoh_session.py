@@ -12,7 +12,7 @@ import secrets
 import struct
 import threading
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
@@ -22,8 +22,8 @@ from pc2grid.config import ReadConfig
 from pc2grid.errors import ConfigError, LiveError
 from pc2grid.io import topics
 from pc2grid.io.export import ros_messages as ros
-from pc2grid.io.live.feed import Arrived, FeedCounts, News
-from pc2grid.io.live.inbox import INBOX, Inbox, InboxParameters
+from pc2grid.io.live.feed import Feed
+from pc2grid.io.live.inbox import INBOX, Arrived, Inbox, InboxParameters
 from pc2grid.io.message_source import RawMessage, TopicInfo
 from pc2grid.io.read_plan import published_once
 
@@ -79,7 +79,7 @@ class Token:
         return self.qos.split(":")[0] == _BEST_EFFORT
 
 
-class ZenohSession:
+class ZenohSession(Feed):
     """The topics of a robot in one ROS domain."""
 
     realtime = True
@@ -90,77 +90,27 @@ class ZenohSession:
         Raises LiveError if there is no connection, or without the package `eclipse-zenoh`, ConfigError for an
         address of another form.
         """
-        self.name = url
-        self.counts, self.news = FeedCounts(), News()
-        self._config = config
-        self._inbox = Inbox(self.counts, inbox)
+        super().__init__(url, config, inbox)
         host, self._domain = _address(url)
-        self._lock = threading.RLock()
         self._tokens: dict[str, Token] = {}
-        self._subscribers: dict[str, Any] = {}
-        self._topics: dict[tuple[str, str], TopicInfo] = {}
-        self._wanted: frozenset[str] | None = None
-        self._offered: dict[str, tuple[str, bool]] = {}
-        self._publishers: dict[str, Any] = {}
-        self._own_tokens: list[Any] = []
-        self._sequence = 0
-        self._gid = secrets.token_bytes(16)
-        self._closed = False
-        self._was_connected = True
         self._session = _open(url, host)
-        liveliness = self._session.liveliness()
-        self._watching = liveliness.declare_subscriber(
+        self._publishing = _Publishing(self._session, self._domain)
+        self._watching = self._session.liveliness().declare_subscriber(
             f"{_TOKENS}/{self._domain}/**", self._take_token, history=True
         )
 
-    # --- Feed -----------------------------------------------------------------------------------------
-
-    @property
-    def ended(self) -> bool:
-        """Never, until it is closed: a robot may come back."""
-        return self._closed
-
-    @property
-    def connected(self) -> bool:
-        """Whether there is a router."""
-        info = self._session.info
-        return bool(info.routers_zid() or info.peers_zid())
-
-    def topics(self) -> tuple[TopicInfo, ...]:
-        """See Feed."""
-        with self._lock:
-            return tuple(self._topics.values())
-
-    def want(self, topics: Collection[str]) -> None:
-        """See Feed."""
-        with self._lock:
-            self._wanted = frozenset(topics)
-            unused = [name for name in self._subscribers if name not in self._wanted]
-            dropped = [self._subscribers.pop(name) for name in unused]
-        for subscriber in dropped:
-            subscriber.undeclare()
-        self._subscribe()
-
-    def keep_up(self) -> None:
-        """See Feed."""
-        self._inbox.keep_up()
-
-    def pending(self, topics: Collection[str]) -> Sequence[RawMessage]:
-        """See Feed."""
-        return self._inbox.pending(topics)
-
     def receive(self, timeout_s: float) -> Arrived | None:
         """See Feed."""
-        arrived = self._inbox.get(timeout_s)
+        arrived = super().receive(timeout_s)
         if arrived is None:
-            self._tell_connection()
+            info = self._session.info
+            self._set_connected(bool(info.routers_zid() or info.peers_zid()))
         return arrived
 
     def close(self) -> None:
         """End the session."""
-        if not self._closed:
-            self._closed = True
-            self._inbox.wake()
+        if not self._over:
+            super().close()
             self._session.close()
 
     # --- Publisher ------------------------------------------------------------------------------------
@@ -171,41 +121,17 @@ class ZenohSession:
         type_name : such as `nav_msgs/msg/OccupancyGrid`. definition : not needed here.
         keep_last : who subscribes later gets the last message.
         """
-        self._offered[topic] = type_name, keep_last
+        self._publishing.offered[topic] = type_name, keep_last
 
     def publish(self, topic: str, message: bytes) -> None:
-        """Send a message in CDR."""
-        with self._lock:
-            if topic not in self._publishers:
-                self._publishers[topic] = self._declare(topic, *self._offered[topic])
-            self._sequence += 1
-            number = self._sequence
-        self._publishers[topic].put(message, attachment=_attachment(number, self._gid))
+        """Send a message in CDR.
 
-    def _declare(self, topic: str, type_name: str, keep_last: bool) -> Any:
-        """A publisher, and the tokens by which the robot's nodes know it as one of a node `pc2grid`.
-
-        It is made with the first message, when the nodes of the robot, and so the hash that they use, are
-        known.
+        The publisher is made with the first one, when the nodes of the robot, and so the hash that they use,
+        are known.
         """
-        from zenoh.ext import CacheConfig, MissDetectionConfig, declare_advanced_publisher
-
-        package, _, kind = type_name.partition("/msg/")
-        mangled = f"{package}::msg::dds_::{kind}_"
-        name_of_hash = self._hash_of(topic, mangled) or ros.type_hash(type_name)
-        zid = self._session.info.zid()
-        node = f"{_TOKENS}/{self._domain}/{zid}/0"
-        qos = _TRANSIENT_LOCAL if keep_last else _RELIABLE
-        entity = f"{topic.replace('/', '%')}/{mangled}/{name_of_hash}/{qos}"
-        number = len(self._publishers) + 1
-        for token in (f"{node}/0/NN/%/%/pc2grid", f"{node}/{number}/MP/%/%/pc2grid/{entity}"):
-            self._own_tokens.append(self._session.liveliness().declare_token(token))
-        options: dict[str, Any] = {}
-        if keep_last:
-            miss = MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
-            options = {"cache": CacheConfig(1), "publisher_detection": True, "sample_miss_detection": miss}
-        key = f"{self._domain}/{topic.lstrip('/')}/{mangled}/{name_of_hash}"
-        return declare_advanced_publisher(self._session, key, **options)
+        type_name, _ = self._publishing.offered[topic]
+        name_of_hash = self._hash_of(topic, _mangled(type_name)) or ros.type_hash(type_name)
+        self._publishing.publish(topic, message, name_of_hash)
 
     def _hash_of(self, topic: str, mangled: str) -> str | None:
         """The hash by which the robot names a type; it depends on the release of ROS."""
@@ -230,50 +156,84 @@ class ZenohSession:
             token = Token.of(key)
             if token is None:
                 return
-            twin = next((t for t in self._tokens.values() if _rivals(t, token)), None)
+            self._tell_of(token)
             self._tokens[key] = token
             if token.kind == "MP":
-                self._topics.setdefault((token.topic, token.info.type), token.info)
-                if twin is not None and twin.info.type in topics.SENSORS:
-                    who = f"{twin.node} and {token.node}"
-                    self.news.tell(f"{token.topic}: published by {who}; the messages of both are used")
-            elif token.topic in self._offered and token.best_effort:
-                self.news.tell(
-                    f"{token.topic}: {token.node} subscribes as best effort: messages may get lost"
-                )
-        self._subscribe()
+                self._offer((token.topic, token.info.type), token.info)
+        self._refresh()
 
-    def _subscribe(self) -> None:
-        """Subscribe to the topics that are wanted and new."""
+    def _tell_of(self, token: Token) -> None:
+        """Tell the user of a second publisher of scans, and of a subscription that may lose messages."""
+        twin = next((t for t in self._tokens.values() if _rivals(t, token)), None)
+        if twin is not None and twin.info.type in topics.SENSORS:
+            who = f"{twin.node} and {token.node}"
+            self.news.tell(f"{token.topic}: published by {who}; the messages of both are used")
+        if token.kind == "MS" and token.topic in self._publishing.offered and token.best_effort:
+            self.news.tell(f"{token.topic}: {token.node} subscribes as best effort: messages may get lost")
+
+    def _subscribe(self, key: Hashable, topic: TopicInfo) -> Any:
         from zenoh.ext import HistoryConfig, declare_advanced_subscriber
 
+        package, _, kind = topic.type.partition("/")
+        # Any hash: it depends on the release of ROS.
+        place = f"{self._domain}/{topic.topic.lstrip('/')}/{package}::msg::dds_::{kind}_/*"
+        options: dict[str, Any] = {}
+        if published_once(topic):
+            options["history"] = HistoryConfig(detect_late_publishers=True)
+        return declare_advanced_subscriber(self._session, place, _Receiver(topic, self._inbox), **options)
+
+    def _unsubscribe(self, key: Hashable, subscription: Any) -> None:
+        subscription.undeclare()
+
+
+class _Publishing:
+    """Publishers of a session, and the tokens by which the robot's nodes know them as those of a node
+    `pc2grid`.
+
+    offered : type, and whether the last message is kept, by topic.
+    """
+
+    def __init__(self, session: Any, domain: int) -> None:
+        self.offered: dict[str, tuple[str, bool]] = {}
+        self._session, self._domain = session, domain
+        self._publishers: dict[str, Any] = {}
+        self._tokens: list[Any] = []
+        self._lock = threading.Lock()
+        self._sequence = 0
+        self._gid = secrets.token_bytes(16)
+
+    def publish(self, topic: str, message: bytes, name_of_hash: str) -> None:
+        """Send a message in CDR; the hash is that of its type."""
         with self._lock:
-            there = list(self._topics.values())
-            for topic in there:
-                if topic.topic in self._subscribers or not self._is_wanted(topic, there):
-                    continue
-                package, _, kind = topic.type.partition("/")
-                # Any hash: it depends on the release of ROS.
-                key = f"{self._domain}/{topic.topic.lstrip('/')}/{package}::msg::dds_::{kind}_/*"
-                options: dict[str, Any] = {}
-                if published_once(topic):
-                    options["history"] = HistoryConfig(detect_late_publishers=True)
-                self._subscribers[topic.topic] = declare_advanced_subscriber(
-                    self._session, key, _Receiver(topic, self._inbox), **options
-                )
+            if topic not in self._publishers:
+                self._publishers[topic] = self._declare(topic, name_of_hash)
+            self._sequence += 1
+            number = self._sequence
+        self._publishers[topic].put(message, attachment=_attachment(number, self._gid))
 
-    def _is_wanted(self, topic: TopicInfo, there: Sequence[TopicInfo]) -> bool:
-        if self._wanted is not None:
-            return topic.topic in self._wanted
-        return topics.may_be_used(topic, there, self._config.topic)
+    def _declare(self, topic: str, name_of_hash: str) -> Any:
+        from zenoh.ext import CacheConfig, MissDetectionConfig, declare_advanced_publisher
 
-    def _tell_connection(self) -> None:
-        connected = self.connected
-        if self._was_connected and not connected:
-            self.news.tell(f"{self.name}: the connection is lost; trying again", again=True)
-        elif connected and not self._was_connected:
-            self.counts.reconnected += 1
-        self._was_connected = connected
+        type_name, keep_last = self.offered[topic]
+        mangled = _mangled(type_name)
+        node = f"{_TOKENS}/{self._domain}/{self._session.info.zid()}/0"
+        qos = _TRANSIENT_LOCAL if keep_last else _RELIABLE
+        entity = f"{topic.replace('/', '%')}/{mangled}/{name_of_hash}/{qos}"
+        number = len(self._publishers) + 1
+        for token in (f"{node}/0/NN/%/%/pc2grid", f"{node}/{number}/MP/%/%/pc2grid/{entity}"):
+            self._tokens.append(self._session.liveliness().declare_token(token))
+        options: dict[str, Any] = {}
+        if keep_last:
+            miss = MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
+            options = {"cache": CacheConfig(1), "publisher_detection": True, "sample_miss_detection": miss}
+        key = f"{self._domain}/{topic.lstrip('/')}/{mangled}/{name_of_hash}"
+        return declare_advanced_publisher(self._session, key, **options)
+
+
+def _mangled(type_name: str) -> str:
+    """`nav_msgs/msg/OccupancyGrid` as DDS names it."""
+    package, _, kind = type_name.partition("/msg/")
+    return f"{package}::msg::dds_::{kind}_"
 
 
 @dataclass(frozen=True, slots=True)

@@ -195,7 +195,8 @@ class ToAndFro:
     def __init__(self, path: Path, robot_s: float) -> None:
         from mcap.reader import make_reader
 
-        from pc2grid.io.live.feed import FeedCounts, News
+        from pc2grid.io.live.feed import News
+        from pc2grid.io.live.inbox import FeedCounts
         from pc2grid.io.message_source import TopicInfo
 
         self.name = path.name
@@ -220,7 +221,7 @@ class ToAndFro:
         self._over = False
 
     def _play(self, robot_s: float) -> Iterator[object]:
-        from pc2grid.io.live.feed import Arrived
+        from pc2grid.io.live.inbox import Arrived
         from pc2grid.io.message_source import RawMessage
 
         first, last = self._recorded[0][1], self._recorded[-1][1]

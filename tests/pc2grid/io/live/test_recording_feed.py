@@ -5,19 +5,17 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-import apsw
 import numpy as np
 import pytest
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogCorrupt, LogNotFound, NotALog
 from pc2grid.io import open_log
-from pc2grid.io.live.growing_db3 import GrowingDb3
-from pc2grid.io.live.growing_mcap import GrowingMcap
 from pc2grid.io.live.live_log import LiveLog
+from pc2grid.io.live.mcap_tail import McapTail
 from pc2grid.io.live.standard_input import StandardInput
 from pc2grid.io.live.targets import open_live
 from pc2grid.model import Scan
@@ -97,15 +95,25 @@ def test_a_growing_file_gives_the_same_scans(
     thread.join()
 
 
-def test_bytes_that_come_one_block_at_a_time_are_whole_messages(
-    tmp_path: Path, messages: list[Message], finished: list[Scan], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("pc2grid.io.live.growing_mcap._BLOCK_BYTES", 777)
-    path = tmp_path / "a.mcap"
-    recorder = Recorder(path, **SMALL)
+def test_bytes_that_come_some_at_a_time_are_whole_messages(tmp_path: Path, messages: list[Message]) -> None:
+    recorded, path = tmp_path / "recorded.mcap", tmp_path / "a.mcap"
+    recorder = Recorder(recorded, **SMALL)
     recorder.add(messages)
     recorder.finish()
-    same(scans_of(open_live(str(path), last_s=ALL_S)), finished)
+    data = recorded.read_bytes()
+    path.touch()
+    tail = McapTail.of_file(path, ReadConfig())
+    found = []
+    with path.open("ab") as growing:
+        for at in range(0, len(data), 777):
+            growing.write(data[at : at + 777])
+            growing.flush()
+            found += list(tail.read())
+    assert [(m.channel.topic, m.log_time_ns, bytes(m.data)) for m in found] == [
+        (m.topic, m.log_time_ns, m.data) for m in messages
+    ]
+    assert tail.ended
+    tail.close()
 
 
 def test_nothing_is_read_twice(
@@ -114,7 +122,10 @@ def test_nothing_is_read_twice(
     path = tmp_path / "a.mcap"
     recorder = Recorder(path, **SMALL)
     recorder.add(messages)
-    growing = GrowingMcap(path, ReadConfig(), 1.0)
+    growing = McapTail.of_file(path, ReadConfig())
+    newest_ns = growing.newest_ns()
+    assert newest_ns is not None
+    growing.skip_to(newest_ns - 10**9)
     first = list(growing.read())
     assert first[0].channel.topic == "/tf_static"
     assert min(m.log_time_ns for m in first[1:]) >= max(m.log_time_ns for m in first) - 10**9
@@ -161,15 +172,48 @@ def test_what_is_not_an_mcap_is_refused_on_standard_input() -> None:
     os.close(read_end)
 
 
-# --- folders and .db3 -----------------------------------------------------------------------------------
+# --- folders --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_a_finished_folder_gives_the_same_scans(
-    tmp_path: Path, messages: list[Message], finished: list[Scan], storage: str
+    tmp_path: Path, messages: list[Message], finished: list[Scan]
 ) -> None:
-    folder = write_rosbag2(tmp_path / "bag", messages, "mcap" if storage == "mcap" else "sqlite3")
+    folder = write_rosbag2(tmp_path / "bag", messages, "mcap")
     same(scans_of(open_live(str(folder), last_s=ALL_S)), finished)
+
+
+def in_parts(folder: Path, parts: Sequence[Sequence[Message]]) -> None:
+    """A finished folder of several files."""
+    folder.mkdir()
+    for number, part in enumerate(parts):
+        recorder = Recorder(folder / f"bag_{number}.mcap", **SMALL)
+        recorder.add(part)
+        recorder.finish()
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+
+
+def test_the_last_seconds_of_a_folder_may_begin_in_any_file(
+    tmp_path: Path, messages: list[Message], finished: list[Scan]
+) -> None:
+    folder = tmp_path / "bag"
+    in_parts(folder, [messages[:100], messages[100:320], messages[320:]])
+    newest_ns = max(m.log_time_ns for m in messages)
+    for last_s in (1.0, 2.0, 7.0):
+        tail = scans_of(open_live(str(folder), last_s=last_s))
+        same(tail, [s for s in finished if s.stamp_ns >= newest_ns - round(last_s * 1e9)])
+
+
+def test_a_damaged_file_is_left_out_where_another_follows(tmp_path: Path, messages: list[Message]) -> None:
+    folder = tmp_path / "bag"
+    in_parts(folder, [messages[:100], messages[100:200], messages[200:]])
+    middle = folder / "bag_1.mcap"
+    data = bytearray(middle.read_bytes())
+    data[3000:3100] = bytes(100)
+    middle.write_bytes(data)
+    with open_live(str(folder), last_s=ALL_S) as live:
+        stamps = [scan.stamp_ns for scan in live.scans()]
+        assert any("bag_1.mcap" in told and "left out" in told for told in live.feed.news.take())
+    assert stamps[-1] == max(m.log_time_ns for m in messages if m.topic == "/scan")
 
 
 def test_a_folder_that_is_split_while_it_is_followed(
@@ -199,71 +243,19 @@ def test_a_folder_that_is_split_while_it_is_followed(
     thread.join()
 
 
-def write_db3(path: Path, messages: Sequence[Message], journal: str) -> Iterator[None]:
-    """Write a .db3 as rosbag2 does, 30 messages in a transaction; the recorder stays connected."""
-    connection = apsw.Connection(str(path))
-    connection.execute(f"PRAGMA journal_mode={journal}; PRAGMA synchronous=OFF")
-    connection.execute(
-        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);"
-        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);"
-        "CREATE INDEX timestamp_idx ON messages (timestamp ASC)"
-    )
-    known: dict[str, int] = {}
-    for start in range(0, len(messages), 30):
-        with connection:
-            for topic, kind, time_ns, data in messages[start : start + 30]:
-                if topic not in known:
-                    known[topic] = len(known) + 1
-                    row = (known[topic], topic, kind.replace("/", "/msg/"), "cdr")
-                    connection.execute("INSERT INTO topics VALUES (?, ?, ?, ?)", row)
-                connection.execute(
-                    "INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)",
-                    (known[topic], time_ns, data),
-                )
-        yield
-    connection.close()
-
-
-@pytest.mark.parametrize("journal", ["WAL", "MEMORY"])
-def test_a_growing_db3_gives_all_messages_once_and_never_stops_its_recorder(
-    tmp_path: Path, messages: list[Message], journal: str
-) -> None:
-    path = tmp_path / "a.db3"
-    growing: GrowingDb3 | None = None
-    found = []
-    for _ in write_db3(path, messages, journal):
-        growing = growing or GrowingDb3(path, ReadConfig(), ALL_S)
-        found += list(growing.read())
-    assert growing is not None
-    time.sleep(0.02)
-    found += list(growing.read())
-    assert [(m.channel.topic, m.log_time_ns, bytes(m.data)) for m in found] == [
-        (m.topic, m.log_time_ns, m.data) for m in messages
-    ]
-
-
-def test_a_db3_is_followed_from_its_last_seconds(
-    tmp_path: Path, messages: list[Message], finished: list[Scan]
-) -> None:
-    folder = tmp_path / "bag"
-    folder.mkdir()
-    writer = write_db3(folder / "bag_0.db3", messages, "WAL")
-    list(writer)
-    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
-    tail = scans_of(open_live(str(folder), last_s=2.0))
-    newest_ns = max(m.log_time_ns for m in messages)
-    same(tail, [s for s in finished if s.stamp_ns >= newest_ns - 2 * 10**9])
-
-
 # --- what can be wrong ----------------------------------------------------------------------------------
 
 
 def test_what_cannot_be_followed_is_refused_with_what_can(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("not a recording")
     (tmp_path / "empty").mkdir()
+    write_rosbag2(tmp_path / "bag", laser_drive(3), "sqlite3")
+    (tmp_path / "a.db3").write_bytes(next((tmp_path / "bag").glob("*.db3")).read_bytes())
     os.mkfifo(tmp_path / "pipe")
     for target, kind, words in (
         ("a.txt", NotALog, "not a recording that can be followed"),
+        ("bag", LogNotFound, "holds no .mcap"),
+        ("a.db3", NotALog, "not a recording that can be followed"),
         ("empty", LogNotFound, "a folder without a recording"),
         ("pipe", LogNotFound, "watch - <"),
         ("missing", LogNotFound, "no such file"),
