@@ -40,13 +40,13 @@ Types
 Everywhere metres, radians, int64 nanoseconds; `T_target_source` maps coordinates of source into target.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 from pc2grid._version import __version__
-from pc2grid.lazy import lazy_names
 
-# The only list of the public names. A function with the name of its module has another name here, because the
-# module would hide it.
+# The public names, for type checkers and editors. A function with the name of its module has another name,
+# as the module would hide it.
 if TYPE_CHECKING:
     from pc2grid.errors import Pc2GridError as Pc2GridError
     from pc2grid.geometry import SE2 as SE2
@@ -88,8 +88,55 @@ if TYPE_CHECKING:
     from signature.relocalization.relocalizer import Relocalizer as Relocalizer
     from signature.relocalization.relocalizer import relocalize as locate  # noqa: F401
 
-__getattr__, _names = lazy_names(__name__, __file__)
-__all__ = ["__version__", *_names]
+# Where each is found; with another name there, behind the colon. A test compares this with the list above.
+_HOMES = {
+    "Pc2GridError": "pc2grid.errors",
+    "SE2": "pc2grid.geometry",
+    "load_map": "pc2grid.io.nav2_map",
+    "save_map": "pc2grid.io.nav2_map",
+    "Log": "pc2grid.io.recording",
+    "open_log": "pc2grid.io.recording",
+    "read_tum": "pc2grid.io.trajectory",
+    "write_kitti": "pc2grid.io.trajectory",
+    "write_tum": "pc2grid.io.trajectory",
+    "Health": "pc2grid.model",
+    "Loop": "pc2grid.model",
+    "OccupancyGrid": "pc2grid.model",
+    "RegisteredScan": "pc2grid.model",
+    "Scan": "pc2grid.model",
+    "SessionMap": "pc2grid.model",
+    "Submap": "pc2grid.model",
+    "Trajectory": "pc2grid.model",
+    "Observer": "pc2grid.observer",
+    "build_map": "pc2grid.pipeline",
+    "build_maps": "pc2grid.pipeline",
+    "follow": "pc2grid.pipeline",
+    "map_scans": "pc2grid.pipeline",
+    "SimulationConfig": "pc2grid.simulate",
+    "simulate_session": "pc2grid.simulate",
+    "submaps_of": "pc2grid.submaps.partition:partition",
+    "TimeSpan": "pc2grid.time_span",
+    "Config": "signature.config",
+    "Label": "signature.database",
+    "SubmapDatabase": "signature.database",
+    "open_database": "signature.database",
+    "convert": "signature.files",
+    "relocalize": "signature.files",
+    "Answer": "signature.relocalization.answer",
+    "MapIndex": "signature.relocalization.map_index",
+    "Prior": "signature.relocalization.prior",
+    "Relocalizer": "signature.relocalization.relocalizer",
+    "locate": "signature.relocalization.relocalizer:relocalize",
+}
+__all__ = ["__version__", *_HOMES]
+
+
+def __getattr__(name: str) -> object:
+    """Load the module of a public name when it is first used (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, thing = _HOMES[name].partition(":")
+    return getattr(import_module(module), thing or name)
 
 
 def __dir__() -> list[str]:

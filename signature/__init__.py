@@ -31,12 +31,11 @@ Answers
     Config              settings
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
-from pc2grid.lazy import lazy_names
-
-# The only list of the public names. A function with the name of its module has another name here, because the
-# module would hide it.
+# The public names, for type checkers and editors. A function with the name of its module has another name,
+# as the module would hide it.
 if TYPE_CHECKING:
     from signature.config import Config as Config
     from signature.database import Label as Label
@@ -62,8 +61,41 @@ if TYPE_CHECKING:
     from signature.similarity import SignatureTable as SignatureTable
     from signature.similarity import distances as distances
 
-__getattr__, _names = lazy_names(__name__, __file__)
-__all__ = [*_names]
+# Where each is found; with another name there, behind the colon. A test compares this with the list above.
+_HOMES = {
+    "Config": "signature.config",
+    "Label": "signature.database",
+    "SubmapDatabase": "signature.database",
+    "create_database": "signature.database",
+    "open_database": "signature.database",
+    "Signature": "signature.describe",
+    "signature_of": "signature.describe:describe",
+    "convert": "signature.files",
+    "relocalize": "signature.files",
+    "Answer": "signature.relocalization.answer",
+    "MapIndex": "signature.relocalization.map_index",
+    "PoseCheck": "signature.relocalization.pose_check",
+    "check_pose": "signature.relocalization.pose_check",
+    "Prior": "signature.relocalization.prior",
+    "Relocalizer": "signature.relocalization.relocalizer",
+    "locate": "signature.relocalization.relocalizer:relocalize",
+    "locate_map": "signature.relocalization.relocalizer",
+    "add_session": "signature.sessions",
+    "build_session": "signature.sessions",
+    "build_sessions": "signature.sessions",
+    "provenance": "signature.sessions",
+    "SignatureTable": "signature.similarity",
+    "distances": "signature.similarity",
+}
+__all__ = [*_HOMES]
+
+
+def __getattr__(name: str) -> object:
+    """Load the module of a public name when it is first used (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, thing = _HOMES[name].partition(":")
+    return getattr(import_module(module), thing or name)
 
 
 def __dir__() -> list[str]:

@@ -95,6 +95,21 @@ def test_help_begins_with_every_public_name(package: ModuleType) -> None:
     assert not missing, f"not in the docstring of {package.__name__}/__init__.py: {missing}"
 
 
+@pytest.mark.parametrize("package", [pc2grid, signature])
+def test_type_checkers_see_the_public_names_where_they_are_loaded_from(package: ModuleType) -> None:
+    assert package.__file__ is not None
+    body = ast.parse(Path(package.__file__).read_text("utf-8")).body
+    block = next(node for node in body if isinstance(node, ast.If))
+    seen = {
+        alias.asname: f"{node.module}:{alias.name}"
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    homes = {name: home if ":" in home else f"{home}:{name}" for name, home in package._HOMES.items()}
+    assert homes == seen
+
+
 @pytest.mark.parametrize("package", ["pc2grid", "signature"])
 def test_importing_a_package_loads_no_library(package: str) -> None:
     code = (
