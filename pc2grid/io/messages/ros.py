@@ -1,8 +1,9 @@
 """ROS messages, decoded from CDR (ROS 2) or ROS 1 serialisation.
 
-Own decoders, field by field in the order of `ros_definitions`, because those of kiss-icp and of rosbags were
-measured to be 9 and more times slower on clouds and images. `decoder_for` first checks that the log's own
-definition of the type has the layout decoded here. Large arrays stay views of the log's bytes.
+Clouds, scans and images have own decoders, field by field in the order of `ros_definitions`, because those of
+kiss-icp and of rosbags were measured to be 9 and more times slower. `decoder_for` first checks that the log's
+own definition of the type has the layout decoded here. Large arrays stay views of the log's bytes. All other
+messages are decoded by rosbags, with the log's own definition.
 """
 
 from __future__ import annotations
@@ -35,7 +36,6 @@ from pc2grid.io.messages.types import (
 # Counts that no real message reaches: a damaged one is refused before memory is allocated for it.
 _MOST_CLOUD_FIELDS = 1000
 _MOST_DISTORTION = 100
-_MOST_TRANSFORMS = 100_000
 
 
 class Reader:
@@ -139,48 +139,60 @@ def _compressed_image(r: Reader) -> CompressedImage:
     return CompressedImage(r.header(), r.text(), r.blob())
 
 
-def _camera_info(r: Reader) -> CameraInfo:
-    header = r.header()
-    height, width = r.take("II")
-    model, d, k = r.text(), r.array("f8"), r.array("f8", 9)
-    if len(d) > _MOST_DISTORTION:
-        raise PointCloudError(f"a CameraInfo with {len(d)} numbers of distortion")
-    r.array("f8", 9)
-    p = r.array("f8", 12)
-    return CameraInfo(header, height, width, model, tuple(d.tolist()), tuple(k.tolist()), tuple(p.tolist()))
-
-
-def _odometry(r: Reader) -> Odometry:
-    header, child = r.header(), r.text().lstrip("/")
-    return Odometry(header, child, _seven(r.take("ddddddd")))
-
-
-def _pose_stamped(r: Reader) -> PoseStamped:
-    return PoseStamped(r.header(), _seven(r.take("ddddddd")))
-
-
-def _pose_with_covariance(r: Reader) -> PoseStamped:
-    header, pose = r.header(), _seven(r.take("ddddddd"))
-    return PoseStamped(header, pose, tuple(r.array("f8", 36).tolist()))
-
-
-def _transforms(r: Reader) -> tuple[Transform, ...]:
-    count = int(r.number("I"))
-    if count > _MOST_TRANSFORMS:
-        raise PointCloudError(f"a tf message with {count} transforms")
-    return tuple(Transform(r.header(), r.text().lstrip("/"), _seven(r.take("ddddddd"))) for _ in range(count))
-
-
-def _seven(values: tuple[Any, ...]) -> Seven:
-    x, y, z, qx, qy, qz, qw = values
-    return (x, y, z, qx, qy, qz, qw)
-
-
 _PARSERS: dict[str, Callable[[Reader], Any]] = {
     "sensor_msgs/PointCloud2": _point_cloud,
     "sensor_msgs/LaserScan": _laser_scan,
     "sensor_msgs/Image": _image,
     "sensor_msgs/CompressedImage": _compressed_image,
+}
+
+
+# --- messages that rosbags decodes, with the names of their fields in small letters --------------------
+
+
+def _camera_info(m: Any) -> CameraInfo:
+    if len(m.d) > _MOST_DISTORTION:
+        raise PointCloudError(f"a CameraInfo with {len(m.d)} numbers of distortion")
+    d, k, p = (tuple(values.tolist()) for values in (m.d, m.k, m.p))
+    return CameraInfo(_header(m.header), m.height, m.width, m.distortion_model, d, k, p)
+
+
+def _odometry(m: Any) -> Odometry:
+    pose = m.pose.pose
+    return Odometry(_header(m.header), m.child_frame_id.lstrip("/"), _seven(pose.position, pose.orientation))
+
+
+def _pose_stamped(m: Any) -> PoseStamped:
+    return PoseStamped(_header(m.header), _seven(m.pose.position, m.pose.orientation))
+
+
+def _pose_with_covariance(m: Any) -> PoseStamped:
+    pose = m.pose.pose
+    return PoseStamped(
+        _header(m.header), _seven(pose.position, pose.orientation), tuple(m.pose.covariance.tolist())
+    )
+
+
+def _transforms(m: Any) -> tuple[Transform, ...]:
+    return tuple(
+        Transform(
+            _header(edge.header),
+            edge.child_frame_id.lstrip("/"),
+            _seven(edge.transform.translation, edge.transform.rotation),
+        )
+        for edge in m.transforms
+    )
+
+
+def _header(m: Any) -> Header:
+    return Header(m.stamp.sec * 1_000_000_000 + m.stamp.nanosec, m.frame_id.lstrip("/"))
+
+
+def _seven(p: Any, q: Any) -> Seven:
+    return (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+
+
+_CONVERTERS: dict[str, Callable[[Any], Any]] = {
     "sensor_msgs/CameraInfo": _camera_info,
     "nav_msgs/Odometry": _odometry,
     "geometry_msgs/PoseStamped": _pose_stamped,
@@ -196,8 +208,7 @@ def decoder_for(channel: TopicInfo) -> Callable[[Bytes], Any]:
     Raises UnsupportedSchema for a type, an encoding or a definition of the type in the log that is not
     supported. The function raises PointCloudError for a message that is too short.
     """
-    parse = _PARSERS.get(channel.type)
-    if parse is None:
+    if channel.type not in _PARSERS and channel.type not in _CONVERTERS:
         raise UnsupportedSchema(
             f"{channel.topic}: messages of type {channel.type or 'unknown'} are not read",
             hint="supported: PointCloud2, LaserScan, depth Image or CompressedImage",
@@ -208,36 +219,69 @@ def decoder_for(channel: TopicInfo) -> Callable[[Bytes], Any]:
             hint="supported: cdr (ROS 2), ros1, and protobuf or json of Foxglove's types",
         )
     ros1 = channel.encoding == "ros1"
-    check_schema(channel, ros1)
-    return lambda data: parse(Reader(data, ros1=ros1))
+    text = _checked_schema(channel, ros1)
+    if channel.type in _PARSERS:
+        parse = _PARSERS[channel.type]
+        return lambda data: parse(Reader(data, ros1=ros1))
+    return _by_rosbags(channel, ros1, text)
 
 
-def check_schema(channel: TopicInfo, ros1: bool) -> None:
-    """Raise UnsupportedSchema if the log defines the type differently from `ros_definitions`."""
-    type_name = "tf2_msgs/TFMessage" if channel.type == "tf/tfMessage" else channel.type
-    expected = ros_definitions.expected_layout(type_name, ros1)
+def _by_rosbags(channel: TopicInfo, ros1: bool, text: str) -> Callable[[Bytes], Any]:
+    """The decoder of a message by its definition in the log, or that of ROS if the text is empty."""
+    from rosbags.serde import SerdeError
+    from rosbags.typesys.base import TypesysError
+
+    known = channel.type if text else _name_of(channel)
+    store = ros_definitions.store_of(known, ros1, channel.schema_encoding, text)
+    name, convert = known.replace("/", "/msg/"), _CONVERTERS[channel.type]
+    parse = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+
+    def decode(data: Bytes) -> Any:
+        try:
+            return convert(parse(memoryview(data), name))
+        except (SerdeError, TypesysError) as error:
+            reason = " ".join(str(error).split())[:120]
+            raise PointCloudError(f"the message is not a {channel.type}: {reason}") from error
+
+    return decode
+
+
+def _name_of(channel: TopicInfo) -> str:
+    """The type as ROS calls it today."""
+    return "tf2_msgs/TFMessage" if channel.type == "tf/tfMessage" else channel.type
+
+
+def _checked_schema(channel: TopicInfo, ros1: bool) -> str:
+    """The log's definition of the type; empty if some writer left it out.
+
+    Raises UnsupportedSchema if it cannot be read, or has not the fields of ROS: exactly these for a type with
+    a parser, and at least these for the others.
+    """
     text = channel.schema.decode("utf-8", "replace").replace("\r\n", "\n")
     if not text.strip():
-        return  # some writers omit the text; then only the name can be compared
+        return ""
     known = ("ros1msg",) if ros1 else ("ros2msg", "ros2idl")
     if channel.schema_encoding not in known:
         raise UnsupportedSchema(
             f"{channel.topic}: schema encoding {channel.schema_encoding!r:.40} is not read",
             hint=f"supported: {', '.join(known)}",
         )
+    expected = ros_definitions.expected_layout(_name_of(channel), ros1)
     try:
         found = ros_definitions.layout_of(channel.type, channel.schema_encoding, text)
     except ValueError as error:
         raise UnsupportedSchema(
             f"{channel.topic}: the schema of {channel.type} is not readable: {error}"
         ) from error
-    if found != expected:
+    same = found == expected if channel.type in _PARSERS else set(expected) <= set(found)
+    if not same:
         differences = [f"{t} {n}" for n, t in dict.fromkeys((*found, *expected))]
         odd = [d for d in differences if (d in _named(found)) != (d in _named(expected))]
         raise UnsupportedSchema(
             f"{channel.topic}: the log defines {channel.type} differently from ROS: "
             f"{', '.join(odd[:4]) or 'the order of its fields'}"
         )
+    return text
 
 
 def _named(layout: ros_definitions.Layout) -> set[str]:

@@ -1,23 +1,27 @@
-"""Does a recording define a ROS message type as `ros` decodes it?
+"""Definitions of ROS message types: those of a recording, and those of ROS where it has none.
 
-`ros` decodes the fields of `_DECODED` in their order. A recording's own definition of a type is reduced to
-the flat list of its primitive fields and compared with ours, so that a type of the right name but another
-layout is refused instead of read wrongly.
+Both are parsed by `rosbags`. Messages whose arrays are large are decoded by `ros` itself; for these, the
+recording's definition is reduced to the flat list of its primitive fields and compared with that of ROS, so
+that a type of the right name but another layout is refused instead of read wrongly. All others are decoded by
+a store of rosbags with the recording's own definition, which may have more fields than ROS's.
 
-Definitions in the .msg language are parsed by `rosbags`, those in IDL here: the time that rosbags needs for
-nested parentheses in an IDL text grows by a factor of 100 a level (`const long b = ((1));` takes 20 s), so a
-crafted recording of a few bytes could keep it busy for ever.
+Texts are bounded before they are parsed, and only names and types of fields are registered.
 """
 
 from __future__ import annotations
 
 import functools
+import keyword
 import re
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rosbags.interfaces.typing import Typesdict
+    from rosbags.typesys.store import Typestore
 
 # ros2/common_interfaces, branch humble, without comments and constants. The layout is the wire format.
-_DECODED = """\
+_OF_ROS = """\
 float64 x
 float64 y
 float64 z
@@ -138,43 +142,21 @@ uint32 binning_x
 uint32 binning_y
 sensor_msgs/RegionOfInterest roi
 """
-_HEADER, _TIME = "std_msgs/Header", "builtin_interfaces/Time"
-
-# What .msg and IDL call the primitive types.
-_PRIMITIVES = {
-    "bool": "bool",
-    "boolean": "bool",
-    "byte": "uint8",
-    "octet": "uint8",
-    "char": "uint8",
-    "int8": "int8",
-    "uint8": "uint8",
-    "int16": "int16",
-    "short": "int16",
-    "uint16": "uint16",
-    "unsigned short": "uint16",
-    "int32": "int32",
-    "long": "int32",
-    "uint32": "uint32",
-    "unsigned long": "uint32",
-    "int64": "int64",
-    "long long": "int64",
-    "uint64": "uint64",
-    "unsigned long long": "uint64",
-    "float32": "float32",
-    "float": "float32",
-    "float64": "float64",
-    "double": "float64",
-    "string": "string",
-}
+_TIME = "builtin_interfaces/msg/Time"
+_SAME = {"byte": "uint8", "char": "uint8", "octet": "uint8"}
+"""Types of one layout."""
+_ROS_1_HEADER = "uint32 seq\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+_ROS_2_HEADER = "builtin_interfaces/Time stamp\nstring frame_id\n"
 
 # The known types flatten to some tens of fields; their published definitions with all comments have up to
 # 15,000 characters. The limits bound the time for a crafted text to half a second.
 _MOST_FIELDS = 1000
 _MOST_CHARACTERS = 1 << 16
+_MOST_ITEMS = 100_000
+"""Of a sequence in a message that rosbags decodes; no real one comes near."""
+_NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
 Layout = tuple[tuple[str, str], ...]  # (path of a field, its primitive type)
-_Fields = tuple[tuple[str, str, str], ...]  # (type, array suffix, name)
 
 
 def short_name(type_name: str) -> str:
@@ -183,120 +165,127 @@ def short_name(type_name: str) -> str:
 
 
 def expected_layout(type_name: str, ros1: bool) -> Layout:
-    """The layout that `ros` decodes. type_name : one of the types that it decodes."""
-    structs = dict(_decoded())
-    structs[_HEADER] = ((_TIME, "", "stamp"), ("string", "", "frame_id"))
-    if ros1:
-        structs[_HEADER] = (("uint32", "", "seq"), *structs[_HEADER])
-    structs[_TIME] = _time_fields(ros1)
-    return _flatten(short_name(type_name), structs)
+    """The layout of a type of ROS. type_name : one of those in `_OF_ROS`."""
+    return _flatten(short_name(type_name), _of_ros(ros1))
 
 
-@functools.lru_cache(maxsize=32)  # a log's topics share types, and each is looked at several times
 def layout_of(type_name: str, encoding: str, text: str) -> Layout:
     """The layout of a type in a schema text of a log.
 
     encoding : `ros2msg`, `ros1msg` or `ros2idl`. Raises ValueError if the text cannot be understood.
     """
-    if len(text) > _MOST_CHARACTERS:
-        raise ValueError(f"{type_name}: a definition of {len(text)} characters")
-    name = short_name(type_name)
-    structs = _parse_idl(text) if encoding == "ros2idl" else _parse_msg(name, text)
-    if encoding == "ros1msg" or _TIME not in structs:
-        structs[_TIME] = _time_fields(encoding == "ros1msg")
-    return _flatten(name, structs)
+    return _flatten(short_name(type_name), _parsed(short_name(type_name), encoding, text))
 
 
-def _time_fields(ros1: bool) -> _Fields:
-    return (("uint32" if ros1 else "int32", "", "sec"), ("uint32", "", "nanosec"))
+@functools.lru_cache(maxsize=32)
+def store_of(type_name: str, ros1: bool, encoding: str = "", text: str = "") -> Typestore:
+    """A store of rosbags with a type and all types that it consists of; the names of fields in small letters.
+
+    encoding, text : of the schema in the log, of which `layout_of` must be known; empty: as ROS defines it.
+    """
+    from rosbags.typesys.store import Typestore
+
+    store = Typestore(max_sequence_length=_MOST_ITEMS)
+    store.register(_parsed(short_name(type_name), encoding, text) if text else _of_ros(ros1))
+    return store
 
 
 @functools.cache
-def _decoded() -> dict[str, _Fields]:
-    return _parse_msg("geometry_msgs/Point", _DECODED)
+def _of_ros(ros1: bool) -> Typesdict:
+    header = _ROS_1_HEADER if ros1 else _ROS_2_HEADER
+    text = f"{_OF_ROS}===\nMSG: std_msgs/Header\n{header}"
+    return _parsed("geometry_msgs/Point", "ros1msg" if ros1 else "ros2msg", text)
 
 
-def _flatten(top: str, structs: dict[str, _Fields]) -> Layout:
+@functools.lru_cache(maxsize=32)  # a log's topics share types, and each is looked at several times
+def _parsed(name: str, encoding: str, text: str) -> Typesdict:
+    """The types in a definition; `name` is the first one of a text in the .msg language.
+
+    Raises ValueError.
+    """
+    from rosbags.interfaces import Nodetype
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
+
+    if len(text) > _MOST_CHARACTERS:
+        raise ValueError(f"{name}: a definition of {len(text)} characters")
+    try:
+        if encoding == "ros2idl":
+            found = get_types_from_idl(_plain_idl(text))
+        else:
+            ruled = re.sub(r"^=+[ \t]*$", "=" * 80, text, flags=re.MULTILINE)
+            found = get_types_from_msg(ruled, name.replace("/", "/msg/"))
+    except Exception as error:  # the parser raises whatever a malformed text leads it to
+        raise ValueError(f"{name}: not a definition that rosbags understands") from error
+    types: Typesdict = {
+        kind: ([], [(field.lower(), node) for field, node in fields]) for kind, (_, fields) in found.items()
+    }
+    # Of this, rosbags makes Python code.
+    names = [part for kind in types for part in kind.split("/")]
+    names += [field for _, fields in types.values() for field, _ in fields]
+    if not all(_NAME.fullmatch(part) and not keyword.iskeyword(part) for part in names):
+        raise ValueError(f"{name}: a name in its definition is not one of ROS")
+    if encoding == "ros1msg" or _TIME not in types:
+        sec: Any = (Nodetype.BASE, ("uint32" if encoding == "ros1msg" else "int32", 0))
+        types[_TIME] = ([], [("sec", sec), ("nanosec", (Nodetype.BASE, ("uint32", 0)))])
+    return types
+
+
+def _plain_idl(text: str) -> str:
+    """The structs and typedefs of an IDL text as rosbag2 writes it, without what the layout does not need.
+
+    The time that rosbags takes grows by a factor of 100 with each level of parentheses
+    (`const long b = ((1));` takes 20 s), and by 2 with each level of sequences.
+
+    Raises ValueError for a text in which such are left.
+    """
+    # Comments and strings in one pass, to the end if they do not end: so each character is looked at once.
+    text = re.sub(r"//[^\n]*|/\*.*?(?:\*/|\Z)|\"(?:[^\"\\]|\\.)*(?:\"|\Z)", "", text, flags=re.DOTALL)
+    text = re.sub(r"@\w+\s*(\((?:[^()]|\([^()]*\))*\))?", "", text)
+    text = re.sub(r"^[=#][^\n]*$|^IDL:[^\n]*$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"\bconst\b[^;]*;", "", text)
+    text = re.sub(r"\bmodule\s+\w+\s*\{\s*\}\s*;", "", text)  # of constants only
+    text = re.sub(r"\b(w?string)\s*<\s*\d+\s*>", r"\1", text)
+    if re.search(r"[()+*/%^|&~-]|<[^<>]*<", text):
+        raise ValueError("expressions or nested sequences")
+    return text
+
+
+def _flatten(top: str, types: Typesdict) -> Layout:
     flat: list[tuple[str, str]] = []
-    todo, seen = [(top, "")], 0
+    todo: list[tuple[Any, str]] = [((_named(), top.replace("/", "/msg/")), "")]
+    seen = 0
     while todo:
         seen += 1
         if seen + len(todo) > _MOST_FIELDS:  # a few lines can nest into billions
             raise ValueError(
                 f"{top}: its definitions nest without end, or into more than {_MOST_FIELDS} fields"
             )
-        kind, path = todo.pop()
-        if kind in _PRIMITIVES:
-            flat.append((path, _PRIMITIVES[kind]))
-            continue
-        if kind not in structs:
-            raise ValueError(f"{kind}: definition missing")
-        for inner, array, field in reversed(structs[kind]):
-            todo.append((inner, f"{path}.{field}{array}" if path else f"{field}{array}"))
+        (node, kind), path = todo.pop()
+        if node != _named():
+            flat.append((path, _SAME.get(kind[0], kind[0])))
+        elif kind not in types:
+            raise ValueError(f"{short_name(kind)}: definition missing")
+        else:
+            todo += reversed(list(_inside(path, types[kind][1])))
     return tuple(flat)
 
 
-def _parse_msg(name: str, text: str) -> dict[str, _Fields]:
-    """The types of a concatenated .msg definition, as rosbag2 and ROS 1 write it; `name` is the first."""
-    from rosbags.typesys import get_types_from_msg
-
-    text = re.sub(r"^=+[ \t]*$", "=" * 80, text, flags=re.MULTILINE)
-    try:
-        types = get_types_from_msg(text, name.replace("/", "/msg/"))
-    except Exception as error:  # the parser raises whatever a malformed text leads it to
-        raise ValueError(f"{name}: not a definition in the .msg language") from error
-    return {short_name(key): _fields(fields) for key, (_, fields) in types.items()}
-
-
-def _fields(parsed: Iterable[tuple[str, Any]]) -> _Fields:
-    """Fields as `rosbags` describes them: a kind of node with its content."""
+def _inside(path: str, fields: list[tuple[str, Any]]) -> Iterator[tuple[Any, str]]:
+    """The fields of a type with their paths; of an array or sequence what it holds. Raises ValueError."""
     from rosbags.interfaces import Nodetype
 
-    fields = []
-    for name, (node, content) in parsed:
-        array, inner, what = "", node, content
+    for name, (node, content) in fields:
+        inner, array = (node, content), ""
         if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            (inner, what), size = content
+            inner, size = content
             array = f"[{size}]" if node == Nodetype.ARRAY else "[]"
-        kind = short_name(str(what)) if inner == Nodetype.NAME else str(what[0])
-        fields.append((kind, array, name.lower()))
-    return tuple(fields)
+            if node == Nodetype.ARRAY and size > _MOST_FIELDS:  # rosbags writes code for each item
+                raise ValueError(f"{name}: an array of {size}")
+        yield inner, f"{path}.{name}{array}" if path else f"{name}{array}"
 
 
-def _parse_idl(text: str) -> dict[str, _Fields]:
-    """Structs of an IDL text as rosbag2 writes it (OMG IDL 4.2, the part that ROS 2 uses)."""
-    # Comments and strings in one pass, to the end if they do not end: so each character is looked at once.
-    text = re.sub(r"//[^\n]*|/\*.*?(?:\*/|\Z)|\"(?:[^\"\\]|\\.)*(?:\"|\Z)", "", text, flags=re.DOTALL)
-    text = re.sub(r"@\w+\s*(\((?:[^()]|\([^()]*\))*\))?", "", text)
-    text = re.sub(r"^[=#][^\n]*$|^IDL:[^\n]*$", "", text, flags=re.MULTILINE)
-    typedefs: dict[str, tuple[str, str]] = {}
-    for statement in re.split("[;{}]", text):
-        words = statement.split()
-        if words[:1] == ["typedef"] and words[-1].endswith("]"):
-            declared, _, size = " ".join(words[1:]).removesuffix("]").rpartition("[")
-            kind, _, alias = declared.rstrip().rpartition(" ")
-            typedefs[alias] = (kind, f"[{size}]")
-    structs: dict[str, _Fields] = {}
-    package = ""
-    for match in re.finditer(r"module\s+(\w+)|struct\s+(\w+)\s*\{([^{}]*)\}", text):
-        if match.group(1):
-            if match.group(1) != "msg":
-                package = match.group(1)
-            continue
-        fields = []
-        for member in match.group(3).split(";"):
-            words = member.split()
-            if not words:
-                continue
-            kind, name = " ".join(words[:-1]), words[-1].lower()
-            kind, array = typedefs.get(kind, (kind, ""))
-            sequence = re.fullmatch(r"sequence\s*<\s*([^,>]+?)\s*(?:,\s*\d+\s*)?>", kind)
-            if sequence:
-                kind, array = sequence.group(1), "[]"
-            kind = re.sub(r"^string<.*", "string", kind)
-            kind = kind if kind in _PRIMITIVES else short_name(kind)
-            if kind not in _PRIMITIVES and "/" not in kind:
-                kind = f"{package}/{kind}"
-            fields.append((kind, array, name))
-        structs[f"{package}/{match.group(2)}"] = tuple(fields)
-    return structs
+def _named() -> Any:
+    """What rosbags calls a field that is a message."""
+    from rosbags.interfaces import Nodetype
+
+    return Nodetype.NAME

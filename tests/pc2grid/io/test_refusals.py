@@ -237,7 +237,7 @@ def test_foxglove_topics_that_are_not_read(channel: TopicInfo, words: str) -> No
     ("kind", "data", "words"),
     [
         ("sensor_msgs/PointCloud2", b"\0\1", "shorter than its encapsulation header"),
-        ("tf2_msgs/TFMessage", b"\0\1\0\0" + struct.pack("<I", 100_001), "a tf message with 100001"),
+        ("tf2_msgs/TFMessage", b"\0\1\0\0" + struct.pack("<I", 100_001), "Invalid sequence length 100001"),
         ("sensor_msgs/PointCloud2", b"\0\1\0\0\1\0\0\0", "shorter than its schema"),
     ],
 )

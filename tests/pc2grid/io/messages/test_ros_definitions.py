@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import struct
 import time
 
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from pc2grid.errors import PointCloudError, UnsupportedSchema
+from pc2grid.io.message_source import TopicInfo
+from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.ros_definitions import expected_layout, layout_of
+from pc2grid.io.messages.types import Header, Odometry
 
 TYPES = [
     "sensor_msgs/PointCloud2", "sensor_msgs/LaserScan", "sensor_msgs/Image", "sensor_msgs/CompressedImage",
@@ -76,6 +81,75 @@ def test_published_texts_with_comments_constants_and_short_names() -> None:
 def test_nested_parentheses_in_idl_take_no_time(inside: str) -> None:
     text = "module a { " + inside.format("(" * 20_000 + "1" + ")" * 20_000) + " };"
     started = time.process_time()
-    with pytest.raises(ValueError, match="definition missing"):
+    with pytest.raises(ValueError, match="not a definition"):
         layout_of("sensor_msgs/LaserScan", "ros2idl", text)
     assert time.process_time() - started < 2.0
+
+
+ODOMETRY = """\
+module builtin_interfaces { module msg { struct Time { int32 sec; uint32 nanosec; }; }; };
+module std_msgs { module msg { struct Header { builtin_interfaces::msg::Time stamp; string frame_id; }; }; };
+module geometry_msgs { module msg {
+  typedef double double__36[36];
+  struct Point { double x; double y; double z; };
+  struct Quaternion { @default (value=1.0) double w; double x; double y; double z; };
+  struct Vector3 { double x; double y; double z; };
+  struct Pose { geometry_msgs::msg::Point position; geometry_msgs::msg::Quaternion orientation; };
+  struct PoseWithCovariance { geometry_msgs::msg::Pose pose; double__36 covariance; };
+  struct Twist { geometry_msgs::msg::Vector3 linear; geometry_msgs::msg::Vector3 angular; };
+  struct TwistWithCovariance { geometry_msgs::msg::Twist twist; double__36 covariance; };
+}; };
+module nav_msgs { module msg {
+  module Odometry_Constants { const uint8 SLIPPING = 1; };
+  struct Odometry {
+    std_msgs::msg::Header header;
+    sequence<string<8>> wheels;
+    string child_frame_id;
+    geometry_msgs::msg::PoseWithCovariance pose;
+    geometry_msgs::msg::TwistWithCovariance twist;
+  };
+}; };
+"""
+
+
+def odometry_of(definition: str) -> TopicInfo:
+    return TopicInfo(
+        topic="/odom",
+        type="nav_msgs/Odometry",
+        encoding="cdr",
+        schema_encoding="ros2idl",
+        schema=definition.encode(),
+    )
+
+
+def test_odometry_with_a_field_and_an_order_of_its_own() -> None:
+    """As a fork of ROS may define it: the recording says where everything is."""
+    data = b"\0\1\0\0" + struct.pack("<iI", 3, 5)
+    data += struct.pack("<I5sxxx", 5, b"odom\0") + struct.pack("<II3sx", 1, 3, b"FL\0")
+    data += struct.pack("<I10sxx", 10, b"base_link\0")
+    data += bytes(-(len(data) - 4) % 8) + struct.pack("<7d", 1, 2, 3, 1, 0, 0, 0) + bytes(8 * (36 + 6 + 36))
+    found = decoder_for(odometry_of(ODOMETRY))(data)
+    assert found == Odometry(Header(3_000_000_005, "odom"), "base_link", (1, 2, 3, 0, 0, 0, 1))
+    with pytest.raises(PointCloudError, match="not a nav_msgs/Odometry"):
+        decoder_for(odometry_of(ODOMETRY))(data[:-20])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("string child_frame_id", "string child", "differently from ROS: .*string child"),
+        ("sequence<string<8>> wheels", "sequence<sequence<string<8>>> wheels", "not readable"),
+        ("double__36[36]", "double__36[(36)]", "not readable"),
+        ("sequence<string<8>> wheels", "std_msgs::msg::Header wheels[2000000000]", "not readable"),
+    ],
+)
+def test_odometry_that_is_refused(old: str, new: str, words: str) -> None:
+    with pytest.raises(UnsupportedSchema, match=words):
+        decoder_for(odometry_of(ODOMETRY.replace(old, new)))
+
+
+@pytest.mark.parametrize("name", ["import", "x\nimport os", "__class__", "a-b"])
+def test_no_name_in_a_definition_becomes_code(name: str) -> None:
+    text = f"float64 {name}\n" + FIELD_WITH_CONSTANTS
+    with pytest.raises((UnsupportedSchema, ValueError)):
+        layout_of("sensor_msgs/PointField", "ros2msg", text)
