@@ -35,6 +35,7 @@ from pc2grid.model import (
     part_name,
 )
 from pc2grid.observer import Observer
+from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.time_span import TimeSpan
 
 if TYPE_CHECKING:
@@ -145,19 +146,20 @@ def build_maps(
 
     parts, track = _map(reported(), config, observer, recognizer)
     sensor = log.choose().sensor
+    planar = SENSOR_MODELS[sensor].planar
     if not any(len(part.trajectory) for part in parts):
         raise NoScans(f"{log.info.path}: no scans in the part asked for", hint="check --start and --duration")
-    if sensor == "laser" and not has_odometry:
+    if planar and not has_odometry:
         check_followed(_in_order([part.trajectory for part in parts]), str(log.info.path))
     kept = _of_use(parts)
     read = log.report()
     read = dataclasses.replace(read, warnings=(*read.warnings, *_ride_warnings(track)))
-    if config.projection.points_voxel_m is not None and sensor == "laser":
+    if config.projection.points_voxel_m is not None and planar:
         no_points = "a 2D laser shows no points in space, so none are kept"
         read = dataclasses.replace(read, warnings=(*read.warnings, no_points))
     reached = [part.storey for part in kept]
     floors, heights_m = floor_names(track.storeys, reached), floor_heights(track.storeys, reached)
-    reports = _reports(read, session, parts, kept, floors, slopes_unseen=sensor == "laser")
+    reports = _reports(read, session, parts, kept, floors, slopes_unseen=planar)
     maps = []
     for number, (part, report) in enumerate(zip(kept, reports, strict=True)):
         graph, submaps = divide(part.grid, config.partition)
@@ -351,19 +353,19 @@ def _map(
             kept = stack.enter_context(closing(KeyframePoints(voxel_m, config.projection.max_range_m)))
         rest = iter(scans)
         begin = [scan for scan in (next(rest, None),) if scan is not None]
-        depth = bool(begin) and begin[0].sensor == "depth"
+        narrow = bool(begin) and SENSOR_MODELS[begin[0].sensor].narrow
         closer = LoopCloser(
             keyframes,
             recognizer=recognizer,
             projection=config.projection,
-            parameters=CAMERA_LOOPS if depth else LOOPS,
-            local_map_parameters=CAMERA_LOCAL_MAPS if depth else LOCAL_MAPS,
+            parameters=CAMERA_LOOPS if narrow else LOOPS,
+            local_map_parameters=CAMERA_LOCAL_MAPS if narrow else LOCAL_MAPS,
         )
         selection = _KeyframeSelection(keyframes, config.projection, closer)
         for scan in chain(begin, rest):
             tracked = tracker.track(scan)
             selection.add(tracked, index=len(stamps))
-            if kept is not None and tracked.keyframe and scan.sensor != "laser":
+            if kept is not None and tracked.keyframe and not SENSOR_MODELS[scan.sensor].planar:
                 kept.append(len(stamps), tracked.registered.scan)
             stamps.append(scan.stamp_ns)
             poses.extend(tracked.registered.T_session_base.ravel())

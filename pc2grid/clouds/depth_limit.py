@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pc2grid.arrays import F64
 from pc2grid.clouds.parameters import CLOUD_PARAMETERS, CloudParameters
 from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.sensor_model import SENSOR_MODELS
 
 
 class DepthLimit:
@@ -33,8 +34,8 @@ class DepthLimit:
     @property
     def unbiased_m(self) -> float:
         """Depth up to which the limit cuts off less than one pixel in forty."""
-        p, farthest_m = self._parameters, self._farthest_m
-        return farthest_m - p.limit_sigmas * p.camera_noise_per_m2 * farthest_m**2
+        noise_per_m2 = SENSOR_MODELS["depth"].noise_per_m2
+        return self._farthest_m - self._parameters.limit_sigmas * noise_per_m2 * self._farthest_m**2
 
     def observe(self, points_m: NDArray[np.floating], T_base_sensor: F64) -> None:
         """Take in the points (N, 3) of a scan, base frame, of a camera at `T_base_sensor` (4, 4)."""

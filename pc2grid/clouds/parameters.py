@@ -47,8 +47,6 @@ class CloudParameters:
 
     Planar scan:
 
-    camera_noise_per_m2 : standard deviation of a depth over its square, as of stereo and structured light
-        (Khoshelham and Elberink 2012 give 0.0014 for the Kinect).
     limit_sigmas : hits so many standard deviations before the farthest depth of a camera, or beyond, are left
         out; see `pc2grid.clouds.depth_limit`.
     max_gap_bins : bearings without a return between two with one count as seen up to this many.
@@ -81,7 +79,6 @@ class CloudParameters:
     sparse_factor: float = 4.0
     max_flatness: float = 0.3
 
-    camera_noise_per_m2: float = 0.0015
     limit_sigmas: float = 2.0
     max_gap_bins: int = 5
 

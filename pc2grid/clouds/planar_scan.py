@@ -19,6 +19,7 @@ from pc2grid.clouds.parameters import CLOUD_PARAMETERS, CloudParameters
 from pc2grid.clouds.slope import flatten_slopes
 from pc2grid.config import ProjectionConfig
 from pc2grid.model import SensorKind
+from pc2grid.sensor_model import SENSOR_MODELS
 
 BEARINGS = 1440
 """Bearings of a planar scan: a quarter of a degree is one grid cell of 5 cm at a range of 12 m."""
@@ -94,6 +95,7 @@ def project_to_plane(
     """
     from pc2grid.clouds._kernels import scan_bearings
 
+    model = SENSOR_MODELS[sensor]
     origin = np.asarray(sensor_m, dtype=np.float64)
     points = np.asarray(points_m, dtype=np.float32)
     if ground is None:
@@ -101,11 +103,11 @@ def project_to_plane(
         cell_m = 0.5 * config.resolution_m  # a planar laser has few beams: nearly all of them are kept
     else:
         plane, band = np.array([*ground.normal, ground.offset_m]), (config.band_min_m, config.band_max_m)
-        if sensor == "depth":
+        if model.narrow:
             points = flatten_slopes(points, origin, ground, band, parameters)
         cell_m = config.resolution_m
     # Two standard deviations of the noise on either side of the mean.
-    depths = (cell_m, 4.0 * parameters.camera_noise_per_m2 if sensor == "depth" else 0.0)
+    depths = (cell_m, 4.0 * model.noise_per_m2)
     nearest, reach, surfaces = scan_bearings(
         points, origin, plane, band, config.max_range_m, depths, BEARINGS
     )

@@ -14,6 +14,7 @@ from pc2grid.io.frames import FrameTree
 from pc2grid.io.message_source import Choice, MessageSource, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Header
+from pc2grid.sensor_model import SENSOR_MODELS
 
 _BASE_FRAMES = ("base_link", "base_footprint")  # REP-105 and REP-120
 
@@ -98,7 +99,8 @@ class _Planner:
         if more:
             reason += f", with {', '.join(t.topic for t in more)}"
         cameras = [
-            topics.camera_info_topic(t, found_topics) if sensor == "depth" else None for t in (scans, *more)
+            topics.camera_info_topic(t, found_topics) if SENSOR_MODELS[sensor].image else None
+            for t in (scans, *more)
         ]
         odometry, why_odometry = topics.odometry_topic(found_topics, config.odometry)
         tf_topics = [t for t in found_topics if t.type in topics.TF and t.message_count != 0]

@@ -31,6 +31,7 @@ from pc2grid.io.read_plan import Plan, is_static, tolerant
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
 from pc2grid.io.sensors.scan_decoder import ScanDecoder
 from pc2grid.model import Scan
+from pc2grid.sensor_model import SENSOR_MODELS
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +111,8 @@ class Stream:
         self._last_ns: int | None = None
         self._last_log_ns: int | None = None
         self._error: Pc2GridError | None = None
-        self._sweep_ns = 0 if plan.choice.sensor == "depth" else parameters.sweep_ns
+        self._model = SENSOR_MODELS[plan.choice.sensor]
+        self._sweep_ns = 0 if self._model.image else parameters.sweep_ns
         self._odometry_frame = plan.odometry_frame
         self._handlers = self._make_handlers()
 
@@ -365,7 +367,7 @@ class Stream:
         plan = self._plan
         if plan.sensor_is_base:
             # REP-103: images are in optical axes (z forward); without tf they are turned here.
-            optical = plan.choice.sensor == "depth" or frame.endswith("_optical") or "_optical_" in frame
+            optical = self._model.image or frame.endswith("_optical") or "_optical_" in frame
             return T_BODY_OPTICAL if optical else np.eye(4)
         base = plan.choice.base_frame
         if frame != base and frame not in self._frames:

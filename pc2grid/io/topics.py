@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pc2grid.errors import NoScans, TopicError, UnsupportedSchema
 from pc2grid.io.message_source import TopicInfo
 from pc2grid.model import SensorKind
+from pc2grid.sensor_model import SENSOR_MODELS
 
 SENSORS: dict[str, SensorKind] = {
     "sensor_msgs/PointCloud2": "lidar",
@@ -147,7 +148,7 @@ def odometry_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[Top
 
 def _fits(topic: TopicInfo, topics: Sequence[TopicInfo]) -> bool:
     kind = SENSORS.get(topic.type)
-    if kind != "depth":
+    if kind is None or not SENSOR_MODELS[kind].image:
         return kind is not None
     return "depth" in topic.topic.lower() and any(t.type in CAMERA_INFOS for t in topics)
 

@@ -7,7 +7,6 @@ the file with the travel: 0.4 GB for an hour of a lidar at 0.5 m/s.
 
 from __future__ import annotations
 
-import math
 import tempfile
 from array import array
 from collections.abc import Iterator
@@ -15,11 +14,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from pc2grid.arrays import F32, F64, BoolGrid
-from pc2grid.clouds.parameters import CLOUD_PARAMETERS, CloudParameters
 from pc2grid.clouds.voxel_cloud import VoxelCloud
 from pc2grid.errors import OutputError
 from pc2grid.geometry import transform_points
 from pc2grid.model import PointMap, Scan
+from pc2grid.sensor_model import SENSOR_MODELS
 
 _STEPS = 32767  # of int16, from the origin of the base to the farthest point
 _MOUNTED_M = 3.0  # farthest place of a sensor on its base
@@ -32,19 +31,16 @@ class KeyframePoints:
     voxel_m : edge of a voxel. max_range_m : returns farther than this from the sensor are left out.
     """
 
-    def __init__(
-        self, voxel_m: float, max_range_m: float, parameters: CloudParameters = CLOUD_PARAMETERS
-    ) -> None:
+    def __init__(self, voxel_m: float, max_range_m: float) -> None:
         self._voxel_m, self._max_range_m = voxel_m, max_range_m
-        # A camera measures farther surfaces with a noise that is larger than a voxel.
-        self._camera_range_m = min(max_range_m, math.sqrt(voxel_m / parameters.camera_noise_per_m2))
         self._step_m = (max_range_m + _MOUNTED_M) / _STEPS
         self._file = tempfile.SpooledTemporaryFile(max_size=_IN_MEMORY_BYTES)  # noqa: SIM115
         self._index, self._ends = array("q"), array("q", [0])
 
     def append(self, index: int, scan: Scan) -> None:
         """Add a deskewed scan, number `index` of the session. Raises OutputError if the disk is full."""
-        range_m = self._camera_range_m if scan.sensor == "depth" else self._max_range_m
+        # A camera measures farther surfaces with a noise that is larger than a voxel.
+        range_m = min(self._max_range_m, SENSOR_MODELS[scan.sensor].range_of_noise_m(self._voxel_m))
         away = scan.points_m - scan.T_base_sensor[:3, 3].astype(np.float32)
         near = np.einsum("ij,ij->i", away, away) < range_m**2
         cloud = VoxelCloud(self._voxel_m)

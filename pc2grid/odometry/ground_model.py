@@ -12,6 +12,7 @@ from pc2grid.clouds.sampling import random_subset
 from pc2grid.geometry import SE2, invert_pose
 from pc2grid.model import Scan
 from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.sensor_model import SENSOR_MODELS
 
 _UPRIGHT_HEIGHT_M, _UPRIGHT_TILT_RAD = 0.05, math.radians(0.5)
 """A base on wheels keeps its height and its tilt within these, as its odometry reports them: an EKF in three
@@ -52,7 +53,7 @@ class GroundModel:
         is assumed. points_m : (N, 3) points of the scan that are used, base frame. rolling : by default what
         `is_rolling` says.
         """
-        if scan.sensor == "laser":
+        if SENSOR_MODELS[scan.sensor].planar:
             return cls(None, rolling=True, parameters=parameters)
         sensor_m = scan.T_base_sensor[:3, 3]
         assumed = assumed_ground(scan.T_base_sensor)

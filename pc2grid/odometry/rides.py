@@ -21,6 +21,7 @@ from pc2grid.clouds.upright import CAMERA_UPRIGHT, UPRIGHT, vertical_of
 from pc2grid.geometry import SE2
 from pc2grid.model import Scan, SensorKind, Storey
 from pc2grid.odometry.floor_ahead import FloorAhead
+from pc2grid.sensor_model import SENSOR_MODELS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,10 +174,11 @@ class _Slope:
 
     def __init__(self, sensor: SensorKind, parameters: RideParameters) -> None:
         self._parameters = parameters
-        self._factor = parameters.camera_factor if sensor == "depth" else 1.0
-        self._upright = CAMERA_UPRIGHT if sensor == "depth" else UPRIGHT
+        model = SENSOR_MODELS[sensor]
+        self._factor = parameters.camera_factor if model.narrow else 1.0
+        self._upright = CAMERA_UPRIGHT if model.narrow else UPRIGHT
         self._latest: deque[tuple[float, float]] = deque(maxlen=parameters.measurements)
-        self._ahead = FloorAhead() if sensor == "depth" else None
+        self._ahead = FloorAhead() if model.narrow else None
         self._vertical: F64 | None = None
         self._unmeasured_m = math.inf
         self._tilted = False

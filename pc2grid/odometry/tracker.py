@@ -38,6 +38,7 @@ from pc2grid.odometry.point_to_line import Match
 from pc2grid.odometry.registration import KissRegistration
 from pc2grid.odometry.rides import Ride, RideWatch
 from pc2grid.odometry.surface_map import SurfaceMap
+from pc2grid.sensor_model import SENSOR_MODELS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +114,8 @@ class Tracker:
         """Begin with a scan whose base is at a place of the session frame, on wheels or in the hand."""
         points = self._deskewed(scan, *self._motion.within(scan, None))
         self._ground = GroundModel.start(points, scan, self._parameters, rolling=rolling)
-        self._camera_on_wheels = scan.sensor == "depth" and self._ground.rolling
+        narrow = SENSOR_MODELS[scan.sensor].narrow
+        self._camera_on_wheels = narrow and self._ground.rolling
         self._maps = MatchingMaps(
             self._projection.max_range_m,
             self._parameters,
@@ -121,7 +123,7 @@ class Tracker:
         )
         self._health = HealthJudge(rolling=self._ground.rolling, parameters=self._parameters)
         self.kiss = self._new_kiss()
-        self._surfaces = SurfaceMap() if scan.sensor == "depth" and not self._ground.rolling else None
+        self._surfaces = SurfaceMap() if narrow and not self._ground.rolling else None
         pose = at.lift() @ self._ground.start_pose()
         self._register(scan, points, pose, Prediction(motion=np.eye(4), seconds=0.0))
         planar_scan = self._project(points, scan, _split(pose)[1])
@@ -307,7 +309,7 @@ class Tracker:
 
     def _project(self, points: F32, scan: Scan, T_level_base: F64) -> PlanarScan:
         """Reduce points (N, 3) of the base frame to the plane."""
-        if scan.sensor == "depth":
+        if SENSOR_MODELS[scan.sensor].noise_per_m2:
             self._depth_limit.observe(points, scan.T_base_sensor)
         sensor_m, ground = scan.T_base_sensor[:3, 3], self._ground.ground
         if ground is not None:
@@ -323,7 +325,7 @@ class Tracker:
             config=self._projection,
             sensor=scan.sensor,
         )
-        if scan.sensor != "depth":
+        if not SENSOR_MODELS[scan.sensor].noise_per_m2:
             return planar_scan
         return self._depth_limit.before(planar_scan, T_level_base @ scan.T_base_sensor)
 

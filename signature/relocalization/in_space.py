@@ -20,6 +20,7 @@ from pc2grid.clouds.voxel_cloud import VoxelCloud
 from pc2grid.geometry import SE2, transform_points
 from pc2grid.matching.icp_in_space import RAYS, SpatialFit, SpatialView, register_in_space
 from pc2grid.model import Health, PointMap, RegisteredScan
+from pc2grid.sensor_model import SENSOR_MODELS
 from signature.database import SubmapDatabase
 from signature.relocalization.answer import Answer, Moment
 from signature.relocalization.confidence import LIMITS
@@ -79,7 +80,7 @@ class ViewSpacing:
             self.__init__()  # type: ignore[misc]
             return False
         at_m = registered.T_session_base[:3, 3]
-        if registered.scan.sensor == "laser":
+        if SENSOR_MODELS[registered.scan.sensor].planar:
             return False
         if self._last_m is not None:
             step_m = float(np.linalg.norm(at_m - self._last_m))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pc2grid.errors import one_line
+from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid_cli.console import print_json, warn
 from pc2grid_cli.options import AsJson, Assignments, Recover, Topic, make_config
 
@@ -156,7 +157,9 @@ def describe(path: Path, *, topic: str | None = None, recover: bool = False) -> 
                 "topic": chosen.topic,
                 "sensor": chosen.sensor,
                 "odometry_topic": chosen.odometry_topic,
-                "camera_topic": _camera_topic(found, chosen.topic) if chosen.sensor == "depth" else None,
+                "camera_topic": _camera_topic(found, chosen.topic)
+                if SENSOR_MODELS[chosen.sensor].image
+                else None,
                 "base_frame": chosen.base_frame,
                 "sensor_frame": chosen.sensor_frame or "",
                 "reason": chosen.reason,

@@ -14,6 +14,7 @@ from pc2grid.config import ProjectionConfig
 from pc2grid.geometry import SE2
 from pc2grid.mapping.occupancy import OCCUPANCY
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.simulate.passage import outline_mask
 from pc2grid.submaps.isovist import isovist
 
@@ -72,14 +73,12 @@ class TrueFloor:
     def __init__(self, session: Session, projection: ProjectionConfig) -> None:
         self._session = session
         self._projection = projection
-        kind, plan = session.sensor.kind, session.grid
+        planar, plan = SENSOR_MODELS[session.sensor.kind].planar, session.grid
         height_m = float(session.sensor.T_base_sensor[2, 3])
-        self._band = (
-            (height_m, height_m) if kind == "laser" else (projection.band_min_m, projection.band_max_m)
-        )
+        self._band = (height_m, height_m) if planar else (projection.band_min_m, projection.band_max_m)
         self._walls: BoolGrid = plan.occupied
         self._solid: BoolGrid = self._walls | _standing(session, self._band)
-        blocking = self._solid if kind == "laser" else self._walls
+        blocking = self._solid if planar else self._walls
         # In the simulator unknown cells are empty space.
         self._open = OccupancyGrid(
             cells=np.where(blocking, OCCUPIED, FREE).astype(np.int8),
@@ -100,7 +99,7 @@ class TrueFloor:
         T = sensor.T_base_sensor
         points = (reading.values_m[kept, None] * sensor.directions[kept]) @ T[:3, :3].T + T[:3, 3]
         near = np.linalg.norm(points[:, :2] - T[:2, 3], axis=1) <= self._projection.max_range_m
-        if sensor.kind != "laser":
+        if not SENSOR_MODELS[sensor.kind].planar:
             near &= (points[:, 2] >= self._band[0]) & (points[:, 2] <= self._band[1])
         poses = session.drive.at(reading.time_s + sensor.offsets_s[kept][near])
         c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])

@@ -33,6 +33,7 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind, Trajectory
 from pc2grid.odometry.tracker import Tracker
+from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid_lab.experiments.program import digest_of_sources
 from pc2grid_lab.experiments.registered_session import register
 from pc2grid_lab.experiments.sensor_matrix import query_start
@@ -266,7 +267,7 @@ def _has_map(site: Site) -> bool:
 
 def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
     """Draw the grid at the true poses and, of a lidar, keep the clouds."""
-    step_m = SITE.keyframe_m if site.sensor == "laser" else SITE.lidar_keyframe_m
+    step_m = SITE.keyframe_m if SENSOR_MODELS[site.sensor].planar else SITE.lidar_keyframe_m
     builder, last = GridBuilder(config.projection), None
     path, clouds = [], []
     for scan, T_world_base in scans:
@@ -277,13 +278,13 @@ def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
         if (
             last is not None
             and math.hypot(step.x, step.y) < step_m
-            and (abs(step.yaw) < SITE.keyframe_rad or site.sensor != "laser")
+            and (abs(step.yaw) < SITE.keyframe_rad or not SENSOR_MODELS[site.sensor].planar)
         ):
             continue
         last = pose
         tracked = Tracker(config.registration, config.projection).start(scan)
         builder.add(tracked.planar_scan, pose)
-        if site.sensor != "laser":
+        if not SENSOR_MODELS[site.sensor].planar:
             path.append(T_world_base)
             clouds.append(_thinned(transform_points(T_world_base, tracked.registered.scan.points_m)))
     site.folder.mkdir(parents=True, exist_ok=True)
@@ -317,7 +318,7 @@ def _save_query(
         return
     truth = session.T_world_odom() @ SE2(*session.T_odom_base[-1].tolist())
     session.save(stem.with_suffix(".npz"))
-    if site.sensor == "laser":
+    if SENSOR_MODELS[site.sensor].planar:
         save_beams(stem.with_suffix(".ranges.npz"), [registered.scan for registered in seen])
     else:
         T_odom_query = seen[-1].T_session_base
