@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import FrameError, NoScans, PointCloudError
@@ -86,66 +86,85 @@ def tolerant(decode: Callable[[Any], Any], data: Any, otherwise: Any) -> Any:
         return otherwise
 
 
+class _Sensors(NamedTuple):
+    """The topic of the scans, those of more sensors of its kind, and the calibration of each."""
+
+    scans: TopicInfo
+    more: tuple[TopicInfo, ...]
+    cameras: list[TopicInfo | None]
+    reason: str
+
+    def need(self, base: str | None) -> None:
+        """Raise FrameError if there are several sensors, and no tf that says where on the robot they are."""
+        if self.more and base is None:
+            first, second = self.scans.topic, self.more[0].topic
+            raise FrameError(
+                f"{first}, {second}: without tf their places on the robot are not known",
+                hint=f"record /tf_static too, or choose one: --topic {first}",
+            )
+
+
 class _Planner:
     def __init__(self, source: MessageSource, config: ReadConfig, frames: FrameTree) -> None:
         self._source, self._config, self._frames = source, config, frames
         self._topics = source.info.topics
 
     def plan(self) -> Plan:
-        config, found_topics, frames = self._config, self._topics, self._frames
-        scans, reason = topics.scan_topic(found_topics, config.topic)
-        sensor = topics.SENSORS[scans.type]
-        more = topics.further_scan_topics(found_topics, config.topic)
-        if more:
-            reason += f", with {', '.join(t.topic for t in more)}"
-        cameras = [
-            topics.camera_info_topic(t, found_topics) if SENSOR_MODELS[sensor].image else None
-            for t in (scans, *more)
-        ]
-        odometry, why_odometry = topics.odometry_topic(found_topics, config.odometry)
-        tf_topics = [t for t in found_topics if t.type in topics.TF and t.message_count != 0]
+        sensors = self._sensors()
+        odometry, why_odometry = topics.odometry_topic(self._topics, self._config.odometry)
+        tf_topics = [t for t in self._topics if t.type in topics.TF and t.message_count != 0]
         self._read_static([t for t in tf_topics if is_static(t)])
-
-        first_ns, headers = self._first_headers(scans)
+        first_ns, headers = self._first_headers(sensors.scans)
         sensor_frame = headers[0].frame if headers else ""  # none can be decoded: the stream counts them
-        child = self._odometry_child(odometry)
         moving = [t for t in tf_topics if not is_static(t)]
-        in_tf = odometry.type in topics.TF if odometry else config.odometry is None
+        in_tf = odometry.type in topics.TF if odometry else self._config.odometry is None
+        child = self._odometry_child(odometry)
         base = self._search_tf(moving, sensor_frame, child, first_ns, odometry_too=in_tf)
-
-        if more and base is None:
-            raise FrameError(
-                f"{scans.topic}, {more[0].topic}: without tf their places on the robot are not known",
-                hint=f"record /tf_static too, or choose one: --topic {scans.topic}",
-            )
+        sensors.need(base)
         sensor_is_base = base is None
         if base is None:
-            base = sensor_frame or config.base_frame or "sensor"
+            base = sensor_frame or self._config.base_frame or "sensor"
         odometry_frame = self._odometry_frame(base) if in_tf and not sensor_is_base else None
-        if in_tf:
-            odometry = None
         if odometry_frame is not None:
             why_odometry = f"odometry from tf, {odometry_frame} -> {base}"
-        moves = odometry_frame is not None or (
-            not sensor_is_base
-            and sensor_frame in frames
-            and frames.connected(base, sensor_frame)
-            and frames.moving(base, sensor_frame)
-        )
-        named = odometry.topic if odometry else (moving[0].topic if odometry_frame and moving else None)
+        named = [*moving[:1]] if odometry_frame else []
+        named += [odometry] if odometry and not in_tf else []
         choice = Choice(
-            topic=scans.topic,
-            sensor=sensor,
-            odometry_topic=named,
+            topic=sensors.scans.topic,
+            sensor=topics.SENSORS[sensors.scans.type],
+            odometry_topic=named[0].topic if named else None,
             base_frame=base,
             sensor_frame=sensor_frame or None,
-            reason=f"{reason}; {why_odometry}",
+            reason=f"{sensors.reason}; {why_odometry}",
         )
-        stampless = bool(headers) and all(header.stamp_ns == 0 for header in headers)
-        further = tuple(zip(more, cameras[1:], strict=True))
         return Plan(
-            choice, scans, cameras[0], odometry, odometry_frame, moves, sensor_is_base, stampless, further
+            choice=choice,
+            scans=sensors.scans,
+            camera=sensors.cameras[0],
+            odometry=None if in_tf else odometry,
+            odometry_frame=odometry_frame,
+            tf_moves=odometry_frame is not None or self._sensor_moves(base, sensor_frame, sensor_is_base),
+            sensor_is_base=sensor_is_base,
+            stampless=bool(headers) and all(header.stamp_ns == 0 for header in headers),
+            further=tuple(zip(sensors.more, sensors.cameras[1:], strict=True)),
         )
+
+    def _sensors(self) -> _Sensors:
+        wanted = self._config.topic
+        scans, reason = topics.scan_topic(self._topics, wanted)
+        more = topics.further_scan_topics(self._topics, wanted)
+        if more:
+            reason += f", with {', '.join(t.topic for t in more)}"
+        cameras: list[TopicInfo | None] = [None] * (1 + len(more))
+        if SENSOR_MODELS[topics.SENSORS[scans.type]].image:
+            cameras = [topics.camera_info_topic(t, self._topics) for t in (scans, *more)]
+        return _Sensors(scans, more, cameras, reason)
+
+    def _sensor_moves(self, base: str, sensor_frame: str, sensor_is_base: bool) -> bool:
+        """Whether the sensor moves on the robot."""
+        frames = self._frames
+        there = not sensor_is_base and sensor_frame in frames and frames.connected(base, sensor_frame)
+        return there and frames.moving(base, sensor_frame)
 
     def _first_headers(self, scans: TopicInfo) -> tuple[int, list[Header]]:
         """The log time of the first scan, and the headers of the first scans that can be decoded.
@@ -211,11 +230,7 @@ class _Planner:
         if base is not None and sensor_frame == base:
             return base
         name = sensor_frame or "(empty)"
-        # If the connection may be among what is lost, a guess would shift every scan.
-        tally = self._source.tally
-        lost = tally.topics_lost or (tally.bytes_lost and any(t.type in topics.TF for t in self._topics))
-        lost = lost or bool(frames.warnings)
-        if not frames.frames and self._config.base_frame is None and not lost:
+        if not frames.frames and self._config.base_frame is None and not self._tf_may_be_lost():
             self._source.tally.warn(
                 f"the log has no tf: frame {name} of the scans is taken for the robot's base"
             )
@@ -230,6 +245,13 @@ class _Planner:
                 hint="--set read.base_frame=NAME says which is the robot's base",
             )
         raise frames.missing(sensor_frame, base or "the base")
+
+    def _tf_may_be_lost(self) -> bool:
+        """Whether tf may be among what is lost: then a guess would shift every scan."""
+        tally = self._source.tally
+        if tally.topics_lost or self._frames.warnings:
+            return True
+        return bool(tally.bytes_lost) and any(t.type in topics.TF for t in self._topics)
 
     def _connected_base(self, sensor_frame: str, child: str | None) -> str | None:
         base = self._base_frame(child)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import heapq
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from pc2grid.geometry import invert_pose
 from pc2grid.io import topics
 from pc2grid.io.frames import FrameTree, PoseTrack
 from pc2grid.io.further_scans import FurtherScans, together
-from pc2grid.io.message_source import MessageSource, RawMessage, TopicInfo
+from pc2grid.io.message_source import MessageSource, RawMessage, Tally, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Odometry, ScanMessage, Transform
 from pc2grid.io.read_plan import Plan, is_static, tolerant
@@ -75,170 +75,123 @@ class _Waiting(NamedTuple):
     message: ScanMessage
 
 
-class Stream:
-    """One pass, to be run once; it counts in the source's tally what is read and what is lost.
+class _Part:
+    """The part of the log that is read, and how many of its scans could be decoded.
 
-    out_of_time : number of scans in a row that were skipped because their stamps go back or jump.
+    holds : of a log time, whether a scan recorded then is wanted.
     """
 
-    def __init__(
-        self,
-        source: MessageSource,
-        config: ReadConfig,
-        frames: FrameTree,
-        plan: Plan,
-        start_s: float = 0.0,
-        duration_s: float | None = None,
-        parameters: StreamParameters | None = None,
-    ) -> None:
-        self._source, self._frames, self._plan = source, frames, plan
-        self._parameters = parameters = parameters or PARAMETERS
-        self.out_of_time = 0
-        self._tally = source.tally
-        self._start_ns = source.info.start_ns + round(start_s * 1e9)
-        self._end_ns = None if duration_s is None else self._start_ns + round(duration_s * 1e9)
-        self._part = f"from {start_s:g} s" + ("" if duration_s is None else f" for {duration_s:g} s")
-        self._decoder = ScanDecoder(plan.scans.topic, plan.choice.sensor, decoder_for(plan.scans), config)
-        self._further = [
-            FurtherScans(t, camera, ScanDecoder(t.topic, plan.choice.sensor, decoder_for(t), config))
-            for t, camera in plan.further
-        ]
-        self._track = PoseTrack()
-        self._T_child_base: F64 | None = None
-        self._waiting: list[_Waiting] = []
-        self._waiting_bytes = 0
-        self._count = self._bad = self._good = 0
-        self._last_ns: int | None = None
-        self._last_log_ns: int | None = None
+    def __init__(self, source: MessageSource, start_s: float, duration_s: float | None) -> None:
+        self.start_ns = source.info.start_ns + round(start_s * 1e9)
+        self.end_ns = None if duration_s is None else self.start_ns + round(duration_s * 1e9)
+        self._name = f"from {start_s:g} s" + ("" if duration_s is None else f" for {duration_s:g} s")
+        self._length_s = source.info.duration_s
+        self.count = self.good = self._bad = 0
         self._error: Pc2GridError | None = None
-        self._model = SENSOR_MODELS[plan.choice.sensor]
-        self._sweep_ns = 0 if self._model.image else parameters.sweep_ns
-        self._odometry_frame = plan.odometry_frame
-        self._handlers = self._make_handlers()
 
-    def _make_handlers(self) -> dict[TopicInfo, Callable[[Any, int], None]]:
-        """By topic, what takes in its messages. Reads the first CameraInfo of the source."""
-        plan = self._plan
-        on: dict[TopicInfo, Callable[[Any, int], None]] = {plan.scans: self._take_scan}
-        if plan.odometry is not None:
-            on[plan.odometry] = self._take_odometry()
-        if plan.camera is not None:
-            on[plan.camera] = self._take_camera(plan.camera, self._decoder)
-            self._first_camera(plan.camera, on[plan.camera])
-        for further in self._further:
-            on[further.topic] = functools.partial(self._take_further, further)
-            if further.camera is not None and further.camera not in on:
-                on[further.camera] = self._take_camera(further.camera, further.decoder)
-                self._first_camera(further.camera, on[further.camera])
-        if plan.tf_moves:
-            for topic in self._source.info.topics:
-                if topic.type in topics.TF and not is_static(topic):
-                    on[topic] = self._take_tf(topic)
-        return on
+    def holds(self, log_time_ns: int) -> bool:
+        """See above."""
+        return log_time_ns >= self.start_ns and (self.end_ns is None or log_time_ns < self.end_ns)
 
-    def run(self) -> Iterator[Scan]:
-        """Yield the scans of the source. Raises as `Log.scans` says."""
-        margin_ns = self._parameters.margin_ns
-        low = max(self._start_ns - margin_ns, 0) if self._start_ns > self._source.info.start_ns else None
-        high = None if self._end_ns is None else self._end_ns + margin_ns
-        for message in self._source.messages(self.topics, low, high):
-            yield from self.take(message)
-        yield from self.release_all()
-        self._finish()
+    def skipped(self, error: Pc2GridError, topic: str, patience: int) -> None:
+        """Count a scan that cannot be used. Raises after too many from the beginning on."""
+        self._bad += 1
+        self._error = self._error or error
+        if self._bad >= patience and not self.good:
+            raise self._mostly_bad(topic)
 
-    def take(self, message: RawMessage) -> Iterator[Scan]:
-        """Take in one message, and yield the scans that need not wait any longer."""
-        take = self._handlers.get(message.channel)
-        if take is not None:
-            take(message.data, message.log_time_ns)
-        while self._waiting and self._is_due(self._waiting[0], message.log_time_ns):
-            yield from self._release()
+    def finish(self, topic: str, max_bad_share: float) -> None:
+        """Raises NoScans if there were none, LogCorrupt or PointCloudError if too many were bad."""
+        if self.count == 0:
+            raise NoScans(f"{topic}: no scan {self._name}", hint=f"the log lasts {self._length_s:.1f} s")
+        if self.good == 0 or self._bad > max_bad_share * self.count:
+            raise self._mostly_bad(topic)
 
-    def absorb(self, message: RawMessage) -> None:
-        """Take in a message of odometry or tf before its turn; it may be given to `take` as well."""
-        scans = (self._plan.scans, *(further.topic for further in self._further))
-        if message.channel not in scans and message.channel in self._handlers:
-            self._handlers[message.channel](message.data, message.log_time_ns)
-
-    @property
-    def last_log_ns(self) -> int:
-        """The log time of the last scan that was yielded; 0 before the first one."""
-        return self._last_log_ns or 0
-
-    @property
-    def topics(self) -> frozenset[str]:
-        """The topics whose messages are used."""
-        return frozenset(topic.topic for topic in self._handlers)
-
-    def release_all(self) -> Iterator[Scan]:
-        """Yield the scans that wait: nothing more will come."""
-        while self._waiting:
-            yield from self._release()
-
-    def _is_due(self, first: _Waiting, now_ns: int) -> bool:
-        p = self._parameters
-        return (
-            now_ns - first.log_time_ns > p.wait_ns
-            or len(self._waiting) > p.max_waiting
-            or self._waiting_bytes > p.max_waiting_bytes
-            or (p.eager and self._all_is_there(first.stamp_ns))
+    def _mostly_bad(self, topic: str) -> Pc2GridError:
+        assert self._error is not None
+        kind = PointCloudError if self.good == 0 else LogCorrupt
+        return kind(
+            f"{topic}: {self._bad} of {self.count} scans are unreadable: {self._error.message}",
+            hint=self._error.hint,
         )
 
-    def _all_is_there(self, stamp_ns: int) -> bool:
-        """Whether what belongs to a scan has arrived: those of further sensors, and odometry if there is
-        any."""
-        if any(further.newest_ns < stamp_ns for further in self._further):
-            return False
-        newest_ns = self.newest_odometry_ns()
-        needed_ns = [stamp_ns + self._sweep_ns, *(f.nearest_ns(stamp_ns) for f in self._further)]
-        return newest_ns is None or newest_ns >= max(needed_ns)
 
-    def newest_odometry_ns(self) -> int | None:
-        """The stamp up to which odometry is known; 0 if none has arrived, None if there is none at all."""
-        plan = self._plan
-        if plan.odometry_frame is not None:
-            return self._frames.newest_ns(plan.odometry_frame, plan.choice.base_frame)
-        return None if plan.odometry is None else self._track.newest_ns
+class _Queue:
+    """Scans that wait, the earliest stamp first."""
 
-    def newest_odometry(self) -> tuple[int, F64] | None:
-        """The newest stamp of the odometry and `T_odom_base` (4, 4) there; None if there is none."""
-        newest_ns = self.newest_odometry_ns()
-        pose = self._odometry_at(newest_ns) if newest_ns else None
-        return None if pose is None or newest_ns is None else (newest_ns, pose)
+    def __init__(self) -> None:
+        self.scans: list[_Waiting] = []
+        self.size_bytes = 0
 
-    @property
-    def odometry_frame(self) -> str | None:
-        """The parent frame of the odometry, such as `odom`; None as long as it is not known."""
-        return self._odometry_frame
+    def push(self, scan: _Waiting) -> None:
+        """Add a scan."""
+        heapq.heappush(self.scans, scan)
+        self.size_bytes += scan.size_bytes
 
-    # --- decoding messages ----------------------------------------------------------------------------
+    def pop(self) -> _Waiting:
+        """Take the scan with the earliest stamp."""
+        scan = heapq.heappop(self.scans)
+        self.size_bytes -= scan.size_bytes
+        return scan
 
-    def _take_scan(self, data: Any, log_time_ns: int) -> None:
-        if log_time_ns < self._start_ns or (self._end_ns is not None and log_time_ns >= self._end_ns):
+
+class _Stamps:
+    """Whether stamps go on; compared with the time of recording.
+
+    last_ns, last_log_ns : of the last scan that was used. out_of_time : see Stream.
+    """
+
+    def __init__(self, parameters: StreamParameters, tally: Tally) -> None:
+        self._parameters, self._tally = parameters, tally
+        self.last_ns: int | None = None
+        self.last_log_ns = 0
+        self.out_of_time = 0
+
+    def used(self, stamp_ns: int, log_time_ns: int) -> None:
+        """A scan was used."""
+        self.last_ns, self.last_log_ns = stamp_ns, log_time_ns
+        self.out_of_time = 0
+
+    def check(self, stamp_ns: int, log_time_ns: int, waiting: Sequence[_Waiting]) -> None:
+        """Compare a stamp with the one before. Raises PointCloudError for a scan to be skipped."""
+        if self.last_ns is None:
             return
-        self._count += 1
-        try:
-            message = self._decoder.message(data)
-        except Pc2GridError as error:
-            self._skip(error)
-            return
-        stamp_ns = message.header.stamp_ns
-        if self._plan.stampless:
-            self._tally.warn("the stamps of the scans are zero: the time of recording is used instead")
-            stamp_ns = log_time_ns
-        elif stamp_ns <= 0:
-            self._skip(PointCloudError("stamp is zero or negative"))
-            return
-        if stamp_ns >= 1 << 63:
-            self._skip(PointCloudError("stamp is past the year 2262"))
-            return
-        size = max(len(data), message.size_bytes)
-        heapq.heappush(self._waiting, _Waiting(stamp_ns, self._count, log_time_ns, size, message))
-        self._waiting_bytes += size
+        if stamp_ns == self.last_ns:
+            raise PointCloudError("stamp is a duplicate")
+        if stamp_ns < self.last_ns:
+            self.out_of_time += 1
+            raise PointCloudError(
+                "stamp goes back in time",
+                hint="the stamps in the headers must increase: a topic for each sensor, and a clock that is "
+                "not set while it is recorded; a part in which they do: --start and --duration",
+            )
+        ahead_ns = (stamp_ns - self.last_ns) - (log_time_ns - self.last_log_ns)
+        if ahead_ns > self._parameters.clock_jump_ns:
+            # If the next scan is near this stamp, too, the clock was set; else this one stamp is wrong.
+            if not any(0 <= entry.stamp_ns - stamp_ns < self._parameters.gap_ns for entry in waiting):
+                self.out_of_time += 1
+                raise PointCloudError("stamp jumps")
+            self._tally.warn("the clock of the scans jumps forward within the log")
+        elif stamp_ns - self.last_ns > self._parameters.gap_ns:
+            self._tally.warn("the log has gaps of more than 5 s between scans")
 
-    def _take_odometry(self) -> Callable[[Any, int], None]:
-        assert self._plan.odometry is not None
-        decode = decoder_for(self._plan.odometry)
+
+class _Poses:
+    """The poses of the sensors on the robot, and of the robot in the odometry frame, by time.
+
+    frame : the parent frame of the odometry, such as `odom`; None as long as it is not known.
+    """
+
+    def __init__(self, plan: Plan, frames: FrameTree, tally: Tally) -> None:
+        self._plan, self._frames, self._tally = plan, frames, tally
+        self._track = PoseTrack()
+        self._T_child_base: F64 | None = None
+        self._images = SENSOR_MODELS[plan.choice.sensor].image
+        self.frame = plan.odometry_frame
+
+    def take_odometry(self, topic: TopicInfo) -> Callable[[Any, int], None]:
+        """What takes in the messages of the topic of the odometry."""
+        decode = decoder_for(topic)
 
         def take(data: Any, log_time_ns: int) -> None:
             found: Odometry | None = tolerant(decode, data, None)
@@ -246,7 +199,17 @@ class Stream:
                 self._tally.warn("some odometry messages are unreadable or not finite, and were ignored")
             elif self._T_child_base is None:
                 self._T_child_base = self._child_to_base(found.child)
-                self._odometry_frame = found.header.frame or None
+                self.frame = found.header.frame or None
+
+        return take
+
+    def take_tf(self, topic: TopicInfo) -> Callable[[Any, int], None]:
+        """What takes in the messages of a topic of moving transforms."""
+        decode = decoder_for(topic)
+
+        def take(data: Any, log_time_ns: int) -> None:
+            edges: tuple[Transform, ...] | None = tolerant(decode, data, None)
+            self._frames.add_all(edges, log_time_ns=log_time_ns)
 
         return take
 
@@ -262,122 +225,15 @@ class Stream:
         self._tally.warn(f"the odometry is of frame {child}, which is taken for {base}")
         return np.eye(4)
 
-    def _take_further(self, further: FurtherScans, data: Any, log_time_ns: int) -> None:
-        try:
-            further.take(data)
-        except Pc2GridError as error:
-            self._tally.skip(f"{further.topic.topic}: {error.message}")
-
-    def _take_camera(self, camera: TopicInfo, decoder: ScanDecoder) -> Callable[[Any, int], None]:
-        decode = decoder_for(camera)
-
-        def take(data: Any, log_time_ns: int) -> None:
-            found = tolerant(decode, data, None)
-            if found is not None:
-                decoder.camera = found
-
-        return take
-
-    def _first_camera(self, camera: TopicInfo, take: Callable[[Any, int], None]) -> None:
-        """Take the first CameraInfo of the log: it may have been published only once, at the beginning."""
-        for message in self._source.messages({camera.topic}):
-            if message.channel == camera:
-                take(message.data, message.log_time_ns)
-                return
-        raise NoScans(f"{camera.topic}: no message in the log, but the depth images need it")
-
-    def _take_tf(self, topic: TopicInfo) -> Callable[[Any, int], None]:
-        decode = decoder_for(topic)
-
-        def take(data: Any, log_time_ns: int) -> None:
-            edges: tuple[Transform, ...] | None = tolerant(decode, data, None)
-            self._frames.add_all(edges, log_time_ns=log_time_ns)
-
-        return take
-
-    # --- yielding scans -------------------------------------------------------------------------------
-
-    def _release(self) -> Iterator[Scan]:
-        """Yield the waiting scan with the earliest stamp, unless it is skipped."""
-        stamp_ns, _, log_time_ns, size, message = heapq.heappop(self._waiting)
-        self._waiting_bytes -= size
-        try:
-            self._check_stamp(stamp_ns, log_time_ns)
-            T_base_sensor = self._sensor_pose(message.header.frame, stamp_ns)
-            scan = self._decoder.scan(message, stamp_ns, T_base_sensor, self._odometry_at(stamp_ns))
-            scan = self._with_motion(self._with_further(scan))
-        except (PointCloudError, LimitExceeded) as error:
-            self._skip(error)
-            return
-        except UnsupportedSchema as error:
-            if self._good:
-                self._skip(error)
-                return
-            raise UnsupportedSchema(f"{self._plan.scans.topic}: {error.message}", hint=error.hint) from error
-        self._last_ns, self._last_log_ns = stamp_ns, log_time_ns
-        self.out_of_time = 0
-        self._good += 1
-        self._tally.scans_read += 1
-        self._tally.points_dropped += scan.dropped
-        for note in self._decoder.notes:
-            self._tally.warn(note)
-        if not len(scan.points_m):
-            self._tally.warn("some scans hold no returns at all")
-        yield scan
-
-    def _with_further(self, scan: Scan) -> Scan:
-        """The scan together with those of the further sensors that are near in time."""
-        found = []
-        for further in self._further:
-            try:
-                near = further.near(scan.stamp_ns, self._sensor_pose, self._odometry_at)
-            except (PointCloudError, LimitExceeded) as error:
-                self._tally.skip(f"{further.topic.topic}: {error.message}")
-                continue
-            if near is None:
-                self._tally.skip(f"{further.topic.topic}: no scan near the first sensor's")
-            else:
-                found.append(near)
-        return together(scan, found) if found else scan
-
-    def _check_stamp(self, stamp_ns: int, log_time_ns: int) -> None:
-        """Compare a stamp with the one before. Raises PointCloudError for a scan to be skipped."""
-        if self._last_ns is None or self._last_log_ns is None:
-            return
-        if stamp_ns == self._last_ns:
-            raise PointCloudError("stamp is a duplicate")
-        if stamp_ns < self._last_ns:
-            self.out_of_time += 1
-            raise PointCloudError(
-                "stamp goes back in time",
-                hint="the stamps in the headers must increase: a topic for each sensor, and a clock that is "
-                "not set while it is recorded; a part in which they do: --start and --duration",
-            )
-        ahead_ns = (stamp_ns - self._last_ns) - (log_time_ns - self._last_log_ns)
-        if ahead_ns > self._parameters.clock_jump_ns:
-            # If the next scan is near this stamp, too, the clock was set; else this one stamp is wrong.
-            if not any(0 <= entry.stamp_ns - stamp_ns < self._parameters.gap_ns for entry in self._waiting):
-                self.out_of_time += 1
-                raise PointCloudError("stamp jumps")
-            self._tally.warn("the clock of the scans jumps forward within the log")
-        elif stamp_ns - self._last_ns > self._parameters.gap_ns:
-            self._tally.warn("the log has gaps of more than 5 s between scans")
-
-    def _sensor_pose(self, frame: str, stamp_ns: int) -> F64:
+    def newest_ns(self) -> int | None:
+        """The stamp up to which odometry is known; 0 if none has arrived, None if there is none at all."""
         plan = self._plan
-        if plan.sensor_is_base:
-            # REP-103: images are in optical axes (z forward); without tf they are turned here.
-            optical = self._model.image or frame.endswith("_optical") or "_optical_" in frame
-            return T_BODY_OPTICAL if optical else np.eye(4)
-        base = plan.choice.base_frame
-        if frame != base and frame not in self._frames:
-            raise self._frames.missing(frame, base)
-        found = self._frames.lookup(base, frame, stamp_ns)
-        if found is None:
-            raise PointCloudError("tf is unknown at the stamp")
-        return found
+        if plan.odometry_frame is not None:
+            return self._frames.newest_ns(plan.odometry_frame, plan.choice.base_frame)
+        return None if plan.odometry is None else self._track.newest_ns
 
-    def _odometry_at(self, stamp_ns: int) -> F64 | None:
+    def odometry(self, stamp_ns: int) -> F64 | None:
+        """`T_odom_base` (4, 4) at a time; None if it is not known."""
         plan = self._plan
         if plan.odometry_frame is not None:
             return self._frames.lookup(plan.odometry_frame, plan.choice.base_frame, stamp_ns)
@@ -388,6 +244,230 @@ class Stream:
             return found
         return found @ self._T_child_base
 
+    def sensor(self, frame: str, stamp_ns: int) -> F64:
+        """`T_base_sensor` (4, 4) of the sensor with this frame. Raises FrameError, PointCloudError."""
+        if self._plan.sensor_is_base:
+            # REP-103: images are in optical axes (z forward); without tf they are turned here.
+            optical = self._images or frame.endswith("_optical") or "_optical_" in frame
+            return T_BODY_OPTICAL if optical else np.eye(4)
+        base = self._plan.choice.base_frame
+        if frame != base and frame not in self._frames:
+            raise self._frames.missing(frame, base)
+        found = self._frames.lookup(base, frame, stamp_ns)
+        if found is None:
+            raise PointCloudError("tf is unknown at the stamp")
+        return found
+
+
+class Stream:
+    """One pass, to be run once; it counts in the source's tally what is read and what is lost."""
+
+    def __init__(
+        self,
+        source: MessageSource,
+        config: ReadConfig,
+        frames: FrameTree,
+        plan: Plan,
+        start_s: float = 0.0,
+        duration_s: float | None = None,
+        parameters: StreamParameters | None = None,
+    ) -> None:
+        self._source, self._plan = source, plan
+        self._parameters = parameters = parameters or PARAMETERS
+        self._part = _Part(source, start_s, duration_s)
+        sensor = plan.choice.sensor
+        self._decoder = ScanDecoder(plan.scans.topic, sensor, decoder_for(plan.scans), config)
+        self._further = [
+            FurtherScans(t, camera, ScanDecoder(t.topic, sensor, decoder_for(t), config))
+            for t, camera in plan.further
+        ]
+        self._poses = _Poses(plan, frames, source.tally)
+        self._stamps = _Stamps(parameters, source.tally)
+        self._waiting = _Queue()
+        self._sweep_ns = 0 if SENSOR_MODELS[sensor].image else parameters.sweep_ns
+        self._handlers = self._make_handlers()
+
+    def _make_handlers(self) -> dict[TopicInfo, Callable[[Any, int], None]]:
+        """By topic, what takes in its messages. Reads the first CameraInfo of the source."""
+        plan = self._plan
+        on: dict[TopicInfo, Callable[[Any, int], None]] = {plan.scans: self._take_scan}
+        if plan.odometry is not None:
+            on[plan.odometry] = self._poses.take_odometry(plan.odometry)
+        on.update((f.topic, functools.partial(self._take_further, f)) for f in self._further)
+        for camera, decoder in (
+            (plan.camera, self._decoder),
+            *((further.camera, further.decoder) for further in self._further),
+        ):
+            if camera is not None and camera not in on:
+                on[camera] = _take_camera(camera, decoder)
+                self._first_camera(camera, on[camera])
+        if plan.tf_moves:
+            tf = [t for t in self._source.info.topics if t.type in topics.TF and not is_static(t)]
+            on.update((topic, self._poses.take_tf(topic)) for topic in tf)
+        return on
+
+    def run(self) -> Iterator[Scan]:
+        """Yield the scans of the source. Raises as `Log.scans` says."""
+        margin_ns, part = self._parameters.margin_ns, self._part
+        low = max(part.start_ns - margin_ns, 0) if part.start_ns > self._source.info.start_ns else None
+        high = None if part.end_ns is None else part.end_ns + margin_ns
+        for message in self._source.messages(self.topics, low, high):
+            yield from self.take(message)
+        yield from self.release_all()
+        part.finish(self._plan.scans.topic, self._parameters.max_bad_share)
+
+    def take(self, message: RawMessage) -> Iterator[Scan]:
+        """Take in one message, and yield the scans that need not wait any longer."""
+        take = self._handlers.get(message.channel)
+        if take is not None:
+            take(message.data, message.log_time_ns)
+        while self._waiting.scans and self._is_due(self._waiting.scans[0], message.log_time_ns):
+            yield from self._release()
+
+    def absorb(self, message: RawMessage) -> None:
+        """Take in a message of odometry or tf before its turn; it may be given to `take` as well."""
+        scans = (self._plan.scans, *(further.topic for further in self._further))
+        if message.channel not in scans and message.channel in self._handlers:
+            self._handlers[message.channel](message.data, message.log_time_ns)
+
+    @property
+    def out_of_time(self) -> int:
+        """Number of scans in a row that were skipped because their stamps go back or jump."""
+        return self._stamps.out_of_time
+
+    @property
+    def last_log_ns(self) -> int:
+        """The log time of the last scan that was yielded; 0 before the first one."""
+        return self._stamps.last_log_ns
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """The topics whose messages are used."""
+        return frozenset(topic.topic for topic in self._handlers)
+
+    def release_all(self) -> Iterator[Scan]:
+        """Yield the scans that wait: nothing more will come."""
+        while self._waiting.scans:
+            yield from self._release()
+
+    def _is_due(self, first: _Waiting, now_ns: int) -> bool:
+        p = self._parameters
+        return (
+            now_ns - first.log_time_ns > p.wait_ns
+            or len(self._waiting.scans) > p.max_waiting
+            or self._waiting.size_bytes > p.max_waiting_bytes
+            or (p.eager and self._all_is_there(first.stamp_ns))
+        )
+
+    def _all_is_there(self, stamp_ns: int) -> bool:
+        """Whether what belongs to a scan has arrived: those of further sensors, and odometry if there is
+        any."""
+        if any(further.newest_ns < stamp_ns for further in self._further):
+            return False
+        newest_ns = self.newest_odometry_ns()
+        needed_ns = [stamp_ns + self._sweep_ns, *(f.nearest_ns(stamp_ns) for f in self._further)]
+        return newest_ns is None or newest_ns >= max(needed_ns)
+
+    def newest_odometry_ns(self) -> int | None:
+        """The stamp up to which odometry is known; 0 if none has arrived, None if there is none at all."""
+        return self._poses.newest_ns()
+
+    def newest_odometry(self) -> tuple[int, F64] | None:
+        """The newest stamp of the odometry and `T_odom_base` (4, 4) there; None if there is none."""
+        newest_ns = self._poses.newest_ns()
+        pose = self._poses.odometry(newest_ns) if newest_ns else None
+        return None if pose is None or newest_ns is None else (newest_ns, pose)
+
+    @property
+    def odometry_frame(self) -> str | None:
+        """The parent frame of the odometry, such as `odom`; None as long as it is not known."""
+        return self._poses.frame
+
+    # --- decoding messages ----------------------------------------------------------------------------
+
+    def _take_scan(self, data: Any, log_time_ns: int) -> None:
+        if not self._part.holds(log_time_ns):
+            return
+        self._part.count += 1
+        try:
+            message = self._decoder.message(data)
+            stamp_ns = self._stamp_of(message, log_time_ns)
+        except Pc2GridError as error:
+            self._skip(error)
+            return
+        size = max(len(data), message.size_bytes)
+        self._waiting.push(_Waiting(stamp_ns, self._part.count, log_time_ns, size, message))
+
+    def _stamp_of(self, message: ScanMessage, log_time_ns: int) -> int:
+        """The stamp of a scan. Raises PointCloudError for one that is none."""
+        stamp_ns = message.header.stamp_ns
+        if self._plan.stampless:
+            self._source.tally.warn("the stamps of the scans are zero: the time of recording is used instead")
+            stamp_ns = log_time_ns
+        elif stamp_ns <= 0:
+            raise PointCloudError("stamp is zero or negative")
+        if stamp_ns >= 1 << 63:
+            raise PointCloudError("stamp is past the year 2262")
+        return stamp_ns
+
+    def _take_further(self, further: FurtherScans, data: Any, log_time_ns: int) -> None:
+        try:
+            further.take(data)
+        except Pc2GridError as error:
+            self._source.tally.skip(f"{further.topic.topic}: {error.message}")
+
+    def _first_camera(self, camera: TopicInfo, take: Callable[[Any, int], None]) -> None:
+        """Take the first CameraInfo of the log: it may have been published only once, at the beginning."""
+        for message in self._source.messages({camera.topic}):
+            if message.channel == camera:
+                take(message.data, message.log_time_ns)
+                return
+        raise NoScans(f"{camera.topic}: no message in the log, but the depth images need it")
+
+    # --- yielding scans -------------------------------------------------------------------------------
+
+    def _release(self) -> Iterator[Scan]:
+        """Yield the waiting scan with the earliest stamp, unless it is skipped."""
+        stamp_ns, _, log_time_ns, _, message = self._waiting.pop()
+        try:
+            self._stamps.check(stamp_ns, log_time_ns, self._waiting.scans)
+            T_base_sensor = self._poses.sensor(message.header.frame, stamp_ns)
+            scan = self._decoder.scan(message, stamp_ns, T_base_sensor, self._poses.odometry(stamp_ns))
+            scan = self._with_motion(self._with_further(scan))
+        except (PointCloudError, LimitExceeded) as error:
+            self._skip(error)
+            return
+        except UnsupportedSchema as error:
+            if self._part.good:
+                self._skip(error)
+                return
+            raise UnsupportedSchema(f"{self._plan.scans.topic}: {error.message}", hint=error.hint) from error
+        self._stamps.used(stamp_ns, log_time_ns)
+        self._part.good += 1
+        tally = self._source.tally
+        tally.scans_read += 1
+        tally.points_dropped += scan.dropped
+        for note in self._decoder.notes:
+            tally.warn(note)
+        if not len(scan.points_m):
+            tally.warn("some scans hold no returns at all")
+        yield scan
+
+    def _with_further(self, scan: Scan) -> Scan:
+        """The scan together with those of the further sensors that are near in time."""
+        tally, found = self._source.tally, []
+        for further in self._further:
+            try:
+                near = further.near(scan.stamp_ns, self._poses.sensor, self._poses.odometry)
+            except (PointCloudError, LimitExceeded) as error:
+                tally.skip(f"{further.topic.topic}: {error.message}")
+                continue
+            if near is None:
+                tally.skip(f"{further.topic.topic}: no scan near the first sensor's")
+            else:
+                found.append(near)
+        return together(scan, found) if found else scan
+
     def _with_motion(self, scan: Scan) -> Scan:
         """The scan with the motion from its first to its last point, if there is odometry at both."""
         if scan.offsets_s is None or not len(scan.offsets_s):
@@ -397,33 +477,23 @@ class Stream:
         self._sweep_ns = max(round(times_s[1] * 1e9), 0)
         if scan.T_odom_base is None:
             return scan
-        first, last = (self._odometry_at(scan.stamp_ns + round(time_s * 1e9)) for time_s in times_s)
+        first, last = (self._poses.odometry(scan.stamp_ns + round(time_s * 1e9)) for time_s in times_s)
         if first is None or last is None:
             return scan
         return replace(scan, T_first_last=invert_pose(first) @ last)
 
     def _skip(self, error: Pc2GridError) -> None:
-        self._bad += 1
-        self._error = self._error or error
-        self._tally.skip(error.message)
-        if self._bad >= self._parameters.patience and not self._good:
-            raise self._mostly_bad()
+        self._source.tally.skip(error.message)
+        self._part.skipped(error, self._plan.scans.topic, self._parameters.patience)
 
-    def _finish(self) -> None:
-        topic = self._plan.scans.topic
-        if self._count == 0:
-            raise NoScans(
-                f"{topic}: no scan {self._part}",
-                hint=f"the log lasts {self._source.info.duration_s:.1f} s",
-            )
-        if self._good == 0 or self._bad > self._parameters.max_bad_share * self._count:
-            raise self._mostly_bad()
 
-    def _mostly_bad(self) -> Pc2GridError:
-        assert self._error is not None
-        kind = PointCloudError if self._good == 0 else LogCorrupt
-        return kind(
-            f"{self._plan.scans.topic}: {self._bad} of {self._count} scans are unreadable: "
-            f"{self._error.message}",
-            hint=self._error.hint,
-        )
+def _take_camera(camera: TopicInfo, decoder: ScanDecoder) -> Callable[[Any, int], None]:
+    """What takes in the calibrations of a camera."""
+    decode = decoder_for(camera)
+
+    def take(data: Any, log_time_ns: int) -> None:
+        found = tolerant(decode, data, None)
+        if found is not None:
+            decoder.camera = found
+
+    return take
