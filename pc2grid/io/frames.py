@@ -134,23 +134,27 @@ class FrameTree:
                 f"a transform {parent or '?'} -> {child or '?'} of the log makes no sense and is ignored"
             )
             return
-        known = self._parent.get(child)
-        if known is None and len(self._parent) >= PARAMETERS.max_frames:
+        if child not in self._parent and len(self._parent) >= PARAMETERS.max_frames:
             self._warn(f"the log has more than {PARAMETERS.max_frames} frames; the others are ignored")
             return
-        if known is not None and known != parent:
-            self._warn(f"frame {child} has two parents, {known} and {parent}: the latest counts")
-            self._moving.pop(child, None)
-            self._static.pop(child, None)
-        if known != parent:
-            self._cache.clear()
-        self._parent[child] = parent
+        self._set_parent(child, parent)
         if static:
             self._static[child] = pose_from_xyz_quat(edge.pose[:3], edge.pose[3:])
             self._cache.clear()
         elif child not in self._static:
             track = self._moving.setdefault(child, PoseTrack(lasting=edge.lasting))
             track.add(edge.header.stamp_ns or log_time_ns, edge.pose)
+
+    def _set_parent(self, child: str, parent: str) -> None:
+        known = self._parent.get(child)
+        if known == parent:
+            return
+        if known is not None:
+            self._warn(f"frame {child} has two parents, {known} and {parent}: the latest counts")
+            self._moving.pop(child, None)
+            self._static.pop(child, None)
+        self._cache.clear()
+        self._parent[child] = parent
 
     def chain(self, frame: str) -> list[str]:
         """The frame, its parent, and so on to the root. Raises FrameError if the parents form a circle."""

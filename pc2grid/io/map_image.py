@@ -34,18 +34,7 @@ def read_image(path: Path) -> GreyImage:
 
     Raises MapFileError for what is not a whole image of 8 bits and grey, or is larger than MAX_CELLS.
     """
-    try:
-        if path.exists() and not path.is_file():  # reading a device or a pipe might not end
-            raise MapFileError(f"{path}: the map's image is not a regular file")
-        if path.stat().st_size > _MAX_BYTES:
-            raise MapFileError(f"{path}: larger than {_MAX_BYTES} bytes: not the image of a map")
-        data = path.read_bytes()
-    except (OSError, ValueError) as error:
-        what = getattr(error, "strerror", None) or error
-        raise MapFileError(
-            f"{path.absolute()}: cannot read the map's image: {what}",
-            hint="the key `image` of the .yaml names it: copy it to that place, or correct the name",
-        ) from error
+    data = _content(path)
     if data[:2] in (b"P5", b"P2"):
         return _decode_pgm(path, data)
     if data[:8] == png.MAGIC:
@@ -54,6 +43,26 @@ def read_image(path: Path) -> GreyImage:
         _check_bmp(path, data)
     else:
         raise MapFileError(f"{path}: not an image of a map", hint="nav2 maps are 8-bit pgm, png or bmp")
+    return _decoded(path, data)
+
+
+def _content(path: Path) -> bytes:
+    try:
+        if path.exists() and not path.is_file():  # reading a device or a pipe might not end
+            raise MapFileError(f"{path}: the map's image is not a regular file")
+        if path.stat().st_size > _MAX_BYTES:
+            raise MapFileError(f"{path}: larger than {_MAX_BYTES} bytes: not the image of a map")
+        return path.read_bytes()
+    except (OSError, ValueError) as error:
+        what = getattr(error, "strerror", None) or error
+        raise MapFileError(
+            f"{path.absolute()}: cannot read the map's image: {what}",
+            hint="the key `image` of the .yaml names it: copy it to that place, or correct the name",
+        ) from error
+
+
+def _decoded(path: Path, data: bytes) -> GreyImage:
+    """A PNG or BMP that was checked."""
     import cv2
 
     try:

@@ -116,6 +116,13 @@ class Tally:
             warnings=tuple(dict.fromkeys((*self.warnings, *more_warnings))),
         )
 
+    def take_over(self, other: Tally) -> None:
+        """Add what another one counts of damage, and its warnings."""
+        self.bytes_lost += other.bytes_lost
+        self.topics_lost |= other.topics_lost
+        for sentence in other.warnings:
+            self.warn(sentence)
+
     def skip(self, reason: str) -> None:
         """Count one more scan left out for `reason`."""
         self.skipped[reason] = self.skipped.get(reason, 0) + 1

@@ -104,6 +104,20 @@ class _Sensors(NamedTuple):
             )
 
 
+class _Motion(NamedTuple):
+    """Where the odometry comes from: a topic, or the transform from a frame in tf; and the topic to name."""
+
+    topic: TopicInfo | None
+    named: TopicInfo | None
+    frame: str | None
+    reason: str
+
+    @property
+    def name(self) -> str | None:
+        """The name of the topic to name."""
+        return None if self.named is None else self.named.topic
+
+
 class _Planner:
     def __init__(self, source: MessageSource, config: ReadConfig, frames: FrameTree) -> None:
         self._source, self._config, self._frames = source, config, frames
@@ -111,43 +125,52 @@ class _Planner:
 
     def plan(self) -> Plan:
         sensors = self._sensors()
-        odometry, why_odometry = topics.odometry_topic(self._topics, self._config.odometry)
-        tf_topics = [t for t in self._topics if t.type in topics.TF and t.message_count != 0]
-        self._read_static([t for t in tf_topics if is_static(t)])
+        odometry, why = topics.odometry_topic(self._topics, self._config.odometry)
+        self._read_static([t for t in self._tf_topics() if is_static(t)])
         first_ns, headers = self._first_headers(sensors.scans)
         sensor_frame = headers[0].frame if headers else ""  # none can be decoded: the stream counts them
-        moving = [t for t in tf_topics if not is_static(t)]
+        moving = [t for t in self._tf_topics() if not is_static(t)]
         in_tf = odometry.type in topics.TF if odometry else self._config.odometry is None
         child = self._odometry_child(odometry)
-        base = self._search_tf(moving, sensor_frame, child, first_ns, odometry_too=in_tf)
-        sensors.need(base)
-        sensor_is_base = base is None
-        if base is None:
-            base = sensor_frame or self._config.base_frame or "sensor"
-        odometry_frame = self._odometry_frame(base) if in_tf and not sensor_is_base else None
-        if odometry_frame is not None:
-            why_odometry = f"odometry from tf, {odometry_frame} -> {base}"
-        named = [*moving[:1]] if odometry_frame else []
-        named += [odometry] if odometry and not in_tf else []
-        choice = Choice(
-            topic=sensors.scans.topic,
-            sensor=topics.SENSORS[sensors.scans.type],
-            odometry_topic=named[0].topic if named else None,
-            base_frame=base,
-            sensor_frame=sensor_frame or None,
-            reason=f"{sensors.reason}; {why_odometry}",
-        )
+        found = self._search_tf(moving, sensor_frame, child, first_ns, odometry_too=in_tf)
+        sensors.need(found)
+        base = self._base_or_sensor(found, sensor_frame)
+        motion = _Motion(odometry, odometry, None, why)
+        if in_tf:
+            motion = self._motion_in_tf(found, moving, why)
         return Plan(
-            choice=choice,
+            choice=Choice(
+                topic=sensors.scans.topic,
+                sensor=topics.SENSORS[sensors.scans.type],
+                odometry_topic=motion.name,
+                base_frame=base,
+                sensor_frame=sensor_frame or None,
+                reason=f"{sensors.reason}; {motion.reason}",
+            ),
             scans=sensors.scans,
             camera=sensors.cameras[0],
-            odometry=None if in_tf else odometry,
-            odometry_frame=odometry_frame,
-            tf_moves=odometry_frame is not None or self._sensor_moves(base, sensor_frame, sensor_is_base),
-            sensor_is_base=sensor_is_base,
-            stampless=bool(headers) and all(header.stamp_ns == 0 for header in headers),
+            odometry=motion.topic,
+            odometry_frame=motion.frame,
+            tf_moves=motion.frame is not None or self._sensor_moves(found, sensor_frame),
+            sensor_is_base=found is None,
+            stampless=bool(headers) and not any(header.stamp_ns for header in headers),
             further=tuple(zip(sensors.more, sensors.cameras[1:], strict=True)),
         )
+
+    def _base_or_sensor(self, found: str | None, sensor_frame: str) -> str:
+        if found is not None:
+            return found
+        return sensor_frame or self._config.base_frame or "sensor"
+
+    def _tf_topics(self) -> list[TopicInfo]:
+        return [t for t in self._topics if t.type in topics.TF and t.message_count != 0]
+
+    def _motion_in_tf(self, base: str | None, moving: list[TopicInfo], why: str) -> _Motion:
+        """The odometry that tf holds, if it does; base : None if the log has no tf."""
+        frame = None if base is None else self._odometry_frame(base)
+        if frame is None:
+            return _Motion(None, None, None, why)
+        return _Motion(None, next(iter(moving), None), frame, f"odometry from tf, {frame} -> {base}")
 
     def _sensors(self) -> _Sensors:
         wanted = self._config.topic
@@ -160,11 +183,12 @@ class _Planner:
             cameras = [topics.camera_info_topic(t, self._topics) for t in (scans, *more)]
         return _Sensors(scans, more, cameras, reason)
 
-    def _sensor_moves(self, base: str, sensor_frame: str, sensor_is_base: bool) -> bool:
-        """Whether the sensor moves on the robot."""
+    def _sensor_moves(self, base: str | None, sensor_frame: str) -> bool:
+        """Whether the sensor moves on the robot. base : None if the log has no tf."""
         frames = self._frames
-        there = not sensor_is_base and sensor_frame in frames and frames.connected(base, sensor_frame)
-        return there and frames.moving(base, sensor_frame)
+        if base is None or sensor_frame not in frames:
+            return False
+        return frames.connected(base, sensor_frame) and frames.moving(base, sensor_frame)
 
     def _first_headers(self, scans: TopicInfo) -> tuple[int, list[Header]]:
         """The log time of the first scan, and the headers of the first scans that can be decoded.

@@ -40,17 +40,8 @@ def scan_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicIn
     if wanted is not None:
         return _named(topics, fitting, names_in(wanted)[0]), "named by the user"
     full = [t for t in fitting if t.message_count != 0]
-    if fitting and not full:
-        raise NoScans(f"{_listed(fitting)}: no message in the log")
     if not full:
-        for image in topics:
-            if SENSORS.get(image.type) == "depth" and "depth" in image.topic.lower():
-                camera_info_topic(image, topics)
-        there = _listed(topics) if topics else "the log has no topics at all"
-        raise NoScans(
-            f"no topic with scans; there is: {there}",
-            hint="scans are PointCloud2, LaserScan, or a depth Image with a CameraInfo",
-        )
+        raise _no_scans(topics, fitting)
     # An image and its compressed copy come from the same camera: take the uncompressed one.
     distinct = [t for t in full if not (_is_compressed(t) and any(_raw_twin(t, other) for other in full))]
     if len(distinct) > 1:
@@ -61,6 +52,18 @@ def scan_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicIn
             hint=f"choose one, e.g. --topic {distinct[0].topic}{both}",
         )
     return distinct[0], f"the only topic with scans ({distinct[0].type})"
+
+
+def _no_scans(topics: Sequence[TopicInfo], fitting: Sequence[TopicInfo]) -> NoScans:
+    if fitting:
+        return NoScans(f"{_listed(fitting)}: no message in the log")
+    if image := next((t for t in topics if _is_depth_image(t)), None):
+        return _no_camera_info(image)
+    there = _listed(topics) if topics else "the log has no topics at all"
+    return NoScans(
+        f"no topic with scans; there is: {there}",
+        hint="scans are PointCloud2, LaserScan, or a depth Image with a CameraInfo",
+    )
 
 
 def further_scan_topics(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicInfo, ...]:
@@ -108,11 +111,15 @@ def camera_info_topic(image: TopicInfo, topics: Sequence[TopicInfo]) -> TopicInf
     """
     infos = [t for t in topics if t.type in CAMERA_INFOS]
     if not infos:
-        raise NoScans(
-            f"{image.topic}: a depth image without a CameraInfo topic",
-            hint="record the camera_info topic next to the image",
-        )
+        raise _no_camera_info(image)
     return max(infos, key=lambda t: (_shared(image.topic, t.topic), "depth" in t.topic, t.topic))
+
+
+def _no_camera_info(image: TopicInfo) -> NoScans:
+    return NoScans(
+        f"{image.topic}: a depth image without a CameraInfo topic",
+        hint="record the camera_info topic next to the image",
+    )
 
 
 def odometry_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicInfo | None, str]:
@@ -122,21 +129,9 @@ def odometry_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[Top
     """
     if wanted is not None and wanted.lower() == "none":
         return None, "odometry is ignored as asked"
-    candidates = [t for t in topics if t.type in ODOMETRY]
     if wanted is not None:
-        found = next((t for t in topics if t.topic == wanted and (t in candidates or t.type in TF)), None)
-        if found is None:
-            raise TopicError(
-                f"no odometry topic {wanted}; there is: {_listed(candidates) or 'none'}",
-                hint="--odometry none goes without",
-            )
-        return found, f"odometry from {wanted} as asked"
-    # A PoseInFrame may also be a goal or a landmark, so its topic must contain `odom`.
-    candidates = [
-        t
-        for t in candidates
-        if t.message_count != 0 and (t.type != "foxglove.PoseInFrame" or "odom" in t.topic.lower())
-    ]
+        return _named_odometry(topics, wanted), f"odometry from {wanted} as asked"
+    candidates = [t for t in topics if t.message_count != 0 and _holds_odometry(t)]
     if not candidates:
         return None, "no odometry topic"
     best = min(candidates, key=lambda t: (t.topic not in ("/odom", "/odometry"), len(t.topic), t.topic))
@@ -146,11 +141,31 @@ def odometry_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[Top
     return best, f"odometry from {best.topic}"
 
 
+def _named_odometry(topics: Sequence[TopicInfo], wanted: str) -> TopicInfo:
+    for topic in topics:
+        if topic.topic == wanted and topic.type in (*ODOMETRY, *TF):
+            return topic
+    there = _listed([t for t in topics if t.type in ODOMETRY])
+    raise TopicError(
+        f"no odometry topic {wanted}; there is: {there or 'none'}", hint="--odometry none goes without"
+    )
+
+
+def _holds_odometry(topic: TopicInfo) -> bool:
+    # A PoseInFrame may also be a goal or a landmark, so its topic must contain `odom`.
+    return topic.type in ODOMETRY and (topic.type != "foxglove.PoseInFrame" or "odom" in topic.topic.lower())
+
+
 def _fits(topic: TopicInfo, topics: Sequence[TopicInfo]) -> bool:
     kind = SENSORS.get(topic.type)
     if kind is None or not SENSOR_MODELS[kind].image:
         return kind is not None
-    return "depth" in topic.topic.lower() and any(t.type in CAMERA_INFOS for t in topics)
+    return _is_depth_image(topic) and any(t.type in CAMERA_INFOS for t in topics)
+
+
+def _is_depth_image(topic: TopicInfo) -> bool:
+    kind = SENSORS.get(topic.type)
+    return kind is not None and SENSOR_MODELS[kind].image and "depth" in topic.topic.lower()
 
 
 def _named(topics: Sequence[TopicInfo], fitting: Sequence[TopicInfo], wanted: str) -> TopicInfo:

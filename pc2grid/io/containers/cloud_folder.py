@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -38,20 +39,12 @@ class CloudFolder:
         self.tally = Tally()
         self.tally.warn("files of clouds carry no checksum: damage to their data would not be seen")
         self._max_bytes = config.max_record_bytes
-        found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file()]
-        kinds = sorted(
-            {p.suffix.lower() for p in found}, key=lambda s: -sum(p.suffix.lower() == s for p in found)
-        )
-        if len(kinds) > 1:
-            self.tally.warn(f"the folder holds several kinds of clouds: only its {kinds[0]} files are read")
-        self._clouds = sorted(
-            (p for p in found if p.suffix.lower() == kinds[0]), key=lambda p: natural(p.name)
-        )
+        self._clouds = _clouds_of(folder, self.tally)
         side = Sidecars(folder)
         self._stamps, poses = side.stamps_and_poses(self._clouds, self.tally)
         self._poses = poses
         self.files: tuple[Path, ...] = (*self._clouds, *side.used)
-        kind = kinds[0][1:]
+        kind = self._clouds[0].suffix.lower()[1:]
         topics = [
             TopicInfo(topic=CLOUDS, type=f"cloud/{kind}", encoding=kind, message_count=len(self._clouds))
         ]
@@ -78,19 +71,21 @@ class CloudFolder:
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[RawMessage]:
         """See MessageSource.messages; each file is read when its message is due."""
-        entries: list[tuple[int, int, Any]] = []
-        if POSES in topics and self._poses is not None:
-            poses = self._poses
-            entries += [(int(t), 0, T) for t, T in zip(poses.stamps_ns, poses.T_session_base, strict=True)]
-        if CLOUDS in topics:
-            entries += [(t, 1, path) for t, path in zip(self._stamps, self._clouds, strict=True)]
-        for stamp_ns, is_cloud, what in sorted(entries, key=lambda e: e[:2]):
+        for stamp_ns, is_cloud, what in sorted(self._entries(topics), key=lambda e: e[:2]):
             if (start_ns is not None and stamp_ns < start_ns) or (end_ns is not None and stamp_ns >= end_ns):
                 continue
             if is_cloud:
                 yield RawMessage(self._topics[CLOUDS], stamp_ns, pack_cloud(stamp_ns, self._content(what)))
             else:
                 yield RawMessage(self._topics[POSES], stamp_ns, pack_pose(stamp_ns, what))
+
+    def _entries(self, topics: Collection[str]) -> Iterator[tuple[int, int, Any]]:
+        """Stamp, whether it is a cloud, and its file or pose; poses before the clouds of their stamps."""
+        if POSES in topics and self._poses is not None:
+            poses = self._poses
+            yield from ((int(t), 0, T) for t, T in zip(poses.stamps_ns, poses.T_session_base, strict=True))
+        if CLOUDS in topics:
+            yield from ((t, 1, path) for t, path in zip(self._stamps, self._clouds, strict=True))
 
     def _content(self, path: Path) -> bytes:
         size = path.stat().st_size
@@ -103,6 +98,17 @@ class CloudFolder:
             return path.read_bytes()
         except OSError as error:
             raise LogCorrupt(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _clouds_of(folder: Path, tally: Tally) -> list[Path]:
+    """The clouds of the most frequent kind, in the order of the numbers in their names."""
+    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file()]
+    counts = Counter(path.suffix.lower() for path in found)
+    kind = min(counts, key=lambda suffix: (-counts[suffix], suffix))
+    if len(counts) > 1:
+        tally.warn(f"the folder holds several kinds of clouds: only its {kind} files are read")
+    of_kind = [path for path in found if path.suffix.lower() == kind]
+    return sorted(of_kind, key=lambda path: natural(path.name))
 
 
 class Sidecars:
@@ -127,12 +133,8 @@ class Sidecars:
                 raise TrajectoryFileError(
                     f"{tum}: {len(poses)} poses for {len(clouds)} clouds whose names are no times"
                 )
-            stamps = [int(t) for t in poses.stamps_ns]
-        if stamps is None:
-            tally.warn(
-                "neither a file nor the names of the clouds tell the time: 10 clouds a second are assumed"
-            )
-            stamps = [(i + 10) * _ASSUMED_PERIOD_NS for i in range(len(clouds))]
+            stamps = poses.stamps_ns.tolist()
+        stamps = stamps or _assumed(len(clouds), tally)
         if stamps[0] <= 0:  # KITTI counts from zero, but a stamp of zero means that there is none
             stamps = [t - stamps[0] + 1_000_000_000 for t in stamps]
         if kitti is not None:
@@ -198,6 +200,11 @@ class Sidecars:
                     raise TrajectoryFileError(f"{path}: {name} is not a rigid pose")
         result: F64 = invert_pose(T_cam_lidar) @ T_cam0_cam @ T_cam_lidar
         return result
+
+
+def _assumed(count: int, tally: Tally) -> list[int]:
+    tally.warn("neither a file nor the names of the clouds tell the time: 10 clouds a second are assumed")
+    return [(i + 10) * _ASSUMED_PERIOD_NS for i in range(count)]
 
 
 def natural(name: str) -> list[tuple[int, str]]:

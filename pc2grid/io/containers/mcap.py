@@ -11,6 +11,7 @@ with the index, does not bound a decompression, and holds all chunks that overla
 
 from __future__ import annotations
 
+import bisect
 import io
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -98,27 +99,26 @@ class McapSource:
         with self._path.open("rb") as stream:
             found = survey(stream, size, self._limits, resync=self._recover, known=known)
         index, tally = found.index, self.tally
-        there = {chunk.chunk_start_offset for chunk in index.chunks}
-        hidden = [chunk for chunk in own.chunks if chunk.chunk_start_offset not in there] if own else []
-        if hidden and not found.bytes_lost:
-            # A chunk whose kind was changed by damage is passed over like a record of an application.
-            found.bytes_lost = sum(chunk.chunk_length for chunk in hidden)
-            found.warnings.append(f"{len(hidden)} chunks that the index lists are not there")
+        if own is not None:
+            found.compare(own.chunks)
         for sentence in found.warnings:
             tally.warn(sentence)
         tally.bytes_lost += found.bytes_lost
         unexplained = found.missing > 0 and not found.bytes_lost
         tally.topics_lost = (found.holes and own is None) or unexplained
         if found.damage is not None and not self._recover:
-            seconds = (index.end_ns - index.start_ns) * 1e-9
-            count = sum(index.counts.values())
-            kind = LogTruncated if found.damage.truncated else LogCorrupt
-            raise kind(
-                f"{self._path}: {found.damage.what}, at byte {found.damage.offset} of {size}; "
-                f"{count} messages ({seconds:.1f} s) before it are readable",
-                hint=RECOVER_HINT,
-            )
+            raise self._damaged(found.damage, index, size)
         return index
+
+    def _damaged(self, damage: Damage, index: McapIndex, size: int) -> LogCorrupt | LogTruncated:
+        seconds = (index.end_ns - index.start_ns) * 1e-9
+        count = sum(index.counts.values())
+        kind = LogTruncated if damage.truncated else LogCorrupt
+        return kind(
+            f"{self._path}: {damage.what}, at byte {damage.offset} of {size}; "
+            f"{count} messages ({seconds:.1f} s) before it are readable",
+            hint=RECOVER_HINT,
+        )
 
     def _describe(self) -> LogInfo:
         index = self._index
@@ -164,26 +164,17 @@ class McapSource:
     def _chunk_messages(self, wanted: frozenset[int], times: _TimeRange) -> Iterator[RawMessage]:
         chunks = sorted(self._index.chunks, key=lambda c: (c.message_start_time, c.chunk_start_offset))
         pending: list[RawMessage] = []
-        pending_bytes = 0
         for chunk in chunks:
-            if chunk.message_end_time < times.start_ns or chunk.message_start_time >= times.end_ns:
+            if not _is_wanted(chunk, wanted, times):
                 continue
-            # Without message indexes, only its records say which topics are in a chunk.
-            if chunk.message_index_offsets and not chunk.message_index_offsets.keys() & wanted:
-                continue
-            start_ns = chunk.message_start_time
-            if pending and (pending[0].log_time_ns < start_ns or pending_bytes > _MAX_PENDING_BYTES):
-                ready = len(pending)
-                if pending_bytes <= _MAX_PENDING_BYTES and pending[-1].log_time_ns >= start_ns:
-                    ready = next(i for i, m in enumerate(pending) if m.log_time_ns >= start_ns)
-                yield from pending[:ready]
-                del pending[:ready]
-                pending_bytes = sum(len(m.data) for m in pending)
-            for message in self._load(chunk):
-                if message.channel_id in wanted and message.log_time in times:
-                    found = RawMessage(self._topic_of[message.channel_id], message.log_time, message.data)
-                    pending.append(found)
-                    pending_bytes += len(found.data)
+            ready = _ready(pending, chunk.message_start_time)
+            yield from pending[:ready]
+            del pending[:ready]
+            pending += (
+                RawMessage(self._topic_of[message.channel_id], message.log_time, message.data)
+                for message in self._load(chunk)
+                if message.channel_id in wanted and message.log_time in times
+            )
             pending.sort(key=lambda m: m.log_time_ns)  # stable: equal times stay in file order
         yield from pending
 
@@ -275,3 +266,18 @@ class McapSource:
         doubtful = sum(end - start for start, end in index.loose)
         self.tally.bytes_lost += doubtful
         self.tally.warn(f"{doubtful} bytes of messages fail their checksum and may be wrong")
+
+
+def _is_wanted(chunk: ChunkIndex, channels: frozenset[int], times: _TimeRange) -> bool:
+    """Whether a chunk may hold messages of these channels and times."""
+    if chunk.message_end_time < times.start_ns or chunk.message_start_time >= times.end_ns:
+        return False
+    # Without message indexes, only its records say which topics are in a chunk.
+    return not chunk.message_index_offsets or bool(chunk.message_index_offsets.keys() & channels)
+
+
+def _ready(pending: list[RawMessage], start_ns: int) -> int:
+    """How many of the sorted messages need not wait for those of a chunk that begins at `start_ns`."""
+    if sum(len(m.data) for m in pending) > _MAX_PENDING_BYTES:
+        return len(pending)
+    return bisect.bisect_left(pending, start_ns, key=lambda m: m.log_time_ns)

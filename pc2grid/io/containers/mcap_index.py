@@ -55,19 +55,14 @@ def read_index(stream: BinaryIO, size: int, limits: rec.Limits) -> McapIndex | s
         return "it has no statistics"
     if statistics.chunk_count != len(chunks):
         return "it does not list the chunks"
-    if statistics.channel_count > len(summary.channels):
-        return "it does not list the channels"
-    if statistics.message_count and not (chunks or summary.channels):
+    needed = max(statistics.channel_count, int(statistics.message_count > 0 and not chunks))
+    if needed > len(summary.channels):
         return "it does not list the channels"
     definitions = Definitions()
     for definition in (*summary.schemas.values(), *summary.channels.values()):
         definitions.take(definition, summary_at)
     for chunk in chunks:
-        if not chunk.message_index_offsets.keys() <= summary.channels.keys():
-            raise Damage(summary_at, "it names channels that are missing")
-        first, behind = chunk.chunk_start_offset, _behind(chunk)
-        if first < len(rec.MAGIC) or chunk.chunk_length < rec.HEAD_BYTES or behind > summary_at:
-            raise Damage(summary_at, "it places a chunk outside of the data")
+        _check(chunk, summary, summary_at)
     chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
     loose, data_end, data_crc = _between_chunks(stream, chunks, summary_at, limits)
     counts = statistics.channel_message_counts
@@ -82,6 +77,15 @@ def read_index(stream: BinaryIO, size: int, limits: rec.Limits) -> McapIndex | s
         data_end=data_end,
         data_crc=data_crc,
     )
+
+
+def _check(chunk: ChunkIndex, summary: Summary, summary_at: int) -> None:
+    """Raises Damage if a chunk cannot be where the summary says."""
+    if not chunk.message_index_offsets.keys() <= summary.channels.keys():
+        raise Damage(summary_at, "it names channels that are missing")
+    first, behind = chunk.chunk_start_offset, _behind(chunk)
+    if first < len(rec.MAGIC) or chunk.chunk_length < rec.HEAD_BYTES or behind > summary_at:
+        raise Damage(summary_at, "it places a chunk outside of the data")
 
 
 def _behind(chunk: ChunkIndex) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import re
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
@@ -60,6 +61,17 @@ class Survey:
     holes: bool = False
     missing: int = 0
     warnings: list[str] = field(default_factory=list)
+
+    def compare(self, listed: Sequence[ChunkIndex]) -> None:
+        """Take note of chunks that the file's own index lists and that are not there.
+
+        A chunk whose kind was changed by damage is passed over like a record of an application.
+        """
+        there = {chunk.chunk_start_offset for chunk in self.index.chunks}
+        hidden = [chunk for chunk in listed if chunk.chunk_start_offset not in there]
+        if hidden and not self.bytes_lost:
+            self.bytes_lost = sum(chunk.chunk_length for chunk in hidden)
+            self.warnings.append(f"{len(hidden)} chunks that the index lists are not there")
 
 
 def survey(

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from pc2grid.errors import LogCorrupt, LogNotFound, NotALog
 from pc2grid.io.containers.cloud_folder import natural
 from pc2grid.io.containers.split_recording import SplitSource
-from pc2grid.io.message_source import MessageSource, Tally
+from pc2grid.io.message_source import LogInfo, MessageSource, Tally
 from pc2grid.model import MISSING_FILES
 
 METADATA = "metadata.yaml"
@@ -68,21 +68,15 @@ def _refuse_unrelated(folder: Path, parts: Sequence[MessageSource]) -> None:
     The names of its files differ in their numbers only, its files follow each other in time, and each of them
     has a topic of those before it, with the same type.
     """
-    first, reasons = parts[0].info.path, []
-    topics = {(t.topic, t.type) for t in parts[0].info.topics}
-    for before, part in itertools.pairwise(parts):
-        path, gap_s = part.info.path, (part.info.start_ns - before.info.end_ns) * 1e-9
-        timed = before.info.message_count != 0 and part.info.message_count != 0
-        own = {(t.topic, t.type) for t in part.info.topics}
-        if _without_numbers(path) != _without_numbers(first):
-            reasons.append(f"the name of {path.name} is not that of {first.name} with another number")
-        elif timed and abs(gap_s) > _MAX_GAP_S:
-            reasons.append(
-                f"{path.name} begins {abs(gap_s) / 3600:.0f} h"
-                f" {'after' if gap_s > 0 else 'before'} the end of {before.info.path.name}"
-            )
-        elif topics and own and not topics & own:
-            reasons.append(f"{path.name} has none of the topics of {first.name}")
+    infos = [part.info for part in parts]
+    first, reasons = infos[0].path, []
+    topics = {(t.topic, t.type) for t in infos[0].topics}
+    for before, info in itertools.pairwise(infos):
+        own = {(t.topic, t.type) for t in info.topics}
+        reason = _does_not_follow(before, info, first)
+        if reason is None and topics and own and not topics & own:
+            reason = f"{info.path.name} has none of the topics of {first.name}"
+        reasons += [] if reason is None else [reason]
         topics |= own
     if reasons:
         raise NotALog(
@@ -90,6 +84,17 @@ def _refuse_unrelated(folder: Path, parts: Sequence[MessageSource]) -> None:
             hint=f"name the files: pc2grid convert {folder}/*{first.suffix}; if they are one recording,"
             f" `ros2 bag reindex {folder}` writes its {METADATA}",
         )
+
+
+def _does_not_follow(before: LogInfo, info: LogInfo, first: Path) -> str | None:
+    """Why a file is not the one after another in a recording that begins with `first`; None if it may be."""
+    path, gap_s = info.path, (info.start_ns - before.end_ns) * 1e-9
+    if _without_numbers(path) != _without_numbers(first):
+        return f"the name of {path.name} is not that of {first.name} with another number"
+    if before.message_count != 0 and info.message_count != 0 and abs(gap_s) > _MAX_GAP_S:
+        order = "after" if gap_s > 0 else "before"
+        return f"{path.name} begins {abs(gap_s) / 3600:.0f} h {order} the end of {before.path.name}"
+    return None
 
 
 def _without_numbers(path: Path) -> str:

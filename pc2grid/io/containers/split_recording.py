@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,25 +20,11 @@ class SplitSource:
         self.files: tuple[Path, ...] = tuple(file for part in parts for file in part.files)
         self.tally = tally
         for part in parts:
-            tally.bytes_lost += part.tally.bytes_lost
-            tally.topics_lost |= part.tally.topics_lost
-            for sentence in part.tally.warnings:
-                tally.warn(sentence)
+            tally.take_over(part.tally)
             part.tally = tally
         self._max_chunk_bytes = max_chunk_bytes
         self._topics = _merged([t for part in parts for t in part.info.topics])
-        spans = [part.info for part in parts if part.info.message_count != 0]
-        counts = [part.info.message_count for part in parts]
-        self.info = LogInfo(
-            path=path,
-            format=next((p.info.format for p in parts if p.info.topics), parts[0].info.format),
-            size_bytes=sum(part.info.size_bytes for part in parts),
-            start_ns=min((s.start_ns for s in spans), default=0),
-            end_ns=max((s.end_ns for s in spans), default=0),
-            message_count=None if None in counts else sum(c for c in counts if c is not None),
-            topics=tuple(sorted(set(self._topics.values()), key=lambda t: (t.topic, t.type))),
-            warnings=tuple(tally.warnings),
-        )
+        self.info = _info(path, [part.info for part in parts], self._topics, tally)
 
     def close(self) -> None:
         """Close all files."""
@@ -59,6 +45,29 @@ class SplitSource:
                 yield RawMessage(self._topics[channel], log_time_ns, plain)
 
 
+def _info(
+    path: Path, infos: Sequence[LogInfo], topics: Mapping[TopicInfo, TopicInfo], tally: Tally
+) -> LogInfo:
+    """The facts about the whole recording, by those about its parts."""
+    spans = [info for info in infos if info.message_count != 0]
+    return LogInfo(
+        path=path,
+        format=next((info.format for info in infos if info.topics), infos[0].format),
+        size_bytes=sum(info.size_bytes for info in infos),
+        start_ns=min((s.start_ns for s in spans), default=0),
+        end_ns=max((s.end_ns for s in spans), default=0),
+        message_count=_total(info.message_count for info in infos),
+        topics=tuple(sorted(set(topics.values()), key=lambda t: (t.topic, t.type))),
+        warnings=tuple(tally.warnings),
+    )
+
+
+def _total(counts: Iterable[int | None]) -> int | None:
+    """The sum; None if one is unknown."""
+    known = list(counts)
+    return None if None in known else sum(count for count in known if count is not None)
+
+
 def _merged(topics: list[TopicInfo]) -> dict[TopicInfo, TopicInfo]:
     """For each topic of a part, the topic of the whole recording, with all messages counted."""
     groups: dict[tuple[str, str, str], list[TopicInfo]] = {}
@@ -66,8 +75,7 @@ def _merged(topics: list[TopicInfo]) -> dict[TopicInfo, TopicInfo]:
         groups.setdefault((topic.topic, topic.type, topic.encoding), []).append(topic)
     whole: dict[TopicInfo, TopicInfo] = {}
     for group in groups.values():
-        counts = [t.message_count for t in group]
-        total = None if None in counts else sum(c for c in counts if c is not None)
+        total = _total(t.message_count for t in group)
         described = next((t for t in group if t.schema), group[0])
         whole.update(dict.fromkeys(group, replace(described, message_count=total)))
     return whole

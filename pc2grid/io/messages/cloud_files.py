@@ -27,6 +27,7 @@ from pc2grid.errors import PointCloudError, UnsupportedSchema
 from pc2grid.io.messages.types import Bytes, Header, PointCloud2
 
 Fields = tuple[tuple[str, int, int, int], ...]  # name, offset, datatype, count
+Columns = list[tuple[str, int, int]]  # name, datatype, count
 
 # Limits that keep a damaged header from asking for memory that the file cannot fill.
 _MAX_HEADER_BYTES = 1 << 16
@@ -63,18 +64,7 @@ def _pcd(data: Bytes, header: Header) -> PointCloud2:
     if match is None:
         raise PointCloudError("a PCD without a DATA line")
     kind, body = match.group(1).decode(), memoryview(data)[match.end() :]
-    lines = [line.split() for line in bytes(data[: match.start()]).decode("ascii", "replace").splitlines()]
-    keys = {line[0]: line[1:] for line in lines if line and not line[0].startswith("#")}
-    try:
-        names = keys["FIELDS"]
-        types = [kind_of + size for kind_of, size in zip(keys["TYPE"], keys["SIZE"], strict=True)]
-        counts = [int(n) for n in keys.get("COUNT", ["1"] * len(names))]
-        points = int(keys["WIDTH"][0]) * int(keys["HEIGHT"][0])
-        columns = [(n, _PCD_TYPES[t], c) for n, t, c in zip(names, types, counts, strict=True)]
-    except (KeyError, ValueError, IndexError) as error:
-        raise PointCloudError(f"the header of a PCD makes no sense: {error}") from error
-    if points < 0 or any(count < 0 for count in counts):
-        raise PointCloudError("the header of a PCD makes no sense: a negative count")
+    columns, points = _pcd_columns(bytes(data[: match.start()]).decode("ascii", "replace"))
     if kind == "ascii":
         return _from_text(bytes(body), header, [(n, c) for n, _, c in columns], points)
     fields, step = _packed(columns)
@@ -87,6 +77,23 @@ def _pcd(data: Bytes, header: Header) -> PointCloud2:
     raise UnsupportedSchema(
         f"a PCD of data {kind!r:.40} is not read", hint="ascii, binary, binary_compressed"
     )
+
+
+def _pcd_columns(head: str) -> tuple[Columns, int]:
+    """The columns that the header of a PCD declares, and the number of points. Raises PointCloudError."""
+    lines = [line.split() for line in head.splitlines()]
+    keys = {line[0]: line[1:] for line in lines if line and not line[0].startswith("#")}
+    try:
+        names = keys["FIELDS"]
+        types = [kind_of + size for kind_of, size in zip(keys["TYPE"], keys["SIZE"], strict=True)]
+        counts = [int(n) for n in keys.get("COUNT", ["1"] * len(names))]
+        points = int(keys["WIDTH"][0]) * int(keys["HEIGHT"][0])
+        columns = [(n, _PCD_TYPES[t], c) for n, t, c in zip(names, types, counts, strict=True)]
+    except (KeyError, ValueError, IndexError) as error:
+        raise PointCloudError(f"the header of a PCD makes no sense: {error}") from error
+    if min([points, *counts]) < 0:
+        raise PointCloudError("the header of a PCD makes no sense: a negative count")
+    return columns, points
 
 
 def _unpacked(body: memoryview, size: int) -> bytes:
@@ -114,28 +121,10 @@ def _ply(data: Bytes, header: Header) -> PointCloud2:
     end = re.search(rb"^end_header[ \r]*\n", data[:_MAX_HEADER_BYTES], re.MULTILINE)
     if bytes(data[:3]) != b"ply" or end is None:
         raise PointCloudError("a PLY without a header")
-    kind = ""
-    elements: list[tuple[str, int, list[tuple[str, int, int]]]] = []
-    try:
-        for line in bytes(data[: end.start()]).decode("ascii", "replace").splitlines():
-            words = line.split()
-            if words[:1] == ["format"]:
-                kind = words[1]
-            elif words[:1] == ["element"]:
-                elements.append((words[1], int(words[2]), []))
-            elif words[:1] == ["property"]:
-                # A list has no fixed size, so the place of what follows it is not known.
-                code = 0 if words[1] == "list" else _PLY_TYPES[words[1]]
-                elements[-1][2].append((words[-1], code, 1))
-    except (KeyError, ValueError, IndexError) as error:
-        raise PointCloudError(f"the header of a PLY makes no sense: {error}") from error
+    kind, elements = _ply_elements(bytes(data[: end.start()]).decode("ascii", "replace"))
     body = memoryview(data)[end.end() :]
     for name, count, columns in elements:
-        if count < 0 or any(code == 0 for _, code, _ in columns):
-            raise PointCloudError(
-                f"element {name} of a PLY stands before the points or in them, and has lists"
-            )
-        fields, step = _packed(columns)
+        fields, step = _ply_packed(name, count, columns)
         if name == "vertex" and kind == "ascii":
             return _from_text(bytes(body), header, [(n, 1) for n, _, _ in columns], count)
         if name == "vertex" and kind in ("binary_little_endian", "binary_big_endian"):
@@ -147,7 +136,37 @@ def _ply(data: Bytes, header: Header) -> PointCloud2:
     raise PointCloudError(f"a PLY without points (format {kind!r:.30})")
 
 
-def _packed(columns: list[tuple[str, int, int]]) -> tuple[Fields, int]:
+def _ply_elements(head: str) -> tuple[str, list[tuple[str, int, Columns]]]:
+    """The format that the header of a PLY declares, and name, count and columns of its elements.
+
+    Raises PointCloudError.
+    """
+    kind = ""
+    elements: list[tuple[str, int, Columns]] = []
+    try:
+        for line in head.splitlines():
+            words = line.split()
+            if words[:1] == ["format"]:
+                kind = words[1]
+            elif words[:1] == ["element"]:
+                elements.append((words[1], int(words[2]), []))
+            elif words[:1] == ["property"]:
+                # A list has no fixed size, so the place of what follows it is not known.
+                code = 0 if words[1] == "list" else _PLY_TYPES[words[1]]
+                elements[-1][2].append((words[-1], code, 1))
+    except (KeyError, ValueError, IndexError) as error:
+        raise PointCloudError(f"the header of a PLY makes no sense: {error}") from error
+    return kind, elements
+
+
+def _ply_packed(name: str, count: int, columns: Columns) -> tuple[Fields, int]:
+    """The fields of an element, and the bytes of one. Raises PointCloudError if it has no fixed size."""
+    if count < 0 or any(code == 0 for _, code, _ in columns):
+        raise PointCloudError(f"element {name} of a PLY stands before the points or in them, and has lists")
+    return _packed(columns)
+
+
+def _packed(columns: Columns) -> tuple[Fields, int]:
     """The fields of columns (name, datatype, count) without gaps, and the bytes of a point."""
     fields, at = [], 0
     for name, datatype, count in columns:

@@ -219,15 +219,20 @@ def _parsed(name: str, encoding: str, text: str) -> Typesdict:
     types: Typesdict = {
         kind: ([], [(field.lower(), node) for field, node in fields]) for kind, (_, fields) in found.items()
     }
-    # Of this, rosbags makes Python code.
-    names = [part for kind in types for part in kind.split("/")]
-    names += [field for _, fields in types.values() for field, _ in fields]
-    if not all(_NAME.fullmatch(part) and not keyword.iskeyword(part) for part in names):
-        raise ValueError(f"{name}: a name in its definition is not one of ROS")
+    _check_names(types)
     if encoding == "ros1msg" or _TIME not in types:
         sec: Any = (Nodetype.BASE, ("uint32" if encoding == "ros1msg" else "int32", 0))
         types[_TIME] = ([], [("sec", sec), ("nanosec", (Nodetype.BASE, ("uint32", 0)))])
     return types
+
+
+def _check_names(types: Typesdict) -> None:
+    """Raises ValueError for a name that is not one of ROS: rosbags makes Python code of them."""
+    names = [part for kind in types for part in kind.split("/")]
+    names += [field for _, fields in types.values() for field, _ in fields]
+    for name in names:
+        if not _NAME.fullmatch(name) or keyword.iskeyword(name):
+            raise ValueError(f"{name!r:.40}: not a name in ROS")
 
 
 def _plain_idl(text: str) -> str:
