@@ -15,6 +15,7 @@ from collections.abc import Callable, Collection, Hashable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from pc2grid import extras
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LiveError
 from pc2grid.io.live.feed import Feed
@@ -66,7 +67,7 @@ class _Link:
         take: Callable[[str | bytes], None],
         changed: Callable[[bool], None],
     ) -> None:
-        """Raises LiveError if the first connection fails, or without the package `websockets`."""
+        """Raises LiveError if the first connection fails."""
         self._url, self._parameters, self._take, self._changed = url, parameters, take, changed
         self._closing = threading.Event()
         self._connection: ClientConnection | None = self._connect_first()
@@ -107,15 +108,10 @@ class _Link:
             time.sleep(self._parameters.least_pause_s)
 
     def _connect(self) -> ClientConnection:
-        try:
-            from websockets.exceptions import InvalidHandshake, InvalidURI
-            from websockets.sync.client import connect
-            from websockets.typing import Subprotocol
-        except ModuleNotFoundError as error:
-            raise LiveError(
-                "ws:// needs the package `websockets`",
-                hint="pip install 'pc2grid[live]'; it is not installed",
-            ) from error
+        from websockets.exceptions import InvalidHandshake, InvalidURI
+        from websockets.sync.client import connect
+        from websockets.typing import Subprotocol
+
         p = self._parameters
         problem: Exception | None = None
         for subprotocol in SUBPROTOCOLS:
@@ -207,6 +203,7 @@ class FoxgloveWebsocket(Feed):
         inbox: InboxParameters = INBOX,
     ) -> None:
         """Raises LiveError if the first connection fails, or without the package `websockets`."""
+        extras.require({"live": "ws://"})
         super().__init__(url, config, inbox)
         self._introduced_s = parameters.open_s
         self._advertised: dict[str, _Advertised] = {}
