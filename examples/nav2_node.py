@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import threading
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import pc2grid
@@ -53,7 +53,10 @@ class RclpyFeed(Feed):
             self._offer(name, TopicInfo(topic=name, type=kind, encoding="cdr"))
         self._refresh()
 
-    def _subscribe(self, key: Hashable, topic: TopicInfo) -> Any:
+    def _subscribe(self, new: Mapping[Hashable, TopicInfo]) -> Mapping[Hashable, Any]:
+        return {key: self._subscription(topic) for key, topic in new.items()}
+
+    def _subscription(self, topic: TopicInfo) -> Any:
         # Best effort takes from every publisher; static transforms are published once and kept for those who
         # ask.
         latched = topic.topic.endswith("tf_static")
@@ -74,8 +77,9 @@ class RclpyFeed(Feed):
             _type(topic.type), topic.topic, take, qos, raw=True, event_callbacks=events
         )
 
-    def _unsubscribe(self, key: Hashable, subscription: Any) -> None:
-        self._node.destroy_subscription(subscription)
+    def _unsubscribe(self, old: Mapping[Hashable, Any]) -> None:
+        for subscription in old.values():
+            self._node.destroy_subscription(subscription)
 
     def advertise(self, topic: str, type_name: str, definition: str, *, keep_last: bool) -> None:
         """Make a publisher."""

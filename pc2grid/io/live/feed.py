@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Collection, Hashable, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -120,22 +120,25 @@ class Feed:
         with self._lock:
             there = list(self._offered.values())
             wanted = {key: topic for key, topic in self._offered.items() if self._is_wanted(topic, there)}
-            for key in [key for key in self._subscriptions if key not in wanted]:
-                self._unsubscribe(key, self._subscriptions.pop(key))
-            for key, topic in wanted.items():
-                if key not in self._subscriptions:
-                    self._subscriptions[key] = self._subscribe(key, topic)
+            old = {key: given for key, given in self._subscriptions.items() if key not in wanted}
+            new = {key: topic for key, topic in wanted.items() if key not in self._subscriptions}
+            for key in old:
+                del self._subscriptions[key]
+            if old:
+                self._unsubscribe(old)
+            if new:
+                self._subscriptions.update(self._subscribe(new))
 
     def _is_wanted(self, topic: TopicInfo, there: Sequence[TopicInfo]) -> bool:
         if self._wanted is not None:
             return topic.topic in self._wanted
         return topics.may_be_used(topic, there, self._scans_topic)
 
-    def _subscribe(self, key: Hashable, topic: TopicInfo) -> Any:
-        """Ask for the messages of a topic; what is returned is given to `_unsubscribe`."""
-        return None
+    def _subscribe(self, new: Mapping[Hashable, TopicInfo]) -> Mapping[Hashable, Any]:
+        """Ask for the messages of topics; what is returned for each is given to `_unsubscribe`."""
+        return new
 
-    def _unsubscribe(self, key: Hashable, subscription: Any) -> None:
+    def _unsubscribe(self, old: Mapping[Hashable, Any]) -> None:
         """Ask for them no longer."""
 
     def _set_connected(self, connected: bool) -> None:

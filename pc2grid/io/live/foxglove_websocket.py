@@ -11,7 +11,7 @@ import json
 import struct
 import threading
 import time
-from collections.abc import Callable, Collection, Hashable
+from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -302,12 +302,14 @@ class FoxgloveWebsocket(Feed):
             if twin is None or twin.type != found.type:
                 self._offer(number, found)
 
-    def _subscribe(self, key: Hashable, topic: TopicInfo) -> TopicInfo:
-        self._link.send({"op": "subscribe", "subscriptions": [{"id": key, "channelId": key}]})
-        return topic
+    def _subscribe(self, new: Mapping[Hashable, TopicInfo]) -> Mapping[Hashable, TopicInfo]:
+        # Before it is sent: the first message may come at once.
+        self._subscriptions.update(new)
+        self._link.send({"op": "subscribe", "subscriptions": [{"id": n, "channelId": n} for n in new]})
+        return new
 
-    def _unsubscribe(self, key: Hashable, subscription: object) -> None:
-        self._link.send({"op": "unsubscribe", "subscriptionIds": [key]})
+    def _unsubscribe(self, old: Mapping[Hashable, Any]) -> None:
+        self._link.send({"op": "unsubscribe", "subscriptionIds": list(old)})
 
 
 def _topic_of(channel: dict[str, Any]) -> TopicInfo:

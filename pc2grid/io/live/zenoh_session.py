@@ -12,7 +12,7 @@ import secrets
 import struct
 import threading
 import time
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
@@ -171,7 +171,10 @@ class ZenohSession(Feed):
         if token.kind == "MS" and token.topic in self._publishing.offered and token.best_effort:
             self.news.tell(f"{token.topic}: {token.node} subscribes as best effort: messages may get lost")
 
-    def _subscribe(self, key: Hashable, topic: TopicInfo) -> Any:
+    def _subscribe(self, new: Mapping[Hashable, TopicInfo]) -> Mapping[Hashable, Any]:
+        return {key: self._subscriber(topic) for key, topic in new.items()}
+
+    def _subscriber(self, topic: TopicInfo) -> Any:
         from zenoh.ext import HistoryConfig, declare_advanced_subscriber
 
         package, _, kind = topic.type.partition("/")
@@ -182,8 +185,9 @@ class ZenohSession(Feed):
             options["history"] = HistoryConfig(detect_late_publishers=True)
         return declare_advanced_subscriber(self._session, place, _Receiver(topic, self._inbox), **options)
 
-    def _unsubscribe(self, key: Hashable, subscription: Any) -> None:
-        subscription.undeclare()
+    def _unsubscribe(self, old: Mapping[Hashable, Any]) -> None:
+        for subscriber in old.values():
+            subscriber.undeclare()
 
 
 class _Publishing:
