@@ -133,7 +133,7 @@ def is_rolling(scan: Scan, first: Scan | None = None) -> bool:
     to be on wheels.
     """
     T = scan.T_odom_base
-    if scan.sensor == "laser":
+    if SENSOR_MODELS[scan.sensor].planar:
         return True
     if T is None:
         return float(scan.T_base_sensor[2, 3]) > _UPRIGHT_HEIGHT_M
