@@ -18,12 +18,12 @@ def main(recording: str, database: str) -> None:
         # The index is made once for many queries. It reads the maps of a large database when they are needed.
         # Queries are processed with the settings that made the maps.
         config = opened.config()
-        relocalizer = pc2grid.Relocalizer(pc2grid.MapIndex.of(opened, config))
+        localizer = pc2grid.Localizer(pc2grid.MapIndex.of(opened, config))
         for registered, planar_scan in pc2grid.follow(log.scans(), config):
-            moment = relocalizer.add(registered, planar_scan)
+            moment = localizer.add(registered, planar_scan)
             if moment is None:  # the database is asked after every metre of travel
                 continue
-            answer = relocalizer.answer()
+            answer = localizer.answer()
             print(f"after {moment.path_m:.1f} m: {answer.status}, confidence {answer.confidence:.3f}")
             if answer.T_map_base is not None:
                 x, y, yaw_deg = answer.T_map_base.x, answer.T_map_base.y, math.degrees(answer.T_map_base.yaw)

@@ -24,9 +24,8 @@ from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.io.message_source import RawMessage, TopicInfo
 from signature.database import open_database
-from signature.relocalization.looking import Looking
-from signature.relocalization.map_index import MapIndex
-from signature.relocalization.watcher import Look, Watcher
+from signature.localization.follower import Follower
+from signature.localization.localizer import Localizer, Look, MapIndex
 
 try:
     import rclpy
@@ -113,15 +112,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     spin.start()
     with open_database(options.database) as database, LiveLog(feed, ReadConfig(topic=options.topic)) as live:
         config = database.config()
-        watcher = Watcher(MapIndex.of(database, config))
-        with Nav2Publisher(feed) as publisher, Looking(watcher, beside=True) as looking:
+        localizer = Localizer(MapIndex.of(database, config))
+        with Nav2Publisher(feed) as publisher, Follower(localizer, beside=True) as follower:
             publisher.announce("/initialpose")
             # Called several times a second; true ends the stream of scans.
-            live.on_poll = lambda: tell(node, live, publisher, looking.take())
+            live.on_poll = lambda: tell(node, live, publisher, follower.take())
             while not live.ended:
                 for registered, planar_scan in pc2grid.follow(live.scans(), config):
-                    looking.add(registered, planar_scan)
-                looking.restart()
+                    follower.add(registered, planar_scan)
+                follower.restart()
 
 
 def tell(node: Any, live: LiveLog, publisher: Nav2Publisher, looks: Sequence[Look]) -> bool:

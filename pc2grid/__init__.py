@@ -27,7 +27,7 @@ Recordings to maps
 Databases and answers
     open_database       a SubmapDatabase; Label: building and floor of a session
     locate              where registered scans were taken: an Answer
-    Relocalizer         the same while the robot drives, in a MapIndex
+    Localizer           the same while the robot drives, in a MapIndex
     Prior               where the robot is known to be, roughly
 
 Types
@@ -82,11 +82,11 @@ if TYPE_CHECKING:
     from signature.database import open_database as open_database
     from signature.files import convert as convert
     from signature.files import relocalize as relocalize
-    from signature.relocalization.answer import Answer as Answer
-    from signature.relocalization.map_index import MapIndex as MapIndex
-    from signature.relocalization.prior import Prior as Prior
-    from signature.relocalization.relocalizer import Relocalizer as Relocalizer
-    from signature.relocalization.relocalizer import relocalize as locate  # noqa: F401
+    from signature.localization.answer import Answer as Answer
+    from signature.localization.localizer import Localizer as Localizer
+    from signature.localization.localizer import locate as locate
+    from signature.localization.map_index import MapIndex as MapIndex
+    from signature.localization.prior import Prior as Prior
 
 # Where each is found; with another name there, behind the colon. A test compares this with the list above.
 _HOMES = {
@@ -122,11 +122,11 @@ _HOMES = {
     "open_database": "signature.database",
     "convert": "signature.files",
     "relocalize": "signature.files",
-    "Answer": "signature.relocalization.answer",
-    "MapIndex": "signature.relocalization.map_index",
-    "Prior": "signature.relocalization.prior",
-    "Relocalizer": "signature.relocalization.relocalizer",
-    "locate": "signature.relocalization.relocalizer:relocalize",
+    "Answer": "signature.localization.answer",
+    "MapIndex": "signature.localization.map_index",
+    "Prior": "signature.localization.prior",
+    "Localizer": "signature.localization.localizer",
+    "locate": "signature.localization.localizer",
 }
 __all__ = ["__version__", *_HOMES]
 

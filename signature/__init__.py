@@ -1,7 +1,7 @@
 """Submaps -> signatures -> database -> retrieval -> verified pose.
 
 The back of pc2grid: one file for each section of the paper (`boundary`, `freespace`, `symmetry`,
-`similarity`), the database behind one protocol, and relocalization. Importing this package loads no library:
+`similarity`), the database behind one protocol, and localization. Importing this package loads no library:
 each name loads its module when it is first used. `help(signature.locate)` and so on explain them.
 
 >>> import pc2grid, signature
@@ -25,7 +25,7 @@ Databases
 Answers
     relocalize          where in a database a recording was made: an Answer
     locate              where registered scans were taken; locate_map: where a drawn map lies
-    Relocalizer         the same while the robot drives, in a MapIndex
+    Localizer           the same while the robot drives, in a MapIndex
     Prior               where the robot is known to be, roughly
     check_pose          whether a pose that is believed agrees with the map: a PoseCheck
     Config              settings
@@ -46,14 +46,14 @@ if TYPE_CHECKING:
     from signature.describe import describe as signature_of  # noqa: F401
     from signature.files import convert as convert
     from signature.files import relocalize as relocalize
-    from signature.relocalization.answer import Answer as Answer
-    from signature.relocalization.map_index import MapIndex as MapIndex
-    from signature.relocalization.pose_check import PoseCheck as PoseCheck
-    from signature.relocalization.pose_check import check_pose as check_pose
-    from signature.relocalization.prior import Prior as Prior
-    from signature.relocalization.relocalizer import Relocalizer as Relocalizer
-    from signature.relocalization.relocalizer import locate_map as locate_map
-    from signature.relocalization.relocalizer import relocalize as locate  # noqa: F401
+    from signature.localization.answer import Answer as Answer
+    from signature.localization.localizer import Localizer as Localizer
+    from signature.localization.localizer import locate as locate
+    from signature.localization.localizer import locate_map as locate_map
+    from signature.localization.map_index import MapIndex as MapIndex
+    from signature.localization.pose_check import PoseCheck as PoseCheck
+    from signature.localization.pose_check import check_pose as check_pose
+    from signature.localization.prior import Prior as Prior
     from signature.sessions import add_session as add_session
     from signature.sessions import build_session as build_session
     from signature.sessions import build_sessions as build_sessions
@@ -72,14 +72,14 @@ _HOMES = {
     "signature_of": "signature.describe:describe",
     "convert": "signature.files",
     "relocalize": "signature.files",
-    "Answer": "signature.relocalization.answer",
-    "MapIndex": "signature.relocalization.map_index",
-    "PoseCheck": "signature.relocalization.pose_check",
-    "check_pose": "signature.relocalization.pose_check",
-    "Prior": "signature.relocalization.prior",
-    "Relocalizer": "signature.relocalization.relocalizer",
-    "locate": "signature.relocalization.relocalizer:relocalize",
-    "locate_map": "signature.relocalization.relocalizer",
+    "Answer": "signature.localization.answer",
+    "MapIndex": "signature.localization.map_index",
+    "PoseCheck": "signature.localization.pose_check",
+    "check_pose": "signature.localization.pose_check",
+    "Prior": "signature.localization.prior",
+    "Localizer": "signature.localization.localizer",
+    "locate": "signature.localization.localizer",
+    "locate_map": "signature.localization.localizer",
     "add_session": "signature.sessions",
     "build_session": "signature.sessions",
     "build_sessions": "signature.sessions",

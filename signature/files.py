@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from pc2grid.io.recording import Log
     from pc2grid.model import RegisteredScan
     from signature.database import SubmapDatabase
-    from signature.relocalization.answer import Answer, Moment
-    from signature.relocalization.map_index import MapIndex
-    from signature.relocalization.prior import Prior
-    from signature.relocalization.relocalizer import Watch
+    from signature.localization.answer import Answer, Moment
+    from signature.localization.localizer import Watch
+    from signature.localization.map_index import MapIndex
+    from signature.localization.prior import Prior
 
 
 def convert(
@@ -115,7 +115,7 @@ def relocalize(
     from pc2grid.io.recording import open_log
     from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
     from signature.database import open_database
-    from signature.relocalization.relocalizer import MapIndex, locate_map
+    from signature.localization.localizer import MapIndex, locate_map
 
     with open_database(database) as opened:
         settings = query_config(opened, config)
@@ -138,31 +138,31 @@ def locate_log(
     span: TimeSpan = TimeSpan(),
     until_located: bool = False,
     watch: Watch | None = None,
-    ask: int = 0,
+    on_the_way: int = 0,
     observer: Observer = Observer(),
 ) -> Answer:
     """Find where an open recording, or the part of it that `span` names, was made.
 
     config : see `query_config`. until_located, watch : as in
-    `signature.relocalization.relocalizer.localize`. observer : as in `relocalize`.
-    ask : at so many moments at most, spread evenly over the time of the recording, `watch` gets what the
-        answer would have been there, and nothing at others; 0: what each look says.
+    `signature.localization.localizer.locate_in`. observer : as in `relocalize`.
+    on_the_way : at so many moments at most, spread evenly over the time of the recording, `watch` gets what
+        the answer would have been there, and nothing at others; 0: what each look says.
 
     Raises NoScans if no scan can be used.
     """
     from pc2grid.pipeline import follow
-    from signature.relocalization.relocalizer import localize
+    from signature.localization.localizer import locate_in
 
     ends_ns = log.info.start_ns, log.info.end_ns
-    asked_about = 0
+    answered = 0
 
     def due(registered: RegisteredScan) -> bool:
-        nonlocal asked_about
-        part = math.floor(ask * span.share_done(registered.scan.stamp_ns, *ends_ns))
-        if part < asked_about:
+        nonlocal answered
+        part = math.floor(on_the_way * span.share_done(registered.scan.stamp_ns, *ends_ns))
+        if part < answered:
             return False
-        asked_about = part + 1
-        return part < ask
+        answered = part + 1
+        return part < on_the_way
 
     def see(registered: RegisteredScan, moment: Moment | None) -> None:
         observer.on_scan(registered)
@@ -172,8 +172,9 @@ def locate_log(
 
     with observer.step("locate", span.length_ns(*ends_ns) * 1e-9):
         scans = follow(log.scans(span.start_s, span.duration_s), config)
-        (asked,) = localize(scans, [index], until_located=until_located, watch=see, ask=due if ask else None)
-    return asked.answers[0]
+        return locate_in(
+            scans, index, until_located=until_located, watch=see, answer_at=due if on_the_way else None
+        )
 
 
 def query_config(database: SubmapDatabase, config: Config) -> Config:

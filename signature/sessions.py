@@ -140,7 +140,7 @@ def build_sessions(
 
     from pc2grid.io import open_log
     from pc2grid.pipeline import build_maps
-    from signature.relocalization.place_recognition import recognizer_for
+    from signature.localization.place_recognition import recognizer_for
 
     with open_log(path, config.read, recover=recover) as log:
         choice = log.choose()

@@ -21,7 +21,7 @@ BANDS = {"pc2grid_lab": "#8A6D00", "pc2grid_cli": "#B0568A", "signature": "#0080
 ABOUT = {
     "pc2grid_lab": "the laboratory: experiments, peers, benchmarks",
     "pc2grid_cli": "the program: one file for each command",
-    "signature": "submaps to signatures, database, relocalization",
+    "signature": "submaps to signatures, database, localization",
     "pc2grid": "recordings to clouds, trajectories, maps, submaps",
 }
 PAPER = ("boundary", "freespace", "symmetry", "describe", "similarity", "seen", "seen_likelihood", "_kernels")
@@ -55,7 +55,7 @@ class Box:
 def imports() -> tuple[nx.DiGraph, dict[str, list[str]]]:
     """What each folder or file imports of its own package, and the modules in each of them.
 
-    Their names are like "signature.relocalization" and "pc2grid.pipeline". Imports for type checking only are
+    Their names are like "signature.localization" and "pc2grid.pipeline". Imports for type checking only are
     left out, and the `__init__` files of the three packages, which only pass names on.
     """
     code = grimp.build_graph(*BANDS, exclude_type_checking_imports=True)

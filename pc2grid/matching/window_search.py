@@ -2,7 +2,7 @@
 
 This is the one coarse search. It is used twice:
 
-- around each place that retrieval proposes, in boxes of 0.8 m and 16 degrees (`relocalization.hypotheses`);
+- around each place that retrieval proposes, in boxes of 0.8 m and 16 degrees (`localization.hypotheses`);
 - over a whole map, in such boxes side by side on all free ground, when retrieval did not settle the question.
 
 A box is a set of poses. Three bounds, each of which no pose exceeds, keep most poses from being scored, as in

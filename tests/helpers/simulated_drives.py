@@ -17,7 +17,7 @@ from pc2grid.submaps.partition import partition
 from signature.config import Config
 from signature.database import Label
 from signature.describe import describe
-from signature.relocalization.relocalizer import MapIndex
+from signature.localization.map_index import MapIndex
 from signature.similarity import SignatureTable
 
 RESOLUTION_M = 0.05

@@ -19,9 +19,9 @@ from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
-from pc2grid_cli.locate import ASKED
+from pc2grid_cli.locate import ON_THE_WAY
 from pc2grid_cli.main import app
-from signature.relocalization.relocalizer import Query
+from signature.localization.localizer import Localizer
 from tests.helpers.simulated_drives import office
 
 DRIFT_RAD_PER_M = math.radians(1.0)
@@ -88,17 +88,17 @@ def test_a_page_asks_a_bounded_number_of_times(
     folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     asked = []
-    answer = Query.answer
+    answer = Localizer.answer
 
-    def counted(query: Query, search: Any) -> Any:
-        asked.append(query.path_m)
-        return answer(query, search)
+    def counted(localizer: Localizer) -> Any:
+        asked.append(localizer.path_m)
+        return answer(localizer)
 
-    monkeypatch.setattr(Query, "answer", counted)
+    monkeypatch.setattr(Localizer, "answer", counted)
     page = tmp_path / "page.html"
     run("relocalize", folder / "drive.mcap", "-d", folder / "plan.submaps", "--report", page)
-    assert len(asked) <= ASKED + 1
-    assert max(np.diff(asked)) < 2.5 * max(asked) / ASKED
+    assert len(asked) <= ON_THE_WAY + 1
+    assert max(np.diff(asked)) < 2.5 * max(asked) / ON_THE_WAY
     found = re.search(r'"asked": ?(\d+)', page.read_text())
     assert found is not None and int(found[1]) == len(asked) - 1
     assert "moments spread evenly over the time of the recording" in page.read_text()

@@ -20,6 +20,7 @@ from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
 from pc2grid_cli.view import Locator
 from pc2grid_cli.view_server import ViewServer
+from pc2grid_lab.experiments.answers import localize
 from signature.config import Config
 from signature.database import open_database
 from tests.helpers.simulated_drives import office
@@ -142,3 +143,56 @@ def test_view(expected: tuple[Path, Expected], tmp_path: Path) -> None:
             thread.join()
             server.stop()
     assert_same(document, last)
+
+
+def test_localizer_of_the_library(expected: tuple[Path, Expected]) -> None:
+    folder, last = expected
+    with (
+        open_database(folder / "monday.submaps") as database,
+        pc2grid.open_log(folder / "tuesday.mcap") as log,
+    ):
+        config = database.config()
+        localizer = pc2grid.Localizer(pc2grid.MapIndex.of(database, config))
+        for registered, planar_scan in pc2grid.follow(log.scans(), config):
+            localizer.add(registered, planar_scan)
+        assert_same(localizer.answer().to_json(), last)
+
+
+def test_laboratory(expected: tuple[Path, Expected]) -> None:
+    """Several maps are compared with one query, which is drawn once."""
+    folder, last = expected
+    with (
+        open_database(folder / "monday.submaps") as database,
+        pc2grid.open_log(folder / "tuesday.mcap") as log,
+    ):
+        config = database.config()
+        index = pc2grid.MapIndex.of(database, config)
+        (found,) = localize(pc2grid.follow(log.scans(), config), [index, index])
+    for answer in found.answers:
+        assert_same(answer.to_json(), last)
+
+
+def relocalize_at_once(folder: Path, *words: object) -> Any:
+    """`--check` does not search on the way, so that an early place cannot speak for or against the pose."""
+    begin = ("relocalize", folder / "tuesday.mcap", "-d", folder / "monday.submaps", "--json")
+    at_once = ("--set", "relocalize.step_m=100")
+    return json.loads(CliRunner().invoke(app, [str(word) for word in (*begin, *at_once, *words)]).stdout)
+
+
+def test_check_of_the_right_pose(expected: tuple[Path, Expected]) -> None:
+    folder, _ = expected
+    last = relocalize_at_once(folder)
+    pose = last["pose"]
+    document = relocalize_at_once(folder, "--check", pose["x"], pose["y"], math.degrees(pose["yaw"]))
+    assert (document["status"], document["probability"]) == ("fine", rounded(last["confidence"]))
+    # The best place near the pose is found in space, too: it is the pose itself.
+    assert document["off_m"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_check_of_a_wrong_pose_tells_the_answer(expected: tuple[Path, Expected]) -> None:
+    folder, watched = expected
+    last = relocalize_at_once(folder)
+    document = relocalize_at_once(folder, "--check", last["pose"]["x"] + 4.0, last["pose"]["y"], 0.0)
+    assert document["status"] == "lost"
+    assert document["better"]["pose"] == rounded(last["pose"]) == rounded(watched["pose"])
+    assert document["better"]["confidence"] == rounded(last["confidence"])

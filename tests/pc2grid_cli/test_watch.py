@@ -22,6 +22,7 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app, main
+from pc2grid_cli.watch import ResetPolicy
 from tests.helpers.interruptible import interruptible
 from tests.helpers.json_schema import closed
 from tests.helpers.robot import Recorded, Robot, ZenohRobot
@@ -230,3 +231,12 @@ def test_a_robot_that_is_silent_is_given_up(here: Path, capsys: pytest.CaptureFi
     code, looks, err = watch(capsys, "cut.mcap", "--timeout", "0.5")
     assert (code, looks) == (1, [])
     assert "/scan" in err or "no topics" in err or "no topic with scans" in err
+
+
+def test_resets_are_paused_and_bounded() -> None:
+    now_s = 0.0
+    policy = ResetPolicy(pause_s=10.0, most=2, calm_s=60.0, clock=lambda: now_s)
+    allowed = {}
+    for now_s in (0.0, 5.0, 11.0, 22.0, 40.0, 80.0, 85.0):
+        allowed[now_s] = policy.allows()
+    assert [now_s for now_s, may in allowed.items() if may] == [0.0, 11.0, 80.0]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from signature.relocalization.confidence import Calibration, Evidence
+from signature.localization.confidence import Calibration, Evidence
 
 SCRIPT = Path(__file__).parents[2] / "tools" / "pc2grid_lab" / "bench" / "fit_confidence.py"
 TRUTH = Calibration(bias=-5.0, support=4.0, clearance=1.5)

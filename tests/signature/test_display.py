@@ -12,9 +12,9 @@ from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import OccupancyGrid
 from signature.database import Label, open_database
 from signature.database.maintenance import store
-from signature.relocalization.answer import Answer
-from signature.relocalization.confidence import NO_EVIDENCE
-from signature.relocalization.hypotheses import Hypothesis
+from signature.localization.answer import Answer
+from signature.localization.confidence import NO_EVIDENCE
+from signature.localization.hypotheses import Hypothesis
 from tests.helpers.databases import make_entry
 
 LONGEST_LINE = 200

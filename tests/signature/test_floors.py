@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pc2grid.model import UNKNOWN, SessionMap
 from signature.config import Config
 from signature.database import Label, Provenance, open_database
-from signature.relocalization.relocalizer import Answer, MapIndex, locate_map
+from signature.localization.localizer import Answer, MapIndex, locate_map
 from signature.sessions import add_sessions, on_floors, provenance
 from tests.helpers.session_maps import session, way
 from tests.helpers.simulated_drives import cut, office

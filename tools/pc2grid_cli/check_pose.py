@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from pc2grid_cli.json_schemas import CheckedPoseJudgement, RelocalizeCheck, WatchCheck
     from signature.config import Config
     from signature.database import SubmapDatabase
-    from signature.relocalization.pose_check import PoseCheck
-    from signature.relocalization.pose_watcher import PoseLook
+    from signature.localization.pose_check import PoseCheck, PoseLook
 
 
 def check_log(
@@ -39,8 +38,8 @@ def check_log(
     from pc2grid.io import open_log
     from pc2grid.pipeline import follow
     from signature.files import query_config
-    from signature.relocalization.map_index import MapIndex
-    from signature.relocalization.pose_check import check_pose
+    from signature.localization.map_index import MapIndex
+    from signature.localization.pose_check import check_pose
 
     config = query_config(database, config)
     with open_log(path, config.read, recover=recover) as log:

@@ -16,7 +16,7 @@ from pc2grid_cli.plural import counted
 
 if TYPE_CHECKING:
     from pc2grid.model import RegisteredScan
-    from signature.relocalization.answer import Moment
+    from signature.localization.answer import Moment
 
 BUILDING_SEED = 3
 MAP_LENGTH_M = 60.0
@@ -41,7 +41,7 @@ def demo_command(
     from pc2grid.io.trajectory import read_tum
     from pc2grid.simulate import SimulationConfig, simulate_session
     from pc2grid.simulate.config import LidarConfig
-    from pc2grid_cli.locate import ASKED, Found, about_log, locate
+    from pc2grid_cli.locate import ON_THE_WAY, Found, about_log, locate
     from pc2grid_cli.picture import draw_answer
     from pc2grid_cli.relocalize import as_text
     from pc2grid_cli.report import write_report
@@ -87,7 +87,9 @@ def demo_command(
             if moment is not None:
                 asked.append(moment)
 
-        answer, poses = locate(query, opened, config, observer=terminal.observer(), watch=watch, ask=ASKED)
+        answer, poses = locate(
+            query, opened, config, observer=terminal.observer(), watch=watch, on_the_way=ON_THE_WAY
+        )
         # The frame of the database is the first pose of the lidar robot; the truth is in that of the plan.
         T_map_plan = next(truth_map.poses()).inverse()
         true_poses = [T_map_plan @ pose for pose in truth_query.poses()]
@@ -97,7 +99,7 @@ def demo_command(
         truth_m = np.array([(p.x, p.y) for p in true_poses])
         draw_answer(picture, opened, answer, poses, truth_m)
         about = about_log(depth, query, answer, scans=len(poses))
-        found = Found(answer=answer, poses=poses, about=about, asked=tuple(asked))
+        found = Found(answer=answer, poses=poses, about=about, on_the_way=tuple(asked))
         write_report(page, opened, found=found, accept=config.relocalize.accept, truth_m=truth_m)
     scans, submaps = counted(len(session.trajectory), "lidar scan"), counted(len(session.submaps), "submap")
     print(f"map: {scans}, {submaps}: {database}")

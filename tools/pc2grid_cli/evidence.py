@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pc2grid.matching.agreement import Agreement
     from signature.database import SubmapDatabase
-    from signature.relocalization.answer import Answer
+    from signature.localization.answer import Answer
 
 
 def agreements(answer: Answer, database: SubmapDatabase) -> tuple[Agreement, ...]:

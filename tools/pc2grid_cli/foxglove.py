@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pc2grid.arrays import F64
     from pc2grid.model import OccupancyGrid, Trajectory
     from signature.database import SubmapDatabase
-    from signature.relocalization.answer import Answer
+    from signature.localization.answer import Answer
 
 # Okabe and Ito's green, grey and purple.
 _GREEN, _GREY, _PURPLE = (0.0, 0.62, 0.45, 1.0), (0.4, 0.4, 0.4, 0.6), (0.8, 0.47, 0.65, 1.0)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 # Before Python 3.12 pydantic, which makes the schemas, does not take the TypedDict of typing.
 from typing_extensions import TypedDict
 
-from signature.relocalization.answer_json import (
+from signature.localization.answer_json import (
     Pose,
     PoseInSpace,
     Result,
@@ -23,7 +23,7 @@ from signature.relocalization.answer_json import (
     Travel,
     Version,
 )
-from signature.relocalization.watcher import State
+from signature.localization.belief import State
 
 CheckStatus = Literal["fine", "lost", "unsure"]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pc2grid.io import Log
     from pc2grid.time_span import TimeSpan
-    from signature.relocalization.prior import Prior
+    from signature.localization.prior import Prior
 
 Three = tuple[float, float, float]
 
@@ -59,7 +59,7 @@ class KnownPose:
 
     def region(self) -> Prior | None:
         """The region of `--near`; None if nothing is said about it. Raises ConfigError."""
-        from signature.relocalization.prior import Prior
+        from signature.localization.prior import Prior
 
         self.validate(is_map=False)
         if self.near is None:
@@ -73,7 +73,7 @@ class KnownPose:
         Raises ConfigError, or what `Log.map_pose` raises.
         """
         from pc2grid_cli.nav2_pose import read_pose
-        from signature.relocalization.prior import Prior
+        from signature.localization.prior import Prior
 
         if self.near_pose is None:
             return self.region()

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from pc2grid_cli.json_schemas import Query
     from signature.config import Config
     from signature.database import SubmapDatabase
-    from signature.relocalization.answer import Moment
-    from signature.relocalization.map_index import MapIndex
-    from signature.relocalization.prior import Prior
-    from signature.relocalization.relocalizer import Answer, Watch
+    from signature.localization.answer import Moment
+    from signature.localization.localizer import Answer, Watch
+    from signature.localization.map_index import MapIndex
+    from signature.localization.prior import Prior
 
 
-ASKED = 8
+ON_THE_WAY = 8
 """At so many moments on the way the page and rerun say what the answer would have been. Chosen by hand: each
 takes as long as the answer, so that a page takes a few times as long as the answer alone."""
 
@@ -38,7 +38,7 @@ class Found:
     poses : the query in its own frame, see `followed`; empty for a map. drawn : the query if it is a map.
     about : the description of the query in the JSON document.
     report : what was read of a recording, and what was lost; None for a map.
-    asked : what the answer would have been on the way; empty if this was not wanted.
+    on_the_way : what the answer would have been on the way; empty if this was not wanted.
     """
 
     answer: Answer
@@ -46,7 +46,7 @@ class Found:
     about: Query
     drawn: OccupancyGrid | None = None
     report: ReadReport | None = None
-    asked: tuple[Moment, ...] = ()
+    on_the_way: tuple[Moment, ...] = ()
 
 
 def find_log(
@@ -59,22 +59,22 @@ def find_log(
     observer: Observer = Observer(),
     watch: Watch | None = None,
     known: KnownPose = KnownPose(),
-    ask: int = 0,
+    on_the_way: int = 0,
     index: MapIndex | None = None,
 ) -> Found:
     """Locate a recording, or the part of it that `span` names.
 
-    ask : find out, too, what the answer would have been at so many moments on the way (`Found.asked`, and
+    on_the_way : find out, too, what the answer would have been at so many moments (`Found.on_the_way`, and
         what `watch` gets), see `signature.files.locate_log`.
     index : of the database, if it is prepared.
     """
     from pc2grid.io import open_log
 
-    asked: list[Moment] = []
+    moments: list[Moment] = []
 
     def see(registered: RegisteredScan, moment: Moment | None) -> None:
-        if ask and moment is not None:
-            asked.append(moment)
+        if on_the_way and moment is not None:
+            moments.append(moment)
         if watch is not None:
             watch(registered, moment)
 
@@ -88,12 +88,12 @@ def find_log(
             observer=observer,
             watch=see,
             prior=prior,
-            ask=ask,
+            on_the_way=on_the_way,
             index=index,
         )
         about = about_log(path, query, answer, scans=len(poses))
         report = query.report()
-        return Found(answer=answer, poses=poses, about=about, report=report, asked=tuple(asked))
+        return Found(answer=answer, poses=poses, about=about, report=report, on_the_way=tuple(moments))
 
 
 def about_log(path: Path, query: Log, answer: Answer, *, scans: int) -> Query:
@@ -116,7 +116,7 @@ def find_map(path: Path, database: SubmapDatabase, config: Config) -> Found:
 
     from pc2grid.mapping.drawn_map import load_drawn_map
     from pc2grid.model import Trajectory
-    from signature.relocalization.relocalizer import MapIndex, locate_map
+    from signature.localization.localizer import MapIndex, locate_map
 
     made_with = database.config().model_copy(update={"read": config.read})
     drawn = load_drawn_map(path, made_with)
@@ -143,13 +143,13 @@ def locate(
     observer: Observer = Observer(),
     watch: Watch | None = None,
     prior: Prior | None = None,
-    ask: int = 0,
+    on_the_way: int = 0,
     index: MapIndex | None = None,
 ) -> tuple[Answer, Trajectory]:
     """The answer for a recording, and its poses in its own odometry frame, as `followed` corrects them.
 
-    watch : called with each scan, and with the state of the answer if the database was asked after it.
-    prior : what is known of the pose beforehand. ask : see `signature.files.locate_log`.
+    watch : called with each scan, and with the state of the answer if the database was searched after it.
+    prior : what is known of the pose beforehand. on_the_way : see `signature.files.locate_log`.
     index : of the database, if it is prepared.
 
     config : see `query_config`.
@@ -158,7 +158,7 @@ def locate(
 
     from pc2grid.model import Trajectory
     from signature.files import locate_log, query_config
-    from signature.relocalization.map_index import MapIndex
+    from signature.localization.map_index import MapIndex
 
     config = query_config(database, config)
     index = index or MapIndex.of(database, config, observer)
@@ -175,7 +175,7 @@ def locate(
         config,
         span=span,
         watch=see,
-        ask=ask,
+        on_the_way=on_the_way,
         observer=observer,
     )
     poses = Trajectory(
@@ -252,7 +252,7 @@ def _located_moments(
     import numpy as np
 
     from pc2grid.geometry import SE2, wrap_angle
-    from signature.relocalization.watcher import WATCH
+    from signature.localization.belief import WATCH
 
     planar = poses.planar()
     found = [

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pc2grid.arrays import F64
     from pc2grid.geometry import SE2
     from pc2grid.io.map_pose import MapPose
-    from signature.relocalization.answer import Answer
+    from signature.localization.answer import Answer
 
 
 def write_initialpose(path: Path, answer: Answer) -> None:

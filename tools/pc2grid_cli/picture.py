@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from pc2grid.matching.agreement import Agreement
     from pc2grid.model import OccupancyGrid, Trajectory
     from signature.database import SubmapDatabase
-    from signature.relocalization.answer import Answer
-    from signature.relocalization.hypotheses import Hypothesis
+    from signature.localization.answer import Answer
+    from signature.localization.hypotheses import Hypothesis
 
 BLUE, ORANGE, GREEN, VERMILLION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
 YELLOW = "#F0E442"

@@ -17,7 +17,7 @@ from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
 from pc2grid_cli import options as options
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import ASKED, Found, find_log, find_map, in_map
+from pc2grid_cli.locate import ON_THE_WAY, Found, find_log, find_map, in_map
 from pc2grid_cli.nav2_pose import write_initialpose
 from pc2grid_cli.output_files import check_file
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from pc2grid_cli.json_schemas import Relocalize
     from signature.config import Config
     from signature.database import SubmapDatabase
-    from signature.relocalization.hypotheses import Hypothesis
-    from signature.relocalization.relocalizer import Answer
+    from signature.localization.hypotheses import Hypothesis
+    from signature.localization.localizer import Answer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,7 +189,7 @@ def relocalize_command(
             terminal=console.of(context),
             known=known,
             # Only these show it, and it takes time.
-            ask=ASKED if report is not None or rerun is not None else 0,
+            on_the_way=ON_THE_WAY if report is not None or rerun is not None else 0,
         )
         # Printed first: a file that cannot be written must not cost the answer.
         _print(found, where, left_out, map_sigma_m(found.answer, opened), as_json=json)
@@ -245,7 +245,7 @@ def _find(
     rerun: str | None,
     terminal: console.Console,
     known: KnownPose,
-    ask: int,
+    on_the_way: int,
 ) -> tuple[Found, Trajectory | None]:
     """The answer, and the query's poses in the map; both are streamed to `rerun` meanwhile.
 
@@ -271,7 +271,7 @@ def _find(
             observer=terminal.observer(),
             watch=None if shown is None else shown.watch,
             known=known,
-            ask=ask,
+            on_the_way=on_the_way,
         )
         located = in_map(found.poses, found.answer)
         if shown is not None:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pc2grid.model import Consistency, Loop, OccupancyGrid, Precision, Trajectory
     from pc2grid_cli.locate import Found
     from signature.database import SessionInfo, SubmapDatabase
-    from signature.relocalization.answer import Answer
+    from signature.localization.answer import Answer
     from signature.similarity import SignatureTable
 
 _LARGEST_PIXELS = 3000
@@ -261,9 +261,9 @@ def _answer(found: Found, database: SubmapDatabase, accept: float, truth_m: F64 
         ],
         "history": [
             {"path_m": m.path_m, "status": m.status, "confidence": m.confidence}
-            for m in (*(found.asked or answer.history[:-1]), answer.history[-1])
+            for m in (*(found.on_the_way or answer.history[:-1]), answer.history[-1])
         ],
-        "asked": len(found.asked),
+        "asked": len(found.on_the_way),
         "path": runs(found.poses),
         "truth": [] if truth_m is None else _short(np.ravel(truth_m), 2),
     }

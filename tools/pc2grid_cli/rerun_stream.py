@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from pc2grid.model import Loop, OccupancyGrid, PointMap, RegisteredScan, SessionMap, Trajectory
     from signature.config import Config
     from signature.database import SubmapDatabase
-    from signature.relocalization.answer import Answer, Moment
+    from signature.localization.answer import Answer, Moment
 
 _COLOURS = {"fine": VERMILLION, "overruled": YELLOW, "degenerate": ORANGE, "lost": PURPLE}
 """Of a scan, by its health."""

@@ -27,8 +27,8 @@ from pc2grid_cli.view_server import Options, ViewServer
 if TYPE_CHECKING:
     from signature.config import Config
     from signature.database import SubmapDatabase
-    from signature.relocalization.map_index import MapIndex
-    from signature.relocalization.watcher import Look
+    from signature.localization.localizer import Look
+    from signature.localization.map_index import MapIndex
 
 _MOST_GB = 4.0
 _SHARES_EVERY_S = 0.2
@@ -182,20 +182,20 @@ class Locator:
         from pc2grid.io.live.targets import open_live
         from pc2grid.pipeline import follow
         from signature.files import query_config
-        from signature.relocalization.looking import Looking
-        from signature.relocalization.watcher import Watcher
+        from signature.localization.follower import Follower
+        from signature.localization.localizer import Localizer
 
         config = query_config(self._database, self._settings)
-        watcher, progress = Watcher(self._prepared()), Progress(self.events)
+        localizer, progress = Localizer(self._prepared()), Progress(self.events)
         with (
             open_live(source, config.read) as live,
-            Looking(watcher, beside=live.feed.realtime, step_m=config.relocalize.step_m) as looking,
+            Follower(localizer, beside=live.feed.realtime, step_m=config.relocalize.step_m) as follower,
         ):
 
             def poll() -> bool:
                 for sentence in live.feed.news.take():
                     console.warn(sentence)
-                for look in looking.take():
+                for look in follower.take():
                     _tell(progress, look)
                 return False
 
@@ -204,11 +204,11 @@ class Locator:
             while not live.ended:
                 for registered, planar_scan in follow(live.scans(), config):
                     progress.add(registered)
-                    looking.add(registered, planar_scan)
+                    follower.add(registered, planar_scan)
                     poll()
-                looking.restart()
+                follower.restart()
                 progress.add(None)
-            looking.finish()
+            follower.finish()
             poll()
             progress.flush()
         self.events.publish("end", {"source": source, "error": "the source has ended", "hint": None})
@@ -216,7 +216,7 @@ class Locator:
     def _prepared(self) -> MapIndex:
         """The maps, prepared once for all recordings."""
         from signature.files import query_config
-        from signature.relocalization.map_index import MapIndex
+        from signature.localization.map_index import MapIndex
 
         if self._index is None:
             self._index = MapIndex.of(self._database, query_config(self._database, self._settings))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pc2grid.geometry import SE2
     from pc2grid.model import RegisteredScan
-    from signature.relocalization.answer import Moment
+    from signature.localization.answer import Moment
 
 _MOST_WAITING = 1000
 """Events that wait for a page that does not read them; older ones are dropped."""

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.database.protocol import SessionInfo
-    from signature.relocalization.looking import Looking
-    from signature.relocalization.prior import Prior
-    from signature.relocalization.watcher import Look, ResetPolicy
+    from signature.localization.follower import Follower
+    from signature.localization.localizer import Look
+    from signature.localization.prior import Prior
 
 
 LookT = TypeVar("LookT")
@@ -161,8 +161,8 @@ class _Following:
         own = {name: getattr(self.settings, name) for name in ("read", "relocalize", "registration")}
         return self.database.config().model_copy(update=own)
 
-    def run(self, looking: Looking[LookT], use: Callable[[LookT], bool]) -> None:
-        """Feed `looking` with scans. use : what to do with each look; true if that was enough."""
+    def run(self, follower: Follower[LookT], use: Callable[[LookT], bool]) -> None:
+        """Feed `follower` with scans. use : what to do with each look; true if that was enough."""
         from pc2grid.pipeline import follow
 
         live, config = self.live, self.config
@@ -171,7 +171,7 @@ class _Following:
         def poll() -> bool:
             nonlocal over
             _tell_news(live)
-            for look in looking.take():
+            for look in follower.take():
                 over = over or use(look)
             over = over or time.monotonic() > self.end_s
             return over
@@ -181,12 +181,12 @@ class _Following:
         self.terminal.note(f"{live.feed.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
         while not live.ended and not over:
             for registered, planar_scan in follow(live.scans(), config):
-                looking.add(registered, planar_scan)
+                follower.add(registered, planar_scan)
                 if poll():
                     break
-            looking.restart()
+            follower.restart()
         if not over:
-            looking.finish()
+            follower.finish()
             poll()
 
 
@@ -197,23 +197,22 @@ def _search(
 
     prior : where the robot is at the beginning, as far as it is known. forever : go on when it is located.
     """
-    from signature.relocalization.looking import Looking
-    from signature.relocalization.map_index import MapIndex
-    from signature.relocalization.watcher import Watcher
+    from signature.localization.follower import Follower
+    from signature.localization.localizer import Localizer, MapIndex
 
     live, config = following.live, following.config
     index = MapIndex.of(following.database, config, following.terminal.observer())
-    watcher = Watcher(index if prior is None else index.within(prior))
+    localizer = Localizer(index if prior is None else index.within(prior))
     located = False
-    with Looking(watcher, beside=live.feed.realtime, step_m=config.relocalize.step_m) as looking:
+    with Follower(localizer, beside=live.feed.realtime, step_m=config.relocalize.step_m) as follower:
 
         def use(look: Look) -> bool:
             nonlocal located
-            _print(look, live, robot, robot.tell(look, looking.lock), as_json=as_json)
+            _print(look, live, robot, robot.tell(look, follower.lock), as_json=as_json)
             located = look.state in ("located", "recovered")
             return located and not forever
 
-        following.run(looking, use)
+        following.run(follower, use)
     return located
 
 
@@ -221,16 +220,16 @@ def _check(following: _Following, topic: str, session: str | None, *, as_json: b
     """Follow the robot, and judge the pose that it believes in; whether the last one was fine."""
     from pc2grid_cli.check_pose import as_text as check_as_text
     from pc2grid_cli.check_pose import live_document
-    from signature.relocalization.looking import Looking
-    from signature.relocalization.map_index import MapIndex
-    from signature.relocalization.pose_watcher import PoseLook, PoseWatcher
+    from signature.localization.follower import Follower
+    from signature.localization.map_index import MapIndex
+    from signature.localization.pose_check import PoseLook, PoseWatch
 
     live, config = following.live, following.config
     live.listen_to_pose(topic)
     index = MapIndex.of(following.database, config, following.terminal.observer())
-    watcher = PoseWatcher(index, lambda: live.believed, session)
+    watch = PoseWatch(index, lambda: live.believed, session)
     fine = False
-    with Looking(watcher, beside=live.feed.realtime, step_m=config.relocalize.step_m) as looking:
+    with Follower(watch, beside=live.feed.realtime, step_m=config.relocalize.step_m) as follower:
 
         def use(look: PoseLook) -> bool:
             nonlocal fine
@@ -241,10 +240,39 @@ def _check(following: _Following, topic: str, session: str | None, *, as_json: b
                 print(check_as_text(look.checked), flush=True)
             return False
 
-        following.run(looking, use)
+        following.run(follower, use)
     if live.believed is None:
         console.warn(f"{topic}: no pose of the robot in a map; nothing was checked")
     return fine
+
+
+@dataclass(slots=True)
+class ResetPolicy:
+    """When the robot may be told a new place: not too often, and not for ever.
+
+    A program that resets a robot again and again keeps it from ever coming to rest.
+
+    pause_s : least time between two resets. most : resets until the robot has been located for `calm_s`.
+    """
+
+    pause_s: float = 10.0
+    most: int = 5
+    calm_s: float = 60.0
+    clock: Callable[[], float] = time.monotonic
+    _last_s: float | None = None
+    _count: int = 0
+
+    def allows(self) -> bool:
+        """Whether a reset may be made now; it then counts as made."""
+        now_s = self.clock()
+        if self._last_s is not None:
+            if now_s - self._last_s > self.calm_s:
+                self._count = 0
+            if now_s - self._last_s < self.pause_s or self._count >= self.most:
+                return False
+        self._last_s = now_s
+        self._count += 1
+        return True
 
 
 @dataclass(kw_only=True)
@@ -271,8 +299,6 @@ class _Robot:
         live: LiveLog, database: SubmapDatabase, publish: Publish, publish_map: bool, map_frame: str
     ) -> Iterator[_Robot]:
         """Raises ConfigError if the source takes no messages, LiveError if the robot does not."""
-        from signature.relocalization.watcher import ResetPolicy
-
         robot = _Robot(
             live=live,
             database=database,
@@ -388,7 +414,7 @@ def as_text(look: Look, published: list[str]) -> str:
 
 
 def _document(look: Look, live: LiveLog, robot: _Robot, published: list[str]) -> Watch:
-    from signature.relocalization.answer_json import in_space_document
+    from signature.localization.answer_json import in_space_document
 
     answer, pose, T_map_odom, counts = look.answer, look.T_map_base, look.T_map_odom, live.feed.counts
     document: Watch = {

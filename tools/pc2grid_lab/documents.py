@@ -13,7 +13,7 @@ from pc2grid_lab.experiments.recordings.changes import Change
 from pc2grid_lab.experiments.recordings.rows import MapRow, PairRow
 from pc2grid_lab.experiments.trial import Trial
 from pc2grid_lab.peers.outcome import PeerCell, PeerTrial
-from signature.relocalization.answer_json import Version
+from signature.localization.answer_json import Version
 
 
 class Simulate(TypedDict):

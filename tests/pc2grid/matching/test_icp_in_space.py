@@ -11,7 +11,7 @@ from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, invert_pose, pose_from_rotation_vector, rotation_vector, transform_points
 from pc2grid.matching.icp_in_space import SpatialView, register_in_space
 from pc2grid.model import PointMap
-from signature.relocalization.in_space import QueryInSpace
+from signature.localization.query import QueryInSpace
 from tests.helpers.building_clouds import box_surface
 from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, twin_map
 

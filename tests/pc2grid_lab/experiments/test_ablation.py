@@ -20,7 +20,7 @@ from pc2grid_lab.experiments.metrics import ConfidenceError
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from signature.config import SignatureConfig
 from signature.describe import Signature
-from signature.relocalization.query_map import query_of
+from signature.localization.query import query_of
 from signature.similarity import distances
 from tests.helpers.simulated_drives import building, office, plan
 from tests.helpers.trials import trial
@@ -75,10 +75,8 @@ def test_a_query_of_the_map_itself_ranks_its_own_places_first() -> None:
     query = query_of(
         office(),
         where.places.table.center_m[:8],
-        partition=made_with.partition,
-        signature=made_with.signature,
-        config=where.config,
-        T_odom_base=SE2(),
+        made_with,
+        where.config,
     )
     found = ranks(query, where.places, SE2(), made_with.signature, 1.0)
     assert found[COMBINATIONS[-1]] == 0 and set(found) == set(COMBINATIONS)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pc2grid_lab.experiments.calibration import Known, fit, left_out, log_loss, roc_area, share_by_session
-from signature.relocalization.confidence import Calibration, Evidence
+from signature.localization.confidence import Calibration, Evidence
 
 TRUTH = Calibration(bias=-5.0, support=4.0, clearance=1.5)
 

@@ -28,7 +28,7 @@ from pc2grid_lab.experiments.selection import (
     tally,
 )
 from pc2grid_lab.experiments.sensor_map import SensorMap
-from signature.relocalization.query_map import QueryWindow
+from signature.localization.query import Query
 from signature.retrieval.place_index import PlaceBlock
 from signature.seen_places import SeenPlaces
 from tests.helpers.json_schema import closed
@@ -39,13 +39,13 @@ OFFICE = building({"office": office()})
 
 def query() -> tuple[object, SE2]:
     """What a drive of 8 m in the office has seen, and its frame there."""
-    window = QueryWindow(OFFICE.made_with.projection, OFFICE.config)
+    window = Query(OFFICE.made_with, OFFICE.config)
     first: SE2 | None = None
     for registered, planar_scan, truth in drive(office(), [(1.5, 7.0), (9.5, 7.0)]):
         first = first or truth
-        window.add(planar_scan, SE2.from_matrix(registered.T_session_base))
+        window.add(registered, planar_scan)
     assert first is not None
-    return window.query(OFFICE.made_with.partition, OFFICE.made_with.signature), first
+    return window.map(), first
 
 
 def test_each_selector_looks_at_its_share_and_all_places_find_the_right_one() -> None:

@@ -21,7 +21,7 @@ from pc2grid_lab.experiments.sensor_map import SensorMap
 from pc2grid_lab.experiments.sensor_matrix import map_building, query_trials
 from signature.config import Config
 from signature.describe import describe
-from signature.relocalization.relocalizer import MapIndex
+from signature.localization.localizer import MapIndex
 from signature.similarity import SignatureTable
 from tests.helpers.json_schema import closed
 from tests.helpers.trials import trial

@@ -15,7 +15,7 @@ from pc2grid_cli.main import app
 from pc2grid_cli.relocalize import as_text
 from signature.config import Config
 from signature.database import Label, open_database
-from signature.relocalization.relocalizer import MapIndex, locate_map
+from signature.localization.localizer import MapIndex, locate_map
 from signature.sessions import add_session, provenance
 from tests.helpers.simulated_drives import plan
 

@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 from pc2grid.errors import DatabaseCorrupt
-from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid, SessionMap, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.submaps.partition import partition
 from signature.config import Config, RelocalizeConfig
 from signature.database import maintenance, open_database
-from signature.relocalization import map_index as building_file
-from signature.relocalization.query_map import query_of
-from signature.relocalization.relocalizer import MapIndex, locate_map
+from signature.localization import map_index as building_file
+from signature.localization.localizer import MapIndex, locate_map
+from signature.localization.query import query_of
 from signature.retrieval import viewpoints
 from signature.retrieval.view import View
 from signature.seen_places import SeenPlaces
@@ -134,14 +133,7 @@ def store_maps(file: Path, maps: Mapping[str, OccupancyGrid]) -> None:
 def query_views() -> tuple[View, ...]:
     """The views of `PART`."""
     made_with = ALL.made_with
-    return query_of(
-        PART,
-        np.empty((0, 2)),
-        partition=made_with.partition,
-        signature=made_with.signature,
-        config=made_with.relocalize,
-        T_odom_base=SE2(),
-    ).views
+    return query_of(PART, np.empty((0, 2)), made_with, made_with.relocalize).views
 
 
 def test_a_stored_map_is_read_when_it_matters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from pc2grid.arrays import F32
 from pc2grid.geometry import SE2
-from signature.relocalization.query_map import QueryMap, QueryWindow
+from signature.localization.query import Query, QueryMap
 from signature.retrieval import place_index
 from signature.retrieval.likeness import LIKENESS, plain_rotate_and_compare
 from signature.retrieval.place_index import (
@@ -31,13 +31,13 @@ OWN = OFFICE.places.described()
 
 def query(field_deg: float = 360.0) -> tuple[QueryMap, SE2]:
     """What a drive of 8 m in the office has seen, and its frame there."""
-    window, first = QueryWindow(OFFICE.made_with.projection, OFFICE.config), None
+    window, first = Query(OFFICE.made_with, OFFICE.config), None
     corners = [(1.5, 7.0), (9.5, 7.0)]
     for registered, planar_scan, truth in drive(office(), corners, field_rad=math.radians(field_deg)):
         first = first or truth
-        window.add(planar_scan, SE2.from_matrix(registered.T_session_base))
+        window.add(registered, planar_scan)
     assert first is not None
-    return window.query(OFFICE.made_with.partition, OFFICE.made_with.signature), first
+    return window.map(), first
 
 
 def scrambled(copies: int) -> PlaceBlock:

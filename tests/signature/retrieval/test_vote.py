@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2
-from signature.relocalization.query_map import QueryWindow
+from signature.localization.query import Query
 from signature.retrieval.likeness import peaks, plain_rotate_and_compare, rotate_and_compare
 from signature.retrieval.vote import distinct_placements, retrieve, view_scores
 from tests.helpers.simulated_drives import building, drive, office
@@ -16,13 +16,13 @@ from tests.helpers.simulated_drives import building, drive, office
 OFFICE = building({"office": office()})
 
 
-def window(corners: list[tuple[float, float]], field_deg: float = 360.0) -> tuple[QueryWindow, SE2]:
+def window(corners: list[tuple[float, float]], field_deg: float = 360.0) -> tuple[Query, SE2]:
     """The query map of a drive, and its frame in the office."""
-    seen = QueryWindow(OFFICE.made_with.projection, OFFICE.config)
+    seen = Query(OFFICE.made_with, OFFICE.config)
     first: SE2 | None = None
     for registered, planar_scan, truth in drive(office(), corners, field_rad=math.radians(field_deg)):
         first = first or truth
-        seen.add(planar_scan, SE2.from_matrix(registered.T_session_base))
+        seen.add(registered, planar_scan)
     assert first is not None
     return seen, first
 
@@ -31,7 +31,7 @@ def window(corners: list[tuple[float, float]], field_deg: float = 360.0) -> tupl
 def test_the_right_place_is_among_the_first_twenty(field_deg: float) -> None:
     seen, T_map_query = window([(1.5, 7.0), (9.5, 7.0)], field_deg)
     made_with = OFFICE.made_with
-    query = seen.query(made_with.partition, made_with.signature)
+    query = seen.map()
     found = retrieve(
         query.views,
         (query.T_odom_base.x, query.T_odom_base.y),
@@ -65,7 +65,7 @@ def test_the_right_place_is_among_the_first_twenty(field_deg: float) -> None:
 def test_all_places_are_compared_unless_there_are_too_many() -> None:
     seen, _ = window([(1.5, 7.0), (9.5, 7.0)])
     made_with = OFFICE.made_with
-    query = seen.query(made_with.partition, made_with.signature)
+    query = seen.map()
 
     def rows_compared(**changes: float) -> tuple[list[int], float]:
         config = OFFICE.config.model_copy(update=changes)
@@ -101,7 +101,7 @@ def test_every_view_has_a_viewpoint_beside_it_that_belongs_to_the_nearest_place(
 
 def test_views_lie_apart_and_on_what_was_seen() -> None:
     seen, _ = window([(1.5, 7.0), (9.5, 7.0)], 90.0)
-    query = seen.query(OFFICE.made_with.partition, OFFICE.made_with.signature)
+    query = seen.map()
     centers = np.array([v.center_m for v in query.views])
     apart = np.hypot(*(centers[:, None] - centers[None]).transpose(2, 0, 1))
     assert 2 <= len(centers) <= OFFICE.config.views
@@ -113,21 +113,21 @@ def test_views_lie_apart_and_on_what_was_seen() -> None:
 def test_a_window_forgets_what_lies_farther_back() -> None:
     config = OFFICE.config.model_copy(update={"window_m": 3.0})
     long, short = (
-        QueryWindow(OFFICE.made_with.projection, OFFICE.config),
-        QueryWindow(OFFICE.made_with.projection, config),
+        Query(OFFICE.made_with, OFFICE.config),
+        Query(OFFICE.made_with, config),
     )
     for registered, planar_scan, _ in drive(office(), [(1.5, 7.0), (9.5, 7.0)]):
         for seen in (long, short):
-            seen.add(planar_scan, SE2.from_matrix(registered.T_session_base))
+            seen.add(registered, planar_scan)
     assert long.path_m == pytest.approx(short.path_m) == pytest.approx(7.8, abs=0.3)
     assert len(short) < 20 < len(long)
 
 
 def test_standing_still_adds_nothing() -> None:
-    seen = QueryWindow(OFFICE.made_with.projection, OFFICE.config)
+    seen = Query(OFFICE.made_with, OFFICE.config)
     registered, planar_scan, _ = next(drive(office(), [(1.5, 7.0), (9.5, 7.0)]))
     for _ in range(50):
-        seen.add(planar_scan, SE2.from_matrix(registered.T_session_base))
+        seen.add(registered, planar_scan)
     assert len(seen) == 1 and seen.path_m == 0.0
 
 

@@ -4,7 +4,7 @@
 
 Each file is one that `real_queries` has written, one of the folder trials/ of `pc2grid compare sensors`, or
 the document of `compare real` or `compare log --json`. An answer is judged by a fit without all answers whose
-query or map is of one of its buildings. Prints the coefficients for `signature.relocalization.confidence`,
+query or map is of one of its buildings. Prints the coefficients for `signature.localization.confidence`,
 the log loss, and by kind of pair and distance how many answers are right, and how many would be located by
 the coefficients in use and by those fitted without the building, rightly and wrongly.
 
@@ -26,7 +26,7 @@ import numpy as np
 
 from pc2grid_lab.experiments.calibration import Known, fit, left_out, log_loss, roc_area, share_by_session
 from signature.config import Config
-from signature.relocalization.confidence import CALIBRATION, Evidence
+from signature.localization.confidence import CALIBRATION, Evidence
 
 RIGHT_M, RIGHT_RAD = 0.5, math.radians(5.0)
 """Errors of answers to real logs at the right place. How precise they are is not the question here; the poses

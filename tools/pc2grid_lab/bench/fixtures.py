@@ -23,8 +23,8 @@ from pc2grid.submaps.partition import partition
 from signature.config import Config
 from signature.database.maintenance import store
 from signature.describe import Signature, describe
-from signature.relocalization.query_map import QueryMap, query_of
-from signature.relocalization.relocalizer import MapIndex
+from signature.localization.localizer import MapIndex
+from signature.localization.query import QueryMap, query_of
 from signature.sessions import provenance
 from signature.similarity import SignatureTable
 
@@ -139,10 +139,9 @@ def query_map(scans: Sequence[PosedScan], config: Config, grid: OccupancyGrid | 
     return query_of(
         grid or grid_of(scans),
         np.array([(scan.T_map_base.x, scan.T_map_base.y) for scan in scans]),
-        partition=config.partition,
-        signature=config.signature,
-        config=config.relocalize,
-        T_odom_base=scans[-1].T_map_base,
+        config,
+        config.relocalize,
+        scans[-1].T_map_base,
     )
 
 

@@ -122,7 +122,7 @@ _LOCATE = """
 import resource, sys, time
 from pc2grid.simulate import office_floorplan
 from signature.database import open_database
-from signature.relocalization.relocalizer import MapIndex, locate_map
+from signature.localization.localizer import MapIndex, locate_map
 part = office_floorplan(1).crop((12.0, 8.0), 6.0)
 wall, cpu = time.perf_counter(), time.process_time()
 with open_database(sys.argv[1]) as database:

@@ -72,9 +72,8 @@ def lag(folder: Path, quick: bool) -> Iterator[Row]:
     from pc2grid.io.live.targets import open_live
     from pc2grid.pipeline import follow
     from signature.database import open_database
-    from signature.relocalization.looking import Looking
-    from signature.relocalization.map_index import MapIndex
-    from signature.relocalization.watcher import Watcher
+    from signature.localization.follower import Follower
+    from signature.localization.localizer import Localizer, MapIndex
 
     database = database_of(folder)
     for kind, what in (
@@ -96,19 +95,19 @@ def lag(folder: Path, quick: bool) -> Iterator[Row]:
         lags: list[float] = []
         cpu_s = time.process_time()
         with open_database(database) as opened, open_live(url, ReadConfig()) as live:
-            watcher = Watcher(MapIndex.of(opened, opened.config()))
+            localizer = Localizer(MapIndex.of(opened, opened.config()))
             live.on_poll = Stopped(live)
             live.choose()
             count = 0
-            with Looking(watcher, beside=True) as looking:
+            with Follower(localizer, beside=True) as follower:
                 for registered, planar_scan in follow(live.scans(), opened.config()):
                     # The lag is that of the scan before; those held back for the plan have waited on purpose.
                     if live.keeps_up:
                         lags.append(live.lag_s)
                     count += 1
-                    looking.add(registered, planar_scan)
-                looking.finish()
-                at_m = [look.answer.path_m for look in looking.take() if look.state == "located"]
+                    follower.add(registered, planar_scan)
+                follower.finish()
+                at_m = [look.answer.path_m for look in follower.take() if look.state == "located"]
                 located_m = min(at_m, default=None)
             dropped = live.feed.counts.dropped
         cpu_s = time.process_time() - cpu_s
@@ -129,10 +128,10 @@ def warm_up(path: Path, database: Path) -> None:
     from pc2grid.io import open_log
     from pc2grid.pipeline import follow
     from signature.database import open_database
-    from signature.relocalization.relocalizer import relocalize
+    from signature.localization.localizer import locate
 
     with open_database(database) as opened, open_log(path) as log:
-        relocalize(follow(log.scans(0.0, 2.0), opened.config()), opened, opened.config())
+        locate(follow(log.scans(0.0, 2.0), opened.config()), opened, opened.config())
 
 
 def memory(folder: Path, quick: bool) -> Iterator[Row]:
@@ -141,21 +140,20 @@ def memory(folder: Path, quick: bool) -> Iterator[Row]:
     from pc2grid.io.live.live_log import LiveLog
     from pc2grid.pipeline import follow
     from signature.database import open_database
-    from signature.relocalization.looking import Looking
-    from signature.relocalization.map_index import MapIndex
-    from signature.relocalization.watcher import Watcher
+    from signature.localization.follower import Follower
+    from signature.localization.localizer import Localizer, MapIndex
 
     robot_s = 300.0 if quick else 3600.0
     path, _ = simulated(folder, "laser", 8.0)
     database = database_of(folder)
     sizes: list[tuple[float, int]] = []
     with open_database(database) as opened, LiveLog(ToAndFro(path, robot_s), ReadConfig()) as live:
-        watcher = Watcher(MapIndex.of(opened, opened.config()))
-        with Looking(watcher, beside=False) as looking:
+        localizer = Localizer(MapIndex.of(opened, opened.config()))
+        with Follower(localizer, beside=False) as follower:
             first_ns: int | None = None
             for registered, planar_scan in follow(live.scans(), opened.config()):
-                looking.add(registered, planar_scan)
-                looking.take()
+                follower.add(registered, planar_scan)
+                follower.take()
                 stamp_ns = registered.scan.stamp_ns
                 first_ns = stamp_ns if first_ns is None else first_ns
                 if not sizes or (stamp_ns - first_ns) * 1e-9 - sizes[-1][0] > 10.0:

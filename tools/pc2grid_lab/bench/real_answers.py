@@ -22,10 +22,10 @@ from scipy.spatial import cKDTree
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.model import OccupancyGrid
 from pc2grid_lab.bench.real_queries import STANDING_SCANS, index_of, read
+from pc2grid_lab.experiments.answers import localize
 from pc2grid_lab.experiments.registered_session import RegisteredSession
 from signature.config import Config
-from signature.relocalization.map_index import MapIndex, share_known
-from signature.relocalization.relocalizer import localize
+from signature.localization.map_index import MapIndex, share_known
 
 TRAVEL_M = (0.0, 3.0, 10.0)
 ELSEWHERE_M = (1.0, 3.0, 5.0, 8.0)
@@ -55,14 +55,14 @@ def count(name: str, grid: OccupancyGrid, queries: list[RegisteredSession], inde
         spent_ms = 0.0
         after = scans_after(driven, TRAVEL_M)
         scans = ((registered, planar_scan) for registered, planar_scan, _ in driven.scans())
-        for travel_m, asked in zip(TRAVEL_M, localize(scans, [index], after=set(after)), strict=False):
-            (answer,) = asked.answers
-            scan = asked.scans - 1
+        for travel_m, found in zip(TRAVEL_M, localize(scans, [index], after=set(after)), strict=False):
+            (answer,) = found.answers
+            scan = found.scans - 1
             truth = driven.true_pose(scan)
             if truth is None:
                 continue
             kind = "covered" if covered(grid, driven, scan, truth) else "uncovered"
-            share = share_known(grid, asked.query.grid, truth @ asked.query.T_odom_base.inverse())
+            share = share_known(grid, found.query.grid, truth @ found.query.T_odom_base.inverse())
             if kind == "covered" and share >= KNOWN:
                 kind = "covered, known"
             error = ""
@@ -102,10 +102,10 @@ def count_elsewhere(name: str, queries: list[RegisteredSession], others: dict[st
     for number, driven in enumerate(queries):
         scans = ((registered, planar_scan) for registered, planar_scan, _ in driven.scans())
         after = set(scans_after(driven, ELSEWHERE_M))
-        for travel_m, asked in zip(
+        for travel_m, found in zip(
             ELSEWHERE_M, localize(scans, list(others.values()), after=after), strict=False
         ):
-            for other, answer in zip(others, asked.answers, strict=True):
+            for other, answer in zip(others, found.answers, strict=True):
                 answers[travel_m] += 1
                 if answer.status == "located":
                     located.append((number, other, travel_m, answer.confidence))

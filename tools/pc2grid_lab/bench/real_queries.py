@@ -35,9 +35,9 @@ from pc2grid_lab.experiments.registered_session import RegisteredSession, regist
 from pc2grid_lab.experiments.replay import Replay
 from signature.config import Config
 from signature.describe import describe
-from signature.relocalization.confidence import Evidence
-from signature.relocalization.map_index import MapIndex, unseen_by
-from signature.relocalization.query_map import QueryMap, QueryWindow
+from signature.localization.confidence import Evidence
+from signature.localization.map_index import MapIndex, unseen_by
+from signature.localization.query import Query, QueryMap
 from signature.similarity import SignatureTable
 
 MAPPED_S = {"fr079": 600.0, "intel": 900.0, "csail": 250.0, "killian": 900.0}
@@ -86,26 +86,18 @@ def moments(
     driven: RegisteredSession, config: Config
 ) -> Iterator[tuple[float, dict[float, QueryMap], SE2 | None]]:
     """The query after each of `DISTANCES_M`: one map for each of `WINDOWS_M`, and the true pose."""
-    windows = {
-        m: QueryWindow(config.projection, config.relocalize.model_copy(update={"window_m": m}))
-        for m in WINDOWS_M
-    }
+    windows = {m: Query(config, config.relocalize.model_copy(update={"window_m": m})) for m in WINDOWS_M}
     want = list(DISTANCES_M)
     for i, (registered, planar_scan, _) in enumerate(driven.scans()):
         if driven.lost[i]:
             return
-        T_odom_base = SE2.from_matrix(registered.T_session_base)
         for window in windows.values():
-            window.add(planar_scan, T_odom_base)
+            window.add(registered, planar_scan)
         if i + 1 < STANDING_SCANS or not want or windows[WINDOWS_M[0]].path_m < want[0]:
             continue
         truth = driven.true_pose(i)
         travel_m = want.pop(0)
-        maps = {
-            m: w.query(config.partition, config.signature)
-            for m, w in windows.items()
-            if m == WINDOWS_M[0] or m < travel_m
-        }
+        maps = {m: w.map() for m, w in windows.items() if m == WINDOWS_M[0] or m < travel_m}
         yield travel_m, maps, truth
 
 
@@ -143,7 +135,7 @@ def _looks(
 ) -> Iterator[dict[str, Any]]:
     """As in `MapIndex.decide`, two answers: by what is proposed, and by a search of the whole map."""
     proposed = index.look_up(query)
-    for stage, found in (("proposed", proposed), ("everywhere", index.look_everywhere(query, proposed))):
+    for stage, found in (("proposed", proposed), ("everywhere", index.search_whole_maps(query, proposed))):
         poses = [h.fit.T_map_query @ query.T_odom_base for h in found]
         yield row | {
             "stage": stage,

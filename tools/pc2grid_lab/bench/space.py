@@ -25,8 +25,9 @@ from pc2grid_lab.bench.measure import Row
 from pc2grid_lab.experiments.sensor_matrix import query_start
 from signature.config import Config
 from signature.database import open_database
-from signature.relocalization.in_space import QueryInSpace, winner
-from signature.relocalization.relocalizer import relocalize
+from signature.localization.in_space import winner
+from signature.localization.localizer import locate
+from signature.localization.query import QueryInSpace
 from signature.sessions import add_sessions, build_session
 
 VOXEL_M = 0.05
@@ -71,7 +72,7 @@ def poses(folder: Path, quick: bool) -> Iterator[Row]:
             start = query_start(plan, mapping, seed)
             simulate_session(drive, sensor=sensor, grid=plan, config=_simulation(5.0, seed, start))
             with open_database(folder / "office.submaps") as database, open_log(drive, config.read) as log:
-                answer = relocalize(follow(log.scans(), config), database, config)
+                answer = locate(follow(log.scans(), config), database, config)
             drive.unlink()
             if answer.status != "located" or answer.in_space is None:
                 continue

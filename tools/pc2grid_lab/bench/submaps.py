@@ -22,8 +22,8 @@ from pc2grid_lab.bench import fixtures
 from pc2grid_lab.bench.measure import Row, Time, median, timed
 from signature.config import Config
 from signature.describe import describe
-from signature.relocalization.hypotheses import coarse_points
-from signature.relocalization.query_map import QueryMap
+from signature.localization.hypotheses import coarse_points
+from signature.localization.query import QueryMap
 from signature.retrieval.likeness import rotate_and_compare
 
 _ONE = SearchParameters(most=1)

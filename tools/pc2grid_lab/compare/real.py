@@ -361,9 +361,9 @@ def _locate(setting: Setting, sensor: SensorKind, seed: int) -> RealQuery | None
     """Locate one query session in every map but those made of the same scans; None without a true pose."""
     import numpy as np
 
+    from pc2grid_lab.experiments.answers import localize
     from pc2grid_lab.experiments.real_sensors import RealQuery
     from pc2grid_lab.experiments.registered_session import RegisteredSession
-    from signature.relocalization.relocalizer import localize
 
     session = RegisteredSession.load(setting.session_file(sensor, seed))
     if session.lost.all() or np.isnan(session.T_world_base[:, 0]).all():
@@ -374,14 +374,14 @@ def _locate(setting: Setting, sensor: SensorKind, seed: int) -> RealQuery | None
     elif session.planar_scans[0].stamp_ns > _last_stamp_ns(setting):
         names.append(_EARLIER)
     scans = ((registered, planar_scan) for registered, planar_scan, _ in session.scans())
-    (asked,) = localize(scans, [_map(setting, name).index for name in names])
+    (found,) = localize(scans, [_map(setting, name).index for name in names])
     return RealQuery(
         sensor=sensor,
         seed=seed,
-        T_frame_base=session.T_world_odom() @ asked.answers[0].T_odom_base,
-        query=asked.query,
-        answers=dict(zip(names, asked.answers, strict=True)),
-        look_up_ms=dict(zip(names, asked.elapsed_ms, strict=True)),
+        T_frame_base=session.T_world_odom() @ found.answers[0].T_odom_base,
+        query=found.query,
+        answers=dict(zip(names, found.answers, strict=True)),
+        look_up_ms=dict(zip(names, found.elapsed_ms, strict=True)),
     )
 
 

@@ -213,7 +213,7 @@ def _elsewhere(trials: Sequence[Trial]) -> list[Trial]:
 
 def _by_tuning(trials: Sequence[Trial]) -> tuple[list[Trial], list[Trial]]:
     """The trials in plans that the confidence was fitted on, and the other ones."""
-    from signature.relocalization.confidence import FITTED_ON
+    from signature.localization.confidence import FITTED_ON
 
     tuned = [t for t in trials if FITTED_ON.intersection(t.buildings)]
     return tuned, [t for t in trials if not FITTED_ON.intersection(t.buildings)]

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from pc2grid_lab.experiments.sensor_map import SensorMap
     from pc2grid_lab.worlds import WorldConfig
     from signature.config import Config
-    from signature.relocalization.map_index import MapIndex
-    from signature.relocalization.query_map import QueryMap
+    from signature.localization.map_index import MapIndex
+    from signature.localization.query import QueryMap
     from signature.retrieval.place_index import PlaceBlock
 
 MAP_SEED = 1000

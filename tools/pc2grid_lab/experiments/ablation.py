@@ -24,7 +24,7 @@ from pc2grid_lab.experiments.sensor_map import SensorMap
 from pc2grid_lab.experiments.trial import Trial
 from signature.config import SignatureConfig
 from signature.describe import Signature, describe
-from signature.relocalization.query_map import QueryMap
+from signature.localization.query import QueryMap
 from signature.retrieval.viewpoints import Places
 from signature.seen import seen_signatures
 from signature.seen_likelihood import COMBINATIONS as SEEN_COMBINATIONS

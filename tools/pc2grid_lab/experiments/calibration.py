@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F64
-from signature.relocalization.confidence import Calibration, Evidence
+from signature.localization.confidence import Calibration, Evidence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

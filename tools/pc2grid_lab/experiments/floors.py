@@ -26,14 +26,15 @@ from pc2grid.pipeline import follow
 from pc2grid.simulate import SimulationConfig
 from pc2grid.simulate.config import DepthConfig, LaserConfig, LidarConfig
 from pc2grid.simulate.session import EPOCH_NS
+from pc2grid_lab.experiments.answers import localize
 from pc2grid_lab.experiments.calibration import share_by_session
 from pc2grid_lab.experiments.program import program_digest
 from pc2grid_lab.worlds import HouseConfig, HouseSession, prepare_house_session, simulate_session
 from signature.config import Config
 from signature.database import Label, open_database
 from signature.files import convert, query_config
-from signature.relocalization.answer import Answer
-from signature.relocalization.relocalizer import MapIndex, localize
+from signature.localization.answer import Answer
+from signature.localization.map_index import MapIndex
 
 Way = Literal["stairs", "lift", "logs"]
 FloorStatus = Literal["right", "ambiguous", "not_found", "wrong"]
@@ -339,10 +340,10 @@ def _ask(
         settings = query_config(opened, config)
         index = MapIndex.of(opened, settings)
         for scans in cut_queries(session, task):
-            (asked,) = localize(follow(scans, settings), [index])
-            (answer,) = asked.answers
+            (found,) = localize(follow(scans, settings), [index])
+            (answer,) = found.answers
             true = SE2.from_matrix(session.pose((answer.stamp_ns - EPOCH_NS) * 1e-9))
-            yield _judged(answer, asked.query.walls.points_m.astype(np.float32), floor, true, parts)
+            yield _judged(answer, found.query.walls.points_m.astype(np.float32), floor, true, parts)
 
 
 def cut_queries(session: HouseSession, task: FloorTask) -> Iterator[list[Scan]]:

@@ -12,8 +12,8 @@ from pc2grid.model import SensorKind
 from pc2grid_lab.experiments.ablation import ranks
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from pc2grid_lab.experiments.trial import JUDGEMENT, Trial
-from signature.relocalization.query_map import QueryMap
-from signature.relocalization.relocalizer import Answer
+from signature.localization.localizer import Answer
+from signature.localization.query import QueryMap
 from signature.retrieval.vote import retrieve
 
 

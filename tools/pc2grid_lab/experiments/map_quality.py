@@ -16,7 +16,7 @@ from pc2grid.odometry.registration import BareKissIcp
 from pc2grid.pipeline import map_scans
 from pc2grid_lab.experiments.true_floor import GridQuality, TrueFloor
 from signature.config import Config
-from signature.relocalization.place_recognition import recognizer_for
+from signature.localization.place_recognition import recognizer_for
 
 if TYPE_CHECKING:
     from pc2grid.simulate import Session

@@ -23,8 +23,8 @@ from pc2grid.model import SensorKind
 from pc2grid_lab.experiments.judgement import judge
 from pc2grid_lab.experiments.sensor_map import MapKind, SensorMap
 from pc2grid_lab.experiments.trial import Trial
-from signature.relocalization.query_map import QueryMap
-from signature.relocalization.relocalizer import Answer
+from signature.localization.localizer import Answer
+from signature.localization.query import QueryMap
 
 Frame = Literal["floor", "log"]
 

@@ -21,13 +21,14 @@ from pc2grid.model import Scan, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.pipeline import build_map
 from pc2grid.time_span import TimeSpan
+from pc2grid_lab.experiments.answers import localize
 from pc2grid_lab.experiments.judgement import judge
 from pc2grid_lab.experiments.registered_session import RegisteredSession, register
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from pc2grid_lab.experiments.trial import JUDGEMENT, Trial
 from signature.config import Config
-from signature.relocalization.place_recognition import recognizer_for
-from signature.relocalization.relocalizer import MapIndex, localize
+from signature.localization.map_index import MapIndex
+from signature.localization.place_recognition import recognizer_for
 from signature.sessions import describe_all
 from signature.similarity import SignatureTable
 
@@ -181,19 +182,19 @@ class Replay:
         if np.isnan(session.T_world_base[:, 0]).all():
             return None
         scans = ((registered, planar_scan) for registered, planar_scan, _ in session.scans())
-        (asked,) = localize(scans, [part.sensor_map.index])
-        (answer,) = asked.answers
+        (found,) = localize(scans, [part.sensor_map.index])
+        (answer,) = found.answers
         T_world_base = session.T_world_odom() @ answer.T_odom_base
         trial = judge(
             part.around(T_world_base),
-            asked.query,
+            found.query,
             answer,
             T_world_base,
             building=self.name,
             query_sensor=self.sensor,
             seed=round(span.start_s),
             travel_m=answer.path_m,
-            look_up_ms=asked.elapsed_ms[0],
+            look_up_ms=found.elapsed_ms[0],
             right_m=JUDGEMENT.right_recorded_m,
         )
         return replace(trial, map_bent_m=part.bent_m(T_world_base))

@@ -12,7 +12,7 @@ from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.isovist import look_around
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from signature.config import Config
-from signature.relocalization.query_map import QueryMap, best_observed
+from signature.localization.query import QueryMap, best_observed
 from signature.seen import seen_signatures
 from signature.seen_likelihood import Pairs
 from signature.seen_places import PROFILE_BEARINGS

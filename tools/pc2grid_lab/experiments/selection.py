@@ -23,8 +23,8 @@ from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from pc2grid_lab.experiments.trial import JUDGEMENT
 from signature.config import Config
-from signature.relocalization.map_index import MapIndex
-from signature.relocalization.query_map import QueryMap, QueryWindow
+from signature.localization.map_index import MapIndex
+from signature.localization.query import Query, QueryMap
 from signature.retrieval.place_index import PlaceBlock, PlaceIndex
 from signature.retrieval.seen_index import SeenIndex
 from signature.retrieval.vote import retrieve
@@ -125,14 +125,14 @@ def queries_of(
     session: RegisteredSession, config: Config, travels_m: Sequence[float] = TRAVELS_M
 ) -> Iterator[tuple[float, QueryMap, SE2]]:
     """The query after each of `travels_m`: metres, what has been seen, and its true frame in the plan."""
-    window = QueryWindow(config.projection, config.relocalize)
+    query = Query(config, config.relocalize)
     path_m = session.path_m()
     due = sorted(d for d in travels_m if len(path_m) and d <= path_m[-1])
     for number, (registered, planar_scan, _) in enumerate(session.scans()):
         if not session.lost[number]:
-            window.add(planar_scan, SE2.from_matrix(registered.T_session_base))
+            query.add(registered, planar_scan)
         while due and path_m[number] >= due[0]:
-            if len(window):
+            if len(query):
                 so_far = dataclasses.replace(
                     session,
                     planar_scans=session.planar_scans[: number + 1],
@@ -140,7 +140,7 @@ def queries_of(
                     lost=session.lost[: number + 1],
                     T_world_base=session.T_world_base[: number + 1],
                 )
-                yield due[0], window.query(config.partition, config.signature), so_far.T_world_odom()
+                yield due[0], query.map(), so_far.T_world_odom()
             del due[0]
 
 

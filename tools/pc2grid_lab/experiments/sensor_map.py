@@ -10,7 +10,7 @@ from typing import Literal
 from pc2grid.geometry import SE2
 from pc2grid.model import SensorKind, SessionMap
 from signature.config import Config
-from signature.relocalization.map_index import MapIndex
+from signature.localization.map_index import MapIndex
 
 MapKind = SensorKind | Literal["scan"]
 """The sensor that has made a map; or "scan", a 3D scan of the building that is a map as it is."""

@@ -16,12 +16,12 @@ from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid, Scan, SensorKind, SessionMap
 from pc2grid.pipeline import map_scans
 from pc2grid.submaps.partition import partition
+from pc2grid_lab.experiments.answers import Answers, localize
 from pc2grid_lab.experiments.judgement import judge
 from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from pc2grid_lab.experiments.trial import Trial
 from signature.config import Config
-from signature.relocalization.relocalizer import Asked, localize
 
 if TYPE_CHECKING:
     from pc2grid.simulate import Building
@@ -99,20 +99,20 @@ def query_trials(
     after = np.maximum.accumulate(after) + np.arange(len(travels_m))
     truths = [truth for _, _, truth in session.scans()]
     trials: list[Trial] = []
-    for asked_maps, first in ((own, 0), (others, len(travels_m) - 1)):
-        if not asked_maps or not travels_m:
+    for searched_maps, first in ((own, 0), (others, len(travels_m) - 1)):
+        if not searched_maps or not travels_m:
             continue
-        answers = _localize(session, asked_maps, set(after[first:].tolist()))
-        for travel_m, asked in zip(travels_m[first:], answers, strict=True):
+        answers = _localize(session, searched_maps, set(after[first:].tolist()))
+        for travel_m, found in zip(travels_m[first:], answers, strict=True):
             for sensor_map, answer, elapsed_ms in zip(
-                asked_maps, asked.answers, asked.elapsed_ms, strict=True
+                searched_maps, found.answers, found.elapsed_ms, strict=True
             ):
                 trials.append(
                     judge(
                         sensor_map,
-                        asked.query,
+                        found.query,
                         answer,
-                        truths[asked.scans - 1],
+                        truths[found.scans - 1],
                         building=name,
                         query_sensor=session.sensor,
                         seed=seed,
@@ -125,6 +125,6 @@ def query_trials(
 
 def _localize(
     session: RegisteredSession, maps: Sequence[SensorMap], after: Collection[int]
-) -> Iterator[Asked]:
+) -> Iterator[Answers]:
     scans = ((registered, planar_scan) for registered, planar_scan, _ in session.scans())
     return localize(scans, [m.index for m in maps], after=after)

@@ -13,12 +13,12 @@ from pathlib import Path
 
 from pc2grid.io.nav2_map import load_map
 from pc2grid.submaps.partition import partition
+from pc2grid_lab.experiments.answers import localize
 from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.peers.cloud_matchers import Found, answer_stream, serve
 from signature.config import Config
 from signature.describe import describe
-from signature.relocalization.map_index import MapIndex
-from signature.relocalization.relocalizer import localize
+from signature.localization.map_index import MapIndex
 from signature.similarity import SignatureTable
 
 
@@ -34,8 +34,8 @@ def locate(index: MapIndex, query: str) -> Found:
     """The pose, if the query is located."""
     session = RegisteredSession.load(Path(f"{query}.npz"))
     scans = ((registered, planar_scan) for registered, planar_scan, _ in session.scans())
-    (asked,) = localize(scans, [index])
-    (answer,) = asked.answers
+    (found,) = localize(scans, [index])
+    (answer,) = found.answers
     if answer.T_map_base is None:
         return None
     return answer.T_map_base.lift(), answer.confidence

@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from signature.relocalization.confidence import (
+from signature.localization.confidence import (
     CALIBRATION,
     LIMITS,
     NO_EVIDENCE,
@@ -18,8 +18,8 @@ from signature.relocalization.confidence import (
     Evidence,
     Presence,
 )
-from signature.relocalization.hypotheses import Hypothesis
-from signature.relocalization.query_map import QueryMap
+from signature.localization.hypotheses import Hypothesis
+from signature.localization.query import QueryMap
 
 AGREEMENTS = np.linspace(0.0, 1.0, 11).tolist()
 WALLS = [5.0, 30.0, 100.0, 300.0, 2000.0]

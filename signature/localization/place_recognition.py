@@ -1,7 +1,7 @@
 """Recognises places within a session while it is made, for loop closure.
 
 The session is its own database: each stretch of some metres of travel becomes a small map with a few
-described places, and every new stretch is looked up among those before it with the parts of the relocalizer.
+described places, and every new stretch is looked up among those before it with the parts of a `MapIndex`.
 Signatures and isovists propose, the alignment of walls in both directions verifies, and a calibrated
 probability says how sure it is that the two maps show the same place. Which of several such places is the
 right one is decided by loop closure (`pc2grid.mapping.loop_candidates`), which knows the travel between them.
@@ -10,21 +10,20 @@ right one is decided by loop closure (`pc2grid.mapping.loop_candidates`), which 
 from __future__ import annotations
 
 import zlib
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import overload
+from functools import lru_cache
 
 import numpy as np
 
-from pc2grid.geometry import SE2
 from pc2grid.mapping.place_recognition import Recognition, Stretch
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
-from signature.relocalization.confidence import SAME_PLACE
-from signature.relocalization.hypotheses import Hypothesis, verify
-from signature.relocalization.query_map import QueryMap, query_of
+from signature.localization.confidence import SAME_PLACE
+from signature.localization.hypotheses import Hypothesis, verify
+from signature.localization.lazy_maps import LazySequence
+from signature.localization.query import QueryMap, query_of
 from signature.retrieval.viewpoints import Places
 from signature.retrieval.vote import retrieve
 from signature.similarity import SignatureTable
@@ -66,7 +65,7 @@ class SessionRecognizer:
 
     def __init__(self, config: Config, parameters: RecognitionParameters = RECOGNITION) -> None:
         """config : stretches are described as the places of a database with this configuration."""
-        self._partition, self._signature = config.partition, config.signature
+        self._made_with = config
         self._config = config.relocalize.model_copy(
             update={
                 "views": parameters.views,
@@ -76,42 +75,38 @@ class SessionRecognizer:
             }
         )
         self._parameters = parameters
-        self._grids = _StoredGrids()
-        self._maps = _PreparedMaps(self._grids, parameters.maps)
+        # Grids are kept compressed: some 10 kB a stretch, so that a long session needs little memory.
+        self._stored: list[tuple[bytes, tuple[int, ...], float, tuple[float, float]]] = []
+        self._map = lru_cache(parameters.maps)(lambda index: SearchMap.of(self._grid(index)))
         self._places: Places | None = None
 
     def recognize(self, newest: Stretch) -> Sequence[Recognition]:
         """The earlier stretches that look like the newest one, each place with its own probability."""
-        query = query_of(
-            newest.grid,
-            newest.poses[:, :2],
-            partition=self._partition,
-            signature=self._signature,
-            config=self._config,
-            T_odom_base=SE2(),
-        )
+        query = query_of(newest.grid, newest.poses[:, :2], self._made_with, self._config)
         found = [] if self._places is None else self._look_up(query, self._places)
         self._remember(newest.grid, query)
         return found
 
     def _look_up(self, query: QueryMap, places: Places) -> list[Recognition]:
         proposals = retrieve(
-            query.views, query.center_m, places, signature=self._signature, config=self._config
+            query.views, query.center_m, places, signature=self._made_with.signature, config=self._config
         )
+        maps = LazySequence(self._map, len(self._stored), most=0)
         return [
             Recognition(
                 older=found.session_index,
                 T_older_newest=found.fit.T_map_query,
                 probability=probability,
             )
-            for found in verify(query, proposals, places, self._maps, self._config)
+            for found in verify(query, proposals, places, maps, self._config)
             if (probability := probability_of(found, query)) >= self._parameters.least
         ]
 
     def _remember(self, grid: OccupancyGrid, query: QueryMap) -> None:
         """Add the newest stretch to the places that later ones are looked up in."""
-        index = len(self._grids)
-        self._grids.append(grid)
+        index = len(self._stored)
+        cells = zlib.compress(np.ascontiguousarray(grid.cells, np.int8).tobytes(), 1)
+        self._stored.append((cells, grid.cells.shape, grid.resolution_m, grid.origin_m))
         table = SignatureTable.of(
             [view.signature for view in query.views],
             [view.center_m for view in query.views],
@@ -122,7 +117,17 @@ class SessionRecognizer:
         known = self._places
         if known is not None:
             table = SignatureTable.concatenated((known.table, table))
-        self._places = Places(table, self._grids, self._partition.radius_m, [0.0] * len(self._grids), known)
+        count = len(self._stored)
+        grids = LazySequence(self._grid, count, most=0)
+        self._places = Places(table, grids, self._made_with.partition.radius_m, [0.0] * count, known)
+
+    def _grid(self, index: int) -> OccupancyGrid:
+        cells, shape, resolution_m, origin_m = self._stored[index]
+        return OccupancyGrid(
+            cells=np.frombuffer(zlib.decompress(cells), np.int8).reshape(shape),
+            resolution_m=resolution_m,
+            origin_m=origin_m,
+        )
 
 
 def probability_of(hypothesis: Hypothesis, query: QueryMap) -> float:
@@ -139,61 +144,3 @@ def recognizer_for(config: Config) -> SessionRecognizer | None:
     False
     """
     return SessionRecognizer(config) if config.loops.recognize else None
-
-
-class _StoredGrids(Sequence[OccupancyGrid]):
-    """Grids that are kept compressed: some 10 kB a stretch, so that a long session needs little memory."""
-
-    def __init__(self) -> None:
-        self._stored: list[tuple[bytes, tuple[int, ...], float, tuple[float, float]]] = []
-
-    def append(self, grid: OccupancyGrid) -> None:
-        """Add one."""
-        cells = zlib.compress(np.ascontiguousarray(grid.cells, np.int8).tobytes(), 1)
-        self._stored.append((cells, grid.cells.shape, grid.resolution_m, grid.origin_m))
-
-    def __len__(self) -> int:
-        return len(self._stored)
-
-    @overload
-    def __getitem__(self, index: int) -> OccupancyGrid: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[OccupancyGrid]: ...
-
-    def __getitem__(self, index: int | slice) -> OccupancyGrid | Sequence[OccupancyGrid]:
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        cells, shape, resolution_m, origin_m = self._stored[index]
-        return OccupancyGrid(
-            cells=np.frombuffer(zlib.decompress(cells), np.int8).reshape(shape),
-            resolution_m=resolution_m,
-            origin_m=origin_m,
-        )
-
-
-class _PreparedMaps(Sequence[SearchMap]):
-    """The maps of stretches, prepared to be searched; the `count` used last are kept."""
-
-    def __init__(self, grids: Sequence[OccupancyGrid], count: int) -> None:
-        self._grids, self._count = grids, count
-        self._prepared: OrderedDict[int, SearchMap] = OrderedDict()
-
-    def __len__(self) -> int:
-        return len(self._grids)
-
-    @overload
-    def __getitem__(self, index: int) -> SearchMap: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[SearchMap]: ...
-
-    def __getitem__(self, index: int | slice) -> SearchMap | Sequence[SearchMap]:
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        if index not in self._prepared:
-            self._prepared[index] = SearchMap.of(self._grids[index])
-            if len(self._prepared) > self._count:
-                self._prepared.popitem(last=False)
-        self._prepared.move_to_end(index)
-        return self._prepared[index]

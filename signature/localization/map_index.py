@@ -22,22 +22,22 @@ from pc2grid.model import UNKNOWN, OccupancyGrid, same_recording
 from pc2grid.observer import Observer
 from signature.config import Config
 from signature.database.protocol import Label
-from signature.relocalization.answer import Status, Verdict
-from signature.relocalization.confidence import CALIBRATION, LIMITS, PRESENCE, RIVALS, SAME_PLACE, Evidence
-from signature.relocalization.hypotheses import (
+from signature.localization.answer import Status, Verdict
+from signature.localization.confidence import CALIBRATION, LIMITS, PRESENCE, RIVALS, SAME_PLACE, Evidence
+from signature.localization.hypotheses import (
     HYPOTHESES,
     Hypothesis,
     coarse_score,
     distinct,
     fitted,
     same_pose,
-    search_everywhere,
+    search_whole_map,
     verify,
 )
-from signature.relocalization.in_space import PointsOf, points_reader
-from signature.relocalization.lazy_maps import DatabaseGrids, LazySequence
-from signature.relocalization.prior import PRIOR, Prior
-from signature.relocalization.query_map import QueryMap, query_of
+from signature.localization.in_space import PointsOf, points_reader
+from signature.localization.lazy_maps import DatabaseGrids, LazySequence
+from signature.localization.prior import PRIOR, Prior
+from signature.localization.query import QueryMap, query_of
 from signature.retrieval.viewpoints import AT_ONCE_M2, Places
 from signature.retrieval.vote import retrieve
 from signature.seen_places import SeenPlaces
@@ -274,28 +274,28 @@ class MapIndex:
         found = (*old, *verify(query, proposals, self.places, self.maps, self.config))
         region = self._region(query)
         if region is not None and len(region[1]) * HYPOTHESES.square_m**2 <= PRIOR.searched_m2:
-            return self.look_everywhere(query, found)
+            return self.search_whole_maps(query, found)
         return self._worth_keeping(found, query)
 
-    def look_everywhere(
+    def search_whole_maps(
         self, query: QueryMap, known: tuple[Hypothesis, ...], least: float = 0.0
     ) -> tuple[Hypothesis, ...]:
         """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole; in
         a large database, on those that look most like the query. With a prior: anywhere in its region.
 
-        least : what has a lower coarse score is left out, see `hypotheses.search_everywhere`.
+        least : what has a lower coarse score is left out, see `hypotheses.search_whole_map`.
         """
         found = list(known)
         region = self._region(query)
         if region is not None:
             index, free = region
             if len(free) * HYPOTHESES.square_m**2 <= self.config.exhaustive_m2:
-                found.extend(search_everywhere(query, index, self.maps[index], free, self.config, least))
+                found.extend(search_whole_map(query, index, self.maps[index], free, self.config, least))
             return self._worth_keeping(tuple(found), query)
         for index in self.places.sessions(query.views, self.made_with.signature, self.config):
             if self._areas_m2[index] <= self.config.exhaustive_m2:
                 found.extend(
-                    search_everywhere(query, index, self.maps[index], self._free[index], self.config, least)
+                    search_whole_map(query, index, self.maps[index], self._free[index], self.config, least)
                 )
         return self._worth_keeping(tuple(found), query)
 
@@ -384,14 +384,7 @@ class MapIndex:
         """T_there_here of two maps that agree where both know something; None if they do not."""
         if (here, there) not in self._alike:
             grid = self.grids[here]
-            whole = query_of(
-                grid,
-                np.empty((0, 2)),
-                partition=self.made_with.partition,
-                signature=self.made_with.signature,
-                config=self.config,
-                T_odom_base=SE2(),
-            )
+            whole = query_of(grid, np.empty((0, 2)), self.made_with, self.config)
             rows = np.flatnonzero(self.places.table.session_index == there)
             fits = [h.fit for h in self.look_up(whole, rows=rows) if h.session_index == there]
             alike = [
@@ -412,14 +405,14 @@ class MapIndex:
         """
         verdict = self.judge(query, hypotheses)
         if verdict.status != "located":
-            return self.judge_everywhere(query, hypotheses)
+            return self.judge_whole_maps(query, hypotheses)
         best = verdict.hypotheses[0]
         score = coarse_score(query, self.maps[best.session_index], best.fit.T_map_query)
-        return self.judge(query, self.look_everywhere(query, hypotheses, score))
+        return self.judge(query, self.search_whole_maps(query, hypotheses, score))
 
-    def judge_everywhere(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> Verdict:
+    def judge_whole_maps(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> Verdict:
         """What the hypotheses amount to, together with all that fits anywhere on the maps."""
-        return self.judge(query, self.look_everywhere(query, hypotheses))
+        return self.judge(query, self.search_whole_maps(query, hypotheses))
 
     def _worth_keeping(self, found: tuple[Hypothesis, ...], query: QueryMap) -> tuple[Hypothesis, ...]:
         """Best first, what scores enough beside the best one; what a prior excludes is kept beside it."""

@@ -12,8 +12,9 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from signature.config import Config, RelocalizeConfig
-from signature.relocalization.prior import Prior
-from signature.relocalization.watcher import Look, ResetPolicy, Watcher, WatchParameters
+from signature.localization.belief import WatchParameters
+from signature.localization.localizer import Localizer, Look
+from signature.localization.prior import Prior
 from tests.helpers.simulated_drives import building, drive, office, plan
 
 OFFICE = building({"office": office()})
@@ -42,10 +43,10 @@ def stretch(
         yield moved, planar_scan, truth
 
 
-def looks_of(watcher: Watcher, steps: list[Step]) -> list[tuple[Look, SE2]]:
+def looks_of(localizer: Localizer, steps: list[Step]) -> list[tuple[Look, SE2]]:
     found = []
     for registered, planar_scan, truth in steps:
-        look = watcher.add(registered, planar_scan)
+        look = localizer.follow(registered, planar_scan)
         if look is not None:
             found.append((look, truth))
     return found
@@ -59,7 +60,7 @@ def check_poses(looks: list[tuple[Look, SE2]]) -> None:
 
 
 def test_a_robot_that_drives_on_stays_located() -> None:
-    looks = looks_of(Watcher(OFFICE), list(stretch(FIRST)))
+    looks = looks_of(Localizer(OFFICE), list(stretch(FIRST)))
     states = [look.state for look, _ in looks]
     at = states.index("located")
     assert set(states[:at]) <= {"searching"}
@@ -69,7 +70,7 @@ def test_a_robot_that_drives_on_stays_located() -> None:
 
 
 def test_the_odometry_frame_in_the_map_does_not_change_while_the_robot_drives() -> None:
-    looks = looks_of(Watcher(OFFICE), list(stretch(FIRST)))
+    looks = looks_of(Localizer(OFFICE), list(stretch(FIRST)))
     frames = [look.T_map_odom for look, _ in looks if look.state == "located"]
     poses = np.array([(f.x, f.y) for f in frames if f is not None])
     assert len(poses) > 2
@@ -85,7 +86,7 @@ def test_a_robot_that_is_seen_being_carried_away_is_lost_and_then_recovered_by_t
     steps = list(stretch(FIRST))
     end = SE2.from_matrix(steps[-1][0].T_session_base)
     steps += list(stretch([(3.0, 3.5), (10.0, 3.5)], end, Health.LOST))[:25]
-    looks = looks_of(Watcher(OFFICE), [*steps, *stretch(SECOND, end)])
+    looks = looks_of(Localizer(OFFICE), [*steps, *stretch(SECOND, end)])
     states = [look.state for look, _ in looks]
     at = states.index("lost")
     assert set(states[:at]) == {"located"}
@@ -99,8 +100,8 @@ def test_a_robot_that_is_carried_away_unseen_is_recovered_all_the_same() -> None
     """It was put down before a scan showed anything, so odometry says that it is where it was."""
     steps = list(stretch([FIRST[0], (3.6, 7.0)]))
     end = SE2.from_matrix(steps[-1][0].T_session_base)
-    watcher = Watcher(OFFICE, WatchParameters(doubtful_looks=2))
-    looks = looks_of(watcher, [*steps, *stretch(SECOND, end)])
+    localizer = Localizer(OFFICE, parameters=WatchParameters(doubtful_looks=2))
+    looks = looks_of(localizer, [*steps, *stretch(SECOND, end)])
     states = [look.state for look, _ in looks]
     assert states.count("recovered") == 1
     assert states[states.index("recovered") - 1] == "doubtful"
@@ -110,7 +111,7 @@ def test_a_robot_that_is_carried_away_unseen_is_recovered_all_the_same() -> None
 
 def test_a_robot_elsewhere_is_never_located() -> None:
     other = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
-    looks = looks_of(Watcher(OFFICE), list(stretch([(2, 2), (2, 4.5)], grid=other)))
+    looks = looks_of(Localizer(OFFICE), list(stretch([(2, 2), (2, 4.5)], grid=other)))
     assert {look.state for look, _ in looks} == {"searching"}
     assert all(look.T_map_base is None and look.T_map_odom is None for look, _ in looks)
 
@@ -121,18 +122,18 @@ def test_a_robot_that_stands_is_looked_for_once() -> None:
     for number in range(60):
         scan = replace(first[0].scan, stamp_ns=number * 10**8)
         steps.append((replace(first[0], scan=scan), first[1], first[2]))
-    looks = looks_of(Watcher(OFFICE), steps)
+    looks = looks_of(Localizer(OFFICE), steps)
     assert len(looks) == 1
     assert looks[0][0].answer.path_m == 0.0
     check_poses(looks)
 
 
 def test_after_a_restart_one_look_is_not_enough() -> None:
-    watcher = Watcher(OFFICE)
-    assert looks_of(watcher, list(stretch(FIRST)))[-1][0].state == "located"
-    watcher.restart()
-    assert not watcher.located
-    looks = looks_of(watcher, list(stretch(FIRST, SE2(40.0, 2.0, 1.0))))
+    localizer = Localizer(OFFICE)
+    assert looks_of(localizer, list(stretch(FIRST)))[-1][0].state == "located"
+    localizer.restart()
+    assert not localizer.located
+    looks = looks_of(localizer, list(stretch(FIRST, SE2(40.0, 2.0, 1.0))))
     states = [look.state for look, _ in looks if look.answer.status == "located"]
     assert states[:3] == ["doubtful", "recovered", "located"]
     check_poses(looks)
@@ -141,7 +142,7 @@ def test_after_a_restart_one_look_is_not_enough() -> None:
 def test_the_same_place_in_another_session_is_the_same_place() -> None:
     """A database of two maps of one floor: the pose stays in the map in which it was found first."""
     both = building({"monday": office(), "tuesday": office()})
-    looks = looks_of(Watcher(both), list(stretch(FIRST)))
+    looks = looks_of(Localizer(both), list(stretch(FIRST)))
     sessions = {look.session for look, _ in looks if look.state == "located"}
     assert len(sessions) == 1
     assert "doubtful" not in {look.state for look, _ in looks}
@@ -155,22 +156,13 @@ def test_a_prior_is_about_the_beginning_and_is_forgotten_when_the_search_begins_
     index = building({"twins": twins}, Config(relocalize=RelocalizeConfig(accept=0.95)))
     steps = list(stretch([(1.0, 1.0), (5.0, 1.0)], grid=twins))
     for where, index_of in (("unknown", index), ("left", index.within(Prior.around(1.0, 1.0, 1.0)))):
-        watcher = Watcher(index_of)
-        looks = looks_of(watcher, steps)
+        localizer = Localizer(index_of)
+        looks = looks_of(localizer, steps)
         states = {look.state for look, _ in looks}
         if where == "unknown":
             assert states == {"searching"}
             continue
         assert "located" in states  # although it has left the disc in which it began
         check_poses(looks)
-        watcher.restart()
-        assert {look.state for look, _ in looks_of(watcher, steps)} == {"lost"}
-
-
-def test_resets_are_paused_and_bounded() -> None:
-    now_s = 0.0
-    policy = ResetPolicy(pause_s=10.0, most=2, calm_s=60.0, clock=lambda: now_s)
-    allowed = {}
-    for now_s in (0.0, 5.0, 11.0, 22.0, 40.0, 80.0, 85.0):
-        allowed[now_s] = policy.allows()
-    assert [now_s for now_s, may in allowed.items() if may] == [0.0, 11.0, 80.0]
+        localizer.restart()
+        assert {look.state for look, _ in looks_of(localizer, steps)} == {"lost"}

@@ -20,12 +20,12 @@ from pc2grid.model import FREE, Health, OccupancyGrid, RegisteredScan, Submap
 from signature.config import Config, SignatureConfig
 from signature.database import Label
 from signature.describe import Signature, describe
-from signature.relocalization import query_map
-from signature.relocalization.answer import Moment, Verdict
-from signature.relocalization.confidence import NO_EVIDENCE
-from signature.relocalization.hypotheses import Hypothesis, fitted
-from signature.relocalization.query_map import QueryMap, QueryWindow
-from signature.relocalization.relocalizer import Answer, MapIndex, Query, Relocalizer, Search, localize
+from signature.localization import query as query_module
+from signature.localization.answer import Moment, Verdict
+from signature.localization.confidence import NO_EVIDENCE
+from signature.localization.hypotheses import Hypothesis, fitted
+from signature.localization.localizer import Answer, Localizer, MapIndex, answer_query, locate_in
+from signature.localization.query import Query, QueryMap
 from tests.helpers.simulated_drives import building, drive, office, plan
 
 OFFICE = building({"office": office()})
@@ -35,11 +35,11 @@ ROUTE = [(1.5, 7.0), (9.5, 7.0), (9.5, 4.0)]
 def ask(
     where: MapIndex, grid: OccupancyGrid, corners: list[tuple[float, float]], **kind: float
 ) -> tuple[Answer, SE2]:
-    relocalizer = Relocalizer(where)
+    localizer = Localizer(where)
     for registered, planar_scan, truth in drive(grid, corners, **kind):
-        relocalizer.add(registered, planar_scan)
+        localizer.add(registered, planar_scan)
         end = truth
-    return relocalizer.answer(), end
+    return localizer.answer(), end
 
 
 @pytest.mark.parametrize("field_deg", [360.0, 270.0, 90.0])
@@ -59,7 +59,7 @@ def test_a_better_place_that_was_not_proposed_takes_a_certain_answer_away() -> N
     config = Config()
     daring = config.model_copy(update={"relocalize": config.relocalize.model_copy(update={"accept": 0.001})})
     index = MapIndex({"office": office()}, OFFICE.places.table, config, daring)
-    query = Query(index)
+    query = Query(index.made_with, index.config)
     for registered, planar_scan, end in drive(office(), ROUTE, field_rad=math.radians(90)):
         query.add(registered, planar_scan)
         truth = end
@@ -97,15 +97,14 @@ def test_asking_on_the_way_says_what_the_answer_would_be_and_changes_nothing() -
         asked.extend([] if moment is None else [moment])
 
     registered = [(scan, planar_scan) for scan, planar_scan, _ in scans]
-    (quiet,) = localize(registered, [OFFICE])
-    (told,) = localize(registered, [OFFICE], watch=watch, ask=lambda _: True)
-    assert told.answers[0].to_json()["history"] == quiet.answers[0].to_json()["history"]
-    assert told.answers[0].confidence == quiet.answers[0].confidence
-    assert len(asked) == len(quiet.answers[0].history) - 1
+    quiet = locate_in(registered, OFFICE)
+    told = locate_in(registered, OFFICE, watch=watch, answer_at=lambda _: True)
+    assert told.to_json()["history"] == quiet.to_json()["history"]
+    assert told.confidence == quiet.confidence
+    assert len(asked) == len(quiet.history) - 1
     for moment in asked[::3]:
         before = [pair for pair in registered if pair[0].scan.stamp_ns <= moment.stamp_ns]
-        (there,) = localize(before, [OFFICE])
-        answer = there.answers[0]
+        answer = locate_in(before, OFFICE)
         assert (moment.status, moment.confidence) == (answer.status, answer.confidence)
         assert moment.path_m == answer.path_m
 
@@ -198,8 +197,8 @@ def test_like_rooms_of_two_buildings_are_told_apart_by_what_lies_around_them() -
 
 
 def test_the_answer_does_not_depend_on_where_the_query_starts() -> None:
-    late = Relocalizer(OFFICE)
-    early = Relocalizer(OFFICE)
+    late = Localizer(OFFICE)
+    early = Localizer(OFFICE)
     scans = list(drive(office(), [(18.0, 1.5), (18.0, 2.4), (18.5, 7.0), *ROUTE[1:]]))
     for k, (registered, planar_scan, truth) in enumerate(scans):
         early.add(registered, planar_scan)
@@ -214,16 +213,16 @@ def test_the_answer_does_not_depend_on_where_the_query_starts() -> None:
 
 
 def test_lost_scans_end_a_part_and_the_last_one_alone_is_a_query() -> None:
-    relocalizer = Relocalizer(OFFICE)
+    localizer = Localizer(OFFICE)
     for registered, planar_scan, _ in drive(office(), ROUTE[:2]):
         lost = RegisteredScan(
             scan=registered.scan, T_session_base=registered.T_session_base, health=Health.LOST
         )
-        relocalizer.add(lost, planar_scan)
-    assert relocalizer.path_m == 0.0
-    assert relocalizer.answer().path_m == 0.0
+        localizer.add(lost, planar_scan)
+    assert localizer.path_m == 0.0
+    assert localizer.answer().path_m == 0.0
     with pytest.raises(NoScans):
-        Relocalizer(OFFICE).answer()
+        Localizer(OFFICE).answer()
 
 
 def test_the_json_document_keeps_its_contract() -> None:
@@ -268,7 +267,7 @@ class Judged:
             evidence=NO_EVIDENCE,
         )
 
-    judge_everywhere = decide = judge
+    judge_whole_maps = decide = judge
 
 
 @pytest.mark.parametrize(
@@ -292,7 +291,10 @@ def test_the_last_metres_answer_where_the_whole_query_is_not_sure(
             made.append(confidence)
             yield query_with(confidence)
 
-    answer = Search(cast("MapIndex", Judged())).answer(query_with(whole), last_metres())
+    index = cast("MapIndex", Judged())
+    query = cast("Query", SimpleNamespace(last_metres=last_metres, in_space=None))
+    seen = query_with(whole)
+    answer = answer_query(index, query, seen, index.look_up(seen, ()))
     x, confidence = expected
     assert answer.hypotheses[0].fit.T_map_query.x == x
     assert answer.confidence == pytest.approx(confidence)
@@ -301,18 +303,17 @@ def test_the_last_metres_answer_where_the_whole_query_is_not_sure(
 
 
 def query_with(path_m: float) -> QueryMap:
-    query = QueryWindow(Config().projection, Config().relocalize)
+    query = Query(Config(), Config().relocalize)
     for registered, planar_scan, _ in itertools.islice(drive(office(), ROUTE), 1):
-        query.add(planar_scan, SE2.from_matrix(registered.T_session_base))
-    return replace(query.query(Config().partition, Config().signature), path_m=path_m)
+        query.add(registered, planar_scan)
+    return replace(query.map(), path_m=path_m)
 
 
 def test_the_last_metres_are_drawn_from_the_newest_scans_alone() -> None:
-    window = QueryWindow(Config().projection, Config().relocalize)
+    query = Query(Config(), Config().relocalize)
     for registered, planar_scan, _ in drive(office(), ROUTE, reach_m=3.0):
-        window.add(planar_scan, SE2.from_matrix(registered.T_session_base))
-    whole = window.query(Config().partition, Config().signature)
-    last = window.query(Config().partition, Config().signature, 2.0)
+        query.add(registered, planar_scan)
+    whole, last = query.map(), query.map(2.0)
     assert last.T_odom_base == whole.T_odom_base and last.path_m == whole.path_m
     assert 0 < last.walls.weight < 0.7 * whole.walls.weight
 
@@ -327,7 +328,7 @@ def test_views_are_described_by_signatures_only_where_these_select(
         described.append(submap)
         return describe(submap, config)
 
-    monkeypatch.setattr(query_map, "describe", counted)
+    monkeypatch.setattr(query_module, "describe", counted)
     config = Config()
     few = {"all_places": 10, "shortlist": 5, "select_by": select_by}
     settings = config.model_copy(update={"relocalize": config.relocalize.model_copy(update=few)})
@@ -343,12 +344,12 @@ def test_a_query_whose_last_scans_contradict_the_others_is_not_located(slip_deg:
     scans = list(drive(office(), ROUTE))
     slip = SE2(0.0, 0.0, math.radians(slip_deg))
     turn_at = SE2.from_matrix(scans[-10][0].T_session_base)
-    relocalizer = Relocalizer(OFFICE)
+    localizer = Localizer(OFFICE)
     for k, (registered, planar_scan, _) in enumerate(scans):
         T = SE2.from_matrix(registered.T_session_base)
         if k >= len(scans) - 10:
             T = turn_at @ slip @ turn_at.inverse() @ T
-        relocalizer.add(replace(registered, T_session_base=T.lift()), planar_scan)
-    answer = relocalizer.answer()
+        localizer.add(replace(registered, T_session_base=T.lift()), planar_scan)
+    answer = localizer.answer()
     assert (answer.status == "located") == (slip_deg == 0.0)
     assert (answer.evidence.worst_scan < -1.5) == (slip_deg != 0.0)

@@ -10,9 +10,9 @@ import pytest
 
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.model import RegisteredScan
-from signature.relocalization import looking as looking_module
-from signature.relocalization.looking import Looking
-from signature.relocalization.watcher import Look, Watcher
+from signature.localization import follower as follower_module
+from signature.localization.follower import Follower
+from signature.localization.localizer import Localizer, Look
 from tests.helpers.simulated_drives import building, drive, office
 
 OFFICE = building({"office": office()})
@@ -29,28 +29,29 @@ def facts(looks: list[Look]) -> list[tuple[object, ...]]:
 def test_a_thread_makes_the_same_looks() -> None:
     found = []
     for beside in (False, True):
-        with Looking(Watcher(OFFICE), beside=beside) as looking:
+        with Follower(Localizer(OFFICE), beside=beside) as follower:
             looks: list[Look] = []
             for registered, planar_scan in STEPS:
-                looking.add(registered, planar_scan)
-                looking.finish()  # no travel waits, so no look is left out
-                looks += looking.take()
+                follower.add(registered, planar_scan)
+                follower.finish()  # no travel waits, so no look is left out
+                looks += follower.take()
         found.append(facts(looks))
     assert found[0] == found[1]
     assert len(found[0]) >= 3
 
 
 class Slow:
-    """A watcher whose looks last until they are let go."""
+    """A localizer whose looks last until they are let go."""
 
     uses_points = False
 
     def __init__(self) -> None:
         self.go = threading.Event()
-        self.scans = self.looks = self.restarts = 0
+        self.scans = self.looks = self.restarts = self.points = 0
 
-    def add(self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_look: bool = True) -> None:
+    def follow(self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_look: bool = True) -> None:
         self.scans += 1
+        self.points += len(registered.scan.points_m)
         if may_look:
             self.looks += 1
             self.go.wait(60.0)
@@ -61,12 +62,12 @@ class Slow:
 
 def test_a_slow_look_holds_up_no_scan_and_looks_that_are_out_of_date_are_left_out() -> None:
     slow = Slow()
-    with Looking(slow, beside=True) as looking:  # type: ignore[arg-type]
+    with Follower(slow, beside=True) as follower:  # type: ignore[arg-type]
         for registered, planar_scan in STEPS:  # returns at once, although the first look lasts
-            looking.add(registered, planar_scan)
-        looking.restart()
+            follower.add(registered, planar_scan)
+        follower.restart()
         slow.go.set()
-        looking.finish()
+        follower.finish()
     assert slow.scans == len(STEPS)
     assert slow.restarts == 1
     # The looks at the last metre, and at what was there before the rest came.
@@ -74,36 +75,37 @@ def test_a_slow_look_holds_up_no_scan_and_looks_that_are_out_of_date_are_left_ou
 
 
 def test_what_waits_is_bounded_and_holds_no_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(looking_module, "_MOST_WAITING", 5)
+    monkeypatch.setattr(follower_module, "_MOST_WAITING", 5)
     slow = Slow()
-    with Looking(slow, beside=True) as looking:  # type: ignore[arg-type]
+    with Follower(slow, beside=True) as follower:  # type: ignore[arg-type]
         for registered, planar_scan in STEPS:
-            looking.add(registered, planar_scan)
-        waiting = [item for item in looking._waiting if item is not None]
-        assert len(waiting) <= 5
-        assert all(len(item[0].scan.points_m) == 0 for item in waiting)
+            follower.add(registered, planar_scan)
         slow.go.set()
+        follower.finish()
+    assert 5 <= slow.scans <= 6 and slow.points == 0
 
 
 def test_an_error_of_the_thread_is_raised_where_looks_are_taken() -> None:
     class Broken(Slow):
-        def add(self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_look: bool = True) -> None:
+        def follow(
+            self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_look: bool = True
+        ) -> None:
             raise MemoryError("too large")
 
-    with Looking(Broken(), beside=True) as looking:  # type: ignore[arg-type]
-        looking.add(*STEPS[0])
-        looking.finish()
+    with Follower(Broken(), beside=True) as follower:  # type: ignore[arg-type]
+        follower.add(*STEPS[0])
+        follower.finish()
         with pytest.raises(MemoryError, match="too large"):
-            looking.take()
+            follower.take()
 
 
 def test_leaving_ends_the_thread_without_using_what_waits() -> None:
     slow = Slow()
-    with Looking(slow, beside=True) as looking:  # type: ignore[arg-type]
+    with Follower(slow, beside=True) as follower:  # type: ignore[arg-type]
         for registered, planar_scan in STEPS:
-            looking.add(registered, planar_scan)
+            follower.add(registered, planar_scan)
         while not slow.scans:
             time.sleep(0.001)
         threading.Timer(0.05, slow.go.set).start()
     assert slow.scans < len(STEPS)
-    assert "looks" not in {thread.name for thread in threading.enumerate()}
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("looks")]

@@ -10,9 +10,9 @@ import pytest
 
 from pc2grid.model import PointMap
 from signature.database import Label
-from signature.relocalization.looking import Looking
-from signature.relocalization.map_index import MapIndex
-from signature.relocalization.watcher import Look, Watcher
+from signature.localization.follower import Follower
+from signature.localization.localizer import Localizer, Look
+from signature.localization.map_index import MapIndex
 from tests.helpers.simulated_drives import building, office
 from tests.helpers.tall_offices import lidar_drive, points
 
@@ -36,12 +36,12 @@ def maps() -> dict[str, PointMap]:
 
 @pytest.mark.parametrize(("height_m", "name"), [(LOW_M, "low"), (HIGH_M, "high")])
 def test_twins_that_differ_in_height_only(height_m: float, name: str, maps: dict[str, PointMap]) -> None:
-    plain, spatial = Watcher(TWINS), Watcher(with_points(TWINS, maps))
+    plain, spatial = Localizer(TWINS), Localizer(with_points(TWINS, maps))
     answers: list[Look] = []
     for registered, planar_scan, _ in lidar_drive(height_m):
-        in_plane = plain.add(registered, planar_scan)
+        in_plane = plain.follow(registered, planar_scan)
         assert in_plane is None or in_plane.answer.status != "located"
-        look = spatial.add(registered, planar_scan)
+        look = spatial.follow(registered, planar_scan)
         answers += [] if look is None else [look]
     located = [look for look in answers if look.state == "located"]
     assert located
@@ -51,14 +51,14 @@ def test_twins_that_differ_in_height_only(height_m: float, name: str, maps: dict
 
 def test_a_thread_refines_a_located_robot(maps: dict[str, PointMap]) -> None:
     """The thread gets the points of a scan every 0.2 m; the pose is that of space."""
-    watcher = Watcher(with_points(ALONE, maps))
+    localizer = Localizer(with_points(ALONE, maps))
     truth, errors_m = {}, []
-    with Looking(watcher, beside=True) as looking:
+    with Follower(localizer, beside=True) as follower:
         for registered, planar_scan, T_map_base in lidar_drive(HIGH_M):
             truth[registered.scan.stamp_ns] = T_map_base
-            looking.add(registered, planar_scan)
-        looking.finish()
-        looks = looking.take()
+            follower.add(registered, planar_scan)
+        follower.finish()
+        looks = follower.take()
     for look in looks:
         if look.T_map_base is None:
             continue
@@ -69,8 +69,8 @@ def test_a_thread_refines_a_located_robot(maps: dict[str, PointMap]) -> None:
 
 
 def test_without_points_nothing_is_done_in_space() -> None:
-    assert not Watcher(ALONE).uses_points
-    watcher = Watcher(with_points(ALONE, {}))
-    looks = [watcher.add(registered, planar_scan) for registered, planar_scan, _ in lidar_drive(LOW_M)]
+    assert not Localizer(ALONE).uses_points
+    localizer = Localizer(with_points(ALONE, {}))
+    looks = [localizer.follow(registered, planar_scan) for registered, planar_scan, _ in lidar_drive(LOW_M)]
     located = [look for look in looks if look is not None and look.state == "located"]
     assert located and all(look.answer.in_space is None for look in located)

@@ -43,8 +43,8 @@ import numpy as np
 
 from pc2grid.matching.likelihood_field import LikelihoodField
 from pc2grid.matching.two_way_score import Fit
-from signature.relocalization.hypotheses import Hypothesis
-from signature.relocalization.query_map import QueryMap
+from signature.localization.hypotheses import Hypothesis
+from signature.localization.query import QueryMap
 
 FITTED_ON = frozenset({"fr079", "intel", "csail", "aces"})
 """Buildings that `CALIBRATION` and `PRESENCE` were fitted on: real recordings of the first three, simulated

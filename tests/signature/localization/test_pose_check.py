@@ -19,8 +19,8 @@ from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import UNKNOWN, Health, OccupancyGrid, RegisteredScan
 from signature.config import Config
-from signature.relocalization.map_index import MapIndex
-from signature.relocalization.pose_check import PoseCheck, check_pose
+from signature.localization.map_index import MapIndex
+from signature.localization.pose_check import PoseCheck, check_pose
 from signature.similarity import SignatureTable
 from tests.helpers.simulated_drives import building, drive, office, plan
 

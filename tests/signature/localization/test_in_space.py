@@ -12,10 +12,11 @@ from pc2grid.matching.icp_in_space import register_in_space
 from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import Health, OccupancyGrid, PointMap
 from signature.database import Label
-from signature.relocalization.answer import Answer
-from signature.relocalization.confidence import NO_EVIDENCE
-from signature.relocalization.hypotheses import Hypothesis
-from signature.relocalization.in_space import QueryInSpace, settle_in_space
+from signature.localization.answer import Answer
+from signature.localization.confidence import NO_EVIDENCE
+from signature.localization.hypotheses import Hypothesis
+from signature.localization.in_space import settle_in_space
+from signature.localization.query import QueryInSpace
 from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, furnished_map, twin_map
 
 

@@ -14,10 +14,10 @@ from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, RegisteredScan
 from signature.config import Config, RelocalizeConfig
-from signature.relocalization.answer import Answer
-from signature.relocalization.map_index import MapIndex
-from signature.relocalization.prior import PRIOR, Prior
-from signature.relocalization.relocalizer import Relocalizer
+from signature.localization.answer import Answer
+from signature.localization.localizer import Localizer
+from signature.localization.map_index import MapIndex
+from signature.localization.prior import PRIOR, Prior
 from tests.helpers.simulated_drives import building, drive, office, plan
 
 BENT = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]
@@ -37,11 +37,11 @@ def driven(in_office: bool) -> list[tuple[RegisteredScan, PlanarScan, SE2]]:
 
 
 def ask(index: MapIndex, *, in_office: bool = True) -> tuple[Answer, SE2]:
-    relocalizer = Relocalizer(index)
+    localizer = Localizer(index)
     for registered, planar_scan, truth in driven(in_office):
-        relocalizer.add(registered, planar_scan)
+        localizer.add(registered, planar_scan)
         end = truth
-    return relocalizer.answer(), end
+    return localizer.answer(), end
 
 
 def distance(a: SE2 | None, b: SE2) -> float:
@@ -81,7 +81,7 @@ def test_a_prior_that_holds_changes_no_right_answer() -> None:
 
 def test_a_large_region_is_searched_through_proposals(monkeypatch: pytest.MonkeyPatch) -> None:
     small = replace(PRIOR, searched_m2=1.0)
-    monkeypatch.setattr("signature.relocalization.map_index.PRIOR", small)
+    monkeypatch.setattr("signature.localization.map_index.PRIOR", small)
     answer, truth = ask(OFFICE.within(Prior.around(9.0, 5.0, radius_m=4.0)))
     assert answer.status == "located" and distance(answer.T_map_base, truth) < 0.1
     # Proposals outside are dropped all the same.
@@ -103,17 +103,17 @@ def test_a_pose_of_the_first_scan_is_carried_along_by_the_travel() -> None:
 
 
 def test_a_prior_from_before_registration_was_lost_is_not_used() -> None:
-    relocalizer = Relocalizer(OFFICE.within(Prior.around(17.0, 2.0, 1.0)))
+    localizer = Localizer(OFFICE.within(Prior.around(17.0, 2.0, 1.0)))
     timed = replace(Prior.around(17.0, 2.0, 1.0), stamp_ns=0)
-    relocalizers = [relocalizer, Relocalizer(OFFICE.within(timed))]
+    localizers = [localizer, Localizer(OFFICE.within(timed))]
     for k, (registered, planar_scan, _) in enumerate(driven(in_office=True)):
         if k == 10:
             registered = RegisteredScan(
                 scan=registered.scan, T_session_base=registered.T_session_base, health=Health.LOST
             )
-        for each in relocalizers:
+        for each in localizers:
             each.add(registered, planar_scan)
-    always, at_start = (each.answer() for each in relocalizers)
+    always, at_start = (each.answer() for each in localizers)
     assert (always.status, always.prior) == ("not_found", "used")
     assert (at_start.status, at_start.prior) == ("located", "lapsed")
 

@@ -10,7 +10,7 @@ from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.mapping.place_recognition import Stretch
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from signature.config import Config
-from signature.relocalization.place_recognition import RecognitionParameters, SessionRecognizer
+from signature.localization.place_recognition import RecognitionParameters, SessionRecognizer
 
 
 def rooms(seed: int, *, size_m: float = 9.0) -> OccupancyGrid:

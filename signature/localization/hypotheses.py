@@ -15,7 +15,7 @@ from pc2grid.matching.two_way_score import Fit, score_fit
 from pc2grid.matching.walls import thin_evenly
 from pc2grid.matching.window_search import SearchMap, SearchParameters, search_windows
 from signature.config import RelocalizeConfig
-from signature.relocalization.query_map import QueryMap
+from signature.localization.query import QueryMap
 from signature.retrieval.viewpoints import Places
 from signature.retrieval.vote import Proposal
 
@@ -112,7 +112,7 @@ def verify(
     return distinct(found, query.T_odom_base)
 
 
-def search_everywhere(
+def search_whole_map(
     query: QueryMap,
     session_index: int,
     target: SearchMap,
@@ -149,7 +149,7 @@ def search_everywhere(
 
 
 def coarse_score(query: QueryMap, target: SearchMap, T_map_query: SE2) -> float:
-    """What `search_everywhere` scores a pose with, 0..1."""
+    """What `search_whole_map` scores a pose with, 0..1."""
     center = (query.T_odom_base.x, query.T_odom_base.y)
     at = T_map_query @ SE2(*center)
     poses = search_windows(

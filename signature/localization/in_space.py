@@ -7,7 +7,6 @@ space, for example of two rooms that differ in height only.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -16,16 +15,14 @@ from typing import Any
 import numpy as np
 
 from pc2grid.arrays import F64
-from pc2grid.clouds.voxel_cloud import VoxelCloud
-from pc2grid.geometry import SE2, transform_points
+from pc2grid.geometry import SE2
 from pc2grid.matching.icp_in_space import RAYS, SpatialFit, SpatialView, register_in_space
-from pc2grid.model import Health, PointMap, RegisteredScan
-from pc2grid.sensor_model import SENSOR_MODELS
+from pc2grid.model import PointMap
 from signature.database import SubmapDatabase
-from signature.relocalization.answer import Answer, Moment
-from signature.relocalization.confidence import LIMITS
-from signature.relocalization.hypotheses import Hypothesis
-from signature.relocalization.pose_in_space import PoseInSpace, SpaceStatus
+from signature.localization.answer import Answer, Moment, PoseInSpace, SpaceStatus
+from signature.localization.confidence import LIMITS
+from signature.localization.hypotheses import Hypothesis
+from signature.localization.query import QueryInSpace
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,8 +30,6 @@ class SpaceParameters:
     """When an answer is compared in space, and what follows from it. Chosen by hand; in a simulated drive
     through a real 3D scan right places have 0.90 to 0.97 of the rays on surfaces, random ones 0.17 to 0.78.
 
-    last_m : metres of travel whose scans are used. every_m : travel between two of them.
-    voxel_m : edge of the voxels that a scan is reduced to.
     agrees, contradicts : from the first share of rays on surfaces a place agrees, below the second it
         contradicts.
     sure : of several places one is chosen only from this share on.
@@ -44,9 +39,6 @@ class SpaceParameters:
     places : of more places than this, none is chosen.
     """
 
-    last_m: float = 5.0
-    every_m: float = 0.2
-    voxel_m: float = 0.05
     agrees: float = 0.75
     contradicts: float = 0.55
     sure: float = 0.85
@@ -65,62 +57,6 @@ def points_reader(database: SubmapDatabase) -> PointsOf | None:
     if not any(info.provenance.config.projection.points_voxel_m for info in database.sessions()):
         return None
     return lru_cache(maxsize=SPACE.places)(database.points)
-
-
-class ViewSpacing:
-    """Which scans of a query are compared in space: one every `SPACE.every_m` of travel."""
-
-    def __init__(self) -> None:
-        self.path_m = 0.0
-        self._last_m: F64 | None = None
-
-    def takes(self, registered: RegisteredScan) -> bool:
-        """Whether the next scan is one of them. One that registration was lost on begins anew."""
-        if registered.health is Health.LOST:
-            self.__init__()  # type: ignore[misc]
-            return False
-        at_m = registered.T_session_base[:3, 3]
-        if SENSOR_MODELS[registered.scan.sensor].planar:
-            return False
-        if self._last_m is not None:
-            step_m = float(np.linalg.norm(at_m - self._last_m))
-            if step_m < SPACE.every_m:
-                return False
-            self.path_m += step_m
-        self._last_m = at_m
-        return True
-
-
-class QueryInSpace:
-    """The scans of the last metres of a query, in its odom frame. Memory is bounded by the metres."""
-
-    def __init__(self) -> None:
-        self._views: deque[tuple[float, SpatialView]] = deque()
-        self._spacing = ViewSpacing()
-        self.T_odom_base: F64 | None = None
-
-    def add(self, registered: RegisteredScan) -> None:
-        """Take in the next scan. One that registration was lost on begins anew."""
-        scan, T = registered.scan, registered.T_session_base
-        if registered.health is Health.LOST:
-            self.__init__()  # type: ignore[misc]
-            return
-        self.T_odom_base = T
-        # A scan may come without its points, which `Looking` leaves out.
-        if not len(scan.points_m) or not self._spacing.takes(registered):
-            return
-        cloud = VoxelCloud(SPACE.voxel_m)
-        cloud.add(scan.points_m)
-        sensor_m = (T @ scan.T_base_sensor)[:3, 3]
-        view = SpatialView(sensor_m=sensor_m, points_m=transform_points(T, cloud.points_m()))
-        self._views.append((self._spacing.path_m, view))
-        while self._spacing.path_m - self._views[0][0] > SPACE.last_m:
-            self._views.popleft()
-
-    @property
-    def views(self) -> tuple[SpatialView, ...]:
-        """The scans, oldest first."""
-        return tuple(view for _, view in self._views)
 
 
 def settle_in_space(answer: Answer, query: QueryInSpace, points_of: PointsOf, accept: float) -> Answer:

@@ -6,31 +6,37 @@ prior, so equal rooms elsewhere are no rivals), and everywhere. The pose is
 - fine, if the best place, of all or near the pose, is certain, and the pose lies within the tolerance of it;
 - lost, if another place is certain, or if the map around the pose contradicts what the robot has seen;
 - unsure otherwise: the map knows too little there, or several places fit equally well.
+
+`check_pose` asks this of a recording; a `PoseWatch` asks it of a running robot again and again: after every
+metre, when the robot has stood for a while, and when its belief jumps.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.io.map_pose import MapPose
 from pc2grid.matching.two_way_score import score_fit
-from pc2grid.model import RegisteredScan
-from signature.relocalization.answer import Answer
-from signature.relocalization.confidence import LIMITS
-from signature.relocalization.hypotheses import Hypothesis
-from signature.relocalization.map_index import MapIndex
-from signature.relocalization.prior import Prior
-from signature.relocalization.query_map import QueryMap
-from signature.relocalization.relocalizer import Query, Search
+from pc2grid.model import Health, RegisteredScan
+from signature.localization.answer import Answer
+from signature.localization.confidence import LIMITS
+from signature.localization.hypotheses import Hypothesis
+from signature.localization.localizer import Localizer, answer_query
+from signature.localization.map_index import MapIndex
+from signature.localization.prior import Prior
 
 if TYPE_CHECKING:
-    from signature.relocalization.relocalizer import Watch
+    from signature.localization.localizer import Watch
 
 CheckStatus = Literal["fine", "lost", "unsure"]
 
@@ -42,6 +48,10 @@ class CheckParameters:
     tolerance_m, tolerance_rad : a pose this near to the right one is fine: three times the usual error of
         AMCL, and less than two hypotheses differ by.
     near_m, near_rad : poses so far around the checked one are compared with it.
+    most_scans : so many past scans of a running robot are remembered with their poses; a belief may be as old
+        as the oldest, at 40 scans a second two minutes.
+    most_waiting : so many beliefs wait for their scans; of more, the oldest are left out.
+    nearest_s : a belief counts at the scan that is nearest to it in time, if it is as near as this.
     clearly : a place elsewhere speaks against a pose if its two-way score is higher by more than this:
         twice the spread of the score between two equal places.
     """
@@ -50,6 +60,9 @@ class CheckParameters:
     tolerance_rad: float = math.radians(8.0)
     near_m: float = 1.5
     near_rad: float = math.radians(45.0)
+    most_scans: int = 5000
+    most_waiting: int = 50
+    nearest_s: float = 0.5
     clearly: float = 2.0 * LIMITS.equal_lead
 
 
@@ -106,13 +119,13 @@ def check_pose(
     >>> checked.status, checked.off_m < 0.1
     ('fine', True)
     """
-    about = replace(_around(T_map_base, session), stamp_ns=stamp_ns)
-    query = Query(index.within(about))
+    index.within(_around(T_map_base, session))  # raises what is wrong with the session before any work
+    localizer = Localizer(index, prior_ns=stamp_ns)
     for registered, planar_scan in scans:
-        query.add(registered, planar_scan)
+        localizer.take(registered, planar_scan)
         if watch is not None:
             watch(registered, None)
-    seen = query.map()
+    seen = localizer.query.map()
     if stamp_ns is not None:
         if seen.T_odom_prior is None:
             return PoseCheck(
@@ -125,31 +138,21 @@ def check_pose(
                 lapsed=True,
             )
         T_map_base = T_map_base @ seen.T_odom_prior.inverse() @ seen.T_odom_base
-    return judge_pose(seen, index, T_map_base, session=session, last_metres=tuple(query.last_metres()))
+    return judge_pose(localizer, T_map_base, session)
 
 
-def judge_pose(
-    query: QueryMap,
-    index: MapIndex,
-    T_map_base: SE2,
-    *,
-    session: str | None = None,
-    last_metres: Sequence[QueryMap] = (),
-) -> PoseCheck:
-    """Whether a pose at the query's last scan is right.
-
-    last_metres : the query again with less of its travel, longest first. Raises ConfigError as `check_pose`.
-    """
-    # All of this is one part: what is found near the pose is a hypothesis everywhere.
-    query, last_metres = replace(query, part=0), [replace(part, part=0) for part in last_metres]
+def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None) -> PoseCheck:
+    """Whether a pose at the query's last scan is right. Raises the errors of `check_pose`."""
+    index = localizer.index
     restricted = index.within(_around(T_map_base, session))
+    query, seen = localizer.query, localizer.query.map()
     session = session or index.sessions[0]
     number = index.sessions.index(session)
-    T_map_query = T_map_base @ query.T_odom_base.inverse()
-    here = score_fit(index.maps[number].walls, query.walls, T_map_query, np.zeros((3, 3)))
-    known = (Hypothesis(session_index=number, row=-1, fit=here),)
-    near = Search(restricted, known).answer(query, last_metres, look_outside=False)
-    everywhere = Search(index, near.hypotheses).answer(query, last_metres)
+    T_map_query = T_map_base @ seen.T_odom_base.inverse()
+    here = score_fit(index.maps[number].walls, seen.walls, T_map_query, np.zeros((3, 3)))
+    found = restricted.look_up(seen, (Hypothesis(session_index=number, row=-1, fit=here),))
+    near = answer_query(restricted, query, seen, found, look_outside=False)
+    everywhere = localizer.answer(near.hypotheses)
     best_near = _bases(near, number)[:1]
     off_m, off_rad = _apart(T_map_base, best_near[0]) if best_near else (None, None)
     is_there = any(_within_tolerance(T_map_base, base) for base in best_near)
@@ -160,8 +163,8 @@ def judge_pose(
             probability=probability,
             T_map_base=T_map_base,
             session=session,
-            stamp_ns=query.stamp_ns,
-            path_m=query.path_m,
+            stamp_ns=seen.stamp_ns,
+            path_m=seen.path_m,
             off_m=off_m,
             off_rad=off_rad,
             better=better,
@@ -180,7 +183,7 @@ def judge_pose(
     # The pose fits no better than the best place near it, so it is no more probable; and if that one is
     # another place, they exclude each other.
     at_most = near.confidence if is_there else min(near.confidence, 1.0 - near.confidence)
-    known_walls = here.overlap * query.walls.weight
+    known_walls = here.overlap * seen.walls.weight
     contradicted = near.status == "not_found" and known_walls >= LIMITS.few_walls
     contradicted = contradicted and at_most <= 1.0 - index.config.accept
     return judged("lost" if contradicted else "unsure", at_most)
@@ -217,3 +220,101 @@ def _apart(a: SE2, b: SE2) -> tuple[float, float]:
 def _within_tolerance(a: SE2, b: SE2) -> bool:
     off_m, off_rad = _apart(a, b)
     return off_m <= CHECK.tolerance_m and off_rad <= CHECK.tolerance_rad
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseLook:
+    """What one look said of the pose. registered : the scan of the look. elapsed_s : time of the look."""
+
+    checked: PoseCheck
+    registered: RegisteredScan
+    elapsed_s: float
+
+
+class PoseWatch:
+    """Takes in scans for as long as the robot runs, and judges what it believes. Its memory does not grow.
+
+    index : where to look. believed : the newest pose in the map that the robot believes in, None before the
+    first. session : whose map frame that is; may be None if there is only one.
+    """
+
+    def __init__(
+        self, index: MapIndex, believed: Callable[[], MapPose | None], session: str | None = None
+    ) -> None:
+        self._index, self._believed, self._session = index, believed, session
+        self._received: MapPose | None = None
+        self.restart()
+
+    @property
+    def uses_points(self) -> bool:
+        """Whether scans must be given with their points."""
+        return self._localizer.uses_points
+
+    def restart(self) -> None:
+        """The scans do not go on from those before."""
+        self._localizer = Localizer(self._index)
+        self._driven: deque[tuple[int, SE2]] = deque(maxlen=CHECK.most_scans)
+        self._waiting: deque[MapPose] = deque(maxlen=CHECK.most_waiting)
+        self._T_map_session: SE2 | None = None
+        self._judged: SE2 | None = None
+
+    def follow(
+        self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_look: bool = True
+    ) -> PoseLook | None:
+        """Take in the next scan; returns what a look said if there was one after it.
+
+        may_look : if not, a look that is due is put off until it is true. Raises ConfigError for a missing or
+        unknown session.
+        """
+        begin = time.perf_counter()
+        T_session_base = SE2.from_matrix(registered.T_session_base)
+        if registered.health is Health.LOST:  # the motion from before to what comes next is not known
+            self._driven.clear()
+            self._waiting.clear()
+            self._T_map_session = self._judged = None
+        else:
+            self._driven.append((registered.scan.stamp_ns, T_session_base))
+            self._update()
+        T_map_session = self._T_map_session
+        may_look = may_look and T_map_session is not None
+        is_time = self._localizer.take(registered, planar_scan, may_look=may_look)
+        if T_map_session is None or not may_look:
+            return None
+        T_map_base = T_map_session @ T_session_base
+        if not is_time and (
+            self._judged is None or _within_tolerance(T_map_base, self._judged @ T_session_base)
+        ):
+            return None
+        try:
+            checked = judge_pose(self._localizer, T_map_base, self._session)
+        except NoScans:  # the scans since registration was lost show nothing
+            return None
+        if self._localizer.due:
+            self._localizer.looked()
+        self._judged = T_map_session
+        return PoseLook(checked=checked, registered=registered, elapsed_s=time.perf_counter() - begin)
+
+    def _update(self) -> None:
+        """Find out where the frame of the registered scans lies in the map, as the robot believes.
+
+        A belief that is older than the scans since registration was lost says nothing of now; one that is
+        ahead of the scans waits for them.
+        """
+        newest = self._believed()
+        if newest is not None and newest is not self._received:
+            self._received = newest
+            self._waiting.append(newest)
+        while self._waiting and self._waiting[0].stamp_ns <= self._driven[-1][0]:
+            pose = self._waiting.popleft()
+            nearest_ns, T_session_base = self._nearest(pose.stamp_ns)
+            if abs(nearest_ns - pose.stamp_ns) <= CHECK.nearest_s * 1e9:
+                self._T_map_session = pose.T_map_base @ T_session_base.inverse()
+
+    def _nearest(self, stamp_ns: int) -> tuple[int, SE2]:
+        """The scan nearest in time: stamp and pose. A belief is recent, so the newest are looked at first."""
+        later = self._driven[-1]
+        for known in reversed(self._driven):
+            if known[0] <= stamp_ns:
+                return min(known, later, key=lambda scan: abs(scan[0] - stamp_ns))
+            later = known
+        return later

@@ -14,7 +14,7 @@ from pc2grid.geometry import SE2
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.loop_closure import LoopCloser
 from signature.config import Config
-from signature.relocalization.place_recognition import SessionRecognizer
+from signature.localization.place_recognition import SessionRecognizer
 
 LENGTH_M, PITCH_M, ROOM_M, APART_M, STEP_M = 42.0, 7.0, 5.0, 16.0, 0.3
 

@@ -20,8 +20,8 @@ from pc2grid.model import RegisteredScan, Scan, Trajectory
 from pc2grid.odometry.tracker import Tracker
 from pc2grid.pipeline import follow
 from signature.config import Config
-from signature.relocalization.answer import Answer
-from signature.relocalization.relocalizer import MapIndex, localize
+from signature.localization.answer import Answer
+from signature.localization.localizer import MapIndex, locate_in
 from tests.helpers.simulated_drives import building
 
 CONFIG = Config()
@@ -56,8 +56,7 @@ def map_of(scans: Iterator[Scan], truth: Trajectory) -> MapIndex:
 
 
 def ask(scans: list[tuple[RegisteredScan, PlanarScan]], index: MapIndex) -> Answer:
-    (asked,) = localize(scans, [index])
-    return asked.answers[0]
+    return locate_in(scans, index)
 
 
 def test_a_place_that_the_proposals_lack_is_found_before_the_answer_is_certain() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pc2grid.arrays import F32
-from signature.relocalization.hypotheses import HYPOTHESES, coarse_points
+from signature.localization.hypotheses import HYPOTHESES, coarse_points
 
 CENTER_M = (3.0, -2.0)
 

@@ -12,7 +12,7 @@ from typing_extensions import TypedDict
 
 if TYPE_CHECKING:
     from pc2grid.geometry import SE2
-    from signature.relocalization import answer
+    from signature.localization import answer
 
 Status = Literal["located", "ambiguous", "not_found"]
 Version = Literal[1]

@@ -1,0 +1,335 @@
+"""What a robot has seen over its last metres, made ready to be looked up.
+
+A robot rarely stands where it has seen most. So the query is described not where the robot is but at
+those places of its own path whose surroundings it has observed best; each is a view, and all views vote.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from pc2grid.arrays import F64, cells_of
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.clouds.voxel_cloud import VoxelCloud
+from pc2grid.errors import NoScans
+from pc2grid.geometry import SE2, transform_points
+from pc2grid.mapping.occupancy import GridBuilder
+from pc2grid.matching.icp_in_space import SpatialView
+from pc2grid.matching.self_likeness import self_likeness
+from pc2grid.matching.walls import Walls
+from pc2grid.model import Health, OccupancyGrid, RegisteredScan
+from pc2grid.sensor_model import SENSOR_MODELS
+from pc2grid.submaps.isovist import HIDDEN, isovist, look_around
+from pc2grid.submaps.partition import view_at
+from pc2grid.submaps.sampling import sample_evenly
+from pc2grid.submaps.skeleton import skeleton_of
+from signature.config import Config, RelocalizeConfig
+from signature.describe import Signature, describe
+from signature.retrieval.view import View
+from signature.seen_places import PROFILE_BEARINGS
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QueryParameters:
+    """What a query is made of. All chosen by hand.
+
+    keyframe_m, keyframe_rad : a scan is kept if the robot has moved or turned so far since the last one.
+    clearance_m : views on the middle lines of the free space are at least so far from walls.
+    every_m : distance of the candidates for views along the middle lines.
+    path_candidates : candidates for views on the path, evenly spread.
+    last_m : a query that is not located is searched for again with only so many metres of its travel, longest
+        first.
+    space_m, space_every_m : metres of travel whose scans are compared in space, and travel between two of
+        them. voxel_m : edge of the voxels that such a scan is reduced to.
+    """
+
+    keyframe_m: float = 0.1
+    keyframe_rad: float = math.radians(5.0)
+    clearance_m: float = 0.3
+    every_m: float = 0.5
+    path_candidates: int = 40
+    last_m: tuple[float, ...] = (8.0, 4.0)
+    space_m: float = 5.0
+    space_every_m: float = 0.2
+    voxel_m: float = 0.05
+
+
+QUERY = QueryParameters()
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A planar scan of a query, in the base frame, and the base there; path_m : metres driven until then."""
+
+    planar_scan: PlanarScan
+    T_odom_base: SE2
+    path_m: float
+
+
+@dataclass(frozen=True, kw_only=True)  # no slots, for what is computed once
+class QueryMap:
+    """The query at one moment of its travel.
+
+    stamp_ns : the last scan. T_odom_base : pose of the base there. path_m : metres driven so far.
+    grid : local map in the odom frame. views : best observed first. walls : the local map as verification
+    takes it. center_m : (x, y) in the odom frame that poses of the query rotate about.
+    part : number of times that registration was lost before; each part has an odom frame of its own.
+    T_odom_prior : the base at the time that a prior is about; None if it is not known in this odom frame.
+    since_prior_m : metres driven since that time.
+    keyframes : the scans that it was drawn from, oldest first, and the last scan; none of a drawn map.
+    """
+
+    stamp_ns: int
+    path_m: float
+    T_odom_base: SE2
+    grid: OccupancyGrid
+    views: tuple[View, ...]
+    walls: Walls
+    center_m: tuple[float, float]
+    part: int = 0
+    T_odom_prior: SE2 | None = None
+    since_prior_m: float = 0.0
+    keyframes: tuple[Keyframe, ...] = ()
+
+    @cached_property
+    def likeness(self) -> float:
+        """`pc2grid.matching.self_likeness` of the walls."""
+        return self_likeness(self.walls)
+
+
+class ViewSpacing:
+    """Which scans of a query are compared in space: one every `QueryParameters.space_every_m` of travel."""
+
+    def __init__(self) -> None:
+        self.path_m = 0.0
+        self._last_m: F64 | None = None
+
+    def takes(self, registered: RegisteredScan) -> bool:
+        """Whether the next scan is one of them. One that registration was lost on begins anew."""
+        if registered.health is Health.LOST:
+            self.path_m, self._last_m = 0.0, None
+            return False
+        at_m = registered.T_session_base[:3, 3]
+        step_m = math.inf if self._last_m is None else float(np.linalg.norm(at_m - self._last_m))
+        if SENSOR_MODELS[registered.scan.sensor].planar or step_m < QUERY.space_every_m:
+            return False
+        self.path_m += 0.0 if self._last_m is None else step_m
+        self._last_m = at_m
+        return True
+
+
+class QueryInSpace:
+    """The scans of the last metres of a query, in its odom frame. Memory is bounded by the metres."""
+
+    def __init__(self) -> None:
+        self._views: deque[tuple[float, SpatialView]] = deque()
+        self._spacing = ViewSpacing()
+        self.T_odom_base: F64 | None = None
+
+    def add(self, registered: RegisteredScan) -> None:
+        """Take in the next scan. One that registration was lost on begins anew."""
+        scan, T = registered.scan, registered.T_session_base
+        if registered.health is Health.LOST:
+            self._views.clear()
+            self.T_odom_base = None
+            self._spacing = ViewSpacing()
+            return
+        self.T_odom_base = T
+        # A scan may come without its points, which `Follower` leaves out.
+        if not len(scan.points_m) or not self._spacing.takes(registered):
+            return
+        cloud = VoxelCloud(QUERY.voxel_m)
+        cloud.add(scan.points_m)
+        sensor_m = (T @ scan.T_base_sensor)[:3, 3]
+        view = SpatialView(sensor_m=sensor_m, points_m=transform_points(T, cloud.points_m()))
+        self._views.append((self._spacing.path_m, view))
+        while self._spacing.path_m - self._views[0][0] > QUERY.space_m:
+            self._views.popleft()
+
+    @property
+    def views(self) -> tuple[SpatialView, ...]:
+        """The scans, oldest first."""
+        return tuple(view for _, view in self._views)
+
+
+class Query:
+    """The last metres of a recording, scan by scan. Memory is bounded by the metres.
+
+    Scans on which registration was lost are not used, and nothing seen before them is kept, because the
+    motion between the two parts is unknown. If registration was lost on the last scan, this scan alone is the
+    query.
+
+    in_space : the same scans in space; None if their points are not needed. part : number of times that
+    registration was lost. lost_scans : on how many of the last scans in a row. driven_m : metres driven in
+    all parts. first_ns : stamp of the first scan.
+    """
+
+    def __init__(
+        self,
+        made_with: Config,
+        config: RelocalizeConfig,
+        *,
+        prior_ns: int | None = None,
+        in_space: bool = False,
+    ) -> None:
+        """made_with : of the database; the query is drawn and described as its maps are.
+
+        prior_ns : the time of a prior; the pose there is remembered.
+        """
+        self._made_with, self._config, self._prior_ns = made_with, config, prior_ns
+        self.in_space = QueryInSpace() if in_space else None
+        self.part = self.lost_scans = 0
+        self.driven_m = 0.0
+        self.first_ns: int | None = None
+        self._keyframes: deque[Keyframe] = deque()
+        self._newest: Keyframe | None = None
+        self._at_prior: tuple[float, Keyframe | None] = math.inf, None  # time to the nearest scan; that scan
+        self._drawn: QueryMap | None = None
+
+    @property
+    def path_m(self) -> float:
+        """Metres driven since the start, or since registration was lost."""
+        return self._newest.path_m if self._newest is not None else 0.0
+
+    def __len__(self) -> int:
+        """The number of keyframes."""
+        return len(self._keyframes)
+
+    def add(self, registered: RegisteredScan, planar_scan: PlanarScan) -> None:
+        """Take in the next scan; forget what lies more than `relocalize.window_m` of travel back."""
+        if self.in_space is not None:
+            self.in_space.add(registered)
+        pose = SE2.from_matrix(registered.T_session_base)
+        self._drawn = None
+        self.first_ns = registered.scan.stamp_ns if self.first_ns is None else self.first_ns
+        if registered.health is Health.LOST:
+            self.part += 1
+            self.lost_scans += 1
+            self._keyframes.clear()
+            self._newest = Keyframe(planar_scan, pose, 0.0) if len(planar_scan.hits_m) else None
+            self._at_prior = self._at_prior[0], None
+            return
+        self.lost_scans = 0
+        path_m = 0.0
+        if self._keyframes and self._newest is not None:
+            step = self._newest.T_odom_base.inverse() @ pose
+            step_m = math.hypot(step.x, step.y)
+            path_m = self._newest.path_m + step_m
+            self.driven_m += step_m
+        self._newest = newest = Keyframe(planar_scan, pose, path_m)
+        if self._prior_ns is not None and abs(planar_scan.stamp_ns - self._prior_ns) < self._at_prior[0]:
+            self._at_prior = abs(planar_scan.stamp_ns - self._prior_ns), newest
+        if self._keyframes:
+            last = self._keyframes[-1].T_odom_base.inverse() @ pose
+            if math.hypot(last.x, last.y) < QUERY.keyframe_m and abs(last.yaw) < QUERY.keyframe_rad:
+                return
+        self._keyframes.append(newest)
+        while path_m - self._keyframes[0].path_m > self._config.window_m:
+            self._keyframes.popleft()
+
+    def map(self, last_m: float = math.inf) -> QueryMap:
+        """What has been seen over the last `last_m` of travel, described as the database is.
+
+        Raises NoScans if no scan could be used.
+        """
+        if self._newest is None:
+            raise NoScans("no scan of the query shows anything", hint="look at it with `pc2grid info`")
+        if last_m < math.inf or self._drawn is None:
+            drawn = self._draw(self._newest, last_m)
+            if last_m < math.inf:
+                return drawn
+            self._drawn = drawn
+        return self._drawn
+
+    def last_metres(self) -> Iterator[QueryMap]:
+        """The query map again, with the last metres only, as long as these are less than the whole."""
+        for last_m in QUERY.last_m:
+            if last_m < min(self.path_m, self._config.window_m):
+                yield self.map(last_m)
+
+    def _draw(self, newest: Keyframe, last_m: float) -> QueryMap:
+        keyframes = [k for k in self._keyframes if self._keyframes[-1].path_m - k.path_m <= last_m]
+        keyframes = keyframes or [newest]
+        builder = GridBuilder(self._made_with.projection)
+        for keyframe in keyframes:
+            builder.add(keyframe.planar_scan, keyframe.T_odom_base)
+        path = np.array([(k.T_odom_base.x, k.T_odom_base.y) for k in keyframes])
+        query = query_of(builder.grid(), path, self._made_with, self._config, newest.T_odom_base)
+        at_prior = self._at_prior[1]
+        return replace(
+            query,
+            stamp_ns=newest.planar_scan.stamp_ns,
+            path_m=newest.path_m,
+            part=self.part,
+            T_odom_prior=None if at_prior is None else at_prior.T_odom_base,
+            since_prior_m=0.0 if at_prior is None else newest.path_m - at_prior.path_m,
+            keyframes=(*keyframes, *(() if newest is keyframes[-1] else (newest,))),
+        )
+
+
+def query_of(
+    grid: OccupancyGrid,
+    path_xy_m: F64,
+    made_with: Config,
+    config: RelocalizeConfig,
+    T_odom_base: SE2 | None = None,
+) -> QueryMap:
+    """Describe a local map (odom frame) that was seen from `path_xy_m` (K, 2).
+
+    made_with : how the database was made, or the two sides are not comparable.
+    """
+    T_odom_base = T_odom_base or SE2()
+    radius_m = made_with.partition.radius_m
+    views = tuple(
+        View(
+            center_m=center,
+            profile=isovist(grid, center, radius_m, bearings=PROFILE_BEARINGS),
+            describe=partial(_signature_at, grid, center, made_with),
+        )
+        for center in best_observed(grid, path_xy_m, radius_m, config)
+    )
+    return QueryMap(
+        stamp_ns=0,
+        path_m=0.0,
+        T_odom_base=T_odom_base,
+        grid=grid,
+        views=views,
+        walls=Walls.of(grid),
+        center_m=(T_odom_base.x, T_odom_base.y),
+    )
+
+
+def _signature_at(grid: OccupancyGrid, center_m: tuple[float, float], made_with: Config) -> Signature:
+    return describe(view_at(grid, center_m, made_with.partition), made_with.signature)
+
+
+def best_observed(
+    grid: OccupancyGrid, path_xy_m: F64, sight_m: float, config: RelocalizeConfig
+) -> tuple[tuple[float, float], ...]:
+    """Up to `config.views` points, `config.view_spacing_m` apart, best observed first.
+
+    Half of them lie on the path, where the robot has looked around; the others on the middle lines of all
+    the free space seen, because much of what surrounds a place is seen from elsewhere. How well a place
+    is observed is the share of the rays from it that end on something known.
+    """
+    middle = skeleton_of(grid.free, grid.resolution_m, QUERY.clearance_m)
+    spaced = sample_evenly(cells_of(middle), QUERY.every_m / grid.resolution_m)
+    chosen: list[tuple[float, float]] = []
+    for points, most in (
+        (path_xy_m[:: max(1, len(path_xy_m) // QUERY.path_candidates)], (config.views + 1) // 2),
+        (grid.to_point(spaced), config.views),
+    ):
+        _, ends = look_around(grid, points, sight_m, bearings=PROFILE_BEARINGS)
+        hidden = np.count_nonzero(ends == HIDDEN, axis=1)
+        for x, y in points[np.argsort(hidden, kind="stable")].tolist():
+            if len(chosen) == most:
+                break
+            if all(math.dist((x, y), c) >= config.view_spacing_m for c in chosen):
+                chosen.append((x, y))
+    return tuple(chosen)

@@ -1,0 +1,64 @@
+"""The answers to one query in several maps, each by a `Localizer` of its own; the query is drawn once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.model import RegisteredScan
+from signature.localization.answer import Answer
+from signature.localization.localizer import Localizer
+from signature.localization.map_index import MapIndex
+from signature.localization.query import QueryMap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answers:
+    """The answers to a query after `scans` of its scans, one for each index. elapsed_ms : time of each."""
+
+    scans: int
+    query: QueryMap
+    answers: tuple[Answer, ...]
+    elapsed_ms: tuple[float, ...]
+
+
+def localize(
+    scans: Iterable[tuple[RegisteredScan, PlanarScan]],
+    indexes: Sequence[MapIndex],
+    *,
+    after: Collection[int] | None = None,
+) -> Iterator[Answers]:
+    """Find where a registered recording was made, in each of several indexes separately.
+
+    scans : with their planar scans, from `pc2grid.pipeline.follow`, in any frame of their own.
+    indexes : at least one, of databases made with the same settings.
+    after : numbers of scans after which the answers are wanted; by default after the last scan.
+
+    Raises NoScans if an answer is due and no scan could be used.
+    """
+    first = Localizer(indexes[0])
+    localizers = [first, *(Localizer(index, query=first.query) for index in indexes[1:])]
+
+    def answers(count: int) -> Answers:
+        begin = time.perf_counter()
+        query = first.query.map()
+        describe_ms = 1000.0 * (time.perf_counter() - begin)
+        found, elapsed_ms = [], []
+        for localizer in localizers:
+            begin = time.perf_counter()
+            found.append(localizer.answer())
+            elapsed_ms.append(describe_ms + 1000.0 * (time.perf_counter() - begin))
+        return Answers(scans=count, query=query, answers=tuple(found), elapsed_ms=tuple(elapsed_ms))
+
+    count = 0
+    for count, (registered, planar_scan) in enumerate(scans, start=1):
+        first.add(registered, planar_scan)
+        for localizer in localizers[1:]:
+            if localizer.due:
+                localizer.look()
+        if after is not None and count in after:
+            yield answers(count)
+    if after is None:
+        yield answers(count)
