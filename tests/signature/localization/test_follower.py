@@ -62,7 +62,7 @@ class Slow:
 
 def test_a_slow_look_holds_up_no_scan_and_looks_that_are_out_of_date_are_left_out() -> None:
     slow = Slow()
-    with Follower(slow, beside=True) as follower:  # type: ignore[arg-type]
+    with Follower[None](slow, beside=True) as follower:
         for registered, planar_scan in STEPS:  # returns at once, although the first look lasts
             follower.add(registered, planar_scan)
         follower.restart()
@@ -77,7 +77,7 @@ def test_a_slow_look_holds_up_no_scan_and_looks_that_are_out_of_date_are_left_ou
 def test_what_waits_is_bounded_and_holds_no_points(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(follower_module, "_MOST_WAITING", 5)
     slow = Slow()
-    with Follower(slow, beside=True) as follower:  # type: ignore[arg-type]
+    with Follower[None](slow, beside=True) as follower:
         for registered, planar_scan in STEPS:
             follower.add(registered, planar_scan)
         slow.go.set()
@@ -92,7 +92,7 @@ def test_an_error_of_the_thread_is_raised_where_looks_are_taken() -> None:
         ) -> None:
             raise MemoryError("too large")
 
-    with Follower(Broken(), beside=True) as follower:  # type: ignore[arg-type]
+    with Follower[None](Broken(), beside=True) as follower:
         follower.add(*STEPS[0])
         follower.finish()
         with pytest.raises(MemoryError, match="too large"):
@@ -101,7 +101,7 @@ def test_an_error_of_the_thread_is_raised_where_looks_are_taken() -> None:
 
 def test_leaving_ends_the_thread_without_using_what_waits() -> None:
     slow = Slow()
-    with Follower(slow, beside=True) as follower:  # type: ignore[arg-type]
+    with Follower[None](slow, beside=True) as follower:
         for registered, planar_scan in STEPS:
             follower.add(registered, planar_scan)
         while not slow.scans:
