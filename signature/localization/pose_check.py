@@ -269,12 +269,10 @@ class PoseWatch:
         begin = time.perf_counter()
         T_session_base = SE2.from_matrix(registered.T_session_base)
         if registered.health is Health.LOST:  # the motion from before to what comes next is not known
-            self._driven.clear()
-            self._waiting.clear()
-            self._T_map_session = self._judged = None
-        else:
-            self._driven.append((registered.scan.stamp_ns, T_session_base))
-            self._update()
+            self.restart()
+            return None
+        self._driven.append((registered.scan.stamp_ns, T_session_base))
+        self._update()
         T_map_session = self._T_map_session
         may_look = may_look and T_map_session is not None
         is_time = self._localizer.take(registered, planar_scan, may_look=may_look)

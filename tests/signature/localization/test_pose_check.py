@@ -16,11 +16,12 @@ import pc2grid
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2
+from pc2grid.io.map_pose import MapPose
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import UNKNOWN, Health, OccupancyGrid, RegisteredScan
 from signature.config import Config
 from signature.localization.map_index import MapIndex
-from signature.localization.pose_check import PoseCheck, check_pose
+from signature.localization.pose_check import PoseCheck, PoseWatch, check_pose
 from signature.similarity import SignatureTable
 from tests.helpers.simulated_drives import building, drive, office, plan
 
@@ -149,3 +150,18 @@ def test_a_real_log_in_the_nav2_map_of_the_floor() -> None:
     right, *wrong = zip(*told, strict=True)
     assert "lost" not in right and right.count("fine") >= 1
     assert all("fine" not in statuses for statuses in wrong)
+
+
+def test_a_robot_that_stands_is_judged_once_after_each_loss() -> None:
+    """Ten scans a second, the fiftieth lost: the pose is judged two seconds after the start of each part."""
+    registered, planar_scan, truth = in_office()[-1]
+    newest = MapPose(stamp_ns=0, T_map_base=truth)
+    watch = PoseWatch(OFFICE, lambda: newest)
+    judged = []
+    for number in range(100):
+        scan = replace(registered.scan, stamp_ns=number * 10**8)
+        moved = replace(registered, scan=scan, health=Health.LOST if number == 50 else Health.FINE)
+        newest = replace(newest, stamp_ns=number * 10**8)
+        if watch.follow(moved, planar_scan) is not None:
+            judged.append(number)
+    assert judged == [21, 72]
