@@ -97,7 +97,7 @@ def options(
 app.add_typer(
     typer.Typer(
         cls=group(COMPARE),
-        help="Measure: log, maps, real, sensors, signatures, floors, peers, and the paper's tables.",
+        help="Measure: log, maps, real, recordings, sensors, signatures, floors, peers, the paper's tables.",
         no_args_is_help=True,
     ),
     name="compare",
