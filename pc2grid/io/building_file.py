@@ -23,6 +23,9 @@ import numpy as np
 from pc2grid.arrays import F64, I64
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogError, MapFileError
+from pc2grid.io.messages.cloud_files import parser
+from pc2grid.io.messages.types import Header
+from pc2grid.io.sensors.pointcloud2 import decode
 
 CLOUD_SUFFIXES = (".pcd", ".ply", ".xyz", ".pts")
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
@@ -184,9 +187,6 @@ def _cloud_blocks(path: Path) -> Iterator[F64]:
     if path.suffix.lower() not in (".pcd", ".ply"):
         yield from _text_blocks(path)
         return
-    from pc2grid.io.messages.cloud_files import parser
-    from pc2grid.io.messages.types import Header
-    from pc2grid.io.sensors.pointcloud2 import decode
 
     if not path.stat().st_size:
         raise MapFileError(f"{path}: empty file")

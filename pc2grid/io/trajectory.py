@@ -6,6 +6,7 @@ KITTI: the first three rows of the pose, 12 numbers per line, no time.
 
 from __future__ import annotations
 
+from decimal import Decimal
 from pathlib import Path
 from typing import Literal
 
@@ -28,8 +29,6 @@ def stamp_ns_from_text(text: str) -> int:
     """
     mantissa, e, _ = text.strip().lower().partition("e")
     if e:  # as numpy.savetxt writes: 1.283e+09
-        from decimal import Decimal
-
         seconds = Decimal(text)
         if seconds.adjusted() > 10:  # the integer of 1e999000 would take minutes
             raise ValueError(f"not a time: {text!r:.60}")

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from pc2grid.errors import OutputError
 from signature.database.database import SubmapDatabase
+from signature.database.postgres.database import PostgresDatabase
 from signature.database.postgres.server import is_url, location
 from signature.database.protocol import Label, Place, Problem, Provenance, SessionInfo
+from signature.database.sqlite.database import SqliteDatabase
 
 __all__ = [
     "Label",
@@ -61,9 +63,6 @@ def refuse_existing(place: Place, force: bool) -> None:
 def engine_of(place: Place) -> type[SubmapDatabase]:
     """The engine of a path or URL."""
     if is_url(place):
-        from signature.database.postgres.database import PostgresDatabase
-
         return PostgresDatabase
-    from signature.database.sqlite.database import SqliteDatabase
 
     return SqliteDatabase

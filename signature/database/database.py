@@ -12,11 +12,14 @@ import numpy as np
 from pc2grid.display import html_table, short
 from pc2grid.errors import DatabaseCorrupt, DatabaseError
 from pc2grid.model import Loop, OccupancyGrid, PointMap, SessionMap, Submap, Trajectory
+from pc2grid.submaps.junction_graph import graph_from_arrays
+from pc2grid.submaps.partition import view_at
 from signature.config import Config
 from signature.database import codec, stored, validation
 from signature.database.protocol import Place, Problem, Provenance, SessionInfo, none_there
 from signature.database.rows import Rows, SessionRow, no_session
 from signature.database.stored import PARTS, StoredSession, SubmapArrays, stored_session
+from signature.similarity import SignatureTable
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -24,7 +27,6 @@ if TYPE_CHECKING:
 
     from signature.describe import Signature
     from signature.seen_places import SeenPlaces
-    from signature.similarity import SignatureTable
 
 
 class SubmapDatabase(ABC):
@@ -127,8 +129,6 @@ class SubmapDatabase(ABC):
 
     def signatures(self, session: str | None = None) -> SignatureTable:
         """All signatures, or those of one session; `session_index` counts in the order of `sessions()`."""
-        from signature.similarity import SignatureTable
-
         config, filled, table = self.config(), 0, dict[str, Any]()
         capacity = self._rows.count_submaps()
         for index, row in enumerate(self._known()):
@@ -170,8 +170,6 @@ class SubmapDatabase(ABC):
 
     def graph(self, session: str) -> nx.Graph:
         """The junction graph of a session's free space (`pc2grid.submaps.junction_graph`)."""
-        from pc2grid.submaps.junction_graph import graph_from_arrays
-
         return graph_from_arrays(self._parts(session, "grid", "graph")["graph"])
 
     def points(self, session: str) -> PointMap | None:
@@ -303,8 +301,6 @@ class SubmapDatabase(ABC):
 
     def _cut(self, session: str, submap_id: int | None = None) -> Iterator[Submap]:
         """The submaps of a session, or that of a number, cut from its grid."""
-        from pc2grid.submaps.partition import view_at
-
         parts = self._parts(session, "grid", "submaps")
         submaps, config = parts["submaps"], parts["info"].provenance.config
         for number, (x, y) in zip(submaps.submap_id.tolist(), submaps.center_m.tolist(), strict=True):

@@ -16,8 +16,10 @@ from pc2grid.arrays import F32, F64, freeze
 from pc2grid.errors import DatabaseError
 from pc2grid.model import Loop, OccupancyGrid, PointMap, Trajectory
 from pc2grid.submaps.junction_graph import GraphArrays, graph_from_arrays, graph_to_arrays, junction_graph
+from pc2grid.submaps.partition import divide
 from signature.database import codec, validation
 from signature.database.protocol import Entry, SessionInfo
+from signature.describe import describe
 from signature.seen_places import SeenPlaces
 from signature.similarity import I32, SignatureTable
 
@@ -139,9 +141,6 @@ def completed(parts: Mapping[str, Any]) -> StoredSession:
 
     parts : the others, at least info, grid, trajectory and loops.
     """
-    from pc2grid.submaps.partition import divide
-    from signature.describe import describe
-
     found, grid, config = {"points": None, **parts}, parts["grid"], parts["info"].provenance.config
     if not {"graph", "submaps"} <= found.keys():
         graph, submaps = divide(grid, config.partition)

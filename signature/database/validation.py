@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64
 from pc2grid.model import POINT_STEPS, Loop, OccupancyGrid, PointMap, Trajectory
+from signature.boundary import boundary_bins
+from signature.freespace import freespace_bins
+from signature.seen_places import PROFILE_BEARINGS, SIGNATURE_COLUMNS
 
 if TYPE_CHECKING:
     from pc2grid.submaps.junction_graph import GraphArrays
@@ -178,8 +181,6 @@ def check_points(points: PointMap | None) -> None:
 
 def check_seen(seen: SeenPlaces) -> None:
     """What is seen from places has the rays and columns that queries are compared by."""
-    from signature.seen_places import PROFILE_BEARINGS, SIGNATURE_COLUMNS
-
     rays, columns = seen.ranges.shape[1], seen.signatures.shape[1]
     if (rays, columns) != (PROFILE_BEARINGS, SIGNATURE_COLUMNS):
         raise ValueError(f"isovists of {rays} rays and {columns} columns")
@@ -211,9 +212,6 @@ def check_ids(submap_id: NDArray[np.int32]) -> None:
 
 def check_bins(boundary: int, freespace: int, config: Config) -> None:
     """Histograms have as many bins as the configuration makes; others cannot be compared with a query's."""
-    from signature.boundary import boundary_bins
-    from signature.freespace import freespace_bins
-
     radius_m = config.partition.radius_m
     wanted = boundary_bins(radius_m, config.signature), freespace_bins(radius_m, config.signature)
     if (boundary, freespace) != wanted:

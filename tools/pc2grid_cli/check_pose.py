@@ -8,13 +8,18 @@ from typing import TYPE_CHECKING
 
 from pc2grid.display import probability
 from pc2grid.errors import one_line
+from pc2grid.geometry import SE2
+from pc2grid.io import open_log
 from pc2grid.observer import Observer
+from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli.known_pose import KnownPose, end_s
+from signature.files import query_config
+from signature.localization.map_index import MapIndex
+from signature.localization.pose_check import check_pose
 
 if TYPE_CHECKING:
-    from pc2grid.geometry import SE2
     from pc2grid.io import Log
     from pc2grid.io.live.live_log import LiveLog
     from pc2grid.model import RegisteredScan
@@ -35,12 +40,6 @@ def check_log(
     observer: Observer = Observer(),
 ) -> tuple[PoseCheck, RelocalizeCheck]:
     """Check the pose at the end of a recording, or of the part of it that `span` names."""
-    from pc2grid.io import open_log
-    from pc2grid.pipeline import follow
-    from signature.files import query_config
-    from signature.localization.map_index import MapIndex
-    from signature.localization.pose_check import check_pose
-
     config = query_config(database, config)
     with open_log(path, config.read, recover=recover) as log:
         T_map_base, stamp_ns = _believed(log, known, span)
@@ -66,8 +65,6 @@ def check_log(
 
 def _believed(log: Log, known: KnownPose, span: TimeSpan) -> tuple[SE2, int | None]:
     """The pose to be checked, and its time; None: the last scan."""
-    from pc2grid.geometry import SE2
-
     if known.check_topic is not None:
         pose = log.map_pose(known.check_topic, end_s(span))
         return pose.T_map_base, pose.stamp_ns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pc2grid.settings import dump_settings
 from pc2grid_cli.options import Assignments, ConfigFile, Preset, PresetName, make_config
 
 
@@ -12,6 +13,4 @@ def config_dump_command(
 
     Example: pc2grid config dump > mine.toml
     """
-    from pc2grid.settings import dump_settings
-
     print(dump_settings(make_config(config, set_, preset=preset)), end="")

@@ -6,7 +6,9 @@ from typing import Annotated
 
 import typer
 
+from pc2grid.errors import ConfigError
 from pc2grid_cli import console
+from pc2grid_cli.json_schemas import documents, schema
 
 
 def config_schema_command(
@@ -18,9 +20,6 @@ def config_schema_command(
 
     Example: pc2grid config schema relocalize
     """
-    from pc2grid.errors import ConfigError
-    from pc2grid_cli.json_schemas import documents, schema
-
     names = ["settings", *documents()]
     if name is None:
         print("\n".join(names))

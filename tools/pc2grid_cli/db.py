@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from signature.database import open_database
+
 if TYPE_CHECKING:
     from pc2grid_cli.json_schemas import Damage, DbWrite
     from signature.database import Problem
@@ -17,8 +19,6 @@ def damage(problem: Problem) -> Damage:
 
 def written(output: str, left_out: Sequence[Problem] = ()) -> DbWrite:
     """The document about a database that was written."""
-    from signature.database import open_database
-
     with open_database(output) as opened:
         number, where = len(opened.sessions()), opened.location
     return {

@@ -10,6 +10,7 @@ from pc2grid.errors import one_line
 from pc2grid_cli import console
 from pc2grid_cli.db import damage
 from pc2grid_cli.options import AsJson, Database
+from signature.database.maintenance import check, shown
 
 if TYPE_CHECKING:
     from pc2grid_cli.json_schemas import DbCheck
@@ -20,8 +21,6 @@ def db_check_command(database: Database, json: AsJson = False) -> None:
 
     Example: pc2grid db check building.submaps
     """
-    from signature.database.maintenance import check, shown
-
     problems = check(database)
     if json:
         document: DbCheck = {

@@ -11,6 +11,8 @@ from pc2grid_cli import console
 from pc2grid_cli.db import written
 from pc2grid_cli.options import AsJson, Database, Force, WrittenDatabase
 from pc2grid_cli.plural import counted
+from signature.database import open_database
+from signature.database.maintenance import copy, shown
 
 
 def db_copy_command(
@@ -24,8 +26,6 @@ def db_copy_command(
 
     Example: pc2grid db copy --recover damaged.submaps -o good.submaps
     """
-    from signature.database.maintenance import copy, shown
-
     problems = copy(database, output, recover=recover, force=force)
     for problem in problems:
         console.warn(f"left out: {problem.where}: {problem.what}")
@@ -39,8 +39,6 @@ def db_copy_command(
 
 def _size(output: str) -> str:
     """The size of a copy: of a file in bytes, of anything else in sessions."""
-    from signature.database import open_database
-
     path = Path(output)
     if path.is_file():
         return f"{path.stat().st_size / 1e6:.1f} MB"

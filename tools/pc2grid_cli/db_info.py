@@ -8,6 +8,8 @@ from pc2grid.errors import one_line
 from pc2grid_cli import console
 from pc2grid_cli.options import AsJson, Database
 from pc2grid_cli.plural import counted
+from pc2grid_cli.session_documents import consistency_document, odometry_document, precision_document
+from signature.database import open_database
 
 if TYPE_CHECKING:
     from pc2grid_cli.json_schemas import DbInfo, Session
@@ -18,9 +20,6 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
 
     Example: pc2grid db info building.submaps
     """
-    from pc2grid_cli.session_documents import consistency_document, odometry_document, precision_document
-    from signature.database import open_database
-
     with open_database(database) as opened:
         sessions, where = opened.sessions(), opened.location
     if json:

@@ -10,6 +10,7 @@ from pc2grid_cli import console
 from pc2grid_cli.db import written
 from pc2grid_cli.options import DATABASE, AsJson, Force, WrittenDatabase
 from pc2grid_cli.plural import counted
+from signature.database.maintenance import merge, shown
 
 
 def db_merge_command(
@@ -22,8 +23,6 @@ def db_merge_command(
 
     Example: pc2grid db merge monday.submaps tuesday.submaps -o week.submaps
     """
-    from signature.database.maintenance import merge, shown
-
     count = merge(databases, output, force=force)
     if json:
         console.print_json(written(output))

@@ -6,10 +6,13 @@ from typing import Annotated
 
 import typer
 
+from pc2grid.errors import DatabaseError
 from pc2grid_cli import console
 from pc2grid_cli.db import written
 from pc2grid_cli.options import AsJson, Database
 from pc2grid_cli.plural import counted
+from signature.database import open_database
+from signature.database.maintenance import remove
 
 
 def db_remove_command(
@@ -22,8 +25,6 @@ def db_remove_command(
 
     Example: pc2grid db remove building.submaps monday
     """
-    from signature.database.maintenance import remove
-
     if not force:
         _refuse_all(database, sessions)
     remove(database, sessions)
@@ -36,9 +37,6 @@ def db_remove_command(
 
 def _refuse_all(database: str, sessions: list[str]) -> None:
     """Raises DatabaseError if no session of the database would be left."""
-    from pc2grid.errors import DatabaseError
-    from signature.database import open_database
-
     with open_database(database) as opened:
         known = {info.name for info in opened.sessions()}
         if known and known <= set(sessions):

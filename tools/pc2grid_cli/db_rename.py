@@ -6,9 +6,11 @@ from typing import Annotated
 
 import typer
 
+from pc2grid.errors import one_line
 from pc2grid_cli import console
 from pc2grid_cli.db import written
 from pc2grid_cli.options import AsJson, Database
+from signature.database.maintenance import rename, shown
 
 
 def db_rename_command(
@@ -21,9 +23,6 @@ def db_rename_command(
 
     Example: pc2grid db rename building.submaps monday first-floor
     """
-    from pc2grid.errors import one_line
-    from signature.database.maintenance import rename, shown
-
     rename(database, old, new)
     if json:
         console.print_json(written(database))

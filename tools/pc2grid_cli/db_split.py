@@ -10,6 +10,7 @@ from pc2grid_cli import console
 from pc2grid_cli.db import written
 from pc2grid_cli.options import AsJson, Database, Force, WrittenDatabase
 from pc2grid_cli.plural import counted
+from signature.database.maintenance import shown, split
 
 
 def db_split_command(
@@ -23,8 +24,6 @@ def db_split_command(
 
     Example: pc2grid db split building.submaps monday -o monday.submaps
     """
-    from signature.database.maintenance import shown, split
-
     count = split(database, sessions, output, force=force)
     if json:
         console.print_json(written(output))

@@ -7,12 +7,26 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
+from pc2grid.geometry import wrap_angle
+from pc2grid.io import open_log
+from pc2grid.io.atomic import require_writable
+from pc2grid.io.trajectory import read_tum
+from pc2grid.simulate import SimulationConfig, simulate_session
+from pc2grid.simulate.config import LidarConfig
 from pc2grid_cli import console
+from pc2grid_cli.locate import ON_THE_WAY, Found, about_log, locate
 from pc2grid_cli.options import OUTPUT_FOLDER, Force
 from pc2grid_cli.output_files import make_folder
+from pc2grid_cli.picture import draw_answer
 from pc2grid_cli.plural import counted
+from pc2grid_cli.relocalize import as_text
+from pc2grid_cli.report import write_report
+from signature.config import Config
+from signature.database import open_database
+from signature.sessions import add_sessions, build_session
 
 if TYPE_CHECKING:
     from pc2grid.model import RegisteredScan
@@ -35,20 +49,6 @@ def demo_command(
 
     Example: pc2grid demo
     """
-    from pc2grid.geometry import wrap_angle
-    from pc2grid.io import open_log
-    from pc2grid.io.atomic import require_writable
-    from pc2grid.io.trajectory import read_tum
-    from pc2grid.simulate import SimulationConfig, simulate_session
-    from pc2grid.simulate.config import LidarConfig
-    from pc2grid_cli.locate import ON_THE_WAY, Found, about_log, locate
-    from pc2grid_cli.picture import draw_answer
-    from pc2grid_cli.relocalize import as_text
-    from pc2grid_cli.report import write_report
-    from signature.config import Config
-    from signature.database import open_database
-    from signature.sessions import add_sessions, build_session
-
     terminal = console.of(context)
     begin = time.monotonic()
     lidar, depth = out / "lidar.mcap", out / "depth.mcap"
@@ -94,7 +94,6 @@ def demo_command(
         T_map_plan = next(truth_map.poses()).inverse()
         true_poses = [T_map_plan @ pose for pose in truth_query.poses()]
         terminal.note("4/4 draw it")
-        import numpy as np
 
         truth_m = np.array([(p.x, p.y) for p in true_poses])
         draw_answer(picture, opened, answer, poses, truth_m)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pc2grid.matching.agreement import agreement
+from pc2grid.matching.walls import Walls
+
 if TYPE_CHECKING:
     from pc2grid.matching.agreement import Agreement
     from signature.database import SubmapDatabase
@@ -12,9 +15,6 @@ if TYPE_CHECKING:
 
 def agreements(answer: Answer, database: SubmapDatabase) -> tuple[Agreement, ...]:
     """For each hypothesis of an answer, best first, what supports and what contradicts it."""
-    from pc2grid.matching.agreement import agreement
-    from pc2grid.matching.walls import Walls
-
     query = Walls.of(answer.local_map)
     indices = {hypothesis.session_index for hypothesis in answer.hypotheses}
     maps = {index: Walls.of(database.grid(answer.sessions[index])) for index in indices}

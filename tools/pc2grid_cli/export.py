@@ -7,12 +7,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 import typer
 
 from pc2grid import extras
+from pc2grid.errors import ConfigError, DatabaseError
+from pc2grid.io.export.cloud import write_cloud
+from pc2grid.io.export.g2o import write_g2o
+from pc2grid.io.export.graphml import write_graph
+from pc2grid.io.nav2_map import save_map
+from pc2grid.io.trajectory import write_trajectory
 from pc2grid_cli import console
+from pc2grid_cli.foxglove import write_session
 from pc2grid_cli.options import AsJson, Database, Force, Rerun
 from pc2grid_cli.output_files import check_file, map_stem
+from pc2grid_cli.picture import draw_session
+from pc2grid_cli.report import write_report
+from pc2grid_cli.rerun_stream import write_session as stream_session
+from pc2grid_cli.rerun_target import require_target, url_of
+from signature.database import open_database
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory
@@ -79,8 +92,6 @@ def export_command(
 
     Example: pc2grid export building.submaps --map building --trajectory building.tum
     """
-    from signature.database import open_database
-
     terminal = console.of(context)
     outputs = _Outputs(
         map_stem=None if map_ is None else map_stem(map_),
@@ -103,8 +114,6 @@ def export_command(
         if name is not None:
             _write_session(outputs, opened, name, terminal)
         if report is not None:
-            from pc2grid_cli.report import write_report
-
             write_report(report, opened)
     for path in outputs.written():
         terminal.note(f"wrote {path}")
@@ -150,15 +159,11 @@ class _Outputs:
 
     def written(self) -> list[Path]:
         """All files, in the order in which they are listed for the user."""
-        from pc2grid_cli.rerun_target import url_of
-
         paths = self.files() + ([] if self.report is None else [self.report])
         return paths + ([Path(self.rerun)] if self.rerun is not None and url_of(self.rerun) is None else [])
 
     def check(self) -> None:
         """Raises ConfigError if there is nothing to write, OutputError if a target cannot be written."""
-        from pc2grid.errors import ConfigError
-
         if not self.of_session() and self.report is None:
             raise ConfigError(
                 "nothing to export",
@@ -171,15 +176,11 @@ class _Outputs:
         for path in self.map_files():
             check_file("map", path, self.force)
         if self.rerun is not None:
-            from pc2grid_cli.rerun_target import require_target
-
             require_target(self.rerun, self.force)
 
 
 def _session_name(database: SubmapDatabase, asked: str | None) -> str:
     """The session to write. Raises DatabaseError if none is asked for and there is not exactly one."""
-    from pc2grid.errors import DatabaseError
-
     if asked is not None:
         return asked
     names = [info.name for info in database.sessions()]
@@ -196,40 +197,24 @@ def _write_session(outputs: _Outputs, database: SubmapDatabase, name: str, termi
     # A session without a trajectory is refused before anything is written.
     poses = _poses(database, name) if outputs.trajectory or outputs.g2o else None
     if outputs.map_stem is not None:
-        from pc2grid.io.nav2_map import save_map
-
         save_map(database.grid(name), outputs.map_stem)
     if outputs.trajectory is not None and poses is not None:
-        from pc2grid.io.trajectory import write_trajectory
-
         write_trajectory(outputs.trajectory, poses, outputs.trajectory_format)
     if outputs.cloud is not None:
         _write_cloud(outputs.cloud, database, name, terminal)
     if outputs.graph is not None:
-        from pc2grid.io.export.graphml import write_graph
-
         write_graph(outputs.graph, database.graph(name))
     if outputs.g2o is not None and poses is not None:
-        from pc2grid.io.export.g2o import write_g2o
-
         write_g2o(outputs.g2o, poses, database.loops(name))
     if outputs.mcap is not None:
-        from pc2grid_cli.foxglove import write_session
-
         write_session(outputs.mcap, database, name, outputs.force)
     if outputs.rerun is not None:
-        from pc2grid_cli.rerun_stream import write_session as stream_session
-
         stream_session(outputs.rerun, database, name)
     if outputs.plot is not None:
-        from pc2grid_cli.picture import draw_session
-
         draw_session(outputs.plot, database, name)
 
 
 def _poses(database: SubmapDatabase, session: str) -> Trajectory:
-    from pc2grid.errors import DatabaseError
-
     poses = database.trajectory(session)
     if not len(poses):
         raise DatabaseError(
@@ -240,9 +225,6 @@ def _poses(database: SubmapDatabase, session: str) -> Trajectory:
 
 def _write_cloud(path: Path, database: SubmapDatabase, session: str, terminal: console.Console) -> None:
     """The points in space if the session has them, else one point for each occupied cell."""
-    import numpy as np
-
-    from pc2grid.io.export.cloud import write_cloud
 
     points = database.points(session)
     if points is not None:

@@ -7,12 +7,21 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
-from pc2grid.errors import one_line
+from pc2grid.config import ReadConfig
+from pc2grid.errors import Pc2GridError, one_line
+from pc2grid.geometry import invert_pose, transform_points
+from pc2grid.io import open_log
+from pc2grid.io.containers.detect import is_submap_database
+from pc2grid.io.topics import TF, camera_info_topic
+from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid_cli.console import print_json, warn
+from pc2grid_cli.db_info import db_info_command
 from pc2grid_cli.options import AsJson, Assignments, Recover, Topic, make_config
+from signature.database.postgres.server import is_url
 
 if TYPE_CHECKING:
     from pc2grid.io.message_source import LogInfo
@@ -39,11 +48,7 @@ def info_command(
 
     Example: pc2grid info monday.mcap
     """
-    from pc2grid.mapping.drawn_map import is_drawn_map
-
     if is_database(log):
-        from pc2grid_cli.db_info import db_info_command
-
         db_info_command(log, json)
         return
     if is_drawn_map(Path(log)):
@@ -64,9 +69,6 @@ def info_command(
 
 def is_database(name: str) -> bool:
     """Whether this is the URL or the file of a submap database."""
-    from pc2grid.io.containers.detect import is_submap_database
-    from signature.database.postgres.server import is_url
-
     if is_url(name):
         return True
     try:
@@ -78,9 +80,6 @@ def is_database(name: str) -> bool:
 
 def describe_map(path: Path, assignments: list[str] | None = None) -> InfoMap:
     """The document of a map. Raises MapFileError if it cannot be read."""
-    import numpy as np
-
-    from pc2grid.mapping.drawn_map import load_drawn_map
 
     drawn = load_drawn_map(path, make_config(None, assignments))
     grid, R = drawn.grid, drawn.T_map_file[:3, :3]
@@ -105,9 +104,6 @@ def describe_map(path: Path, assignments: list[str] | None = None) -> InfoMap:
 
 def _floor_z_m(drawn: DrawnMap) -> float:
     """Height of the floor in the frame of the file, in the middle of the map."""
-    import numpy as np
-
-    from pc2grid.geometry import invert_pose, transform_points
 
     height, width = drawn.grid.cells.shape
     middle = drawn.grid.to_point(np.array([(height // 2, width // 2)]))[0]
@@ -116,8 +112,6 @@ def _floor_z_m(drawn: DrawnMap) -> float:
 
 def _camera_topic(log: LogInfo, images: str) -> str:
     """The topic with the calibration of the camera whose depth images are used."""
-    from pc2grid.io.topics import camera_info_topic
-
     image = next(topic for topic in log.topics if topic.topic == images)
     return camera_info_topic(image, log.topics).topic
 
@@ -140,10 +134,6 @@ def describe(path: Path, *, topic: str | None = None, recover: bool = False) -> 
     Reads the log's summary and a few messages only, unless it has no summary.
     Raises LogError if the file cannot be opened.
     """
-    from pc2grid.config import ReadConfig
-    from pc2grid.errors import Pc2GridError
-    from pc2grid.io import open_log
-
     with open_log(path, ReadConfig(topic=topic), recover=recover) as log:
         found = log.info
         choice: Choice | None = None
@@ -189,8 +179,6 @@ def _show(document: Info) -> None:
     from rich import markup
     from rich.console import Console
     from rich.table import Table
-
-    from pc2grid.io.topics import TF
 
     def escape(text: str) -> str:
         # Names come from the log, and may hold control sequences for a terminal.

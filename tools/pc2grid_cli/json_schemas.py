@@ -13,6 +13,7 @@ from typing import Any, Literal
 # Before Python 3.12 pydantic, which makes the schemas, does not take the TypedDict of typing.
 from typing_extensions import TypedDict
 
+from signature.config import Config
 from signature.localization.answer_json import (
     Pose,
     PoseInSpace,
@@ -416,8 +417,6 @@ def documents() -> dict[str, type]:
 def schema(name: str) -> dict[str, Any]:
     """JSON Schema of a command's document, or of all `settings` as TOML holds them. Raises KeyError."""
     if name == "settings":
-        from signature.config import Config
-
         about = Config.model_json_schema()
     else:
         from pydantic import TypeAdapter

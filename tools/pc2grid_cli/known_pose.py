@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pc2grid.errors import ConfigError
+from pc2grid_cli.nav2_pose import read_pose
+from signature.localization.prior import Prior
+
 if TYPE_CHECKING:
     from pc2grid.io import Log
     from pc2grid.time_span import TimeSpan
-    from signature.localization.prior import Prior
 
 Three = tuple[float, float, float]
 
@@ -36,8 +39,6 @@ class KnownPose:
 
     def validate(self, *, is_map: bool) -> None:
         """Raises ConfigError for options that do not go together. is_map : the query is a map."""
-        from pc2grid.errors import ConfigError
-
         given = {
             "--near": self.near,
             "--near-pose": self.near_pose,
@@ -59,8 +60,6 @@ class KnownPose:
 
     def region(self) -> Prior | None:
         """The region of `--near`; None if nothing is said about it. Raises ConfigError."""
-        from signature.localization.prior import Prior
-
         self.validate(is_map=False)
         if self.near is None:
             return None
@@ -72,16 +71,11 @@ class KnownPose:
 
         Raises ConfigError, or what `Log.map_pose` raises.
         """
-        from pc2grid_cli.nav2_pose import read_pose
-        from signature.localization.prior import Prior
-
         if self.near_pose is None:
             return self.region()
         is_topic = self.near_pose.startswith("/") and not Path(self.near_pose).exists()
         pose = log.map_pose(self.near_pose, end_s(span)) if is_topic else read_pose(Path(self.near_pose))
         if pose.covariance is None:
-            from pc2grid.errors import ConfigError
-
             raise ConfigError(
                 f"--near-pose: poses of {self.near_pose} have no covariance",
                 hint="--near X Y RADIUS names a region",

@@ -4,25 +4,33 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+import numpy as np
+
+from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.io import open_log
+from pc2grid.mapping.drawn_map import load_drawn_map
+from pc2grid.model import Health, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli.known_pose import KnownPose
+from signature.files import locate_log, query_config
+from signature.localization.belief import WATCH
+from signature.localization.localizer import locate_map
+from signature.localization.map_index import MapIndex
 
 if TYPE_CHECKING:
     from pc2grid.arrays import F64, I64
-    from pc2grid.geometry import SE2
     from pc2grid.io import Log
-    from pc2grid.model import OccupancyGrid, ReadReport, RegisteredScan, Trajectory
+    from pc2grid.model import OccupancyGrid, ReadReport, RegisteredScan
     from pc2grid_cli.json_schemas import Query
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.localization.answer import Moment
     from signature.localization.localizer import Answer, Watch
-    from signature.localization.map_index import MapIndex
     from signature.localization.prior import Prior
 
 
@@ -68,8 +76,6 @@ def find_log(
         what `watch` gets), see `signature.files.locate_log`.
     index : of the database, if it is prepared.
     """
-    from pc2grid.io import open_log
-
     moments: list[Moment] = []
 
     def see(registered: RegisteredScan, moment: Moment | None) -> None:
@@ -112,11 +118,6 @@ def about_log(path: Path, query: Log, answer: Answer, *, scans: int) -> Query:
 
 def find_map(path: Path, database: SubmapDatabase, config: Config) -> Found:
     """Locate a map: of nav2, or a cloud or mesh."""
-    import numpy as np
-
-    from pc2grid.mapping.drawn_map import load_drawn_map
-    from pc2grid.model import Trajectory
-    from signature.localization.localizer import MapIndex, locate_map
 
     made_with = database.config().model_copy(update={"read": config.read})
     drawn = load_drawn_map(path, made_with)
@@ -154,11 +155,6 @@ def locate(
 
     config : see `query_config`.
     """
-    import numpy as np
-
-    from pc2grid.model import Trajectory
-    from signature.files import locate_log, query_config
-    from signature.localization.map_index import MapIndex
 
     config = query_config(database, config)
     index = index or MapIndex.of(database, config, observer)
@@ -188,8 +184,6 @@ def locate(
 
 def in_map(poses: Trajectory, answer: Answer) -> Trajectory | None:
     """The query's poses in the map frame; None without an answer."""
-    from dataclasses import replace
-
     if answer.T_map_odom is None:
         return None
     return replace(poses, T_session_base=answer.T_map_odom.lift() @ poses.T_session_base)
@@ -205,12 +199,6 @@ def followed(poses: Trajectory, answer: Answer) -> Trajectory:
 
     Without an answer: as they are.
     """
-    from dataclasses import replace
-
-    import numpy as np
-
-    from pc2grid.geometry import SE2, wrap_angle
-    from pc2grid.model import Health
 
     if answer.T_map_odom is None:
         return poses
@@ -249,10 +237,6 @@ def _located_moments(
     poses: Trajectory, travel_m: F64, part: I64, answer: Answer
 ) -> tuple[list[int], list[SE2]]:
     """The scans at which the query was located in the session of the answer, and the base in its map."""
-    import numpy as np
-
-    from pc2grid.geometry import SE2, wrap_angle
-    from signature.localization.belief import WATCH
 
     planar = poses.planar()
     found = [
@@ -280,9 +264,6 @@ def _located_moments(
 
 def _without_points(registered: RegisteredScan) -> RegisteredScan:
     """Only the pose is needed later; a long query must not keep all its points."""
-    from dataclasses import replace
-
-    import numpy as np
 
     scan = replace(registered.scan, points_m=np.empty((0, 3), np.float32), offsets_s=None)
     return replace(registered, scan=scan)

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pc2grid.errors import ConfigError
+from pc2grid.geometry import SE2, quat_xyzw_from_pose
+from pc2grid.io.atomic import replace_file
+from pc2grid.io.map_pose import MapPose
 
 _MOST_BYTES = 1 << 20
 """A file above this is no single message."""
 
 if TYPE_CHECKING:
     from pc2grid.arrays import F64
-    from pc2grid.geometry import SE2
-    from pc2grid.io.map_pose import MapPose
     from signature.localization.answer import Answer
 
 
 def write_initialpose(path: Path, answer: Answer) -> None:
     """The pose as JSON that `ros2 topic pub --once /initialpose` takes. The answer must be located."""
-    from pc2grid.io.atomic import replace_file
-
     assert answer.T_map_base is not None
     assert answer.covariance is not None
     message = initialpose(answer.stamp_ns, answer.T_map_base, answer.covariance)
@@ -32,9 +36,6 @@ def initialpose(stamp_ns: int, T_map_base: SE2, covariance: F64, frame: str = "m
 
     covariance : (3, 3) of x, y, yaw; becomes 36 numbers, row-major over x, y, z, roll, pitch, yaw.
     """
-    import numpy as np
-
-    from pc2grid.geometry import quat_xyzw_from_pose
 
     full = np.zeros((6, 6))
     full[np.ix_((0, 1, 5), (0, 1, 5))] = covariance
@@ -58,14 +59,7 @@ def read_pose(path: Path) -> MapPose:
 
     Raises ConfigError if the file cannot be read or holds no such message.
     """
-    import math
-
-    import numpy as np
     import yaml
-
-    from pc2grid.errors import ConfigError
-    from pc2grid.geometry import SE2
-    from pc2grid.io.map_pose import MapPose
 
     advice = "`pc2grid relocalize --initialpose OUT.json` writes one; --near X Y RADIUS needs none"
     try:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from pc2grid.errors import OutputError
+from pc2grid.io.atomic import require_writable
+from signature.database.postgres.server import is_url
 
 SUFFIXES: dict[str, tuple[str, ...]] = {
     "trajectory": (".tum", ".kitti", ".txt"),
@@ -31,8 +33,6 @@ def check_file(option: str, path: Path | None, force: bool, *, any_suffix: bool 
 
     Raises OutputError for a suffix of another format, and as `require_writable`.
     """
-    from pc2grid.io.atomic import require_writable
-
     if path is None:
         return
     known, suffix = SUFFIXES[option], path.suffix.lower()
@@ -73,17 +73,12 @@ def check_database_name(output: str) -> None:
 
 def check_database(output: str) -> None:
     """Raises OutputError if the file of a database cannot be written; a server is asked later."""
-    from pc2grid.io.atomic import require_writable
-    from signature.database.postgres.server import is_url
-
     if not is_url(output):
         require_writable(output, force=True)
 
 
 def make_folder(path: Path) -> None:
     """Make the folder for results. Raises OutputError if it cannot be made or written to."""
-    from pc2grid.io.atomic import require_writable
-
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -10,6 +10,7 @@ import numpy as np
 
 from pc2grid.display import probability
 from pc2grid.io.atomic import replace_file
+from pc2grid.matching.agreement import Support
 from pc2grid_cli.evidence import agreements
 from pc2grid_cli.plural import counted
 
@@ -148,8 +149,6 @@ def draw_answer(
 
 def _title(answer: Answer, session: str, compared: Agreement | None) -> str:
     """The answer, and what it rests on."""
-    from pc2grid.matching.agreement import Support
-
     said = {"located": f"located in {session}", "ambiguous": "ambiguous", "not_found": "not found"}
     title = f"{said[answer.status]}, confidence {probability(answer.confidence)}"
     if compared is None:
@@ -248,8 +247,6 @@ def _draw_way(axes: Any, database: SubmapDatabase, session: str) -> None:
 
 def _draw_agreement(axes: Any, best: Hypothesis, compared: Agreement, *, point_size: float) -> None:
     """The query's walls at a hypothesis, and the map's walls that it should have seen."""
-    from pc2grid.matching.agreement import Support
-
     points_m = best.fit.T_map_query.apply(compared.points_m)
     for kind in (Support.FITS, Support.CONTRADICTED, Support.UNKNOWN):
         chosen = points_m[compared.support == kind]

@@ -8,18 +8,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from pc2grid import extras
 from pc2grid.display import probability
-from pc2grid.errors import one_line
+from pc2grid.errors import ConfigError, NotALog, one_line
+from pc2grid.io.nav2_map import is_map_file
+from pc2grid.io.trajectory import write_trajectory
+from pc2grid.mapping.drawn_map import is_drawn_map
+from pc2grid.mapping.precision import PRECISION
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
 from pc2grid_cli import options as options
+from pc2grid_cli.check_pose import check_log, report_check
+from pc2grid_cli.foxglove import write_answer, write_located_map
+from pc2grid_cli.info import is_database
 from pc2grid_cli.known_pose import KnownPose
 from pc2grid_cli.locate import ON_THE_WAY, Found, find_log, find_map, in_map
 from pc2grid_cli.nav2_pose import write_initialpose
 from pc2grid_cli.output_files import check_file
+from pc2grid_cli.picture import draw_answer
+from pc2grid_cli.report import write_report
+from pc2grid_cli.rerun_stream import Search, stream_to
+from pc2grid_cli.rerun_target import require_target
+from signature.database import open_database
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory
@@ -48,8 +61,6 @@ class _Outputs:
 
     def refuse(self, reason: str, rerun: str | None) -> None:
         """Raises ConfigError if there is any."""
-        from pc2grid.errors import ConfigError
-
         files = ("trajectory", "initialpose", "output", "plot", "report")
         asked = [f"--{option}" for option in files if getattr(self, option) is not None]
         if rerun is not None:
@@ -135,9 +146,6 @@ def relocalize_command(
 
     Example: pc2grid relocalize tuesday.mcap --database building.submaps
     """
-    from pc2grid.io.nav2_map import is_map_file
-    from signature.database import open_database
-
     extras.require(({} if rerun is None else {"viz": "--rerun"}) | extras.of_addresses(database))
     outputs = _Outputs(
         trajectory=trajectory,
@@ -154,8 +162,6 @@ def relocalize_command(
     if known.is_check:
         outputs.refuse("--check judges a pose and finds none", rerun)
     if rerun is not None:
-        from pc2grid_cli.rerun_target import require_target
-
         require_target(rerun, force)
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity, top_k=top_k
@@ -167,8 +173,6 @@ def relocalize_command(
             opened.keep_only(building=building, floor=floor)
         left_out = [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
         if known.is_check:
-            from pc2grid_cli.check_pose import check_log, report_check
-
             checked, document = check_log(
                 log,
                 opened,
@@ -212,9 +216,6 @@ def relocalize_command(
 
 def _check_not_swapped(log: Path, database: str) -> None:
     """Raises NotALog if a database is given in place of the recording."""
-    from pc2grid.errors import NotALog
-    from pc2grid_cli.info import is_database
-
     if is_database(str(log)):
         raise NotALog(
             f"{log}: a submap database, where a recording or a map is expected",
@@ -224,9 +225,6 @@ def _check_not_swapped(log: Path, database: str) -> None:
 
 def _check_options_for_maps(log: Path, outputs: _Outputs, rerun: str | None) -> None:
     """Raises ConfigError for options that need a robot, if the query is a map."""
-    from pc2grid.errors import ConfigError
-    from pc2grid.mapping.drawn_map import is_drawn_map
-
     asked = {"--trajectory": outputs.trajectory, "--initialpose": outputs.initialpose, "--rerun": rerun}
     for option, value in asked.items():
         if value is not None and is_drawn_map(log):
@@ -251,16 +249,12 @@ def _find(
 
     ask : find out, too, what the answer would have been at so many moments on the way.
     """
-    from pc2grid.mapping.drawn_map import is_drawn_map
-
     if is_drawn_map(log):
         found = find_map(log, database, settings)
         return found, in_map(found.poses, found.answer)
     with contextlib.ExitStack() as stack:
         shown = None
         if rerun is not None:
-            from pc2grid_cli.rerun_stream import Search, stream_to
-
             shown = Search(stack.enter_context(stream_to(rerun, log.stem)), database)
         found = find_log(
             log,
@@ -290,25 +284,17 @@ def _write(
     answer = found.answer
     if located is not None:
         if outputs.trajectory is not None:
-            from pc2grid.io.trajectory import write_trajectory
-
             write_trajectory(outputs.trajectory, located)
         if outputs.initialpose is not None:
             write_initialpose(outputs.initialpose, answer)
         if outputs.output is not None:
-            from pc2grid_cli.foxglove import write_answer, write_located_map
-
             if found.drawn is not None:
                 write_located_map(outputs.output, database, answer, found.drawn, outputs.force)
             else:
                 write_answer(outputs.output, database, answer, located, outputs.force)
     if outputs.plot is not None:
-        from pc2grid_cli.picture import draw_answer
-
         draw_answer(outputs.plot, database, answer, found.poses)
     if outputs.report is not None:
-        from pc2grid_cli.report import write_report
-
         write_report(outputs.report, database, found=found, accept=settings.relocalize.accept)
 
 
@@ -317,8 +303,6 @@ def map_sigma_m(answer: Answer, database: SubmapDatabase) -> float | None:
 
     The covariance of the answer is about the walls there. Where these lie in the map is another question.
     """
-    import numpy as np
-
     if answer.T_map_base is None or answer.session is None:
         return None
     (info,) = database.sessions([answer.session])
@@ -332,8 +316,6 @@ def map_sigma_m(answer: Answer, database: SubmapDatabase) -> float | None:
 
 def _about_map(sigma_m: float | None) -> str:
     """A line about the map where it is not known well enough to rely on; else nothing."""
-    from pc2grid.mapping.precision import PRECISION
-
     if sigma_m is None or sigma_m <= PRECISION.promised_m:
         return ""
     return (

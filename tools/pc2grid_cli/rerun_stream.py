@@ -17,7 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pc2grid.geometry import SE2, quat_xyzw_from_pose, transform_points
 from pc2grid.io.atomic import replace_file
+from pc2grid.matching.agreement import Support
+from pc2grid.model import Health
 from pc2grid.observer import Observer
 from pc2grid_cli import console
 from pc2grid_cli.evidence import agreements
@@ -38,7 +41,6 @@ if TYPE_CHECKING:
     import networkx as nx
 
     from pc2grid.arrays import F32, F64
-    from pc2grid.geometry import SE2
     from pc2grid.model import Loop, OccupancyGrid, PointMap, RegisteredScan, SessionMap, Trajectory
     from signature.config import Config
     from signature.database import SubmapDatabase
@@ -147,8 +149,6 @@ class Search:
 
     def watch(self, registered: RegisteredScan, moment: Moment | None) -> None:
         """The next scan, and the state of the answer if the database was asked after it."""
-        from pc2grid.geometry import SE2
-
         rr = require_rerun()
         if moment is not None:
             _set_time(self._recording, moment.stamp_ns)
@@ -181,8 +181,6 @@ class Search:
 
     def _show_evidence(self, answer: Answer, session: str) -> None:
         """Per hypothesis in this session, best first, what supports and what contradicts it."""
-        from pc2grid.matching.agreement import Support
-
         rr = require_rerun()
         colours = {int(kind): _rgb(SUPPORT_COLOURS[kind.name])[0] for kind in Support}
         entities = []
@@ -221,17 +219,12 @@ class _Live:
 
     def move(self, T_map_odom: SE2) -> None:
         """Move all scans to this pose of their frame in the map."""
-        from pc2grid.geometry import quat_xyzw_from_pose
-
         T = T_map_odom.lift()
         transform = require_rerun().Transform3D(translation=T[:3, 3], quaternion=quat_xyzw_from_pose(T))
         self._recording.log(self._entity, transform)
 
     def add(self, registered: RegisteredScan) -> None:
         """The next scan."""
-        from pc2grid.geometry import transform_points
-        from pc2grid.model import Health
-
         rr = require_rerun()
         scan, T = registered.scan, registered.T_session_base
         _set_time(self._recording, scan.stamp_ns)
@@ -329,8 +322,6 @@ def _grid_map(grid: OccupancyGrid) -> Any:
 
 def _log_moving(recording: Any, entity: str, poses: Trajectory, color: str) -> None:
     """The base over time, as an arrow of half a metre."""
-    from pc2grid.geometry import quat_xyzw_from_pose
-
     rr = require_rerun()
     if not len(poses):
         return

@@ -11,6 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from signature.boundary import boundary_edges, boundary_points
+from signature.freespace import freespace_nodes, visibility_graph
+from signature.similarity import score_matrix
+from signature.symmetry import line_segments, symmetry_axes
+
 if TYPE_CHECKING:
     import networkx as nx
 
@@ -31,10 +36,6 @@ def sources(submap: Submap, config: SignatureConfig) -> dict[str, Any]:
     boundary : the boundary points. nodes, edges : the free-space graph, see `joined_pairs`.
     axes : directions of the symmetry axes alpha and beta, radians; empty if there is none.
     """
-    from signature.boundary import boundary_edges, boundary_points
-    from signature.freespace import freespace_nodes, visibility_graph
-    from signature.symmetry import line_segments, symmetry_axes
-
     grid = submap.grid
     edges = boundary_edges(submap, config)
     nodes = freespace_nodes(submap, config)
@@ -67,8 +68,6 @@ def similar_places(
 
     Submaps of the same session whose centre is nearer than the radius show the same walls and are left out.
     """
-    from signature.similarity import score_matrix
-
     found = []
     for row in rows:
         one = slice(row, row + 1)

@@ -15,20 +15,28 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pc2grid import extras
-from pc2grid.errors import OutputError
+from pc2grid.errors import ConfigError, OutputError, Pc2GridError
+from pc2grid.io.live.targets import open_live
 from pc2grid.observer import Observer
+from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.known_pose import KnownPose
+from pc2grid_cli.locate import find_log
+from pc2grid_cli.report import page
 from pc2grid_cli.view_events import Events, Progress
-from pc2grid_cli.view_server import Options, ViewServer
+from pc2grid_cli.view_server import Cancelled, Options, ViewServer
+from signature.database import open_database
+from signature.files import query_config
+from signature.localization.follower import Follower
+from signature.localization.localizer import Localizer
+from signature.localization.map_index import MapIndex
 
 if TYPE_CHECKING:
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.localization.localizer import Look
-    from signature.localization.map_index import MapIndex
 
 _MOST_GB = 4.0
 _SHARES_EVERY_S = 0.2
@@ -65,8 +73,6 @@ def view_command(
 
     Example: pc2grid view building.submaps
     """
-    from signature.database import open_database
-
     extras.require(extras.of_addresses(source, database))
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
@@ -122,10 +128,6 @@ class Locator:
 
         options : `near`, x,y,radius in metres, and `session`, whose map frame they are in.
         """
-        from pc2grid.errors import Pc2GridError
-        from pc2grid_cli.locate import find_log
-        from pc2grid_cli.view_server import Cancelled
-
         events, progress = self.events, Progress(self.events)
         events.publish("begin", {"source": path.name})
 
@@ -179,12 +181,6 @@ class Locator:
 
         source : as `pc2grid watch` takes it. Raises the errors of `pc2grid.io.live.targets.open_live`.
         """
-        from pc2grid.io.live.targets import open_live
-        from pc2grid.pipeline import follow
-        from signature.files import query_config
-        from signature.localization.follower import Follower
-        from signature.localization.localizer import Localizer
-
         config = query_config(self._database, self._settings)
         localizer, progress = Localizer(self._prepared()), Progress(self.events)
         with (
@@ -215,9 +211,6 @@ class Locator:
 
     def _prepared(self) -> MapIndex:
         """The maps, prepared once for all recordings."""
-        from signature.files import query_config
-        from signature.localization.map_index import MapIndex
-
         if self._index is None:
             self._index = MapIndex.of(self._database, query_config(self._database, self._settings))
         return self._index
@@ -238,8 +231,6 @@ class _Shares(Observer):
 
 def live_page(database: SubmapDatabase, **answer: Any) -> bytes:
     """The page of a report, with the part that takes recordings and shows events."""
-    from pc2grid_cli.report import page
-
     html = page(database, **answer)
     live = files("pc2grid_cli").joinpath("view.html").read_text(encoding="utf-8")
     # The policy of a report allows no connection; the server sends one that allows those to itself.
@@ -266,8 +257,6 @@ def _tell(progress: Progress, look: Look) -> None:
 
 def _near(text: str | None) -> tuple[float, float, float] | None:
     """x,y,radius of a request. Raises ConfigError."""
-    from pc2grid.errors import ConfigError
-
     if text is None:
         return None
     try:

@@ -11,8 +11,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from pc2grid.geometry import SE2
+from pc2grid.model import Health
+
 if TYPE_CHECKING:
-    from pc2grid.geometry import SE2
     from pc2grid.model import RegisteredScan
     from signature.localization.answer import Moment
 
@@ -128,8 +130,6 @@ class Progress:
 
     def add(self, registered: RegisteredScan | None) -> None:
         """The next scan; None: what follows does not go on from what was before."""
-        from pc2grid.model import Health
-
         if registered is None:
             self._waiting.append([*self._base, 1])
             return
@@ -170,7 +170,5 @@ class Progress:
 
 def _planar(registered: RegisteredScan) -> tuple[float, float, float]:
     """x, y, yaw of the base in the query's frame, as finely as it can be seen."""
-    from pc2grid.geometry import SE2
-
     base = SE2.from_matrix(registered.T_session_base)
     return round(base.x, 3), round(base.y, 3), round(base.yaw, 4)

@@ -24,6 +24,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from pc2grid.errors import LogTruncated, OutputError, Pc2GridError
+from pc2grid_cli.console import json_text
 from pc2grid_cli.view_events import Events
 
 _ADDRESS = "127.0.0.1"
@@ -236,8 +237,6 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def _send_json(self, status: HTTPStatus, document: Any) -> None:
-        from pc2grid_cli.console import json_text
-
         self._send(status, "application/json", json_text(document).encode())
 
     def _refuse(self, status: HTTPStatus, error: str, hint: str | None = None) -> None:

@@ -16,19 +16,29 @@ import typer
 from pc2grid import extras
 from pc2grid.display import probability
 from pc2grid.errors import ConfigError, one_line
+from pc2grid.geometry import SE2
+from pc2grid.io.live.nav2 import Nav2Publisher
+from pc2grid.io.live.targets import open_live
+from pc2grid.pipeline import follow
 from pc2grid_cli import console
 from pc2grid_cli import options as options
+from pc2grid_cli.check_pose import as_text as check_as_text
+from pc2grid_cli.check_pose import live_document
 from pc2grid_cli.known_pose import KnownPose
+from signature.database import open_database
+from signature.localization.answer_json import in_space_document
+from signature.localization.follower import Follower
+from signature.localization.localizer import Localizer
+from signature.localization.map_index import MapIndex
+from signature.localization.pose_check import PoseLook, PoseWatch
 
 if TYPE_CHECKING:
-    from pc2grid.geometry import SE2
     from pc2grid.io.live.live_log import LiveLog
-    from pc2grid.io.live.nav2 import Nav2Publisher, Outlet
+    from pc2grid.io.live.nav2 import Outlet
     from pc2grid_cli.json_schemas import Watch
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.database.protocol import SessionInfo
-    from signature.localization.follower import Follower
     from signature.localization.localizer import Look
     from signature.localization.prior import Prior
 
@@ -116,9 +126,6 @@ def watch_command(
 
     Example: pc2grid watch ws://robot:8765 --database building.submaps --publish initialpose
     """
-    from pc2grid.io.live.targets import open_live
-    from signature.database import open_database
-
     extras.require(extras.of_addresses(source, database))
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
@@ -163,8 +170,6 @@ class _Following:
 
     def run(self, follower: Follower[LookT], use: Callable[[LookT], bool]) -> None:
         """Feed `follower` with scans. use : what to do with each look; true if that was enough."""
-        from pc2grid.pipeline import follow
-
         live, config = self.live, self.config
         over = False
 
@@ -197,9 +202,6 @@ def _search(
 
     prior : where the robot is at the beginning, as far as it is known. forever : go on when it is located.
     """
-    from signature.localization.follower import Follower
-    from signature.localization.localizer import Localizer, MapIndex
-
     live, config = following.live, following.config
     index = MapIndex.of(following.database, config, following.terminal.observer())
     localizer = Localizer(index if prior is None else index.within(prior))
@@ -218,12 +220,6 @@ def _search(
 
 def _check(following: _Following, topic: str, session: str | None, *, as_json: bool) -> bool:
     """Follow the robot, and judge the pose that it believes in; whether the last one was fine."""
-    from pc2grid_cli.check_pose import as_text as check_as_text
-    from pc2grid_cli.check_pose import live_document
-    from signature.localization.follower import Follower
-    from signature.localization.map_index import MapIndex
-    from signature.localization.pose_check import PoseLook, PoseWatch
-
     live, config = following.live, following.config
     live.listen_to_pose(topic)
     index = MapIndex.of(following.database, config, following.terminal.observer())
@@ -313,7 +309,6 @@ class _Robot:
         if not topics:
             yield robot
             return
-        from pc2grid.io.live.nav2 import Nav2Publisher
 
         feed = live.feed
         if not hasattr(feed, "advertise"):
@@ -358,8 +353,6 @@ class _Robot:
     def _now(self, look: Look) -> tuple[int, SE2]:
         """The stamp of the newest odometry and the pose of the base there: the look is about an earlier
         scan."""
-        from pc2grid.geometry import SE2
-
         T_map_odom, newest = look.T_map_odom, self.live.newest_odometry()
         if T_map_odom is None or newest is None:
             assert look.T_map_base is not None
@@ -414,8 +407,6 @@ def as_text(look: Look, published: list[str]) -> str:
 
 
 def _document(look: Look, live: LiveLog, robot: _Robot, published: list[str]) -> Watch:
-    from signature.localization.answer_json import in_space_document
-
     answer, pose, T_map_odom, counts = look.answer, look.T_map_base, look.T_map_odom, live.feed.counts
     document: Watch = {
         "schema_version": 1,

@@ -9,6 +9,9 @@ from pathlib import Path
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogNotFound, LogTruncated, NotALog
 from pc2grid.io.containers import cloud_folder, rosbag2_folder
+from pc2grid.io.containers.bag import BagSource
+from pc2grid.io.containers.db3 import Db3Source
+from pc2grid.io.containers.mcap import McapSource
 from pc2grid.io.message_source import MessageSource
 
 _MCAP = b"\x89MCAP0\r\n"
@@ -61,22 +64,17 @@ def _open_file(path: Path, head: bytes, config: ReadConfig, recover: bool) -> Me
             raise LogTruncated(
                 f"{path}: an MCAP that ends after its first 8 bytes", hint="nothing to recover"
             )
-        from pc2grid.io.containers.mcap import McapSource
 
         return McapSource(path, config, recover=recover)
     if _MCAP.startswith(head):
         raise LogTruncated(f"{path}: an MCAP that ends after {len(head)} bytes", hint="nothing to recover")
     if head.startswith(_BAG):
-        from pc2grid.io.containers.bag import BagSource
-
         return BagSource(path, config)
     if is_submap_database(head):
         raise NotALog(
             f"{path}: a submap database, not a recording", hint=f"`pc2grid info {path}` shows what is in it"
         )
     if head.startswith(_SQLITE):
-        from pc2grid.io.containers.db3 import Db3Source
-
         return Db3Source(path, config)
     raise NotALog(f"{path}: not a recording; looks like {_looks_like(head)}", hint=_advice(head))
 

@@ -7,7 +7,11 @@ from pathlib import Path
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogNotFound
 from pc2grid.io.live.feed import Feed
+from pc2grid.io.live.foxglove_websocket import FoxgloveWebsocket
 from pc2grid.io.live.live_log import LiveLog
+from pc2grid.io.live.recording_feed import RecordingFeed
+from pc2grid.io.live.standard_input import StandardInput
+from pc2grid.io.live.zenoh_session import ZenohSession
 
 _ADDRESSES = "ws://ROBOT:8765, zenoh://ROBOT:7447, a recording, or - for standard input"
 
@@ -32,26 +36,18 @@ def open_live(target: str, config: ReadConfig | None = None, *, last_s: float = 
 def open_feed(target: str, config: ReadConfig, last_s: float) -> Feed:
     """The feed of a target; see `open_live`."""
     if target == "-":
-        from pc2grid.io.live.standard_input import StandardInput
-
         return StandardInput(config)
     scheme, separator, _ = target.partition("://")
     if not separator:
         return _recording(Path(target), config, last_s)
     if scheme in ("ws", "wss"):
-        from pc2grid.io.live.foxglove_websocket import FoxgloveWebsocket
-
         return FoxgloveWebsocket(target, config)
     if scheme == "zenoh":
-        from pc2grid.io.live.zenoh_session import ZenohSession
-
         return ZenohSession(target, config)
     raise LogNotFound(f"{target}: {scheme}:// is not known", hint=f"expected {_ADDRESSES}")
 
 
 def _recording(path: Path, config: ReadConfig, last_s: float) -> Feed:
-    from pc2grid.io.live.recording_feed import RecordingFeed
-
     if path.is_file() or path.is_dir():
         return RecordingFeed(path, config, last_s)
     if path.exists():

@@ -24,6 +24,7 @@ import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.errors import PointCloudError, UnsupportedSchema
+from pc2grid.io.messages import lzf
 from pc2grid.io.messages.types import Bytes, Header, PointCloud2
 
 Fields = tuple[tuple[str, int, int, int], ...]  # name, offset, datatype, count
@@ -97,8 +98,6 @@ def _pcd_columns(head: str) -> tuple[Columns, int]:
 
 
 def _unpacked(body: memoryview, size: int) -> bytes:
-    from pc2grid.io.messages import lzf
-
     stored, expanded = (int.from_bytes(body[i : i + 4], "little") for i in (0, 4))
     if expanded != size or len(body) < 8 + stored:
         raise PointCloudError(f"{expanded} bytes of compressed data where {size} are declared")

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pc2grid.io.message_source import TopicInfo
-from pc2grid.io.messages import cloud_messages, ros
+from pc2grid.io.messages import cloud_messages, foxglove, ros
 
 
 def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
@@ -15,8 +15,6 @@ def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
     Raises UnsupportedSchema for a type or encoding that is not supported.
     """
     if channel.encoding in ("protobuf", "json"):
-        from pc2grid.io.messages import foxglove
-
         return foxglove.decoder_for(channel)
     if channel.type.startswith("cloud/"):
         return cloud_messages.decoder_for(channel)
