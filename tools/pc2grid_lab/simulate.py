@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from pc2grid.errors import ConfigError
+from pc2grid.io.atomic import require_writable
+from pc2grid.simulate import load_building
+from pc2grid.simulate.config import OdometryConfig
 from pc2grid_cli import console
 from pc2grid_cli.options import AsJson, Force, SensorName
-
-if TYPE_CHECKING:
-    from pc2grid_lab.documents import Simulate
+from pc2grid_lab.documents import Simulate
+from pc2grid_lab.worlds import ChangeConfig, HouseConfig, WorldConfig, simulate_session
 
 
 class RideName(str, enum.Enum):
@@ -68,12 +71,6 @@ def simulate_command(
     Example: pc2grid simulate map.yaml drive.mcap --sensor depth --length 20
     """
     from pydantic import ValidationError
-
-    from pc2grid.errors import ConfigError
-    from pc2grid.io.atomic import require_writable
-    from pc2grid.simulate import load_building
-    from pc2grid.simulate.config import OdometryConfig
-    from pc2grid_lab.worlds import ChangeConfig, HouseConfig, WorldConfig, simulate_session
 
     if len(files) > 2:
         raise typer.BadParameter(f"expected [BUILDING] OUT.mcap, got {len(files)} files")

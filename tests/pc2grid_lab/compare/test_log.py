@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from pc2grid.errors import ConfigError
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli.main import app
+from pc2grid_lab.compare import log as compare_log
 from pc2grid_lab.compare import matrix_report
-from pc2grid_lab.experiments import replay
 from pc2grid_lab.experiments.trial import Trial
 from tests.helpers.recordings import STEP, T0, ros, write_mcap
 from tests.helpers.trials import trial
@@ -41,7 +41,7 @@ class Asked:
 @pytest.fixture
 def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A log of 17.5 s, with its truth."""
-    monkeypatch.setattr(replay, "Replay", Asked)
+    monkeypatch.setattr(compare_log, "Replay", Asked)
     Asked.spans = []
     (tmp_path / "a.tum").write_text("1 0 0 0 0 0 0 1\n")
     (tmp_path / "a.relations").write_text("5 6 1 0 0 0 0 0\n")

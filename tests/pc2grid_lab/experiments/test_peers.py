@@ -20,6 +20,7 @@ from pc2grid.model import Scan
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app
+from pc2grid_lab.compare import peers as compare_peers
 from pc2grid_lab.compare import peers_report
 from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.peers.environment import PEERS, PINS, PeerEnvironment, PeerKind
@@ -307,7 +308,7 @@ def test_a_drive_through_a_plan_beside_the_peers(tmp_path: Path, monkeypatch: py
     simulate_session(tmp_path / "drive.mcap", sensor="laser", grid=office(), config=simulation)
     monkeypatch.setenv("PATH", str(tmp_path))  # whether MRPT is installed or not
     drawn: list[Any] = []
-    monkeypatch.setattr(peers_report, "draw", lambda *arguments: drawn.append(arguments))
+    monkeypatch.setattr(compare_peers, "draw", lambda *arguments: drawn.append(arguments))
     out = tmp_path / "out"
     words = ["compare", "peers", tmp_path / "drive.mcap", "--of-base", "--queries", "1", "--travel", "1.5"]
     words += ["--environment", tmp_path / "none", "-o", out, "--json"]

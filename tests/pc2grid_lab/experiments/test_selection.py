@@ -117,8 +117,8 @@ def test_the_command_uses_what_it_has_stored(tmp_path: Path, monkeypatch: pytest
     grid = plan(12, 10, [(4, 0, 4, 6), (6, 4, 12, 4), (6, 6, 6, 10)])
     monkeypatch.setattr(compare_signatures, "_plan", lambda _: grid)
     monkeypatch.setattr(compare_signatures, "_city", lambda *_: tmp_path / "city")
-    monkeypatch.setattr("pc2grid_lab.experiments.selection.with_floors", lambda own, *_: own.index)
-    monkeypatch.setattr("pc2grid_lab.experiments.selection.described_floor", made_up_floor)
+    monkeypatch.setattr(compare_signatures, "with_floors", lambda own, *_: own.index)
+    monkeypatch.setattr(compare_signatures, "described_floor", made_up_floor)
     monkeypatch.setattr(compare_signatures, "_FLOORS_AT_ONCE", 3)
     arguments = ["compare", "signatures", "a.yaml", "--queries", "1", "--map-length", "12", "--rate", "2"]
     arguments += ["--clutter", "0", "--change", "0", "--share", "0.3", "-o", str(tmp_path), "--json"]

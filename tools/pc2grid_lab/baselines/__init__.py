@@ -5,34 +5,20 @@ A method is fitted to the submaps of a map. Then it compares queries with each o
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from collections.abc import Collection, Iterable
 
 from pc2grid import extras
-from pc2grid.arrays import F64
-from pc2grid.model import Submap
-
-if TYPE_CHECKING:
-    from pc2grid_lab.baselines.words import Vocabulary
-
-
-@runtime_checkable
-class Matcher(Protocol):
-    """A method that is fitted to the submaps of a map."""
-
-    def similarities(self, query: Submap) -> F64:
-        """Similarity of the query to each of the N fitted submaps: (N,), larger is more alike, never NaN."""
-        ...
-
-
-@runtime_checkable
-class Method(Protocol):
-    """A way to describe and compare submaps."""
-
-    def fit(self, submaps: Sequence[Submap]) -> Matcher:
-        """Describe the submaps of a map and learn from them what the method needs, such as a vocabulary."""
-        ...
-
+from pc2grid_lab.baselines.method import Matcher as Matcher
+from pc2grid_lab.baselines.method import Method as Method
+from pc2grid_lab.baselines.opencv_shape_context import OpenCvShapeContext, require_shapes
+from pc2grid_lab.baselines.point_contexts import PointContexts
+from pc2grid_lab.baselines.proposed import Proposed
+from pc2grid_lab.baselines.sdf import DistanceFeatures
+from pc2grid_lab.baselines.several_centres import SeveralCentres
+from pc2grid_lab.baselines.shape_context import ShapeContext
+from pc2grid_lab.baselines.verified import Verified
+from pc2grid_lab.baselines.words import FEATURES, Vocabulary, Words
+from signature.config import SignatureConfig
 
 METHOD_NAMES = (
     "shape_context",
@@ -64,8 +50,6 @@ def require_packages(names: Collection[str]) -> None:
     if wanted:
         extras.require({"paper": ", ".join(wanted)})
     if "opencv_shape_context" in names:
-        from pc2grid_lab.baselines.opencv_shape_context import require_shapes
-
         require_shapes()
 
 
@@ -80,46 +64,25 @@ def make_methods(names: Iterable[str]) -> dict[str, Method]:
 
 
 def _make(name: str, vocabularies: dict[str, Vocabulary]) -> Method:
-    # Imported here because each method needs a library that the others do not need.
     if name == "boundary_centres":
-        from pc2grid_lab.baselines.proposed import Proposed
-        from pc2grid_lab.baselines.several_centres import SeveralCentres
-        from signature.config import SignatureConfig
-
         # A spread of 1e6 makes Omega of Eq. 6 equal to 1.
         return SeveralCentres(method=Proposed(SignatureConfig(weight_boundary=1.0, symmetry_sigma=1e6)))
     if name in ("proposed_centres", "shape_context_centres"):
-        from pc2grid_lab.baselines.several_centres import SeveralCentres
-
         return SeveralCentres(method=_make(name.removesuffix("_centres"), vocabularies))
     if name == "proposed":
-        from pc2grid_lab.baselines.proposed import Proposed
-
         return Proposed()
     if name in ("shape_context", "shape_rings"):
-        from pc2grid_lab.baselines.shape_context import ShapeContext
-
         return ShapeContext(turns=name == "shape_context")
     if name == "point_contexts":
-        from pc2grid_lab.baselines.point_contexts import PointContexts
-
         return PointContexts()
     if name == "opencv_shape_context":
-        from pc2grid_lab.baselines.opencv_shape_context import OpenCvShapeContext
-
         return OpenCvShapeContext()
     if name == "verified":
-        from pc2grid_lab.baselines.verified import Verified
-
         return Verified()
     if name == "sdf":
-        from pc2grid_lab.baselines.sdf import DistanceFeatures
-
         return DistanceFeatures()
     feature, _, weighting = name.partition("_")
     if name in METHOD_NAMES:
-        from pc2grid_lab.baselines.words import FEATURES, Vocabulary, Words
-
         vocabulary = vocabularies.setdefault(feature, Vocabulary(FEATURES[feature]))
         return Words(vocabulary, tfidf=weighting == "tfidf")
     raise KeyError(f"no method {name!r}; there are {', '.join(METHOD_NAMES + EXTRA_METHOD_NAMES)}")

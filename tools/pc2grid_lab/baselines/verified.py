@@ -18,7 +18,7 @@ from pc2grid.matching.two_way_score import score_fit
 from pc2grid.matching.walls import Walls, thin_evenly
 from pc2grid.matching.window_search import SearchMap, SearchParameters, search_windows
 from pc2grid.model import Submap
-from pc2grid_lab.baselines import Matcher
+from pc2grid_lab.baselines.method import Matcher
 from pc2grid_lab.baselines.proposed import Proposed
 from signature.config import SignatureConfig
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64
 from pc2grid.model import Submap
+from pc2grid_lab.baselines.surf import surf_descriptors
 
 Feature = Callable[[NDArray[np.uint8]], F32]
 
@@ -52,8 +53,6 @@ def sift(image: NDArray[np.uint8]) -> F32:
 
 def surf(image: NDArray[np.uint8]) -> F32:
     """Up to 300 SURF descriptors (K, 64), those of the strongest response."""
-    from pc2grid_lab.baselines.surf import surf_descriptors
-
     return surf_descriptors(image, MAX_FEATURES)
 
 

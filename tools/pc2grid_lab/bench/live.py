@@ -13,14 +13,28 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pc2grid.config import ReadConfig
+from pc2grid.io import open_log
+from pc2grid.io.live.feed import News
+from pc2grid.io.live.inbox import Arrived, FeedCounts
+from pc2grid.io.live.live_log import LiveLog
+from pc2grid.io.live.targets import open_live
+from pc2grid.io.message_source import RawMessage, TopicInfo
+from pc2grid.io.nav2_map import save_map
+from pc2grid.pipeline import follow
+from pc2grid.simulate import SimulationConfig, office_floorplan, simulate_session
+from pc2grid.simulate.config import DepthConfig, LaserConfig
+from pc2grid.simulate.record import TOPICS
 from pc2grid_lab.bench.measure import ROOT, Row
-
-if TYPE_CHECKING:
-    from pc2grid.io.live.live_log import LiveLog
+from signature.config import Config
+from signature.database import open_database
+from signature.localization.follower import Follower
+from signature.localization.localizer import Localizer, MapIndex, locate
+from signature.localization.map_index import MapIndex
+from signature.sessions import add_sessions, build_session
 
 _ROBOT = (
     "import sys, pathlib\n"
@@ -36,10 +50,6 @@ SENSORS = {"laser": "laser, 40 Hz", "lidar": "lidar, 10 Hz", "depth": "depth 640
 
 def simulated(folder: Path, kind: str, length_m: float) -> tuple[Path, str]:
     """A drive through the office by one sensor, at the rate of a usual device; and the topic of its scans."""
-    from pc2grid.simulate import SimulationConfig, office_floorplan, simulate_session
-    from pc2grid.simulate.config import DepthConfig, LaserConfig
-    from pc2grid.simulate.record import TOPICS
-
     config = SimulationConfig(
         length_m=length_m,
         seed=3,
@@ -54,11 +64,6 @@ def simulated(folder: Path, kind: str, length_m: float) -> tuple[Path, str]:
 
 def database_of(folder: Path) -> Path:
     """A database of the office's plan."""
-    from pc2grid.io.nav2_map import save_map
-    from pc2grid.simulate import office_floorplan
-    from signature.config import Config
-    from signature.sessions import add_sessions, build_session
-
     path = folder / "office.submaps"
     if not path.exists():
         save_map(office_floorplan(0), folder / "office")
@@ -68,13 +73,6 @@ def database_of(folder: Path) -> Path:
 
 def lag(folder: Path, quick: bool) -> Iterator[Row]:
     """Time from the arrival of a scan to the end of its tracking, 95th percentile, for each sensor."""
-    from pc2grid.config import ReadConfig
-    from pc2grid.io.live.targets import open_live
-    from pc2grid.pipeline import follow
-    from signature.database import open_database
-    from signature.localization.follower import Follower
-    from signature.localization.localizer import Localizer, MapIndex
-
     database = database_of(folder)
     for kind, what in (
         ("laser", "laser, 40 Hz"),
@@ -125,24 +123,12 @@ def lag(folder: Path, quick: bool) -> Iterator[Row]:
 
 def warm_up(path: Path, database: Path) -> None:
     """Use each function once: the first use compiles it."""
-    from pc2grid.io import open_log
-    from pc2grid.pipeline import follow
-    from signature.database import open_database
-    from signature.localization.localizer import locate
-
     with open_database(database) as opened, open_log(path) as log:
         locate(follow(log.scans(0.0, 2.0), opened.config()), opened, opened.config())
 
 
 def memory(folder: Path, quick: bool) -> Iterator[Row]:
     """Memory of `watch --keep` while a laser drives to and fro, as fast as it can be followed."""
-    from pc2grid.config import ReadConfig
-    from pc2grid.io.live.live_log import LiveLog
-    from pc2grid.pipeline import follow
-    from signature.database import open_database
-    from signature.localization.follower import Follower
-    from signature.localization.localizer import Localizer, MapIndex
-
     robot_s = 300.0 if quick else 3600.0
     path, _ = simulated(folder, "laser", 8.0)
     database = database_of(folder)
@@ -193,10 +179,6 @@ class ToAndFro:
     def __init__(self, path: Path, robot_s: float) -> None:
         from mcap.reader import make_reader
 
-        from pc2grid.io.live.feed import News
-        from pc2grid.io.live.inbox import FeedCounts
-        from pc2grid.io.message_source import TopicInfo
-
         self.name = path.name
         self.counts, self.news = FeedCounts(), News()
         self._topics: dict[str, TopicInfo] = {}
@@ -219,9 +201,6 @@ class ToAndFro:
         self._over = False
 
     def _play(self, robot_s: float) -> Iterator[object]:
-        from pc2grid.io.live.inbox import Arrived
-        from pc2grid.io.message_source import RawMessage
-
         first, last = self._recorded[0][1], self._recorded[-1][1]
         span, played = last - first, 0
         while played * span < robot_s * 1e9:

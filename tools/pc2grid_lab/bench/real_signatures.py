@@ -35,7 +35,7 @@ from pc2grid_lab.experiments.selection import (
     recall_at_scale,
     tally_at_scale,
 )
-from pc2grid_lab.experiments.sensor_map import SensorMap, load_map
+from pc2grid_lab.experiments.sensor_map import SensorMap
 from signature.config import Config
 from signature.retrieval.place_index import PlaceBlock
 from signature.seen_places import SeenPlaces
@@ -53,7 +53,7 @@ def maps_of(folder: Path) -> dict[str, SensorMap]:
     maps: dict[str, SensorMap] = {}
     for sensor, pattern in patterns.items():
         (path,) = (folder / "maps").glob(pattern)
-        made = load_map(path, name="floor", sensor=sensor, config=Config())  # type: ignore[arg-type]
+        made = SensorMap.load(path, name="floor", sensor=sensor, config=Config())  # type: ignore[arg-type]
         if sensor == "laser":
             made = replace(made, T_plan_map=T_floor_log @ made.T_plan_map)
         maps[sensor] = made

@@ -12,6 +12,7 @@ import numpy as np
 from pc2grid.arrays import F32, F64
 from pc2grid.config import PartitionConfig
 from pc2grid.geometry import SE2
+from pc2grid.io.nav2_map import load_map
 from pc2grid.matching.refinement import refine
 from pc2grid.matching.two_way_score import Fit, score_fit
 from pc2grid.matching.window_search import SearchMap, SearchParameters, search_windows
@@ -34,8 +35,6 @@ def describe_time(folder: Path, quick: bool) -> Iterator[Row]:
     grids = [office_floorplan(0)]
     path = fixtures.data_file("maps/fr079.yaml")
     if path is not None:
-        from pc2grid.io.nav2_map import load_map
-
         grids.append(load_map(path))
     disc = PartitionConfig.paper()
     seen = disc.model_copy(update={"view": "isovist"})

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from pc2grid.errors import ConfigError
+from pc2grid.model import OccupancyGrid
+from pc2grid_cli.console import of, print_json
 from pc2grid_cli.options import OUTPUT_FOLDER, SensorName
 from pc2grid_cli.output_files import make_folder
-
-if TYPE_CHECKING:
-    from pc2grid.model import OccupancyGrid
-    from pc2grid_lab.documents import CompareFloors, FloorRow
-    from pc2grid_lab.experiments.floors import FloorResult, FloorTask
+from pc2grid_cli.tables import show
+from pc2grid_lab.compare.floors_report import draw, example_of, floors_table, mapped
+from pc2grid_lab.documents import CompareFloors, FloorRow
+from pc2grid_lab.experiments.floors import WAYS, FloorResult, FloorTask, database_file, stored_floors
+from pc2grid_lab.experiments.program import program_digest
+from signature.database import open_database
 
 
 def compare_floors_command(
@@ -48,13 +52,6 @@ def compare_floors_command(
 
     Example: pc2grid compare floors --seeds 1,2,3
     """
-    from pc2grid.errors import ConfigError
-    from pc2grid_cli.console import of, print_json
-    from pc2grid_cli.tables import show
-    from pc2grid_lab.compare.floors_report import draw, example_of, floors_table, mapped
-    from pc2grid_lab.experiments.floors import WAYS, FloorTask, stored_floors
-    from pc2grid_lab.experiments.program import program_digest
-
     names = [word.strip() for word in ways.split(",")]
     unknown = [name for name in names if name not in WAYS]
     if unknown:
@@ -100,8 +97,6 @@ def compare_floors_command(
 
 
 def _whole_numbers(text: str, option: str) -> tuple[int, ...]:
-    from pc2grid.errors import ConfigError
-
     try:
         return tuple(int(word) for word in text.split(","))
     except ValueError:
@@ -110,9 +105,6 @@ def _whole_numbers(text: str, option: str) -> tuple[int, ...]:
 
 def _grids(task: FloorTask, result: FloorResult, out: Path) -> dict[str, OccupancyGrid]:
     """The maps in the database of a house."""
-    from pc2grid_lab.experiments.floors import database_file
-    from signature.database import open_database
-
     with open_database(database_file(task, out)) as database:
         return {name: database.grid(name) for name in result.floors}
 

@@ -5,17 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from rich.table import Table
+
+from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid_cli.picture import GREEN, GREY, ORANGE, VERMILLION
+from pc2grid_cli.tables import table
+from pc2grid_lab.compare.picture import picture
+from pc2grid_lab.experiments.floors import (
+    STATUSES,
+    FloorAnswer,
+    FloorResult,
+    FloorStatus,
+    FloorTask,
+    share_of,
+)
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from pc2grid.model import OccupancyGrid
-    from pc2grid_lab.experiments.floors import FloorAnswer, FloorResult, FloorStatus, FloorTask
-
-    Asked = tuple[FloorTask, FloorResult]
+Asked = tuple[FloorTask, FloorResult]
 
 _LIGHT_BLUE = "#A6CBE6"
 _COLOURS: dict[FloorStatus, str] = {
@@ -42,9 +50,6 @@ def mapped(result: FloorResult, grids: Mapping[str, OccupancyGrid]) -> FloorResu
 
     grids : of the sessions of the house's database.
     """
-    import numpy as np
-
-    from pc2grid.model import UNKNOWN
 
     def is_in_the_map(answer: FloorAnswer) -> bool:
         shares = []
@@ -61,11 +66,6 @@ def mapped(result: FloorResult, grids: Mapping[str, OccupancyGrid]) -> FloorResu
 
 def floors_table(houses: Sequence[Asked], in_the_map: Sequence[Asked]) -> Table:
     """A row for each way and kind of furniture. in_the_map : the same houses, as `mapped` has them."""
-    from scipy.stats import binomtest
-
-    from pc2grid_cli.tables import table
-    from pc2grid_lab.experiments.floors import STATUSES, share_of
-
     counts = ("houses", "told apart", "named", *(_SHOWN[status] for status in STATUSES), "misplaced")
     made = table(
         "floors with one plan",
@@ -73,25 +73,31 @@ def floors_table(houses: Sequence[Asked], in_the_map: Sequence[Asked]) -> Table:
         (*counts, "wrong up to", "in the map", "right or ambiguous there"),
     )
     for way, alike in dict.fromkeys((task.way, task.alike) for task, _ in houses):
-        group = [(task, result) for task, result in houses if (task.way, task.alike) == (way, alike)]
-        asked = sum(len(result.answers) for _, result in group)
-        wrong = sum(result.count("wrong") for _, result in group)
-        there = [(task, result) for task, result in in_the_map if (task.way, task.alike) == (way, alike)]
-        count = sum(len(result.answers) for _, result in there)
-        share = "{:.3f} [{:.3f}, {:.3f}]".format(*share_of(there, ("right", "ambiguous"))) if count else ""
-        made.add_row(
-            way,
-            _furniture(alike),
-            str(len(group)),
-            str(sum(result.told_apart for _, result in group)),
-            str(sum(result.named for _, result in group)),
-            *(str(sum(result.count(status) for _, result in group)) for status in STATUSES),
-            str(sum(result.misplaced for _, result in group)),
-            f"{binomtest(wrong, asked).proportion_ci(method='wilson').high:.1%}",
-            str(count),
-            share,
+        group, there = (
+            [(task, result) for task, result in some if (task.way, task.alike) == (way, alike)]
+            for some in (houses, in_the_map)
         )
+        made.add_row(way, _furniture(alike), *_row([result for _, result in group]), *_share(there))
     return made
+
+
+def _row(results: Sequence[FloorResult]) -> list[str]:
+    """The counts of some houses, and the upper bound of the share that is wrong."""
+    from scipy.stats import binomtest
+
+    named = (sum(result.told_apart for result in results), sum(result.named for result in results))
+    counts = [sum(result.count(status) for result in results) for status in STATUSES]
+    misplaced = sum(result.misplaced for result in results)
+    wrong, asked = counts[STATUSES.index("wrong")], sum(len(result.answers) for result in results)
+    bound = binomtest(wrong, asked).proportion_ci(method="wilson").high
+    return [*map(str, (len(results), *named, *counts, misplaced)), f"{bound:.1%}"]
+
+
+def _share(there: Sequence[Asked]) -> tuple[str, str]:
+    """Queries in the map, and the share of them that is right or ambiguous with its interval."""
+    count = sum(len(result.answers) for _, result in there)
+    share = "{:.3f} [{:.3f}, {:.3f}]".format(*share_of(there, ("right", "ambiguous"))) if count else ""
+    return str(count), share
 
 
 def _furniture(alike: bool) -> str:
@@ -103,32 +109,25 @@ def draw(path: Path, houses: Sequence[Asked], grids: Mapping[str, OccupancyGrid]
 
     example : the house of that query. grids : of the sessions of its database.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
-    from pc2grid.io.atomic import replace_file
-
-    ways = list(dict.fromkeys(task.way for task, _ in houses))
+    of_way: dict[str, list[Asked]] = {}
+    for house in houses:
+        of_way.setdefault(house[0].way, []).append(house)
     task, result = example
     answer = example_answer(result)
-    of_way = {way: [house for house in houses if house[0].way == way] for way in ways}
     bars_in = 1.2 + 0.22 * max(map(len, of_way.values()))
-    figure = Figure(figsize=(11.0, bars_in + 4.2), dpi=110, constrained_layout=True)
-    FigureCanvasAgg(figure)
-    parts: Any = figure.subfigures(2, 1, height_ratios=(bars_in, 4.2))
-    bars, maps = parts
-    _draw_bars(bars, of_way)
-    floors = maps.subplots(1, len(task.floors), squeeze=False, sharex=True, sharey=True)[0]
-    for ax, floor in zip(floors, task.floors, strict=True):
-        _draw_floor(ax, floor, result, answer, grids)
-    maps.suptitle(
-        f"a query made on floor {answer.floor} of house {task.seed} (by {task.way}, furniture"
-        f" {_furniture(task.alike)}) fits on {len(answer.poses)} floors: {_SHOWN[answer.status]},"
-        f" confidence {answer.confidence:.3f}",
-        fontsize=10,
-    )
-    with replace_file(path) as draft:
-        figure.savefig(draft, format="png", metadata={"Software": "pc2grid"})
+    with picture(path, 11.0, bars_in + 4.2) as figure:
+        bars, maps = figure.subfigures(2, 1, height_ratios=(bars_in, 4.2))
+        _draw_bars(bars, of_way)
+        floors = maps.subplots(1, len(task.floors), squeeze=False, sharex=True, sharey=True)[0]
+        for ax, floor in zip(floors, task.floors, strict=True):
+            _draw_floor(ax, floor, result, answer, grids)
+        maps.suptitle(
+            f"a query made on floor {answer.floor} of house {task.seed} (by {task.way}, furniture"
+            f" {_furniture(task.alike)}) fits on {len(answer.poses)} floors: {_SHOWN[answer.status]},"
+            f" confidence {answer.confidence:.3f}",
+            fontsize=10,
+        )
 
 
 def example_of(houses: Sequence[Asked]) -> Asked:
@@ -187,8 +186,6 @@ def _draw_floor(
     ax: Any, floor: int, result: FloorResult, answer: FloorAnswer, grids: Mapping[str, OccupancyGrid]
 ) -> None:
     """The maps of a floor in the frame of the house, and the query where it fits on them."""
-    import numpy as np
-
     sessions = [name for name, other in result.floors.items() if other == floor]
     for name in sessions:
         T_house_map, grid = result.frames[name], grids[name]
@@ -198,16 +195,15 @@ def _draw_floor(
     if floor == answer.floor:
         true = answer.T_house_query.apply(answer.walls_m)
         ax.plot(*true.T, ".", color=GREEN, ms=6.0, mew=0, alpha=0.4, label="query, true place")
-    for name in sessions:
-        if name in answer.poses:
-            walls = (result.frames[name] @ answer.poses[name]).apply(answer.walls_m)
-            colour = VERMILLION if name == answer.session and answer.status == "wrong" else ORANGE
-            ax.plot(*walls.T, ".", color=colour, ms=2.5, mew=0, label="query, where it fits")
+    label: str | None = "query, where it fits"
+    for name in (name for name in sessions if name in answer.poses):
+        walls = (result.frames[name] @ answer.poses[name]).apply(answer.walls_m)
+        colour = VERMILLION if name == answer.session and answer.status == "wrong" else ORANGE
+        ax.plot(*walls.T, ".", color=colour, ms=2.5, mew=0, label=label)
+        label = None  # once in the legend
     called = ", ".join(f"{name} ({result.names[name]})" for name in sessions)
     ax.set_title(f"floor {floor}: {called or 'no map'}", fontsize=8)
     ax.set_aspect("equal")
     ax.tick_params(labelsize=7)
-    handles, labels = ax.get_legend_handles_labels()
-    if handles:
-        shown = dict(zip(labels, handles, strict=True))
-        ax.legend(shown.values(), shown.keys(), fontsize=7, loc="upper left", markerscale=2.0)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(fontsize=7, loc="upper left", markerscale=2.0)

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from pc2grid.display import probability
+from pc2grid.errors import ConfigError
+from pc2grid.io import open_log
+from pc2grid.io.trajectory import read_tum
+from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli import options as options
-
-if TYPE_CHECKING:
-    from pc2grid_lab.experiments.metrics import QueryCounts
-    from pc2grid_lab.experiments.trial import Trial
+from pc2grid_cli.tables import show, table
+from pc2grid_lab.experiments.metrics import QueryCounts
+from pc2grid_lab.experiments.replay import Replay, spread
+from pc2grid_lab.experiments.trial import JUDGEMENT, Trial
 
 _MAP_S, _QUERY_S = 600.0, 40.0
 """Longest map and query that are chosen by default; chosen on fr079 and intel."""
@@ -56,13 +60,6 @@ def compare_log_command(
 
     Example: pc2grid compare log fr079.mcap --truth fr079_corrected.tum --map 0..600 --queries 10
     """
-    from pc2grid.errors import ConfigError
-    from pc2grid.io import open_log
-    from pc2grid.io.trajectory import read_tum
-    from pc2grid.time_span import TimeSpan
-    from pc2grid_lab.experiments.metrics import QueryCounts
-    from pc2grid_lab.experiments.replay import Replay, spread
-
     settings = options.make_config(config, set_, topic=topic, odometry=odometry)
     asked = None if map_ is None else _seconds(map_)
     _refuse_relations(truth)
@@ -109,8 +106,6 @@ def compare_log_command(
 
 def _refuse_relations(truth: Path) -> None:
     """Raises ConfigError for a list of relations, which has no pose of a single scan."""
-    from pc2grid.errors import ConfigError
-
     if truth.suffix == ".relations":
         raise ConfigError(
             f"{truth}: relations between poses, but poses are needed (TUM)",
@@ -120,8 +115,6 @@ def _refuse_relations(truth: Path) -> None:
 
 def _seconds(text: str) -> tuple[float, float]:
     """The two numbers of `FROM..TO`. Raises ConfigError."""
-    from pc2grid.errors import ConfigError
-
     first, _, last = text.partition("..")
     try:
         from_s, to_s = float(first), float(last)
@@ -133,9 +126,6 @@ def _seconds(text: str) -> tuple[float, float]:
 
 
 def _print(trials: list[Trial], counts: QueryCounts, unknown: int) -> None:
-    from pc2grid_cli.tables import show, table
-    from pc2grid_lab.experiments.trial import JUDGEMENT
-
     title = "later parts of the recording in the map of the earlier one"
     numbers = ["driven", "covered", "confidence", "off by", "map bent by"]
     found = table(title, ["from", "answer", "judged"], numbers)

@@ -4,22 +4,32 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
-import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
+from rich.table import Table
 
+from pc2grid.errors import ConfigError
+from pc2grid.io import open_log
+from pc2grid.io.nav2_map import load_map
+from pc2grid.io.trajectory import read_tum
+from pc2grid.model import Health
+from pc2grid.simulate.config import OdometryConfig
+from pc2grid_cli.console import of, print_json
 from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from pc2grid_lab.experiments.map_quality import MappingRun
+from pc2grid_cli.tables import show, table
+from pc2grid_lab.experiments.map_quality import MappingRun, map_beside_bare, map_simulated
+from pc2grid_lab.experiments.relation_fit import relation_fit
+from pc2grid_lab.experiments.sensor_matrix import SENSORS
+from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
+from pc2grid_lab.experiments.stored import in_processes, write_text
+from pc2grid_lab.experiments.trajectory_error import trajectory_error
+from pc2grid_lab.worlds import WorldConfig, prepare_session
+from signature.config import Config
 
 Row = dict[str, Any]
 
@@ -48,61 +58,50 @@ def compare_maps_command(
 
     Example: pc2grid compare maps fr079.yaml intel.yaml --log hall.mcap --truth hall.tum
     """
-    from pc2grid.errors import ConfigError
-    from pc2grid_cli.console import of, print_json
-    from pc2grid_cli.tables import show
-
-    logs, truths = log or [], truth or []
     tasks = _simulated_tasks(plans or [], sensors, length, seeds, not no_odometry)
-    if len(logs) != len(truths):
-        raise ConfigError(
-            f"{len(logs)} times --log, but {len(truths)} times --truth", hint="give each log its truth"
-        )
-    tasks += [{"log": str(a), "truth": str(b)} for a, b in zip(logs, truths, strict=True)]
-    if not tasks:
-        raise ConfigError("nothing to compare", hint="name floor plans, or a --log with its --truth")
-    for task in tasks:
-        for file in (Path(task[key]) for key in ("plan", "log", "truth") if key in task):
-            if not file.exists():
-                raise ConfigError(f"{file}: no such file")
+    tasks += _recorded_tasks(log or [], truth or [])
+    _refuse(tasks)
     make_folder(out)
-    waiting = [task for task in tasks if not _result(task, out).exists()]
+    waiting = [(task, out) for task in tasks if not _result(task, out).exists()]
     with of(context).progress("map") as advance:
-        for done, _ in enumerate(_run_all(waiting, str(out), jobs or os.cpu_count() or 1), start=1):
-            advance(done / len(waiting))
+        in_processes(_run, waiting, jobs=jobs, advance=advance)
     rows = [json.loads(_result(task, out).read_text()) for task in tasks]
     if as_json:
         print_json({"schema_version": 1, "rows": rows})
         return
     simulated, recorded = [r for r in rows if "plan" in r], [r for r in rows if "log" in r]
+    title = "{}: trajectories against the truth, beside bare KISS-ICP"
     if simulated:
         show(
-            _table(
-                "simulated: trajectories against the truth, beside bare KISS-ICP",
-                _PLAN,
-                [*_SIMULATED, *_HEALTH],
-                simulated,
-            ),
+            _table(title.format("simulated"), _PLAN, [*_SIMULATED, *_HEALTH], simulated),
             _table("simulated: cells of the maps against the truth, %", _PLAN, _CELLS, simulated),
         )
     if recorded:
-        show(
-            _table(
-                "recorded: trajectories against the truth, beside bare KISS-ICP",
-                _LOG,
-                [*_RECORDED, *_HEALTH],
-                recorded,
-            )
+        show(_table(title.format("recorded"), _LOG, [*_RECORDED, *_HEALTH], recorded))
+
+
+def _recorded_tasks(logs: list[Path], truths: list[Path]) -> list[dict[str, Any]]:
+    """A task for each recording. Raises ConfigError unless each has its truth."""
+    if len(logs) != len(truths):
+        raise ConfigError(
+            f"{len(logs)} times --log, but {len(truths)} times --truth", hint="give each log its truth"
         )
+    return [{"log": str(log), "truth": str(truth)} for log, truth in zip(logs, truths, strict=True)]
+
+
+def _refuse(tasks: list[dict[str, Any]]) -> None:
+    """Raises ConfigError if there is no task, or a file of one is missing."""
+    if not tasks:
+        raise ConfigError("nothing to compare", hint="name floor plans, or a --log with its --truth")
+    for file in (Path(task[key]) for task in tasks for key in ("plan", "log", "truth") if key in task):
+        if not file.exists():
+            raise ConfigError(f"{file}: no such file")
 
 
 def _simulated_tasks(
     plans: list[Path], sensors: str, length_m: float, seeds: str, odometry: bool
 ) -> list[dict[str, Any]]:
     """A task for each plan, sensor and seed. Raises ConfigError for words that cannot be read."""
-    from pc2grid.errors import ConfigError
-    from pc2grid_lab.experiments.sensor_matrix import SENSORS
-
     kinds = [name.strip() for name in sensors.split(",")]
     unknown = [name for name in kinds if name not in SENSORS]
     if unknown:
@@ -119,46 +118,21 @@ def _simulated_tasks(
     ]
 
 
-def _result(task: dict[str, Any], out: str | Path) -> Path:
+def _result(task: dict[str, Any], out: Path) -> Path:
     if "log" in task:
-        return Path(out) / f"{Path(task['log']).stem}.{Path(task['truth']).suffix[1:]}.json"
+        return out / f"{Path(task['log']).stem}.{Path(task['truth']).suffix[1:]}.json"
     wheels = "odometry" if task["odometry"] else "alone"
     name = f"{Path(task['plan']).stem}.{task['sensor']}.{task['length_m']:g}m.{task['seed']}.{wheels}.json"
-    return Path(out) / name
+    return out / name
 
 
-def _run_all(tasks: list[dict[str, Any]], out: str, jobs: int) -> Iterator[None]:
-    """Yield once for each task that is done. With more than one job the tasks run in processes."""
-    if jobs == 1 or len(tasks) < 2:
-        for task in tasks:
-            _run(task, out)
-            yield
-        return
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(_run, task, out) for task in tasks]):
-            future.result()
-            yield
-
-
-def _run(task: dict[str, Any], out: str) -> None:
+def _run(task: dict[str, Any], out: Path) -> None:
     """Map one session or log, and store the result."""
-    from pc2grid.io.atomic import replace_file
-
     row = _of_log(task) if "log" in task else _of_plan(task)
-    with replace_file(_result(task, out)) as draft:
-        draft.write_text(json.dumps({**task, **row}, indent=1))
+    write_text(_result(task, out), json.dumps({**task, **row}, indent=1))
 
 
 def _of_plan(task: dict[str, Any]) -> Row:
-    from dataclasses import asdict
-
-    from pc2grid.io.nav2_map import load_map
-    from pc2grid.simulate.config import OdometryConfig
-    from pc2grid_lab.experiments.map_quality import map_simulated
-    from pc2grid_lab.experiments.trajectory_error import trajectory_error
-    from pc2grid_lab.worlds import WorldConfig, prepare_session
-    from signature.config import Config
-
     simulation = WorldConfig(
         length_m=task["length_m"], seed=task["seed"], odometry=OdometryConfig(enabled=task["odometry"])
     )
@@ -173,16 +147,6 @@ def _of_plan(task: dict[str, Any]) -> Row:
 
 
 def _of_log(task: dict[str, Any]) -> Row:
-    from dataclasses import asdict
-
-    from pc2grid.io import open_log
-    from pc2grid.io.trajectory import read_tum
-    from pc2grid_lab.experiments.map_quality import map_beside_bare
-    from pc2grid_lab.experiments.relation_fit import relation_fit
-    from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
-    from pc2grid_lab.experiments.trajectory_error import trajectory_error
-    from signature.config import Config
-
     config = Config()
     truth = Path(task["truth"])
     with open_log(Path(task["log"]), config.read) as log:
@@ -208,8 +172,6 @@ def _of_log(task: dict[str, Any]) -> Row:
 
 
 def _health(run: MappingRun) -> Row:
-    from pc2grid.model import Health
-
     return {
         "scans": len(run.trajectory),
         "lost": run.share(Health.LOST),
@@ -220,19 +182,19 @@ def _health(run: MappingRun) -> Row:
     }
 
 
-def _metres(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.3f}"
+def _number(value: float, digits: int = 3) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
 
 def _percent(value: float) -> str:
-    return "-" if math.isnan(value) else f"{100 * value:.2f}"
+    return _number(100 * value, 2)
 
 
 def _errors(row: Row, who: str) -> str:
     found = row[who]
     if "ate_m" in found:
-        return f"{_metres(found['ate_m'])} m"
-    return f"{_metres(found['translation_m'])} m, {found['rotation_deg']:.2f} deg"
+        return f"{_number(found['ate_m'])} m"
+    return f"{_number(found['translation_m'])} m, {found['rotation_deg']:.2f} deg"
 
 
 def _fits(row: Row) -> str:
@@ -259,9 +221,9 @@ _PLAN: Columns = [
     ("odometry", lambda r: "yes" if r["odometry"] else "no"),
 ]
 _SIMULATED: Columns = [
-    ("ATE, m", lambda r: _metres(r["ours"]["ate_m"])),
-    ("RPE, m/m", lambda r: _metres(r["ours"]["rpe_m"])),
-    ("bare: ATE, m", lambda r: _metres(r["bare"]["ate_m"])),
+    ("ATE, m", lambda r: _number(r["ours"]["ate_m"])),
+    ("RPE, m/m", lambda r: _number(r["ours"]["rpe_m"])),
+    ("bare: ATE, m", lambda r: _number(r["bare"]["ate_m"])),
 ]
 _CELLS: Columns = [
     ("occupied right", lambda r: _percent(r["grid"]["occupied_right"])),
@@ -282,8 +244,6 @@ _RECORDED: Columns = [
 
 
 def _table(title: str, texts: Columns, numbers: Columns, rows: list[Row]) -> Table:
-    from pc2grid_cli.tables import table
-
     made = table(title, [name for name, _ in texts], [name for name, _ in numbers])
     for row in rows:
         made.add_row(*(shown(row) for _, shown in (*texts, *numbers)))

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
 from pc2grid_cli.tables import show, table
-
-if TYPE_CHECKING:
-    from pc2grid_lab.experiments.ablation import Independence
-    from pc2grid_lab.experiments.metrics import MatrixCell
-    from pc2grid_lab.experiments.trial import Trial
+from pc2grid_lab.compare.picture import picture
+from pc2grid_lab.experiments.ablation import Independence
+from pc2grid_lab.experiments.metrics import MatrixCell
+from pc2grid_lab.experiments.trial import Trial
 
 _SENSORS = ("lidar", "laser", "depth")
 
@@ -24,34 +26,29 @@ def tables(cells: Sequence[MatrixCell], elsewhere: Sequence[Trial]) -> None:
     shares = table("located and right, by metres driven", who, (*(f"{d:g} m" for d in distances), "n"))
     figures = ("wrong", "ambiguous", "not found", "recall 1/5/20", "median", "95 %", "ms")
     detail = table(f"after {last:g} m", who, figures)
-    for map_sensor, query_sensor in ((m, q) for m in _SENSORS for q in _SENSORS):
-        row = {c.travel_m: c for c in cells if (c.map_sensor, c.query_sensor) == (map_sensor, query_sensor)}
-        if not row:  # no query of this sensor drove where the map is
-            shares.add_row(map_sensor, query_sensor, *("-" for _ in distances), "0")
-            continue
-        shares.add_row(
-            map_sensor,
-            query_sensor,
-            *(f"{row[d].located_right:.2f}" if d in row else "" for d in distances),
-            str(max(c.trials for c in row.values())),
-        )
+    for pair in itertools.product(_SENSORS, _SENSORS):
+        row = {c.travel_m: c for c in cells if (c.map_sensor, c.query_sensor) == pair}
+        # Without a row no query of this sensor drove where the map is.
+        shown = [f"{row[d].located_right:.2f}" if d in row else "" if row else "-" for d in distances]
+        shares.add_row(*pair, *shown, str(max((c.trials for c in row.values()), default=0)))
         if last in row:
-            cell = row[last]
-            detail.add_row(
-                map_sensor,
-                query_sensor,
-                f"{cell.wrong:.3f}",
-                f"{cell.ambiguous:.2f}",
-                f"{cell.not_found:.2f}",
-                _recall(cell.recall),
-                _metres(cell.median_error_m),
-                _metres(cell.p95_error_m),
-                f"{cell.look_up_ms:.0f}",
-            )
+            detail.add_row(*pair, *_figures(row[last]))
     show(shares, detail)
     if elsewhere:
         right = sum(t.status == "not_found" for t in elsewhere)
         show(f"queries from another building: {right} of {len(elsewhere)} answered not_found")
+
+
+def _figures(cell: MatrixCell) -> tuple[str, ...]:
+    return (
+        f"{cell.wrong:.3f}",
+        f"{cell.ambiguous:.2f}",
+        f"{cell.not_found:.2f}",
+        _recall(cell.recall),
+        _metres(cell.median_error_m),
+        _metres(cell.p95_error_m),
+        f"{cell.look_up_ms:.0f}",
+    )
 
 
 def draw(
@@ -65,40 +62,30 @@ def draw(
 
     fitted_on : the reliability is that in buildings that the confidence was fitted on.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from pc2grid.io.atomic import replace_file
-    from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
-
     colours = dict(zip(_SENSORS, (BLUE, ORANGE, VERMILLION), strict=True))
-    figure, axes = plt.subplots(1, 4, figsize=(15, 3.8), constrained_layout=True)
-    for ax, map_sensor in zip(axes, _SENSORS, strict=False):
-        for query_sensor, marker in zip(_SENSORS, "os^", strict=True):
-            row = [c for c in cells if (c.map_sensor, c.query_sensor) == (map_sensor, query_sensor)]
-            ax.plot(
-                [c.travel_m for c in row],
-                [c.located_right for c in row],
-                marker=marker,
-                color=colours[query_sensor],
-                label=f"{query_sensor} query",
-            )
-        farthest_m = max((c.travel_m for c in cells), default=1.0)
-        ax.set(title=f"{map_sensor} map", xlabel="driven, m", xlim=(0, 1.05 * farthest_m), ylim=(0, 1.03))
-        ax.grid(alpha=0.3)
-    axes[0].set_ylabel("located and right")
-    axes[0].legend(loc="lower right")
-    axes[3].plot([0, 1], [0, 1], color="0.6", lw=1)
-    if reliability:
-        confidence, right, count = zip(*reliability, strict=True)
-        axes[3].scatter(confidence, right, s=[20 + 2 * min(n, 200) for n in count], color=BLUE, alpha=0.7)
-    axes[3].set(title=_RELIABILITY[fitted_on], xlabel="confidence", ylabel="share that was right")
-    axes[3].grid(alpha=0.3)
-    with replace_file(path) as draft:
-        figure.savefig(draft, format="png", dpi=130)
-    plt.close(figure)
+    with picture(path, 15.0, 3.8, dpi=130) as figure:
+        axes = figure.subplots(1, 4)
+        for ax, map_sensor in zip(axes, _SENSORS, strict=False):
+            for query_sensor, marker in zip(_SENSORS, "os^", strict=True):
+                row = [c for c in cells if (c.map_sensor, c.query_sensor) == (map_sensor, query_sensor)]
+                ax.plot(
+                    [c.travel_m for c in row],
+                    [c.located_right for c in row],
+                    marker=marker,
+                    color=colours[query_sensor],
+                    label=f"{query_sensor} query",
+                )
+            farthest_m = max((c.travel_m for c in cells), default=1.0)
+            ax.set(title=f"{map_sensor} map", xlabel="driven, m", xlim=(0, 1.05 * farthest_m), ylim=(0, 1.03))
+            ax.grid(alpha=0.3)
+        axes[0].set_ylabel("located and right")
+        axes[0].legend(loc="lower right")
+        axes[3].plot([0, 1], [0, 1], color="0.6", lw=1)
+        if reliability:
+            confidence, right, count = zip(*reliability, strict=True)
+            axes[3].scatter(confidence, right, s=[20 + 2 * min(n, 200) for n in count], color=BLUE, alpha=0.7)
+        axes[3].set(title=_RELIABILITY[fitted_on], xlabel="confidence", ylabel="share that was right")
+        axes[3].grid(alpha=0.3)
 
 
 _RELIABILITY = {True: "confidence, buildings of its fit", False: "confidence, other buildings"}
@@ -128,43 +115,32 @@ def contribution_table(independent: Mapping[str, Independence], recalls: Recalls
 
 def draw_signatures(path: Path, independent: Mapping[str, Independence], recalls: Recalls) -> None:
     """One picture: distances of one place across sensors against other places; AUC; the ablation."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    import numpy as np
-
-    from pc2grid.io.atomic import replace_file
-    from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
-
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(15, 4.2), constrained_layout=True)
-    whole = list(independent.values())[-1]
-    if len(whole.same) and len(whole.other):
-        bins = np.linspace(0.0, float(np.quantile(np.concatenate((whole.same, whole.other)), 0.999)), 60)
-        for values, colour, label in (
-            (whole.same, BLUE, "one place, two sensors"),
-            (whole.other, VERMILLION, "two places, one sensor"),
-        ):
-            left.hist(values, bins, density=True, color=colour, alpha=0.6, label=label)
-        left.legend()
-    left.set(title="distance by all three signatures (Eq. 6)", xlabel="distance", ylabel="density")
-    names = list(independent)
-    middle.barh(names, [independent[name].auc for name in names], color=BLUE)
-    middle.set(title="AUC: one place across sensors before others", xlim=(0.5, 1.0))
-    middle.invert_yaxis()
-    rows = list(recalls["all"])
-    height = 0.27
-    for offset, (k, colour) in enumerate(zip((1, 5, 20), (VERMILLION, ORANGE, BLUE), strict=True)):
-        at = np.arange(len(rows)) + (offset - 1) * height
-        right.barh(
-            at, [recalls["all"][name][k] or 0.0 for name in rows], height, color=colour, label=f"at {k}"
-        )
-    right.set(title="recall of the right place, all sensors", xlim=(0.0, 1.0))
-    right.set_yticks(np.arange(len(rows)), rows)
-    right.invert_yaxis()
-    right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=3)
-    for ax in (middle, right):
-        ax.grid(axis="x", alpha=0.3)
-    with replace_file(path) as draft:
-        figure.savefig(draft, format="png", dpi=130)
-    plt.close(figure)
+    with picture(path, 15.0, 4.2, dpi=130) as figure:
+        left, middle, right = figure.subplots(1, 3)
+        whole = list(independent.values())[-1]
+        if len(whole.same) and len(whole.other):
+            bins = np.linspace(0.0, float(np.quantile(np.concatenate((whole.same, whole.other)), 0.999)), 60)
+            for values, colour, label in (
+                (whole.same, BLUE, "one place, two sensors"),
+                (whole.other, VERMILLION, "two places, one sensor"),
+            ):
+                left.hist(values, bins, density=True, color=colour, alpha=0.6, label=label)
+            left.legend()
+        left.set(title="distance by all three signatures (Eq. 6)", xlabel="distance", ylabel="density")
+        names = list(independent)
+        middle.barh(names, [independent[name].auc for name in names], color=BLUE)
+        middle.set(title="AUC: one place across sensors before others", xlim=(0.5, 1.0))
+        middle.invert_yaxis()
+        rows = list(recalls["all"])
+        height = 0.27
+        for offset, (k, colour) in enumerate(zip((1, 5, 20), (VERMILLION, ORANGE, BLUE), strict=True)):
+            at = np.arange(len(rows)) + (offset - 1) * height
+            right.barh(
+                at, [recalls["all"][name][k] or 0.0 for name in rows], height, color=colour, label=f"at {k}"
+            )
+        right.set(title="recall of the right place, all sensors", xlim=(0.0, 1.0))
+        right.set_yticks(np.arange(len(rows)), rows)
+        right.invert_yaxis()
+        right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=3)
+        for ax in (middle, right):
+            ax.grid(axis="x", alpha=0.3)

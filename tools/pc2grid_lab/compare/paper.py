@@ -8,16 +8,29 @@ import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from pc2grid import __version__
+from pc2grid.errors import ConfigError, MapFileError
+from pc2grid.io.atomic import replace_file
+from pc2grid_cli.console import Console, json_text, of, print_json
 from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
-
-if TYPE_CHECKING:
-    from pc2grid_cli.console import Console
-    from pc2grid_lab.experiments.paper_task import PaperCell, PaperTask
+from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES, require_packages
+from pc2grid_lab.compare import paper_report
+from pc2grid_lab.compare.paper_report import published
+from pc2grid_lab.experiments.paper_task import (
+    ABLATION,
+    OPEN_CHOICES,
+    PaperCell,
+    PaperTask,
+    known_maps,
+    load_result,
+    paper_tasks,
+    run_task,
+)
 
 _COSTS = {
     "proposed": 1.0,
@@ -82,12 +95,6 @@ def compare_paper_command(
 
     Example: pc2grid compare paper --maps maps/ --queries 200 --ablation
     """
-    from pc2grid.errors import ConfigError, MapFileError
-    from pc2grid_cli.console import of, print_json
-    from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES, require_packages
-    from pc2grid_lab.compare import paper_report
-    from pc2grid_lab.experiments.paper_task import ABLATION, OPEN_CHOICES, known_maps, paper_tasks
-
     chosen = tuple(methods or METHOD_NAMES)
     known = METHOD_NAMES + EXTRA_METHOD_NAMES
     for name in chosen:
@@ -129,8 +136,6 @@ def compare_paper_command(
 
 def run_tasks(tasks: Sequence[PaperTask], cells: Path, jobs: int, terminal: Console) -> None:
     """Run the tasks that have no result yet in `jobs` processes, and show the progress on `terminal`."""
-    from pc2grid_lab.experiments.paper_task import load_result
-
     open_tasks = [t for t in tasks if any(load_result(t, m, cells) is None for m in t.methods)]
     if not open_tasks:
         return
@@ -180,8 +185,6 @@ def _start_worker(shares: Any) -> None:
 
 
 def _run(index: int, task: PaperTask, cells: Path) -> int:
-    from pc2grid_lab.experiments.paper_task import run_task
-
     reported = 0.0
 
     def report(share: float) -> None:
@@ -195,19 +198,12 @@ def _run(index: int, task: PaperTask, cells: Path) -> int:
 
 
 def _results(tasks: Iterable[PaperTask], cells: Path) -> list[PaperCell]:
-    from pc2grid_lab.experiments.paper_task import load_result
-
     found = (load_result(task, method, cells) for task in tasks for method in task.methods)
     return [result for result in found if result is not None]
 
 
 def _write(results: Sequence[PaperCell], out: Path, queries: int, seed: int) -> dict[str, Any]:
     """results.json and results.csv; returns the JSON document."""
-    from pc2grid import __version__
-    from pc2grid.io.atomic import replace_file
-    from pc2grid_cli.console import json_text
-    from pc2grid_lab.compare.paper_report import published
-
     rows = []
     for result in results:
         paper = published(result)

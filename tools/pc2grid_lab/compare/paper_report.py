@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
-from pc2grid.io.atomic import replace_file
 from pc2grid_cli.tables import show, table
+from pc2grid_lab.compare.picture import picture
 from pc2grid_lab.experiments.paper_experiment import MatchMeasures, largest_right_share
 from pc2grid_lab.experiments.paper_tables import MAPS, SUBMAPS, TABLE_3, TABLE_4, Measures
 from pc2grid_lab.experiments.paper_task import ABLATION, OPEN_CHOICES, RADII_M, Choice, PaperCell, Reading
@@ -39,32 +40,39 @@ def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
     )
     _print_submaps(plain)
     for offset_m in dict.fromkeys(r.offset_m for r in plain):
-        here = [r for r in plain if r.offset_m == offset_m]
+        of_offset = [r for r in results if r.offset_m == offset_m]
+        here = [r for r in of_offset if not r.overrides]
         where = f"queries within {offset_m:g} m of a submap centre"
         for measure in MatchMeasures._fields:
-            title = "R@1" if measure == "r_at_1" else measure.upper()
-            shown = _table(f"Table III, {title}, {where}", columns, "noise", "method")
-            for level in range(len(_LEVELS)):
-                for i, method in enumerate(methods):
-                    row = [r for r in here if (r.method, r.level, r.radius_m) == (method, level, 8.0)]
-                    shown.add_row(str(level) if i == 0 else "", method, *_cells(row, columns, measure))
-                shown.add_section()
-            show(shown)
-        shown = _table(f"Table IV (proposed, noise level 1), {where}", columns, "radius", "measure")
-        for radius_m in RADII_M:
-            row = [r for r in here if (r.method, r.level, r.radius_m) == ("proposed", 1, radius_m)]
-            for measure in Measures._fields:
-                shown.add_row(
-                    f"{radius_m:g} m" if measure == "auc" else "",
-                    measure.upper(),
-                    *_cells(row, columns, measure),
-                )
-        show(shown)
+            show(_table_3(here, columns, methods, measure, where))
+        show(_table_4(here, columns, where))
         for line in verdicts(here):
             show(line)
-        of_offset = [r for r in results if r.offset_m == offset_m]
         _print_choices(of_offset, columns, "What each signature adds", ABLATION, where)
         _print_choices(of_offset, columns, "What other choices move", OPEN_CHOICES, where)
+
+
+def _table_3(
+    results: Sequence[PaperCell], columns: Sequence[Column], methods: Sequence[str], measure: str, where: str
+) -> Table:
+    title = "R@1" if measure == "r_at_1" else measure.upper()
+    shown = _table(f"Table III, {title}, {where}", columns, "noise", "method")
+    for level in range(len(_LEVELS)):
+        for i, method in enumerate(methods):
+            row = [r for r in results if (r.method, r.level, r.radius_m) == (method, level, 8.0)]
+            shown.add_row(str(level) if i == 0 else "", method, *_cells(row, columns, measure))
+        shown.add_section()
+    return shown
+
+
+def _table_4(results: Sequence[PaperCell], columns: Sequence[Column], where: str) -> Table:
+    shown = _table(f"Table IV (proposed, noise level 1), {where}", columns, "radius", "measure")
+    for radius_m in RADII_M:
+        row = [r for r in results if (r.method, r.level, r.radius_m) == ("proposed", 1, radius_m)]
+        for measure in Measures._fields:
+            first = f"{radius_m:g} m" if measure == "auc" else ""
+            shown.add_row(first, measure.upper(), *_cells(row, columns, measure))
+    return shown
 
 
 Column = tuple[str, Reading]
@@ -120,42 +128,28 @@ def _print_submaps(results: Sequence[PaperCell]) -> None:
 
 def verdicts(results: Sequence[PaperCell]) -> list[str]:
     """The tables in words: the differences, and the best method. Results of one offset."""
-    cells = {
-        (r.method, r.level, r.map_name): r.auc
-        for r in results
-        if r.radius_m == 8.0 and r.reading == "paper" and not r.overrides
-    }
-    lines = []
-    shares = {
-        r.map_name: r.true_share
-        for r in results
-        if (r.method, r.level, r.radius_m, r.reading, r.overrides) == ("proposed", 0, 8.0, "paper", ())
-    }
-    possible = [
-        name
-        for name in MAPS
-        if name in shares and shares[name] <= largest_right_share(TABLE_3[0]["proposed"][name].f1)
-    ]
-    lines.append(
+    here = [r for r in results if r.radius_m == 8.0 and r.reading == "paper" and not r.overrides]
+    own = {r.map_name: r for r in here if (r.method, r.level) == ("proposed", 0)}
+    paper = TABLE_3[0]["proposed"]
+    found = [name for name in MAPS if name in own]
+    possible = [name for name in found if own[name].true_share <= largest_right_share(paper[name].f1)]
+    near = [name for name in found if abs(own[name].auc - paper[name].auc) <= 0.03]
+    return [
         "proposed, without noise: R@1 is possible with the published F1, p <= F1 / (2 - F1), on"
-        f" {len(possible)} ({', '.join(possible) or 'none'})"
-    )
-    near = [
-        name
-        for name in MAPS
-        if abs(cells.get(("proposed", 0, name), -1.0) - TABLE_3[0]["proposed"][name].auc) <= 0.03
+        f" {len(possible)} ({', '.join(possible) or 'none'})",
+        f"proposed, without noise: AUC within 0.03 of the paper on {len(near)} ({', '.join(near) or 'none'})",
+        *(_leaders([r for r in here if r.level == level], _LEVELS[level]) for level in (0, 2)),
     ]
-    lines.append(
-        f"proposed, without noise: AUC within 0.03 of the paper on {len(near)} ({', '.join(near) or 'none'})"
-    )
-    for level in (0, 2):
-        leaders = {}
-        for name in MAPS:
-            here = {method: auc for (method, at, m), auc in cells.items() if (at, m) == (level, name)}
-            if here:
-                leaders[name] = max(here, key=lambda method: here[method])
-        lines.append(f"{_LEVELS[level]}, best AUC: " + ", ".join(f"{m} {who}" for m, who in leaders.items()))
-    return lines
+
+
+def _leaders(results: Sequence[PaperCell], title: str) -> str:
+    """The method with the best AUC on each map."""
+    best: dict[str, PaperCell] = {}
+    for result in results:
+        name = result.map_name
+        if name not in best or result.auc > best[name].auc:
+            best[name] = result
+    return f"{title}, best AUC: " + ", ".join(f"{m} {best[m].method}" for m in MAPS if m in best)
 
 
 def _print_choices(
@@ -175,26 +169,33 @@ def _print_choices(
     for level in (0, 2):
         here = [base[name, level] for name in maps if (name, level) in base]
         if here:
-            means = [float(np.mean(values)) for values in ([m.auc for m in here], [m.r_at_1 for m in here])]
-            cells = [f"{1000 * value:.0f}" for value in [m.auc for m in here] + means]
+            means = [np.mean([m.auc for m in here]), np.mean([m.r_at_1 for m in here])]
+            cells = [f"{1000 * value:.0f}" for value in [*(m.auc for m in here), *means]]
             shown.add_row("all three", "", "Eq. 6", str(level), *cells)
-    for choice in choices:
-        for level in (0, 2):
-            moved = {
-                r.map_name: r.matches.measures()
-                for r in results
-                if r.overrides == choice.overrides and r.level == level and (r.map_name, level) in base
-            }
-            if not moved:
-                continue
-            auc = {name: 1000 * (moved[name].auc - base[name, level].auc) for name in moved}
-            right = [1000 * (moved[name].r_at_1 - base[name, level].r_at_1) for name in moved]
-            shifts = [f"{auc[name]:+.0f}" if name in auc else "" for name in maps]
+    for choice, level in itertools.product(choices, (0, 2)):
+        chosen = [r for r in results if r.overrides == choice.overrides and r.level == level]
+        moved = _moved(chosen, base)
+        if moved:
             words = (choice.name, choice.paper, choice.ours) if level == 0 else ("", "", "")
-            shown.add_row(
-                *words, str(level), *shifts, f"{np.mean(list(auc.values())):+.0f}", f"{np.mean(right):+.0f}"
-            )
+            shifts = [f"{moved[name][0]:+.0f}" if name in moved else "" for name in maps]
+            means = [f"{mean:+.0f}" for mean in np.mean(list(moved.values()), axis=0)]
+            shown.add_row(*words, str(level), *shifts, *means)
     show(shown)
+
+
+def _moved(
+    results: Sequence[PaperCell], base: Mapping[tuple[str, int], MatchMeasures]
+) -> dict[str, tuple[float, float]]:
+    """By map, how much AUC and R@1 differ from those of the defaults, in thousandths."""
+    pairs = {
+        r.map_name: (r.matches.measures(), base[r.map_name, r.level])
+        for r in results
+        if (r.map_name, r.level) in base
+    }
+    return {
+        name: (1000 * (new.auc - old.auc), 1000 * (new.r_at_1 - old.r_at_1))
+        for name, (new, old) in pairs.items()
+    }
 
 
 def _is_base(result: PaperCell) -> bool:
@@ -208,36 +209,45 @@ def _is_base(result: PaperCell) -> bool:
 
 def draw_figures(results: Sequence[PaperCell], out: Path) -> list[Path]:
     """figure-9-OFFSET.png and figure-10-OFFSET.png: precision over recall; returns their paths."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib.figure import Figure
-
     paths = []
     plain = [r for r in results if not r.overrides and r.reading == "paper"]
     names = [name for name, _ in _columns(plain)]
     for offset_m in sorted({r.offset_m for r in plain}):
         here = [r for r in plain if r.offset_m == offset_m]
-        figure = Figure(figsize=(3.2 * len(names), 8.4), layout="constrained")
-        axes = figure.subplots(len(_LEVELS), len(names), squeeze=False, sharex=True, sharey=True)
-        for row, title in enumerate(_LEVELS):
-            for column, name in enumerate(names):
-                cell = [r for r in here if (r.level, r.map_name, r.radius_m) == (row, name, 8.0)]
-                _draw_curves(axes[row, column], [(r.method, r) for r in cell])
-                axes[row, column].set_title(f"{name}, {title}", fontsize=9)
-        paths.append(_save(figure, axes, out / f"figure-9-offset-{offset_m:g}.png"))
-        figure = Figure(figsize=(3.2 * len(names), 3.2), layout="constrained")
-        axes = figure.subplots(1, len(names), squeeze=False, sharex=True, sharey=True)
-        for column, name in enumerate(names):
-            cell = [r for r in here if (r.level, r.map_name, r.method) == (1, name, "proposed")]
-            cell.sort(key=lambda r: r.radius_m)
-            _draw_curves(axes[0, column], [(f"r = {r.radius_m:g} m", r) for r in cell])
-            axes[0, column].set_title(f"{name}, noise level 1", fontsize=9)
-        paths.append(_save(figure, axes, out / f"figure-10-offset-{offset_m:g}.png"))
+        by_level = [
+            (title, [(r.method, r) for r in here if (r.level, r.radius_m) == (level, 8.0)])
+            for level, title in enumerate(_LEVELS)
+        ]
+        of_radius = sorted(
+            (r for r in here if (r.level, r.method) == (1, "proposed")), key=lambda r: r.radius_m
+        )
+        by_radius = [("noise level 1", [(f"r = {r.radius_m:g} m", r) for r in of_radius])]
+        for number, rows in ((9, by_level), (10, by_radius)):
+            paths.append(out / f"figure-{number}-offset-{offset_m:g}.png")
+            _draw_figure(paths[-1], rows, names)
     return paths
 
 
-def _draw_curves(axis: Any, curves: Sequence[tuple[str, PaperCell]]) -> None:
+Curves = Sequence[tuple[str, PaperCell]]
+"""Results, and what they are called."""
+
+
+def _draw_figure(path: Path, rows: Sequence[tuple[str, Curves]], names: Sequence[str]) -> None:
+    """The curves of each map (columns) and title (rows)."""
+    with picture(path, 3.2 * len(names), 0.4 + 2.7 * len(rows)) as figure:
+        axes = figure.subplots(len(rows), len(names), squeeze=False, sharex=True, sharey=True)
+        for of_row, (title, curves) in zip(axes, rows, strict=True):
+            for axis, name in zip(of_row, names, strict=True):
+                _draw_curves(axis, [(label, r) for label, r in curves if r.map_name == name])
+                axis.set_title(f"{name}, {title}", fontsize=9)
+            of_row[0].set_ylabel("precision")
+        for axis in axes[-1]:
+            axis.set_xlabel("recall")
+        if axes[0, 0].lines:
+            axes[0, 0].legend(fontsize=7, loc="lower left")
+
+
+def _draw_curves(axis: Any, curves: Curves) -> None:
     for label, result in curves:
         curve = result.matches.curve()
         if len(curve.recall):
@@ -248,15 +258,3 @@ def _draw_curves(axis: Any, curves: Sequence[tuple[str, PaperCell]]) -> None:
     axis.set_xlim(0, 1.01)
     axis.set_ylim(0, 1.01)
     axis.grid(alpha=0.3)
-
-
-def _save(figure: Any, axes: Any, path: Path) -> Path:
-    for axis in axes[-1]:
-        axis.set_xlabel("recall")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("precision")
-    if axes[0, 0].lines:
-        axes[0, 0].legend(fontsize=7, loc="lower left")
-    with replace_file(path) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
-    return path

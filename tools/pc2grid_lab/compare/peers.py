@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
+from pc2grid.errors import ConfigError, LogNotFound
+from pc2grid.io.building_file import is_building_file
+from pc2grid_cli.console import json_text, of, print_json, warn
 from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
-
-if TYPE_CHECKING:
-    from pc2grid_lab.peers.environment import PeerEnvironment
-    from pc2grid_lab.peers.outcome import PeerTrial
-    from pc2grid_lab.peers.site import Site
+from pc2grid_lab.compare.peers_report import draw, print_table
+from pc2grid_lab.experiments.stored import in_processes, write_text
+from pc2grid_lab.peers.environment import PEERS, PeerEnvironment
+from pc2grid_lab.peers.experiment import run, tasks
+from pc2grid_lab.peers.outcome import OUTCOME, counted
+from pc2grid_lab.peers.site import Site, recorded_site, simulated_site, site_name
+from signature.config import Config
 
 
 def compare_peers_command(
@@ -56,32 +62,19 @@ def compare_peers_command(
 
     Example: pc2grid compare peers intel.mcap fr079.mcap hall.mcap --mapped intel=900 --mapped fr079=600
     """
-    from pc2grid.io.atomic import replace_file
-    from pc2grid_cli.console import json_text, of, print_json, warn
-    from pc2grid_lab.compare.peers_report import draw, print_table
-    from pc2grid_lab.peers.environment import PEERS
-    from pc2grid_lab.peers.experiment import run, tasks
-    from pc2grid_lab.peers.outcome import OUTCOME, counted
-
     seconds = _seconds(mapped or [], recordings)
-    where = _environment(environment, install)
+    where, terminal = _environment(environment, install), of(context)
     missing = {kind.name: command for kind in PEERS if (command := where.missing(kind)) is not None}
     for name, command in missing.items():
         warn(f"{name} is not installed: {command}")
     for folder in ("sites", "trials"):
         make_folder(out / folder)
-    sites: list[Site] = []
-    with of(context).progress("prepare") as advance:
-        for done, recording in enumerate(recordings, start=1):
-            mapped_s = seconds.get(recording.stem)
-            sites.append(_site(recording, out / "sites", queries, travel, mapped_s, of_base))
-            advance(done / len(recordings))
-    trials: list[PeerTrial] = []
-    with of(context).progress("locate") as advance:
-        doing = tasks(sites, where)
-        for done, task in enumerate(doing, start=1):
-            trials += run(task, where, out / "trials")
-            advance(done / len(doing))
+    with terminal.progress("prepare") as advance:
+        prepare = [(r, out / "sites", queries, travel, seconds.get(r.stem), of_base) for r in recordings]
+        sites = in_processes(_site, prepare, jobs=1, advance=advance)
+    with terminal.progress("locate") as advance:
+        asking = [(task, where, out / "trials") for task in tasks(sites, where)]
+        trials = [t for found in in_processes(run, asking, jobs=1, advance=advance) for t in found]
     cells = counted(trials)
     document = {
         "schema_version": 1,
@@ -91,8 +84,7 @@ def compare_peers_command(
         "cells": [asdict(cell) for cell in cells],
         "trials": [asdict(trial) for trial in trials],
     }
-    with replace_file(out / "peers.json") as draft:
-        draft.write_text(json_text(document) + "\n", encoding="utf-8")
+    write_text(out / "peers.json", json_text(document) + "\n")
     sensors = {site.name: site.sensor for site in sites}
     draw(out / "peers.png", cells, sensors)
     if as_json:
@@ -106,34 +98,18 @@ def _site(
     recording: Path, folder: Path, queries: int, travel_m: float, mapped_s: float | None, of_base: bool
 ) -> Site:
     """The building of a recording, or of a 3D scan; what was prepared from the same before is used again."""
-    from pc2grid.errors import LogNotFound
-    from pc2grid.io.building_file import is_building_file
-    from pc2grid_lab.peers.site import recorded_site, simulated_site, site_name
-    from signature.config import Config
-
     if not recording.exists():
         raise LogNotFound(f"{recording}: no such file")
     config = Config()
-    made = folder / site_name(
-        recording, config, queries=queries, travel_m=travel_m, mapped_s=mapped_s, of_base=of_base
-    )
+    asked: dict[str, Any] = {"queries": queries, "travel_m": travel_m}
+    known: dict[str, Any] = {"mapped_s": mapped_s, "of_base": of_base}
+    made = folder / site_name(recording, config, **asked, **known)
     if is_building_file(recording):
-        return simulated_site(recording, made, config, queries=queries, travel_m=travel_m)
-    return recorded_site(
-        recording,
-        made,
-        config,
-        queries=queries,
-        travel_m=travel_m,
-        mapped_s=mapped_s,
-        of_base=of_base,
-    )
+        return simulated_site(recording, made, config, **asked)
+    return recorded_site(recording, made, config, **asked, **known)
 
 
 def _environment(folder: Path | None, install: bool) -> PeerEnvironment:
-    import sys
-
-    from pc2grid_lab.peers.environment import PEERS, PeerEnvironment
 
     environment = PeerEnvironment(folder=(folder or Path(sys.prefix) / "peers").absolute())
     if install and any("pip install" in (environment.missing(kind) or "") for kind in PEERS):
@@ -143,8 +119,6 @@ def _environment(folder: Path | None, install: bool) -> PeerEnvironment:
 
 def _seconds(mapped: Sequence[str], recordings: Sequence[Path]) -> dict[str, float]:
     """The values of `--mapped`, by name. Raises ConfigError."""
-    from pc2grid.errors import ConfigError
-
     names, seconds = [recording.stem for recording in recordings], {}
     if len(set(names)) != len(names):
         raise ConfigError(f"two recordings share a name: {', '.join(names)}", hint="rename one of the files")

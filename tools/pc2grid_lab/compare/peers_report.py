@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-if TYPE_CHECKING:
-    from pc2grid_lab.peers.outcome import PeerCell
+from pc2grid_cli.picture import BLUE, GREEN, VERMILLION
+from pc2grid_cli.tables import show, table
+from pc2grid_lab.compare.picture import picture
+from pc2grid_lab.peers.environment import PEERS
+from pc2grid_lab.peers.outcome import PeerCell
 
 
 def print_table(cells: Sequence[PeerCell], sensors: Mapping[str, str], missing: Mapping[str, str]) -> None:
     """Print a row for each building and program. sensors : of each building."""
-    from pc2grid_cli.tables import show, table
-    from pc2grid_lab.peers.environment import PEERS
-
     title = "later parts of recordings in a map of an earlier part; of the queries that the map covers:"
     figures = ("covered", "right", "5-95 %", "wrong", "none", "uncovered\nwrong", "elsewhere\nwrong")
     shown = table(title, ("building", "program"), (*figures, "off by", "CPU", "CPU\nelsewhere", "memory"))
@@ -55,49 +55,32 @@ def draw(path: Path, cells: Sequence[PeerCell], sensors: Mapping[str, str]) -> N
     In the building, queries that the map does not cover are rightly left without an answer, as those
     elsewhere are.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from pc2grid.io.atomic import replace_file
-    from pc2grid_cli.picture import BLUE, GREEN, VERMILLION
-    from pc2grid_lab.peers.environment import PEERS
-
-    titles = {kind.name: kind.title for kind in PEERS}
     order = [cell for site in sensors for cell in cells if cell.site == site]
-    figure, (inside, outside) = plt.subplots(
-        1,
-        2,
-        figsize=(9.0, 0.9 + 0.3 * max(len(order), 1)),
-        sharey=True,
-        constrained_layout=True,
-        width_ratios=(3, 2),
-    )
-    for y, cell in enumerate(order):
-        rest, elsewhere = cell.covered - cell.right - cell.wrong, cell.uncovered + cell.elsewhere
-        wrong = cell.uncovered_wrong + cell.elsewhere_wrong
-        for axes, total, parts in (
-            (inside, cell.covered, ((cell.right, GREEN), (rest, "0.85"), (cell.wrong, VERMILLION))),
-            (outside, elsewhere, ((elsewhere - wrong, BLUE), (wrong, VERMILLION))),
-        ):
-            left = 0.0
-            for count, colour in parts:
-                share = count / max(total, 1)
-                axes.barh(y, share, left=left, color=colour, height=0.75)
-                if count:
-                    axes.text(left + share / 2, y, str(count), ha="center", va="center", fontsize=7)
-                left += share
-    names = [f"{cell.site}: {titles[cell.peer]}" for cell in order]
-    inside.set_yticks(range(len(order)), names, fontsize=8)
-    if order:
-        inside.invert_yaxis()
-    inside.set_title("covered by the map: right, none, wrong", fontsize=9)
-    outside.set_title("not in the map: refused, wrong", fontsize=9)
-    for axes in (inside, outside):
-        axes.set(xlim=(0, 1))
-        axes.tick_params(labelsize=7, axis="x")
-        axes.set_xlabel("share of the queries", fontsize=8)
-    with replace_file(path) as draft:
-        figure.savefig(draft, format="png", dpi=110)
-    plt.close(figure)
+    with picture(path, 9.0, 0.9 + 0.3 * max(len(order), 1)) as figure:
+        inside, outside = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
+        for y, cell in enumerate(order):
+            rest, elsewhere = cell.covered - cell.right - cell.wrong, cell.uncovered + cell.elsewhere
+            wrong = cell.uncovered_wrong + cell.elsewhere_wrong
+            _draw_bar(inside, y, ((cell.right, GREEN), (rest, "0.85"), (cell.wrong, VERMILLION)))
+            _draw_bar(outside, y, ((elsewhere - wrong, BLUE), (wrong, VERMILLION)))
+        titles = {kind.name: kind.title for kind in PEERS}
+        names = [f"{cell.site}: {titles[cell.peer]}" for cell in order]
+        inside.set_yticks(range(len(order)), names, fontsize=8)
+        if order:
+            inside.invert_yaxis()
+        inside.set_title("covered by the map: right, none, wrong", fontsize=9)
+        outside.set_title("not in the map: refused, wrong", fontsize=9)
+        for axes in (inside, outside):
+            axes.set(xlim=(0, 1))
+            axes.tick_params(labelsize=7, axis="x")
+            axes.set_xlabel("share of the queries", fontsize=8)
+
+
+def _draw_bar(axes: Any, y: int, parts: Sequence[tuple[int, str]]) -> None:
+    """Counts and their colours, as shares of their sum."""
+    left, total = 0.0, max(sum(count for count, _ in parts), 1)
+    for count, colour in parts:
+        axes.barh(y, count / total, left=left, color=colour, height=0.75)
+        if count:
+            axes.text(left + count / total / 2, y, str(count), ha="center", va="center", fontsize=7)
+        left += count / total

@@ -5,31 +5,43 @@ The scan is driven through, and is a map itself.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import numpy as np
 import typer
 
+from pc2grid.errors import LogNotFound, MapFileError
+from pc2grid.geometry import SE2, invert_pose
+from pc2grid.io import open_log
+from pc2grid.io.trajectory import read_tum
+from pc2grid.mapping.drawn_map import load_drawn_map
+from pc2grid.model import Health, SensorKind, Trajectory
+from pc2grid.pipeline import build_map
+from pc2grid.simulate import Building, load_building
+from pc2grid.time_span import TimeSpan
+from pc2grid_cli.console import Console, json_text, of, print_json
 from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
+from pc2grid_lab.compare.real_report import draw, print_table
+from pc2grid_lab.experiments.answers import localize
+from pc2grid_lab.experiments.plan_drives import MAP_SEED
+from pc2grid_lab.experiments.real_sensors import Agreement, RealQuery, judge_all, real_cells
+from pc2grid_lab.experiments.registered_session import RegisteredSession, register
+from pc2grid_lab.experiments.replay import Replay
+from pc2grid_lab.experiments.sensor_map import MapKind, SensorMap, is_saved, save_map
+from pc2grid_lab.experiments.sensor_matrix import map_building, query_start
+from pc2grid_lab.experiments.stored import in_processes, write_text
+from pc2grid_lab.experiments.trial import Trial
+from pc2grid_lab.worlds import WorldConfig, iter_session
+from signature.config import Config
+from signature.database import open_database
+from signature.sessions import session_of_map
 
-if TYPE_CHECKING:
-    from pc2grid.model import SensorKind, Trajectory
-    from pc2grid.simulate import Building
-    from pc2grid_lab.experiments.real_sensors import RealQuery
-    from pc2grid_lab.experiments.replay import Replay
-    from pc2grid_lab.experiments.sensor_map import MapKind, SensorMap
-    from pc2grid_lab.worlds import WorldConfig
-
-MAP_SEED = 1000
-"""Map sessions and query sessions never share a seed: other clutter, start, direction and noise."""
 _DRIVEN: tuple[SensorKind, ...] = ("lidar", "depth")
 _SCAN = "scan"  # the map that the 3D scan is, without a drive
 _LOG, _EARLIER = "laser", "laser-earlier"  # maps of the whole log and of its first part
@@ -45,11 +57,14 @@ class Setting:
     truth: Path | None
     out: Path
     map_length_m: float
+    queries: int
     query_s: float
     window_s: float
+    every_s: float
     earlier: float
     rate_hz: float
     clutter: int
+    seed: int
 
     def map_file(self, name: str) -> Path:
         """Of the map by a driven sensor, or of the log."""
@@ -58,9 +73,8 @@ class Setting:
         elif name == _SCAN:
             made = f"{self.floor.stem}.{name}"
         else:
-            made = f"{self.log.stem}.{name}.{self._judged_by}" + (
-                f".{self.earlier:g}" if name == _EARLIER else ""
-            )
+            share = f".{self.earlier:g}" if name == _EARLIER else ""
+            made = f"{self.log.stem}.{name}.{self._judged_by}{share}"
         return self.out / "maps" / f"{made}.submaps"
 
     def session_file(self, sensor: str, seed: int) -> Path:
@@ -80,8 +94,6 @@ class Setting:
         self, length_m: float, seed: int, start_m: tuple[float, float] | None = None
     ) -> WorldConfig:
         """Of one drive through the scan."""
-        from pc2grid_lab.worlds import WorldConfig
-
         return WorldConfig.model_validate(
             {
                 "length_m": length_m,
@@ -135,18 +147,6 @@ def compare_real_command(
 
     Example: pc2grid compare real fr079_floor.ply fr079.mcap --output real-sensors
     """
-    from pc2grid.errors import LogNotFound, MapFileError
-    from pc2grid.io import open_log
-    from pc2grid.io.atomic import replace_file
-    from pc2grid_cli.console import json_text, of, print_json
-    from pc2grid_lab.compare.real_report import draw, print_table
-    from pc2grid_lab.experiments.real_sensors import Agreement, judge_all, real_cells
-    from signature.config import Config
-
-    if not floor.is_file():
-        raise MapFileError(f"{floor}: no such file", hint="give a 3D scan of the floor")
-    if not log.exists():
-        raise LogNotFound(f"{log}: no such file")
     if quick:
         queries, every, map_length = max(queries // 3, 1), 3 * every, map_length / 2
     setting = Setting(
@@ -155,85 +155,85 @@ def compare_real_command(
         truth=truth,
         out=out,
         map_length_m=map_length,
+        queries=queries,
         query_s=query_time,
         window_s=window,
+        every_s=every,
         earlier=earlier,
         rate_hz=rate,
         clutter=clutter,
+        seed=seed,
     )
+    _compare(setting, of(context), jobs, as_json)
+
+
+def _compare(setting: Setting, terminal: Console, jobs: int | None, as_json: bool) -> None:
+    if not setting.floor.is_file():
+        raise MapFileError(f"{setting.floor}: no such file", hint="give a 3D scan of the floor")
+    if not setting.log.exists():
+        raise LogNotFound(f"{setting.log}: no such file")
+    out = setting.out
     for folder in ("maps", "sessions"):
         make_folder(out / folder)
-    with open_log(log, Config().read) as opened:
-        length_s = (opened.info.end_ns - opened.info.start_ns) * 1e-9
-    starts_s = [round(k * every) for k in range(int(max(length_s - window, 0.0) // every) + 1)]
-    asking = [("laser", start_s) for start_s in starts_s]
-    asking += [(sensor, seed + k) for k in range(queries) for sensor in _DRIVEN]
-    with ProcessPoolExecutor(jobs or os.cpu_count(), mp_context=multiprocessing.get_context("spawn")) as pool:
-
-        def run(what: str, function: Callable[..., Any], tasks: Iterable[tuple[Any, ...]]) -> list[Any]:
-            with of(context).progress(what) as advance:
-                return _all(pool, function, list(tasks), advance)
-
+    asking = _asking(setting)
+    for what, function, tasks in (
         # The camera takes longest to map and the log's parts wait for its poses, so these come first.
-        run("map", _make_map, [(setting, name) for name in ("depth", _LOG, "lidar", _SCAN)])
-        run("drive", _register, [(setting, *task) for task in asking])
-        asked = run("locate", _locate, [(setting, *task) for task in asking])
+        ("map", _make_map, [(setting, name) for name in ("depth", _LOG, "lidar", _SCAN)]),
+        ("drive", _register, [(setting, *task) for task in asking]),
+        ("locate", _locate, [(setting, *task) for task in asking]),
+    ):
+        with terminal.progress(what) as advance:
+            asked = in_processes(function, tasks, jobs=jobs, advance=advance)
     found: list[RealQuery] = [query for query in asked if query is not None]
     maps = {name: _map(setting, name) for name in _MAPS}
     agreement = Agreement.of(found, maps)
     trials = judge_all(found, maps, agreement)
-    cells = real_cells(trials)
+    document = _document(setting, agreement, trials)
+    write_text(out / "real.json", json_text(document) + "\n")
+    draw(out / "real.png", found, maps, agreement, real_cells(trials), trials)
+    if as_json:
+        print_json(document)
+        return
+    print_table(real_cells(trials), agreement)
+    print("\n".join(str(out / name) for name in ("real.json", "real.png")))
+
+
+def _asking(setting: Setting) -> list[tuple[str, int]]:
+    """Sensor and seed of each query; of the laser, the first second of its window of the log."""
+    with open_log(setting.log, Config().read) as opened:
+        length_s = (opened.info.end_ns - opened.info.start_ns) * 1e-9
+    windows = int(max(length_s - setting.window_s, 0.0) // setting.every_s) + 1
+    asking = [("laser", round(k * setting.every_s)) for k in range(windows)]
+    return asking + [(sensor, setting.seed + k) for k in range(setting.queries) for sensor in _DRIVEN]
+
+
+def _document(setting: Setting, agreement: Agreement, trials: Sequence[Trial]) -> dict[str, Any]:
     transform = agreement.T_floor_log
-    document = {
+    return {
         "schema_version": 1,
-        "floor": floor.name,
-        "log": log.name,
+        "floor": setting.floor.name,
+        "log": setting.log.name,
         "T_floor_log": None if transform is None else [transform.x, transform.y, transform.yaw],
         "agreeing": agreement.agreeing,
         "across": len(agreement.clues),
         "setting": {
-            "map_length": map_length,
-            "queries": queries,
-            "query_time": query_time,
-            "window": window,
-            "every": every,
-            "earlier": earlier,
-            "clutter": clutter,
-            "rate": rate,
-            "seed": seed,
+            "map_length": setting.map_length_m,
+            "queries": setting.queries,
+            "query_time": setting.query_s,
+            "window": setting.window_s,
+            "every": setting.every_s,
+            "earlier": setting.earlier,
+            "clutter": setting.clutter,
+            "rate": setting.rate_hz,
+            "seed": setting.seed,
         },
-        "cells": [asdict(cell) for cell in cells],
+        "cells": [asdict(cell) for cell in real_cells(trials)],
         "trials": [asdict(trial) for trial in trials],
     }
-    with replace_file(out / "real.json") as draft:
-        draft.write_text(json_text(document) + "\n", encoding="utf-8")
-    draw(out / "real.png", found, maps, agreement, cells, trials)
-    if as_json:
-        print_json(document)
-        return
-    print_table(cells, agreement)
-    print("\n".join(str(out / name) for name in ("real.json", "real.png")))
-
-
-def _all(
-    pool: Executor,
-    function: Callable[..., Any],
-    tasks: list[tuple[Any, ...]],
-    advance: Callable[[float], None],
-) -> list[Any]:
-    """The results of all tasks, in their order."""
-    waiting = [pool.submit(function, *task) for task in tasks]
-    for done, future in enumerate(as_completed(waiting), start=1):
-        future.result()
-        advance(done / len(waiting))
-    return [future.result() for future in waiting]
 
 
 @cache
 def _building(floor: Path) -> Building:
-    from pc2grid.errors import MapFileError
-    from pc2grid.simulate import Building, load_building
-
     building = load_building(floor)
     if not isinstance(building, Building):
         raise MapFileError(f"{floor}: a plan, not a 3D scan", hint="use `pc2grid compare sensors` for plans")
@@ -242,10 +242,6 @@ def _building(floor: Path) -> Building:
 
 def _make_map(setting: Setting, name: str) -> None:
     """Make the map of a driven sensor, of the scan, or those of the log, unless they exist."""
-    from pc2grid_lab.experiments.sensor_map import is_saved, save_map
-    from pc2grid_lab.experiments.sensor_matrix import map_building
-    from signature.config import Config
-
     if name == _LOG:
         _map_log(setting)
         return
@@ -263,12 +259,6 @@ def _make_map(setting: Setting, name: str) -> None:
 
 def _map_scan(floor: Path, target: Path) -> None:
     """The 3D scan as `pc2grid convert` makes a map of it, in the frame that is driven in."""
-    from pc2grid.geometry import SE2, invert_pose
-    from pc2grid.mapping.drawn_map import load_drawn_map
-    from pc2grid_lab.experiments.sensor_map import save_map
-    from signature.config import Config
-    from signature.sessions import session_of_map
-
     config = Config()
     drawn = load_drawn_map(floor, config)
     T_floor_map = SE2.from_matrix(_building(floor).T_map_file @ invert_pose(drawn.T_map_file))
@@ -277,12 +267,6 @@ def _map_scan(floor: Path, target: Path) -> None:
 
 def _map_log(setting: Setting) -> None:
     """Map the whole log and its first part."""
-    from pc2grid.io import open_log
-    from pc2grid.pipeline import build_map
-    from pc2grid.time_span import TimeSpan
-    from pc2grid_lab.experiments.sensor_map import is_saved, save_map
-    from signature.config import Config
-
     config = Config()
     whole, part = setting.map_file(_LOG), setting.map_file(_EARLIER)
     with open_log(setting.log, config.read) as log:
@@ -297,11 +281,6 @@ def _map_log(setting: Setting) -> None:
 
 def _replay(setting: Setting, log: Any, whole: Trajectory | None = None) -> Replay:
     """The log with its true poses: those given, or of its map. whole : the trajectory of that map."""
-    from pc2grid.io.trajectory import read_tum
-    from pc2grid_lab.experiments.replay import Replay
-    from signature.config import Config
-    from signature.database import open_database
-
     if setting.truth is not None:
         return Replay(log, read_tum(setting.truth), Config())
     if whole is None:
@@ -312,9 +291,6 @@ def _replay(setting: Setting, log: Any, whole: Trajectory | None = None) -> Repl
 
 def _without_lost(trajectory: Trajectory) -> Trajectory:
     """The poses that are known."""
-    import numpy as np
-
-    from pc2grid.model import Health, Trajectory
 
     if not trajectory.health:
         return trajectory
@@ -324,13 +300,6 @@ def _without_lost(trajectory: Trajectory) -> Trajectory:
 
 def _register(setting: Setting, sensor: SensorKind, seed: int) -> None:
     """Drive and register one query session, or a window of the log, unless it was done before."""
-    from pc2grid.io import open_log
-    from pc2grid.time_span import TimeSpan
-    from pc2grid_lab.experiments.registered_session import register
-    from pc2grid_lab.experiments.sensor_matrix import query_start
-    from pc2grid_lab.worlds import iter_session
-    from signature.config import Config
-
     target, config = setting.session_file(sensor, seed), Config()
     if target.exists():
         return
@@ -349,21 +318,13 @@ def _register(setting: Setting, sensor: SensorKind, seed: int) -> None:
 
 @cache
 def _map(setting: Setting, name: str) -> SensorMap:
-    from pc2grid_lab.experiments.sensor_map import load_map
-    from signature.config import Config
-
     kinds: dict[str, MapKind] = {"lidar": "lidar", "depth": "depth", _SCAN: "scan"}
     kind = kinds.get(name, "laser")
-    return load_map(setting.map_file(name), name="floor", sensor=kind, config=Config())
+    return SensorMap.load(setting.map_file(name), name="floor", sensor=kind, config=Config())
 
 
 def _locate(setting: Setting, sensor: SensorKind, seed: int) -> RealQuery | None:
     """Locate one query session in every map but those made of the same scans; None without a true pose."""
-    import numpy as np
-
-    from pc2grid_lab.experiments.answers import localize
-    from pc2grid_lab.experiments.real_sensors import RealQuery
-    from pc2grid_lab.experiments.registered_session import RegisteredSession
 
     session = RegisteredSession.load(setting.session_file(sensor, seed))
     if session.lost.all() or np.isnan(session.T_world_base[:, 0]).all():
@@ -388,7 +349,5 @@ def _locate(setting: Setting, sensor: SensorKind, seed: int) -> RealQuery | None
 @cache
 def _last_stamp_ns(setting: Setting) -> int:
     """Stamp of the last scan of the log's first part."""
-    from signature.database import open_database
-
     with open_database(setting.map_file(_EARLIER)) as database:
         return int(database.trajectory(_LOG).stamps_ns[-1])

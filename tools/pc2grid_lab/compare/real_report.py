@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from pc2grid_lab.experiments.real_sensors import Agreement, RealCell, RealQuery
-    from pc2grid_lab.experiments.sensor_map import SensorMap
-    from pc2grid_lab.experiments.trial import Trial
+import numpy as np
+
+from pc2grid.arrays import F64
+from pc2grid.geometry import SE2
+from pc2grid.model import SensorKind
+from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
+from pc2grid_cli.tables import show, table
+from pc2grid_lab.compare.picture import picture
+from pc2grid_lab.experiments.real_sensors import Agreement, RealCell, RealQuery
+from pc2grid_lab.experiments.sensor_map import SensorMap
+from pc2grid_lab.experiments.trial import Trial
+from signature.localization.answer import Answer
 
 _SENSORS = ("lidar", "depth", "laser")
 _MAPS = (*_SENSORS, "scan")
+_COLOURS = dict(zip(_SENSORS, (BLUE, ORANGE, VERMILLION), strict=True))
 _SHOWN = {"lidar": "lidar", "depth": "depth camera", "laser": "2D laser"}
 _TITLES = {**{name: f"map by {shown}" for name, shown in _SHOWN.items()}, "scan": "the 3D scan as map"}
 _SIZES = {"lidar": 9.0, "depth": 5.5, "laser": 7.0}  # lidar and camera drive the same ways
@@ -21,8 +31,6 @@ _DRAWN_AT_MOST = 30_000  # wall points of a map; more would only make the pictur
 
 def print_table(cells: Sequence[RealCell], agreement: Agreement) -> None:
     """Print a row for each pair of sensors."""
-    from pc2grid_cli.tables import show, table
-
     title = "one real floor, maps by each sensor, queries by each"
     counts = ("queries", "located, right", "right first", "in the map", "share right")
     others = ("wrong", "ambiguous", "not found", "median", "95 %", "wrong outside")
@@ -77,72 +85,63 @@ def draw(
     An arrow is an answer. A mark without one is the true place of a query that got none: filled if the right
     place came first, open if not.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    import numpy as np
-
-    from pc2grid.geometry import SE2
-    from pc2grid.io.atomic import replace_file
-    from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
-
-    colours = dict(zip(_SENSORS, (BLUE, ORANGE, VERMILLION), strict=True))
     T_floor_log = agreement.T_floor_log or SE2()
     frames = {name: T_floor_log if m.sensor == "laser" else SE2() for name, m in maps.items()}
     first = {(t.map_sensor, t.query_sensor, t.seed) for t in trials if t.right}
-    shares = {(c.map_sensor, c.query_sensor): c for c in cells}
-    walls_m = {}
-    for name, sensor_map in maps.items():
-        grid = sensor_map.index.grids[0]
-        points = grid.to_point(np.argwhere(grid.occupied))
-        walls_m[name] = (frames[name] @ sensor_map.T_plan_map).apply(
-            points[:: len(points) // _DRAWN_AT_MOST + 1]
-        )
+    walls_m = {name: _walls_m(sensor_map, frames[name]) for name, sensor_map in maps.items()}
     everything = np.concatenate(list(walls_m.values()))
     (x0, y0), (x1, y1) = everything.min(axis=0), everything.max(axis=0)
     height = min(max(9.0 * (y1 - y0) / (x1 - x0), 2.0), 9.0) + 0.45
-    figure, axes = plt.subplots(
-        len(_MAPS), 1, figsize=(9.0, height * len(_MAPS)), constrained_layout=True, sharex=True
-    )
-    for ax, name in zip(axes, _MAPS, strict=True):
-        ax.plot(*walls_m[name].T, ".", color="0.35", ms=1.0, mew=0)
-        for query in queries:
-            asked = "laser-earlier" if name == query.sensor == "laser" else name
-            answer = query.answers.get(asked)
-            if answer is None:
-                continue
-            colour = colours[query.sensor]
-            if answer.T_map_base is not None:
-                found = frames[asked] @ maps[asked].T_plan_map @ answer.T_map_base
-                _arrow(ax, found, colour, size=_SIZES[query.sensor])
-            else:
-                true = T_floor_log @ query.T_frame_base if query.sensor == "laser" else query.T_frame_base
-                inside = colour if (name, query.sensor, query.seed) in first else "none"
-                ax.plot(true.x, true.y, "o", mfc=inside, mec=colour, mew=1.2, ms=5)
-        texts = [
-            f"{_SHOWN[q]} {c.located_right} of {c.queries}"
-            + (f", {c.wrong + c.wrong_outside} wrong" if c.wrong + c.wrong_outside else "")
-            for q in _SENSORS
-            if (c := shares.get((name, q))) is not None
-        ]
-        ax.set_title(f"{_TITLES[name]}; located and right: " + "; ".join(texts), fontsize=9)
-        ax.set(xlim=(x0 - 0.5, x1 + 0.5), ylim=(y0 - 0.5, y1 + 0.5), aspect="equal")
-        ax.tick_params(labelsize=7)
-    for sensor in _SENSORS:
-        axes[0].plot([], [], ">", color=colours[sensor], label=f"{_SHOWN[sensor]}, located")
-    axes[0].plot([], [], "o", color="0.3", label="no answer, right place first")
-    axes[0].plot([], [], "o", mfc="none", mec="0.3", label="no answer")
-    axes[0].legend(loc="lower center", bbox_to_anchor=(0.5, 1.1), fontsize=7, ncols=5)
-    axes[-1].set_xlabel("metres, frame of the 3D scan", fontsize=8)
-    with replace_file(path) as draft:
-        figure.savefig(draft, format="png", dpi=110)
-    plt.close(figure)
+    with picture(path, 9.0, height * len(_MAPS)) as figure:
+        axes = figure.subplots(len(_MAPS), 1, sharex=True)
+        for ax, name in zip(axes, _MAPS, strict=True):
+            ax.plot(*walls_m[name].T, ".", color="0.35", ms=1.0, mew=0)
+            for query in queries:
+                asked = "laser-earlier" if name == query.sensor == "laser" else name
+                if asked in query.answers:
+                    true = T_floor_log @ query.T_frame_base if query.sensor == "laser" else query.T_frame_base
+                    T_floor_map = frames[asked] @ maps[asked].T_plan_map
+                    is_first = (name, query.sensor, query.seed) in first
+                    _draw_answer(ax, query.sensor, query.answers[asked], T_floor_map, true, is_first)
+            ax.set_title(f"{_TITLES[name]}; located and right: {_counts(name, cells)}", fontsize=9)
+            ax.set(xlim=(x0 - 0.5, x1 + 0.5), ylim=(y0 - 0.5, y1 + 0.5), aspect="equal")
+            ax.tick_params(labelsize=7)
+        for sensor in _SENSORS:
+            axes[0].plot([], [], ">", color=_COLOURS[sensor], label=f"{_SHOWN[sensor]}, located")
+        axes[0].plot([], [], "o", color="0.3", label="no answer, right place first")
+        axes[0].plot([], [], "o", mfc="none", mec="0.3", label="no answer")
+        axes[0].legend(loc="lower center", bbox_to_anchor=(0.5, 1.1), fontsize=7, ncols=5)
+        axes[-1].set_xlabel("metres, frame of the 3D scan", fontsize=8)
+
+
+def _walls_m(sensor_map: SensorMap, T_floor_plan: SE2) -> F64:
+    """Points (N, 2) of the walls of a map, in the frame of the scan."""
+    grid = sensor_map.index.grids[0]
+    points = grid.to_point(np.argwhere(grid.occupied))
+    return (T_floor_plan @ sensor_map.T_plan_map).apply(points[:: len(points) // _DRAWN_AT_MOST + 1])
+
+
+def _counts(map_sensor: str, cells: Sequence[RealCell]) -> str:
+    """What became of the queries of each sensor in a map."""
+    texts = []
+    for cell in (c for c in _in_order(cells) if c.map_sensor == map_sensor):
+        wrong = cell.wrong + cell.wrong_outside
+        counts = f"{_SHOWN[cell.query_sensor]} {cell.located_right} of {cell.queries}"
+        texts.append(f"{counts}, {wrong} wrong" if wrong else counts)
+    return "; ".join(texts)
+
+
+def _draw_answer(
+    ax: Any, sensor: SensorKind, answer: Answer, T_floor_map: SE2, true: SE2, is_first: bool
+) -> None:
+    colour = _COLOURS[sensor]
+    if answer.T_map_base is not None:
+        _arrow(ax, T_floor_map @ answer.T_map_base, colour, size=_SIZES[sensor])
+    else:
+        ax.plot(true.x, true.y, "o", mfc=colour if is_first else "none", mec=colour, mew=1.2, ms=5)
 
 
 def _arrow(ax: Any, pose: Any, colour: str, *, size: float) -> None:
-    import math
-
     ax.plot(pose.x, pose.y, "o", color=colour, ms=size, mec="white", mew=0.6, zorder=20 - size)
     ax.annotate(
         "",

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from pc2grid.errors import ConfigError
 from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
-
-if TYPE_CHECKING:
-    from pc2grid_lab.experiments.recordings.rows import Table
+from pc2grid_lab.experiments.recordings.catalogue import Catalogue
+from pc2grid_lab.experiments.recordings.changes import changes
+from pc2grid_lab.experiments.recordings.judging import judged_table
+from pc2grid_lab.experiments.recordings.page import change_lines, page
+from pc2grid_lab.experiments.recordings.program import commit, digest
+from pc2grid_lab.experiments.recordings.rows import Table
+from pc2grid_lab.experiments.recordings.run import Folder, run_all
+from pc2grid_lab.experiments.stored import write_text
 
 
 def compare_recordings_command(
@@ -47,20 +54,7 @@ def compare_recordings_command(
 
     Example: pc2grid compare recordings data --output real-recordings --quick
     """
-    from pc2grid.errors import ConfigError
-    from pc2grid.io.atomic import replace_file
-    from pc2grid_lab.experiments.recordings.catalogue import Catalogue
-    from pc2grid_lab.experiments.recordings.changes import changes
-    from pc2grid_lab.experiments.recordings.judging import judged_table
-    from pc2grid_lab.experiments.recordings.page import change_lines, page
-    from pc2grid_lab.experiments.recordings.program import commit, digest
-    from pc2grid_lab.experiments.recordings.run import Folder, run_all
-
-    if not data.is_dir():
-        raise ConfigError(f"{data}: no such folder", hint="give the folder of recordings")
-    catalogue = Catalogue.of(only=only, quick=quick)
-    if not catalogue.mapped and not catalogue.pairs:
-        raise ConfigError(f"--only {only}: no recording, building, sensor or kind is named so")
+    catalogue = _catalogue(data, only, quick)
     work = out / "work" / digest()
     make_folder(work)
     _remove_others(work)
@@ -74,9 +68,8 @@ def compare_recordings_command(
     before = _read(kept)
     changed = [] if before is None else changes(before, found)
     if only is None and not quick:
-        for file, text in ((kept, found.to_text()), (kept.with_suffix(".md"), page(found, changed))):
-            with replace_file(file) as draft:
-                draft.write_text(text, encoding="utf-8")
+        write_text(kept, found.to_text())
+        write_text(kept.with_suffix(".md"), page(found, changed))
     if as_json:
         console.print_json({**found.to_json(), "changes": [asdict(change) for change in changed]})
         return
@@ -87,12 +80,18 @@ def compare_recordings_command(
         print(f"changed since {before.commit} ({kept}):", *(change_lines(changed) or ["- nothing"]), sep="\n")
 
 
+def _catalogue(data: Path, only: str | None, quick: bool) -> Catalogue:
+    """What is run. Raises ConfigError if there is nothing."""
+    if not data.is_dir():
+        raise ConfigError(f"{data}: no such folder", hint="give the folder of recordings")
+    catalogue = Catalogue.of(only=only, quick=quick)
+    if not catalogue.mapped and not catalogue.pairs:
+        raise ConfigError(f"--only {only}: no recording, building, sensor or kind is named so")
+    return catalogue
+
+
 def _read(file: Path) -> Table | None:
     """The table of an earlier run; None if there is none. Raises ConfigError if it cannot be read."""
-    import json
-
-    from pc2grid.errors import ConfigError
-    from pc2grid_lab.experiments.recordings.rows import Table
 
     if not file.exists():
         return None

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
 from pc2grid_cli.tables import show, table
+from pc2grid_lab.compare.picture import picture
 
 _SCOPES = ("building", "city")
+_COLOURS = (VERMILLION, ORANGE, BLUE)
+"""By metres driven."""
 
 
 def _interval(values: Sequence[float] | None) -> str:
@@ -24,32 +31,8 @@ def _cells(document: Mapping[str, Any]) -> dict[tuple[str, str, float], Mapping[
 
 def print_table(document: Mapping[str, Any], selectors: Sequence[str]) -> None:
     """Print, for building and city, how often the right place is selected and the query located rightly."""
-    cells = _cells(document)
-    travels_m = sorted({travel_m for _, _, travel_m in cells})
     for scope in _SCOPES:
-        rows = [row for row in document["rows"] if row["scope"] == scope]
-        if not rows:
-            continue
-        some = rows[0]
-        title = (
-            f"{scope}: {some['places']} places, {some['queries']} queries of {some['sessions']} sessions"
-            " (below: 5 % to 95 %, by session); processor time without alignment"
-        )
-        figures = [f"{what}\n{travel_m:g} m" for what in ("selected", "right") for travel_m in travels_m]
-        shown = table(title, ["selected by"], ["places", *figures, "ms"])
-        for selector in selectors:
-            row = [cells.get((scope, selector, travel_m)) for travel_m in travels_m]
-            if not any(row):
-                continue
-            last = next(cell for cell in reversed(row) if cell)
-            shown.add_row(
-                selector,
-                str(last["looked_at"]),
-                *(_interval(cell["found"]) if cell else "" for cell in row),
-                *(_interval(cell["right"]) if cell else "" for cell in row),
-                f"{last['processor_ms']:.0f}" if last["right"] is not None else "",
-            )
-        show(shown)
+        _print_scope(scope, document, selectors)
     _print_scale(document["scale"])
     title = "one place by two sensors against two places by one: area under the curve"
     one = table(title, ["signatures"], ["AUC", "5 % to 95 %", "pairs"])
@@ -61,6 +44,28 @@ def print_table(document: Mapping[str, Any], selectors: Sequence[str]) -> None:
             f"{measured['same']:,} / {measured['other']:,}",
         )
     show(one)
+
+
+def _print_scope(scope: str, document: Mapping[str, Any], selectors: Sequence[str]) -> None:
+    some = next((row for row in document["rows"] if row["scope"] == scope), None)
+    if some is None:
+        return
+    title = (
+        f"{scope}: {some['places']} places, {some['queries']} queries of {some['sessions']} sessions"
+        " (below: 5 % to 95 %, by session); processor time without alignment"
+    )
+    cells = _cells(document)
+    travels_m = sorted({travel_m for _, _, travel_m in cells})
+    figures = [f"{what}\n{travel_m:g} m" for what in ("selected", "right") for travel_m in travels_m]
+    shown = table(title, ["selected by"], ["places", *figures, "ms"])
+    for selector in selectors:
+        row = [cells.get((scope, selector, travel_m), {}) for travel_m in travels_m]
+        last = next(filter(None, reversed(row)), None)
+        if last is not None:
+            shares = [_interval(cell.get(what)) for what in ("found", "right") for cell in row]
+            time = f"{last['processor_ms']:.0f}" if last["right"] is not None else ""
+            shown.add_row(selector, str(last["looked_at"]), *shares, time)
+    show(shown)
 
 
 def _print_scale(rows: Sequence[Mapping[str, Any]]) -> None:
@@ -88,84 +93,72 @@ def _print_scale(rows: Sequence[Mapping[str, Any]]) -> None:
 def draw(path: Path, document: Mapping[str, Any], selectors: Sequence[str]) -> None:
     """One picture: share of the queries whose place is selected, that are located rightly, and whose place is
     selected among very many; what was not measured is left out."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    import numpy as np
-
-    from pc2grid.io.atomic import replace_file
-    from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
-
-    cells = _cells(document)
-    travels_m = sorted({travel_m for _, _, travel_m in cells})
     panels = [("building", "found"), ("city", "found")]
     if any(row["right"] for row in document["rows"]):
         panels.append(("city", "right"))
     columns = len(panels) + bool(document["scale"])
-    figure, axes = plt.subplots(1, columns, figsize=(5 * columns, 4.6), constrained_layout=True)
-    for ax, (scope, what) in zip(axes, panels, strict=False):
-        named = [s for s in selectors if any(cells.get((scope, s, t), {}).get(what) for t in travels_m)]
-        at, height = np.arange(len(named)), 0.8 / max(len(travels_m), 1)
-        for number, (travel_m, colour) in enumerate(zip(travels_m, (VERMILLION, ORANGE, BLUE), strict=False)):
-            values = [cells.get((scope, s, travel_m), {}).get(what) or (0.0, 0.0, 0.0) for s in named]
-            share, low, high = np.array(values).reshape(-1, 3).T
-            ax.barh(
-                at + (number - (len(travels_m) - 1) / 2) * height,
-                share,
-                height,
-                xerr=(np.maximum(share - low, 0), np.maximum(high - share, 0)),
-                color=colour,
-                ecolor="0.4",
-                label=f"after {travel_m:g} m",
-            )
-        ax.set_yticks(at, named)
-        ax.invert_yaxis()
-        ax.set(xlim=(0, 1.02))
-        ax.grid(axis="x", alpha=0.3)
-        places = next((row["places"] for row in document["rows"] if row["scope"] == scope), 0)
-        percent = 100 * document["setting"]["share"]
-        title = "right place selected" if what == "found" else "located and right"
-        ax.set_title(f"{title}\n{scope}: {percent:g} % of {places} places", fontsize=10)
-    if document["scale"]:
-        _draw_scale(axes[-1], document["scale"])
-    axes[1].legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3)
-    with replace_file(path) as draft:
-        figure.savefig(draft, format="png", dpi=110)
-    plt.close(figure)
+    with picture(path, 5.0 * columns, 4.6) as figure:
+        axes = figure.subplots(1, columns)
+        for ax, (scope, what) in zip(axes, panels, strict=False):
+            _draw_panel(ax, scope, what, document, selectors)
+        if document["scale"]:
+            _draw_scale(axes[-1], document["scale"])
+        axes[1].legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3)
+
+
+def _draw_panel(
+    ax: Any, scope: str, what: str, document: Mapping[str, Any], selectors: Sequence[str]
+) -> None:
+    """The shares of a scope: a bar for each selector and travel."""
+    cells = _cells(document)
+    travels_m = sorted({travel_m for _, _, travel_m in cells})
+    values = {s: [cells.get((scope, s, t), {}).get(what) for t in travels_m] for s in selectors}
+    named = [s for s in selectors if any(values[s])]
+    height = 0.8 / max(len(travels_m), 1)
+    for number, (travel_m, colour) in enumerate(zip(travels_m, _COLOURS, strict=False)):
+        intervals = np.array([values[s][number] or (0.0, 0.0, 0.0) for s in named]).reshape(-1, 3)
+        share, low, high = intervals.T
+        ax.barh(
+            np.arange(len(named)) + (number - (len(travels_m) - 1) / 2) * height,
+            share,
+            height,
+            xerr=(np.maximum(share - low, 0), np.maximum(high - share, 0)),
+            color=colour,
+            ecolor="0.4",
+            label=f"after {travel_m:g} m",
+        )
+    ax.set_yticks(np.arange(len(named)), named)
+    ax.invert_yaxis()
+    ax.set(xlim=(0, 1.02))
+    ax.grid(axis="x", alpha=0.3)
+    places = next((row["places"] for row in document["rows"] if row["scope"] == scope), 0)
+    percent = 100 * document["setting"]["share"]
+    title = "right place selected" if what == "found" else "located and right"
+    ax.set_title(f"{title}\n{scope}: {percent:g} % of {places} places", fontsize=10)
 
 
 def _draw_scale(ax: Any, rows: Sequence[Mapping[str, Any]]) -> None:
     """Share selected against the share of the places that is looked at, for the largest number of places."""
-    from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
-
     most = max(row["places"] for row in rows)
     chosen = [row for row in rows if row["places"] == most and row["query_sensor"] == "all"]
-    travels_m = sorted({row["travel_m"] for row in chosen})
-    selectors = sorted({row["selector"] for row in chosen}, reverse=True)
-    shares = sorted({row["share"] for row in chosen})
+    travels_m, selectors, shares = (
+        sorted({row[key] for row in chosen}) for key in ("travel_m", "selector", "share")
+    )
     # Side by side, as several of them agree: lines would hide each other.
-    series = [(selector, travel_m) for selector in selectors for travel_m in travels_m]
+    series = list(itertools.product(reversed(selectors), travels_m))
     width = 0.8 / max(len(series), 1)
-    colours = dict(zip(travels_m, (VERMILLION, ORANGE, BLUE), strict=False))
-    for number, (selector, travel_m) in enumerate(series):
-        some = {
-            r["share"]: r["found"] for r in chosen if (r["selector"], r["travel_m"]) == (selector, travel_m)
-        }
-        at = [shares.index(share) + (number - (len(series) - 1) / 2) * width for share in some]
-        found, low, high = zip(*some.values(), strict=True)
-        around = [
-            [f - a for f, a in zip(found, low, strict=True)],
-            [b - f for f, b in zip(found, high, strict=True)],
-        ]
-        colour = colours[travel_m]
+    for number, key in enumerate(series):
+        selector, travel_m = key
+        some = {r["share"]: r["found"] for r in chosen if (r["selector"], r["travel_m"]) == key}
+        found, low, high = np.array(list(some.values())).T
+        colour = _COLOURS[travels_m.index(travel_m)]
         ax.errorbar(
-            at,
+            [shares.index(share) + (number - (len(series) - 1) / 2) * width for share in some],
             found,
-            yerr=around,
+            yerr=(found - low, high - found),
             fmt="o",
             color=colour,
-            markerfacecolor=colour if selector == selectors[0] else "white",
+            markerfacecolor=colour if selector == selectors[-1] else "white",
             markersize=6,
             elinewidth=1,
             label=selector if travel_m == travels_m[-1] else None,

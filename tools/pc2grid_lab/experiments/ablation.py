@@ -19,6 +19,7 @@ from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.isovist import look_around
 from pc2grid.submaps.partition import view_at
+from pc2grid_lab.experiments.calibration import area
 from pc2grid_lab.experiments.metrics import recall
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from pc2grid_lab.experiments.trial import Trial
@@ -110,17 +111,8 @@ class Independence:
 
     @property
     def auc(self) -> float:
-        """Probability that a distance of `same` is smaller than one of `other`: the area under the ROC curve.
-
-        It is computed by the Mann-Whitney statistic. 0.5 is chance, 1 is perfect; NaN without distances.
-        """
-        from scipy.stats import rankdata
-
-        n = len(self.same)
-        if not n or not len(self.other):
-            return float("nan")
-        ranked = rankdata(np.concatenate((self.same, self.other)))
-        return float(1.0 - (ranked[:n].sum() - n * (n + 1) / 2) / (n * len(self.other)))
+        """Probability that a distance of `same` is smaller than one of `other`; NaN without distances."""
+        return area(self.other, self.same)
 
 
 def independence(maps: Sequence[SensorMap]) -> tuple[Independence, ...]:

@@ -87,18 +87,32 @@ def log_loss(answers: Sequence[Known], probabilities: F64) -> float:
 
 def roc_area(answers: Sequence[Known], probabilities: F64) -> float:
     """Area under the ROC curve: how often a right answer is surer than a wrong one."""
-    from scipy.stats import rankdata
-
     right = np.array([answer.right for answer in answers])
-    ranks = rankdata(probabilities)[right]
-    count = len(ranks)
-    return float((ranks.sum() - count * (count + 1) / 2) / (count * (len(answers) - count)))
+    return area(probabilities[right], probabilities[~right])
+
+
+def area(larger: F64, smaller: F64) -> float:
+    """Probability that a value of `larger` exceeds one of `smaller`: the area under the ROC curve.
+
+    It is computed by the Mann-Whitney statistic. 0.5 is chance, 1 is perfect; NaN if either is empty.
+    """
+    from scipy.stats import mannwhitneyu
+
+    if not len(larger) or not len(smaller):
+        return float("nan")
+    statistic = mannwhitneyu(larger, smaller, method="asymptotic").statistic
+    return float(statistic / (len(larger) * len(smaller)))
 
 
 def share_by_session(
-    sessions: Sequence[str], yes: NDArray[np.bool_], *, draws: int = 1000, seed: int = 0
+    sessions: Sequence[str | int],
+    yes: NDArray[np.bool_],
+    *,
+    draws: int = 1000,
+    seed: int = 0,
+    percentiles: tuple[float, float] = (5.0, 95.0),
 ) -> tuple[float, float, float]:
-    """A share, and its 5th and 95th percentile when whole sessions are drawn anew (bootstrap).
+    """A share, and its percentiles when whole sessions are drawn anew (bootstrap).
 
     sessions : of each answer, which need not be independent within one. yes : (N,).
     """
@@ -106,7 +120,7 @@ def share_by_session(
     count, hits = np.bincount(number), np.bincount(number, weights=yes)
     drawn = np.random.default_rng(seed).integers(0, len(names), (draws, len(names)))
     shares = hits[drawn].sum(axis=1) / count[drawn].sum(axis=1)
-    low, high = np.percentile(shares, (5.0, 95.0)).tolist()
+    low, high = np.percentile(shares, percentiles).tolist()
     return float(np.mean(yes)), low, high
 
 

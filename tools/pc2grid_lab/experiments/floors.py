@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -29,6 +29,7 @@ from pc2grid.simulate.session import EPOCH_NS
 from pc2grid_lab.experiments.answers import localize
 from pc2grid_lab.experiments.calibration import share_by_session
 from pc2grid_lab.experiments.program import program_digest
+from pc2grid_lab.experiments.stored import write_text
 from pc2grid_lab.worlds import HouseConfig, HouseSession, prepare_house_session, simulate_session
 from signature.config import Config
 from signature.database import Label, open_database
@@ -161,8 +162,7 @@ class FloorResult:
                 for answer in self.answers
             ],
         }
-        with replace_file(path) as draft:
-            draft.write_text(json.dumps(document), encoding="utf-8")
+        write_text(path, json.dumps(document))
 
     @staticmethod
     def load(path: Path) -> FloorResult:
@@ -229,18 +229,21 @@ def run_floors(task: FloorTask, database: Path, config: Config = Config()) -> Fl
     parts = _parts(task, database)
     answers = tuple(answer for floor in task.floors for answer in _ask(task, database, floor, parts, config))
     names = {part.floor: part.name for part in parts.values()}
-    pure = all(part.purity >= _MOSTLY for part in parts.values())
-    same_floor_same_name = all(names[part.floor] == part.name for part in parts.values())
     return FloorResult(
-        told_apart=pure
-        and same_floor_same_name
-        and len(set(names.values())) == len(task.floors) == len(names),
+        told_apart=_told_apart(task, parts.values()),
         named=all(name == str(floor) for floor, name in names.items()),
         floors={name: part.floor for name, part in parts.items()},
         names={name: part.name for name, part in parts.items()},
         frames={name: part.T_house_map for name, part in parts.items()},
         answers=answers,
     )
+
+
+def _told_apart(task: FloorTask, parts: Collection[_Part]) -> bool:
+    pairs = {(part.floor, part.name) for part in parts}
+    floors, names = {floor for floor, _ in pairs}, {name for _, name in pairs}
+    one_to_one = len(pairs) == len(floors) == len(names) == len(task.floors)
+    return one_to_one and all(part.purity >= _MOSTLY for part in parts)
 
 
 def share_of(

@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 
-from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.geometry import SE2
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import SensorKind
 from pc2grid_lab.experiments.ablation import ranks
+from pc2grid_lab.experiments.frames import apart
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from pc2grid_lab.experiments.trial import JUDGEMENT, Trial
 from signature.localization.localizer import Answer
@@ -43,8 +44,7 @@ def judge(
     error_m = error_rad = None
     right = False
     if answer.hypotheses:
-        error = T_map_base.inverse() @ (answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base)
-        error_m, error_rad = math.hypot(error.x, error.y), abs(float(wrap_angle(error.yaw)))
+        error_m, error_rad = apart(T_map_base, answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base)
         right = in_building and error_m <= right_m and error_rad <= JUDGEMENT.right_rad
     signature = index.made_with.signature
     return Trial(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,12 +13,10 @@ from pc2grid.geometry import SE2
 from pc2grid.model import Health, OccupancyGrid, Scan, Trajectory
 from pc2grid.odometry.registration import BareKissIcp
 from pc2grid.pipeline import map_scans
+from pc2grid.simulate import Session
 from pc2grid_lab.experiments.true_floor import GridQuality, TrueFloor
 from signature.config import Config
 from signature.localization.place_recognition import recognizer_for
-
-if TYPE_CHECKING:
-    from pc2grid.simulate import Session
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -49,21 +50,28 @@ def matrix(trials: Sequence[Trial]) -> list[MatrixCell]:
 
 def _cell(map_sensor: str, query_sensor: str, travel_m: float, trials: Sequence[Trial]) -> MatrixCell:
     located = [t for t in trials if t.status == "located"]
-    errors_m = [t.error_m for t in located if t.right and t.error_m is not None]
+    right = [t for t in located if t.right]
+    statuses = Counter(t.status for t in trials)
     return MatrixCell(
         map_sensor=map_sensor,
         query_sensor=query_sensor,
         travel_m=travel_m,
         trials=len(trials),
-        located_right=sum(t.right for t in located) / len(trials),
-        wrong=sum(not t.right for t in located) / max(len(located), 1),
-        ambiguous=sum(t.status == "ambiguous" for t in trials) / len(trials),
-        not_found=sum(t.status == "not_found" for t in trials) / len(trials),
+        located_right=len(right) / len(trials),
+        wrong=(len(located) - len(right)) / max(len(located), 1),
+        ambiguous=statuses["ambiguous"] / len(trials),
+        not_found=statuses["not_found"] / len(trials),
         recall=recall([t.rank for t in trials]),
-        median_error_m=float(np.median(errors_m)) if errors_m else None,
-        p95_error_m=float(np.percentile(errors_m, 95)) if errors_m else None,
         look_up_ms=float(np.median([t.look_up_ms for t in trials])),
+        **errors_m(right),
     )
+
+
+def errors_m(trials: Sequence[Trial]) -> dict[str, float | None]:
+    """`median_error_m` and `p95_error_m` of a cell, by its answers that are located and right."""
+    known = [t.error_m for t in trials if t.error_m is not None]
+    median, p95 = (float(np.median(known)), float(np.percentile(known, 95))) if known else (None, None)
+    return {"median_error_m": median, "p95_error_m": p95}
 
 
 def recall(ranks: Sequence[int]) -> dict[int, float | None]:

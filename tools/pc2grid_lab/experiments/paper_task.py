@@ -22,6 +22,7 @@ from pc2grid.io.nav2_map import load_map
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid.submaps.partition import partition
 from pc2grid_lab.baselines import METHOD_NAMES, Method, make_methods
+from pc2grid_lab.baselines.proposed import Proposed
 from pc2grid_lab.experiments.noise import NOISE_LEVELS, Noise
 from pc2grid_lab.experiments.paper_experiment import BestMatches, Experiment, MatchMeasures, evaluate
 from pc2grid_lab.experiments.paper_tables import MAPS, SIZE_PX
@@ -400,8 +401,6 @@ def run_task(task: PaperTask, folder: Path, progress: Callable[[float], None] | 
 def _methods(names: Sequence[str], task: PaperTask) -> dict[str, Method]:
     methods = make_methods(names)
     if "proposed" in methods and task.overrides:
-        from pc2grid_lab.baselines.proposed import Proposed
-
         methods["proposed"] = Proposed(SignatureConfig(**dict(task.overrides)))
     return methods
 

@@ -11,16 +11,19 @@ transform that is fitted to the other queries only.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.geometry import SE2
 from pc2grid.model import SensorKind
+from pc2grid_lab.experiments.calibration import share_by_session
+from pc2grid_lab.experiments.frames import apart, fit_frame
 from pc2grid_lab.experiments.judgement import judge
+from pc2grid_lab.experiments.metrics import QueryCounts, errors_m
 from pc2grid_lab.experiments.sensor_map import MapKind, SensorMap
 from pc2grid_lab.experiments.trial import Trial
 from signature.localization.localizer import Answer
@@ -89,9 +92,8 @@ class _Clue:
 
     def agrees(self, T_floor_log: SE2) -> bool:
         """Whether the transform brings the two poses together."""
-        error = self.T_floor_base.inverse() @ T_floor_log @ self.T_log_base
-        near = math.hypot(error.x, error.y) <= AGREEMENT.near_m
-        return near and abs(float(wrap_angle(error.yaw))) <= AGREEMENT.near_rad
+        metres, radians = apart(self.T_floor_base, T_floor_log @ self.T_log_base)
+        return metres <= AGREEMENT.near_m and radians <= AGREEMENT.near_rad
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,11 +150,7 @@ def _fit(clues: Sequence[_Clue]) -> SE2 | None:
     """The transform nearest to all of them, least squares; None for fewer than two."""
     if len(clues) < 2:
         return None
-    ahead = np.array([(0.0, 0.0), (AGREEMENT.lever_m, 0.0)])
-    return SE2.fit(
-        np.concatenate([clue.T_log_base.apply(ahead) for clue in clues]),
-        np.concatenate([clue.T_floor_base.apply(ahead) for clue in clues]),
-    )
+    return fit_frame([(clue.T_log_base, clue.T_floor_base) for clue in clues], AGREEMENT.lever_m)
 
 
 def judge_all(
@@ -163,12 +161,11 @@ def judge_all(
     for number, query in enumerate(queries):
         T_floor_log = agreement.without(number)
         for name, answer in query.answers.items():
-            T_plan_base = query.T_frame_base
+            T_plan_base: SE2 | None = query.T_frame_base
             if frame_of(query.sensor) != frame_of(maps[name].sensor):
-                if T_floor_log is None:
-                    continue
-                log_query = frame_of(query.sensor) == "log"
-                T_plan_base = (T_floor_log if log_query else T_floor_log.inverse()) @ T_plan_base
+                T_plan_base = _across(T_floor_log, query)
+            if T_plan_base is None:
+                continue
             trials.append(
                 judge(
                     maps[name],
@@ -184,6 +181,14 @@ def judge_all(
                 )
             )
     return trials
+
+
+def _across(T_floor_log: SE2 | None, query: RealQuery) -> SE2 | None:
+    """The true pose of a query in the other frame."""
+    if T_floor_log is None:
+        return None
+    is_log = frame_of(query.sensor) == "log"
+    return (T_floor_log if is_log else T_floor_log.inverse()) @ query.T_frame_base
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,30 +232,28 @@ def real_cells(trials: Sequence[Trial]) -> list[RealCell]:
 
 
 def _cell(map_sensor: str, query_sensor: str, trials: Sequence[Trial]) -> RealCell:
+    counts = QueryCounts.of(trials)
     inside = [t for t in trials if t.in_map]
-    outside = [t for t in trials if not t.in_map]
-    right = [t for t in inside if t.status == "located" and t.right]
-    located = [t for t in trials if t.status == "located" and t.right]
-    errors = [t.error_m for t in located if t.error_m is not None]
+    statuses = Counter(t.status for t in inside)
+    right = [t for t in trials if t.status == "located" and t.right]
     low, high = share_interval(inside)
     return RealCell(
         map_sensor=map_sensor,
         query_sensor=query_sensor,
         queries=len(trials),
         right_first=sum(t.right for t in trials),
-        located_right=len(located),
-        in_map=len(inside),
-        right=len(right),
-        wrong=sum(t.status == "located" and not t.right for t in inside),
-        ambiguous=sum(t.status == "ambiguous" for t in inside),
-        not_found=sum(t.status == "not_found" for t in inside),
-        right_share=len(right) / len(inside) if inside else None,
+        located_right=len(right),
+        in_map=counts.inside,
+        right=counts.right,
+        wrong=counts.wrong,
+        ambiguous=statuses["ambiguous"],
+        not_found=statuses["not_found"],
+        right_share=counts.right / counts.inside if inside else None,
         low=low,
         high=high,
-        refused_outside=sum(t.status != "located" for t in outside),
-        wrong_outside=sum(t.status == "located" and not t.right for t in outside),
-        median_error_m=float(np.median(errors)) if errors else None,
-        p95_error_m=float(np.percentile(errors, 95)) if errors else None,
+        refused_outside=counts.refused,
+        wrong_outside=counts.wrong_outside,
+        **errors_m(right),
     )
 
 
@@ -262,12 +265,6 @@ def share_interval(trials: Sequence[Trial]) -> tuple[float | None, float | None]
     """
     if not trials:
         return None, None
-    seeds = sorted({t.seed for t in trials})
-    right: F64 = np.array(
-        [sum(t.status == "located" and t.right for t in trials if t.seed == s) for s in seeds]
-    )
-    count: F64 = np.array([sum(t.seed == s for t in trials) for s in seeds])
-    drawn = np.random.default_rng(0).integers(len(seeds), size=(AGREEMENT.resamples, len(seeds)))
-    shares = right[drawn].sum(axis=1) / count[drawn].sum(axis=1)
-    low, high = np.quantile(shares, (0.025, 0.975))
-    return float(low), float(high)
+    right = np.array([t.status == "located" and t.right for t in trials])
+    seeds = [t.seed for t in trials]
+    return share_by_session(seeds, right, draws=AGREEMENT.resamples, percentiles=(2.5, 97.5))[1:]

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +18,12 @@ from pc2grid.arrays import F64
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import Config
 from pc2grid.geometry import SE2
+from pc2grid.io.atomic import replace_file
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, SensorKind
 from pc2grid.pipeline import follow
-
-if TYPE_CHECKING:
-    from pc2grid.simulate import Building
-    from pc2grid_lab.worlds import WorldConfig
+from pc2grid.simulate import Building
+from pc2grid_lab.experiments.frames import fit_frame
+from pc2grid_lab.worlds import WorldConfig, iter_session
 
 _FITTED_M = 3.0  # length of the path that the true frame is fitted over; chosen by hand
 
@@ -68,11 +67,8 @@ class RegisteredSession:
         if known[-1] >= first:
             known = known[known >= first]
         known = known[path_m[known] >= path_m[known[-1]] - _FITTED_M]
-        ahead = np.array([(0.0, 0.0), (_FITTED_M, 0.0)])
-        return SE2.fit(
-            np.concatenate([_pose(self.T_odom_base[k]).apply(ahead) for k in known]),
-            np.concatenate([_pose(self.T_world_base[k]).apply(ahead) for k in known]),
-        )
+        pairs = [(_pose(self.T_odom_base[k]), _pose(self.T_world_base[k])) for k in known]
+        return fit_frame(pairs, _FITTED_M)
 
     def true_pose(self, scan: int) -> SE2 | None:
         """T_world_base of a scan: the truth of the nearest scan that has one, carried on by registration."""
@@ -101,8 +97,6 @@ class RegisteredSession:
 
     def save(self, path: Path) -> None:
         """Write the session to one .npz file, completely or not at all."""
-        from pc2grid.io.atomic import replace_file
-
         empty = np.empty((0, 2), np.float32)
         with replace_file(path) as draft, draft.open("wb") as file:
             np.savez_compressed(
@@ -190,8 +184,6 @@ def simulate_and_register(
     until_m: float = math.inf,
 ) -> RegisteredSession:
     """Simulate a session in a floor plan and register it."""
-    from pc2grid_lab.worlds import iter_session
-
     scans = iter_session(sensor=sensor, grid=plan, config=simulation)
     return register(scans, config, sensor=sensor, until_m=until_m)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from pc2grid.arrays import F64
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2
+from pc2grid.io import Log
 from pc2grid.model import Scan, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.pipeline import build_map
@@ -31,9 +31,6 @@ from signature.localization.map_index import MapIndex
 from signature.localization.place_recognition import recognizer_for
 from signature.sessions import describe_all
 from signature.similarity import SignatureTable
-
-if TYPE_CHECKING:
-    from pc2grid.io import Log
 
 _SAME_NS = 1_000_000  # a true pose belongs to a scan if their stamps differ by no more than this
 

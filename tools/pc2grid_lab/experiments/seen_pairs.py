@@ -10,6 +10,7 @@ from pc2grid.arrays import F32, F64, BoolGrid
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.isovist import look_around
+from pc2grid.submaps.partition import submap_centers
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from signature.config import Config
 from signature.localization.query import QueryMap, best_observed
@@ -36,8 +37,6 @@ def pairs_of(
     queries : each with its true frame in the plan, and the maps of that plan. floors : maps of other
     buildings.
     """
-    from pc2grid.submaps.partition import submap_centers
-
     rng = np.random.default_rng(seed)
     sight_m = config.partition.radius_m
     closer = config.relocalize.model_copy(update={"views": _VIEWS, "view_spacing_m": _VIEW_SPACING_M})

@@ -12,26 +12,30 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
 from pc2grid.arrays import I64
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.model import OCCUPIED, OccupancyGrid, SensorKind, SessionMap, Trajectory
+from pc2grid.simulate import office_floorplan
+from pc2grid.simulate.clutter import covered, place_clutter
+from pc2grid.submaps.partition import partition, submap_centers
+from pc2grid_lab.experiments.calibration import share_by_session
 from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from pc2grid_lab.experiments.trial import JUDGEMENT
 from signature.config import Config
+from signature.database import open_database
 from signature.localization.map_index import MapIndex
 from signature.localization.query import Query, QueryMap
 from signature.retrieval.place_index import PlaceBlock, PlaceIndex
 from signature.retrieval.seen_index import SeenIndex
 from signature.retrieval.vote import retrieve
 from signature.seen_likelihood import COMBINATIONS, seen_weights
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from signature.seen_places import SeenPlaces
+from signature.similarity import SignatureTable
 
 ALL, VOTED, PAPER, RANDOM = "all places", "signatures, then isovists", "paper (Eq. 6)", "random"
 """VOTED is what the program does: the signatures of what was seen, then isovists and a vote of all views
@@ -42,6 +46,8 @@ SIGNATURES = next(iter(SEEN_SELECTORS))
 SELECTORS = (ALL, VOTED, *SEEN_SELECTORS, PAPER, RANDOM)
 LOCATED_BY = (ALL, VOTED, PAPER, RANDOM)
 """The selectors for which queries are also located, which takes most of the time."""
+MEASURED = ("selector", "looked_at", "found", "located", "right", "processor_ms")
+"""The fields of `Selected` that `Selection.measure` yields."""
 TRAVELS_M = (1.0, 3.0, 8.0)
 """Metres of travel after which a query is asked."""
 
@@ -78,9 +84,6 @@ class Selected:
 
 def office_floor(seed: int, clutter: int = 30) -> OccupancyGrid:
     """An office floor of 36 x 26 to 59 x 39 m, with things standing about, as a map that knows everything."""
-    from pc2grid.simulate import office_floorplan
-    from pc2grid.simulate.clutter import covered, place_clutter
-
     rng = np.random.default_rng(seed)
     plan = office_floorplan(seed, float(rng.integers(36, 60)), float(rng.integers(26, 40)))
     things = place_clutter(plan, clutter, rng, robot_m=0.35)
@@ -91,8 +94,6 @@ def office_floor(seed: int, clutter: int = 30) -> OccupancyGrid:
 
 def floor_session(seed: int, config: Config) -> SessionMap:
     """`office_floor` as a session, divided into submaps."""
-    from pc2grid.submaps.partition import partition
-
     grid = office_floor(seed)
     return SessionMap(
         session=f"floor-{seed}",
@@ -105,9 +106,6 @@ def floor_session(seed: int, config: Config) -> SessionMap:
 
 def with_floors(own: SensorMap, floors: Path, config: Config) -> MapIndex:
     """The map of a building together with those of the database `floors`, as one index."""
-    from signature.database import open_database
-    from signature.similarity import SignatureTable
-
     index = own.index
     with open_database(floors) as database:
         table = database.signatures()
@@ -165,8 +163,10 @@ class Selection:
         *,
         locate: bool = True,
     ) -> Iterator[tuple[str, int, bool, bool | None, bool | None, float]]:
-        """For each selector: its name, places looked at, and `found`, `located`, `right` and `processor_ms`
-        of `Selected`. locate : whether the query is also located, by the selectors of `LOCATED_BY`."""
+        """For each selector what `MEASURED` names.
+
+        locate : whether the query is also located, by the selectors of `LOCATED_BY`.
+        """
         table = self.index.places.table
         views_m = T_map_query.apply(np.array([view.center_m for view in query.views]).reshape(-1, 2))
         own = table.session_index == 0
@@ -250,6 +250,11 @@ class Recalled:
     found: bool
     processor_ms: float
 
+    @property
+    def session(self) -> str:
+        """As of `Selected`."""
+        return f"{self.plan}.{self.query_sensor}.{self.seed}"
+
 
 Asked = tuple[SensorKind, int, float, QueryMap, SE2]
 """A query: sensor and seed of its session, metres of travel, what has been seen, its true frame in the
@@ -301,9 +306,6 @@ def recall_at_scale(
 
 def described_floor(seed: int, config: Config) -> PlaceBlock:
     """What is seen from the places of `office_floor`; its seed is the number of the session."""
-    from pc2grid.submaps.partition import submap_centers
-    from signature.seen_places import SeenPlaces
-
     grid = office_floor(seed)
     centers_m = submap_centers(grid, config.partition)
     seen = SeenPlaces.of(grid, centers_m, config.partition.radius_m)
@@ -313,8 +315,6 @@ def described_floor(seed: int, config: Config) -> PlaceBlock:
 def tally_at_scale(trials: Sequence[Recalled], *, draws: int = 1000) -> list[Mapping[str, object]]:
     """By number of places, selector, share, travel and sensor (and "all"): share found with its 5th and 95th
     percentile over sessions drawn anew (bootstrap), and median time."""
-    from pc2grid_lab.experiments.calibration import share_by_session
-
     groups: dict[tuple[int, str, float, float, str], list[Recalled]] = {}
     for trial in trials:
         for sensor in ("all", trial.query_sensor):
@@ -330,11 +330,7 @@ def tally_at_scale(trials: Sequence[Recalled], *, draws: int = 1000) -> list[Map
             "travel_m": travel_m,
             "query_sensor": sensor,
             "queries": len(members),
-            "found": share_by_session(
-                [f"{m.plan}.{m.query_sensor}.{m.seed}" for m in members],
-                np.array([m.found for m in members]),
-                draws=draws,
-            ),
+            "found": _share(members, "found", draws),
             "processor_ms": float(np.median([m.processor_ms for m in members])),
         }
         for (places, selector, share, travel_m, sensor), members in sorted(groups.items())
@@ -344,32 +340,35 @@ def tally_at_scale(trials: Sequence[Recalled], *, draws: int = 1000) -> list[Map
 def tally(trials: Sequence[Selected], *, draws: int = 1000) -> list[Mapping[str, object]]:
     """For each scope, selector and travel: shares found and located rightly, with their 5th and 95th
     percentiles over sessions drawn anew (bootstrap), the share located wrongly, and the median time."""
-    from pc2grid_lab.experiments.calibration import share_by_session
-
     groups: dict[tuple[str, str, float], list[Selected]] = {}
     for trial in trials:
         groups.setdefault((trial.scope, trial.selector, trial.travel_m), []).append(trial)
-    rows: list[Mapping[str, object]] = []
-    for (scope, selector, travel_m), members in groups.items():
-        sessions = [m.session for m in members]
-        tried = [m for m in members if m.right is not None]
-        rows.append(
-            {
-                "scope": scope,
-                "selector": selector,
-                "travel_m": travel_m,
-                "queries": len(members),
-                "sessions": len(set(sessions)),
-                "places": round(float(np.median([m.places for m in members]))),
-                "looked_at": round(float(np.median([m.looked_at for m in members]))),
-                "found": share_by_session(sessions, np.array([m.found for m in members]), draws=draws),
-                "right": share_by_session(
-                    [m.session for m in tried], np.array([bool(m.right) for m in tried]), draws=draws
-                )
-                if tried
-                else None,
-                "wrong": sum(bool(m.located) and not m.right for m in tried) / len(tried) if tried else None,
-                "processor_ms": float(np.median([m.processor_ms for m in members])),
-            }
-        )
-    return rows
+    return [
+        {
+            "scope": scope,
+            "selector": selector,
+            "travel_m": travel_m,
+            "queries": len(members),
+            "sessions": len({m.session for m in members}),
+            "places": round(float(np.median([m.places for m in members]))),
+            "looked_at": round(float(np.median([m.looked_at for m in members]))),
+            "found": _share(members, "found", draws),
+            **_located(members, draws),
+            "processor_ms": float(np.median([m.processor_ms for m in members])),
+        }
+        for (scope, selector, travel_m), members in groups.items()
+    ]
+
+
+def _share(members: Sequence[Selected | Recalled], field: str, draws: int) -> tuple[float, float, float]:
+    yes = np.array([bool(getattr(m, field)) for m in members])
+    return share_by_session([m.session for m in members], yes, draws=draws)
+
+
+def _located(members: Sequence[Selected], draws: int) -> dict[str, object]:
+    """Shares located rightly and wrongly of those that were tried; None if none was."""
+    tried = [m for m in members if m.right is not None]
+    if not tried:
+        return {"right": None, "wrong": None}
+    wrong = sum(bool(m.located) and not m.right for m in tried)
+    return {"right": _share(tried, "right", draws), "wrong": wrong / len(tried)}

@@ -9,8 +9,11 @@ from typing import Literal
 
 from pc2grid.geometry import SE2
 from pc2grid.model import SensorKind, SessionMap
+from pc2grid_lab.experiments.stored import write_text
 from signature.config import Config
+from signature.database import open_database
 from signature.localization.map_index import MapIndex
+from signature.sessions import add_session, provenance
 
 MapKind = SensorKind | Literal["scan"]
 """The sensor that has made a map; or "scan", a 3D scan of the building that is a map as it is."""
@@ -28,6 +31,14 @@ class SensorMap:
     T_plan_map: SE2
     index: MapIndex
 
+    @staticmethod
+    def load(path: Path, *, name: str, sensor: MapKind, config: Config) -> SensorMap:
+        """Read what `save_map` has written, as the map of the building `name`."""
+        with open_database(path) as database:
+            index = MapIndex.of(database, config)
+        frame = json.loads(path.with_suffix(".json").read_text())
+        return SensorMap(name=name, sensor=sensor, T_plan_map=SE2(*frame), index=index)
+
 
 def is_saved(path: Path) -> bool:
     """Whether `save_map` has written this file."""
@@ -39,20 +50,7 @@ def save_map(path: Path, session_map: SessionMap, T_plan_map: SE2, source: Path,
 
     source : the plan, scan or recording that the map was made from; only its name is kept.
     """
-    from pc2grid.io.atomic import replace_file
-    from signature.sessions import add_session, provenance
-
     path.unlink(missing_ok=True)
     add_session(path, session_map, config, provenance(source, "0" * 64, config))
-    with replace_file(path.with_suffix(".json")) as draft:
-        draft.write_text(json.dumps([T_plan_map.x, T_plan_map.y, T_plan_map.yaw]))
-
-
-def load_map(path: Path, *, name: str, sensor: MapKind, config: Config) -> SensorMap:
-    """Read what `save_map` has written, as the map of the building `name`."""
-    from signature.database import open_database
-
-    with open_database(path) as database:
-        index = MapIndex.of(database, config)
-    frame = json.loads(path.with_suffix(".json").read_text())
-    return SensorMap(name=name, sensor=sensor, T_plan_map=SE2(*frame), index=index)
+    frame = (T_plan_map.x, T_plan_map.y, T_plan_map.yaw)
+    write_text(path.with_suffix(".json"), json.dumps(frame))

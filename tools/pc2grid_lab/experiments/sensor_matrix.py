@@ -8,24 +8,21 @@ metres of travel. The sessions are registered as a user would do it; true poses 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid, Scan, SensorKind, SessionMap
 from pc2grid.pipeline import map_scans
+from pc2grid.simulate import Building
 from pc2grid.submaps.partition import partition
 from pc2grid_lab.experiments.answers import Answers, localize
 from pc2grid_lab.experiments.judgement import judge
 from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from pc2grid_lab.experiments.trial import Trial
+from pc2grid_lab.worlds import WorldConfig, iter_session, prepare_session
 from signature.config import Config
-
-if TYPE_CHECKING:
-    from pc2grid.simulate import Building
-    from pc2grid_lab.worlds import WorldConfig
 
 SENSORS: tuple[SensorKind, ...] = ("lidar", "laser", "depth")
 TRAVELS_M = (1.0, 3.0, 5.0, 8.0, 10.0, 15.0)
@@ -44,8 +41,6 @@ def map_building(
     The frame is fitted over the whole trajectory, as for an absolute trajectory error: if it rested on the
     heading of the first scan alone, an error of that heading would move distant places by much.
     """
-    from pc2grid_lab.worlds import iter_session
-
     true_m: list[tuple[float, float]] = []
 
     def scans() -> Iterator[Scan]:
@@ -70,8 +65,6 @@ def query_start(plan: OccupancyGrid | Building, mapping: WorldConfig, seed: int)
 
     A query from where the mapping robot has never been has no right answer.
     """
-    from pc2grid_lab.worlds import prepare_session
-
     path = prepare_session(sensor="laser", grid=plan, config=mapping).drive
     rng = np.random.default_rng([seed, mapping.seed])
     x, y, _ = path.at(np.array([rng.uniform(0.0, path.duration_s)]))[0]

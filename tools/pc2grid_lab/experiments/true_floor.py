@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +14,10 @@ from pc2grid.geometry import SE2
 from pc2grid.mapping.occupancy import OCCUPANCY
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.sensor_model import SENSOR_MODELS
+from pc2grid.simulate import Session
 from pc2grid.simulate.passage import outline_mask
+from pc2grid.simulate.session import Reading
 from pc2grid.submaps.isovist import isovist
-
-if TYPE_CHECKING:
-    from pc2grid.simulate import Session
-    from pc2grid.simulate.session import Reading
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from pc2grid.io.atomic import replace_file
+from pc2grid_lab.experiments.stored import write_text
 from pc2grid_lab.peers.environment import PEERS, PeerEnvironment, PeerKind
 from pc2grid_lab.peers.outcome import PeerTrial
 from pc2grid_lab.peers.peer_process import PeerAnswer
@@ -30,8 +31,8 @@ def tasks(sites: Sequence[Site], environment: PeerEnvironment) -> list[Task]:
     return made
 
 
-def run(task: Task, environment: PeerEnvironment, folder: Path) -> Iterator[PeerTrial]:
-    """The judged answers, one by one.
+def run(task: Task, environment: PeerEnvironment, folder: Path) -> list[PeerTrial]:
+    """The judged answers.
 
     An answer in `folder` from an earlier run is used again if map, query and program are the same; it is
     judged again in any case.
@@ -42,18 +43,13 @@ def run(task: Task, environment: PeerEnvironment, folder: Path) -> Iterator[Peer
     answers = _kept(file)
     queries = site.queries()
     rest = [number for number in queries if number not in answers]
-    peer = environment.start(kind, map_site.map_stem) if rest else None
-    try:
-        for number, query in queries.items():
-            if number not in answers:
-                assert peer is not None
+    if rest:
+        with contextlib.closing(environment.start(kind, map_site.map_stem)) as peer:
+            for number in rest:
                 answers[number] = peer.locate(site.stem(number))
-                with replace_file(file) as draft:
-                    draft.write_text(json.dumps({n: asdict(answer) for n, answer in answers.items()}))
-            yield PeerTrial.of(kind.name, site.name, map_site.name, number, query, answers[number])
-    finally:
-        if peer is not None:
-            peer.close()
+                write_text(file, json.dumps({n: asdict(answer) for n, answer in answers.items()}))
+    names = (kind.name, site.name, map_site.name)
+    return [PeerTrial.of(*names, number, query, answers[number]) for number, query in queries.items()]
 
 
 def _kept(file: Path) -> dict[int, PeerAnswer]:

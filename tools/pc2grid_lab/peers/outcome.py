@@ -8,14 +8,16 @@ wrong ones, in the own building and in another one. So the comparison is in favo
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.geometry import SE2
+from pc2grid_lab.experiments.calibration import share_by_session
+from pc2grid_lab.experiments.frames import apart
 from pc2grid_lab.peers.peer_process import PeerAnswer
 from pc2grid_lab.peers.site import SiteQuery
 
@@ -39,8 +41,8 @@ class OutcomeParameters:
     right_rad: float = math.radians(5.0)
     resamples: int = 2000
     seed: int = 0
-    low: float = 0.05
-    high: float = 0.95
+    low: float = 5.0
+    high: float = 95.0
 
 
 OUTCOME = OutcomeParameters()
@@ -72,9 +74,8 @@ class PeerTrial:
         place: Place = "elsewhere" if map_ != site else "covered" if query.covered else "uncovered"
         right, error_m = False, None
         if answer.pose is not None and place != "elsewhere":
-            error = query.T_map_base.inverse() @ SE2(*answer.pose)
-            error_m = math.hypot(error.x, error.y)
-            right = error_m <= OUTCOME.right_m and abs(float(wrap_angle(error.yaw))) <= OUTCOME.right_rad
+            error_m, error_rad = apart(query.T_map_base, SE2(*answer.pose))
+            right = error_m <= OUTCOME.right_m and error_rad <= OUTCOME.right_rad
         return PeerTrial(
             peer=peer,
             site=site,
@@ -150,43 +151,44 @@ def counted(trials: Sequence[PeerTrial]) -> list[PeerCell]:
 
 def _cell(trials: Sequence[PeerTrial], threshold: float | None) -> PeerCell:
     lowest = -math.inf if threshold is None else threshold
-    covered = [t for t in trials if t.place == "covered"]
-    answered = [t for t in trials if t.answered(lowest)]
-    right = [t for t in answered if t.right and t.place == "covered"]
-    wrong = [t for t in answered if not t.right]
-    low, high = _interval(np.array([t in right for t in covered], np.float64))
-    errors = [t.error_m for t in right if t.error_m is not None]
+    at: dict[Place, list[PeerTrial]] = {"covered": [], "uncovered": [], "elsewhere": []}
+    for trial in trials:
+        at[trial.place].append(trial)
+    covered = at["covered"]
+    wrong = Counter(t.place for t in trials if t.answered(lowest) and not t.right)
+    right = [t for t in covered if t.answered(lowest) and t.right]
+    low, high = _interval([t.answered(lowest) and t.right for t in covered])
     return PeerCell(
         peer=trials[0].peer,
         site=trials[0].site,
         threshold=None if threshold is None or math.isinf(threshold) else threshold,
         covered=len(covered),
         right=len(right),
-        wrong=sum(t.place == "covered" for t in wrong),
-        unanswered=len(covered) - sum(t.place == "covered" for t in answered),
+        wrong=wrong["covered"],
+        unanswered=len(covered) - len(right) - wrong["covered"],
         right_low=low,
         right_high=high,
-        uncovered=sum(t.place == "uncovered" for t in trials),
-        uncovered_wrong=sum(t.place == "uncovered" for t in wrong),
-        elsewhere=sum(t.place == "elsewhere" for t in trials),
-        elsewhere_wrong=sum(t.place == "elsewhere" for t in wrong),
-        median_error_m=float(np.median(errors)) if errors else None,
-        cpu_s=_median_cpu_s(t for t in trials if t.place != "elsewhere"),
-        elsewhere_cpu_s=_median_cpu_s(t for t in trials if t.place == "elsewhere"),
+        uncovered=len(at["uncovered"]),
+        uncovered_wrong=wrong["uncovered"],
+        elsewhere=len(at["elsewhere"]),
+        elsewhere_wrong=wrong["elsewhere"],
+        median_error_m=_median(t.error_m for t in right),
+        cpu_s=_median(t.cpu_s for t in covered + at["uncovered"]),
+        elsewhere_cpu_s=_median(t.cpu_s for t in at["elsewhere"]),
         peak_mb=max(t.peak_mb for t in trials),
     )
 
 
-def _median_cpu_s(trials: Iterable[PeerTrial]) -> float | None:
-    seconds = [trial.cpu_s for trial in trials]
-    return float(np.median(seconds)) if seconds else None
+def _median(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
 
 
-def _interval(right: F64) -> tuple[float | None, float | None]:
+def _interval(right: Sequence[bool]) -> tuple[float | None, float | None]:
     """Percentiles of the share, by resampling the queries."""
-    if not len(right):
+    if not right:
         return None, None
-    rng = np.random.default_rng(OUTCOME.seed)
-    shares = right[rng.integers(len(right), size=(OUTCOME.resamples, len(right)))].mean(axis=1)
-    low, high = np.quantile(shares, (OUTCOME.low, OUTCOME.high))
-    return float(low), float(high)
+    bounds = (OUTCOME.low, OUTCOME.high)
+    return share_by_session(
+        range(len(right)), np.array(right), draws=OUTCOME.resamples, seed=OUTCOME.seed, percentiles=bounds
+    )[1:]

@@ -17,7 +17,6 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,7 +24,7 @@ from scipy.spatial import cKDTree
 from pc2grid.arrays import F32, F64
 from pc2grid.errors import ConfigError, LogNotFound
 from pc2grid.geometry import SE2, transform_points
-from pc2grid.io import open_log
+from pc2grid.io import Log, open_log
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.building_file import is_building_file
 from pc2grid.io.nav2_map import load_map, save_map
@@ -34,16 +33,14 @@ from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind, Trajectory
 from pc2grid.odometry.tracker import Tracker
 from pc2grid.sensor_model import SENSOR_MODELS
+from pc2grid.simulate import load_building
 from pc2grid_lab.experiments.program import digest_of_sources
 from pc2grid_lab.experiments.registered_session import register
 from pc2grid_lab.experiments.sensor_matrix import query_start
 from pc2grid_lab.peers.asked import PREPARES, digest
+from pc2grid_lab.worlds import WorldConfig, iter_session
 from signature.config import Config
 from signature.sessions import digest_of
-
-if TYPE_CHECKING:
-    from pc2grid.io import Log
-    from pc2grid_lab.worlds import WorldConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -218,9 +215,6 @@ def simulated_site(
     building_file: Path, folder: Path, config: Config, *, queries: int, travel_m: float
 ) -> Site:
     """The site of a lidar that is simulated in a real 3D scan of a building (PLY, PCD or a mesh)."""
-    from pc2grid.simulate import load_building
-    from pc2grid_lab.worlds import iter_session
-
     building = load_building(building_file)
     site = Site(name=building_file.stem, sensor="lidar", folder=folder)
     mapping = _simulation(SITE.map_length_m, SITE.map_seed)
@@ -240,8 +234,6 @@ def simulated_site(
 
 
 def _simulation(length_m: float, seed: int, start_m: tuple[float, float] | None = None) -> WorldConfig:
-    from pc2grid_lab.worlds import WorldConfig
-
     lidar = {"rate_hz": SITE.rate_hz, "columns": SITE.columns}
     return WorldConfig.model_validate(
         {"length_m": length_m, "seed": seed, "clutter": SITE.clutter, "start_m": start_m, "lidar": lidar}

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.geometry import SE2
+from pc2grid_lab.experiments.frames import apart, fit_frame
 from pc2grid_lab.experiments.trial import JUDGEMENT
 
 
@@ -105,9 +106,8 @@ def agreed_frame(clues: Sequence[Clue]) -> Frame | None:
 
 def is_right(T_map_base: SE2, expected: SE2, within_m: float) -> tuple[bool, float]:
     """Whether an answer is right, and how far it is from the expected pose, metres."""
-    error = expected.inverse() @ T_map_base
-    apart_m = math.hypot(error.x, error.y)
-    return apart_m <= within_m and abs(float(wrap_angle(error.yaw))) <= JUDGEMENT.right_rad, apart_m
+    apart_m, apart_rad = apart(expected, T_map_base)
+    return apart_m <= within_m and apart_rad <= JUDGEMENT.right_rad, apart_m
 
 
 def _agreement(clues: Sequence[Clue]) -> NDArray[np.bool_]:
@@ -142,11 +142,7 @@ def _places(clues: Sequence[Clue]) -> int:
 
 def _fit(clues: Sequence[Clue]) -> SE2:
     """The transform nearest to what the clues say, least squares."""
-    ahead = np.array([(0.0, 0.0), (AGREEMENT.lever_m, 0.0)])
-    return SE2.fit(
-        np.concatenate([clue.T_drive_base.apply(ahead) for clue in clues]),
-        np.concatenate([clue.T_map_base.apply(ahead) for clue in clues]),
-    )
+    return fit_frame([(clue.T_drive_base, clue.T_map_base) for clue in clues], AGREEMENT.lever_m)
 
 
 def _apart_m(a: SE2, b: SE2) -> float:

@@ -9,6 +9,16 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from pc2grid.io import open_log
+from pc2grid.io.trajectory import read_tum
+from pc2grid.model import Trajectory
+from pc2grid.odometry.registration import BareKissIcp
+from pc2grid.odometry.tracker import Tracker
+from pc2grid_lab.experiments.trajectory_error import trajectory_error
+from signature.config import Config
+
 
 def main() -> None:
     """Print one JSON document: scans, cpu_s, and ate_m or null.
@@ -16,17 +26,8 @@ def main() -> None:
     cpu_s is the processor time of `register_frame` alone, over all points of each scan, with the voxel and
     the range that pc2grid chooses for the recording. ate_m is the error with KISS-ICP's own settings.
     """
-    import numpy as np
     from kiss_icp.config import KISSConfig
     from kiss_icp.kiss_icp import KissICP
-
-    from pc2grid.io import open_log
-    from pc2grid.io.trajectory import read_tum
-    from pc2grid.model import Trajectory
-    from pc2grid.odometry.registration import BareKissIcp
-    from pc2grid.odometry.tracker import Tracker
-    from pc2grid_lab.experiments.trajectory_error import trajectory_error
-    from signature.config import Config
 
     log, truth = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None
     with open_log(log) as opened:

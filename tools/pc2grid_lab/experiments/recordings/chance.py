@@ -12,11 +12,10 @@ def clopper_pearson(successes: int, trials: int, alpha: float = ALPHA) -> tuple[
     >>> low, round(high, 3)
     (0.0, 0.168)
     """
-    from scipy.stats import beta
+    from scipy.stats import binomtest
 
-    low = 0.0 if not successes else float(beta.ppf(alpha / 2, successes, trials - successes + 1))
-    high = 1.0 if successes == trials else float(beta.ppf(1 - alpha / 2, successes + 1, trials - successes))
-    return low, high
+    interval = binomtest(successes, trials).proportion_ci(1.0 - alpha)
+    return float(interval.low), float(interval.high)
 
 
 def by_chance(worse: int, better: int) -> float:
@@ -26,6 +25,6 @@ def by_chance(worse: int, better: int) -> float:
     >>> by_chance(5, 0), by_chance(1, 1)
     (0.03125, 0.75)
     """
-    from scipy.stats import binom
+    from scipy.stats import binomtest
 
-    return float(binom.sf(worse - 1, worse + better, 0.5))
+    return float(binomtest(worse, worse + better, alternative="greater").pvalue)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -64,34 +65,45 @@ def _pace(maps: Sequence[tuple[MapRow, MapRow]]) -> float:
 
 def _map_changes(old: MapRow, new: MapRow, pace: float) -> Iterator[Change]:
     if old.problem != new.problem:
-        text = f"{old.problem or 'mapped'} -> {new.problem or 'mapped'}"
-        yield Change(row=new.name, text=text, worse=bool(new.problem) and not old.problem)
+        yield _problem(new.name, old.problem, new.problem, "mapped")
         return
+    for text, was, is_, told in _figures(old, new, pace):
+        if told:
+            yield Change(row=new.name, text=text, worse=is_ > was)
+    verdicts = [{warning.about: warning.verdict for warning in row.warnings} for row in (old, new)]
+    for words, some, others, bad in (
+        ("new warning", verdicts[1], verdicts[0], "false"),
+        ("no longer warned of", verdicts[0], verdicts[1], "right"),
+    ):
+        for about in sorted(some.keys() - others.keys()):
+            verdict = some[about]
+            yield Change(row=new.name, text=f"{words}: {about} ({verdict})", worse=verdict == bad)
+
+
+def _figures(old: MapRow, new: MapRow, pace: float) -> Iterator[tuple[str, float, float, bool]]:
+    """What is said of each figure of a map, the two values (more is worse), and whether it is told."""
     if old.error_m is not None and new.error_m is not None:
-        grown, ratio = new.error_m - old.error_m, new.error_m / max(old.error_m, 1e-6)
-        if abs(grown) >= CHANGE.error_m and not 1 / (1 + CHANGE.share) < ratio < 1 + CHANGE.share:
-            text = f"error {old.error_m:.3f} -> {new.error_m:.3f} m"
-            yield Change(row=new.name, text=text, worse=grown > 0)
+        text = f"error {old.error_m:.3f} -> {new.error_m:.3f} m"
+        yield text, old.error_m, new.error_m, _moved(old.error_m, new.error_m, CHANGE.error_m)
     if old.cpu_s and new.cpu_s:
-        ratio = new.cpu_s / old.cpu_s / pace
-        moved = abs(new.cpu_s / pace - old.cpu_s) >= CHANGE.seconds
-        if moved and not 1 / (1 + CHANGE.share) < ratio < 1 + CHANGE.share:
-            text = f"processor time {old.cpu_s:.1f} -> {new.cpu_s:.1f} s ({ratio:.2f} of what all changed by)"
-            yield Change(row=new.name, text=text, worse=ratio > 1)
-    if old.parts != new.parts:
-        worse = (new.parts or 0) > (old.parts or 0)
-        yield Change(row=new.name, text=f"parts {old.parts} -> {new.parts}", worse=worse)
-    if round(100 * (old.lost or 0)) != round(100 * (new.lost or 0)):
-        text = f"scans lost {100 * (old.lost or 0):.0f} -> {100 * (new.lost or 0):.0f} %"
-        yield Change(row=new.name, text=text, worse=(new.lost or 0) > (old.lost or 0))
-    verdicts = {warning.about: warning.verdict for row in (old, new) for warning in row.warnings}
-    gone, come = ({w.about for w in row.warnings} for row in (old, new))
-    for about in sorted(come - gone):
-        text = f"new warning: {about} ({verdicts[about]})"
-        yield Change(row=new.name, text=text, worse=verdicts[about] == "false")
-    for about in sorted(gone - come):
-        text = f"no longer warned of: {about} ({verdicts[about]})"
-        yield Change(row=new.name, text=text, worse=verdicts[about] == "right")
+        cpu_s = new.cpu_s / pace
+        ratio = f"({cpu_s / old.cpu_s:.2f} of what all changed by)"
+        text = f"processor time {old.cpu_s:.1f} -> {new.cpu_s:.1f} s {ratio}"
+        yield text, old.cpu_s, cpu_s, _moved(old.cpu_s, cpu_s, CHANGE.seconds)
+    yield f"parts {old.parts} -> {new.parts}", old.parts or 0, new.parts or 0, old.parts != new.parts
+    was, is_ = (100 * (row.lost or 0.0) for row in (old, new))
+    yield f"scans lost {was:.0f} -> {is_:.0f} %", was, is_, round(was) != round(is_)
+
+
+def _moved(old: float, new: float, least: float) -> bool:
+    """Whether a value differs by `least` and by more than `ChangeParameters.share`."""
+    ratio, share = new / max(old, 1e-6), 1 + CHANGE.share
+    return abs(new - old) >= least and not 1 / share < ratio < share
+
+
+def _problem(row: str, old: str, new: str, without: str) -> Change:
+    """Two problems that differ. without : the word for none."""
+    return Change(row=row, text=f"{old or without} -> {new or without}", worse=bool(new) and not old)
 
 
 def _same_windows(
@@ -116,31 +128,24 @@ def _pair_changes(
     name: str, old_problem: str, new_problem: str, windows: Sequence[tuple[QueryRow, QueryRow]]
 ) -> Iterator[Change]:
     if old_problem != new_problem:
-        text = f"{old_problem or 'asked'} -> {new_problem or 'asked'}"
-        yield Change(row=name, text=text, worse=bool(new_problem) and not old_problem)
-    outcomes = [(_outcome(a), _outcome(b)) for a, b in windows]
+        yield _problem(name, old_problem, new_problem, "asked")
+    before, after = (Counter(_outcome(pair[k]) for pair in windows) for k in (0, 1))
     for what in ("right", "wrong", "refused", "not judged", "failed"):
-        then, now = (sum(outcome[k] == what for outcome in outcomes) for k in (0, 1))
-        if then != now:
-            yield Change(
-                row=name,
-                text=f"{what} {then} -> {now} of {len(outcomes)}",
-                worse=what == "failed" and now > then,
-            )
-    for (old, new), (was, is_) in zip(windows, outcomes, strict=True):
-        if is_ == "wrong" and was != "wrong":
+        if before[what] != after[what]:
+            text = f"{what} {before[what]} -> {after[what]} of {len(windows)}"
+            yield Change(row=name, text=text, worse=what == "failed" and after[what] > before[what])
+    for old, new in windows:
+        if _outcome(new) == "wrong" != _outcome(old):
             sure = f" at {new.confidence:.3f}" if new.confidence is not None else ""
             off = f", {new.error_m:.2f} m off" if new.error_m is not None else ""
-            text = f"newly wrong: the window from {old.start_s:.1f} s{off}{sure} ({was} before)"
+            text = f"newly wrong: the window from {old.start_s:.1f} s{off}{sure} ({_outcome(old)} before)"
             yield Change(row=name, text=text, worse=True)
 
 
 def _worse(name: str, windows: Sequence[tuple[QueryRow, QueryRow]]) -> Iterator[Change]:
     """Whether fewer are located and right, by a sign test over the windows that changed."""
-    was = [_outcome(a) == "right" for a, _ in windows]
-    is_ = [_outcome(b) == "right" for _, b in windows]
-    lost = sum(a and not b for a, b in zip(was, is_, strict=True))
-    won = sum(b and not a for a, b in zip(was, is_, strict=True))
+    counts = Counter((_outcome(a) == "right", _outcome(b) == "right") for a, b in windows)
+    lost, won = counts[True, False], counts[False, True]
     if lost == won:
         return
     chance = by_chance(max(lost, won), min(lost, won))

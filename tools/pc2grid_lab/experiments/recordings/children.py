@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
+
+from pc2grid_lab.experiments.stored import write_text
 
 ROOT = Path(__file__).resolve().parents[4]
 """The folder of the packages; `tools/` is below it."""
@@ -70,39 +73,49 @@ def run(command: Sequence[str], *, limit_s: float) -> Finished:
             command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err, env=environment
         )
         try:
-            # `wait4` alone tells the time of this child, and not of all that ended so far.
-            while True:
-                pid, status, used = os.wait4(child.pid, os.WNOHANG)
-                if pid:
-                    break
-                if time.monotonic() - begin > limit_s:
-                    child.kill()
-                time.sleep(0.02)
+            used = _wait(child, begin + limit_s)
         except BaseException:
             child.kill()
             child.wait()
             raise
-        child.returncode = code = os.waitstatus_to_exitcode(status)
         out.seek(0)
         err.seek(0)
-        text, complaint = out.read(), err.read().decode(errors="replace")
-    try:
-        document = json.loads(text)
-    except ValueError:
-        document = None
-    lines = [line for line in complaint.splitlines() if line.strip()]
-    said = next((line for line in lines if "error:" in line), lines[-1] if lines else "nothing was printed")
+        document, complaint = _parsed(out.read()), err.read().decode(errors="replace")
     finished = Finished(
-        code=code,
+        code=child.returncode,
         cpu_s=used.ru_utime + used.ru_stime,
         wall_s=time.monotonic() - begin,
         peak_mb=used.ru_maxrss / (1024 if sys.platform == "linux" else 1024**2),
         document=document,
     )
-    if not finished.failed:
-        return finished
-    ended = f"ended by signal {-code}" if code < 0 else said
-    return Finished(**{**asdict(finished), "error": ended})
+    return replace(finished, error=_error(finished.code, complaint)) if finished.failed else finished
+
+
+def _wait(child: subprocess.Popen[bytes], end_s: float) -> resource.struct_rusage:
+    """Wait for a process, and end it after `end_s` of the monotonic clock; what it has used."""
+    # `wait4` alone tells the time of this child, and not of all that ended so far.
+    while True:
+        pid, status, used = os.wait4(child.pid, os.WNOHANG)
+        if pid:
+            child.returncode = os.waitstatus_to_exitcode(status)
+            return used
+        if time.monotonic() > end_s:
+            child.kill()
+        time.sleep(0.02)
+
+
+def _parsed(text: bytes) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return None
+
+
+def _error(code: int, complaint: str) -> str:
+    """Why a command failed: the error that it names, or the last that it said."""
+    lines = [line for line in complaint.splitlines() if line.strip()] or ["nothing was printed"]
+    said = next((line for line in lines if "error:" in line), lines[-1])
+    return f"ended by signal {-code}" if code < 0 else said
 
 
 def kept(file: Path) -> Finished | None:
@@ -112,9 +125,6 @@ def kept(file: Path) -> Finished | None:
 
 def keep(file: Path, finished: Finished) -> Finished:
     """Write a result to a file, completely or not at all."""
-    from pc2grid.io.atomic import replace_file
-
     file.parent.mkdir(parents=True, exist_ok=True)
-    with replace_file(file) as draft:
-        draft.write_text(json.dumps(asdict(finished)))
+    write_text(file, json.dumps(asdict(finished)))
     return finished

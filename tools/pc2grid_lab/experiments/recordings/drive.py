@@ -8,10 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.geometry import SE2, interpolate_pose
+from pc2grid.io import open_log
+from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Trajectory
+from pc2grid_cli.options import make_config
+from pc2grid_lab.experiments.frames import fit_frame
 from pc2grid_lab.experiments.recordings.catalogue import Recording
 from pc2grid_lab.experiments.recordings.run import Folder
 from signature.config import Config
+from signature.database import open_database
 
 _SAME_NS = 5_000_000
 """Stamps that differ by no more than this are of one scan."""
@@ -26,8 +31,6 @@ _AHEAD_M = 3.0
 
 def sessions(folder: Folder, name: str) -> dict[str, Trajectory]:
     """The trajectories of the sessions of a map, empty if there is none."""
-    from signature.database import open_database
-
     if not folder.map(name).exists():
         return {}
     with open_database(folder.map(name)) as database:
@@ -36,8 +39,6 @@ def sessions(folder: Folder, name: str) -> dict[str, Trajectory]:
 
 def mount(folder: Folder, recording: Recording) -> SE2:
     """T_base_sensor of a recording's first scan."""
-    from pc2grid.io import open_log
-
     with open_log(folder.source(recording), config_of(recording).read) as log:
         return SE2.from_matrix(next(iter(log.scans())).T_base_sensor)
 
@@ -57,8 +58,6 @@ class Drive:
     @staticmethod
     def of(recording: Recording, folder: Folder) -> Drive:
         """Of a recording whose whole map is in the folder."""
-        from pc2grid.io.trajectory import read_tum
-
         parts = tuple(sessions(folder, recording.name).values())
         truth = None if recording.poses is None else read_tum(folder.data / recording.poses)
         T_base_sensor = SE2() if recording.of_base or truth is None else mount(folder, recording)
@@ -102,12 +101,7 @@ class Drive:
         ]
         if not pairs:
             return None
-        ahead = np.array([(0.0, 0.0), (_AHEAD_M, 0.0)])
-        T_world_part = SE2.fit(
-            np.concatenate([T_part_base.apply(ahead) for T_part_base, _ in pairs]),
-            np.concatenate([T_world_base.apply(ahead) for _, T_world_base in pairs]),
-        )
-        return T_world_part @ own[1]
+        return fit_frame(pairs, _AHEAD_M) @ own[1]
 
 
 def _nearest(stamps_ns: NDArray[np.int64], stamp_ns: int) -> int | None:
@@ -120,7 +114,5 @@ def _nearest(stamps_ns: NDArray[np.int64], stamp_ns: int) -> int | None:
 
 def config_of(recording: Recording) -> Config:
     """The settings that the commands read a recording with."""
-    from pc2grid_cli.options import make_config
-
     given = dict(zip(recording.options[::2], recording.options[1::2], strict=True))
     return make_config(None, None, topic=given.get("--topic"), odometry=given.get("--odometry"))

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import groupby
 from typing import Any
 
 import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
+from pc2grid.io import open_log
 from pc2grid.model import OccupancyGrid, Trajectory
+from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_frame, is_right
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
@@ -21,6 +22,7 @@ from pc2grid_lab.experiments.recordings.mapped import MISSING, map_row, said
 from pc2grid_lab.experiments.recordings.rows import NOT_RUN, PairRow, QueryRow, Table, Truth
 from pc2grid_lab.experiments.recordings.run import Folder
 from pc2grid_lab.experiments.trial import JUDGEMENT
+from signature.database import open_database
 
 _KNOWN_M = 0.2
 """A wall hit lies on known ground if the map knows a cell this near: noise puts hits behind the wall."""
@@ -164,9 +166,6 @@ class Judge:
 
     def _last_hits(self, query: Recording, span: TimeSpan, stamp_ns: int) -> F64:
         """(N, 2) walls that the last scan of a window shows, in the axes of the base."""
-        from pc2grid.io import open_log
-        from pc2grid.pipeline import follow
-
         config, end_s = config_of(query), span.start_s + (span.duration_s or 0.0)
         start_s = max(end_s - _LAST_S, span.start_s)
         with open_log(self._folder.source(query), config.read) as log:
@@ -244,8 +243,6 @@ class Judge:
         return Frame(tuple(clues)) if len(clues) >= 2 else None
 
     def _grids_of(self, name: str) -> dict[str, OccupancyGrid]:
-        from signature.database import open_database
-
         if name not in self._grids:
             with open_database(self._folder.map(name)) as database:
                 self._grids[name] = {info.name: database.grid(info.name) for info in database.sessions()}
@@ -304,23 +301,23 @@ def _judged(one: Asked, frames: Frames, grids: Mapping[str, OccupancyGrid]) -> Q
         known_share(grids[session], T_map_base.apply(one.hits_m)) >= JUDGEMENT.mapped
         for session, (T_map_base, _) in expected.items()
     )
-    row["covered"] = bool(covered)
-    if not one.places:
-        return QueryRow(**row, right=False)
+    return QueryRow(**row, covered=covered, **_best(one.places, expected))
+
+
+def _best(
+    places: Sequence[tuple[str, SE2, int]], expected: Mapping[str, tuple[SE2, float]]
+) -> dict[str, Any]:
+    """`right` and `error_m` of the first hypothesis, and `rank` of the first right one, by its place."""
+    if not places:
+        return {"right": False}
     judged = [
-        is_right(pose, *expected[session]) if session in expected else None for session, pose, _ in one.places
+        is_right(pose, *expected[session]) if session in expected else (None, None)
+        for session, pose, _ in places
     ]
-    first = judged[0]
-    order = [place for place, _ in groupby(place for _, _, place in one.places)]
-    of_right = next(
-        (place for (_, _, place), j in zip(one.places, judged, strict=True) if j is not None and j[0]), None
-    )
-    return QueryRow(
-        **row,
-        right=None if first is None else first[0],
-        error_m=None if first is None else first[1],
-        rank=None if of_right is None else list(dict.fromkeys(order)).index(of_right),
-    )
+    order = list(dict.fromkeys(place for _, _, place in places))
+    ranks = (order.index(place) for (_, _, place), (right, _) in zip(places, judged, strict=True) if right)
+    right, error_m = judged[0]
+    return {"right": right, "error_m": error_m, "rank": next(ranks, None)}
 
 
 def known_share(grid: OccupancyGrid, points_m: F64) -> float:

@@ -9,32 +9,22 @@ from typing import Any
 import numpy as np
 
 from pc2grid.geometry import SE2
+from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Trajectory
 from pc2grid_lab.experiments.recordings.catalogue import Recording
-from pc2grid_lab.experiments.recordings.children import kept
+from pc2grid_lab.experiments.recordings.children import Finished, kept
 from pc2grid_lab.experiments.recordings.drive import mount, sessions
 from pc2grid_lab.experiments.recordings.rows import NOT_RUN, MapRow
 from pc2grid_lab.experiments.recordings.run import Folder
 from pc2grid_lab.experiments.recordings.warned import warned
+from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
+from pc2grid_lab.experiments.trajectory_error import TrajectoryError, trajectory_error
 
 MISSING = "not in the data folder"
 
 
 def map_row(recording: Recording, folder: Folder) -> MapRow:
     """The row of a recording as a map; what cannot be judged is a row that says why."""
-    try:
-        return _map_row(recording, folder)
-    except Exception as error:
-        name, building, sensor = recording.name, recording.building, recording.sensor
-        return MapRow(name=name, building=building, sensor=sensor, problem=said(error))
-
-
-def said(error: Exception) -> str:
-    """What became of a row that cannot be judged."""
-    return f"{type(error).__name__}: {error}"
-
-
-def _map_row(recording: Recording, folder: Folder) -> MapRow:
     row: dict[str, Any] = {
         "name": recording.name,
         "building": recording.building,
@@ -43,10 +33,22 @@ def _map_row(recording: Recording, folder: Folder) -> MapRow:
     if folder.missing(recording):
         return MapRow(**row, problem=MISSING)
     done = kept(folder.result(recording.name))
-    if done is None or done.failed:
-        return MapRow(
-            **row, problem=NOT_RUN if done is None else done.error, cpu_s=done.cpu_s if done else None
-        )
+    if done is None:
+        return MapRow(**row, problem=NOT_RUN)
+    if done.failed:
+        return MapRow(**row, problem=done.error, cpu_s=done.cpu_s)
+    try:
+        return MapRow(**row, cpu_s=done.cpu_s, **_figures(recording, folder, done))
+    except Exception as error:
+        return MapRow(**row, problem=said(error))
+
+
+def said(error: Exception) -> str:
+    """What became of a row that cannot be judged."""
+    return f"{type(error).__name__}: {error}"
+
+
+def _figures(recording: Recording, folder: Folder, done: Finished) -> dict[str, Any]:
     stored = done.document["sessions"]
     reports = [session["report"] for session in stored]
     read = sum(report["scans_read"] for report in reports)
@@ -54,23 +56,18 @@ def _map_row(recording: Recording, folder: Folder) -> MapRow:
     bare = kept(folder.bare(recording.name))
     bare_of: dict[str, Any] = {} if bare is None or bare.failed else bare.document
     error = _error(recording, folder)
-    return MapRow(
-        **row,
-        minutes=sum(session["duration_s"] for session in stored) / 60.0,
-        metres=sum(session["path_m"] for session in stored),
-        area_m2=sum(session["area_m2"] for session in stored),
-        cpu_s=done.cpu_s,
-        over_bare=done.cpu_s / bare_of["cpu_s"] if bare_of else None,
-        parts=len(stored),
-        lost=skipped / read if read else None,
-        warnings=warned(
-            (text for report in reports for text in report["warnings"]),
-            storeys=recording.storeys,
-            error_m=error.get("error_m"),
-        ),
-        bare_m=bare_of.get("ate_m"),
+    texts = [text for report in reports for text in report["warnings"]]
+    return {
+        "minutes": sum(session["duration_s"] for session in stored) / 60.0,
+        "metres": sum(session["path_m"] for session in stored),
+        "area_m2": sum(session["area_m2"] for session in stored),
+        "over_bare": done.cpu_s / bare_of["cpu_s"] if bare_of else None,
+        "parts": len(stored),
+        "lost": skipped / read if read else None,
+        "warnings": warned(texts, storeys=recording.storeys, error_m=error.get("error_m")),
+        "bare_m": bare_of.get("ate_m"),
         **error,
-    )
+    }
 
 
 def _error(recording: Recording, folder: Folder) -> dict[str, Any]:
@@ -86,8 +83,6 @@ def _error(recording: Recording, folder: Folder) -> dict[str, Any]:
 
 def _relation_error(parts: Sequence[Trajectory], truth: Path, T_base_sensor: SE2) -> dict[str, float]:
     """Mean errors over the relations that lie in one part."""
-    from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
-
     relations, offset_m = read_relations(truth), (T_base_sensor.x, T_base_sensor.y)
     found = [relation_error(part, relations, base_to_reference_m=offset_m) for part in parts]
     found = [error for error in found if error.used]
@@ -103,9 +98,6 @@ def _relation_error(parts: Sequence[Trajectory], truth: Path, T_base_sensor: SE2
 
 def _pose_error(parts: Sequence[Trajectory], truth: Path) -> dict[str, float]:
     """RMS distance from the true poses, each part aligned by itself."""
-    from pc2grid.io.trajectory import read_tum
-    from pc2grid_lab.experiments.trajectory_error import TrajectoryError, trajectory_error
-
     true = read_tum(truth)
 
     def errors() -> Iterator[TrajectoryError]:

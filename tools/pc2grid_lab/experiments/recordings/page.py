@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import groupby
 
 from pc2grid_lab.experiments.recordings.catalogue import KINDS
 from pc2grid_lab.experiments.recordings.chance import clopper_pearson
@@ -201,47 +200,33 @@ def _by_building(table: Table) -> list[str]:
         ),
         (),
     )
-    cells = []
-    for building in dict.fromkeys(row.building for row in table.pairs):
-        rows = [row for row in inside if row.building == building]
-        names = {row.query for row in rows}
-        counts, other = _total(rows), _total([row for row in outside if row.building == building])
-        cells.append(
-            [
-                building,
-                str(len(names)),
-                str(counts.queries),
-                str(counts.covered),
-                _share(counts.covered_right, counts.covered),
-                _share(counts.wrong, counts.right + counts.wrong),
-                _share(other.wrong, other.queries),
-            ]
-        )
-    counts, other = _total(inside), _total(outside)
-    cells.append(
-        [
-            "all queries",
-            str(len({row.query for row in inside})),
-            str(counts.queries),
-            str(counts.covered),
-            _share(counts.covered_right, counts.covered),
-            _share(counts.wrong, counts.right + counts.wrong),
-            _share(other.wrong, other.queries),
-        ]
-    )
-    with_wrong = [b for b, rows in _grouped(inside + outside) if _total(rows).wrong]
-    buildings = len({row.building for row in inside + outside})
+    buildings = list(dict.fromkeys(row.building for row in table.pairs))
+    cells = [
+        _building_cells(b, *([row for row in rows if row.building == b] for rows in (inside, outside)))
+        for b in buildings
+    ]
+    cells.append(_building_cells("all queries", inside, outside))
+    judged = sorted({row.building for row in inside + outside})
+    with_wrong = [b for b in judged if _total(r for r in inside + outside if r.building == b).wrong]
     return [
         *_markdown(heads, cells),
         "",
         "Queries of one building are not independent. By buildings, which are, one at least wrong answer:"
-        f" {_share(len(with_wrong), buildings)}{' (' + ', '.join(with_wrong) + ')' if with_wrong else ''}.",
+        f" {_share(len(with_wrong), len(judged))}{' (' + ', '.join(with_wrong) + ')' if with_wrong else ''}.",
     ]
 
 
-def _grouped(rows: Iterable[PairRow]) -> list[tuple[str, list[PairRow]]]:
-    ordered = sorted(rows, key=lambda row: row.building)
-    return [(building, list(group)) for building, group in groupby(ordered, key=lambda row: row.building)]
+def _building_cells(name: str, inside: Sequence[PairRow], outside: Sequence[PairRow]) -> list[str]:
+    counts, other = _total(inside), _total(outside)
+    return [
+        name,
+        str(len({row.query for row in inside})),
+        str(counts.queries),
+        str(counts.covered),
+        _share(counts.covered_right, counts.covered),
+        _share(counts.wrong, counts.right + counts.wrong),
+        _share(other.wrong, other.queries),
+    ]
 
 
 def _failures(table: Table) -> list[str]:

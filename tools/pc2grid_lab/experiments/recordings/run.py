@@ -12,9 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pc2grid.errors import Pc2GridError
+from pc2grid.io import open_log
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.children import Finished, keep, kept, pc2grid, python_module
+from pc2grid_lab.experiments.recordings.thinned import write_thinned
 
 _RESULTS = ("maps", "bare", "answers")
 """Folders of results."""
@@ -67,8 +69,6 @@ class Folder:
 
     def length_s(self, recording: Recording) -> float:
         """How long a recording lasts. Raises the errors of `open_log`."""
-        from pc2grid.io import open_log
-
         with open_log(self.source(recording)) as opened:
             return (opened.info.end_ns - opened.info.start_ns) * 1e-9
 
@@ -97,21 +97,10 @@ def run_all(
 
     advance : called with the share of the commands that is done.
     """
-    from pc2grid_lab.experiments.recordings.thinned import write_thinned
-
     pairs = [p for p in catalogue.pairs if not _gap(catalogue, folder, p)]
-    maps: dict[str, tuple[Recording, float | None]] = {
-        r.name: (r, None) for r in catalogue.mapped if not folder.missing(r)
-    }
-    for pair in pairs:
-        maps[pair.map_name] = (catalogue.recordings[pair.map], pair.until_s)
-        if pair.kind != "elsewhere":  # its windows are placed by the trajectory of the whole recording
-            maps[pair.query] = (catalogue.recordings[pair.query], None)
-    for name in {recording.name for recording, _ in maps.values()} | {pair.query for pair in pairs}:
-        recording = catalogue.recordings[name]
-        if recording.every > 1 and not folder.source(recording).exists():
-            folder.source(recording).parent.mkdir(parents=True, exist_ok=True)
-            write_thinned(folder.data / recording.file, folder.source(recording), recording.every)
+    maps, queries = _maps(catalogue, folder, pairs), [catalogue.recordings[p.query] for p in pairs]
+    for recording in [*(r for r, _ in maps.values()), *queries]:
+        _thin(folder, recording)
     tasks = [_convert(folder, name, recording, until_s) for name, (recording, until_s) in maps.items()]
     tasks += [_bare(folder, r) for r in catalogue.mapped if r.sensor == "lidar" and not folder.missing(r)]
     asked = sum(pair.windows for pair in pairs)
@@ -120,6 +109,27 @@ def run_all(
     questions = [task for pair in pairs for task in _questions(catalogue, folder, pair)]
     for done in _run(questions, jobs):
         advance((len(tasks) + done) / (len(tasks) + asked))
+
+
+def _maps(
+    catalogue: Catalogue, folder: Folder, pairs: Sequence[Pair]
+) -> dict[str, tuple[Recording, float | None]]:
+    """The maps that are made, by name: of what recording, and of how much of it."""
+    maps: dict[str, tuple[Recording, float | None]] = {
+        r.name: (r, None) for r in catalogue.mapped if not folder.missing(r)
+    }
+    for pair in pairs:
+        maps[pair.map_name] = (catalogue.recordings[pair.map], pair.until_s)
+        if pair.kind != "elsewhere":  # its windows are placed by the trajectory of the whole recording
+            maps[pair.query] = (catalogue.recordings[pair.query], None)
+    return maps
+
+
+def _thin(folder: Folder, recording: Recording) -> None:
+    target = folder.source(recording)
+    if recording.every > 1 and not target.exists():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_thinned(folder.data / recording.file, target, recording.every)
 
 
 def _questions(catalogue: Catalogue, folder: Folder, pair: Pair) -> list[_Task]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pc2grid.io.atomic import replace_file
+
 
 def write_thinned(source: Path, target: Path, every: int) -> None:
     """Write the MCAP file `target` with every nth message of each topic of scans in `source`.
@@ -12,8 +14,6 @@ def write_thinned(source: Path, target: Path, every: int) -> None:
     """
     from mcap.reader import make_reader
     from mcap.writer import Writer
-
-    from pc2grid.io.atomic import replace_file
 
     with source.open("rb") as read, replace_file(target) as draft, draft.open("wb") as written:
         reader, writer = make_reader(read), Writer(written)
