@@ -5,7 +5,7 @@ With PC2GRID_DATA these are real recordings of a laser and of a lidar, else a li
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from pc2grid.io.nav2_map import save_map
@@ -13,7 +13,7 @@ from pc2grid_lab.bench import fixtures
 from pc2grid_lab.bench.measure import ROOT, Row
 from pc2grid_lab.peers.environment import PEERS, PeerEnvironment
 from pc2grid_lab.peers.experiment import run, tasks
-from pc2grid_lab.peers.outcome import counted
+from pc2grid_lab.peers.outcome import PeerCell, counted
 from pc2grid_lab.peers.site import Site, recorded_site, simulated_site
 from signature.config import Config
 
@@ -34,21 +34,25 @@ def compare(folder: Path, quick: bool) -> Iterator[Row]:
     trials = [
         trial for task in tasks(sites, environment) for trial in run(task, environment, folder / "trials")
     ]
-    cells = {(cell.site, cell.peer): cell for cell in counted(trials)}
+    yield from _rows(counted(trials))
+
+
+def _rows(cells: Sequence[PeerCell]) -> Iterator[Row]:
     titles = {kind.name: kind.title for kind in PEERS}
-    for (site, peer), cell in cells.items():
+    own_s = {cell.site: cell.cpu_s for cell in cells if cell.peer == "pc2grid"}
+    for cell in cells:
         yield Row(
-            what=f"query to pose in {site}, {titles[peer]}",
+            what=f"query to pose in {cell.site}, {titles[cell.peer]}",
             measured=cell.cpu_s,
             cpu=cell.cpu_s,
             unit="s",
             note=f"right {cell.right}, wrong {cell.wrong} of {cell.covered} in the map; elsewhere wrong"
             f" {cell.elsewhere_wrong} of {cell.elsewhere}; {cell.peak_mb:.0f} MB",
         )
-        own_s = cells[site, "pc2grid"].cpu_s
-        if peer != "pc2grid" and own_s and cell.cpu_s:
-            what = f"pc2grid over {titles[peer]}, {site}"
-            yield Row(what=what, measured=own_s / cell.cpu_s, unit="x", goal=1.0)
+        here_s = own_s[cell.site]
+        if cell.peer != "pc2grid" and here_s and cell.cpu_s:
+            what = f"pc2grid over {titles[cell.peer]}, {cell.site}"
+            yield Row(what=what, measured=here_s / cell.cpu_s, unit="x", goal=1.0)
 
 
 def _sites(folder: Path, queries: int) -> Iterator[Site]:

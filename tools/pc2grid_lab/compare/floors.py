@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Annotated
 
@@ -14,9 +15,10 @@ from pc2grid_cli.options import OUTPUT_FOLDER, SensorName
 from pc2grid_cli.output_files import make_folder
 from pc2grid_cli.tables import show
 from pc2grid_lab.compare.floors_report import draw, example_of, floors_table, mapped
-from pc2grid_lab.documents import CompareFloors, FloorRow
-from pc2grid_lab.experiments.floors import WAYS, FloorResult, FloorTask, database_file, stored_floors
+from pc2grid_lab.documents import FloorRow
+from pc2grid_lab.experiments.floors import WAYS, FloorResult, FloorTask, Way, database_file, stored_floors
 from pc2grid_lab.experiments.program import program_digest
+from pc2grid_lab.experiments.stored import in_processes
 from signature.database import open_database
 
 
@@ -52,10 +54,6 @@ def compare_floors_command(
 
     Example: pc2grid compare floors --seeds 1,2,3
     """
-    names = [word.strip() for word in ways.split(",")]
-    unknown = [name for name in names if name not in WAYS]
-    if unknown:
-        raise ConfigError(f"--ways: no way {unknown[0]!r}", hint=f"known are {', '.join(WAYS)}")
     numbers, floors = _whole_numbers(seeds, "--seeds"), _whole_numbers(visits, "--visits")
     tasks = [
         FloorTask(
@@ -68,32 +66,29 @@ def compare_floors_command(
             query_m=query,
             queries=queries,
         )
-        for seed in numbers
-        for way in WAYS
-        if way in names
-        for alike in (True, False)
+        for seed, way, alike in itertools.product(numbers, _known(ways), (True, False))
     ]
     make_folder(out)
     with of(context).progress("floors") as advance:
-        houses = []
-        for done, task in enumerate(tasks, start=1):
-            houses.append((task, stored_floors(task, out)))
-            advance(done / len(tasks))
+        results = in_processes(stored_floors, [(task, out) for task in tasks], jobs=1, advance=advance)
+    houses = list(zip(tasks, results, strict=True))
     example, picture = example_of(houses), out / "floors.png"
     draw(picture, houses, _grids(*example, out), example)
-    in_the_map = [(task, mapped(result, _grids(task, result, out))) for task, result in houses]
+    there = [mapped(result, _grids(task, result, out)) for task, result in houses]
     if as_json:
-        document: CompareFloors = {
-            "schema_version": 1,
-            "program": program_digest(),
-            "rows": [
-                _row(task, result, there)
-                for (task, result), (_, there) in zip(houses, in_the_map, strict=True)
-            ],
-        }
-        print_json(document)
-        return
-    show(floors_table(houses, in_the_map), str(picture))
+        rows = [_row(*row) for row in zip(tasks, results, there, strict=True)]
+        print_json({"schema_version": 1, "program": program_digest(), "rows": rows})
+    else:
+        show(floors_table(houses, list(zip(tasks, there, strict=True))), str(picture))
+
+
+def _known(ways: str) -> list[Way]:
+    """The ways that are named, in the order of `WAYS`. Raises ConfigError for a word that is none."""
+    names = [word.strip() for word in ways.split(",")]
+    unknown = [name for name in names if name not in WAYS]
+    if unknown:
+        raise ConfigError(f"--ways: no way {unknown[0]!r}", hint=f"known are {', '.join(WAYS)}")
+    return [way for way in WAYS if way in names]
 
 
 def _whole_numbers(text: str, option: str) -> tuple[int, ...]:

@@ -10,14 +10,15 @@ import typer
 
 from pc2grid.display import probability
 from pc2grid.errors import ConfigError
-from pc2grid.io import open_log
+from pc2grid.io import Log, open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.tables import show, table
 from pc2grid_lab.experiments.metrics import QueryCounts
-from pc2grid_lab.experiments.replay import Replay, spread
+from pc2grid_lab.experiments.replay import MappedPart, Replay, spread
+from pc2grid_lab.experiments.stored import in_processes
 from pc2grid_lab.experiments.trial import JUDGEMENT, Trial
 
 _MAP_S, _QUERY_S = 600.0, 40.0
@@ -63,45 +64,56 @@ def compare_log_command(
     settings = options.make_config(config, set_, topic=topic, odometry=odometry)
     asked = None if map_ is None else _seconds(map_)
     _refuse_relations(truth)
+    terminal = console.of(context)
     with open_log(log, settings.read) as opened:
-        end_s = (opened.info.end_ns - opened.info.start_ns) * 1e-9
-        from_s, to_s = asked or (0.0, min(_MAP_S, end_s / 2))
-        if to_s >= end_s:
-            raise ConfigError(
-                f"--map {from_s:g}..{to_s:g}: nothing is left to locate, the log lasts {end_s:.1f} s",
-                hint=f"for example --map 0..{end_s / 2:.0f}",
-            )
-        length_s = length or min(_QUERY_S, (end_s - to_s) / 2)
-        console.of(context).note(f"map: {from_s:.1f}..{to_s:.1f} s; queries last {length_s:.1f} s")
+        mapped, length_s, end_s = _spans(opened, asked, length)
+        to_s = mapped.start_s + (mapped.duration_s or 0.0)
+        terminal.note(f"map: {mapped.start_s:.1f}..{to_s:.1f} s; queries last {length_s:.1f} s")
         replay = Replay(opened, read_tum(truth), settings, of_base=of_base)
         if replay.up != "z":
             console.warn(f"{truth.name}: {replay.up} points up in it; its poses are turned so that z does")
-        observer = console.of(context).observer()
-        with observer.step("map"):
-            part = replay.map(TimeSpan(from_s, to_s - from_s), observer)
-        for warning in part.warnings:
-            console.warn(f"map: {warning}")
-        trials = []
-        with console.of(context).progress("locate") as advance:
-            spans = spread(to_s, end_s, queries, length_s)
-            for done, span in enumerate(spans, start=1):
-                trials.append(replay.locate(span, part))
-                advance(done / len(spans))
+        part = _mapped(replay, mapped, terminal)
+        with terminal.progress("locate") as advance:
+            spans = [(span, part) for span in spread(to_s, end_s, queries, length_s)]
+            trials = in_processes(replay.locate, spans, jobs=1, advance=advance)
     judged = [trial for trial in trials if trial is not None]
     counts = QueryCounts.of(judged)
-    if json:
-        document = {
-            "schema_version": 1,
-            "log": log.name,
-            "map_s": [from_s, to_s],
-            "length_s": length_s,
-            "without_truth": len(trials) - len(judged),
-            "tally": asdict(counts),
-            "trials": [asdict(trial) for trial in judged],
-        }
-        console.print_json(document)
-    else:
+    if not json:
         _print(judged, counts, len(trials) - len(judged))
+        return
+    document = {
+        "schema_version": 1,
+        "log": log.name,
+        "map_s": [mapped.start_s, to_s],
+        "length_s": length_s,
+        "without_truth": len(trials) - len(judged),
+        "tally": asdict(counts),
+        "trials": [asdict(trial) for trial in judged],
+    }
+    console.print_json(document)
+
+
+def _spans(
+    log: Log, asked: tuple[float, float] | None, length_s: float | None
+) -> tuple[TimeSpan, float, float]:
+    """What becomes the map, the length of a query, and the end of the log. Raises ConfigError."""
+    end_s = (log.info.end_ns - log.info.start_ns) * 1e-9
+    from_s, to_s = asked or (0.0, min(_MAP_S, end_s / 2))
+    if to_s >= end_s:
+        raise ConfigError(
+            f"--map {from_s:g}..{to_s:g}: nothing is left to locate, the log lasts {end_s:.1f} s",
+            hint=f"for example --map 0..{end_s / 2:.0f}",
+        )
+    return TimeSpan(from_s, to_s - from_s), length_s or min(_QUERY_S, (end_s - to_s) / 2), end_s
+
+
+def _mapped(replay: Replay, span: TimeSpan, terminal: console.Console) -> MappedPart:
+    observer = terminal.observer()
+    with observer.step("map"):
+        part = replay.map(span, observer)
+    for warning in part.warnings:
+        console.warn(f"map: {warning}")
+    return part
 
 
 def _refuse_relations(truth: Path) -> None:

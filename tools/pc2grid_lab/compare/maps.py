@@ -69,7 +69,10 @@ def compare_maps_command(
     if as_json:
         print_json({"schema_version": 1, "rows": rows})
         return
-    simulated, recorded = [r for r in rows if "plan" in r], [r for r in rows if "log" in r]
+    _show([row for row in rows if "plan" in row], [row for row in rows if "log" in row])
+
+
+def _show(simulated: list[Row], recorded: list[Row]) -> None:
     title = "{}: trajectories against the truth, beside bare KISS-ICP"
     if simulated:
         show(

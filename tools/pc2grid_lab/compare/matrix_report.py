@@ -28,15 +28,19 @@ def tables(cells: Sequence[MatrixCell], elsewhere: Sequence[Trial]) -> None:
     detail = table(f"after {last:g} m", who, figures)
     for pair in itertools.product(_SENSORS, _SENSORS):
         row = {c.travel_m: c for c in cells if (c.map_sensor, c.query_sensor) == pair}
-        # Without a row no query of this sensor drove where the map is.
-        shown = [f"{row[d].located_right:.2f}" if d in row else "" if row else "-" for d in distances]
-        shares.add_row(*pair, *shown, str(max((c.trials for c in row.values()), default=0)))
+        shares.add_row(*pair, *_shares(row, distances))
         if last in row:
             detail.add_row(*pair, *_figures(row[last]))
     show(shares, detail)
     if elsewhere:
         right = sum(t.status == "not_found" for t in elsewhere)
         show(f"queries from another building: {right} of {len(elsewhere)} answered not_found")
+
+
+def _shares(row: Mapping[float, MatrixCell], distances: Sequence[float]) -> list[str]:
+    """Of a pair of sensors; without a row no query drove where the map is."""
+    shown = [f"{row[d].located_right:.2f}" if d in row else "" if row else "-" for d in distances]
+    return [*shown, str(max((cell.trials for cell in row.values()), default=0))]
 
 
 def _figures(cell: MatrixCell) -> tuple[str, ...]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import multiprocessing
 import os
-from collections.abc import Iterable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,6 +31,7 @@ from pc2grid_lab.experiments.paper_task import (
     paper_tasks,
     run_task,
 )
+from pc2grid_lab.experiments.stored import write_text
 
 _COSTS = {
     "proposed": 1.0,
@@ -95,13 +96,7 @@ def compare_paper_command(
 
     Example: pc2grid compare paper --maps maps/ --queries 200 --ablation
     """
-    chosen = tuple(methods or METHOD_NAMES)
-    known = METHOD_NAMES + EXTRA_METHOD_NAMES
-    for name in chosen:
-        if name not in known:
-            raise ConfigError(f"--methods: no method {name!r}", hint=f"one of {', '.join(known)}")
-    require_packages(chosen)
-    offsets_m = tuple(offset or (1.0, 0.5))
+    chosen, offsets_m = _chosen(methods), tuple(offset or (1.0, 0.5))
     if min(offsets_m) <= 0:
         raise ConfigError("--offset: expected a distance above 0 m")
     map_paths = known_maps(maps)
@@ -112,17 +107,9 @@ def compare_paper_command(
     cells = out / "cells"
     make_folder(out)
     make_folder(cells)
-    tasks = list(
-        paper_tasks(
-            map_paths,
-            methods=chosen,
-            offsets_m=offsets_m,
-            queries=queries,
-            seed=seed,
-            choices=(*(ABLATION if ablation else ()), *(OPEN_CHOICES if open_choices else ())),
-            speckle_sigma_m=speckles,
-        )
-    )
+    choices = (ABLATION if ablation else ()) + (OPEN_CHOICES if open_choices else ())
+    asked: dict[str, Any] = {"methods": chosen, "offsets_m": offsets_m, "queries": queries, "seed": seed}
+    tasks = list(paper_tasks(map_paths, **asked, choices=choices, speckle_sigma_m=speckles))
     run_tasks(tasks, cells, jobs or os.cpu_count() or 1, of(context))
     results = _results(tasks, cells)
     document = _write(results, out, queries, seed)
@@ -134,6 +121,16 @@ def compare_paper_command(
         print(f"written: {out / 'results.json'}, {out / 'results.csv'}, {', '.join(map(str, pictures))}")
 
 
+def _chosen(methods: Sequence[str] | None) -> tuple[str, ...]:
+    """The methods that are compared. Raises ConfigError if one is not known, or cannot be run."""
+    chosen, known = tuple(methods or METHOD_NAMES), METHOD_NAMES + EXTRA_METHOD_NAMES
+    for name in chosen:
+        if name not in known:
+            raise ConfigError(f"--methods: no method {name!r}", hint=f"one of {', '.join(known)}")
+    require_packages(chosen)
+    return chosen
+
+
 def run_tasks(tasks: Sequence[PaperTask], cells: Path, jobs: int, terminal: Console) -> None:
     """Run the tasks that have no result yet in `jobs` processes, and show the progress on `terminal`."""
     open_tasks = [t for t in tasks if any(load_result(t, m, cells) is None for m in t.methods)]
@@ -143,29 +140,34 @@ def run_tasks(tasks: Sequence[PaperTask], cells: Path, jobs: int, terminal: Cons
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     spawn = multiprocessing.get_context("spawn")
-    done_shares = spawn.SimpleQueue()
+    done_shares, costs = spawn.SimpleQueue(), [_cost(task) for task in open_tasks]
     with (
         terminal.progress(f"{len(open_tasks)} cells of the tables") as advance,
         ProcessPoolExecutor(
             jobs, mp_context=spawn, initializer=_start_worker, initargs=(done_shares,)
         ) as pool,
     ):
-        shares = dict.fromkeys(range(len(open_tasks)), 0.0)
-        costs = [_cost(task) for task in open_tasks]
         pending = {pool.submit(_run, index, task, cells) for index, task in enumerate(open_tasks)}
         try:
-            while pending:
-                finished, pending = wait(pending, timeout=0.5, return_when=FIRST_COMPLETED)
-                for future in finished:
-                    shares[future.result()] = 1.0
-                while not done_shares.empty():
-                    index, share = done_shares.get()
-                    shares[index] = max(shares[index], share)
-                advance(sum(costs[i] * share for i, share in shares.items()) / sum(costs))
+            for shares in _progress(pending, done_shares, len(open_tasks)):
+                advance(sum(cost * share for cost, share in zip(costs, shares, strict=True)) / sum(costs))
         except BaseException:
             # Finished cells are kept; tasks that wait must not start after the user has stopped the program.
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _progress(pending: set[Future[int]], reported: Any, count: int) -> Iterator[list[float]]:
+    """The share of each of `count` tasks that is done, every half a second until all are."""
+    shares = [0.0] * count
+    while pending:
+        finished, pending = wait(pending, timeout=0.5, return_when=FIRST_COMPLETED)
+        for future in finished:
+            shares[future.result()] = 1.0
+        while not reported.empty():
+            index, share = reported.get()
+            shares[index] = max(shares[index], share)
+        yield shares
 
 
 def _cost(task: PaperTask) -> float:
@@ -212,8 +214,7 @@ def _write(results: Sequence[PaperCell], out: Path, queries: int, seed: int) -> 
             | {f"paper_{key}": None if paper is None else getattr(paper, key) for key in ("auc", "rp9", "f1")}
         )
     document = {"schema_version": 1, "version": __version__, "queries": queries, "seed": seed, "cells": rows}
-    with replace_file(out / "results.json") as temporary:
-        temporary.write_text(json_text(document) + "\n", encoding="utf-8")
+    write_text(out / "results.json", json_text(document) + "\n")
     with replace_file(out / "results.csv") as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]) if rows else ["map_name"])
         writer.writeheader()

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from pc2grid.arrays import F64
 from pc2grid_cli.tables import show, table
 from pc2grid_lab.compare.picture import picture
 from pc2grid_lab.experiments.paper_experiment import MatchMeasures, largest_right_share
@@ -163,39 +164,38 @@ def _print_choices(
     if not any(r.overrides == choice.overrides for r in results for choice in choices):
         return
     maps = [name for name, reading in columns if reading == "paper"]
-    base = {(r.map_name, r.level): r.matches.measures() for r in results if _is_base(r)}
+    base = {(r.map_name, r.level): _auc_and_right(r) for r in results if _is_base(r)}
     heads = ("choice", "the paper says", "we do", "noise")
     shown = table(f"{title}: AUC x 1000, {where}", heads, (*maps, "mean", "mean R@1"))
     for level in (0, 2):
-        here = [base[name, level] for name in maps if (name, level) in base]
-        if here:
-            means = [np.mean([m.auc for m in here]), np.mean([m.r_at_1 for m in here])]
-            cells = [f"{1000 * value:.0f}" for value in [*(m.auc for m in here), *means]]
-            shown.add_row("all three", "", "Eq. 6", str(level), *cells)
+        defaults = {name: 1000 * base[name, level] for name in maps if (name, level) in base}
+        _add_row(shown, ("all three", "", "Eq. 6"), level, defaults, maps, "")
     for choice, level in itertools.product(choices, (0, 2)):
         chosen = [r for r in results if r.overrides == choice.overrides and r.level == level]
-        moved = _moved(chosen, base)
-        if moved:
-            words = (choice.name, choice.paper, choice.ours) if level == 0 else ("", "", "")
-            shifts = [f"{moved[name][0]:+.0f}" if name in moved else "" for name in maps]
-            means = [f"{mean:+.0f}" for mean in np.mean(list(moved.values()), axis=0)]
-            shown.add_row(*words, str(level), *shifts, *means)
+        words = (choice.name, choice.paper, choice.ours) if level == 0 else ("", "", "")
+        moved = {
+            r.map_name: 1000 * (_auc_and_right(r) - base[r.map_name, level])
+            for r in chosen
+            if (r.map_name, level) in base
+        }
+        _add_row(shown, words, level, moved, maps, "+")
     show(shown)
 
 
-def _moved(
-    results: Sequence[PaperCell], base: Mapping[tuple[str, int], MatchMeasures]
-) -> dict[str, tuple[float, float]]:
-    """By map, how much AUC and R@1 differ from those of the defaults, in thousandths."""
-    pairs = {
-        r.map_name: (r.matches.measures(), base[r.map_name, r.level])
-        for r in results
-        if (r.map_name, r.level) in base
-    }
-    return {
-        name: (1000 * (new.auc - old.auc), 1000 * (new.r_at_1 - old.r_at_1))
-        for name, (new, old) in pairs.items()
-    }
+def _auc_and_right(result: PaperCell) -> F64:
+    measures = result.matches.measures()
+    return np.array((measures.auc, measures.r_at_1))
+
+
+def _add_row(
+    shown: Table, words: Sequence[str], level: int, by_map: Mapping[str, F64], maps: Sequence[str], sign: str
+) -> None:
+    """AUC on each map, and the means of AUC and R@1; nothing without any map. sign : of the format."""
+    if by_map:
+        means = np.mean(list(by_map.values()), axis=0)
+        values = [by_map[name][0] if name in by_map else None for name in maps]
+        texts = ["" if value is None else f"{value:{sign}.0f}" for value in [*values, *means]]
+        shown.add_row(*words, str(level), *texts)
 
 
 def _is_base(result: PaperCell) -> bool:
@@ -214,15 +214,13 @@ def draw_figures(results: Sequence[PaperCell], out: Path) -> list[Path]:
     names = [name for name, _ in _columns(plain)]
     for offset_m in sorted({r.offset_m for r in plain}):
         here = [r for r in plain if r.offset_m == offset_m]
-        by_level = [
-            (title, [(r.method, r) for r in here if (r.level, r.radius_m) == (level, 8.0)])
-            for level, title in enumerate(_LEVELS)
-        ]
-        of_radius = sorted(
-            (r for r in here if (r.level, r.method) == (1, "proposed")), key=lambda r: r.radius_m
-        )
-        by_radius = [("noise level 1", [(f"r = {r.radius_m:g} m", r) for r in of_radius])]
-        for number, rows in ((9, by_level), (10, by_radius)):
+        levels = [[(r.method, r) for r in here if (r.level, r.radius_m) == (k, 8.0)] for k in range(3)]
+        radii = [(f"r = {r.radius_m:g} m", r) for r in here if (r.level, r.method) == (1, "proposed")]
+        radii.sort(key=lambda pair: pair[1].radius_m)
+        for number, rows in (
+            (9, list(zip(_LEVELS, levels, strict=True))),
+            (10, [("noise level 1", radii)]),
+        ):
             paths.append(out / f"figure-{number}-offset-{offset_m:g}.png")
             _draw_figure(paths[-1], rows, names)
     return paths

@@ -168,10 +168,7 @@ def compare_real_command(
 
 
 def _compare(setting: Setting, terminal: Console, jobs: int | None, as_json: bool) -> None:
-    if not setting.floor.is_file():
-        raise MapFileError(f"{setting.floor}: no such file", hint="give a 3D scan of the floor")
-    if not setting.log.exists():
-        raise LogNotFound(f"{setting.log}: no such file")
+    _refuse(setting)
     out = setting.out
     for folder in ("maps", "sessions"):
         make_folder(out / folder)
@@ -184,7 +181,7 @@ def _compare(setting: Setting, terminal: Console, jobs: int | None, as_json: boo
     ):
         with terminal.progress(what) as advance:
             asked = in_processes(function, tasks, jobs=jobs, advance=advance)
-    found: list[RealQuery] = [query for query in asked if query is not None]
+    found: list[RealQuery] = list(filter(None, asked))
     maps = {name: _map(setting, name) for name in _MAPS}
     agreement = Agreement.of(found, maps)
     trials = judge_all(found, maps, agreement)
@@ -196,6 +193,14 @@ def _compare(setting: Setting, terminal: Console, jobs: int | None, as_json: boo
         return
     print_table(real_cells(trials), agreement)
     print("\n".join(str(out / name) for name in ("real.json", "real.png")))
+
+
+def _refuse(setting: Setting) -> None:
+    """Raises MapFileError or LogNotFound where a file is missing."""
+    if not setting.floor.is_file():
+        raise MapFileError(f"{setting.floor}: no such file", hint="give a 3D scan of the floor")
+    if not setting.log.exists():
+        raise LogNotFound(f"{setting.log}: no such file")
 
 
 def _asking(setting: Setting) -> list[tuple[str, int]]:

@@ -11,7 +11,6 @@ import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
-from pc2grid.model import SensorKind
 from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
 from pc2grid_cli.tables import show, table
 from pc2grid_lab.compare.picture import picture
@@ -99,10 +98,9 @@ def draw(
             for query in queries:
                 asked = "laser-earlier" if name == query.sensor == "laser" else name
                 if asked in query.answers:
-                    true = T_floor_log @ query.T_frame_base if query.sensor == "laser" else query.T_frame_base
                     T_floor_map = frames[asked] @ maps[asked].T_plan_map
                     is_first = (name, query.sensor, query.seed) in first
-                    _draw_answer(ax, query.sensor, query.answers[asked], T_floor_map, true, is_first)
+                    _draw_answer(ax, query, query.answers[asked], T_floor_map, T_floor_log, is_first)
             ax.set_title(f"{_TITLES[name]}; located and right: {_counts(name, cells)}", fontsize=9)
             ax.set(xlim=(x0 - 0.5, x1 + 0.5), ylim=(y0 - 0.5, y1 + 0.5), aspect="equal")
             ax.tick_params(labelsize=7)
@@ -132,12 +130,13 @@ def _counts(map_sensor: str, cells: Sequence[RealCell]) -> str:
 
 
 def _draw_answer(
-    ax: Any, sensor: SensorKind, answer: Answer, T_floor_map: SE2, true: SE2, is_first: bool
+    ax: Any, query: RealQuery, answer: Answer, T_floor_map: SE2, T_floor_log: SE2, is_first: bool
 ) -> None:
-    colour = _COLOURS[sensor]
+    colour = _COLOURS[query.sensor]
     if answer.T_map_base is not None:
-        _arrow(ax, T_floor_map @ answer.T_map_base, colour, size=_SIZES[sensor])
+        _arrow(ax, T_floor_map @ answer.T_map_base, colour, size=_SIZES[query.sensor])
     else:
+        true = T_floor_log @ query.T_frame_base if query.sensor == "laser" else query.T_frame_base
         ax.plot(true.x, true.y, "o", mfc=colour if is_first else "none", mec=colour, mew=1.2, ms=5)
 
 

@@ -56,16 +56,20 @@ def _print_scope(scope: str, document: Mapping[str, Any], selectors: Sequence[st
     )
     cells = _cells(document)
     travels_m = sorted({travel_m for _, _, travel_m in cells})
-    figures = [f"{what}\n{travel_m:g} m" for what in ("selected", "right") for travel_m in travels_m]
+    heads = itertools.product(("selected", "right"), travels_m)
+    figures = [f"{what}\n{travel_m:g} m" for what, travel_m in heads]
     shown = table(title, ["selected by"], ["places", *figures, "ms"])
     for selector in selectors:
         row = [cells.get((scope, selector, travel_m), {}) for travel_m in travels_m]
         last = next(filter(None, reversed(row)), None)
         if last is not None:
-            shares = [_interval(cell.get(what)) for what in ("found", "right") for cell in row]
-            time = f"{last['processor_ms']:.0f}" if last["right"] is not None else ""
-            shown.add_row(selector, str(last["looked_at"]), *shares, time)
+            shares = [_interval(cell.get(what)) for what, cell in itertools.product(("found", "right"), row)]
+            shown.add_row(selector, str(last["looked_at"]), *shares, _milliseconds(last))
     show(shown)
+
+
+def _milliseconds(cell: Mapping[str, Any]) -> str:
+    return "" if cell["right"] is None else f"{cell['processor_ms']:.0f}"
 
 
 def _print_scale(rows: Sequence[Mapping[str, Any]]) -> None:
@@ -140,7 +144,7 @@ def _draw_panel(
 def _draw_scale(ax: Any, rows: Sequence[Mapping[str, Any]]) -> None:
     """Share selected against the share of the places that is looked at, for the largest number of places."""
     most = max(row["places"] for row in rows)
-    chosen = [row for row in rows if row["places"] == most and row["query_sensor"] == "all"]
+    chosen = [row for row in rows if (row["places"], row["query_sensor"]) == (most, "all")]
     travels_m, selectors, shares = (
         sorted({row[key] for row in chosen}) for key in ("travel_m", "selector", "share")
     )
@@ -149,11 +153,11 @@ def _draw_scale(ax: Any, rows: Sequence[Mapping[str, Any]]) -> None:
     width = 0.8 / max(len(series), 1)
     for number, key in enumerate(series):
         selector, travel_m = key
-        some = {r["share"]: r["found"] for r in chosen if (r["selector"], r["travel_m"]) == key}
-        found, low, high = np.array(list(some.values())).T
+        some = [r for r in chosen if (r["selector"], r["travel_m"]) == key]
+        found, low, high = np.array([r["found"] for r in some]).T
         colour = _COLOURS[travels_m.index(travel_m)]
         ax.errorbar(
-            [shares.index(share) + (number - (len(series) - 1) / 2) * width for share in some],
+            np.searchsorted(shares, [r["share"] for r in some]) + (number - (len(series) - 1) / 2) * width,
             found,
             yerr=(found - low, high - found),
             fmt="o",

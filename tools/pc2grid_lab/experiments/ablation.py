@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from pc2grid.arrays import F32, F64
 from pc2grid.geometry import SE2
@@ -121,33 +122,31 @@ def independence(maps: Sequence[SensorMap]) -> tuple[Independence, ...]:
     The places of each map are taken in turn. Each is compared with the other maps, which are described at the
     same point of the building if that point is free in them.
     """
-    same: dict[str, list[F64]] = {name: [] for name in COMBINATIONS}
-    other: dict[str, list[F64]] = {name: [] for name in COMBINATIONS}
+    same: dict[str, list[F64]] = {name: [np.empty(0)] for name in COMBINATIONS}
+    other: dict[str, list[F64]] = {name: [np.empty(0)] for name in COMBINATIONS}
     for one in maps:
         table, config = one.index.places.table, one.index.made_with.signature
-        apart = np.hypot(*(table.center_m[:, None] - table.center_m[None]).transpose(2, 0, 1)) >= FAR_M
         signatures = [_row(table, i) for i in range(len(table))]
-        for i, mine in enumerate(signatures):
-            for name, distance in part_distances(mine, table, config).items():
-                other[name].append(distance[apart[i]])
-        for two in maps:
-            if two is one:
-                continue
+        far = cdist(table.center_m, table.center_m) >= FAR_M
+        for mine, chosen in zip(signatures, far, strict=True):
+            _append(other, part_distances(mine, table, config), chosen)
+        for two in (m for m in maps if m is not one):
             T_two_one = two.T_plan_map.inverse() @ one.T_plan_map
             for mine, center in zip(signatures, T_two_one.apply(table.center_m), strict=True):
                 theirs = _signature_at(two, center)
                 if theirs is not None:
-                    single = SignatureTable.of([theirs], center)
-                    for name, distance in part_distances(mine, single, config).items():
-                        same[name].append(distance)
+                    _append(same, part_distances(mine, SignatureTable.of([theirs], center), config))
     return tuple(
-        Independence(
-            combination=name,
-            same=np.concatenate([np.empty(0), *same[name]]),
-            other=np.concatenate([np.empty(0), *other[name]]),
-        )
+        Independence(combination=name, same=np.concatenate(same[name]), other=np.concatenate(other[name]))
         for name in COMBINATIONS
     )
+
+
+def _append(
+    found: dict[str, list[F64]], distances: dict[str, F64], chosen: slice | NDArray[np.bool_] = slice(None)
+) -> None:
+    for name, distance in distances.items():
+        found[name].append(distance[chosen])
 
 
 def seen_independence(
@@ -198,7 +197,7 @@ def _seen_pairs(buildings: Sequence[Sequence[SensorMap]]) -> tuple[Rows, Rows]:
         for one in maps:
             places = one.index.places
             mine, centers = places.described().seen.shares, places.table.center_m
-            a, b = np.nonzero(np.hypot(*(centers[:, None] - centers[None]).transpose(2, 0, 1)) >= FAR_M)
+            a, b = np.nonzero(cdist(centers, centers) >= FAR_M)
             other.append((mine[a], mine[b], first + a))
             for two in maps:
                 if two is one:

@@ -216,42 +216,32 @@ def paper_tasks(
 
     In its true size killian is given to the proposed method only, because it has five times as many submaps.
     """
-    common: dict[str, Any] = {"queries": queries, "seed": seed, "speckle_sigma_m": speckle_sigma_m}
-    for offset_m in offsets_m:
-        for together in TOGETHER:
-            group = tuple(name for name in together if name in methods)
-            for path in maps:
-                for level in range(len(NOISE_LEVELS)):
-                    if group:
-                        yield _task(path, "paper", group, level, 8.0, offset_m, **common)
-                    if group == ("proposed",) and path.stem == "killian":
-                        yield _task(path, "true", group, level, 8.0, offset_m, **common)
-                if group == ("proposed",):
-                    for radius_m in (r for r in RADII_M if r != 8.0):
-                        yield _task(path, "paper", group, 1, radius_m, offset_m, **common)
-                    for choice, level in itertools.product(choices, (0, 2)):
-                        changed = choice.overrides
-                        yield _task(path, "paper", group, level, 8.0, offset_m, overrides=changed, **common)
+    groups = [tuple(name for name in together if name in methods) for together in TOGETHER]
+    for offset_m, group, path in itertools.product(offsets_m, filter(None, groups), maps):
+        for facts in _cells_of(path, group, choices):
+            yield PaperTask(
+                map_path=path,
+                methods=group,
+                offset_m=offset_m,
+                queries=queries,
+                seed=seed,
+                speckle_sigma_m=speckle_sigma_m,
+                **facts,
+            )
 
 
-def _task(
-    path: Path,
-    reading: Reading,
-    methods: tuple[str, ...],
-    level: int,
-    radius_m: float,
-    offset_m: float,
-    **rest: Any,
-) -> PaperTask:
-    return PaperTask(
-        map_path=path,
-        reading=reading,
-        methods=methods,
-        level=level,
-        radius_m=radius_m,
-        offset_m=offset_m,
-        **rest,
-    )
+def _cells_of(path: Path, group: tuple[str, ...], choices: Sequence[Choice]) -> Iterator[dict[str, Any]]:
+    """Reading, level, radius and overrides of the tasks of some methods on a map."""
+    plain: dict[str, Any] = {"reading": "paper", "radius_m": 8.0}
+    for level in range(len(NOISE_LEVELS)):
+        yield {**plain, "level": level}
+        if group == ("proposed",) and path.stem == "killian":
+            yield {**plain, "level": level, "reading": "true"}
+    if group == ("proposed",):
+        for radius_m in (r for r in RADII_M if r != 8.0):
+            yield {**plain, "level": 1, "radius_m": radius_m}
+        for choice, level in itertools.product(choices, (0, 2)):
+            yield {**plain, "level": level, "overrides": choice.overrides}
 
 
 def read_map(path: Path, reading: Reading) -> OccupancyGrid:

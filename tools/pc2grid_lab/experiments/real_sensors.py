@@ -120,16 +120,16 @@ class Agreement:
             for name, answer in query.answers.items()
             if answer.hypotheses and frame_of(query.sensor) != frame_of(maps[name].sensor)
         )
-        best = max(
-            (clue.T_floor_log for clue in clues),
-            key=lambda T: sum(clue.agrees(T) for clue in clues),
-            default=None,
-        )
-        for _ in range(AGREEMENT.rounds if best is not None else 0):
-            assert best is not None
-            best = _fit([clue for clue in clues if clue.agrees(best)]) or best
-        agreeing = sum(clue.agrees(best) for clue in clues) if best is not None else 0
-        return Agreement(best, agreeing, clues)
+        if not clues:
+            return Agreement(None, 0, clues)
+
+        def agreeing(T_floor_log: SE2) -> list[_Clue]:
+            return [clue for clue in clues if clue.agrees(T_floor_log)]
+
+        best = max((clue.T_floor_log for clue in clues), key=lambda T: len(agreeing(T)))
+        for _ in range(AGREEMENT.rounds):
+            best = _fit(agreeing(best)) or best
+        return Agreement(best, len(agreeing(best)), clues)
 
     def without(self, query: int) -> SE2 | None:
         """The same transform fitted without the answers to one query, so that none is judged by itself."""

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from pc2grid.arrays import I64
 from pc2grid.geometry import SE2, wrap_angle
@@ -171,7 +172,7 @@ class Selection:
         views_m = T_map_query.apply(np.array([view.center_m for view in query.views]).reshape(-1, 2))
         own = table.session_index == 0
         right = np.zeros(len(table), bool)
-        apart = np.hypot(*(views_m[:, None] - table.center_m[own][None]).transpose(2, 0, 1))
+        apart = cdist(views_m, table.center_m[own])
         right[own] = (apart <= JUDGEMENT.retrieved_m).any(axis=0)
         if not right.any():
             return
@@ -275,7 +276,7 @@ def recall_at_scale(
         views_m = (own.T_plan_map.inverse() @ T_plan_query).apply(
             np.array([view.center_m for view in query.views]).reshape(-1, 2)
         )
-        apart = np.hypot(*(views_m[:, None] - places.table.center_m[None]).transpose(2, 0, 1))
+        apart = cdist(views_m, places.table.center_m)
         near = apart <= JUDGEMENT.retrieved_m
         right = np.flatnonzero(near.any(axis=0))
         if not len(right) or near.any(axis=1).mean() < least_mapped:

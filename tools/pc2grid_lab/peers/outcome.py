@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -151,35 +151,36 @@ def counted(trials: Sequence[PeerTrial]) -> list[PeerCell]:
 
 def _cell(trials: Sequence[PeerTrial], threshold: float | None) -> PeerCell:
     lowest = -math.inf if threshold is None else threshold
-    at: dict[Place, list[PeerTrial]] = {"covered": [], "uncovered": [], "elsewhere": []}
-    for trial in trials:
-        at[trial.place].append(trial)
-    covered = at["covered"]
+    asked = Counter(trial.place for trial in trials)
     wrong = Counter(t.place for t in trials if t.answered(lowest) and not t.right)
-    right = [t for t in covered if t.answered(lowest) and t.right]
-    low, high = _interval([t.answered(lowest) and t.right for t in covered])
+    right = [t for t in trials if t.answered(lowest) and t.right and t.place == "covered"]
+    low, high = _interval([t in right for t in trials if t.place == "covered"])
     return PeerCell(
         peer=trials[0].peer,
         site=trials[0].site,
         threshold=None if threshold is None or math.isinf(threshold) else threshold,
-        covered=len(covered),
+        covered=asked["covered"],
         right=len(right),
         wrong=wrong["covered"],
-        unanswered=len(covered) - len(right) - wrong["covered"],
+        unanswered=asked["covered"] - len(right) - wrong["covered"],
         right_low=low,
         right_high=high,
-        uncovered=len(at["uncovered"]),
+        uncovered=asked["uncovered"],
         uncovered_wrong=wrong["uncovered"],
-        elsewhere=len(at["elsewhere"]),
+        elsewhere=asked["elsewhere"],
         elsewhere_wrong=wrong["elsewhere"],
-        median_error_m=_median(t.error_m for t in right),
-        cpu_s=_median(t.cpu_s for t in covered + at["uncovered"]),
-        elsewhere_cpu_s=_median(t.cpu_s for t in at["elsewhere"]),
+        median_error_m=_median([t.error_m for t in right]),
+        cpu_s=_median_cpu_s(trials, elsewhere=False),
+        elsewhere_cpu_s=_median_cpu_s(trials, elsewhere=True),
         peak_mb=max(t.peak_mb for t in trials),
     )
 
 
-def _median(values: Iterable[float | None]) -> float | None:
+def _median_cpu_s(trials: Sequence[PeerTrial], *, elsewhere: bool) -> float | None:
+    return _median([t.cpu_s for t in trials if (t.place == "elsewhere") == elsewhere])
+
+
+def _median(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else None
 

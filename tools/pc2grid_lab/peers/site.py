@@ -25,7 +25,6 @@ from pc2grid.arrays import F32, F64
 from pc2grid.errors import ConfigError, LogNotFound
 from pc2grid.geometry import SE2, transform_points
 from pc2grid.io import Log, open_log
-from pc2grid.io.atomic import replace_file
 from pc2grid.io.building_file import is_building_file
 from pc2grid.io.nav2_map import load_map, save_map
 from pc2grid.io.trajectory import read_tum
@@ -34,9 +33,11 @@ from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind, Traje
 from pc2grid.odometry.tracker import Tracker
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.simulate import load_building
+from pc2grid_lab.experiments.frames import apart
 from pc2grid_lab.experiments.program import digest_of_sources
 from pc2grid_lab.experiments.registered_session import register
 from pc2grid_lab.experiments.sensor_matrix import query_start
+from pc2grid_lab.experiments.stored import write_arrays, write_text
 from pc2grid_lab.peers.asked import PREPARES, digest
 from pc2grid_lab.worlds import WorldConfig, iter_session
 from signature.config import Config
@@ -259,36 +260,37 @@ def _has_map(site: Site) -> bool:
 
 def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
     """Draw the grid at the true poses and, of a lidar, keep the clouds."""
-    step_m = SITE.keyframe_m if SENSOR_MODELS[site.sensor].planar else SITE.lidar_keyframe_m
-    builder, last = GridBuilder(config.projection), None
+    builder = GridBuilder(config.projection)
     path, clouds = [], []
-    for scan, T_world_base in scans:
-        if T_world_base is None:
-            continue
-        pose = SE2.from_matrix(T_world_base)
-        step = pose if last is None else last.inverse() @ pose
-        if (
-            last is not None
-            and math.hypot(step.x, step.y) < step_m
-            and (abs(step.yaw) < SITE.keyframe_rad or not SENSOR_MODELS[site.sensor].planar)
-        ):
-            continue
-        last = pose
+    for scan, T_world_base in _keyframes(site, scans):
         tracked = Tracker(config.registration, config.projection).start(scan)
-        builder.add(tracked.planar_scan, pose)
+        builder.add(tracked.planar_scan, SE2.from_matrix(T_world_base))
         if not SENSOR_MODELS[site.sensor].planar:
             path.append(T_world_base)
             clouds.append(_thinned(transform_points(T_world_base, tracked.registered.scan.points_m)))
     site.folder.mkdir(parents=True, exist_ok=True)
     if clouds:
-        with replace_file(site.map_stem.with_suffix(".npz")) as draft, draft.open("wb") as file:
-            np.savez(
-                file,
-                T_map_base=np.array(path),
-                points_m=np.concatenate(clouds),
-                count=[len(c) for c in clouds],
-            )
+        write_arrays(
+            site.map_stem.with_suffix(".npz"),
+            T_map_base=np.array(path),
+            points_m=np.concatenate(clouds),
+            count=[len(c) for c in clouds],
+        )
     save_map(builder.grid(), site.map_stem, image_format="png")  # last: it says that the map is complete
+
+
+def _keyframes(site: Site, scans: Iterable[PosedScan]) -> Iterator[tuple[Scan, F64]]:
+    """The scans with a true pose between which the robot has moved or, with a laser, turned."""
+    planar = SENSOR_MODELS[site.sensor].planar
+    step_m, last = SITE.keyframe_m if planar else SITE.lidar_keyframe_m, None
+    for scan, T_world_base in scans:
+        if T_world_base is None:
+            continue
+        pose = SE2.from_matrix(T_world_base)
+        metres, radians = (math.inf, math.inf) if last is None else apart(last, pose)
+        if metres >= step_m or (planar and radians >= SITE.keyframe_rad):
+            last = pose
+            yield scan, T_world_base
 
 
 def _save_query(
@@ -317,8 +319,7 @@ def _save_query(
         cloud = [
             transform_points(np.linalg.inv(T_odom_query) @ r.T_session_base, r.scan.points_m) for r in seen
         ]
-        with replace_file(stem.with_suffix(".cloud.npz")) as draft, draft.open("wb") as file:
-            np.savez(file, points_m=_thinned(np.concatenate(cloud)))
+        write_arrays(stem.with_suffix(".cloud.npz"), points_m=_thinned(np.concatenate(cloud)))
     query = SiteQuery(
         pose=(truth.x, truth.y, truth.yaw),
         covered=is_covered(
@@ -326,8 +327,7 @@ def _save_query(
         ),
         travel_m=float(session.path_m()[-1]),
     )
-    with replace_file(stem.with_suffix(".json")) as draft:  # last: it says that the query is complete
-        draft.write_text(json.dumps(asdict(query)))
+    write_text(stem.with_suffix(".json"), json.dumps(asdict(query)))  # last: the query is complete
 
 
 def hits_of(scan: Scan, config: Config) -> F32:
@@ -366,13 +366,12 @@ def save_beams(path: Path, scans: list[Scan]) -> None:
     for row, bearing_rad, p in zip(rows, bearings_rad, points_m, strict=True):
         row[np.rint((bearing_rad - first_rad) / step_rad).astype(int)] = np.hypot(p[:, 0], p[:, 1])
     T_sensor_middle = SE2(0.0, 0.0, float(first_rad + last_rad) / 2.0).lift()
-    with replace_file(path) as draft, draft.open("wb") as file:
-        np.savez(
-            file,
-            ranges_m=rows,
-            fov_rad=float(last_rad - first_rad),
-            T_base_middle=T_base_sensor @ T_sensor_middle,
-        )
+    write_arrays(
+        path,
+        ranges_m=rows,
+        fov_rad=float(last_rad - first_rad),
+        T_base_middle=T_base_sensor @ T_sensor_middle,
+    )
 
 
 def _thinned(points_m: F64) -> F32:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -56,11 +57,12 @@ def _figures(recording: Recording, folder: Folder, done: Finished) -> dict[str, 
     bare = kept(folder.bare(recording.name))
     bare_of: dict[str, Any] = {} if bare is None or bare.failed else bare.document
     error = _error(recording, folder)
-    texts = [text for report in reports for text in report["warnings"]]
+    texts = itertools.chain.from_iterable(report["warnings"] for report in reports)
+    sums = {name: sum(session[name] for session in stored) for name in ("duration_s", "path_m", "area_m2")}
     return {
-        "minutes": sum(session["duration_s"] for session in stored) / 60.0,
-        "metres": sum(session["path_m"] for session in stored),
-        "area_m2": sum(session["area_m2"] for session in stored),
+        "minutes": sums["duration_s"] / 60.0,
+        "metres": sums["path_m"],
+        "area_m2": sums["area_m2"],
         "over_bare": done.cpu_s / bare_of["cpu_s"] if bare_of else None,
         "parts": len(stored),
         "lost": skipped / read if read else None,

@@ -200,20 +200,24 @@ def _by_building(table: Table) -> list[str]:
         ),
         (),
     )
-    buildings = list(dict.fromkeys(row.building for row in table.pairs))
     cells = [
-        _building_cells(b, *([row for row in rows if row.building == b] for rows in (inside, outside)))
-        for b in buildings
+        _building_cells(building, _of(building, inside), _of(building, outside))
+        for building in dict.fromkeys(row.building for row in table.pairs)
     ]
     cells.append(_building_cells("all queries", inside, outside))
-    judged = sorted({row.building for row in inside + outside})
-    with_wrong = [b for b in judged if _total(r for r in inside + outside if r.building == b).wrong]
+    judged = inside + outside
+    buildings = sorted({row.building for row in judged})
+    wrong = [building for building in buildings if _total(_of(building, judged)).wrong]
     return [
         *_markdown(heads, cells),
         "",
         "Queries of one building are not independent. By buildings, which are, one at least wrong answer:"
-        f" {_share(len(with_wrong), len(judged))}{' (' + ', '.join(with_wrong) + ')' if with_wrong else ''}.",
+        f" {_share(len(wrong), len(buildings))}{' (' + ', '.join(wrong) + ')' if wrong else ''}.",
     ]
+
+
+def _of(building: str, rows: Sequence[PairRow]) -> list[PairRow]:
+    return [row for row in rows if row.building == building]
 
 
 def _building_cells(name: str, inside: Sequence[PairRow], outside: Sequence[PairRow]) -> list[str]:

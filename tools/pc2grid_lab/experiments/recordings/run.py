@@ -98,17 +98,23 @@ def run_all(
     advance : called with the share of the commands that is done.
     """
     pairs = [p for p in catalogue.pairs if not _gap(catalogue, folder, p)]
-    maps, queries = _maps(catalogue, folder, pairs), [catalogue.recordings[p.query] for p in pairs]
-    for recording in [*(r for r, _ in maps.values()), *queries]:
-        _thin(folder, recording)
-    tasks = [_convert(folder, name, recording, until_s) for name, (recording, until_s) in maps.items()]
-    tasks += [_bare(folder, r) for r in catalogue.mapped if r.sensor == "lidar" and not folder.missing(r)]
+    tasks = _made(catalogue, folder, pairs)
     asked = sum(pair.windows for pair in pairs)
     for done in _run(tasks, jobs):
         advance(done / (len(tasks) + asked))
     questions = [task for pair in pairs for task in _questions(catalogue, folder, pair)]
     for done in _run(questions, jobs):
         advance((len(tasks) + done) / (len(tasks) + asked))
+
+
+def _made(catalogue: Catalogue, folder: Folder, pairs: Sequence[Pair]) -> list[_Task]:
+    """The commands that make maps, and bare KISS-ICP; the recordings that they read are thinned."""
+    maps = _maps(catalogue, folder, pairs)
+    for recording in [*(r for r, _ in maps.values()), *(catalogue.recordings[p.query] for p in pairs)]:
+        _thin(folder, recording)
+    tasks = [_convert(folder, name, recording, until_s) for name, (recording, until_s) in maps.items()]
+    lidars = [r for r in catalogue.mapped if r.sensor == "lidar" and not folder.missing(r)]
+    return tasks + [_bare(folder, recording) for recording in lidars]
 
 
 def _maps(
