@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from pydantic import ValidationError
 
 from pc2grid.errors import ConfigError
 from pc2grid.io.atomic import require_writable
-from pc2grid.simulate import load_building
-from pc2grid.simulate.config import OdometryConfig
+from pc2grid.model import OccupancyGrid
+from pc2grid.simulate import Building, SimulatedSession, load_building
 from pc2grid_cli import console
 from pc2grid_cli.options import AsJson, Force, SensorName
 from pc2grid_lab.documents import Simulate
 from pc2grid_lab.worlds import ChangeConfig, HouseConfig, WorldConfig, simulate_session
+from pc2grid_lab.worlds.change import Change
 
 
 class RideName(str, enum.Enum):
@@ -70,38 +72,26 @@ def simulate_command(
 
     Example: pc2grid simulate map.yaml drive.mcap --sensor depth --length 20
     """
-    from pydantic import ValidationError
-
-    if len(files) > 2:
-        raise typer.BadParameter(f"expected [BUILDING] OUT.mcap, got {len(files)} files")
-    if files[-1].suffix != ".mcap":
-        raise typer.BadParameter(f"the file to write must end in .mcap: {files[-1]}")
-    for path in (files[-1], files[-1].with_suffix(".tum")):
-        require_writable(path, force)
-    grid = load_building(files[0]) if len(files) == 2 else None
-    try:
-        config = WorldConfig(
-            length_m=length,
-            seed=seed,
-            clutter=clutter,
-            walkers=walkers,
-            start_m=start,
-            change=ChangeConfig(
-                doors=change, furniture=change, relief_per_m=relief, glass=glass, mirrors=mirrors
-            ),
-            building_seed=building_seed,
-            odometry=OdometryConfig(enabled=not no_odometry),
-        )
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise ConfigError(f"{first['loc'][0]}: {first['msg']}, got {first['input']}") from error
+    grid = _building(files, force)
+    config = _world(
+        length_m=length,
+        seed=seed,
+        clutter=clutter,
+        walkers=walkers,
+        start_m=start,
+        change={
+            "doors": change,
+            "furniture": change,
+            "relief_per_m": relief,
+            "glass": glass,
+            "mirrors": mirrors,
+        },
+        building_seed=building_seed,
+        odometry={"enabled": not no_odometry},
+    )
     house = None
     if floors > 1:
-        for value, option in ((change, "--change"), (walkers, "--walkers"), (relief, "--relief")):
-            if value:
-                raise typer.BadParameter(f"{option} is for a single floor, not with --floors")
-        if glass or mirrors or start is not None:
-            raise typer.BadParameter("--glass, --mirrors and --start are for a single floor")
+        _refuse_on_floors(config)
         house = HouseConfig(visits=tuple(range(floors)), ride=ride.value, slope=slope, alike=alike)
     with console.of(context).progress(f"simulate {sensor.value}") as update:
         made, differs = simulate_session(
@@ -116,20 +106,57 @@ def simulate_command(
     if made.clutter < clutter * floors:
         console.warn(f"only {made.clutter} of {clutter * floors} pieces of clutter could be placed")
     if json:
-        document: Simulate = {
-            "schema_version": 1,
-            "recording": str(made.path),
-            "truth": str(made.truth_path),
-            "sensor": made.sensor,
-            "scans": made.scans,
-            "duration_s": made.duration_s,
-            "length_m": made.length_m,
-            "clutter": made.clutter,
-            "change": differs.counts(),
-        }
-        console.print_json(document)
+        console.print_json(_document(made, differs))
         return
     print(f"{made.path}: {made.scans} {made.sensor} scans, {made.length_m:.1f} m in {made.duration_s:.1f} s")
     if change or relief or glass or mirrors:
         print(f"against the building as drawn: {differs.describe()}")
     print(f"{made.truth_path}: {made.scans} true poses of base_link in the map frame")
+
+
+def _building(files: list[Path], force: bool) -> OccupancyGrid | Building | None:
+    """The building of `[BUILDING] OUT.mcap`, None for the office; what is written must be writable."""
+    if len(files) > 2:
+        raise typer.BadParameter(f"expected [BUILDING] OUT.mcap, got {len(files)} files")
+    if files[-1].suffix != ".mcap":
+        raise typer.BadParameter(f"the file to write must end in .mcap: {files[-1]}")
+    for path in (files[-1], files[-1].with_suffix(".tum")):
+        require_writable(path, force)
+    return load_building(files[0]) if len(files) == 2 else None
+
+
+def _world(change: dict[str, float], **given: Any) -> WorldConfig:
+    """Raises ConfigError for a value that does not fit."""
+    try:
+        return WorldConfig.model_validate({**given, "change": ChangeConfig(**change)})
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ConfigError(f"{first['loc'][0]}: {first['msg']}, got {first['input']}") from error
+
+
+def _refuse_on_floors(config: WorldConfig) -> None:
+    """Raises typer.BadParameter for what is of a single floor."""
+    change = config.change
+    for value, option in (
+        (change.doors, "--change"),
+        (config.walkers, "--walkers"),
+        (change.relief_per_m, "--relief"),
+    ):
+        if value:
+            raise typer.BadParameter(f"{option} is for a single floor, not with --floors")
+    if change.glass or change.mirrors or config.start_m is not None:
+        raise typer.BadParameter("--glass, --mirrors and --start are for a single floor")
+
+
+def _document(made: SimulatedSession, differs: Change) -> Simulate:
+    return {
+        "schema_version": 1,
+        "recording": str(made.path),
+        "truth": str(made.truth_path),
+        "sensor": made.sensor,
+        "scans": made.scans,
+        "duration_s": made.duration_s,
+        "length_m": made.length_m,
+        "clutter": made.clutter,
+        "change": differs.counts(),
+    }

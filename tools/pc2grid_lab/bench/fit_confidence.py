@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from pc2grid.arrays import F64
 from pc2grid_lab.experiments.calibration import Known, fit, left_out, log_loss, roc_area, share_by_session
 from signature.config import Config
 from signature.localization.confidence import CALIBRATION, Evidence
@@ -138,22 +139,34 @@ def main() -> None:
     parser.add_argument("files", type=Path, nargs="+")
     answered = [a for file in parser.parse_args().files for a in read(file)]
     known = [a.known for a in answered]
+    refuse(known)
+    in_use = np.array([CALIBRATION.probability(k.evidence) for k in known])
+    refitted = left_out(known, SHARE_RIGHT, fitted_to=fitted_to(answered))
+    print_counts(answered, in_use, refitted)
+    print_sums(known, "in use", in_use)
+    print_sums(known, "fitted without the building", refitted)
+    print(fit(fitted_to(answered), SHARE_RIGHT))
+
+
+def refuse(known: list[Known]) -> None:
+    """Raises SystemExit if a building cannot be left out."""
     for buildings in {k.buildings for k in known}:
         if len({k.right for k in known if not k.buildings & buildings}) < 2:
             raise SystemExit(
                 "the fit is judged by leaving buildings out, and without"
                 f" {' and '.join(sorted(buildings))} there are no right and wrong answers"
             )
-    in_use = np.array([CALIBRATION.probability(k.evidence) for k in known])
-    refitted = left_out(known, SHARE_RIGHT, fitted_to=fitted_to(answered))
-    accept = Config().relocalize.accept
+
+
+def print_counts(answered: list[Answered], *probabilities: F64) -> None:
+    """Print a row for each kind of query and metres driven. probabilities : (N,) in use, and refitted."""
     counts: dict[tuple[str, int], Count] = {}
-    for a, *probabilities in zip(answered, in_use, refitted, strict=True):
+    for a, *each in zip(answered, *probabilities, strict=True):
         count = counts.setdefault((a.kind, math.floor(a.travel_m)), Count())
         count.answers += 1
         count.right += a.known.right
-        for i, probability in enumerate(probabilities):
-            if probability >= accept:
+        for i, probability in enumerate(each):
+            if probability >= Config().relocalize.accept:
                 (count.located_right if a.known.right else count.located_wrong)[i] += 1
     print(f"{'kind':50} {'m':>3} answers right | in use: right wrong | left out: right wrong")
     for (kind, metres), c in sorted(counts.items()):
@@ -162,19 +175,20 @@ def main() -> None:
             f" | {c.located_right[0]:13d} {c.located_wrong[0]:5d} |"
             f" {c.located_right[1]:15d} {c.located_wrong[1]:5d}"
         )
+
+
+def print_sums(known: list[Known], name: str, probabilities: F64) -> None:
+    """Print how good the probabilities (N,) are."""
     right = np.array([k.right for k in known])
-    sessions = [k.session for k in known]
-    for name, probabilities in (("in use", in_use), ("fitted without the building", refitted)):
-        loss, area = log_loss(known, probabilities), roc_area(known, probabilities)
-        located = probabilities >= accept
-        wrong, low, high = share_by_session(sessions, located & ~right)
-        print(
-            f"{name}: log loss {loss:.4f}, area under the ROC curve {area:.4f}, located"
-            f" {np.count_nonzero(located & right)} of {np.count_nonzero(right)} right ones,"
-            f" {np.count_nonzero(located & ~right)} of {np.count_nonzero(~right)} wrong ones"
-            f" ({wrong:.2%} of all answers; 5 to 95 %, by drive: {low:.2%} to {high:.2%})"
-        )
-    print(fit(fitted_to(answered), SHARE_RIGHT))
+    loss, area = log_loss(known, probabilities), roc_area(known, probabilities)
+    located = probabilities >= Config().relocalize.accept
+    wrong, low, high = share_by_session([k.session for k in known], located & ~right)
+    print(
+        f"{name}: log loss {loss:.4f}, area under the ROC curve {area:.4f}, located"
+        f" {np.count_nonzero(located & right)} of {np.count_nonzero(right)} right ones,"
+        f" {np.count_nonzero(located & ~right)} of {np.count_nonzero(~right)} wrong ones"
+        f" ({wrong:.2%} of all answers; 5 to 95 %, by drive: {low:.2%} to {high:.2%})"
+    )
 
 
 if __name__ == "__main__":

@@ -11,35 +11,24 @@ ground that it has seen. An answer is right within 0.3 m and 5 degrees of the gr
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.model import OccupancyGrid
-from pc2grid_lab.bench.real_queries import STANDING_SCANS, index_of, read
+from pc2grid_lab.bench.real_queries import STANDING_SCANS, parser_of, read_all
 from pc2grid_lab.experiments.answers import localize
 from pc2grid_lab.experiments.registered_session import RegisteredSession
-from signature.config import Config
+from pc2grid_lab.peers.site import is_covered
+from signature.localization.answer import Answer
 from signature.localization.map_index import MapIndex, share_known
 
 TRAVEL_M = (0.0, 3.0, 10.0)
 ELSEWHERE_M = (1.0, 3.0, 5.0, 8.0)
 RIGHT_M, RIGHT_RAD = 0.3, math.radians(5.0)
-NEAR_M = 0.2
 KNOWN = 0.5
-
-
-def covered(grid: OccupancyGrid, driven: RegisteredSession, scan: int, T_world_base: SE2) -> bool:
-    """Whether half of a scan lies near a wall of the map."""
-    hits = T_world_base.apply(driven.planar_scans[scan].hits_m)
-    walls = grid.to_point(np.argwhere(grid.occupied))
-    distance_m, _ = cKDTree(walls).query(hits)
-    return bool(len(hits)) and float(np.mean(distance_m <= NEAR_M)) >= 0.5
 
 
 def scans_after(driven: RegisteredSession, travel_m: tuple[float, ...]) -> list[int]:
@@ -53,46 +42,44 @@ def count(name: str, grid: OccupancyGrid, queries: list[RegisteredSession], inde
     counts: dict[float, Counter[str]] = {travel_m: Counter() for travel_m in TRAVEL_M}
     for number, driven in enumerate(queries):
         spent_ms = 0.0
-        after = scans_after(driven, TRAVEL_M)
+        after = set(scans_after(driven, TRAVEL_M))
         scans = ((registered, planar_scan) for registered, planar_scan, _ in driven.scans())
-        for travel_m, found in zip(TRAVEL_M, localize(scans, [index], after=set(after)), strict=False):
+        for travel_m, found in zip(TRAVEL_M, localize(scans, [index], after=after), strict=False):
             (answer,) = found.answers
-            scan = found.scans - 1
-            truth = driven.true_pose(scan)
+            truth = driven.true_pose(found.scans - 1)
             if truth is None:
                 continue
-            kind = "covered" if covered(grid, driven, scan, truth) else "uncovered"
             share = share_known(grid, found.query.grid, truth @ found.query.T_odom_base.inverse())
-            if kind == "covered" and share >= KNOWN:
-                kind = "covered, known"
-            error = ""
-            if answer.hypotheses:
-                e = truth.inverse() @ answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base
-                distance = math.hypot(e.x, e.y)
-                right = distance <= RIGHT_M and abs(wrap_angle(e.yaw)) <= RIGHT_RAD
-                error = f"{distance:.2f} m {math.degrees(e.yaw):.1f} deg"
-                if answer.status == "located":
-                    counts[travel_m][f"{kind} {'right' if right else 'wrong'}"] += 1
-                elif right:
-                    counts[travel_m][f"{kind} right but {answer.status}"] += 1
-            counts[travel_m][kind] += 1
+            kind = kind_of(grid, driven, found.scans - 1, truth, share)
+            verdict, error = judged(answer, truth)
+            counts[travel_m].update([kind, f"{kind} {verdict}"] if verdict else [kind])
             by_last = answer.timing_ms.get("last_metres", 0.0) > spent_ms and answer.status == "located"
             spent_ms = answer.timing_ms.get("last_metres", 0.0)
+            words = (name, number, travel_m, kind, answer.status, f"{answer.confidence:.3f}")
             note = "by the last metres" if by_last else ""
-            print(
-                name,
-                number,
-                travel_m,
-                kind,
-                answer.status,
-                f"{answer.confidence:.3f}",
-                f"knows {share:.2f}",
-                error,
-                note,
-                flush=True,
-            )
+            print(*words, f"knows {share:.2f}", error, note, flush=True)
     for travel_m, counted in counts.items():
         print(name, f"{travel_m:g} m:", dict(sorted(counted.items())), flush=True)
+
+
+def kind_of(grid: OccupancyGrid, driven: RegisteredSession, scan: int, truth: SE2, share: float) -> str:
+    """What the map shows of a query. share : of the ground that it has seen, known to the map."""
+    if not is_covered(grid, driven.planar_scans[scan].hits_m, truth):
+        return "uncovered"
+    return "covered, known" if share >= KNOWN else "covered"
+
+
+def judged(answer: Answer, truth: SE2) -> tuple[str, str]:
+    """What is counted of an answer, and its error in words; empty without a hypothesis."""
+    if not answer.hypotheses:
+        return "", ""
+    error = truth.inverse() @ answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base
+    distance = math.hypot(error.x, error.y)
+    right = distance <= RIGHT_M and abs(wrap_angle(error.yaw)) <= RIGHT_RAD
+    words = f"{distance:.2f} m {math.degrees(error.yaw):.1f} deg"
+    if answer.status == "located":
+        return "right" if right else "wrong", words
+    return f"right but {answer.status}" if right else "", words
 
 
 def count_elsewhere(name: str, queries: list[RegisteredSession], others: dict[str, MapIndex]) -> None:
@@ -114,20 +101,10 @@ def count_elsewhere(name: str, queries: list[RegisteredSession], others: dict[st
 
 def main() -> None:
     """Ask and count."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("data", type=Path)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--logs", default="fr079,intel")
-    parser.add_argument("--queries", type=int, default=24)
+    parser = parser_of(__doc__, "folder", "fr079,intel")
     parser.add_argument("--elsewhere", action="store_true", help="ask in maps of other buildings only")
     options = parser.parse_args()
-    config = Config()
-    kept = options.folder / "drives"
-    kept.mkdir(parents=True, exist_ok=True)
-    logs = {name: read(options.data, name, options.queries, kept, config) for name in options.logs.split(",")}
-    indexes = {name: index_of(name, grid, config) for name, (grid, _) in logs.items()}
+    logs, indexes = read_all(options, options.folder)
     for name, (grid, driven) in logs.items():
         if options.elsewhere:
             others = {other: index for other, index in indexes.items() if other != name}

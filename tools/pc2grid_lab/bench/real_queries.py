@@ -47,9 +47,11 @@ STANDING_SCANS = 6
 WINDOWS_M = (15.0, 8.0, 4.0)
 
 
-def read(
-    data: Path, name: str, queries: int, kept: Path, config: Config
-) -> tuple[OccupancyGrid, list[RegisteredSession]]:
+Drawn = tuple[OccupancyGrid, list[RegisteredSession]]
+"""The map of the first part of a log, and its later parts as registered queries."""
+
+
+def read(data: Path, name: str, queries: int, kept: Path, config: Config) -> Drawn:
     """The map of the first part of a log, and its later parts as registered queries."""
     with open_log(data / "laser" / f"{name}.mcap") as log:
         truth = read_tum(data / "laser" / f"{name}_corrected.tum")
@@ -152,22 +154,31 @@ def _error(pose: SE2, truth: SE2 | None) -> tuple[float, float]:
     return math.hypot(e.x, e.y), abs(wrap_angle(e.yaw))
 
 
-def main() -> None:
-    """Collect the evidence."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def parser_of(description: str | None, out: str, logs: str) -> argparse.ArgumentParser:
+    """Of the arguments DATA, `out`, --logs and --queries."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=description, formatter_class=raw)
     parser.add_argument("data", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--logs", default=",".join(MAPPED_S))
+    parser.add_argument(out, type=Path)
+    parser.add_argument("--logs", default=logs)
     parser.add_argument("--queries", type=int, default=24)
-    options = parser.parse_args()
-    config = Config()
-    kept = options.out.parent / "drives"
+    return parser
+
+
+def read_all(options: argparse.Namespace, folder: Path) -> tuple[dict[str, Drawn], dict[str, MapIndex]]:
+    """The map and queries of each log, and its map as an index; registered queries are kept in the folder."""
+    kept, config = folder / "drives", Config()
     kept.mkdir(parents=True, exist_ok=True)
     names = options.logs.split(",")
     logs = {name: read(options.data, name, options.queries, kept, config) for name in names}
-    indexes = {name: index_of(name, grid, config) for name, (grid, _) in logs.items()}
+    return logs, {name: index_of(name, grid, config) for name, (grid, _) in logs.items()}
+
+
+def main() -> None:
+    """Collect the evidence."""
+    options = parser_of(__doc__, "out", ",".join(MAPPED_S)).parse_args()
+    config = Config()
+    logs, indexes = read_all(options, options.out.parent)
     rows: list[dict[str, Any]] = []
     for name, (_, driven) in logs.items():
         for start, d in enumerate(driven):

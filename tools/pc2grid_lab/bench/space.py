@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations, islice, product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -151,14 +152,7 @@ def twins(folder: Path, quick: bool) -> Iterator[Row]:
             (of_m, register_in_space(query.views, points, T_plan_map.inverse() @ T_plan_odom))
             for of_m, points, T_plan_map in maps
         ]
-        for (a_m, a), (b_m, b) in combinations(fits, 2):
-            if a is None or b is None:
-                continue
-            best = winner((a, b), 0.9)
-            if a_m == b_m:
-                won["alike" if best is None else "alike, chosen"] += 1
-            else:
-                won["none" if best is None else "right" if (a_m, b_m)[best[0]] == height_m else "wrong"] += 1
+        won.update(_outcome(height_m, a, b) for a, b in combinations(fits, 2))
     different = won["right"] + won["wrong"] + won["none"]
     alike = won["alike"] + won["alike, chosen"]
     what = "rooms whose heights differ by 1 m"
@@ -167,6 +161,17 @@ def twins(folder: Path, quick: bool) -> Iterator[Row]:
     yield Row(
         what="rooms of one height: one is chosen", measured=won["alike, chosen"], unit=f"of {alike}", goal=0.0
     )
+
+
+def _outcome(height_m: float, *rooms: tuple[float, Any]) -> str:
+    """Which of two rooms is chosen. height_m : the true one; rooms : height, and fit or None."""
+    heights, fits = zip(*rooms, strict=True)
+    if None in fits:
+        return "no fit"
+    best = winner(fits, 0.9)
+    if heights[0] == heights[1]:
+        return "alike" if best is None else "alike, chosen"
+    return "none" if best is None else "right" if heights[best[0]] == height_m else "wrong"
 
 
 def _twin(length_m: float, seed: int, height_m: float) -> SimulationConfig:

@@ -196,7 +196,7 @@ def _draw_floor(
         true = answer.T_house_query.apply(answer.walls_m)
         ax.plot(*true.T, ".", color=GREEN, ms=6.0, mew=0, alpha=0.4, label="query, true place")
     label: str | None = "query, where it fits"
-    for name in (name for name in sessions if name in answer.poses):
+    for name in filter(answer.poses.__contains__, sessions):
         walls = (result.frames[name] @ answer.poses[name]).apply(answer.walls_m)
         colour = VERMILLION if name == answer.session and answer.status == "wrong" else ORANGE
         ax.plot(*walls.T, ".", color=colour, ms=2.5, mew=0, label=label)

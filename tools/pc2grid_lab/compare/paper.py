@@ -99,12 +99,7 @@ def compare_paper_command(
     chosen, offsets_m = _chosen(methods), tuple(offset or (1.0, 0.5))
     if min(offsets_m) <= 0:
         raise ConfigError("--offset: expected a distance above 0 m")
-    map_paths = known_maps(maps)
-    if not map_paths:
-        raise MapFileError(
-            f"{maps}: no map is here", hint="a map.yaml, or a folder with intel.yaml, fr079.yaml, ..."
-        )
-    cells = out / "cells"
+    cells, map_paths = out / "cells", _maps(maps)
     make_folder(out)
     make_folder(cells)
     choices = (ABLATION if ablation else ()) + (OPEN_CHOICES if open_choices else ())
@@ -121,6 +116,15 @@ def compare_paper_command(
         print(f"written: {out / 'results.json'}, {out / 'results.csv'}, {', '.join(map(str, pictures))}")
 
 
+def _maps(path: Path) -> list[Path]:
+    found = known_maps(path)
+    if not found:
+        raise MapFileError(
+            f"{path}: no map is here", hint="a map.yaml, or a folder with intel.yaml, fr079.yaml, ..."
+        )
+    return list(found)
+
+
 def _chosen(methods: Sequence[str] | None) -> tuple[str, ...]:
     """The methods that are compared. Raises ConfigError if one is not known, or cannot be run."""
     chosen, known = tuple(methods or METHOD_NAMES), METHOD_NAMES + EXTRA_METHOD_NAMES
@@ -133,7 +137,7 @@ def _chosen(methods: Sequence[str] | None) -> tuple[str, ...]:
 
 def run_tasks(tasks: Sequence[PaperTask], cells: Path, jobs: int, terminal: Console) -> None:
     """Run the tasks that have no result yet in `jobs` processes, and show the progress on `terminal`."""
-    open_tasks = [t for t in tasks if any(load_result(t, m, cells) is None for m in t.methods)]
+    open_tasks = [task for task in tasks if len(_results([task], cells)) < len(task.methods)]
     if not open_tasks:
         return
     # One thread in each process, because the processes run in parallel; libraries read this when loaded.

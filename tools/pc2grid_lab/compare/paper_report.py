@@ -161,7 +161,7 @@ def _print_choices(
     where: str,
 ) -> None:
     """A table of some choices: what the paper says, what the default does, and what the choice moves."""
-    if not any(r.overrides == choice.overrides for r in results for choice in choices):
+    if {choice.overrides for choice in choices}.isdisjoint(r.overrides for r in results):
         return
     maps = [name for name, reading in columns if reading == "paper"]
     base = {(r.map_name, r.level): _auc_and_right(r) for r in results if _is_base(r)}
@@ -171,12 +171,12 @@ def _print_choices(
         defaults = {name: 1000 * base[name, level] for name in maps if (name, level) in base}
         _add_row(shown, ("all three", "", "Eq. 6"), level, defaults, maps, "")
     for choice, level in itertools.product(choices, (0, 2)):
-        chosen = [r for r in results if r.overrides == choice.overrides and r.level == level]
+        wanted = (choice.overrides, level)
         words = (choice.name, choice.paper, choice.ours) if level == 0 else ("", "", "")
         moved = {
             r.map_name: 1000 * (_auc_and_right(r) - base[r.map_name, level])
-            for r in chosen
-            if (r.map_name, level) in base
+            for r in results
+            if (r.overrides, r.level) == wanted and (r.map_name, level) in base
         }
         _add_row(shown, words, level, moved, maps, "+")
     show(shown)

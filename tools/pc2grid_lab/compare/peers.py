@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,7 +20,7 @@ from pc2grid_lab.compare.peers_report import draw, print_table
 from pc2grid_lab.experiments.stored import in_processes, write_text
 from pc2grid_lab.peers.environment import PEERS, PeerEnvironment
 from pc2grid_lab.peers.experiment import run, tasks
-from pc2grid_lab.peers.outcome import OUTCOME, counted
+from pc2grid_lab.peers.outcome import OUTCOME, PeerCell, PeerTrial, counted
 from pc2grid_lab.peers.site import Site, recorded_site, simulated_site, site_name
 from signature.config import Config
 
@@ -64,9 +65,7 @@ def compare_peers_command(
     """
     seconds = _seconds(mapped or [], recordings)
     where, terminal = _environment(environment, install), of(context)
-    missing = {kind.name: command for kind in PEERS if (command := where.missing(kind)) is not None}
-    for name, command in missing.items():
-        warn(f"{name} is not installed: {command}")
+    missing = _missing(where)
     for folder in ("sites", "trials"):
         make_folder(out / folder)
     with terminal.progress("prepare") as advance:
@@ -74,23 +73,42 @@ def compare_peers_command(
         sites = in_processes(_site, prepare, jobs=1, advance=advance)
     with terminal.progress("locate") as advance:
         asking = [(task, where, out / "trials") for task in tasks(sites, where)]
-        trials = [t for found in in_processes(run, asking, jobs=1, advance=advance) for t in found]
-    cells = counted(trials)
+        found = in_processes(run, asking, jobs=1, advance=advance)
+    trials = list(itertools.chain.from_iterable(found))
     document = {
         "schema_version": 1,
         "recordings": [recording.name for recording in recordings],
         "setting": {"queries": queries, "travel": travel, "seed": OUTCOME.seed, **seconds},
         "not_installed": missing,
-        "cells": [asdict(cell) for cell in cells],
-        "trials": [asdict(trial) for trial in trials],
     }
-    write_text(out / "peers.json", json_text(document) + "\n")
     sensors = {site.name: site.sensor for site in sites}
+    _finish(out, counted(trials), trials, sensors, document, as_json)
+
+
+def _missing(environment: PeerEnvironment) -> dict[str, str]:
+    """The peers that are not installed, and how they are; each is warned of."""
+    missing = {kind.name: command for kind in PEERS if (command := environment.missing(kind)) is not None}
+    for name, command in missing.items():
+        warn(f"{name} is not installed: {command}")
+    return missing
+
+
+def _finish(
+    out: Path,
+    cells: Sequence[PeerCell],
+    trials: Sequence[PeerTrial],
+    sensors: Mapping[str, str],
+    about: Mapping[str, Any],
+    as_json: bool,
+) -> None:
+    """Write and print the results. sensors : of the sites. about : the rest of the document."""
+    document = {**about, "cells": list(map(asdict, cells)), "trials": list(map(asdict, trials))}
+    write_text(out / "peers.json", json_text(document) + "\n")
     draw(out / "peers.png", cells, sensors)
     if as_json:
         print_json(document)
         return
-    print_table(cells, sensors, missing)
+    print_table(cells, sensors, about["not_installed"])
     print("\n".join(str(out / name) for name in ("peers.json", "peers.png")))
 
 

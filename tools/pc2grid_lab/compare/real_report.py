@@ -104,12 +104,16 @@ def draw(
             ax.set_title(f"{_TITLES[name]}; located and right: {_counts(name, cells)}", fontsize=9)
             ax.set(xlim=(x0 - 0.5, x1 + 0.5), ylim=(y0 - 0.5, y1 + 0.5), aspect="equal")
             ax.tick_params(labelsize=7)
-        for sensor in _SENSORS:
-            axes[0].plot([], [], ">", color=_COLOURS[sensor], label=f"{_SHOWN[sensor]}, located")
-        axes[0].plot([], [], "o", color="0.3", label="no answer, right place first")
-        axes[0].plot([], [], "o", mfc="none", mec="0.3", label="no answer")
-        axes[0].legend(loc="lower center", bbox_to_anchor=(0.5, 1.1), fontsize=7, ncols=5)
+        _legend(axes[0])
         axes[-1].set_xlabel("metres, frame of the 3D scan", fontsize=8)
+
+
+def _legend(ax: Any) -> None:
+    for sensor in _SENSORS:
+        ax.plot([], [], ">", color=_COLOURS[sensor], label=f"{_SHOWN[sensor]}, located")
+    ax.plot([], [], "o", color="0.3", label="no answer, right place first")
+    ax.plot([], [], "o", mfc="none", mec="0.3", label="no answer")
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.1), fontsize=7, ncols=5)
 
 
 def _walls_m(sensor_map: SensorMap, T_floor_plan: SE2) -> F64:

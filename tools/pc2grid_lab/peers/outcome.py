@@ -158,7 +158,7 @@ def _cell(trials: Sequence[PeerTrial], threshold: float | None) -> PeerCell:
     return PeerCell(
         peer=trials[0].peer,
         site=trials[0].site,
-        threshold=None if threshold is None or math.isinf(threshold) else threshold,
+        threshold=threshold if math.isfinite(lowest) else None,
         covered=asked["covered"],
         right=len(right),
         wrong=wrong["covered"],

@@ -7,6 +7,7 @@ walls, glass and mirrors belong to the building: its seed decides them, and they
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,7 +21,7 @@ from pc2grid.simulate.clutter import KINDS, Furniture, Prism
 from pc2grid.simulate.passage import clearance_m, outline_mask
 from pc2grid.simulate.scene import Mesh
 from pc2grid_lab.worlds.config import ChangeConfig
-from pc2grid_lab.worlds.doors import find_doorways, open_angle
+from pc2grid_lab.worlds.doors import Doorway, find_doorways, open_angle
 
 OPAQUE, GLASS, MIRROR = 0, 1, 2
 
@@ -107,48 +108,74 @@ def change_building(
     kind = _panes(plan, config.glass, config.mirrors, building_rng)
     pieces = _pieces(plan) if config.furniture else []
     chosen = [piece for piece in pieces if rng.random() < config.furniture]
+    shell, furniture, exchanged = _refurnished(plan, shell, chosen, config.exchanged, rng)
+    emptied = _without(plan, chosen)
+    doorways = find_doorways(plan) if config.doors else ()
+    doors, closed = _doors(emptied, doorways, config, rng, robot_m, start_m)
+    glass_m, mirror_m = (_length_m(plan, kind, what) for what in (GLASS, MIRROR))
+    change = Change(
+        added=(*doors, *furniture, *relief),
+        kind=kind,
+        doorways=len(doorways),
+        closed=closed,
+        ajar=len(doors) - closed,
+        pieces=len(pieces),
+        moved=len(chosen) - exchanged,
+        exchanged=exchanged,
+        relief=len(relief),
+        glass_m=glass_m,
+        mirror_m=mirror_m,
+        walls_changed=_walls_changed(plan, emptied, (*doors, *furniture)),
+    )
+    return emptied, shell, change
+
+
+def _refurnished(
+    plan: OccupancyGrid, shell: Mesh | None, chosen: list[BoolGrid], share: float, rng: np.random.Generator
+) -> tuple[Mesh | None, list[Furniture], int]:
+    """The building without some pieces, what became of them, and how many were exchanged.
+
+    share : of the pieces that are exchanged, not moved.
+    """
     tops_m = [_PIECE_TOP_M] * len(chosen)
     if shell is not None and chosen:
         shell, tops_m = _cut(shell, plan, chosen)
     furniture, exchanged = [], 0
     for piece, top_m in zip(chosen, tops_m, strict=True):
-        swap = rng.random() < config.exchanged
+        swap = rng.random() < share
         exchanged += swap
         furniture.append(_exchanged(piece, plan, rng) if swap else _moved(piece, plan, top_m, rng))
-    emptied = _without(plan, chosen)
-    doorways = find_doorways(plan) if config.doors else ()
+    return shell, furniture, exchanged
+
+
+def _doors(
+    plan: OccupancyGrid,
+    doorways: Sequence[Doorway],
+    config: ChangeConfig,
+    rng: np.random.Generator,
+    robot_m: float,
+    start_m: tuple[float, float] | None,
+) -> tuple[list[Furniture], int]:
+    """The leaves of the doors that stand in the doorways, and how many of them are closed."""
     doors: list[Furniture] = []
     closed = 0
     for doorway in doorways:
         if rng.random() >= config.doors:
             continue
         leaf = doorway.leaf(0.0)
-        if rng.random() < config.closed and _leaves_room(emptied, [*doors, leaf], robot_m, start_m):
+        if rng.random() < config.closed and _leaves_room(plan, [*doors, leaf], robot_m, start_m):
             closed += 1
         else:
             leaf = doorway.leaf(open_angle(rng), at_b=bool(rng.random() < 0.5))
         doors.append(leaf)
-    added = (*doors, *furniture, *relief)
-    cell_m = plan.resolution_m
-    visible = _visible_walls(plan)
-    return (
-        emptied,
-        shell,
-        Change(
-            added=added,
-            kind=kind,
-            doorways=len(doorways),
-            closed=closed,
-            ajar=len(doors) - closed,
-            pieces=len(pieces),
-            moved=len(chosen) - exchanged,
-            exchanged=exchanged,
-            relief=len(relief),
-            glass_m=0.0 if kind is None else float((visible & (kind == GLASS)).sum()) * cell_m,
-            mirror_m=0.0 if kind is None else float((visible & (kind == MIRROR)).sum()) * cell_m,
-            walls_changed=_walls_changed(plan, emptied, (*doors, *furniture)),
-        ),
-    )
+    return doors, closed
+
+
+def _length_m(plan: OccupancyGrid, kind: U8 | None, what: int) -> float:
+    """Length of the visible wall that is of a kind."""
+    if kind is None:
+        return 0.0
+    return float((_visible_walls(plan) & (kind == what)).sum()) * plan.resolution_m
 
 
 def _footprint(plan: OccupancyGrid, furniture: Furniture) -> BoolGrid:

@@ -7,7 +7,7 @@ either stairs, in each storey two flights side by side with a landing between th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
@@ -31,8 +31,6 @@ from pc2grid.simulate.route import Route, plan_route, plan_way
 from pc2grid.simulate.scene import Mesh, Scene, extrude, quads
 from pc2grid.simulate.sensors import Sensor, make_sensor
 from pc2grid.simulate.session import RAYS_PER_CAST, Reading, scan_of
-
-RideKind = Literal["stairs", "lift"]
 
 _DOOR_M = 1.2  # width of the door to the shaft
 _INSIDE_M = 0.9  # from that door to where rides begin and end
@@ -396,53 +394,13 @@ def prepare_house_session(
     Raises ConfigError if the house has no room for the robot or the shaft.
     """
     config = config or SimulationConfig()
-    robot_m = config.drive.clearance_m
-    built = House.of(office_floorplan(config.building_seed), house, robot_m)
+    built = House.of(office_floorplan(config.building_seed), house, config.drive.clearance_m)
 
     def stream(*numbers: int) -> np.random.Generator:
         return np.random.default_rng([config.seed, *numbers])
 
-    furniture_seed = config.seed if house.furniture_seed is None else house.furniture_seed
-    x, y = built.door_m
-    clear_m = (built.inside_m, (x, y), (x + 0.5 * _LANDING_M, y - 0.7), (x + 0.5 * _LANDING_M, y + 0.7))
-    clutter = {
-        floor: place_clutter(
-            built.plan,
-            config.clutter,
-            np.random.default_rng([furniture_seed, _CLUTTER, 0 if house.alike else floor]),
-            robot_m=robot_m,
-            keep_free_m=clear_m,
-        )
-        for floor in sorted(set(house.visits))
-    }
-    points: list[F64] = [np.array([built.inside_m])]
-    turns: list[int] = []
-
-    def append(line: F64, at: I64) -> None:
-        """Add a line that begins where the last one ends; the robot turns in place there."""
-        begin = sum(map(len, points)) - 1
-        turns.extend([begin, *(begin + at).tolist()])
-        points.append(line[1:])
-
-    for number, floor in enumerate(house.visits):
-        blocked = covered(built.plan, clutter[floor])
-        if number:
-            append(*built.way(up=floor > house.visits[number - 1]))
-        route = plan_route(
-            built.plan,
-            blocked,
-            config.length_m,
-            start_m=built.inside_m,
-            least_m=robot_m,
-            rng=stream(_ROUTE, number),
-        )
-        there = np.concatenate(([built.inside_m], route.points_m))
-        append(there, route.turns + 1)
-        if number + 1 < len(house.visits):
-            end = (float(route.points_m[-1, 0]), float(route.points_m[-1, 1]))
-            append(plan_way(built.plan, blocked, end, built.inside_m, robot_m), np.empty(0, np.int64))
-    whole = Route(np.concatenate(points), np.unique([t for t in turns if t > 0]))
-    planar = drive_along(whole, config.drive, stream(_DRIVE))
+    clutter = _clutter(built, config)
+    planar = drive_along(_route(built, clutter, config, stream), config.drive, stream(_DRIVE))
     drive = _by_stairs(planar, built) if house.ride == "stairs" else _by_lift(planar, built)
     return HouseSession(
         make_sensor(sensor, config),
@@ -453,6 +411,59 @@ def prepare_house_session(
         _odometry(drive, config, stream(_ODOMETRY)),
         config,
     )
+
+
+def _clutter(built: House, config: SimulationConfig) -> dict[int, tuple[Furniture, ...]]:
+    """What stands on each floor that is visited; the way to the shaft is kept free."""
+    house, (x, y) = built.config, built.door_m
+    seed = config.seed if house.furniture_seed is None else house.furniture_seed
+    clear_m = (built.inside_m, (x, y), (x + 0.5 * _LANDING_M, y - 0.7), (x + 0.5 * _LANDING_M, y + 0.7))
+    return {
+        floor: place_clutter(
+            built.plan,
+            config.clutter,
+            np.random.default_rng([seed, _CLUTTER, 0 if house.alike else floor]),
+            robot_m=config.drive.clearance_m,
+            keep_free_m=clear_m,
+        )
+        for floor in sorted(set(house.visits))
+    }
+
+
+def _route(
+    built: House,
+    clutter: dict[int, tuple[Furniture, ...]],
+    config: SimulationConfig,
+    stream: Callable[..., np.random.Generator],
+) -> Route:
+    """The way through the house: on each floor `config.length_m`, and back to the shaft."""
+    robot_m, visits = config.drive.clearance_m, built.config.visits
+    points: list[F64] = [np.array([built.inside_m])]
+    turns: list[int] = []
+
+    def append(line: F64, at: I64) -> None:
+        """Add a line that begins where the last one ends; the robot turns in place there."""
+        begin = sum(map(len, points)) - 1
+        turns.extend([begin, *(begin + at).tolist()])
+        points.append(line[1:])
+
+    for number, floor in enumerate(visits):
+        blocked = covered(built.plan, clutter[floor])
+        if number:
+            append(*built.way(up=floor > visits[number - 1]))
+        route = plan_route(
+            built.plan,
+            blocked,
+            config.length_m,
+            start_m=built.inside_m,
+            least_m=robot_m,
+            rng=stream(_ROUTE, number),
+        )
+        append(np.concatenate(([built.inside_m], route.points_m)), route.turns + 1)
+        if number + 1 < len(visits):
+            end = (float(route.points_m[-1, 0]), float(route.points_m[-1, 1]))
+            append(plan_way(built.plan, blocked, end, built.inside_m, robot_m), np.empty(0, np.int64))
+    return Route(np.concatenate(points), np.unique([t for t in turns if t > 0]))
 
 
 def _by_stairs(planar: Drive, house: House) -> SpatialDrive:
