@@ -33,7 +33,6 @@ from signature.config import Config
 from signature.database import open_database
 from signature.localization.follower import Follower
 from signature.localization.localizer import Localizer, MapIndex, locate
-from signature.localization.map_index import MapIndex
 from signature.sessions import add_sessions, build_session
 
 _ROBOT = (

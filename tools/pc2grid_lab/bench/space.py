@@ -30,7 +30,6 @@ from signature.localization.in_space import winner
 from signature.localization.localizer import locate
 from signature.localization.query import QueryInSpace
 from signature.sessions import add_sessions, build_session
-from tests.helpers.simulated_drives import office
 
 VOXEL_M = 0.05
 _NEAR_M = 4.0
@@ -127,6 +126,8 @@ def twins(folder: Path, quick: bool) -> Iterator[Row]:
     2.5 m and twice of 3.5 m. Queries are registered at their true place in all four maps. Of two maps of
     different height the one of the right height should win, of two maps of one height none.
     """
+    from tests.helpers.simulated_drives import office
+
     config, plan = _with_points(), office()
     maps: list[tuple[float, PointMap, SE2]] = []
     for number, height_m in enumerate((2.5, 2.5, 3.5, 3.5)):
