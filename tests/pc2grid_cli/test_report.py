@@ -205,7 +205,7 @@ def test_the_curve_is_what_asking_would_have_said(database: SubmapDatabase, foun
     assert not quiet["asked"] and len(quiet["history"]) == 1
     last = found.answer.history[-1]
     asked = tuple(replace(last, path_m=float(m), confidence=0.1 * m, status="ambiguous") for m in (1, 2))
-    shown = contents(database, found=replace(found, asked=asked))["answer"]
+    shown = contents(database, found=replace(found, on_the_way=asked))["answer"]
     assert shown["asked"] == 2
     assert [m["path_m"] for m in shown["history"]] == [1.0, 2.0, last.path_m]
     assert [m["status"] for m in shown["history"]] == ["ambiguous", "ambiguous", "located"]
