@@ -41,8 +41,9 @@ from pc2grid.time_span import TimeSpan
 if TYPE_CHECKING:
     from pc2grid.io import Log
     from pc2grid.mapping.keyframes import Keyframe, Keyframes
-    from pc2grid.mapping.loop_closure import LoopCloser, SettledKeyframes
+    from pc2grid.mapping.loop_closure import LoopCloser
     from pc2grid.mapping.place_recognition import PlaceRecognizer
+    from pc2grid.mapping.settled import SettledKeyframes
     from pc2grid.odometry.overruled import Disagreement
     from pc2grid.odometry.tracker import Tracked
 
@@ -336,7 +337,8 @@ def _map(
     from pc2grid.mapping.keyframe_points import KeyframePoints
     from pc2grid.mapping.keyframes import Keyframes
     from pc2grid.mapping.local_maps import CAMERA_LOCAL_MAPS, LOCAL_MAPS
-    from pc2grid.mapping.loop_closure import CAMERA_LOOPS, LOOPS, LoopCloser
+    from pc2grid.mapping.loop_closure import LoopCloser
+    from pc2grid.mapping.loop_parameters import CAMERA_LOOPS, LOOPS
     from pc2grid.mapping.parts import PARTS
     from pc2grid.odometry.tracker import Tracker
 
@@ -456,7 +458,7 @@ def _settled(tracked: Trajectory, closed: SettledKeyframes) -> tuple[I64, F64]:
     A scan belongs to the keyframe before it. Scans before the first keyframe belong to that. The frame of the
     first part is that of the session; that of another is the base at its first scan, levelled.
     """
-    from pc2grid.mapping.loop_closure import spread
+    from pc2grid.mapping.settled import spread
 
     T_session_base = tracked.T_session_base.copy()
     if not len(closed.scans):

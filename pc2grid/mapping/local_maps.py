@@ -166,6 +166,15 @@ class LocalMaps:
         """Add the local map of one more run of keyframes."""
         self.runs.append(run)
 
+    @property
+    def end(self) -> int:
+        """The number of the keyframe behind the last run."""
+        return self.runs[-1].stop if self.runs else 0
+
+    def anchors(self) -> list[int]:
+        """The keyframe in whose frame each local map is drawn."""
+        return [self.anchor(number) for number in range(len(self.runs))]
+
     def anchor(self, number: int) -> int:
         """The keyframe in whose frame a local map is drawn."""
         run = self.runs[number]

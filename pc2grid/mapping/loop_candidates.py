@@ -33,7 +33,7 @@ class CandidateParameters:
 
     The drift over the short travel between two recognitions that support each other:
 
-    short_m, short_per_m, short_rad, short_rad_per_m : as above.
+    short_m, short_per_m, short_rad : as above; per metre of travel the yaw drifts by `drift_rad_per_m`.
     within_m : recognitions farther apart in travel do not support each other: almost all would agree.
     consistent : largest Mahalanobis distance at which two of them agree; 3 degrees of freedom, 1 %.
 
@@ -55,7 +55,6 @@ class CandidateParameters:
     short_m: float = 0.15
     short_per_m: float = 0.015
     short_rad: float = math.radians(1.0)
-    short_rad_per_m: float = math.radians(0.1)
     within_m: float = 60.0
     consistent: float = 3.37
     alone: float = 1.0
@@ -132,7 +131,7 @@ class LoopCandidates:
         apart = _mahalanobis(
             between(there, again),
             p.short_m + p.short_per_m * between_m.ravel(),
-            p.short_rad + p.short_rad_per_m * between_m.ravel(),
+            p.short_rad + p.drift_rad_per_m * between_m.ravel(),
         ).reshape(between_m.shape)
         agrees = apart <= p.consistent
         supports = agrees & (between_m <= p.within_m) & ~same & in_reach

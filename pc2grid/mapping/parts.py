@@ -23,11 +23,9 @@ from pc2grid.mapping.pose_graph import Edge
 class PartParameters:
     """Numbers of the division into parts.
 
-    near_m : local maps whose anchors lie farther apart are not compared, as in loop closure.
     contradicting : share of the points of a local map on ground that another one saw free from which the
-        other contradicts it, as for the windows of `ConsistencyParameters.contradicted_from`. On the maps of
-        fr079, intel, csail, aces and killian it reaches 0.16 in both directions with loops closed, 0.48 to
-        0.56 without loops.
+        other contradicts it, as for the windows of `ConsistencyParameters.contradicted_from`; chosen on maps
+        with loops closed and without (`examples/consistency.md`).
     joining : different local maps on each of the two sides of a cut that must be in agreeing loops, to join
         them; a single room may look like another one. Chosen by hand.
     least_travel_m : a part with less travel is left out: later recordings are recognised by stretches of 8 m
@@ -35,7 +33,6 @@ class PartParameters:
     rounds : divisions at most, each of the parts that are still bent. Chosen by hand.
     """
 
-    near_m: float = 8.0
     contradicting: float = 0.2
     joining: int = 2
     least_travel_m: float = 8.0
@@ -106,17 +103,19 @@ def conflicts_of(
     poses: F64,
     part: I64,
     doubtful: NDArray[np.bool_],
+    near_m: float,
     parameters: PartParameters = PARTS,
 ) -> Iterator[Conflict]:
     """The local maps that contradict each other, in the order of the newer.
 
     poses : (N, 3) settled poses of the local maps. part : (N,) number of the part of each.
     doubtful : (N,) local maps in stretches that contradict the map drawn of their part; one of two must be.
+    near_m : local maps whose anchors lie farther apart are not compared.
     """
     for newer in range(len(poses)):
         # The local map before the newest is left out: tracking matched both against the same walls.
         before = np.arange(max(newer - 1, 0))
-        near = np.hypot(*(poses[before, :2] - poses[newer, :2]).T) < parameters.near_m
+        near = np.hypot(*(poses[before, :2] - poses[newer, :2]).T) < near_m
         near &= (part[before] == part[newer]) & (doubtful[before] | doubtful[newer])
         for older in before[near].tolist():
             T_older_newer = pose_at(poses, older).inverse() @ pose_at(poses, newer)

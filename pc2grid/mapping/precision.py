@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F64, I64
 from pc2grid.mapping.building_axes import WallDirection
+from pc2grid.mapping.parts import PARTS
 from pc2grid.mapping.pose_graph import Edge, information_matrix
 from pc2grid.model import Loose, Precision, Trajectory
 
@@ -36,20 +37,17 @@ class PrecisionParameters:
     promised_m : standard deviation of a position from which a place is called loose. An answer of
         relocalization is called right within this distance (`compare log`). Beyond it, an answer that is
         exact to the walls around it is off in the map by more than that as often as one in three.
-    least_travel_m : shorter loose stretches are not named: later recordings are recognised by stretches of
-        8 m and more.
     rounds : in which the weights of the places are found; they change little after two.
     most_places : whose covariance is computed, evenly chosen. It is interpolated between them, so that the
         time grows linearly with the length of a session.
-    held : information, per square metre and radian, that keeps the first pose where it is while the matrix is
-        inverted. The result does not depend on it.
+    first_information : per square metre and radian, on the first pose, so that the matrix can be inverted.
+        The result does not depend on it.
     """
 
     promised_m: float = 0.5
-    least_travel_m: float = 8.0
     rounds: int = 3
     most_places: int = 1000
-    held: float = 1e4
+    first_information: float = 1e4
 
 
 PRECISION = PrecisionParameters()
@@ -67,7 +65,7 @@ def position_sigmas(
     """Standard deviation (N,) of each position in metres, in its least certain direction, and weights (N,).
 
     poses : (N, 3) x, y, yaw that agree best with the edges. edges : those that count; they connect all poses.
-    walls : of each pose, if the building's axes held the headings.
+    walls : of each pose, if the building's axes constrain the headings.
     weights : with which the places count when the map is placed on the truth.
     """
     count = len(poses)
@@ -97,14 +95,14 @@ def position_sigmas(
 
 
 def _inverse(poses: F64, information: coo_matrix, parameters: PrecisionParameters) -> Callable[[F64], F64]:
-    """The product of columns (3 N, K) with the covariance (3 N, 3 N) of the poses, the first one held."""
+    """The product of columns (3 N, K) with the covariance (3 N, 3 N) of the poses; the first one is fixed."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import splu
 
-    held = coo_matrix(
-        (np.full(3, parameters.held), (np.arange(3), np.arange(3))), shape=(3 * len(poses),) * 2
+    first = coo_matrix(
+        (np.full(3, parameters.first_information), (np.arange(3), np.arange(3))), shape=(3 * len(poses),) * 2
     )
-    factors = splu((information + held).tocsc(), permc_spec="MMD_AT_PLUS_A")
+    factors = splu((information + first).tocsc(), permc_spec="MMD_AT_PLUS_A")
 
     def solve(columns: F64) -> F64:
         product: F64 = factors.solve(columns)
@@ -152,7 +150,7 @@ def precision_of(
         first, last = int(begins[begin]), int(ends[end - 1])
         worst = begin + int(np.argmax(sigma_m[begin:end]))
         length_m = float(travel_m[last] - travel_m[first])
-        if length_m >= parameters.least_travel_m:
+        if length_m >= PARTS.least_travel_m:
             found.append(
                 Loose(
                     from_ns=int(stamps_ns[first]),

@@ -9,7 +9,7 @@ import pytest
 
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.mapping.building_axes import WallDirection, pull_to_axes, wall_direction
-from pc2grid.mapping.loop_closure import LOOPS
+from pc2grid.mapping.loop_parameters import LOOPS
 from pc2grid.mapping.pose_graph import Edge, optimise
 from pc2grid.mapping.precision import position_sigmas
 

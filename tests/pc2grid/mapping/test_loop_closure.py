@@ -11,12 +11,14 @@ import pytest
 from pc2grid.arrays import F64
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
 from pc2grid.geometry import SE2
-from pc2grid.mapping import loop_closure
+from pc2grid.mapping import loop_verification
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.loop_candidates import CandidateParameters
-from pc2grid.mapping.loop_closure import LoopCloser, LoopParameters, SettledKeyframes, spread
+from pc2grid.mapping.loop_closure import LoopCloser
+from pc2grid.mapping.loop_parameters import LoopParameters
 from pc2grid.mapping.place_recognition import Recognition, Stretch
 from pc2grid.mapping.pose_graph import Edge, optimise
+from pc2grid.mapping.settled import SettledKeyframes, spread
 from pc2grid.odometry.point_to_line import Match
 
 Wall = tuple[tuple[float, float], tuple[float, float]]
@@ -177,13 +179,13 @@ def test_a_lost_stretch_is_a_guess_and_its_error_stays_in_it() -> None:
 def test_work_and_loops_grow_with_the_way_and_not_with_its_square(monkeypatch: pytest.MonkeyPatch) -> None:
     """One more lap does not change how many local maps each one is compared with."""
     compared: list[int] = []
-    fit = loop_closure._fit
+    fit = loop_verification.fit
 
     def counted(*arguments: Any) -> Match | None:
         compared[-1] += 1
         return fit(*arguments)
 
-    monkeypatch.setattr(loop_closure, "_fit", counted)
+    monkeypatch.setattr(loop_verification, "fit", counted)
     for laps in (2, 3, 4):
         compared.append(0)
         truth = square(30) * laps
@@ -237,7 +239,7 @@ def test_a_recognizer_closes_loops_beyond_the_search_window() -> None:
     alone, _ = closed(poses, planar_scans, parameters=narrow)
     # The drift, 1.1 degrees per metre, is ten times what the default takes for possible.
     wide = CandidateParameters(
-        **{name: math.radians(1.2) for name in ("drift_rad_per_m", "short_rad_per_m")},
+        drift_rad_per_m=math.radians(1.2),
         drift_per_m=0.1,
         short_per_m=0.1,
         known_way_m=0.0,  # the search window is narrow here: short ways drift out of it, too

@@ -12,9 +12,11 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
 from pc2grid.geometry import SE2
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
-from pc2grid.mapping.loop_closure import LoopCloser, LoopParameters, SettledKeyframes
+from pc2grid.mapping.loop_closure import LoopCloser
+from pc2grid.mapping.loop_parameters import LoopParameters
 from pc2grid.mapping.parts import Conflict, connected, cuts_for
 from pc2grid.mapping.pose_graph import Edge
+from pc2grid.mapping.settled import SettledKeyframes
 from pc2grid.model import (
     Consistency,
     Health,

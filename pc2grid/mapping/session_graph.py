@@ -1,0 +1,133 @@
+"""The pose graph of a session while it grows: its local maps, the tracked steps between them, and loops."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+
+from pc2grid.arrays import F64, I64
+from pc2grid.geometry import SE2
+from pc2grid.mapping.building_axes import WallDirection
+from pc2grid.mapping.local_maps import pose_at
+from pc2grid.mapping.loop_parameters import LoopParameters
+from pc2grid.mapping.pose_graph import Edge, Solution, optimise
+from pc2grid.mapping.precision import position_sigmas
+
+
+class SessionGraph:
+    """The pose graph over the anchors of local maps.
+
+    nodes : (N, 3) x, y, yaw of each anchor in the session, by the last optimisation. edges : tracked steps
+    and loops, in the order in which they were found.
+    """
+
+    def __init__(self, parameters: LoopParameters) -> None:
+        self._parameters = parameters
+        self.nodes: F64 = np.empty((0, 3))
+        self.edges: list[Edge] = []
+        self._walls: list[WallDirection] = []  # of each local map
+        # Of each tracked step, by its local maps: how exactly these determine it.
+        self._step_information: dict[tuple[int, int], F64] = {}
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def begin(self, pose: SE2, walls: WallDirection) -> None:
+        """Add the first local map, at its tracked pose."""
+        self.nodes = np.array([(pose.x, pose.y, pose.yaw)])
+        self._walls.append(walls)
+
+    def extend(self, step: SE2, walls: WallDirection, shown: F64 | None) -> None:
+        """Add the next local map, a tracked step from the last one.
+
+        shown : information (3, 3) on the step by what both local maps show; None: tracking was lost.
+        """
+        newest = len(self)
+        information = self._parameters.tracked_information(math.hypot(step.x, step.y), shown is None)
+        self.edges.append(Edge(newest - 1, newest, step, information))
+        if shown is not None:
+            self._step_information[newest - 1, newest] = shown
+        pose = pose_at(self.nodes, newest - 1) @ step
+        self.nodes = np.vstack((self.nodes, (pose.x, pose.y, pose.yaw)))
+        self._walls.append(walls)
+
+    def relative(self, first: int, second: int) -> SE2:
+        """T_first_second by the present poses."""
+        return pose_at(self.nodes, first).inverse() @ pose_at(self.nodes, second)
+
+    def confirms(self, edge: Edge) -> bool:
+        """Whether a loop agrees with the present poses: then the optimisation can wait."""
+        apart = edge.T_first_second.inverse() @ self.relative(edge.first, edge.second)
+        near = math.hypot(apart.x, apart.y) < self._parameters.unmoved_m
+        return near and abs(apart.yaw) < self._parameters.unmoved_rad
+
+    def close(self, loops: list[Edge]) -> bool:
+        """Add loops; the poses are solved again if these do not confirm them, and True is returned."""
+        self.edges += loops
+        if all(self.confirms(edge) for edge in loops):
+            return False
+        self.solve()
+        return True
+
+    def solve(self) -> Solution:
+        """Solve for the poses that agree best with all edges."""
+        solution = self.solution()
+        self.nodes = solution.poses
+        return solution
+
+    def solution(self) -> Solution:
+        """What `solve` would find."""
+        return optimise(self.nodes, self.edges, self._walls)
+
+    def known(self) -> list[Edge]:
+        """The tracked steps, and the loops that the present poses confirm."""
+        return [edge for edge in self.edges if not edge.loop or self.confirms(edge)]
+
+    def remove_loops(self, between: Collection[tuple[int, int]], segment: I64) -> bool:
+        """Remove the loops between pairs of segments, older and newer; whether there were any.
+
+        segment : (N,) number of the segment of each local map.
+        """
+        before = len(self.edges)
+        self.edges = [
+            edge
+            for edge in self.edges
+            if not edge.loop or (segment[edge.first], segment[edge.second]) not in between
+        ]
+        return len(self.edges) < before
+
+    def cut(self, cuts: Collection[int]) -> None:
+        """Forget the tracked steps to some local maps, as if tracking had been lost before them."""
+        unknown = self._parameters.tracked_information(0.0, restart=True)
+        for k, edge in enumerate(self.edges):
+            if not edge.loop and edge.second in cuts:
+                self.edges[k] = replace(edge, information=unknown)
+                self._step_information.pop((edge.first, edge.second), None)
+
+    def sigmas(self, solution: Solution, part: I64) -> F64:
+        """Standard deviation (N,) in metres of the position of each local map within its part (N,).
+
+        In the pose graph a tracked step counts as exact as it is wherever tracking works at all. How exact a
+        step is by what its local maps show of each other is added here.
+        """
+        sigma_m = np.zeros(len(part))
+        accepted = [edge for edge, kept in zip(self.edges, solution.accepted, strict=True) if kept]
+        for number in range(int(part.max(initial=-1)) + 1):
+            own = np.flatnonzero(part == number)
+            position = {int(local_map): k for k, local_map in enumerate(own)}
+            within = [
+                replace(
+                    edge,
+                    first=position[edge.first],
+                    second=position[edge.second],
+                    information=edge.information + self._step_information.get((edge.first, edge.second), 0.0),
+                )
+                for edge in accepted
+                if edge.first in position and edge.second in position
+            ]
+            walls = [self._walls[local_map] for local_map in own]
+            sigma_m[own] = position_sigmas(solution.poses[own], within, walls)[0]
+        return sigma_m

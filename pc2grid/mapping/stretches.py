@@ -1,0 +1,150 @@
+"""Stretches of travel, and the places that a recognizer finds on them.
+
+Loops that are farther off than the search near the tracked pose reaches are found by a `PlaceRecognizer`. It
+is asked for stretches of a few local maps; what it finds waits among the `LoopCandidates`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pc2grid.config import ProjectionConfig
+from pc2grid.geometry import SE2
+from pc2grid.mapping.local_maps import LocalMaps, pose_at
+from pc2grid.mapping.loop_candidates import Candidate, LoopCandidates
+from pc2grid.mapping.loop_parameters import LoopParameters
+from pc2grid.mapping.occupancy import GridBuilder
+from pc2grid.mapping.place_recognition import PlaceRecognizer, Stretch
+from pc2grid.mapping.tracked_keyframes import TrackedKeyframes
+
+
+class Stretches:
+    """The stretches of a session that its recognizer was asked for.
+
+    recognizer : None: there are no stretches. candidates : get what it finds.
+    projection : how the grids for the recognizer are drawn.
+    """
+
+    def __init__(
+        self,
+        local_maps: LocalMaps,
+        keyframes: TrackedKeyframes,
+        candidates: LoopCandidates,
+        parameters: LoopParameters,
+        recognizer: PlaceRecognizer | None,
+        projection: ProjectionConfig,
+    ) -> None:
+        self._local_maps = local_maps
+        self._keyframes = keyframes
+        self._candidates = candidates
+        self._parameters = parameters
+        self._recognizer = recognizer
+        self._projection = projection
+        self._asked: list[range] = []  # the local maps of each
+        self._known_places: list[bool] = []  # whether each local map overlaps one of an earlier visit
+        self._begin = 0  # first local map of the stretch that is not complete yet
+
+    def extend(self, *, restart: bool, known: bool) -> bool:
+        """Take the newest local map; returns whether it completes a stretch that the recognizer is asked for.
+
+        restart : tracking was lost before it. known : it overlaps a local map of an earlier visit.
+
+        A stretch does not reach across a lost part of the session: its map would be bent. Where all its local
+        maps overlap those of an earlier visit already, there is nothing to ask and nothing new to remember.
+        """
+        newest = len(self._known_places)
+        self._known_places.append(known)
+        if restart:
+            self._begin = newest
+        if newest + 1 - self._begin < self._parameters.stretch_maps:
+            return False
+        numbers = range(self._begin, newest + 1)
+        self._begin = numbers.stop
+        return self._ask(numbers)
+
+    def finish(self) -> bool:
+        """The last local maps make a stretch that may overlap the one before; returns as `extend` does."""
+        stop = len(self._known_places)
+        if self._begin >= stop:
+            return False
+        begin = max(stop - self._parameters.stretch_maps, 0)
+        while self.storey(begin) != self.storey(stop - 1):
+            begin += 1
+        return self._ask(range(begin, stop))
+
+    def storey(self, number: int) -> int:
+        """The floor of a local map."""
+        return self._keyframes.storeys[self._local_maps.runs[number].start]
+
+    def latest(self) -> range:
+        """The local maps of the stretch that was asked for last."""
+        return self._asked[-1]
+
+    def guesses(self, candidate: Candidate) -> list[tuple[int, int, SE2]]:
+        """The pairs of local maps of the two stretches of a candidate, the nearest first.
+
+        Of each the older, the newer, and T_older_newer by the recognition.
+        """
+        pairs = []
+        for older, T_stretch_older in self._around(candidate.older):
+            for newer, T_stretch_newer in self._around(candidate.newer):
+                # The last stretch overlaps the one before. Neighbours are matched by tracking already.
+                if newer - older < 2:
+                    continue
+                guess = T_stretch_older.inverse() @ candidate.T_older_newer @ T_stretch_newer
+                pairs.append((math.hypot(guess.x, guess.y), older, newer, guess))
+        return [pair[1:] for pair in sorted(pairs, key=lambda pair: pair[:3])]
+
+    def _around(self, middle: int) -> list[tuple[int, SE2]]:
+        """The local maps of the stretch around one, and their tracked poses in its frame."""
+        tracked = self._keyframes.poses()
+        at = pose_at(tracked, self._local_maps.anchor(middle)).inverse()
+        stretch = next(numbers for numbers in self._asked if _middle(numbers) == middle)
+        return [(k, at @ pose_at(tracked, self._local_maps.anchor(k))) for k in stretch]
+
+    def _ask(self, numbers: range) -> bool:
+        """Ask where the stretch of some local maps was seen before, unless all of it is known."""
+        if self._recognizer is None or all(self._known_places[k] for k in numbers):
+            return False
+        index = len(self._asked)
+        self._asked.append(numbers)
+        self._candidates.add(
+            [
+                Candidate(
+                    recognition=index,
+                    older=_middle(self._asked[found.older]),
+                    newer=_middle(numbers),
+                    T_older_newer=found.T_older_newest,
+                    probability=found.probability,
+                )
+                for found in self._recognizer.recognize(self._draw(index, numbers))
+                if found.probability >= self._parameters.min_probability
+                and self.storey(self._asked[found.older].start) == self.storey(numbers.start)
+            ]
+        )
+        return True
+
+    def _draw(self, index: int, numbers: range) -> Stretch:
+        """The stretch of some consecutive local maps, in the frame of the anchor of the middle one."""
+        runs = self._local_maps.runs
+        anchor = self._local_maps.anchor(_middle(numbers))
+        keyframes, poses = self._local_maps.keyframes(
+            range(runs[numbers[0]].start, runs[numbers[-1]].stop), anchor
+        )
+        builder = GridBuilder(self._projection)
+        for keyframe, pose in zip(keyframes, poses, strict=True):
+            builder.add(keyframe.planar_scan, pose)
+            builder.add_unseen_hits(pose.apply(keyframe.unseen_hits_m))
+        return Stretch(
+            index=index,
+            grid=builder.grid(),
+            poses=np.array([(pose.x, pose.y, pose.yaw) for pose in poses]),
+            scans=np.array([keyframe.index for keyframe in keyframes]),
+        )
+
+
+def _middle(numbers: range) -> int:
+    """The local map whose frame a stretch is drawn in."""
+    return numbers[len(numbers) // 2]
