@@ -16,9 +16,10 @@ from pc2grid.errors import NoScans, TrackingLost
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
+from pc2grid.mapping.report import check_followed, division_warning
 from pc2grid.model import Health, OccupancyGrid, OdometryCheck, RegisteredScan, Scan, Trajectory
 from pc2grid.observer import Observer
-from pc2grid.pipeline import _division_warning, build_map, build_maps, check_followed, follow, map_scans
+from pc2grid.pipeline import build_map, build_maps, follow, map_scans
 from pc2grid.simulate import SimulationConfig, prepare_session, simulate_session
 from pc2grid.simulate.config import LaserConfig
 from pc2grid.simulate.session import Session
@@ -142,7 +143,7 @@ def test_a_robot_that_was_carried_elsewhere_makes_two_maps(
     assert "robot#2 from 3" in said and "come back to known places" in said
     assert "odometry" not in said  # it has that
     parts: Any = [SimpleNamespace(trajectory=m.trajectory, odometry=OdometryCheck(), storey=0) for m in maps]
-    said = _division_warning("robot", parts, parts, [None, None])
+    said = division_warning("robot", parts, parts, [None, None])
     assert "record with odometry, or come back to known places" in said
     assert longest.session == "robot" and "is used here, without" in longest.report.warnings[-1]
 

@@ -14,9 +14,12 @@ from pc2grid.geometry import SE2
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.loop_closure import LoopCloser
 from pc2grid.mapping.loop_parameters import LoopParameters
+from pc2grid.mapping.part_maps import PartMap, doubtful_scans, draw_parts, long_enough
 from pc2grid.mapping.parts import Conflict, connected, cuts_for
 from pc2grid.mapping.pose_graph import Edge
+from pc2grid.mapping.report import part_reports, ride_warnings
 from pc2grid.mapping.settled import SettledKeyframes
+from pc2grid.mapping.track import Track
 from pc2grid.model import (
     Consistency,
     Health,
@@ -26,7 +29,6 @@ from pc2grid.model import (
     RegisteredScan,
     Trajectory,
 )
-from pc2grid.pipeline import _doubtful, _draw_parts, _Mapped, _of_use, _reports, _ride_warnings, _Track
 from tests.helpers.simulated_drives import drive, office
 
 LAP_M = [(2.0, 7.0), (11.0, 7.0), (11.0, 3.0), (9.5, 5.0), (9.5, 7.0), (18.5, 7.0), (16.5, 4.0), (16.5, 7.0)]
@@ -34,10 +36,10 @@ LAP_M = [(2.0, 7.0), (11.0, 7.0), (11.0, 3.0), (9.5, 5.0), (9.5, 7.0), (18.5, 7.
 WITHOUT_LOOPS = LoopParameters(compared=0)
 
 
-def on_one_floor(trajectory: Trajectory) -> _Track:
+def on_one_floor(trajectory: Trajectory) -> Track:
     """What tracking says of scans without a ride."""
     count = len(trajectory)
-    return _Track(
+    return Track(
         trajectory=trajectory,
         disagreements=[None] * count,
         riding=np.zeros(count, np.bool_),
@@ -84,7 +86,7 @@ def begin_of_second_lap() -> int:
 
 def mapped(
     keyframes: Keyframes, trajectory: Trajectory, parameters: LoopParameters
-) -> tuple[LoopCloser, SettledKeyframes, list[_Mapped]]:
+) -> tuple[LoopCloser, SettledKeyframes, list[PartMap]]:
     closer = LoopCloser(keyframes, parameters=parameters)
     # The closer compares with older keyframes, so all may be there from the beginning.
     for keyframe in keyframes:
@@ -93,11 +95,11 @@ def mapped(
     return (
         closer,
         closed,
-        _draw_parts(keyframes, on_one_floor(trajectory), closed, ProjectionConfig()),
+        draw_parts(keyframes, on_one_floor(trajectory), closed, ProjectionConfig()),
     )
 
 
-def wrong_m(part: _Mapped, truths: list[SE2], first: int = 0) -> float:
+def wrong_m(part: PartMap, truths: list[SE2], first: int = 0) -> float:
     """Largest distance of the positions of a part, whose first scan is `first`, from the true ones."""
     T_part_map = truths[first].inverse()
     true_m = np.array([(T_part_map @ pose).apply(np.zeros((1, 2)))[0] for pose in truths])
@@ -129,13 +131,13 @@ def test_a_map_that_contradicts_itself_is_divided_into_parts_that_do_not() -> No
     keyframes, trajectory, _ = keyframes_of(SE2(0.9, 0.5, 0.3))
     closer, closed, (whole,) = mapped(keyframes, trajectory, WITHOUT_LOOPS)
     assert whole.consistency.bent and closed.segments.max() == 0
-    divided = closer.divide(_doubtful(whole, trajectory))
+    divided = closer.divide(doubtful_scans([whole], trajectory))
     assert divided is not None
-    parts = _draw_parts(keyframes, on_one_floor(trajectory), divided, ProjectionConfig())
+    parts = draw_parts(keyframes, on_one_floor(trajectory), divided, ProjectionConfig())
     assert len(parts) == 2 and not any(part.consistency.bent for part in parts)
     # The place of the cut is not known better than to a local map.
     assert abs(len(parts[0].trajectory) - begin_of_second_lap()) < 30
-    assert closer.divide([run for part in parts for run in _doubtful(part, trajectory)]) is None
+    assert closer.divide(doubtful_scans(parts, trajectory)) is None
 
 
 def test_loops_may_join_what_was_divided() -> None:
@@ -143,9 +145,9 @@ def test_loops_may_join_what_was_divided() -> None:
     keyframes, trajectory, truths = keyframes_of(SE2(1.6, 0.3, 0.25))
     closer, _, (whole,) = mapped(keyframes, trajectory, WITHOUT_LOOPS)
     closer._parameters = LoopParameters()
-    divided = closer.divide(_doubtful(whole, trajectory))
+    divided = closer.divide(doubtful_scans([whole], trajectory))
     assert divided is not None and not divided.parts.any() and divided.segments.max() >= 1
-    (part,) = _draw_parts(keyframes, on_one_floor(trajectory), divided, ProjectionConfig())
+    (part,) = draw_parts(keyframes, on_one_floor(trajectory), divided, ProjectionConfig())
     assert wrong_m(part, truths) < 0.4 < wrong_m(whole, truths)
     assert not part.consistency.bent
 
@@ -153,7 +155,7 @@ def test_loops_may_join_what_was_divided() -> None:
 def test_a_good_map_is_not_divided_even_if_asked() -> None:
     keyframes, trajectory, _ = keyframes_of()
     closer, _, (whole,) = mapped(keyframes, trajectory, LoopParameters())
-    assert not _doubtful(whole, trajectory)
+    assert not doubtful_scans([whole], trajectory)
     assert closer.divide([range(len(trajectory))]) is None
 
 
@@ -182,12 +184,12 @@ def test_a_segment_is_cut_where_it_contradicts_itself_mutually() -> None:
     assert cuts_for(mutual, segment) == [2, 4]
 
 
-def part_of(length_m: float, begin_ns: int) -> _Mapped:
+def part_of(length_m: float, begin_ns: int) -> PartMap:
     count = round(length_m / 0.2) + 1
     poses = np.array([SE2(0.2 * k, 0.0, 0.0).lift() for k in range(count)])
     stamps_ns, health = begin_ns + np.arange(count) * 10**8, (Health.FINE,) * count
     way = Trajectory(stamps_ns=stamps_ns, T_session_base=poses, health=health)
-    return _Mapped(
+    return PartMap(
         grid=office(),
         trajectory=way,
         loops=(),
@@ -197,17 +199,19 @@ def part_of(length_m: float, begin_ns: int) -> _Mapped:
     )
 
 
-def test_a_part_too_short_to_be_of_use_is_left_out_and_counted() -> None:
+def test_a_part_too_short_to_belong_enough_is_left_out_and_counted() -> None:
     long, short, other = part_of(20.0, 0), part_of(3.0, 30 * 10**9), part_of(12.0, 60 * 10**9)
-    kept = _of_use([long, short, other])
+    kept = long_enough([long, short, other])
     assert kept == [long, other]
     read = ReadReport(scans_read=300, bytes_lost=7)
-    first, second = _reports(read, "log", [long, short, other], kept, [None] * len(kept), slopes_unseen=True)
+    first, second = part_reports(
+        read, "log", [long, short, other], kept, [None] * len(kept), slopes_unseen=True
+    )
     assert first.scans_skipped == {"in a part too short to be of use": len(short.trajectory)}
     assert first.scans_read + second.scans_read == 300 and first.bytes_lost == 7 and not second.lossy
     (warning,) = first.warnings
     assert "log from 0 s (20 m), log#2 from 60 s (12 m); 1 shorter than 8 m left out" in warning
-    assert _of_use([short]) == [short]
+    assert long_enough([short]) == [short]
 
 
 def test_rides_that_did_not_divide_a_recording_are_named() -> None:
@@ -216,8 +220,8 @@ def test_rides_that_did_not_divide_a_recording_are_named() -> None:
     poses[:, 2, 3] = heights_m
     stamps_ns = np.arange(20) * 10**9
     track = on_one_floor(Trajectory(stamps_ns=stamps_ns, T_session_base=poses, health=(Health.FINE,) * 20))
-    assert not _ride_warnings(track)
-    (by_hand,) = _ride_warnings(replace(track, carried=True))
+    assert not ride_warnings(track)
+    (by_hand,) = ride_warnings(replace(track, carried=True))
     assert "3.0 m above" in by_hand and "from 10 s" in by_hand
-    (unfinished,) = _ride_warnings(replace(track, riding=np.arange(20) >= 15))
+    (unfinished,) = ride_warnings(replace(track, riding=np.arange(20) >= 15))
     assert "from 15 s" in unfinished and "these 5 scans" in unfinished

@@ -1,0 +1,142 @@
+"""What tracking says of the scans of a session, and which of them become keyframes."""
+
+from __future__ import annotations
+
+import dataclasses
+from array import array
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.arrays import I64
+from pc2grid.config import ProjectionConfig
+from pc2grid.geometry import SE2
+from pc2grid.mapping.keyframe_points import KeyframePoints
+from pc2grid.mapping.keyframes import Keyframe, Keyframes
+from pc2grid.mapping.loop_closure import LoopCloser
+from pc2grid.mapping.unseen_hits import UnseenHits
+from pc2grid.model import Health, Scan, Storey, Trajectory
+from pc2grid.odometry.overruled import Disagreement
+from pc2grid.sensor_model import SENSOR_MODELS
+
+if TYPE_CHECKING:
+    from pc2grid.odometry.tracker import Tracked, Tracker
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Track:
+    """What tracking says of all scans of a session.
+
+    trajectory : before loops are closed. disagreements : of odometry, at each scan. riding : (N,) scans on a
+    ride from floor to floor. storey : (N,) number of the floor of each in `storeys`. carried : see
+    `Tracker`. with_odometry : whether any scan has an odometry pose.
+    """
+
+    trajectory: Trajectory
+    disagreements: Sequence[Disagreement | None]
+    riding: NDArray[np.bool_]
+    storey: I64
+    storeys: tuple[Storey, ...]
+    carried: bool = False
+    with_odometry: bool = False
+
+    def outside_rides(self) -> Trajectory:
+        """The scans that are on no ride."""
+        return chosen(self.trajectory, np.flatnonzero(~self.riding))
+
+
+def chosen(trajectory: Trajectory, scans: I64) -> Trajectory:
+    """Some scans of a trajectory, by their numbers (M,)."""
+    return Trajectory(
+        stamps_ns=trajectory.stamps_ns[scans],
+        T_session_base=trajectory.T_session_base[scans],
+        health=tuple(trajectory.health[k] for k in scans.tolist()),
+    )
+
+
+class TrackRecord:
+    """Collects a track scan by scan; of a scan it keeps the pose, the health and the floor."""
+
+    def __init__(self) -> None:
+        self._stamps, self._poses = array("q"), array("d")
+        self._health: list[Health] = []
+        self._disagreements: list[Disagreement | None] = []
+        self._riding, self._storeys = array("b"), array("q")
+        self._with_odometry = False
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def append(self, scan: Scan, tracked: Tracked) -> None:
+        """Add the next scan."""
+        self._stamps.append(scan.stamp_ns)
+        self._poses.extend(tracked.registered.T_session_base.ravel())
+        self._health.append(tracked.registered.health)
+        self._disagreements.append(tracked.disagreement)
+        self._riding.append(tracked.riding)
+        self._storeys.append(tracked.storey)
+        self._with_odometry |= scan.T_odom_base is not None
+
+    def track(self, tracker: Tracker) -> Track:
+        """The track of all scans, which were tracked by `tracker`."""
+        trajectory = Trajectory(
+            stamps_ns=np.array(self._stamps, dtype=np.int64),
+            T_session_base=np.frombuffer(self._poses).reshape(-1, 4, 4),
+            health=tuple(self._health),
+        )
+        return Track(
+            trajectory=trajectory,
+            disagreements=self._disagreements,
+            riding=np.array(self._riding, dtype=bool),
+            storey=np.array(self._storeys, dtype=np.int64),
+            storeys=tracker.storeys,
+            carried=tracker.carried,
+            with_odometry=self._with_odometry,
+        )
+
+
+class KeyframeSelection:
+    """Stores the keyframes of a session and passes them to the loop closure.
+
+    A keyframe is stored when the next one begins, together with the hits of the scans between them that the
+    keyframe itself did not see.
+
+    points : gets the points in space of each keyframe; None: they are not kept.
+    """
+
+    def __init__(
+        self,
+        keyframes: Keyframes,
+        projection: ProjectionConfig,
+        closer: LoopCloser,
+        points: KeyframePoints | None = None,
+    ) -> None:
+        self._keyframes = keyframes
+        self._closer = closer
+        self._points = points
+        self._unseen_hits = UnseenHits(projection.max_range_m, projection.resolution_m)
+        self._latest: Keyframe | None = None
+        self._storey = 0  # of the latest keyframe
+
+    def add(self, tracked: Tracked, *, index: int) -> None:
+        """The next scan, number `index` of the session."""
+        pose = SE2.from_matrix(tracked.registered.T_session_base)
+        if tracked.keyframe:
+            self.finish()
+            self._latest = Keyframe(index, tracked.planar_scan, pose, tracked.restart)
+            self._storey = tracked.storey
+            self._unseen_hits.restart(tracked.planar_scan, pose)
+            scan = tracked.registered.scan
+            if self._points is not None and not SENSOR_MODELS[scan.sensor].planar:
+                self._points.append(index, scan)
+        elif self._latest is not None and tracked.mapped and tracked.registered.health is not Health.LOST:
+            self._unseen_hits.add(tracked.planar_scan, pose)
+
+    def finish(self) -> None:
+        """Store the latest keyframe, if there is one."""
+        if self._latest is not None:
+            complete = dataclasses.replace(self._latest, unseen_hits_m=self._unseen_hits.take())
+            self._keyframes.append(complete)
+            self._closer.extend(self._latest, self._storey)
