@@ -17,6 +17,7 @@ from typing import Any
 from pc2grid import extras
 from pc2grid._version import __version__
 from pc2grid.errors import ClusterError, DatabaseError
+from pc2grid.mapping.drawn_map import is_drawn_map
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from signature.config import Config
@@ -49,8 +50,6 @@ class Job:
 
     def made_from(self, digest: str) -> Provenance:
         """The provenance that the session of this job will have if its file has this digest."""
-        from pc2grid.mapping.drawn_map import is_drawn_map
-
         span = TimeSpan() if is_drawn_map(self.path) else self.span
         return provenance(self.path, digest, self.config, span=span, label=self.label)
 

@@ -13,12 +13,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pc2grid._version import __version__
+from pc2grid.clouds.voxel_cloud import VoxelCloud
+from pc2grid.io import open_log
+from pc2grid.mapping.drawn_map import digest_of_map, is_drawn_map, load_drawn_map
 from pc2grid.model import PointMap, ReadReport, SessionMap, Trajectory
 from pc2grid.observer import Observer
+from pc2grid.pipeline import build_maps, longest_of
+from pc2grid.submaps.partition import divide
 from pc2grid.time_span import TimeSpan
 from signature.config import Config
 from signature.database import Label, Provenance
+from signature.database.maintenance import store
 from signature.describe import Signature, describe
+from signature.localization.place_recognition import recognizer_for
 
 if TYPE_CHECKING:
     from pc2grid.mapping.drawn_map import DrawnMap
@@ -102,8 +109,6 @@ def build_session(
     >>> session.sensor, len(session.trajectory), origin.source
     ('map', 0, 'map.yaml')
     """
-    from pc2grid.pipeline import longest_of
-
     maps, origin = build_sessions(
         path, name, config, span=span, recover=recover, label=label, observer=observer
     )
@@ -129,18 +134,12 @@ def build_sessions(
     >>> [session.session for session in sessions]
     ['plan']
     """
-    from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
-
     path = Path(path)
     observer.on_session(name)
     if is_drawn_map(path):
         drawn = load_drawn_map(path, config)
         origin = provenance(path, drawn.digest, config, label=label)
         return (session_of_map(drawn, name, config),), origin
-
-    from pc2grid.io import open_log
-    from pc2grid.pipeline import build_maps
-    from signature.localization.place_recognition import recognizer_for
 
     with open_log(path, config.read, recover=recover) as log:
         choice = log.choose()
@@ -202,11 +201,8 @@ def on_floors(
 
 def digest_of(path: Path, config: Config) -> str:
     """The sha256 in the provenance of a session that is made from this recording or map."""
-    from pc2grid.mapping.drawn_map import digest_of_map, is_drawn_map
-
     if is_drawn_map(path):
         return digest_of_map(path)
-    from pc2grid.io import open_log
 
     with open_log(path, config.read) as log:
         return log.digest()
@@ -214,8 +210,6 @@ def digest_of(path: Path, config: Config) -> str:
 
 def session_of_map(drawn: DrawnMap, name: str, config: Config) -> SessionMap:
     """A session of a map, in the frame of that map and without a trajectory."""
-    from pc2grid.submaps.partition import divide
-
     no_poses = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
     graph, submaps = divide(drawn.grid, config.partition)
     return SessionMap(
@@ -232,8 +226,6 @@ def session_of_map(drawn: DrawnMap, name: str, config: Config) -> SessionMap:
 
 def _points(drawn: DrawnMap, config: Config) -> PointMap | None:
     """The points of a cloud or mesh in space, if they are to be kept; never finer than the map."""
-    from pc2grid.clouds.voxel_cloud import VoxelCloud
-
     voxel_m = config.projection.points_voxel_m
     if voxel_m is None or not len(drawn.level_points_m):
         return None
@@ -290,7 +282,5 @@ def add_sessions(
 
     keep : add them to the sessions of the file; otherwise they replace them.
     """
-    from signature.database.maintenance import store
-
     entries = [(m, describe_all(m, config, observer), origin) for m, origin in sessions]
     store(database, entries, keep=keep, force=force)

@@ -9,6 +9,7 @@ import numpy as np
 from pc2grid.arrays import F64, BoolGrid, cells_of
 from pc2grid.config import PartitionConfig
 from pc2grid.model import UNKNOWN, OccupancyGrid, Submap
+from pc2grid.submaps.isovist import isovist, visible_submap
 from pc2grid.submaps.junction_graph import graph_of_skeleton, map_skeleton
 from pc2grid.submaps.sampling import sample_evenly
 from pc2grid.submaps.skeleton import clearance_of
@@ -50,8 +51,6 @@ def view_at(
     The views of a query are made by this function, too, because only views of one kind are comparable.
     """
     if config.view == "isovist":
-        from pc2grid.submaps.isovist import isovist, visible_submap
-
         return visible_submap(grid, isovist(grid, center_m, config.radius_m), submap_id)
     return submap_at(grid, center_m, config.radius_m, submap_id=submap_id)
 
