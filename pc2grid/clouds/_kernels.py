@@ -87,7 +87,6 @@ def scan_bearings(
     count = points.shape[0]
     bearing_of = np.full(count, -1, dtype=np.int32)
     ranges = np.empty(count)
-    starts = np.zeros(bearings + 1, dtype=np.int64)
     sensor_height = plane[0] * sensor[0] + plane[1] * sensor[1] + plane[2] * sensor[2] + plane[3]
     for k in range(count):
         px, py = float(points[k, 0]), float(points[k, 1])
@@ -105,27 +104,49 @@ def scan_bearings(
             nearest[bearing] = min(nearest[bearing], distance)
             if distance <= limit:
                 bearing_of[k] = bearing
-                starts[bearing + 1] += 1
+    order, starts = _by_bearing(bearing_of, ranges, bearings)
+    return nearest, reach, _surfaces(points, ranges, order, starts, depths)
+
+
+@njit(cache=True)
+def _by_bearing(
+    bearing_of: NDArray[np.int32], ranges: F64, bearings: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The points with a bearing (not -1) by bearing and range, and where those of each bearing start."""
+    starts = np.zeros(bearings + 1, dtype=np.int64)
+    for bearing in bearing_of:
+        if bearing >= 0:
+            starts[bearing + 1] += 1
     starts = np.cumsum(starts)
-    by_bearing = np.empty(starts[-1], dtype=np.int64)
+    order = np.empty(starts[-1], dtype=np.int64)
     filled = starts.copy()
-    for k in range(count):
-        if bearing_of[k] >= 0:
-            by_bearing[filled[bearing_of[k]]] = k
-            filled[bearing_of[k]] += 1
-    surfaces = np.empty((len(by_bearing), 3))
+    for k in range(len(bearing_of)):
+        bearing = bearing_of[k]
+        if bearing >= 0:
+            place = filled[bearing]  # insertion sort by range: one bearing has a few dozen points
+            while place > starts[bearing] and ranges[order[place - 1]] > ranges[k]:
+                order[place] = order[place - 1]
+                place -= 1
+            order[place] = k
+            filled[bearing] += 1
+    return order, starts
+
+
+@njit(cache=True)
+def _surfaces(
+    points: F32,
+    ranges: F64,
+    order: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    depths: tuple[float, float],
+) -> F64:
+    """For each surface (S, 3) the sums of x and y of its points, and their number."""
+    surfaces = np.empty((len(order), 3))
     found = 0
-    for bearing in range(bearings):
+    for bearing in range(len(starts) - 1):
         first = 0.0
         for place in range(starts[bearing], starts[bearing + 1]):
-            k = by_bearing[place]
-            before = place  # insertion sort by range: one bearing has a few dozen points
-            while before > starts[bearing] and ranges[by_bearing[before - 1]] > ranges[k]:
-                by_bearing[before] = by_bearing[before - 1]
-                before -= 1
-            by_bearing[before] = k
-        for place in range(starts[bearing], starts[bearing + 1]):
-            k = by_bearing[place]
+            k = order[place]
             if place == starts[bearing] or ranges[k] - first > depths[0] + depths[1] * ranges[k] * ranges[k]:
                 first = ranges[k]
                 surfaces[found] = 0.0
@@ -133,4 +154,4 @@ def scan_bearings(
             surfaces[found - 1, 0] += points[k, 0]
             surfaces[found - 1, 1] += points[k, 1]
             surfaces[found - 1, 2] += 1.0
-    return nearest, reach, surfaces[:found].copy()
+    return surfaces[:found].copy()

@@ -5,15 +5,18 @@ from __future__ import annotations
 import struct
 import tempfile
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from pc2grid.arrays import F32
 from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.config import ProjectionConfig
 from pc2grid.errors import OutputError
 from pc2grid.geometry import SE2
+from pc2grid.mapping.occupancy import GridBuilder
+from pc2grid.model import OccupancyGrid
 
 IN_MEMORY_BYTES = 32 << 20  # chosen by hand: about an hour of a 2D laser
 # index, stamp, restart; T_session_base; origin of the sensor; hits, bearings and unseen_hits
@@ -106,3 +109,12 @@ class Keyframes:
     def close(self) -> None:
         """Delete the file."""
         self._file.close()
+
+
+def grid_of(keyframes: Iterable[tuple[Keyframe, SE2]], projection: ProjectionConfig) -> OccupancyGrid:
+    """The occupancy grid of keyframes, each with the pose of its base in the frame of the grid."""
+    builder = GridBuilder(projection)
+    for keyframe, pose in keyframes:
+        builder.add(keyframe.planar_scan, pose)
+        builder.add_unseen_hits(pose.apply(keyframe.unseen_hits_m))
+    return builder.grid()

@@ -15,10 +15,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pc2grid.arrays import F64, I64
 from pc2grid.geometry import SE2
-from pc2grid.mapping.pose_graph import Edge
+from pc2grid.mapping.pose_graph import Edge, between, compose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,7 +27,7 @@ class CandidateParameters:
     """Numbers of the acceptance. Chosen on aces and csail, unless noted.
 
     The drift that tracking may have over a travel, in standard deviations, generous because a slip of the
-    wheels counts too (measured on right recognitions: 1 to 6 % and up to 0.4 degrees per metre):
+    wheels counts too (`examples/map-quality.md`):
 
     drift_m, drift_per_m : of position, constant and per metre of travel.
     drift_rad, drift_rad_per_m : of yaw.
@@ -111,46 +112,50 @@ class LoopCandidates:
         pending, p = self._pending, self._parameters
         if not pending:
             return []
-        older, newer = (np.array([getattr(c, name) for c in pending]) for name in ("older", "newer"))
+        older, newer = np.array([(c.older, c.newer) for c in pending]).T
         measured = np.array([(c.T_older_newer.x, c.T_older_newer.y, c.T_older_newer.yaw) for c in pending])
-        recognition = np.array([c.recognition for c in pending])
-        same = recognition[:, None] == recognition
         probability = np.clip([c.probability for c in pending], 1e-6, 1.0 - 1e-6)
 
         way_m = ways(len(nodes), travel_m, edges, older)[:, newer].diagonal()
         error = between(measured, between(nodes[older], nodes[newer]))
-        sigma_m, sigma_rad = p.drift_m + p.drift_per_m * way_m, p.drift_rad + p.drift_rad_per_m * way_m
-        off = _mahalanobis(error, sigma_m, sigma_rad)
-        in_reach = off <= p.possible
+        off = _mahalanobis(error, p.drift_m + p.drift_per_m * way_m, p.drift_rad + p.drift_rad_per_m * way_m)
+        in_reach, known = off <= p.possible, way_m <= p.known_way_m
 
-        between_m = np.abs(travel_m[newer][:, None] - travel_m[newer])
-        between_m += np.abs(travel_m[older][:, None] - travel_m[older])
-        first, second = (k.ravel() for k in np.indices(between_m.shape))
+        agrees, near = self._agreement(older, newer, measured, nodes, travel_m)
+        recognition = np.array([c.recognition for c in pending])
+        same = recognition[:, None] == recognition
+        support = np.array([len(set(recognition[row])) for row in agrees & near & ~same & in_reach])
+        likely = np.log(probability / (1.0 - probability)) - 0.5 * off**2
+
+        reach = np.choose(np.minimum(support, 2), (p.alone, p.supported, p.possible))
+        fits = (off <= reach) & ~known & ((support > 0) | (probability >= p.probability_alone))
+        # Rival k of candidate i contradicts it; one of the two must be clearly better.
+        weaker = support < support[:, None]
+        less_likely = (support == support[:, None]) & (likely <= likely[:, None] - p.rival)
+        beaten = weaker | less_likely | ~(same & ~agrees & in_reach)
+        chosen = fits & beaten.all(axis=1)
+        self._pending = [c for c, kept in zip(pending, in_reach & ~known, strict=True) if kept]
+        return [c for c, accepted in zip(pending, chosen, strict=True) if accepted]
+
+    def _agreement(
+        self, older: I64, newer: I64, measured: F64, nodes: F64, travel_m: F64
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which candidates (C, C) fit together with the travel between them, and which are near in travel.
+
+        older, newer : (C,) local maps. measured : (C, 3) x, y, yaw of the newer in the older.
+        """
+        p = self._parameters
+        travelled_m = np.abs(travel_m[newer][:, None] - travel_m[newer])
+        travelled_m += np.abs(travel_m[older][:, None] - travel_m[older])
+        first, second = (k.ravel() for k in np.indices(travelled_m.shape))
         there = compose(measured[first], between(nodes[newer[first]], nodes[newer[second]]))
         again = compose(between(nodes[older[first]], nodes[older[second]]), measured[second])
         apart = _mahalanobis(
             between(there, again),
-            p.short_m + p.short_per_m * between_m.ravel(),
-            p.short_rad + p.drift_rad_per_m * between_m.ravel(),
-        ).reshape(between_m.shape)
-        agrees = apart <= p.consistent
-        supports = agrees & (between_m <= p.within_m) & ~same & in_reach
-        support = np.array([len(set(recognition[row].tolist())) for row in supports])
-        likely = np.log(probability / (1.0 - probability)) - 0.5 * off**2
-
-        known = way_m <= p.known_way_m
-        accepted = []
-        for k in range(len(pending)):
-            rivals = np.flatnonzero(same[k] & ~agrees[k] & in_reach)
-            near = off[k] <= (p.alone, p.supported, p.possible)[min(support[k], 2)]
-            if near and not known[k] and (support[k] or probability[k] >= p.probability_alone):
-                beaten = (support[rivals] < support[k]) | (
-                    (support[rivals] == support[k]) & (likely[rivals] <= likely[k] - p.rival)
-                )
-                if beaten.all():
-                    accepted.append(pending[k])
-        self._pending = [c for c, kept in zip(pending, in_reach & ~known, strict=True) if kept]
-        return accepted
+            p.short_m + p.short_per_m * travelled_m.ravel(),
+            p.short_rad + p.drift_rad_per_m * travelled_m.ravel(),
+        ).reshape(travelled_m.shape)
+        return apart <= p.consistent, travelled_m <= p.within_m
 
 
 def ways(count: int, travel_m: F64, edges: Sequence[Edge], starts: I64) -> F64:
@@ -171,21 +176,6 @@ def ways(count: int, travel_m: F64, edges: Sequence[Edge], starts: I64) -> F64:
     graph = csr_array((length_m[shortest], ends[shortest].T), shape=(count, count))
     different, at = np.unique(starts, return_inverse=True)
     return np.asarray(dijkstra(graph, directed=False, indices=different)[at])
-
-
-def between(a: F64, b: F64) -> F64:
-    """T_a_b (N, 3) of poses (N, 3) in one frame: x, y, yaw."""
-    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-    dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
-    return np.column_stack((c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2]))
-
-
-def compose(a: F64, b: F64) -> F64:
-    """Poses (N, 3) `b`, given in the frames of poses (N, 3) `a`, in the frame of these."""
-    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-    return np.column_stack(
-        (a[:, 0] + c * b[:, 0] - s * b[:, 1], a[:, 1] + s * b[:, 0] + c * b[:, 1], a[:, 2] + b[:, 2])
-    )
 
 
 def _mahalanobis(error: F64, sigma_m: F64, sigma_rad: F64) -> F64:

@@ -12,8 +12,7 @@ from pc2grid.config import ProjectionConfig
 from pc2grid.geometry import SE2
 from pc2grid.mapping.consistency import measure_consistency
 from pc2grid.mapping.keyframe_points import KeyframePoints
-from pc2grid.mapping.keyframes import Keyframe, Keyframes
-from pc2grid.mapping.occupancy import GridBuilder
+from pc2grid.mapping.keyframes import Keyframes, grid_of
 from pc2grid.mapping.parts import PARTS
 from pc2grid.mapping.precision import precision_of
 from pc2grid.mapping.settled import SettledKeyframes, spread
@@ -53,7 +52,8 @@ def draw_parts(
     for number in range(int(part.max(initial=0)) + 1):
         scans = np.flatnonzero((part == number) & ~track.riding)
         own = [k for k, other in enumerate(closed.parts.tolist()) if other == number]
-        grid = _draw((keyframes[k] for k in own), T_part_base, projection)
+        poses = [SE2.from_matrix(T_part_base[closed.scans[k]]) for k in own]
+        grid = grid_of(zip((keyframes[k] for k in own), poses, strict=True), projection)
         trajectory = chosen(everywhere, scans)
         anchored = np.flatnonzero(closed.parts[closed.anchors] == number)
         anchor_scans = closed.scans[closed.anchors[anchored]]
@@ -154,13 +154,3 @@ def _loops_within(loops: Iterable[Loop], scans: I64) -> tuple[Loop, ...]:
         for loop in loops
         if loop.older in number and loop.newer in number
     )
-
-
-def _draw(keyframes: Iterable[Keyframe], T_session_base: F64, projection: ProjectionConfig) -> OccupancyGrid:
-    """The occupancy grid of keyframes, each at the pose (N, 4, 4) of its scan."""
-    builder = GridBuilder(projection)
-    for keyframe in keyframes:
-        pose = SE2.from_matrix(T_session_base[keyframe.index])
-        builder.add(keyframe.planar_scan, pose)
-        builder.add_unseen_hits(pose.apply(keyframe.unseen_hits_m))
-    return builder.grid()

@@ -3,10 +3,7 @@
 The manifold Gauss-Newton of Grisetti et al., "A tutorial on graph-based SLAM" (2010), section IV, with
 Cauchy weights on the edges that may be wrong. In the plane it needs 3 numbers a pose where Open3D's
 optimiser has 6, uses each edge's information as it was measured, and needs no Open3D for a 2D laser.
-
-Measured in place of Open3D's `global_optimization` (Levenberg-Marquardt, line process) on whole logs:
-fr079 0.0397 m on the relations in 0.26 s (Open3D 0.0404 m, 0.68 s), intel 0.0189 m in 0.67 s (Open3D
-0.0231 m, 3.6 s). Open3D's poses during the session are less exact, so that fewer overlaps are found.
+It was measured against Open3D's `global_optimization` (`examples/map-quality.md`).
 """
 
 from __future__ import annotations
@@ -23,7 +20,7 @@ from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.mapping.building_axes import WallDirection, pull_to_axes
 
 if TYPE_CHECKING:
-    from scipy.sparse import coo_matrix
+    from scipy.sparse import coo_matrix, csc_matrix
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +86,7 @@ def optimise(
 ) -> Solution:
     """The poses (N, 3) that agree best with the edges; the first pose stays where it is.
 
-    walls : of each pose, where the building's axes are to hold the headings; see
+    walls : of each pose, where the building's axes constrain the headings; see
         `pc2grid.mapping.building_axes`.
 
     A loop edge starts with its robust weight, because a false one at full weight would bend the graph before
@@ -99,22 +96,16 @@ def optimise(
     half of their weight, and shrinks to its final value during the iterations (graduated non-convexity, Yang
     et al. 2020).
     """
-    from scipy.sparse import coo_matrix, identity
+    from scipy.sparse import identity
     from scipy.sparse.linalg import spsolve
 
     poses = np.array(poses, dtype=np.float64)
     if not edges or len(poses) < 2:
         return Solution(poses, np.ones(len(edges), np.bool_))
-    i = np.array([e.first for e in edges])
-    j = np.array([e.second for e in edges])
-    measured = np.array([(e.T_first_second.x, e.T_first_second.y, e.T_first_second.yaw) for e in edges])
-    information = np.array([e.information for e in edges])
+    i, j, measured, information = _arrays(edges)
     loop = np.array([e.loop for e in edges])
     rows = _unknowns(i, j)
-    row = np.repeat(rows, 6, axis=1).ravel()
-    column = np.tile(rows, (1, 6)).ravel()
-    size = 3 * len(poses)
-    damping = parameters.damping * identity(size - 3, format="csc")
+    damping = parameters.damping * identity(3 * len(poses) - 3, format="csc")
     limit = parameters.robust_sigmas**2
     error, jacobian = _linearise(poses, i, j, measured)
     chi2 = np.einsum("ea,eab,eb->e", error, information, error)
@@ -123,16 +114,9 @@ def optimise(
     scale = np.where(lenient, np.maximum(chi2 / limit, 1.0), 1.0)
     for _ in range(parameters.iterations):
         weight = np.where(loop, 1.0 / (1.0 + chi2 / (scale * limit)), 1.0)
-        weighted = information * weight[:, None, None]
-        JtO = jacobian.transpose(0, 2, 1) @ weighted
-        H = coo_matrix(((JtO @ jacobian).ravel(), (row, column)), shape=(size, size)).tocsc()
-        g = np.zeros(size)
-        np.add.at(g, rows, np.einsum("eab,eb->ea", JtO, error))
-        if walls is not None:
-            deviation, heading = pull_to_axes(poses[:, 2], walls)
-            H += _of_headings(heading)
-            g[2::3] += heading * deviation
-        delta = np.zeros(size)
+        JtO = jacobian.transpose(0, 2, 1) @ (information * weight[:, None, None])
+        H, g = _normal_equations(poses, rows, JtO, jacobian, error, walls)
+        delta = np.zeros(3 * len(poses))
         delta[3:] = spsolve(H[3:, 3:] + damping, -g[3:])
         poses += delta.reshape(-1, 3)
         poses[:, 2] = wrap_angle(poses[:, 2])
@@ -144,6 +128,28 @@ def optimise(
     return Solution(poses, ~loop | (chi2 <= limit))
 
 
+def _normal_equations(
+    poses: F64,
+    rows: NDArray[np.intp],
+    JtO: F64,
+    jacobian: F64,
+    error: F64,
+    walls: Sequence[WallDirection] | None,
+) -> tuple[csc_matrix, F64]:
+    """The matrix (3 N, 3 N) and the gradient (3 N,) of edges and of the building's axes.
+
+    rows : (E, 6) unknowns of each edge. JtO : (E, 6, 3) transposed Jacobian times information.
+    """
+    H = _of_edges(JtO @ jacobian, rows, len(poses)).tocsc()
+    g = np.zeros(3 * len(poses))
+    np.add.at(g, rows, np.einsum("eab,eb->ea", JtO, error))
+    if walls is not None:
+        deviation, heading = pull_to_axes(poses[:, 2], walls)
+        H += _of_headings(heading)
+        g[2::3] += heading * deviation
+    return H, g
+
+
 def information_matrix(
     poses: F64, edges: Sequence[Edge], walls: Sequence[WallDirection] | None = None
 ) -> coo_matrix:
@@ -151,20 +157,21 @@ def information_matrix(
 
     It leaves open where the whole lies. walls : as for `optimise`.
     """
-    from scipy.sparse import coo_matrix
-
-    i = np.array([e.first for e in edges])
-    j = np.array([e.second for e in edges])
-    measured = np.array([(e.T_first_second.x, e.T_first_second.y, e.T_first_second.yaw) for e in edges])
-    information = np.array([e.information for e in edges])
+    i, j, measured, information = _arrays(edges)
     _, jacobian = _linearise(poses, i, j, measured)
-    rows = _unknowns(i, j)
-    row, column = np.repeat(rows, 6, axis=1).ravel(), np.tile(rows, (1, 6)).ravel()
     H = jacobian.transpose(0, 2, 1) @ information @ jacobian
-    by_edges = coo_matrix((H.ravel(), (row, column)), shape=(3 * len(poses), 3 * len(poses)))
+    by_edges = _of_edges(H, _unknowns(i, j), len(poses))
     if walls is None:
         return by_edges
     return by_edges + _of_headings(pull_to_axes(poses[:, 2], walls)[1])
+
+
+def _of_edges(information: F64, rows: NDArray[np.intp], count: int) -> coo_matrix:
+    """The information matrix (3 N, 3 N) of edges, (E, 6, 6), between their unknowns (E, 6); N: `count`."""
+    from scipy.sparse import coo_matrix
+
+    row, column = np.repeat(rows, 6, axis=1).ravel(), np.tile(rows, (1, 6)).ravel()
+    return coo_matrix((information.ravel(), (row, column)), shape=(3 * count, 3 * count))
 
 
 def _of_headings(information: F64) -> coo_matrix:
@@ -173,6 +180,13 @@ def _of_headings(information: F64) -> coo_matrix:
 
     yaw = 3 * np.arange(len(information)) + 2
     return coo_matrix((information, (yaw, yaw)), shape=(3 * len(yaw), 3 * len(yaw)))
+
+
+def _arrays(edges: Sequence[Edge]) -> tuple[NDArray[np.intp], NDArray[np.intp], F64, F64]:
+    """Of edges: first (E,) and second (E,) poses, measured steps (E, 3), information (E, 3, 3)."""
+    i, j = np.array([(e.first, e.second) for e in edges]).T
+    measured = np.array([(e.T_first_second.x, e.T_first_second.y, e.T_first_second.yaw) for e in edges])
+    return i, j, measured, np.array([e.information for e in edges])
 
 
 def _unknowns(i: NDArray[np.intp], j: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -195,14 +209,7 @@ def _confirmed(
     confirmed = np.zeros(len(i), np.bool_)
     index = np.flatnonzero(doubtful)
     a, b, relative = poses[i[index]], poses[j[index]], measured[index]
-    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-    wanted = np.column_stack(
-        (
-            a[:, 0] + c * relative[:, 0] - s * relative[:, 1],
-            a[:, 1] + s * relative[:, 0] + c * relative[:, 1],
-            a[:, 2] + relative[:, 2],
-        )
-    )
+    wanted = compose(a, relative)
     turn = wanted[:, 2] - b[:, 2]
     for k in range(len(index)):
         near = np.hypot(*(b[:, :2] - b[k, :2]).T) < parameters.near_m
@@ -227,7 +234,7 @@ def _linearise(poses: F64, i: NDArray[np.intp], j: NDArray[np.intp], measured: F
     a, b = poses[i], poses[j]
     c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
     dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
-    error = np.column_stack((c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2])) - measured
+    error = between(a, b) - measured
     error[:, 2] = wrap_angle(error[:, 2])
     jacobian = np.zeros((len(i), 3, 6))
     jacobian[:, 0, 0], jacobian[:, 0, 1] = -c, -s
@@ -237,3 +244,18 @@ def _linearise(poses: F64, i: NDArray[np.intp], j: NDArray[np.intp], measured: F
     jacobian[:, :2, 3:5] = -jacobian[:, :2, :2]
     jacobian[:, 2, 2], jacobian[:, 2, 5] = -1.0, 1.0
     return error, jacobian
+
+
+def between(a: F64, b: F64) -> F64:
+    """T_a_b (N, 3) of poses (N, 3) in one frame: x, y, yaw."""
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
+    return np.column_stack((c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2]))
+
+
+def compose(a: F64, b: F64) -> F64:
+    """Poses (N, 3) `b`, given in the frames of poses (N, 3) `a`, in the frame of these."""
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    return np.column_stack(
+        (a[:, 0] + c * b[:, 0] - s * b[:, 1], a[:, 1] + s * b[:, 0] + c * b[:, 1], a[:, 2] + b[:, 2])
+    )

@@ -12,10 +12,10 @@ import numpy as np
 
 from pc2grid.config import ProjectionConfig
 from pc2grid.geometry import SE2
+from pc2grid.mapping.keyframes import grid_of
 from pc2grid.mapping.local_maps import LocalMaps, pose_at
 from pc2grid.mapping.loop_candidates import Candidate, LoopCandidates
 from pc2grid.mapping.loop_parameters import LoopParameters
-from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.mapping.place_recognition import PlaceRecognizer, Stretch
 from pc2grid.mapping.tracked_keyframes import TrackedKeyframes
 
@@ -133,13 +133,9 @@ class Stretches:
         keyframes, poses = self._local_maps.keyframes(
             range(runs[numbers[0]].start, runs[numbers[-1]].stop), anchor
         )
-        builder = GridBuilder(self._projection)
-        for keyframe, pose in zip(keyframes, poses, strict=True):
-            builder.add(keyframe.planar_scan, pose)
-            builder.add_unseen_hits(pose.apply(keyframe.unseen_hits_m))
         return Stretch(
             index=index,
-            grid=builder.grid(),
+            grid=grid_of(zip(keyframes, poses, strict=True), self._projection),
             poses=np.array([(pose.x, pose.y, pose.yaw) for pose in poses]),
             scans=np.array([keyframe.index for keyframe in keyframes]),
         )

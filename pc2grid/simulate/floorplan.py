@@ -93,7 +93,6 @@ def _relief(passages: Passages, layout: Layout, wall: int, margin: int, rng: np.
         corridor = whole.grown(-wall)
         along_x = corridor.width >= corridor.height
         low, high = (corridor.x0, corridor.x1) if along_x else (corridor.y0, corridor.y1)
-        wide = corridor.height if along_x else corridor.width
         for near in (True, False):
             at = low + float(rng.uniform(0.3, 2.0)) * unit
             while at < high:
@@ -101,16 +100,19 @@ def _relief(passages: Passages, layout: Layout, wall: int, margin: int, rng: np.
                 long_m = float(rng.uniform(0.15, 0.4) if slim else rng.uniform(0.6, 1.6))
                 deep = max(round(float(rng.uniform(0.05, 0.2 if slim else 0.15)) * unit), 1)
                 a, b = round(at), round(at + long_m * unit)
-                # Along the corridor from a to b, across it from c to d.
-                c, d = (0, deep) if near else (wide - deep, wide)
-                if along_x:
-                    box = Box(a, corridor.y0 + c, b, corridor.y0 + d)
-                else:
-                    box = Box(corridor.x0 + c, a, corridor.x0 + d, b)
-                crossing = any(_touch(box, other) for other in layout.corridors if other != whole)
-                if not crossing:
+                box = _at_wall(corridor, a, b, deep, near=near)
+                if not any(_touch(box, other) for other in layout.corridors if other != whole):
                     passages.put(_corners(box) + margin)
                 at += (long_m + float(rng.uniform(0.6, 4.0))) * unit
+
+
+def _at_wall(corridor: Box, begin: int, end: int, deep: int, *, near: bool) -> Box:
+    """A box along a corridor from `begin` to `end`, at the wall with the lower coordinate or at the other."""
+    if corridor.width >= corridor.height:
+        y0 = corridor.y0 if near else corridor.y1 - deep
+        return Box(begin, y0, end, y0 + deep)
+    x0 = corridor.x0 if near else corridor.x1 - deep
+    return Box(x0, begin, x0 + deep, end)
 
 
 def _columns(passages: Passages, inside: Box, margin: int, unit: float, rng: np.random.Generator) -> None:

@@ -5,10 +5,13 @@ All lengths are whole cells of the floor plan; rectangles are half-open, x to th
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+
+from pc2grid.arrays import I64, BoolGrid
 
 
 class Box(NamedTuple):
@@ -66,77 +69,100 @@ def _corridors(inside: Box, unit: float, rng: np.random.Generator) -> list[Box]:
         return _cells(float(rng.uniform(4.5, 7.0)), unit)
 
     x0, y0 = inside.x0 + deep(), inside.y0 + deep()
-    x1, y1 = inside.x1 - deep(), inside.y1 - deep()
+    core = Box(x0, y0, inside.x1 - deep(), inside.y1 - deep())
     kind = rng.choice(["ring", "ladder", "comb"], p=[0.5, 0.3, 0.2])
-    corridors: list[Box] = []
     if kind == "ring":
-        corridors += [Box(x0, y0, x1, y0 + wide()), Box(x0, y1 - wide(), x1, y1)]
-        corridors += [Box(x0, y0, x0 + wide(), y1), Box(x1 - wide(), y0, x1, y1)]
-        # A cross through the core, not in the middle, so that its arms differ.
-        x, y = x0 + int((x1 - x0) * rng.uniform(0.3, 0.7)), y0 + int((y1 - y0) * rng.uniform(0.35, 0.65))
+        return _ring(inside, core, wide, _cells(1.0, unit), rng)
+    if kind == "ladder":
+        return _ladder(inside, core, wide, rng)
+    return _comb(inside, core, wide, rng)
+
+
+def _ring(inside: Box, core: Box, wide: Callable[[], int], over: int, rng: np.random.Generator) -> list[Box]:
+    """A ring around the core, a cross through it, and perhaps an arm to the outer wall.
+
+    wide : draws the width of a corridor. over : cells by which the arm overlaps the ring.
+    """
+    x0, y0, x1, y1 = core
+    corridors = [Box(x0, y0, x1, y0 + wide()), Box(x0, y1 - wide(), x1, y1)]
+    corridors += [Box(x0, y0, x0 + wide(), y1), Box(x1 - wide(), y0, x1, y1)]
+    # The cross is not in the middle, so that its arms differ.
+    x, y = x0 + int((x1 - x0) * rng.uniform(0.3, 0.7)), y0 + int((y1 - y0) * rng.uniform(0.35, 0.65))
+    corridors.append(Box(x, y0, x + wide(), y1))
+    if rng.random() < 0.7:
+        corridors.append(Box(x0, y, x1, y + wide()))
+    if rng.random() < 0.6:
+        x = x0 + int((x1 - x0) * rng.uniform(0.2, 0.8))
+        up, down = Box(x, y1 - over, x + wide(), inside.y1), Box(x, inside.y0, x + wide(), y0 + over)
+        corridors.append(up if rng.random() < 0.5 else down)
+    return corridors
+
+
+def _ladder(inside: Box, core: Box, wide: Callable[[], int], rng: np.random.Generator) -> list[Box]:
+    """Two long corridors and rungs between them."""
+    x0, y0, x1, y1 = core
+    corridors = [Box(inside.x0, y0, x1, y0 + wide()), Box(x0, y1 - wide(), inside.x1, y1)]
+    rungs = int(rng.integers(2, 5))
+    for k in range(rungs):
+        x = int(x0 + (k + rng.uniform(0.1, 0.7)) * ((x1 - x0) / rungs))
         corridors.append(Box(x, y0, x + wide(), y1))
-        if rng.random() < 0.7:
-            corridors.append(Box(x0, y, x1, y + wide()))
-        if rng.random() < 0.6:
-            x = x0 + int((x1 - x0) * rng.uniform(0.2, 0.8))
-            over = _cells(1.0, unit)
-            up, down = Box(x, y1 - over, x + wide(), inside.y1), Box(x, inside.y0, x + wide(), y0 + over)
-            corridors.append(up if rng.random() < 0.5 else down)
-    elif kind == "ladder":
-        corridors += [Box(inside.x0, y0, x1, y0 + wide()), Box(x0, y1 - wide(), inside.x1, y1)]
-        rungs = int(rng.integers(2, 5))
-        pitch = (x1 - x0) / rungs
-        for k in range(rungs):
-            x = int(x0 + (k + rng.uniform(0.1, 0.7)) * pitch)
-            corridors.append(Box(x, y0, x + wide(), y1))
-    else:
-        middle = inside.y0 + int(inside.height * rng.uniform(0.4, 0.6))
-        spine = Box(inside.x0, middle, inside.x1, middle + wide())
-        corridors.append(spine)
-        teeth = int(rng.integers(3, 6))
-        pitch = inside.width / teeth
-        for k in range(teeth):
-            x = int(inside.x0 + (k + rng.uniform(0.15, 0.75)) * pitch)
-            side = rng.random()
-            if side < 0.7:
-                corridors.append(Box(x, spine.y0, x + wide(), y1))
-            if side > 0.3:
-                x = min(x + int(rng.uniform(-0.1, 0.1) * pitch), inside.x1 - wide())
-                corridors.append(Box(x, y0, x + wide(), spine.y1))
-        # A crossing corridor closes loops between the teeth.
-        corridors.append(
-            Box(int(inside.x0 + 0.2 * inside.width), y1 - wide(), int(inside.x1 - 0.2 * inside.width), y1)
-        )
+    return corridors
+
+
+def _comb(inside: Box, core: Box, wide: Callable[[], int], rng: np.random.Generator) -> list[Box]:
+    """A spine with teeth to both sides."""
+    middle = inside.y0 + int(inside.height * rng.uniform(0.4, 0.6))
+    spine = Box(inside.x0, middle, inside.x1, middle + wide())
+    corridors = [spine]
+    teeth = int(rng.integers(3, 6))
+    pitch = inside.width / teeth
+    for k in range(teeth):
+        x = int(inside.x0 + (k + rng.uniform(0.15, 0.75)) * pitch)
+        side = rng.random()
+        if side < 0.7:
+            corridors.append(Box(x, spine.y0, x + wide(), core.y1))
+        if side > 0.3:
+            x = min(x + int(rng.uniform(-0.1, 0.1) * pitch), inside.x1 - wide())
+            corridors.append(Box(x, core.y0, x + wide(), spine.y1))
+    # A crossing corridor closes loops between the teeth.
+    x0, x1 = int(inside.x0 + 0.2 * inside.width), int(inside.x1 - 0.2 * inside.width)
+    corridors.append(Box(x0, core.y1 - wide(), x1, core.y1))
     return corridors
 
 
 def _blocks(inside: Box, corridors: list[Box], rng: np.random.Generator) -> list[Box]:
     """The space between the corridors as few large rectangles."""
-    xs = sorted(
-        {inside.x0, inside.x1, *(v for c in corridors for v in (c.x0, c.x1) if inside.x0 < v < inside.x1)}
-    )
-    ys = sorted(
-        {inside.y0, inside.y1, *(v for c in corridors for v in (c.y0, c.y1) if inside.y0 < v < inside.y1)}
-    )
+    xs = _lines(inside.x0, inside.x1, [v for c in corridors for v in (c.x0, c.x1)])
+    ys = _lines(inside.y0, inside.y1, [v for c in corridors for v in (c.y0, c.y1)])
     left = np.ones((len(ys) - 1, len(xs) - 1), bool)
-    for j in range(len(ys) - 1):
-        for i in range(len(xs) - 1):
-            left[j, i] = not any(c.x0 <= xs[i] < c.x1 and c.y0 <= ys[j] < c.y1 for c in corridors)
+    for c in corridors:
+        inside_x, inside_y = (c.x0 <= xs) & (xs < c.x1), (c.y0 <= ys) & (ys < c.y1)
+        left &= ~(inside_y[:-1, None] & inside_x[:-1])
     blocks = []
     while left.any():
         j, i = (int(v) for v in np.argwhere(left)[0])
-        wide, high = 1, 1
-        first_along_x = rng.random() < 0.6
-        for along_x in (first_along_x, not first_along_x):
-            if along_x:
-                while i + wide < left.shape[1] and left[j : j + high, i + wide].all():
-                    wide += 1
-            else:
-                while j + high < left.shape[0] and left[j + high, i : i + wide].all():
-                    high += 1
+        wide, high = _largest(left[j:, i:], along_x_first=rng.random() < 0.6)
         left[j : j + high, i : i + wide] = False
-        blocks.append(Box(xs[i], ys[j], xs[i + wide], ys[j + high]))
+        blocks.append(Box(int(xs[i]), int(ys[j]), int(xs[i + wide]), int(ys[j + high])))
     return blocks
+
+
+def _lines(low: int, high: int, edges: list[int]) -> I64:
+    """The edges between two outer walls, and these, in order; each once."""
+    return np.unique([low, high, *(v for v in edges if low < v < high)])
+
+
+def _largest(left: BoolGrid, *, along_x_first: bool) -> tuple[int, int]:
+    """Columns and rows of a rectangle of true cells at the corner, grown along one axis, then the other."""
+    wide, high = 1, 1
+    for along_x in (along_x_first, not along_x_first):
+        if along_x:
+            while wide < left.shape[1] and left[:high, wide].all():
+                wide += 1
+        else:
+            while high < left.shape[0] and left[high, :wide].all():
+                high += 1
+    return wide, high
 
 
 def _rooms(block: Box, unit: float, rng: np.random.Generator) -> list[Box]:
@@ -191,44 +217,58 @@ def _door(a: Box, b: Box, wall: int, unit: float, rng: np.random.Generator) -> B
     return Box(line - across, at, line + across, at + size)
 
 
+class _Doors:
+    """Opens doors between rooms and corridors.
+
+    opened : so far. wall : half the thickness of an inner wall, cells.
+    """
+
+    def __init__(self, rooms: list[Box], wall: int, unit: float, rng: np.random.Generator) -> None:
+        self.opened: list[Door] = []
+        self._rooms, self._wall, self._unit, self._rng = rooms, wall, unit, rng
+
+    def to_corridor(self, room: int, corridors: list[Box]) -> bool:
+        """Open one door from a room to a corridor, sometimes two; whether there is one."""
+        rng = self._rng
+        tried = [corridors[int(i)] for i in rng.permutation(len(corridors))]
+        count = sum(self._open(room, corridor, -1) for corridor in tried[:1])
+        for corridor in tried[1:]:
+            if count == 0 or (count == 1 and rng.random() < 0.15):
+                count += self._open(room, corridor, -1)
+        return count > 0
+
+    def to_room(self, room: int, others: Iterable[int]) -> bool:
+        """Open a door from a room to the first of others that it can have one to; whether there is one."""
+        return any(self._open(room, self._rooms[other], other) for other in others)
+
+    def _open(self, room: int, other: Box, number: int) -> bool:
+        box = _door(self._rooms[room], other, self._wall, self._unit, self._rng)
+        if box is not None:
+            self.opened.append(Door(box, (room, number)))
+        return box is not None
+
+
 def _doors(
     corridors: list[Box], rooms: list[Box], wall: int, unit: float, rng: np.random.Generator
 ) -> list[Door]:
     """One door from every room to the corridor, or to a room that has one; some rooms have two."""
-    doors: list[Door] = []
-    reached: list[int] = []
-    waiting = [int(k) for k in rng.permutation(len(rooms))]
-
-    def open_between(k: int, other: Box, number: int) -> bool:
-        box = _door(rooms[k], other, wall, unit, rng)
-        if box is not None:
-            doors.append(Door(box, (k, number)))
-        return box is not None
-
-    for k in list(waiting):
-        tried = [corridors[int(i)] for i in rng.permutation(len(corridors))]
-        opened = sum(open_between(k, corridor, -1) for corridor in tried[:1])
-        for corridor in tried[1:]:
-            if opened == 0 or (opened == 1 and rng.random() < 0.15):
-                opened += open_between(k, corridor, -1)
-        if opened:
-            reached.append(k)
-            waiting.remove(k)
-    progress = True
-    while waiting and progress:
-        progress = False
-        for k in list(waiting):
-            for other in reached:
-                if open_between(k, rooms[other], other):
-                    reached.append(k)
-                    waiting.remove(k)
-                    progress = True
-                    break
+    doors = _Doors(rooms, wall, unit, rng)
+    order = [int(k) for k in rng.permutation(len(rooms))]
+    reached = [k for k in order if doors.to_corridor(k, corridors)]
+    waiting = [k for k in order if k not in reached]
+    while waiting:
+        for k in waiting:
+            if doors.to_room(k, reached):
+                reached.append(k)
+        left = [k for k in waiting if k not in reached]
+        if left == waiting:
+            break
+        waiting = left
     for k in reached:
         for other in reached:
             if k < other and rng.random() < 0.1:
-                open_between(k, rooms[other], other)
-    return doors
+                doors.to_room(k, [other])
+    return doors.opened
 
 
 def lay_out(inside: Box, wall: int, unit: float, rng: np.random.Generator) -> Layout:

@@ -9,8 +9,8 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
-from pc2grid.mapping.loop_candidates import Candidate, LoopCandidates, between, compose, ways
-from pc2grid.mapping.pose_graph import Edge
+from pc2grid.mapping.loop_candidates import Candidate, LoopCandidates, ways
+from pc2grid.mapping.pose_graph import Edge, between, compose
 
 STEP_M = 4.0
 
