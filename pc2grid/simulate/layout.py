@@ -255,20 +255,24 @@ def _doors(
     doors = _Doors(rooms, wall, unit, rng)
     order = [int(k) for k in rng.permutation(len(rooms))]
     reached = [k for k in order if doors.to_corridor(k, corridors)]
-    waiting = [k for k in order if k not in reached]
+    _through_rooms(doors, reached, [k for k in order if k not in reached])
+    for k in reached:
+        for other in reached:
+            if k < other and rng.random() < 0.1:
+                doors.to_room(k, [other])
+    return doors.opened
+
+
+def _through_rooms(doors: _Doors, reached: list[int], waiting: list[int]) -> None:
+    """Open doors from waiting rooms to those that are reached, and add them to these, until none is left."""
     while waiting:
         for k in waiting:
             if doors.to_room(k, reached):
                 reached.append(k)
         left = [k for k in waiting if k not in reached]
         if left == waiting:
-            break
+            return
         waiting = left
-    for k in reached:
-        for other in reached:
-            if k < other and rng.random() < 0.1:
-                doors.to_room(k, [other])
-    return doors.opened
 
 
 def lay_out(inside: Box, wall: int, unit: float, rng: np.random.Generator) -> Layout:

@@ -10,7 +10,41 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pc2grid import model
-    from pc2grid_cli.json_schemas import Consistency, OdometryCheck, Precision
+    from pc2grid_cli.json_schemas import Consistency, Converted, OdometryCheck, Precision
+    from signature.database import Provenance
+
+
+def session_document(session: model.SessionMap, origin: Provenance) -> Converted:
+    """The session made of one input, as the JSON document describes it."""
+    path_m = session.trajectory.path_m()
+    grid = session.grid
+    stamps = session.trajectory.stamps_ns
+    report = session.report
+    return {
+        "session": session.session,
+        "building": origin.label.building,
+        "floor": origin.label.floor,
+        "floor_height_m": origin.label.floor_height_m,
+        "source": origin.source,
+        "digest": origin.digest,
+        "sensor": session.sensor,
+        "scans": len(session.trajectory),
+        "path_m": round(float(path_m[-1]), 2) if len(path_m) else 0.0,
+        "duration_s": round(float(stamps[-1] - stamps[0]) / 1e9, 2) if len(stamps) else 0.0,
+        "area_m2": round(grid.free_m2, 1),
+        "submaps": len(session.submaps),
+        "consistency": consistency_document(session.consistency),
+        "odometry": odometry_document(session.odometry),
+        "precision": precision_document(session.precision),
+        "report": {
+            "scans_read": report.scans_read,
+            "points_dropped": report.points_dropped,
+            "scans_skipped": report.scans_skipped,
+            "bytes_lost": report.bytes_lost,
+            "warnings": list(report.warnings),
+            "lossy": report.lossy,
+        },
+    }
 
 
 def consistency_document(consistency: model.Consistency | None) -> Consistency | None:

@@ -1,0 +1,229 @@
+"""What `pc2grid convert` does: jobs for its inputs, their results stored one after the other."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from pc2grid.errors import ConfigError, DatabaseError, one_line
+from pc2grid.model import SessionMap
+from pc2grid.observer import Observer, Observers
+from pc2grid.time_span import TimeSpan
+from pc2grid_cli import console, data_loss
+from pc2grid_cli.plural import counted
+from pc2grid_cli.session_documents import session_document
+from signature import conversion_jobs
+from signature.config import Config
+from signature.conversion_jobs import Job
+from signature.database import Label, maintenance
+from signature.database.protocol import Entry
+
+if TYPE_CHECKING:
+    from pc2grid_cli.json_schemas import Convert, Converted
+    from pc2grid_cli.rerun_stream import Conversions
+
+
+def jobs_of(
+    inputs: list[Path],
+    name: str | None,
+    settings: Config,
+    *,
+    span: TimeSpan,
+    recover: bool,
+    label: Label,
+) -> list[Job]:
+    """A job for each input. Raises ConfigError if two of them have the same name."""
+    if name is not None and len(inputs) > 1:
+        raise ConfigError("--name names one session, but there are several inputs")
+    names = [name or path.stem for path in inputs]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise ConfigError(
+            f"two inputs would both be the session {twice[0]!r}", hint="convert one later with --add --name"
+        )
+    return [
+        Job(path=path, name=session, config=settings, span=span, recover=recover, label=label)
+        for path, session in zip(inputs, names, strict=True)
+    ]
+
+
+@dataclass(kw_only=True)
+class Done:
+    """The results of all inputs so far.
+
+    lossy : data was lost, or an input failed. severe : so much that the exit code is 3.
+    """
+
+    sessions: list[Converted] = field(default_factory=list)
+    unchanged: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    lossy: bool = False
+    severe: bool = False
+
+    def document(self, database: str) -> Convert:
+        """What `--json` prints."""
+        return {
+            "schema_version": 1,
+            "database": database,
+            "lossy": self.lossy,
+            "sessions": self.sessions,
+            "unchanged": self.unchanged,
+            "failed": self.failed,
+        }
+
+    def add(self, entry: Entry, *, quiet: bool, strict: bool) -> None:
+        """Keep and print a session made of one input."""
+        session, _, origin = entry
+        document = session_document(session, origin)
+        self.sessions.append(document)
+        if not quiet:
+            print(one_line(_as_text(document)), flush=True)
+        name, report = session.session, session.report
+        self.warnings += [f"{name}: {warning}" for warning in report.warnings]
+        if not session.submaps:
+            self.warnings.append(f"{name}: no free space to cut submaps from: nothing is found in it")
+        if report.lossy:
+            self.warnings.append(f"{name}: {data_loss.sentence(report)}")
+            self.lossy = True
+            self.severe = self.severe or data_loss.ends_with_3(report, strict)
+
+    def fail(self, job: Job) -> None:
+        """Count an input that failed while others go on."""
+        self.failed.append(str(job.path))
+        self.lossy = self.severe = True
+
+
+def convert_all(
+    jobs: list[Job],
+    output: str,
+    terminal: console.Console,
+    *,
+    keep: bool,
+    force: bool,
+    dask: str | None,
+    processes: int,
+    rerun: str | None,
+    quiet: bool,
+    strict: bool,
+) -> Done:
+    """Convert, here or on a cluster, and store each result in a transaction of its own, in order."""
+    done = Done()
+    with contextlib.ExitStack() as stack:
+        if len(jobs) > 1:
+            stack.enter_context(_note_stored(terminal, done, len(jobs)))
+        shown = None if rerun is None else stack.enter_context(_shown_in(rerun))
+        observer = terminal.observer() if shown is None else Observers(terminal.observer(), shown)
+        # If this block is left early, the cluster ends before anything is printed about it.
+        for outcome in stack.enter_context(_outcomes(jobs, dask, processes, observer)):
+            error = _store(outcome, output, keep=keep, force=force)
+            if error is not None and len(jobs) == 1:
+                raise error
+            if error is not None:
+                terminal.report_error(error)
+                done.fail(outcome.job)
+            elif not outcome.entries:
+                terminal.note(f"{outcome.job.name}: stored already")
+                done.unchanged.append(outcome.job.name)
+            else:
+                keep = True
+                for entry in outcome.entries:
+                    done.add(entry, quiet=quiet, strict=strict)
+                    terminal.note(_odometry_as_text(entry[0]), level=1)
+                    if shown is not None:
+                        shown.show(entry[0], outcome.job.config)
+    return done
+
+
+@contextlib.contextmanager
+def _outcomes(
+    jobs: list[Job], dask: str | None, processes: int, observer: Observer
+) -> Iterator[Iterator[conversion_jobs.Outcome]]:
+    """The results of the jobs as they come, in their order; leaving the block ends what is not done."""
+    if dask is None:
+        with contextlib.closing(conversion_jobs.here(jobs, observer)) as outcomes:
+            yield outcomes
+        return
+    on_cluster = conversion_jobs.on_cluster(jobs, dask, min(processes, len(jobs)), observer)
+    with observer.step(f"convert {len(jobs)} recordings"), contextlib.closing(on_cluster) as outcomes:
+        yield outcomes
+
+
+def _shown_in(rerun: str) -> Conversions:
+    """What streams conversions to a rerun target; rerun is loaded only for that."""
+    from pc2grid_cli.rerun_stream import Conversions
+
+    return Conversions(rerun)
+
+
+def _store(outcome: conversion_jobs.Outcome, output: str, *, keep: bool, force: bool) -> Exception | None:
+    """Store what a job made, if anything. Returns why it failed, or why its result is refused."""
+    if not outcome.entries:
+        return outcome.error
+    try:
+        maintenance.store(output, outcome.entries, keep=keep, force=force)
+    except DatabaseError as refusal:
+        if type(refusal) is not DatabaseError:  # a subclass: the database itself cannot be used
+            raise
+        return refusal
+    return outcome.error
+
+
+@contextlib.contextmanager
+def _note_stored(terminal: console.Console, done: Done, count: int) -> Iterator[None]:
+    """If the block fails, print how many sessions are stored: they stay."""
+    try:
+        yield
+    except BaseException:
+        ready = len(done.sessions) + len(done.unchanged)
+        terminal.note(f"{ready} of {count} are stored; the same command continues from there")
+        raise
+
+
+def _odometry_as_text(session: SessionMap) -> str:
+    """One line on how well the odometry of a session agrees with its scans."""
+    check, trajectory = session.odometry, session.trajectory
+    if check is None or not check.compared:
+        return f"{session.session}: no odometry to compare with the scans"
+    text = f"{session.session}: the scans overruled odometry in {check.overruled} of {check.compared} scans"
+    if not check.stretches:
+        return text
+    worst, start_ns = check.stretches[0], int(trajectory.stamps_ns[0])
+    from_s, to_s = ((stamp - start_ns) * 1e-9 for stamp in (worst.from_ns, worst.to_ns))
+    return (
+        f"{text}, most {from_s:.1f} to {to_s:.1f} s after the first scan: by up to {worst.distance_m:.2f} m "
+        f"and {math.degrees(worst.turn_rad):.0f} degrees from one scan to the next"
+    )
+
+
+def _as_text(d: Converted) -> str:
+    travel = (
+        f"{counted(d['scans'], d['sensor'] + ' scan')}, {d['path_m']:.1f} m in {d['duration_s']:.0f} s, "
+        if d["scans"]
+        else ""
+    )
+    floor = "" if d["floor"] is None else f" (floor {d['floor']})"
+    return f"{d['session']}{floor}: {travel}{d['area_m2']:.0f} m2 free, {counted(d['submaps'], 'submap')}"
+
+
+def conclude(output: str, done: Done, count: int, *, json: bool) -> None:
+    """Print what there is now, and what is to be said of it; end with the exit code."""
+    where = maintenance.shown(output)
+    if json:
+        console.print_json(done.document(where))
+    elif Path(output).is_file():
+        print(f"{where}: {Path(output).stat().st_size / 1e6:.1f} MB")
+    for warning in done.warnings:
+        console.warn(warning)
+    if done.failed:
+        console.warn(f"{len(done.failed)} of {count} failed: {', '.join(done.failed)}")
+    if len(done.failed) == count:
+        raise typer.Exit(console.FAILED)
+    if done.severe:
+        raise typer.Exit(console.LOSSY)

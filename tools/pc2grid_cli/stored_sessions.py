@@ -1,0 +1,139 @@
+"""What a database holds already of the sessions that `convert` is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from pc2grid.errors import DatabaseError, OutputError, Pc2GridError
+from pc2grid.model import is_part_of
+from pc2grid_cli.output_files import check_database_name
+from signature.config import Config
+from signature.conversion_jobs import Job
+from signature.database import Label, Provenance, maintenance, open_database
+from signature.database.postgres.server import is_url
+from signature.sessions import digest_of
+
+
+def stored_sessions(output: str, jobs: Sequence[Job], *, add: bool, force: bool) -> dict[str, Provenance]:
+    """Provenance of the sessions that are stored already and stay; without any, a new database is made.
+
+    Raises OutputError if a database exists that the inputs must not be written to, DatabaseError if one that
+    they are added to has a session of the same name that was made otherwise.
+    """
+    there = maintenance.exists(output)
+    if not is_url(output) and not (there and add):
+        check_database_name(output)
+    if not there or (force and not add):
+        return {}
+    present = _present(output, jobs, add=add)
+    if force:
+        return {}
+    difference = _difference(present, jobs)
+    if not add:
+        _refuse_others(output, present, jobs, difference)
+    elif difference:
+        raise DatabaseError(
+            f"{maintenance.shown(output)}: holds the session{difference}",
+            hint="--force replaces it; --name gives this one another name",
+        )
+    return present
+
+
+def _present(output: str, jobs: Sequence[Job], *, add: bool) -> dict[str, Provenance]:
+    """Provenance of the stored sessions by name."""
+    try:
+        with open_database(output) as opened:
+            # A database may hold a whole fleet: for adding, only sessions of the same names matter.
+            known = opened.sessions([job.name for job in jobs] if add else None)
+        return {info.name: info.provenance for info in known}
+    except DatabaseError:
+        if add:
+            raise
+        where = maintenance.shown(output)
+        raise OutputError(f"{where}: exists already", hint="--force replaces it") from None
+
+
+def _refuse_others(
+    output: str, present: Mapping[str, Provenance], jobs: Sequence[Job], difference: str
+) -> None:
+    """Raises OutputError unless the database is what an interrupted conversion of these jobs left behind."""
+    others = {
+        name for name in present if not any(name == job.name or is_part_of(name, job.name) for job in jobs)
+    }
+    if others:
+        difference = f" and holds {', '.join(map(repr, sorted(present)))}"
+        difference += f" instead of {', '.join(repr(job.name) for job in jobs)}"
+    elif len(jobs) == 1 and not difference:
+        difference = " and is made from the same input with the same settings"
+    if difference:
+        raise OutputError(
+            f"{maintenance.shown(output)}: exists already{difference}",
+            hint="--force replaces it, --add adds to it",
+        )
+
+
+def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
+    """How a stored session differs from the one that is asked for, as the end of a sentence; empty: not.
+
+    The content of the input is compared only if there is one input; of several, each job compares its own.
+    """
+    for job in jobs:
+        if job.name in present:
+            was = present[job.name]
+            difference = _made_otherwise(was, job)
+            if not difference and (was.source != job.path.name or (len(jobs) == 1 and _changed(was, job))):
+                difference = f", {job.name!r} made from a file {was.source!r} with other content"
+            if difference:
+                return difference
+    return ""
+
+
+def _made_otherwise(was: Provenance, job: Job) -> str:
+    """How a stored session differs from a job but for the input, as the end of a sentence; empty: not."""
+    asked = job.made_from(was.digest)
+    if not _label_kept(was.label, asked.label):
+        return (
+            f"; its session {job.name!r} has the label {str(was.label)!r}, this one would have"
+            f" {str(asked.label)!r} (--building, --floor)"
+        )
+    if (was.start_s, was.duration_s) != (asked.start_s, asked.duration_s):
+        return f", {job.name!r} made from another part of the recording (--start, --duration)"
+    made_with = [*_other_settings(was.config, job.config), *_other_versions(was.versions, asked.versions)]
+    return f", {job.name!r} made with {made_with[0]}" if made_with else ""
+
+
+def _other_settings(was: Config, asked: Config) -> list[str]:
+    """The settings that differ."""
+    return [
+        f"{section}.{key} = {old!r}, not {value!r}"
+        for section, settings in asked
+        for key, value in settings
+        if (old := getattr(getattr(was, section), key)) != value
+    ]
+
+
+def _other_versions(was: Mapping[str, str], asked: Mapping[str, str]) -> list[str]:
+    """The libraries that differ, in alphabetical order."""
+    return [
+        f"{library} {was.get(library)}, not {asked.get(library)}"
+        for library in sorted({*was, *asked})
+        if was.get(library) != asked.get(library)
+    ]
+
+
+def _changed(was: Provenance, job: Job) -> bool:
+    """Whether the input has other content than that of the stored session."""
+    try:
+        return digest_of(job.path, job.config) != was.digest
+    except Pc2GridError:
+        return False  # the input cannot be read; with --force its error is shown
+
+
+def _label_kept(was: Label, asked: Label) -> bool:
+    """Whether a stored session, the first of its recording, has the label that is asked for.
+
+    The floors of a recording may have got names of their own; several names may be given, see `on_floors`.
+    """
+    if was.told_apart or (asked.floor is not None and was.floor == asked.floor.split(",")[0].strip()):
+        return was.building == asked.building
+    return was == asked
