@@ -413,7 +413,7 @@ class Consistency:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Loose:
+class UncertainStretch:
     """A stretch of a trajectory whose place relative to the rest of the map is known only roughly.
 
     from_ns, to_ns : stamps of its ends. length_m : planar distance driven.
@@ -444,7 +444,7 @@ class Precision:
 
     stamps_ns: tuple[int, ...] = ()
     sigma_m: tuple[float, ...] = ()
-    loose: tuple[Loose, ...] = ()
+    loose: tuple[UncertainStretch, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.stamps_ns) != len(self.sigma_m):

@@ -4,11 +4,8 @@ A thin wall has two faces, a door post three. Seen from one side and then from t
 centimetres apart. Scan matching that takes them for one surface has an error of half that distance at
 every door, so every hit carries the direction of its surface.
 
-The normals are estimated from the hits and not from the cloud. Open3D's normals of the cloud, projected to
-the plane, are closer to the true ones (median error on the walls of a simulated corridor 0.4 instead of
-1.1 degrees), but they change more from scan to scan where no surface is clear, so that trajectories were
-slightly worse (30 m with a simulated lidar: ATE 6.7 instead of 6.2 mm, without odometry 9.5 instead of
-8.6 mm), at 3.5 ms a scan.
+The normals are estimated from the hits and not from the cloud: those of the cloud change more from scan to
+scan where no surface is clear (`examples/map-quality.md`).
 """
 
 from __future__ import annotations

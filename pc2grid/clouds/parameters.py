@@ -22,7 +22,7 @@ class CloudParameters:
         floor points with a probability of 99 % where a quarter of the points lies on the floor.
     expected_iterations : the same where the plane is known to 2 * `plane_tolerance_m`, so that nearly all
         candidates lie on it.
-    min_plane_share : smallest share of a scan that a floor holds (`min_plane_points`: or this many).
+    min_plane_share : smallest share of a scan that lies on a floor (`min_plane_points`: or this many).
     beneath_m, max_beneath_share : a floor has at most this share of the points farther than this below it.
         This separates a floor from a table.
     min_plane_extent_m : standard deviation of the points of a floor along its shorter side. A narrower

@@ -18,8 +18,7 @@ from pc2grid.clouds.sampling import random_subset
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UprightParameters:
-    """How the vertical is measured. Chosen on simulated scans of a 16-beam lidar, where 98 % of the
-    measurements on level ground err by less than 0.6 degrees.
+    """How the vertical is measured. Chosen on simulated scans of a 16-beam lidar (`examples/floors.md`).
 
     points, voxel_m, normals : so many of a scan are used, of these one a voxel, so that near walls count no
         more, and for so many of them a normal is estimated.
@@ -32,8 +31,8 @@ class UprightParameters:
     rounds : of reweighting.
     least_normals, least_share : with fewer normals, or with less weight on the second direction of walls,
         the vertical is not determined.
-    side_share : weight, as a share of that of all normals, with which the vertical is held perpendicular to
-        the y axis of the base: a robot on wheels hardly rolls. So one wall ahead, which shows the pitch, is
+    side_share : weight, as a share of that of all normals, of the vertical being perpendicular to the y axis
+        of the base: a robot on wheels hardly rolls. So one wall ahead, which shows the pitch, is
         enough.
     most_rad : no robot is tilted by more; seen from a landing, stairs are flatter than their own walls.
     """
@@ -57,8 +56,7 @@ class UprightParameters:
 UPRIGHT = UprightParameters()
 CAMERA_UPRIGHT = UprightParameters(voxel_m=0.1, squeeze=0.7, side_share=0.1)
 """Of a depth camera. It sees small patches densely: with the voxels of a lidar, the neighbours of a point
-span less than `breadth_m`. On simulated level ground 81 to 92 % of its scans show the vertical with these,
-95 % of them to 0.6 degrees."""
+span less than `breadth_m`. Chosen on simulated level ground (`examples/floors.md`)."""
 
 
 def vertical_of(

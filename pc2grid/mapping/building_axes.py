@@ -28,9 +28,8 @@ from pc2grid.geometry import wrap_angle
 class AxesParameters:
     """Numbers of the constraint. They follow from what walls look like, and were not fitted.
 
-    robust_rad : deviation from the axes at which a local map has a quarter of its weight. Walls in a local
-        map are aligned with their building to 0.4 to 0.9 degrees in the median (killian, fr079, belgioioso),
-        1.3 in a cluttered one (intel).
+    robust_rad : deviation from the axes at which a local map has a quarter of its weight: two to seven times
+        that of real walls (`examples/map-quality.md`).
     sigma_rad : standard deviation of the direction of one local map whose walls are all parallel to the axes.
         Local maps 4 m apart show the same walls up to 12 m ahead and behind: six of them are about one
         observation with 3 degrees, so that each alone counts as one with sqrt(6) times as much.

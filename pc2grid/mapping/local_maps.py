@@ -44,8 +44,7 @@ class LocalMapParameters:
 LOCAL_MAPS = LocalMapParameters()
 CAMERA_LOCAL_MAPS = LocalMapParameters(cell_m=0.05, radii_cells=(6, 4, 4, 2, 2, 2, 2, 2))
 """For a depth camera: cells as in `CAMERA_MATCHING`, for the same reason, neighbourhoods as wide in metres.
-Over 200 m of fr079, intel, csail, csail (seed 2), aces, simulated, ATE 0.017, 0.021, 0.018, 0.031, 0.020 m
-instead of 0.018, 0.023, 0.021, 0.033, 0.023 m from the same tracked poses."""
+Chosen on simulated drives (`examples/map-quality.md`)."""
 
 _FREE, _HIT = 1, 2  # what a local map observed in a cell; 0: nothing
 _SUBPIXEL_BITS = 4  # of cv2's polygon corners

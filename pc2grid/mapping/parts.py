@@ -25,7 +25,7 @@ class PartParameters:
 
     contradicting : share of the points of a local map on ground that another one saw free from which the
         other contradicts it, as for the windows of `ConsistencyParameters.contradicted_from`; chosen on maps
-        with loops closed and without (`examples/consistency.md`).
+        with loops closed and without (`examples/map-quality.md`).
     joining : different local maps on each of the two sides of a cut that must be in agreeing loops, to join
         them; a single room may look like another one. Chosen by hand.
     least_travel_m : a part with less travel is left out: later recordings are recognised by stretches of 8 m

@@ -24,7 +24,7 @@ from pc2grid.arrays import F64, I64
 from pc2grid.mapping.building_axes import WallDirection
 from pc2grid.mapping.parts import PARTS
 from pc2grid.mapping.pose_graph import Edge, information_matrix
-from pc2grid.model import Loose, Precision, Trajectory
+from pc2grid.model import Precision, Trajectory, UncertainStretch
 
 if TYPE_CHECKING:
     from scipy.sparse import coo_matrix
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 class PrecisionParameters:
     """Numbers of the estimate.
 
-    promised_m : standard deviation of a position from which a place is called loose. An answer of
+    promised_m : standard deviation of a position from which a place is called uncertain. An answer of
         relocalization is called right within this distance (`compare log`). Beyond it, an answer that is
         exact to the walls around it is off in the map by more than that as often as one in three.
     rounds : in which the weights of the places are found; they change little after two.
@@ -152,7 +152,7 @@ def precision_of(
         length_m = float(travel_m[last] - travel_m[first])
         if length_m >= PARTS.least_travel_m:
             found.append(
-                Loose(
+                UncertainStretch(
                     from_ns=int(stamps_ns[first]),
                     to_ns=int(stamps_ns[last]),
                     x_m=float(xy[scans[worst], 0]),
@@ -169,17 +169,17 @@ def precision_of(
 
 
 def precision_warning(precision: Precision, trajectory: Trajectory) -> str | None:
-    """One sentence that says which part of a map is loosely tied to the rest and what to do; None if none."""
+    """One sentence that says which part of a map is weakly tied to the rest and what to do; None if none."""
     if not precision.loose:
         return None
-    loosest = precision.loose[0]
+    worst = precision.loose[0]
     start_ns = int(trajectory.stamps_ns[0])
-    from_s, to_s = ((stamp - start_ns) * 1e-9 for stamp in (loosest.from_ns, loosest.to_ns))
+    from_s, to_s = ((stamp - start_ns) * 1e-9 for stamp in (worst.from_ns, worst.to_ns))
     others = len(precision.loose) - 1
     more = f" (and {others} more such stretch{'es' if others > 1 else ''})" if others else ""
     return (
-        f"no loop ties {loosest.length_m:.0f} m of the travel, {from_s:.0f} to {to_s:.0f} s after the first "
-        f"scan{more}, well to the rest: near x {loosest.x_m:.1f}, y {loosest.y_m:.1f} m the map may be off "
-        f"by {loosest.sigma_m:.1f} m (standard deviation), and no doubled wall would show it; come back from "
+        f"no loop ties {worst.length_m:.0f} m of the travel, {from_s:.0f} to {to_s:.0f} s after the first "
+        f"scan{more}, well to the rest: near x {worst.x_m:.1f}, y {worst.y_m:.1f} m the map may be off "
+        f"by {worst.sigma_m:.1f} m (standard deviation), and no doubled wall would show it; come back from "
         "there to a place seen before, by another way if there is one"
     )

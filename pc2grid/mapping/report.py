@@ -175,7 +175,7 @@ def _with_warnings(report: ReadReport, part: PartMap, *, slopes_unseen: bool) ->
     )
     if bent is not None:
         warnings.append(bent)
-    loose = precision_warning(part.precision, trajectory)
-    if loose is not None:
-        warnings.append(loose)
+    uncertain = precision_warning(part.precision, trajectory)
+    if uncertain is not None:
+        warnings.append(uncertain)
     return dataclasses.replace(report, scans_skipped=skipped, warnings=tuple(warnings))

@@ -20,7 +20,6 @@ from pc2grid.model import (
     Contradiction,
     Health,
     Loop,
-    Loose,
     OccupancyGrid,
     OdometryCheck,
     Overruled,
@@ -29,6 +28,7 @@ from pc2grid.model import (
     ReadReport,
     SessionMap,
     Trajectory,
+    UncertainStretch,
 )
 from pc2grid.submaps.junction_graph import graph_to_arrays, junction_graph
 from pc2grid.submaps.partition import view_at
@@ -107,7 +107,7 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
             stamps_ns=(int(trajectory.stamps_ns[0]), int(trajectory.stamps_ns[-1])),
             sigma_m=(0.05, 0.7),
             loose=(
-                Loose(
+                UncertainStretch(
                     from_ns=int(trajectory.stamps_ns[3]),
                     to_ns=int(trajectory.stamps_ns[-1]),
                     x_m=1 / 3,
