@@ -7,11 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pc2grid.errors import ConfigError, OutputError
+from pc2grid.io.atomic import require_writable
+from pc2grid.io.recording import open_log
+from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 from pc2grid.model import SessionMap
 from pc2grid.observer import Observer
+from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from signature.config import Config
-from signature.database import Label
+from signature.database import Label, open_database
+from signature.database.maintenance import exists
+from signature.database.postgres.server import is_url
+from signature.localization.localizer import MapIndex, locate_in, locate_map
 from signature.sessions import add_sessions, build_sessions, on_floors
 
 if TYPE_CHECKING:
@@ -57,10 +64,6 @@ def convert(
     >>> monday.session, monday.sensor
     ('monday', 'laser')
     """
-    from pc2grid.io.atomic import require_writable
-    from signature.database.maintenance import exists
-    from signature.database.postgres.server import is_url
-
     if not (add or force) and exists(database):
         raise OutputError(f"{database}: exists already", hint="force=True replaces it, add=True adds to it")
     if not is_url(database):
@@ -112,11 +115,6 @@ def relocalize(
     >>> pc2grid.relocalize("tuesday.mcap", "building.submaps", prior=elsewhere).status
     'not_found'
     """
-    from pc2grid.io.recording import open_log
-    from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
-    from signature.database import open_database
-    from signature.localization.localizer import MapIndex, locate_map
-
     with open_database(database) as opened:
         settings = query_config(opened, config)
         index = MapIndex.of(opened, settings, observer)
@@ -150,9 +148,6 @@ def locate_log(
 
     Raises NoScans if no scan can be used.
     """
-    from pc2grid.pipeline import follow
-    from signature.localization.localizer import locate_in
-
     ends_ns = log.info.start_ns, log.info.end_ns
     answered = 0
 

@@ -15,6 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 import pc2grid.pipeline
+import signature.files
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
 from pc2grid.io.trajectory import read_tum
@@ -64,7 +65,7 @@ follow = pc2grid.pipeline.follow
 def test_the_path_follows_where_the_robot_was_located(
     folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(pc2grid.pipeline, "follow", drifting)
+    monkeypatch.setattr(signature.files, "follow", drifting)
     words = ("--trajectory", tmp_path / "found.tum", "--json")
     document = json.loads(run("relocalize", folder / "drive.mcap", "-d", folder / "plan.submaps", *words))
     truth, found = read_tum(folder / "drive.tum"), read_tum(tmp_path / "found.tum")
