@@ -142,21 +142,25 @@ def _remove_left_over(target: Path, alone: bool) -> None:
     name = re.compile(re.escape(f".{target.name}{_MARK}") + r"[0-9a-f]+\.tmp")
     with contextlib.suppress(OSError):
         for left_over in target.parent.iterdir():
-            if name.fullmatch(left_over.name) and (alone or _is_unlocked(left_over)):
+            if not name.fullmatch(left_over.name):
+                continue
+            if alone:
                 left_over.unlink(missing_ok=True)
+            else:
+                _remove_unlocked(left_over)
 
 
-def _is_unlocked(path: Path) -> bool:
-    """Whether nobody holds a lock on the file; not, if that cannot be told."""
+def _remove_unlocked(path: Path) -> None:
+    """Remove a file that nobody holds a lock on; not, if that cannot be told.
+
+    It is removed while it is locked here: a writer that has just made it waits for the lock, and then sees
+    that the file is gone (`_create`).
+    """
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:
-        return False
-    try:
+        return
+    with contextlib.suppress(OSError):
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    else:
-        return True
-    finally:
-        os.close(descriptor)
+        path.unlink(missing_ok=True)
+    os.close(descriptor)
