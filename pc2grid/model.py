@@ -9,10 +9,11 @@ from __future__ import annotations
 import enum
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import PlainSerializer
 
 from pc2grid.arrays import F32, F64, I64, BoolGrid, freeze, hand_over
 from pc2grid.display import html_picture, html_table, map_png, short
@@ -22,6 +23,11 @@ if TYPE_CHECKING:
     import networkx as nx
 
 SensorKind = Literal["lidar", "laser", "depth"]
+
+# Numbers that a JSON document shows with so many digits.
+TwoDigits = Annotated[float, PlainSerializer(lambda value: round(value, 2), float, when_used="json")]
+ThreeDigits = Annotated[float, PlainSerializer(lambda value: round(value, 3), float, when_used="json")]
+FourDigits = Annotated[float, PlainSerializer(lambda value: round(value, 4), float, when_used="json")]
 
 # Values of nav_msgs/OccupancyGrid: a probability in percent, or -1.
 UNKNOWN = -1
@@ -386,10 +392,10 @@ class Contradiction:
 
     from_ns: int
     to_ns: int
-    x_m: float
-    y_m: float
-    length_m: float
-    share: float
+    x_m: TwoDigits
+    y_m: TwoDigits
+    length_m: TwoDigits
+    share: FourDigits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -406,8 +412,8 @@ class Consistency:
     False
     """
 
-    hits_on_free: float = 0.0
-    contradicted: float = 0.0
+    hits_on_free: FourDigits = 0.0
+    contradicted: FourDigits = 0.0
     bent: bool = False
     stretches: tuple[Contradiction, ...] = ()
 
@@ -423,10 +429,10 @@ class UncertainStretch:
 
     from_ns: int
     to_ns: int
-    x_m: float
-    y_m: float
-    length_m: float
-    sigma_m: float
+    x_m: TwoDigits
+    y_m: TwoDigits
+    length_m: TwoDigits
+    sigma_m: ThreeDigits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -476,8 +482,8 @@ class Overruled:
 
     from_ns: int
     to_ns: int
-    distance_m: float
-    turn_rad: float
+    distance_m: ThreeDigits
+    turn_rad: FourDigits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,6 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pc2grid.arrays import F32, F64, freeze
+from pc2grid.io.atomic import replace_file
 from signature.seen import parts, signature_columns
 
 DIMENSIONS = 24
@@ -100,8 +101,6 @@ class SeenStatistics:
 
     def save(self, path: Path) -> None:
         """Write the statistics to a .npz file."""
-        from pc2grid.io.atomic import replace_file
-
         with replace_file(path) as draft, draft.open("wb") as file:
             content = {field.name: getattr(self, field.name).astype(np.float32) for field in fields(self)}
             np.savez_compressed(file, **content)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
@@ -29,8 +30,6 @@ def line_segments(edges: BoolGrid, resolution_m: float, config: SignatureConfig)
 
     By OpenCV's probabilistic Hough transform, which starts from the same random seed on every call.
     """
-    import cv2
-
     segments = cv2.HoughLinesP(
         edges.view(np.uint8),
         1.0,
@@ -94,8 +93,6 @@ def blurred(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F3
     With `config.symmetry_limited` values above the peak, where lines meet, are cut to it. The paper does not
     do so.
     """
-    import cv2
-
     sigma = config.symmetry_blur_m / resolution_m
     size = 2 * math.ceil(3 * sigma) + 1
     crest = np.float32(config.symmetry_peak * sigma * math.sqrt(2 * math.pi))

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,8 +64,6 @@ def _content(path: Path) -> bytes:
 
 def _decoded(path: Path, data: bytes) -> GreyImage:
     """A PNG or BMP that was checked."""
-    import cv2
-
     try:
         found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -145,8 +144,6 @@ def encode_image(pixels: NDArray[np.uint8], suffix: str, resolution_m: float) ->
         height, width = pixels.shape
         header = f"P5\n# CREATOR: pc2grid {resolution_m:.3f} m/pix\n{width} {height}\n255\n"
         return header.encode("ascii") + pixels.tobytes()
-    import cv2
-
     done, encoded = cv2.imencode(".png", pixels)
     if not done:
         raise MapFileError(f"cannot encode a map image as {suffix}")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pc2grid.arrays import F64
 from pc2grid.config import ReadConfig
@@ -86,8 +87,6 @@ def voxel_m(points_m: F64) -> float:
 
     The points of a lattice, such as the centres of the voxels of an octree, keep its spacing.
     """
-    from scipy.spatial import cKDTree
-
     sample = points_m[:: max(len(points_m) // _SPACING_SAMPLE, 1)]
     spacing = cKDTree(points_m).query(sample, k=2)[0][:, 1]
     low, median, high = np.quantile(spacing, (0.1, 0.5, 0.9))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from pc2grid.arrays import F64, freeze
 from pc2grid.geometry import SE2, wrap_angle
@@ -68,8 +69,6 @@ def _headings(points_m: F64) -> F64:
 
 def _follow(points_m: F64, yaws: F64, config: DriveConfig) -> F64:
     """Times (N,) along a line, starting and ending at rest, within speed, yaw rate and acceleration."""
-    from scipy.ndimage import maximum_filter1d
-
     steps = np.maximum(np.linalg.norm(np.diff(points_m, axis=0), axis=1), 1e-6)
     bend = np.abs(np.gradient(yaws)) / np.gradient(np.concatenate(([0.0], np.cumsum(steps))))
     bend = maximum_filter1d(bend, 5)
@@ -99,8 +98,6 @@ def _turn(angle_rad: float, config: DriveConfig) -> tuple[F64, F64]:
 
 def drive_along(route: Route, config: DriveConfig, rng: np.random.Generator) -> Drive:
     """Drive a route from rest to rest, with random short stops and a stop at each turn in place."""
-    from scipy.ndimage import gaussian_filter1d
-
     points = route.points_m
     last = len(points) - 1
     gap = config.pause_every_m

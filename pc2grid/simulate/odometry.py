@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
 
 from pc2grid.arrays import F64, freeze
 from pc2grid.geometry import SE2
@@ -36,8 +37,6 @@ class Odometry:
 
 def _slip(steps: int, error: float, step_s: float, memory_s: float, rng: np.random.Generator) -> F64:
     """(steps,) relative errors of standard deviation `error`, correlated over `memory_s`."""
-    from scipy.signal import lfilter
-
     keep = math.exp(-step_s / memory_s)
     white = rng.standard_normal(steps) * error * math.sqrt(1 - keep * keep)
     first = error * rng.standard_normal()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from pc2grid.arrays import F32, F64, BoolGrid
 
@@ -20,8 +22,6 @@ def clearance_m(free: BoolGrid, resolution_m: float) -> F32:
 
 def _distance_m(free: BoolGrid, resolution_m: float) -> F32:
     """The same without assuming anything outside of the grid."""
-    import cv2
-
     cells = cv2.distanceTransform(free.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     distance: F32 = np.maximum(cells - np.float32(0.5), 0).astype(np.float32) * np.float32(resolution_m)
     return distance
@@ -29,8 +29,6 @@ def _distance_m(free: BoolGrid, resolution_m: float) -> F32:
 
 def outline_mask(outline_cells: F64, shape: tuple[int, int]) -> BoolGrid:
     """Cells of a grid that a convex outline (N, 2), as x and y in cells from the corner, touches."""
-    import cv2
-
     shift = 6
     corners = np.round((outline_cells - 0.5) * (1 << shift)).astype(np.int32)
     mask = np.zeros(shape, np.uint8)
@@ -65,8 +63,6 @@ class Passages:
         The passable space in a window around the object must stay connected. This is stricter than
         connectivity of the whole building: a corridor is not blocked even if there is another way.
         """
-        from scipy import ndimage
-
         margin = int(np.ceil((self.robot_m + _WINDOW_M) / self.resolution_m))
         low = np.floor(outline_cells.min(axis=0)).astype(int) - margin
         high = np.ceil(outline_cells.max(axis=0)).astype(int) + margin

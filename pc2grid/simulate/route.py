@@ -8,6 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
 from pc2grid.arrays import F32, F64, I64, freeze
 from pc2grid.errors import ConfigError
@@ -81,9 +85,6 @@ def _lattice(
 
     Raises ConfigError if nothing is passable, or nothing within `START_M` of the start.
     """
-    from scipy import ndimage
-    from scipy.sparse import coo_matrix
-
     stride = max(1, round(_LATTICE_M / grid.resolution_m))
     here = clearance[::stride, ::stride]
     passable = here >= least_m
@@ -137,8 +138,6 @@ class _Explorer:
     """Chooses one goal after another; keeps which places were visited."""
 
     def __init__(self, lattice: _Lattice, at: int, rng: np.random.Generator) -> None:
-        from scipy.spatial import cKDTree
-
         self.lattice = lattice
         self.at = at
         self.rng = rng
@@ -158,8 +157,6 @@ class _Explorer:
 
         When everything is visited, a random place far away becomes the goal and all places count as new.
         """
-        from scipy.sparse.csgraph import dijkstra
-
         points = self.lattice.points_m
         for limit in _SEARCH_M:
             away, before = dijkstra(
@@ -277,8 +274,6 @@ def plan_way(
 
     Raises ConfigError if there is no way.
     """
-    from scipy.sparse.csgraph import dijkstra
-
     clearance = clearance_m(grid.free & ~blocked, grid.resolution_m)
     lattice = _lattice(grid, clearance, least_m, start_m)
     first, last = (int(np.argmin(np.linalg.norm(lattice.points_m - at, axis=1))) for at in (start_m, end_m))

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import ndimage
 
 from pc2grid.arrays import F32, F64, freeze
 from pc2grid.model import SensorKind
@@ -59,8 +60,6 @@ class Sensor:
 
 def _measure_depth(true_m: F32, config: DepthConfig, rng: np.random.Generator) -> F32:
     """Noise that grows with the square of the depth, losses at depth jumps, rounding to millimetres."""
-    from scipy import ndimage
-
     depth = np.where(np.isfinite(true_m), true_m, 0).astype(np.float32)
     spread = config.noise_m + config.noise_per_m * depth**2
     lost = np.full(len(depth), config.dropout, np.float32)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -130,8 +131,6 @@ def isovist(
 
 def polygon_mask(view: Isovist, grid: OccupancyGrid, *, margin_m: float = 0.0) -> NDArray[np.bool_]:
     """Cells (H, W) of `grid` inside the isovist's polygon; each ray is longer by `margin_m`."""
-    import cv2
-
     angles = 2 * np.pi * np.arange(len(view.ranges_m)) / len(view.ranges_m)
     reach = np.minimum(view.ranges_m + margin_m, view.sight_m + margin_m)
     x = (view.center_m[0] + reach * np.cos(angles) - grid.origin_m[0]) / grid.resolution_m - 0.5

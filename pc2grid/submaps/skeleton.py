@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -102,8 +103,6 @@ def thin_plain(mask: BoolGrid, thinning: Thinning = "guo_hall") -> BoolGrid:
 
 def _padded(mask: BoolGrid) -> tuple[NDArray[np.uint8], I64]:
     """The mask as a 0/1 image with a border of zeros, and the set pixels that have a zero neighbour."""
-    import cv2
-
     image = np.zeros((mask.shape[0] + 2, mask.shape[1] + 2), np.uint8)
     image[1:-1, 1:-1] = mask
     inner = cv2.erode(image, np.ones((3, 3), np.uint8))
@@ -115,8 +114,6 @@ def clearance_of(free: BoolGrid, resolution_m: float) -> NDArray[np.float32]:
 
     What lies outside the array is not free. Precise to about 2 % (5x5 chamfer distance).
     """
-    import cv2
-
     padded = np.zeros((free.shape[0] + 2, free.shape[1] + 2), np.uint8)
     padded[1:-1, 1:-1] = free
     distance_m = np.asarray(cv2.distanceTransform(padded, cv2.DIST_L2, 5), np.float32)

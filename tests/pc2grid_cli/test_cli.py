@@ -244,12 +244,14 @@ def test_debug_shows_the_traceback(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_interrupted_convert_leaves_nothing(house: Path, tmp_path: Path, number: int, code: int) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-c", "from pc2grid_cli.main import main; main()", "convert",
-         str(house / "drive.mcap"), "-o", "x.submaps"],
-        cwd=tmp_path, stderr=subprocess.PIPE, text=True,
+        [sys.executable, "-c", "from pc2grid_cli.main import main; print('loaded', flush=True); main()",
+         "convert", str(house / "drive.mcap"), "-o", "x.submaps"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         preexec_fn=interruptible,
         env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"},
     )  # fmt: skip
+    assert process.stdout is not None
+    process.stdout.readline()  # from here on it is the program that is interrupted, however slow the machine
     time.sleep(1.0)
     process.send_signal(number)
     _, said = process.communicate(timeout=60)

@@ -21,11 +21,10 @@ from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
 from pc2grid.model import Consistency, Contradiction, Health, OccupancyGrid, Precision, Trajectory
 from pc2grid_cli import report
-from pc2grid_cli.deviation import deviation
 from pc2grid_cli.locate import Found, find_map
 from pc2grid_cli.nav2_pose import initialpose
 from pc2grid_cli.relocalize import map_sigma_m
-from pc2grid_cli.report import contents, runs, write_report
+from pc2grid_cli.report import contents, deviation, runs, write_report
 from signature.boundary import boundary_histogram
 from signature.config import Config
 from signature.database import SubmapDatabase, open_database

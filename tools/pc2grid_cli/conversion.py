@@ -7,16 +7,17 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
+from pc2grid.display import counted
 from pc2grid.errors import ConfigError, DatabaseError, one_line
 from pc2grid.model import SessionMap
 from pc2grid.observer import Observer, Observers
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
-from pc2grid_cli.plural import counted
+from pc2grid_cli.json_schemas import Convert, Converted, plain
 from pc2grid_cli.session_documents import session_document
 from signature import conversion_jobs
 from signature.config import Config
@@ -25,7 +26,6 @@ from signature.database import Label, maintenance
 from signature.database.protocol import Entry
 
 if TYPE_CHECKING:
-    from pc2grid_cli.json_schemas import Convert, Converted
     from pc2grid_cli.rerun_stream import Conversions
 
 
@@ -67,9 +67,9 @@ class Done:
     lossy: bool = False
     severe: bool = False
 
-    def document(self, database: str) -> Convert:
+    def document(self, database: str) -> Any:
         """What `--json` prints."""
-        return {
+        document: Convert = {
             "schema_version": 1,
             "database": database,
             "lossy": self.lossy,
@@ -77,6 +77,7 @@ class Done:
             "unchanged": self.unchanged,
             "failed": self.failed,
         }
+        return plain(Convert, document)
 
     def add(self, entry: Entry, *, quiet: bool, strict: bool) -> None:
         """Keep and print a session made of one input."""

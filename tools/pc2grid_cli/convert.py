@@ -12,10 +12,13 @@ import typer
 from pc2grid import extras
 from pc2grid.errors import ConfigError
 from pc2grid.time_span import TimeSpan
-from pc2grid_cli import console
+from pc2grid_cli import console, conversion
 from pc2grid_cli import options as options
 from pc2grid_cli.output_files import check_database
 from pc2grid_cli.rerun_target import require_target, url_of
+from pc2grid_cli.stored_sessions import stored_sessions
+from signature.conversion_jobs import LOCAL
+from signature.database import Label
 
 _Inputs = Annotated[
     list[Path],
@@ -76,11 +79,6 @@ def convert_command(
 
     Example: pc2grid convert monday.mcap -o building.submaps
     """
-    from pc2grid_cli import conversion
-    from pc2grid_cli.stored_sessions import stored_sessions
-    from signature.conversion_jobs import LOCAL
-    from signature.database import Label
-
     _check(output, rerun, dask=dask, jobs=jobs, several=len(inputs) > 1)
     settings = options.make_config(
         config,

@@ -1,20 +1,216 @@
-"""What the commands of `pc2grid db` share."""
+"""`pc2grid db`: look into databases, check, change, merge, split and copy them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Annotated
 
-from signature.database import open_database
+import typer
 
-if TYPE_CHECKING:
-    from pc2grid_cli.json_schemas import Damage, DbWrite
-    from signature.database import Problem
+from pc2grid.display import counted
+from pc2grid.errors import DatabaseError, one_line
+from pc2grid_cli import console
+from pc2grid_cli.json_schemas import DbCheck, DbInfo, DbWrite, StoredInfo, plain
+from pc2grid_cli.options import DATABASE, AsJson, Database, Force, WrittenDatabase
+from pc2grid_cli.session_documents import precision_summary
+from signature.database import Problem, SessionInfo, open_database
+from signature.database.maintenance import check, copy, merge, remove, rename, shown, split
+
+_Sessions = Annotated[list[str], typer.Argument(metavar="SESSION...", help="which of its sessions")]
 
 
-def damage(problem: Problem) -> Damage:
-    """One thing that is wrong, for a JSON document."""
-    return {"where": problem.where, "what": problem.what}
+def db_info_command(database: Database, json: AsJson = False) -> None:
+    """Show the sessions of a database.
+
+    Example: pc2grid db info building.submaps
+    """
+    with open_database(database) as opened:
+        sessions, where = opened.sessions(), opened.location
+    if json:
+        document: DbInfo = {
+            "schema_version": 1,
+            "database": where,
+            "sessions": list(map(_document, sessions)),
+        }
+        console.print_json(plain(DbInfo, document))
+        return
+    print(
+        f"{where}: {counted(len(sessions), 'session')}, {counted(sum(s.submaps for s in sessions), 'submap')}"
+    )
+    for s in sessions:
+        travel = f", {counted(s.scans, 'scan')}, {s.path_m:.1f} m in {s.duration_s:.0f} s" if s.scans else ""
+        label = s.provenance.label
+        where = f", {label}" if label.building or label.floor else ""
+        line = (
+            f"  {s.name} ({s.sensor}{where}): {counted(s.submaps, 'submap')}, {s.area_m2:.0f} m2 free{travel}"
+        )
+        if s.consistency is not None and s.consistency.bent:
+            line += f", bent: contradicts itself along {s.consistency.contradicted:.0%} of the travel"
+        if s.precision is not None and s.precision.loose:
+            line += f", loosely tied: places up to +- {s.precision.worst_m:.1f} m"
+        print(one_line(line))
+
+
+def _document(s: SessionInfo) -> StoredInfo:
+    return {
+        "name": s.name,
+        "sensor": s.sensor,
+        "building": s.provenance.label.building,
+        "floor": s.provenance.label.floor,
+        "floor_height_m": s.provenance.label.floor_height_m,
+        "source": s.provenance.source,
+        "digest": s.digest,
+        "submaps": s.submaps,
+        "resolution_m": s.resolution_m,
+        "area_m2": s.area_m2,
+        "path_m": s.path_m,
+        "duration_s": s.duration_s,
+        "scans": s.scans,
+        "lossy": s.lossy,
+        "consistency": s.consistency,
+        "odometry": s.odometry,
+        "precision": precision_summary(s.precision),
+        "warnings": list(s.warnings),
+        "versions": dict(s.provenance.versions),
+        "config": s.provenance.config.model_dump(mode="json"),
+    }
+
+
+def db_check_command(database: Database, json: AsJson = False) -> None:
+    """Read everything in a database and list all damage; exit code 1 if there is any.
+
+    Example: pc2grid db check building.submaps
+    """
+    problems = check(database)
+    if json:
+        document: DbCheck = {
+            "schema_version": 1,
+            "database": shown(database),
+            "problems": list(problems),
+        }
+        console.print_json(plain(DbCheck, document))
+    elif not problems:
+        print(f"{shown(database)}: sound")
+    else:
+        for problem in problems:
+            print(one_line(f"{problem.where}: {problem.what}"))
+    if problems:
+        raise typer.Exit(console.FAILED)
+
+
+def db_merge_command(
+    databases: Annotated[list[str], typer.Argument(metavar=f"{DATABASE} ...", help="what to merge")],
+    output: WrittenDatabase,
+    force: Force = False,
+    json: AsJson = False,
+) -> None:
+    """Put the sessions of several databases into a new one.
+
+    Example: pc2grid db merge monday.submaps tuesday.submaps -o week.submaps
+    """
+    count = merge(databases, output, force=force)
+    if json:
+        console.print_json(plain(DbWrite, written(output)))
+    else:
+        print(f"{shown(output)}: {counted(count, 'session')}")
+
+
+def db_copy_command(
+    database: Database,
+    output: WrittenDatabase,
+    recover: Annotated[bool, typer.Option("--recover", help="leave damaged parts out; exit code 3")] = False,
+    force: Force = False,
+    json: AsJson = False,
+) -> None:
+    """Write a compact copy of a database.
+
+    Example: pc2grid db copy --recover damaged.submaps -o good.submaps
+    """
+    problems = copy(database, output, recover=recover, force=force)
+    for problem in problems:
+        console.warn(f"left out: {problem.where}: {problem.what}")
+    if json:
+        console.print_json(plain(DbWrite, written(output, problems)))
+    else:
+        print(f"{shown(output)}: {_size(output)}")
+    if problems:
+        raise typer.Exit(console.LOSSY)
+
+
+def _size(output: str) -> str:
+    """The size of a copy: of a file in bytes, of anything else in sessions."""
+    path = Path(output)
+    if path.is_file():
+        return f"{path.stat().st_size / 1e6:.1f} MB"
+    with open_database(output) as opened:
+        return counted(len(opened.sessions()), "session")
+
+
+def db_split_command(
+    database: Database,
+    sessions: _Sessions,
+    output: WrittenDatabase,
+    force: Force = False,
+    json: AsJson = False,
+) -> None:
+    """Copy sessions of a database into a new one; the first stays as it is.
+
+    Example: pc2grid db split building.submaps monday -o monday.submaps
+    """
+    count = split(database, sessions, output, force=force)
+    if json:
+        console.print_json(plain(DbWrite, written(output)))
+    else:
+        print(f"{shown(output)}: {counted(count, 'session')}")
+
+
+def db_rename_command(
+    database: Database,
+    old: Annotated[str, typer.Argument(metavar="OLD", help="the session")],
+    new: Annotated[str, typer.Argument(metavar="NEW", help="its new name")],
+    json: AsJson = False,
+) -> None:
+    """Give a session another name, for example before databases with equal names are merged.
+
+    Example: pc2grid db rename building.submaps monday first-floor
+    """
+    rename(database, old, new)
+    if json:
+        console.print_json(plain(DbWrite, written(database)))
+    else:
+        print(one_line(f"{shown(database)}: {old} is now {new}"))
+
+
+def db_remove_command(
+    database: Database,
+    sessions: _Sessions,
+    force: Annotated[bool, typer.Option("--force", help="also if no session is left")] = False,
+    json: AsJson = False,
+) -> None:
+    """Remove sessions from a database, all or none; they cannot be brought back.
+
+    Example: pc2grid db remove building.submaps monday
+    """
+    if not force:
+        _refuse_all(database, sessions)
+    remove(database, sessions)
+    document = written(database)
+    if json:
+        console.print_json(plain(DbWrite, document))
+    else:
+        print(f"{document['database']}: {counted(document['sessions'], 'session')} left")
+
+
+def _refuse_all(database: str, sessions: list[str]) -> None:
+    """Raises DatabaseError if no session of the database would be left."""
+    with open_database(database) as opened:
+        known = {info.name for info in opened.sessions()}
+        if known and known <= set(sessions):
+            raise DatabaseError(
+                f"{opened.location}: no session would be left, and they cannot be brought back",
+                hint="--force removes them all the same; `pc2grid db copy` keeps a copy",
+            )
 
 
 def written(output: str, left_out: Sequence[Problem] = ()) -> DbWrite:
@@ -25,5 +221,5 @@ def written(output: str, left_out: Sequence[Problem] = ()) -> DbWrite:
         "schema_version": 1,
         "database": where,
         "sessions": number,
-        "left_out": [damage(problem) for problem in left_out],
+        "left_out": list(left_out),
     }

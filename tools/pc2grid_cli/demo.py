@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
+from pc2grid.display import counted
 from pc2grid.geometry import wrap_angle
 from pc2grid.io import open_log
 from pc2grid.io.atomic import require_writable
@@ -21,7 +22,6 @@ from pc2grid_cli.locate import ON_THE_WAY, Found, about_log, locate
 from pc2grid_cli.options import OUTPUT_FOLDER, Force
 from pc2grid_cli.output_files import make_folder
 from pc2grid_cli.picture import draw_answer
-from pc2grid_cli.plural import counted
 from pc2grid_cli.relocalize import as_text
 from pc2grid_cli.report import write_report
 from signature.config import Config

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
+from rich import markup
+from rich.console import Console
+from rich.table import Table
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import Pc2GridError, one_line
@@ -19,14 +22,14 @@ from pc2grid.io.topics import TF, camera_info_topic
 from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid_cli.console import print_json, warn
-from pc2grid_cli.db_info import db_info_command
+from pc2grid_cli.db import db_info_command
 from pc2grid_cli.options import AsJson, Assignments, Recover, Topic, make_config
 from signature.database.postgres.server import is_url
 
 if TYPE_CHECKING:
     from pc2grid.io.message_source import LogInfo
     from pc2grid.mapping.drawn_map import DrawnMap
-    from pc2grid_cli.json_schemas import Choice, Info, InfoMap
+    from pc2grid_cli.json_schemas import ChosenTopics, Info, InfoMap
 
 _WIDEST = 1000
 """Characters of the widest table of topics."""
@@ -136,7 +139,7 @@ def describe(path: Path, *, topic: str | None = None, recover: bool = False) -> 
     """
     with open_log(path, ReadConfig(topic=topic), recover=recover) as log:
         found = log.info
-        choice: Choice | None = None
+        choice: ChosenTopics | None = None
         problem: str | None = None
         try:
             chosen = log.choose()
@@ -176,10 +179,6 @@ def describe(path: Path, *, topic: str | None = None, recover: bool = False) -> 
 
 
 def _show(document: Info) -> None:
-    from rich import markup
-    from rich.console import Console
-    from rich.table import Table
-
     def escape(text: str) -> str:
         # Names come from the log, and may hold control sequences for a terminal.
         return markup.escape(one_line(text))

@@ -1,19 +1,24 @@
 """The JSON documents of the commands as types, and their JSON Schemas (draft 2020-12).
 
-The commands fill these types, so that mypy compares what is printed with what the schema says. Metres,
-radians, int64 nanoseconds, unless a name says otherwise. Within a `schema_version` documents only gain keys:
-a reader must ignore keys that it does not know.
+The commands fill these types, so that mypy compares what is printed with what the schema says. They hold
+frozen types of the program as they are: `plain` makes JSON of them. Metres, radians, int64 nanoseconds,
+unless a name says otherwise. Within a `schema_version` documents only gain keys: a reader must ignore keys
+that it does not know.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
-# Before Python 3.12 pydantic, which makes the schemas, does not take the TypedDict of typing.
+from pydantic import TypeAdapter
+
+# Before Python 3.12 pydantic does not take the TypedDict of typing.
 from typing_extensions import TypedDict
 
+from pc2grid.model import Consistency, OdometryCheck, ThreeDigits, UncertainStretch
 from signature.config import Config
+from signature.database.protocol import Problem
 from signature.localization.answer_json import (
     Pose,
     PoseInSpace,
@@ -26,10 +31,11 @@ from signature.localization.answer_json import (
 )
 from signature.localization.belief import State
 
+Document = TypeVar("Document")
 CheckStatus = Literal["fine", "lost", "unsure"]
 
 
-class Query(Travel):
+class QueryRecording(Travel):
     """What was looked for. sensor: lidar, laser, depth, or map. lossy: data was lost while reading."""
 
     source: str
@@ -51,7 +57,7 @@ class Relocalize(Result):
     probability that the best hypothesis is right. hypotheses: best first. map_sigma_m: standard deviation of
     the map itself there, relative to the rest of it; the covariance of the pose is about the walls around."""
 
-    query: Query
+    query: QueryRecording
     database: Searched
     map_sigma_m: float | None
 
@@ -101,7 +107,7 @@ class CheckedPoseJudgement(TypedDict):
 class RelocalizeCheck(CheckedPoseJudgement):
     """`pc2grid relocalize --check` and `--check-topic`, with `--json`."""
 
-    query: Query
+    query: QueryRecording
 
 
 class WatchCheck(CheckedPoseJudgement):
@@ -162,7 +168,7 @@ class Topic(TypedDict):
     message_count: int | None
 
 
-class Choice(TypedDict):
+class ChosenTopics(TypedDict):
     """What `convert` would use, and why. camera_topic: the calibration of depth images; else null."""
 
     topic: str
@@ -186,7 +192,7 @@ class Info(TypedDict):
     duration_s: float
     message_count: int | None
     topics: list[Topic]
-    choice: Choice | None
+    choice: ChosenTopics | None
     problem: str | None
     bytes_lost: int
     warnings: list[str]
@@ -223,67 +229,14 @@ class Report(TypedDict):
     lossy: bool
 
 
-class Contradiction(TypedDict):
-    """A stretch of the travel whose scans do not agree with the map. x_m, y_m: where they agree least, in the
-    frame of the session. share: of the wall hits there that lie on ground which the map calls free, 0..1."""
-
-    from_ns: int
-    to_ns: int
-    x_m: float
-    y_m: float
-    length_m: float
-    share: float
-
-
-class Consistency(TypedDict):
-    """How well a map agrees with its own scans. Shares 0..1: hits_on_free of all wall hits, contradicted of
-    the travel. bent: parts of the map are probably drawn in the wrong place. stretches: longest first."""
-
-    hits_on_free: float
-    contradicted: float
-    bent: bool
-    stretches: list[Contradiction]
-
-
-class Overruled(TypedDict):
-    """A stretch of time in which the scans showed another motion than odometry. distance_m, turn_rad: the
-    largest difference from one scan to the next."""
-
-    from_ns: int
-    to_ns: int
-    distance_m: float
-    turn_rad: float
-
-
-class OdometryCheck(TypedDict):
-    """How well odometry agrees with the scans. compared: scans with odometry that were tracked. overruled: of
-    these, scans that fit the map where odometry does not lead. stretches: the largest difference first."""
-
-    compared: int
-    overruled: int
-    stretches: list[Overruled]
-
-
-class Loose(TypedDict):
-    """A stretch of the travel that is tied only loosely to the rest of the map. sigma_m: largest standard
-    deviation of a position along it. x_m, y_m: where that is so, in the frame of the session."""
-
-    from_ns: int
-    to_ns: int
-    x_m: float
-    y_m: float
-    length_m: float
-    sigma_m: float
-
-
-class Precision(TypedDict):
+class PrecisionSummary(TypedDict):
     """How exactly the places of a map lie to each other: standard deviations of a position in the least
     certain direction. median_m: half of the places are known better. worst_m: the largest. loose: stretches
     where it is too large to rely on, the least certain first."""
 
-    median_m: float
-    worst_m: float
-    loose: list[Loose]
+    median_m: ThreeDigits
+    worst_m: ThreeDigits
+    loose: list[UncertainStretch]
 
 
 class Converted(TypedDict):
@@ -305,7 +258,7 @@ class Converted(TypedDict):
     submaps: int
     consistency: Consistency | None
     odometry: OdometryCheck | None
-    precision: Precision | None
+    precision: PrecisionSummary | None
     report: Report
 
 
@@ -320,7 +273,7 @@ class Convert(TypedDict):
     failed: list[str]
 
 
-class Session(TypedDict):
+class StoredInfo(TypedDict):
     """A session of a database, with the versions and settings that made it. consistency: null for an imported
     map, and for a session that was stored before it was measured. floor_height_m: above the lowest floor of
     its recording, null if that is not known."""
@@ -341,7 +294,7 @@ class Session(TypedDict):
     lossy: bool
     consistency: Consistency | None
     odometry: OdometryCheck | None
-    precision: Precision | None
+    precision: PrecisionSummary | None
     warnings: list[str]
     versions: dict[str, str]
     config: dict[str, Any]
@@ -352,14 +305,7 @@ class DbInfo(TypedDict):
 
     schema_version: Version
     database: str
-    sessions: list[Session]
-
-
-class Damage(TypedDict):
-    """One thing that is wrong."""
-
-    where: str
-    what: str
+    sessions: list[StoredInfo]
 
 
 class DbCheck(TypedDict):
@@ -367,7 +313,7 @@ class DbCheck(TypedDict):
 
     schema_version: Version
     database: str
-    problems: list[Damage]
+    problems: list[Problem]
 
 
 class DbWrite(TypedDict):
@@ -377,7 +323,7 @@ class DbWrite(TypedDict):
     schema_version: Version
     database: str
     sessions: int
-    left_out: list[Damage]
+    left_out: list[Problem]
 
 
 class Export(TypedDict):
@@ -414,12 +360,13 @@ def documents() -> dict[str, type]:
     return {**DOCUMENTS, **import_module("pc2grid_lab.documents").DOCUMENTS}
 
 
+def plain(kind: type[Document], document: Document) -> Any:
+    """A document of plain types: the frozen types in it become objects, with the digits that they declare."""
+    return TypeAdapter(kind).dump_python(document, mode="json")
+
+
 def schema(name: str) -> dict[str, Any]:
     """JSON Schema of a command's document, or of all `settings` as TOML holds them. Raises KeyError."""
-    if name == "settings":
-        about = Config.model_json_schema()
-    else:
-        from pydantic import TypeAdapter
-
-        about = TypeAdapter(documents()[name]).json_schema()
+    kind = Config if name == "settings" else documents()[name]
+    about = TypeAdapter(kind).json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **about}

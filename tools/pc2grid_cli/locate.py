@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -17,6 +19,7 @@ from pc2grid.model import Health, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli.known_pose import KnownPose
+from signature.database import open_database
 from signature.files import locate_log, query_config
 from signature.localization.belief import WATCH
 from signature.localization.localizer import locate_map
@@ -26,7 +29,7 @@ if TYPE_CHECKING:
     from pc2grid.arrays import F64, I64
     from pc2grid.io import Log
     from pc2grid.model import OccupancyGrid, ReadReport, RegisteredScan
-    from pc2grid_cli.json_schemas import Query
+    from pc2grid_cli.json_schemas import QueryRecording
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.localization.answer import Moment
@@ -51,10 +54,24 @@ class Found:
 
     answer: Answer
     poses: Trajectory
-    about: Query
+    about: QueryRecording
     drawn: OccupancyGrid | None = None
     report: ReadReport | None = None
     on_the_way: tuple[Moment, ...] = ()
+
+
+@contextlib.contextmanager
+def searched(
+    database: str, building: str | None, floor: str | None
+) -> Iterator[tuple[SubmapDatabase, list[str]]]:
+    """A database to look in, only in the sessions of a building and floor if they are given.
+
+    Yields it, and what is damaged in it and left out.
+    """
+    with open_database(database) as opened:
+        if building is not None or floor is not None:
+            opened.keep_only(building=building, floor=floor)
+        yield opened, [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
 
 
 def find_log(
@@ -102,7 +119,7 @@ def find_log(
         return Found(answer=answer, poses=poses, about=about, report=report, on_the_way=tuple(moments))
 
 
-def about_log(path: Path, query: Log, answer: Answer, *, scans: int) -> Query:
+def about_log(path: Path, query: Log, answer: Answer, *, scans: int) -> QueryRecording:
     """The description of a recording in the JSON document of the answer."""
     report = query.report()
     return {
@@ -123,7 +140,7 @@ def find_map(path: Path, database: SubmapDatabase, config: Config) -> Found:
     drawn = load_drawn_map(path, made_with)
     answer = locate_map(drawn.grid, MapIndex.of(database, config))
     poses = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
-    about: Query = {
+    about: QueryRecording = {
         "path_m": answer.path_m,
         "stamp_ns": answer.stamp_ns,
         "source": path.name,

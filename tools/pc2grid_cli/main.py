@@ -23,17 +23,17 @@ COMMANDS = {
     "view": ("pc2grid_cli.view:view_command", "Look into a database in the browser, and locate there."),
 }
 DB = {
-    "info": ("pc2grid_cli.db_info:db_info_command", "Show the sessions of a database."),
-    "check": ("pc2grid_cli.db_check:db_check_command", "Read everything and list all damage."),
-    "merge": ("pc2grid_cli.db_merge:db_merge_command", "Put the sessions of several databases into one."),
-    "copy": ("pc2grid_cli.db_copy:db_copy_command", "Write a compact copy of a database."),
-    "split": ("pc2grid_cli.db_split:db_split_command", "Copy sessions into a database of their own."),
-    "rename": ("pc2grid_cli.db_rename:db_rename_command", "Give a session another name."),
-    "remove": ("pc2grid_cli.db_remove:db_remove_command", "Remove sessions from a database."),
+    "info": ("pc2grid_cli.db:db_info_command", "Show the sessions of a database."),
+    "check": ("pc2grid_cli.db:db_check_command", "Read everything and list all damage."),
+    "merge": ("pc2grid_cli.db:db_merge_command", "Put the sessions of several databases into one."),
+    "copy": ("pc2grid_cli.db:db_copy_command", "Write a compact copy of a database."),
+    "split": ("pc2grid_cli.db:db_split_command", "Copy sessions into a database of their own."),
+    "rename": ("pc2grid_cli.db:db_rename_command", "Give a session another name."),
+    "remove": ("pc2grid_cli.db:db_remove_command", "Remove sessions from a database."),
 }
 CONFIG = {
-    "dump": ("pc2grid_cli.config_dump:config_dump_command", "Print every setting as TOML."),
-    "schema": ("pc2grid_cli.config_schema:config_schema_command", "Print the JSON Schema of a document."),
+    "dump": ("pc2grid_cli.config:config_dump_command", "Print every setting as TOML."),
+    "schema": ("pc2grid_cli.config:config_schema_command", "Print the JSON Schema of a document."),
 }
 # Commands of the laboratory. No module of the product imports it: it is loaded by name when it is asked for.
 COMPARE = {

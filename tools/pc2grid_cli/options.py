@@ -59,6 +59,11 @@ AsJson = Annotated[bool, typer.Option("--json", help="one JSON document on stdou
 Force = Annotated[bool, typer.Option("--force", help="replace existing files")]
 DATABASE = "BUILDING.submaps|postgresql://..."
 Database = Annotated[str, typer.Argument(metavar=DATABASE, help="the database")]
+SearchedDatabase = Annotated[str, typer.Option("--database", "-d", metavar=DATABASE, help="where to look")]
+Building = Annotated[
+    str | None, typer.Option("--building", metavar="NAME", help="look only in sessions labelled so")
+]
+Floor = Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, of a floor")]
 WrittenDatabase = Annotated[str, typer.Option("--output", "-o", metavar=DATABASE, help="what to write")]
 OUTPUT_FOLDER = ("--output", "-o", "--out")
 """Names of the option for the folder of results; --out is the one it had first."""

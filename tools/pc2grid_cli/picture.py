@@ -8,16 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pc2grid.display import probability
+from pc2grid.display import counted, probability
 from pc2grid.io.atomic import replace_file
-from pc2grid.matching.agreement import Support
-from pc2grid_cli.evidence import agreements
-from pc2grid_cli.plural import counted
+from pc2grid.matching.agreement import Agreement, Support, agreement
+from pc2grid.matching.walls import Walls
 
 if TYPE_CHECKING:
     from pc2grid.arrays import F64, U8
     from pc2grid.geometry import SE2
-    from pc2grid.matching.agreement import Agreement
     from pc2grid.model import OccupancyGrid, Trajectory
     from signature.database import SubmapDatabase
     from signature.localization.answer import Answer
@@ -83,6 +81,17 @@ class _Box:
 
     def __contains__(self, pose: SE2) -> bool:
         return self.left < pose.x < self.right and self.bottom < pose.y < self.top
+
+
+def agreements(answer: Answer, database: SubmapDatabase) -> tuple[Agreement, ...]:
+    """For each hypothesis of an answer, best first, what supports and what contradicts it."""
+    query = Walls.of(answer.local_map)
+    indices = {hypothesis.session_index for hypothesis in answer.hypotheses}
+    maps = {index: Walls.of(database.grid(answer.sessions[index])) for index in indices}
+    return tuple(
+        agreement(maps[hypothesis.session_index], query, hypothesis.fit.T_map_query)
+        for hypothesis in answer.hypotheses
+    )
 
 
 def shades(grid: OccupancyGrid) -> U8:

@@ -25,14 +25,13 @@ from pc2grid_cli.check_pose import check_log, report_check
 from pc2grid_cli.foxglove import write_answer, write_located_map
 from pc2grid_cli.info import is_database
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import ON_THE_WAY, Found, find_log, find_map, in_map
+from pc2grid_cli.locate import ON_THE_WAY, Found, find_log, find_map, in_map, searched
 from pc2grid_cli.nav2_pose import write_initialpose
 from pc2grid_cli.output_files import check_file
 from pc2grid_cli.picture import draw_answer
 from pc2grid_cli.report import write_report
 from pc2grid_cli.rerun_stream import Search, stream_to
 from pc2grid_cli.rerun_target import require_target
-from signature.database import open_database
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory
@@ -75,13 +74,9 @@ def relocalize_command(
         Path,
         typer.Argument(metavar="LOG|MAP", help="the recording or map to locate: .yaml, .pcd, .ply, a mesh"),
     ],
-    database: Annotated[
-        str, typer.Option("--database", "-d", metavar=options.DATABASE, help="where to look")
-    ],
-    building: Annotated[
-        str | None, typer.Option("--building", metavar="NAME", help="look only in sessions labelled so")
-    ] = None,
-    floor: Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, of a floor")] = None,
+    database: options.SearchedDatabase,
+    building: options.Building = None,
+    floor: options.Floor = None,
     near: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
@@ -167,11 +162,8 @@ def relocalize_command(
         config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity, top_k=top_k
     )
     _check_not_swapped(log, database)
-    with open_database(database) as opened:
+    with searched(database, building, floor) as (opened, left_out):
         where = opened.location
-        if building is not None or floor is not None:
-            opened.keep_only(building=building, floor=floor)
-        left_out = [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
         if known.is_check:
             checked, document = check_log(
                 log,

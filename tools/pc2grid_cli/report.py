@@ -9,19 +9,19 @@ from __future__ import annotations
 import base64
 import itertools
 import json
+import math
 from datetime import datetime, timezone
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
 from pc2grid._version import __version__
 from pc2grid.io.atomic import replace_file
 from pc2grid.matching.agreement import Support
-from pc2grid_cli.deviation import deviation
-from pc2grid_cli.evidence import agreements
-from pc2grid_cli.picture import shades
+from pc2grid_cli.picture import agreements, shades
 from pc2grid_cli.submap_sources import similar_places, sources
 
 if TYPE_CHECKING:
@@ -275,11 +275,25 @@ def _deviation(answer: Answer, database: SubmapDatabase) -> tuple[float, float, 
     return deviation(answer.covariance, info.resolution_m, database.config().partition.radius_m)
 
 
+def deviation(covariance: F64, resolution_m: float, radius_m: float) -> tuple[float, float, float]:
+    """Standard deviations of x, y (metres) and yaw (radians), but not less than the map can show.
+
+    covariance : (3, 3), of the refinement alone: with thousands of wall points it gets far smaller than the
+        error of the map. resolution_m : of the map; a position is given no finer than half a cell.
+    radius_m : of the submaps; a heading is given no finer than the angle that moves a wall so far away by
+        half a cell.
+
+    >>> [round(float(v), 4) for v in deviation(np.diag([1e-6, 0.04, 1e-8]), 0.05, 5.0)]
+    [0.025, 0.2, 0.005]
+    """
+    half_cell_m = 0.5 * resolution_m
+    x, y, yaw = np.sqrt(np.diag(covariance)).tolist()
+    return max(x, half_cell_m), max(y, half_cell_m), max(yaw, math.atan(half_cell_m / radius_m))
+
+
 def _picture(grid: OccupancyGrid) -> dict[str, Any]:
     """The known part of a grid as a PNG, unknown cells transparent. Large grids are reduced so that walls
     stay."""
-    import cv2
-
     shade = shades(grid)
     known = np.argwhere(grid.cells >= 0)
     (r0, c0), (r1, c1) = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else ((0, 0), (1, 1))

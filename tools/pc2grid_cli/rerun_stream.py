@@ -23,7 +23,6 @@ from pc2grid.matching.agreement import Support
 from pc2grid.model import Health
 from pc2grid.observer import Observer
 from pc2grid_cli import console
-from pc2grid_cli.evidence import agreements
 from pc2grid_cli.picture import (
     BLUE,
     GREEN,
@@ -33,6 +32,7 @@ from pc2grid_cli.picture import (
     SUPPORT_COLOURS,
     VERMILLION,
     YELLOW,
+    agreements,
 )
 from pc2grid_cli.rerun_layout import CONFIDENCE, GRAPH, GRID, LOOPS, layout
 from pc2grid_cli.rerun_target import VIEWER, require_rerun, url_of

@@ -1,24 +1,16 @@
-"""What a session map says of itself, as the JSON documents of `convert` and `db info` show it.
-
-The types are in `json_schemas`, which loads all experiments; so it is imported for checking only.
-"""
+"""What a session map says of itself, as the JSON documents of `convert` and `db info` show it."""
 
 from __future__ import annotations
 
 import statistics
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from pc2grid import model
-    from pc2grid_cli.json_schemas import Consistency, Converted, OdometryCheck, Precision
-    from signature.database import Provenance
+from pc2grid.model import Precision, SessionMap
+from pc2grid_cli.json_schemas import Converted, PrecisionSummary
+from signature.database import Provenance
 
 
-def session_document(session: model.SessionMap, origin: Provenance) -> Converted:
+def session_document(session: SessionMap, origin: Provenance) -> Converted:
     """The session made of one input, as the JSON document describes it."""
-    path_m = session.trajectory.path_m()
-    grid = session.grid
-    stamps = session.trajectory.stamps_ns
     report = session.report
     return {
         "session": session.session,
@@ -29,13 +21,13 @@ def session_document(session: model.SessionMap, origin: Provenance) -> Converted
         "digest": origin.digest,
         "sensor": session.sensor,
         "scans": len(session.trajectory),
-        "path_m": round(float(path_m[-1]), 2) if len(path_m) else 0.0,
-        "duration_s": round(float(stamps[-1] - stamps[0]) / 1e9, 2) if len(stamps) else 0.0,
-        "area_m2": round(grid.free_m2, 1),
+        "path_m": round(session.trajectory.length_m, 2),
+        "duration_s": round(session.trajectory.duration_s, 2),
+        "area_m2": round(session.grid.free_m2, 1),
         "submaps": len(session.submaps),
-        "consistency": consistency_document(session.consistency),
-        "odometry": odometry_document(session.odometry),
-        "precision": precision_document(session.precision),
+        "consistency": session.consistency,
+        "odometry": session.odometry,
+        "precision": precision_summary(session.precision),
         "report": {
             "scans_read": report.scans_read,
             "points_dropped": report.points_dropped,
@@ -47,63 +39,12 @@ def session_document(session: model.SessionMap, origin: Provenance) -> Converted
     }
 
 
-def consistency_document(consistency: model.Consistency | None) -> Consistency | None:
-    """How well a map agrees with its own scans, as the documents show it."""
-    if consistency is None:
-        return None
-    return {
-        "hits_on_free": round(consistency.hits_on_free, 4),
-        "contradicted": round(consistency.contradicted, 4),
-        "bent": consistency.bent,
-        "stretches": [
-            {
-                "from_ns": stretch.from_ns,
-                "to_ns": stretch.to_ns,
-                "x_m": round(stretch.x_m, 2),
-                "y_m": round(stretch.y_m, 2),
-                "length_m": round(stretch.length_m, 2),
-                "share": round(stretch.share, 4),
-            }
-            for stretch in consistency.stretches
-        ],
-    }
-
-
-def odometry_document(check: model.OdometryCheck | None) -> OdometryCheck | None:
-    """How well odometry agrees with the scans, as the documents show it."""
-    if check is None:
-        return None
-    return {
-        "compared": check.compared,
-        "overruled": check.overruled,
-        "stretches": [
-            {
-                "from_ns": stretch.from_ns,
-                "to_ns": stretch.to_ns,
-                "distance_m": round(stretch.distance_m, 3),
-                "turn_rad": round(stretch.turn_rad, 4),
-            }
-            for stretch in check.stretches
-        ],
-    }
-
-
-def precision_document(precision: model.Precision | None) -> Precision | None:
-    """How exactly the places of a map lie to each other, as the documents show it."""
+def precision_summary(precision: Precision | None) -> PrecisionSummary | None:
+    """How exactly the places of a map lie to each other, in a few numbers."""
     if precision is None:
         return None
     return {
-        "median_m": round(float(statistics.median(precision.sigma_m or (0.0,))), 3),
-        "worst_m": round(precision.worst_m, 3),
-        "loose": [
-            {
-                "from_ns": stretch.from_ns,
-                "to_ns": stretch.to_ns,
-                "x_m": round(stretch.x_m, 2),
-                "y_m": round(stretch.y_m, 2),
-                "length_m": round(stretch.length_m, 2),
-                "sigma_m": round(stretch.sigma_m, 3),
-            }
-            for stretch in precision.loose
-        ],
+        "median_m": float(statistics.median(precision.sigma_m or (0.0,))),
+        "worst_m": precision.worst_m,
+        "loose": list(precision.loose),
     }

@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -15,9 +19,6 @@ left out."""
 
 def table(title: str, texts: Iterable[str], numbers: Iterable[str] = ()) -> Table:
     """An empty table: columns of texts, aligned left, and then columns of numbers, aligned right."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
     made = Table(
         title=title,
         title_justify="left",
@@ -36,8 +37,6 @@ def table(title: str, texts: Iterable[str], numbers: Iterable[str] = ()) -> Tabl
 
 def show(*parts: Table | str) -> None:
     """Print tables, and sentences between them."""
-    from rich.console import Console
-
     console = Console(width=_WIDEST, highlight=False)
     for part in parts:
         if isinstance(part, str):

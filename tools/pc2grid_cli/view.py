@@ -23,11 +23,10 @@ from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import find_log
+from pc2grid_cli.locate import find_log, searched
 from pc2grid_cli.report import page
 from pc2grid_cli.view_events import Events, Progress
 from pc2grid_cli.view_server import Cancelled, Options, ViewServer
-from signature.database import open_database
 from signature.files import query_config
 from signature.localization.follower import Follower
 from signature.localization.localizer import Localizer
@@ -56,10 +55,8 @@ def view_command(
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free")] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="only print the address")] = False,
     most_gb: Annotated[float, typer.Option("--most-gb", min=0.0, help="largest recording, GB")] = _MOST_GB,
-    building: Annotated[
-        str | None, typer.Option("--building", metavar="NAME", help="look only in sessions labelled so")
-    ] = None,
-    floor: Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, of a floor")] = None,
+    building: options.Building = None,
+    floor: options.Floor = None,
     topic: options.Topic = None,
     odometry: options.OdometryTopic = None,
     config: options.ConfigFile = None,
@@ -79,13 +76,11 @@ def view_command(
     )
     terminal = console.of(context)
     with (
-        open_database(database) as opened,
+        searched(database, building, floor) as (opened, damaged),
         tempfile.TemporaryDirectory(prefix="pc2grid-view-") as folder,
     ):
-        if building is not None or floor is not None:
-            opened.keep_only(building=building, floor=floor)
-        for damage in opened.leave_out_damaged():
-            console.warn(f"{opened.location}: damaged and left out: {damage.where}: {damage.what}")
+        for damage in damaged:
+            console.warn(f"{opened.location}: damaged and left out: {damage}")
         locator = Locator(opened, settings)
         try:
             server = ViewServer(
@@ -98,20 +93,27 @@ def view_command(
         locator.pages = server.pages
         server.pages[""] = live_page(opened)
         try:
-            print(server.url, flush=True)
-            if source is None:
-                terminal.note("drop a recording onto the page; Ctrl-C ends this")
-            if not no_browser:
-                _open_browser(server.url)
-            if source is None:
-                server.serve()
-            else:
-                with server.in_background():
-                    locator.follow(source)
-                    terminal.note("the page stays as it is; Ctrl-C ends this")
-                    threading.Event().wait()
+            _serve(server, locator, source, terminal, browser=not no_browser)
         finally:
             server.stop()
+
+
+def _serve(
+    server: ViewServer, locator: Locator, source: str | None, terminal: console.Console, *, browser: bool
+) -> None:
+    """Serve the pages until the program is stopped."""
+    print(server.url, flush=True)
+    if source is None:
+        terminal.note("drop a recording onto the page; Ctrl-C ends this")
+    if browser:
+        _open_browser(server.url)
+    if source is None:
+        server.serve()
+        return
+    with server.in_background():
+        locator.follow(source)
+        terminal.note("the page stays as it is; Ctrl-C ends this")
+        threading.Event().wait()
 
 
 class Locator:

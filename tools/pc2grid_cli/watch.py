@@ -25,7 +25,7 @@ from pc2grid_cli import options as options
 from pc2grid_cli.check_pose import as_text as check_as_text
 from pc2grid_cli.check_pose import live_document
 from pc2grid_cli.known_pose import KnownPose
-from signature.database import open_database
+from pc2grid_cli.locate import searched
 from signature.localization.answer_json import in_space_document
 from signature.localization.follower import Follower
 from signature.localization.localizer import Localizer
@@ -63,13 +63,9 @@ def watch_command(
             help="a robot with foxglove_bridge or rmw_zenoh; a recording, also a growing one; - for stdin",
         ),
     ],
-    database: Annotated[
-        str, typer.Option("--database", "-d", metavar=options.DATABASE, help="where to look")
-    ],
-    building: Annotated[
-        str | None, typer.Option("--building", metavar="NAME", help="look only in sessions labelled so")
-    ] = None,
-    floor: Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, of a floor")] = None,
+    database: options.SearchedDatabase,
+    building: options.Building = None,
+    floor: options.Floor = None,
     near: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
@@ -136,11 +132,12 @@ def watch_command(
         raise ConfigError("--check-topic and --publish do not go together", hint="run `watch` twice")
     terminal = console.of(context)
     end_s = math.inf if timeout is None else time.monotonic() + timeout
-    with open_database(database) as opened, open_live(source, settings.read, last_s=last) as live:
-        if building is not None or floor is not None:
-            opened.keep_only(building=building, floor=floor)
-        for problem in opened.leave_out_damaged():
-            console.warn(f"{opened.location}: damaged and left out: {problem.where}: {problem.what}")
+    with (
+        searched(database, building, floor) as (opened, damaged),
+        open_live(source, settings.read, last_s=last) as live,
+    ):
+        for damage in damaged:
+            console.warn(f"{opened.location}: damaged and left out: {damage}")
         following = _Following(live, opened, settings, end_s, terminal)
         if check_topic is not None:
             good = _check(following, check_topic, session, as_json=json)

@@ -11,6 +11,7 @@ import functools
 import struct
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -116,8 +117,6 @@ def _compressed_depth(image: CompressedImage, max_points: int, stride: int) -> t
     _check_size(height, width, max_points)
     if (found.bits, found.channels) != (16, 1):
         raise PointCloudError("the png of a depth image has not one channel of 16 bits")
-    import cv2
-
     try:
         values = cv2.imdecode(np.frombuffer(found.data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -173,8 +172,6 @@ def _rays(
 
 
 def _undistorted(u: F64, v: F64, k: F64, d: F64, model: str) -> tuple[F64, F64]:
-    import cv2
-
     pixels = np.stack((u.reshape(-1), v.reshape(-1)), axis=1)[:, None, :]
     if model in ("equidistant", "fisheye"):
         rays = cv2.fisheye.undistortPoints(pixels, k, d[:4])

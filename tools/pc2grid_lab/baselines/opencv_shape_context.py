@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 
 from pc2grid.arrays import F32, F64, cells_of
@@ -58,8 +59,6 @@ class OpenCvShapeContext:
 
 def require_shapes() -> Any:
     """What makes OpenCV's shape contexts. Raises ConfigError if OpenCV has no module `shape`."""
-    import cv2
-
     make = getattr(cv2, "createShapeContextDistanceExtractor", None)
     if make is None:
         raise ConfigError(

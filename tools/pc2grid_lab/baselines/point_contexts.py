@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.metrics.pairwise import additive_chi2_kernel
 
 from pc2grid.arrays import F32, F64, cells_of
 from pc2grid.model import Submap
@@ -94,8 +95,6 @@ def _mean_best_costs(wanted: F32, table: F32, starts: NDArray[np.int64]) -> F64:
     wanted (K, B), table (M, B): contexts; submap s has the rows starts[s] to starts[s + 1] of the table.
     Without any context on either side the cost is 1.
     """
-    from sklearn.metrics.pairwise import additive_chi2_kernel
-
     costs = np.ones(len(starts) - 1)
     if len(wanted) and len(table):
         pairs = -0.5 * additive_chi2_kernel(wanted, table)

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
@@ -94,8 +95,6 @@ class DistanceFeatures:
 
     def _keypoints(self, distance: F32, submap: Submap) -> I64:
         """Cells (K, 2) where |det Hessian of D| is a local maximum in known free space."""
-        import cv2
-
         resolution = submap.grid.resolution_m
         dy, dx = np.gradient(distance, resolution)
         (dyy, dyx), (dxy, dxx) = np.gradient(dy, resolution), np.gradient(dx, resolution)
@@ -112,8 +111,6 @@ class DistanceFeatures:
 
 def distance_function(submap: Submap, smooth_m: float) -> F32:
     """D (H, W) in metres: distance to the nearest occupied cell, smoothed; unknown cells are no walls."""
-    import cv2
-
     resolution = submap.grid.resolution_m
     cells = cv2.distanceTransform((~submap.grid.occupied).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(cv2.GaussianBlur(cells, (0, 0), smooth_m / resolution) * resolution, np.float32)

@@ -9,8 +9,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.cluster import KMeans
+from sklearn.feature_extraction.text import TfidfTransformer
 
 from pc2grid.arrays import F32, F64
 from pc2grid.model import Submap
@@ -29,8 +32,6 @@ def submap_image(submap: Submap) -> NDArray[np.uint8]:
     The image is blurred by one cell. Without the blur both features respond to the steps in slanted lines
     of one cell, and recognise a third less.
     """
-    import cv2
-
     image = np.full(submap.grid.cells.shape, 127, np.uint8)
     image[submap.grid.free] = 255
     image[submap.grid.occupied] = 0
@@ -39,8 +40,6 @@ def submap_image(submap: Submap) -> NDArray[np.uint8]:
 
 def sift(image: NDArray[np.uint8]) -> F32:
     """Up to 300 SIFT descriptors (K, 128) of OpenCV, those of the strongest contrast."""
-    import cv2
-
     detector: Any = cv2.SIFT.create(nfeatures=MAX_FEATURES)
     _, descriptors = detector.detectAndCompute(image, None)
     # OpenCV returns more than asked for if several have the contrast of the last.
@@ -79,8 +78,6 @@ class Vocabulary:
         """Learn the words from the features of N submaps; counts of each word in each submap (N, words)."""
         if self._learned is submaps:
             return self.counts
-        from sklearn.cluster import KMeans
-
         features = [self.feature(submap_image(submap)) for submap in submaps]
         everything = np.concatenate(features)
         size = min(WORDS, len(np.unique(everything, axis=0)))
@@ -123,11 +120,8 @@ class Words:
         """Learn the words and their weights from the submaps of a map."""
         counts = self.vocabulary.learn(submaps)
         weights = np.ones(counts.shape[1])
-        if self.tfidf:
-            from sklearn.feature_extraction.text import TfidfTransformer
-
-            if counts.size:
-                weights = TfidfTransformer(norm=None).fit(counts).idf_
+        if self.tfidf and counts.size:
+            weights = TfidfTransformer(norm=None).fit(counts).idf_
         return _Counts(self.vocabulary, weights, _unit(counts * weights))
 
 

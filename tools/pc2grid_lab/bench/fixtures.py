@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from pc2grid.arrays import F32
 from pc2grid.clouds.deskew import deskew
@@ -46,9 +48,6 @@ def lidar_log(path: Path, length_m: float, *, seed: int = 0, lidar: LidarConfig 
 
 def huge_log(path: Path, size_bytes: int, message_bytes: int = 16_000_000) -> None:
     """Write an indexed MCAP of clouds whose points are zero. The zeros use no space on the disk."""
-    from mcap.writer import CompressionType, Writer
-    from rosbags.typesys import Stores, get_typestore
-
     points = message_bytes // 16
     name, store = "sensor_msgs/msg/PointCloud2", get_typestore(Stores.ROS2_HUMBLE)
     types = store.types

@@ -11,9 +11,10 @@ import typer
 from pc2grid.errors import ConfigError
 from pc2grid.model import OccupancyGrid
 from pc2grid_cli.console import of, print_json
-from pc2grid_cli.options import OUTPUT_FOLDER, SensorName
+from pc2grid_cli.options import SensorName
 from pc2grid_cli.output_files import make_folder
 from pc2grid_cli.tables import show
+from pc2grid_lab.compare import options as options
 from pc2grid_lab.compare.floors_report import draw, example_of, floors_table, mapped
 from pc2grid_lab.documents import FloorRow
 from pc2grid_lab.experiments.floors import WAYS, FloorResult, FloorTask, Way, database_file, stored_floors
@@ -33,10 +34,8 @@ def compare_floors_command(
     length: Annotated[float, typer.Option(min=8.0, metavar="M", help="metres to drive on each floor")] = 15.0,
     query: Annotated[float, typer.Option(min=1.0, metavar="M", help="the same of a query")] = 8.0,
     queries: Annotated[int, typer.Option(min=1, help="on each floor")] = 6,
-    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="folder for results; run again to go on")] = Path(
-        "floors"
-    ),
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON document, not a table")] = False,
+    out: options.OutputFolder = Path("floors"),
+    as_json: options.AsJson = False,
 ) -> None:
     """Are floors told apart, and is the right one found? Simulated houses whose floors have one plan.
 

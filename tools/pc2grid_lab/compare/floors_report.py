@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from rich.table import Table
+from scipy.stats import binomtest
 
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid_cli.picture import GREEN, GREY, ORANGE, VERMILLION
@@ -83,8 +84,6 @@ def floors_table(houses: Sequence[Asked], in_the_map: Sequence[Asked]) -> Table:
 
 def _row(results: Sequence[FloorResult]) -> list[str]:
     """The counts of some houses, and the upper bound of the share that is wrong."""
-    from scipy.stats import binomtest
-
     named = (sum(result.told_apart for result in results), sum(result.named for result in results))
     counts = [sum(result.count(status) for result in results) for status in STATUSES]
     misplaced = sum(result.misplaced for result in results)

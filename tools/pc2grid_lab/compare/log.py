@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -77,20 +77,22 @@ def compare_log_command(
             spans = [(span, part) for span in spread(to_s, end_s, queries, length_s)]
             trials = in_processes(replay.locate, spans, jobs=1, advance=advance)
     judged = [trial for trial in trials if trial is not None]
-    counts = QueryCounts.of(judged)
-    if not json:
-        _print(judged, counts, len(trials) - len(judged))
-        return
-    document = {
+    about = {"log": log.name, "map_s": [mapped.start_s, to_s], "length_s": length_s}
+    if json:
+        console.print_json(_document(judged, len(trials) - len(judged), about))
+    else:
+        _print(judged, len(trials) - len(judged))
+
+
+def _document(trials: list[Trial], unknown: int, about: dict[str, Any]) -> dict[str, Any]:
+    """What `--json` prints. unknown : queries that could not be judged."""
+    return {
         "schema_version": 1,
-        "log": log.name,
-        "map_s": [mapped.start_s, to_s],
-        "length_s": length_s,
-        "without_truth": len(trials) - len(judged),
-        "tally": asdict(counts),
-        "trials": [asdict(trial) for trial in judged],
+        **about,
+        "without_truth": unknown,
+        "tally": asdict(QueryCounts.of(trials)),
+        "trials": [asdict(trial) for trial in trials],
     }
-    console.print_json(document)
 
 
 def _spans(
@@ -137,7 +139,8 @@ def _seconds(text: str) -> tuple[float, float]:
     return from_s, to_s
 
 
-def _print(trials: list[Trial], counts: QueryCounts, unknown: int) -> None:
+def _print(trials: list[Trial], unknown: int) -> None:
+    counts = QueryCounts.of(trials)
     title = "later parts of the recording in the map of the earlier one"
     numbers = ["driven", "covered", "confidence", "off by", "map bent by"]
     found = table(title, ["from", "answer", "judged"], numbers)

@@ -19,9 +19,9 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Health
 from pc2grid.simulate.config import OdometryConfig
 from pc2grid_cli.console import of, print_json
-from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
 from pc2grid_cli.tables import show, table
+from pc2grid_lab.compare import options as options
 from pc2grid_lab.experiments.map_quality import MappingRun, map_beside_bare, map_simulated
 from pc2grid_lab.experiments.relation_fit import relation_fit
 from pc2grid_lab.experiments.sensor_matrix import SENSORS
@@ -48,11 +48,9 @@ def compare_maps_command(
     length: Annotated[float, typer.Option(min=1.0, metavar="M", help="metres to drive")] = 200.0,
     seeds: Annotated[str, typer.Option(help="of the simulated sessions, for example 1,2,3")] = "1",
     no_odometry: Annotated[bool, typer.Option("--no-odometry", help="leave odometry out of them")] = False,
-    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="folder for results; run again to go on")] = Path(
-        "map-quality"
-    ),
-    jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="processes [one a core]")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON document, not tables")] = False,
+    out: options.OutputFolder = Path("map-quality"),
+    jobs: options.Jobs = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """How good are the maps? Trajectory, health and cells of each against the truth.
 

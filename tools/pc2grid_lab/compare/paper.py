@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import csv
-import multiprocessing
-import os
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,9 +13,9 @@ from pc2grid import __version__
 from pc2grid.errors import ConfigError, MapFileError
 from pc2grid.io.atomic import replace_file
 from pc2grid_cli.console import Console, json_text, of, print_json
-from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
 from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES, require_packages
+from pc2grid_lab.compare import options as options
 from pc2grid_lab.compare import paper_report
 from pc2grid_lab.compare.paper_report import published
 from pc2grid_lab.experiments.paper_task import (
@@ -31,19 +28,7 @@ from pc2grid_lab.experiments.paper_task import (
     paper_tasks,
     run_task,
 )
-from pc2grid_lab.experiments.stored import write_text
-
-_COSTS = {
-    "proposed": 1.0,
-    "shape_context": 1.0,
-    "sdf": 14.0,
-    "sift_bow": 8.0,
-    "surf_bow": 14.0,
-    "opencv_shape_context": 150.0,
-    "proposed_centres": 4.0,
-    "boundary_centres": 4.0,
-    "shape_context_centres": 4.0,
-}
+from pc2grid_lab.experiments.stored import in_processes, write_text
 
 
 def compare_paper_command(
@@ -55,9 +40,7 @@ def compare_paper_command(
             help="Folder with fr079.yaml, intel.yaml, ... of the paper; or a map, or a folder of maps.",
         ),
     ],
-    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="Folder for results; run again to go on.")] = Path(
-        "paper-tables"
-    ),
+    out: options.OutputFolder = Path("paper-tables"),
     queries: Annotated[
         int, typer.Option("--queries", min=1, help="Queries a map. 2000 take hours; 200 for a quick look.")
     ] = 2000,
@@ -86,26 +69,21 @@ def compare_paper_command(
         float,
         typer.Option("--speckles", min=0.0, help="Spread of the boundary noise, m; the paper gives none."),
     ] = 0.1,
-    jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="Processes. [one a core]")] = None,
+    jobs: options.Jobs = None,
     seed: Annotated[int, typer.Option("--seed", help="Of the queries and their noise.")] = 1,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document instead of tables.")
-    ] = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Reproduce the paper's tables and figures 9 and 10, each number beside the published one.
 
     Example: pc2grid compare paper --maps maps/ --queries 200 --ablation
     """
-    chosen, offsets_m = _chosen(methods), tuple(offset or (1.0, 0.5))
-    if min(offsets_m) <= 0:
-        raise ConfigError("--offset: expected a distance above 0 m")
+    chosen, offsets_m = _chosen(methods), _offsets(offset)
     cells, map_paths = out / "cells", _maps(maps)
-    make_folder(out)
     make_folder(cells)
     choices = (ABLATION if ablation else ()) + (OPEN_CHOICES if open_choices else ())
     asked: dict[str, Any] = {"methods": chosen, "offsets_m": offsets_m, "queries": queries, "seed": seed}
     tasks = list(paper_tasks(map_paths, **asked, choices=choices, speckle_sigma_m=speckles))
-    run_tasks(tasks, cells, jobs or os.cpu_count() or 1, of(context))
+    run_tasks(tasks, cells, jobs, of(context))
     results = _results(tasks, cells)
     document = _write(results, out, queries, seed)
     pictures = paper_report.draw_figures(results, out)
@@ -114,6 +92,13 @@ def compare_paper_command(
     else:
         paper_report.print_tables(results, chosen)
         print(f"written: {out / 'results.json'}, {out / 'results.csv'}, {', '.join(map(str, pictures))}")
+
+
+def _offsets(offset: Sequence[float] | None) -> tuple[float, ...]:
+    offsets_m = tuple(offset or (1.0, 0.5))
+    if min(offsets_m) <= 0:
+        raise ConfigError("--offset: expected a distance above 0 m")
+    return offsets_m
 
 
 def _maps(path: Path) -> list[Path]:
@@ -135,72 +120,12 @@ def _chosen(methods: Sequence[str] | None) -> tuple[str, ...]:
     return chosen
 
 
-def run_tasks(tasks: Sequence[PaperTask], cells: Path, jobs: int, terminal: Console) -> None:
+def run_tasks(tasks: Sequence[PaperTask], cells: Path, jobs: int | None, terminal: Console) -> None:
     """Run the tasks that have no result yet in `jobs` processes, and show the progress on `terminal`."""
-    open_tasks = [task for task in tasks if len(_results([task], cells)) < len(task.methods)]
-    if not open_tasks:
-        return
-    # One thread in each process, because the processes run in parallel; libraries read this when loaded.
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
-    spawn = multiprocessing.get_context("spawn")
-    done_shares, costs = spawn.SimpleQueue(), [_cost(task) for task in open_tasks]
-    with (
-        terminal.progress(f"{len(open_tasks)} cells of the tables") as advance,
-        ProcessPoolExecutor(
-            jobs, mp_context=spawn, initializer=_start_worker, initargs=(done_shares,)
-        ) as pool,
-    ):
-        pending = {pool.submit(_run, index, task, cells) for index, task in enumerate(open_tasks)}
-        try:
-            for shares in _progress(pending, done_shares, len(open_tasks)):
-                advance(sum(cost * share for cost, share in zip(costs, shares, strict=True)) / sum(costs))
-        except BaseException:
-            # Finished cells are kept; tasks that wait must not start after the user has stopped the program.
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
-def _progress(pending: set[Future[int]], reported: Any, count: int) -> Iterator[list[float]]:
-    """The share of each of `count` tasks that is done, every half a second until all are."""
-    shares = [0.0] * count
-    while pending:
-        finished, pending = wait(pending, timeout=0.5, return_when=FIRST_COMPLETED)
-        for future in finished:
-            shares[future.result()] = 1.0
-        while not reported.empty():
-            index, share = reported.get()
-            shares[index] = max(shares[index], share)
-        yield shares
-
-
-def _cost(task: PaperTask) -> float:
-    """Approximate relative time of a task, for an even progress bar."""
-    return _COSTS.get(task.methods[0], 10.0) * (5.0 if task.reading == "true" else 1.0)
-
-
-_shares: Any = None
-
-
-def _start_worker(shares: Any) -> None:
-    global _shares
-    import cv2
-
-    _shares = shares
-    cv2.setNumThreads(1)
-
-
-def _run(index: int, task: PaperTask, cells: Path) -> int:
-    reported = 0.0
-
-    def report(share: float) -> None:
-        nonlocal reported
-        if share >= reported + 0.05:
-            reported = share
-            _shares.put((index, share))
-
-    run_task(task, cells, report)
-    return index
+    waiting = [(task, cells) for task in tasks if len(_results([task], cells)) < len(task.methods)]
+    if waiting:
+        with terminal.progress(f"{len(waiting)} cells of the tables") as advance:
+            in_processes(run_task, waiting, jobs=jobs, advance=advance)
 
 
 def _results(tasks: Iterable[PaperTask], cells: Path) -> list[PaperCell]:

@@ -14,8 +14,8 @@ import typer
 from pc2grid.errors import ConfigError, LogNotFound
 from pc2grid.io.building_file import is_building_file
 from pc2grid_cli.console import json_text, of, print_json, warn
-from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
+from pc2grid_lab.compare import options as options
 from pc2grid_lab.compare.peers_report import draw, print_table
 from pc2grid_lab.experiments.stored import in_processes, write_text
 from pc2grid_lab.peers.environment import PEERS, PeerEnvironment
@@ -35,9 +35,7 @@ def compare_peers_command(
             " and 3D scans, in which a lidar is simulated",
         ),
     ],
-    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="folder for results; run again to go on")] = Path(
-        "peers"
-    ),
+    out: options.OutputFolder = Path("peers"),
     queries: Annotated[int, typer.Option("--queries", min=1, help="queries of each building")] = 24,
     travel: Annotated[float, typer.Option("--travel", min=0.0, help="metres that each drives")] = 10.0,
     mapped: Annotated[
@@ -54,7 +52,7 @@ def compare_peers_command(
     install: Annotated[
         bool, typer.Option("--install", help="make that environment if it does not exist: 100 MB")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON document, not a table")] = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Other programs and pc2grid locate later parts of real recordings in maps of earlier parts.
 

@@ -7,15 +7,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
 from pc2grid.io.atomic import replace_file
 
 
 @contextmanager
 def picture(path: Path, width_in: float, height_in: float, *, dpi: int = 110) -> Iterator[Any]:
     """A figure of matplotlib that is a PNG file when the body ends."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained")
     FigureCanvasAgg(figure)
     yield figure

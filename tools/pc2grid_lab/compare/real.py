@@ -25,8 +25,8 @@ from pc2grid.pipeline import build_map
 from pc2grid.simulate import Building, load_building
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli.console import Console, json_text, of, print_json
-from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
+from pc2grid_lab.compare import options as options
 from pc2grid_lab.compare.real_report import draw, print_table
 from pc2grid_lab.experiments.answers import localize
 from pc2grid_lab.experiments.plan_drives import MAP_SEED
@@ -115,9 +115,7 @@ def compare_real_command(
         Path | None,
         typer.Option("--truth", metavar="TUM", help="true poses of the laser [its own map of the whole log]"),
     ] = None,
-    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="folder for results; run again to go on")] = Path(
-        "real-sensors"
-    ),
+    out: options.OutputFolder = Path("real-sensors"),
     queries: Annotated[int, typer.Option("--queries", min=1, help="drives of each sensor to locate")] = 10,
     query_time: Annotated[
         float, typer.Option("--query-time", min=2.0, help="seconds each of them lasts")
@@ -137,8 +135,8 @@ def compare_real_command(
     quick: Annotated[
         bool, typer.Option("--quick", help="a third of the queries, a short map: a look in minutes")
     ] = False,
-    jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="processes [one a core]")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON document, not a table")] = False,
+    jobs: options.Jobs = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Lidar, depth camera and laser on one real floor: each located in the maps of each, and in the scan.
 

@@ -15,8 +15,8 @@ from pc2grid.errors import ConfigError, MapFileError
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import SensorKind
 from pc2grid_cli.console import Console, json_text, of, print_json
-from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
+from pc2grid_lab.compare import options as options
 from pc2grid_lab.compare.matrix_report import contribution_table, draw, draw_signatures, tables
 from pc2grid_lab.experiments.ablation import COMBINATIONS, Independence, independence, recall_by_combination
 from pc2grid_lab.experiments.metrics import ConfidenceError, matrix, reliability
@@ -35,27 +35,18 @@ def compare_sensors_command(
         list[Path],
         typer.Argument(help="Floor plans: MAP.yaml files; of several, each query is also asked in another."),
     ],
-    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="Folder for results; run again to go on.")] = Path(
-        "sensor-matrix"
-    ),
-    queries: Annotated[int, typer.Option("--queries", min=1, help="Query sessions a plan and sensor.")] = 10,
-    map_length: Annotated[float, typer.Option("--map-length", help="Metres driven to make a map.")] = 200.0,
-    clutter: Annotated[
-        int, typer.Option("--clutter", help="Things in the way, different in each session.")
-    ] = 30,
-    change: Annotated[
-        float,
-        typer.Option("--change", min=0, max=1, help="Share of doors and furniture that differ, by session."),
-    ] = 0.0,
-    rate: Annotated[float, typer.Option("--rate", help="Scans a second, of every sensor.")] = 10.0,
+    out: options.OutputFolder = Path("sensor-matrix"),
+    queries: options.QuerySessions = 10,
+    map_length: options.MapLength = 200.0,
+    clutter: options.Clutter = 30,
+    change: options.Change = 0.0,
+    rate: options.Rate = 10.0,
     travel: Annotated[
         float, typer.Option("--travel", min=1.0, help="Metres that a query drives at most.")
     ] = 15.0,
-    seed: Annotated[int, typer.Option("--seed", help="Of the first query session.")] = 1,
-    jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="Processes. [one a core]")] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document instead of tables.")
-    ] = False,
+    seed: options.FirstSeed = 1,
+    jobs: options.Jobs = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Map plans with lidar, laser and depth camera, locate sessions of each in each: nine cells.
 

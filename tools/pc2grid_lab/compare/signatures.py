@@ -19,8 +19,8 @@ from pc2grid.model import OccupancyGrid, SensorKind
 from pc2grid.observer import Observer
 from pc2grid.simulate import office_floorplan
 from pc2grid_cli.console import Console, json_text, of, print_json
-from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
+from pc2grid_lab.compare import options as options
 from pc2grid_lab.compare.signature_report import draw, print_table
 from pc2grid_lab.experiments.ablation import seen_independence
 from pc2grid_lab.experiments.plan_drives import PlanDrives
@@ -68,26 +68,19 @@ def compare_signatures_command(
     plans: Annotated[
         list[str], typer.Argument(metavar="PLAN...", help="Floor plans: MAP.yaml files, or office:SEED.")
     ],
-    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="Folder for results; run again to go on.")] = Path(
-        "signatures"
-    ),
-    queries: Annotated[int, typer.Option("--queries", min=1, help="Query sessions a plan and sensor.")] = 6,
+    out: options.OutputFolder = Path("signatures"),
+    queries: options.QuerySessions = 6,
     floors: Annotated[
         int, typer.Option("--floors", min=1, help="Office floors of the city besides the building.")
     ] = 12,
     share: Annotated[
         float, typer.Option("--share", min=0.001, max=1.0, help="Share of the places that is looked at.")
     ] = 0.05,
-    map_length: Annotated[float, typer.Option("--map-length", help="Metres driven to make a map.")] = 150.0,
-    clutter: Annotated[
-        int, typer.Option("--clutter", help="Things in the way, different in each session.")
-    ] = 30,
-    change: Annotated[
-        float,
-        typer.Option("--change", min=0, max=1, help="Share of doors and furniture that differ, by session."),
-    ] = 0.2,
-    rate: Annotated[float, typer.Option("--rate", help="Scans a second, of every sensor.")] = 4.0,
-    seed: Annotated[int, typer.Option("--seed", help="Of the first query session.")] = 1,
+    map_length: options.MapLength = 150.0,
+    clutter: options.Clutter = 30,
+    change: options.Change = 0.2,
+    rate: options.Rate = 4.0,
+    seed: options.FirstSeed = 1,
     scale: Annotated[
         list[int] | None,
         typer.Option("--scale", min=1000, help="Also select among so many places; may be repeated."),
@@ -100,9 +93,7 @@ def compare_signatures_command(
         Path | None,
         typer.Option("--fit", metavar="FILE.npz", help="Learn the weights from these plans, and store them."),
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document instead of a table.")
-    ] = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Locate with places selected by all signatures, by some, by Eq. 6, at random, and with all places.
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.stats import mannwhitneyu
 
 from pc2grid.arrays import F64
 from signature.localization.confidence import Calibration, Evidence
@@ -34,8 +36,6 @@ def fit(answers: Sequence[Known], share_right: float | None = None) -> Calibrati
     share_right : the right answers weigh so much of all together, 0..1, however many of each there are; None:
     as much as their weights say. Raises ValueError unless there are both right and wrong answers.
     """
-    from scipy.optimize import minimize
-
     right = np.array([answer.right for answer in answers])
     if right.all() or not right.any():
         raise ValueError("a fit needs right and wrong answers")
@@ -96,8 +96,6 @@ def area(larger: F64, smaller: F64) -> float:
 
     It is computed by the Mann-Whitney statistic. 0.5 is chance, 1 is perfect; NaN if either is empty.
     """
-    from scipy.stats import mannwhitneyu
-
     if not len(larger) or not len(smaller):
         return float("nan")
     statistic = mannwhitneyu(larger, smaller, method="asymptotic").statistic

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
@@ -94,8 +95,6 @@ def relation_fit(
 
 def _distance(a: F64, b: F64, T_a_b: SE2, parameters: RelationFitParameters) -> tuple[float, float]:
     """Mean distance of the points of each scan from the other one, and the smaller share seen there."""
-    from scipy.spatial import cKDTree
-
     distances, shares = [], []
     for target, points in ((a, T_a_b.apply(b)), (b, T_a_b.inverse().apply(a))):
         if not len(target) or not len(points):

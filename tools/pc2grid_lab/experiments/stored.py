@@ -9,6 +9,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from pc2grid.io.atomic import replace_file
@@ -45,9 +46,18 @@ def in_processes(
             found.append(function(*arguments))
             advance(len(found) / len(given))
         return found
-    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
+    # One thread in each process, because the processes run in parallel; libraries read this when loaded.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    pool = ProcessPoolExecutor(
+        count, mp_context=multiprocessing.get_context("spawn"), initializer=cv2.setNumThreads, initargs=(1,)
+    )
+    try:
         waiting = [pool.submit(function, *arguments) for arguments in given]
         for done, future in enumerate(as_completed(waiting), start=1):
             future.result()
             advance(done / len(waiting))
         return [future.result() for future in waiting]
+    finally:
+        # Tasks that wait must not start after the user has stopped the program, or after one has failed.
+        pool.shutdown(wait=False, cancel_futures=True)

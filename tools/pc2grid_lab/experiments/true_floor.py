@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -118,8 +119,6 @@ class TrueFloor:
         self._see(pose)
 
     def _see(self, pose: SE2) -> None:
-        import cv2
-
         x, y = (float(v) for v in pose.apply(self._session.sensor.T_base_sensor[None, :2, 3])[0])
         view = isovist(self._open, (x, y), float(self._reach_m.max()), bearings=VISIBILITY.bearings)
         turned_m = np.roll(self._reach_m, round(pose.yaw * VISIBILITY.bearings / (2 * math.pi)))
@@ -189,16 +188,12 @@ def _lengths(directions: F64) -> F64:
 
 def _grown(mask: BoolGrid) -> BoolGrid:
     """The cells of a mask and their eight neighbours."""
-    import cv2
-
     grown: BoolGrid = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     return grown
 
 
 def _sum_around(counts: NDArray[np.int32]) -> F32:
     """Sum over each cell and its eight neighbours."""
-    import cv2
-
     return cv2.boxFilter(counts.astype(np.float32), -1, (3, 3), normalize=False).astype(np.float32)
 
 

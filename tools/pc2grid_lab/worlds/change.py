@@ -11,8 +11,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from pc2grid.arrays import F64, U8, BoolGrid
 from pc2grid.geometry import SE2
@@ -185,15 +187,11 @@ def _footprint(plan: OccupancyGrid, furniture: Furniture) -> BoolGrid:
 
 def _visible_walls(plan: OccupancyGrid) -> BoolGrid:
     """Occupied cells next to free ones."""
-    from scipy import ndimage
-
     beside: BoolGrid = ndimage.binary_dilation(plan.free, np.ones((3, 3), bool))
     return plan.occupied & beside
 
 
 def _walls_changed(plan: OccupancyGrid, emptied: OccupancyGrid, added: tuple[Furniture, ...]) -> float:
-    from scipy import ndimage
-
     visible = _visible_walls(plan)
     gone = visible & ~emptied.occupied
     new = np.zeros_like(gone)
@@ -207,8 +205,6 @@ def _walls_changed(plan: OccupancyGrid, emptied: OccupancyGrid, added: tuple[Fur
 
 def _pieces(plan: OccupancyGrid) -> list[BoolGrid]:
     """A mask (H, W) for each solid part that is small and stands free: furniture, not walls."""
-    from scipy import ndimage
-
     labels, _ = ndimage.label(plan.occupied, np.ones((3, 3), bool))
     found = []
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
@@ -227,8 +223,6 @@ def _pieces(plan: OccupancyGrid) -> list[BoolGrid]:
 
 def _hull(mask: BoolGrid, plan: OccupancyGrid) -> F64:
     """Convex outline (N, 2) of the cells of a mask, map frame."""
-    import cv2
-
     cells = np.argwhere(mask)
     half = plan.resolution_m / 2
     corners = plan.to_point(cells)[:, None] + np.array(
@@ -269,8 +263,6 @@ def _without(plan: OccupancyGrid, pieces: list[BoolGrid]) -> OccupancyGrid:
 
 def _cut(shell: Mesh, plan: OccupancyGrid, pieces: list[BoolGrid]) -> tuple[Mesh, list[float]]:
     """The geometry of a real building without some pieces of its plan, and how high each of them was."""
-    from scipy import ndimage
-
     number = np.zeros(plan.cells.shape, np.int64)  # of the piece in each cell, from 1
     for k, piece in enumerate(pieces, start=1):
         number[piece] = k
@@ -291,8 +283,6 @@ def _leaves_room(
 ) -> bool:
     """Whether the part of the free space that the robot is in, or else the largest one, stays half of what
     it could reach without the doors."""
-    from scipy import ndimage
-
     free = plan.free.copy()
     before = _largest(ndimage.label(clearance_m(free, plan.resolution_m) >= robot_m)[0], None, plan)
     for door in doors:
@@ -314,8 +304,6 @@ def _largest(labels: Any, start_m: tuple[float, float] | None, plan: OccupancyGr
 
 def _wall_points(plan: OccupancyGrid) -> tuple[F64, F64]:
     """Points (N, 2) on visible walls, and unit vectors (N, 2) from there into the free space."""
-    import cv2
-
     visible = np.argwhere(_visible_walls(plan))
     # The gradient of the smoothed free space points away from the wall.
     smooth = cv2.GaussianBlur(plan.free.astype(np.float32), (0, 0), 3.0)

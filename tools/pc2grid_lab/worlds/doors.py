@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from pc2grid.arrays import F32, F64, I64
 from pc2grid.geometry import SE2
@@ -52,8 +53,6 @@ def find_doorways(plan: OccupancyGrid) -> tuple[Doorway, ...]:
 
     They are looked for along the middle lines of the free space. A door that is drawn closed is a wall.
     """
-    from scipy.spatial import cKDTree
-
     walls: I64 = np.argwhere(plan.occupied)
     if not len(walls) or not plan.free.any():
         return ()

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy import ndimage
 
 from pc2grid.arrays import F32, F64, I64, freeze
 from pc2grid.config import Section
@@ -287,8 +288,6 @@ class House:
 
 def _door_row(free: NDArray[np.bool_], column: int, cell_m: float, half: int, robot_m: float) -> int:
     """The row of the middle of a door in the wall behind a column: a wide place that the robot reaches."""
-    from scipy import ndimage
-
     clearance = clearance_m(free, cell_m)
     labels, _ = ndimage.label(clearance >= robot_m, np.ones((3, 3), bool))
     sizes = np.bincount(labels.ravel())

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from kiss_icp.config import KISSConfig
+from kiss_icp.kiss_icp import KissICP
 
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
@@ -26,9 +28,6 @@ def main() -> None:
     cpu_s is the processor time of `register_frame` alone, over all points of each scan, with the voxel and
     the range that pc2grid chooses for the recording. ate_m is the error with KISS-ICP's own settings.
     """
-    from kiss_icp.config import KISSConfig
-    from kiss_icp.kiss_icp import KissICP
-
     log, truth = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None
     with open_log(log) as opened:
         tracker = Tracker(Config().registration)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from scipy.stats import binomtest
+
 ALPHA = 0.05
 
 
@@ -12,8 +14,6 @@ def clopper_pearson(successes: int, trials: int, alpha: float = ALPHA) -> tuple[
     >>> low, round(high, 3)
     (0.0, 0.168)
     """
-    from scipy.stats import binomtest
-
     interval = binomtest(successes, trials).proportion_ci(1.0 - alpha)
     return float(interval.low), float(interval.high)
 
@@ -25,6 +25,4 @@ def by_chance(worse: int, better: int) -> float:
     >>> by_chance(5, 0), by_chance(1, 1)
     (0.03125, 0.75)
     """
-    from scipy.stats import binomtest
-
     return float(binomtest(worse, worse + better, alternative="greater").pvalue)

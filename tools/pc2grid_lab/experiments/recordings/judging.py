@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from pc2grid.arrays import F64
@@ -322,8 +323,6 @@ def _best(
 
 def known_share(grid: OccupancyGrid, points_m: F64) -> float:
     """Share 0..1 of points (N, 2) in the map frame that have a known cell within `_KNOWN_M`; 0 without."""
-    import cv2
-
     if not len(points_m):
         return 0.0
     reach = round(_KNOWN_M / grid.resolution_m)

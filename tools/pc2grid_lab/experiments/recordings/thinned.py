@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
 from pc2grid.io.atomic import replace_file
 
 
@@ -12,9 +15,6 @@ def write_thinned(source: Path, target: Path, every: int) -> None:
 
     Raises OSError, and the errors of the `mcap` library.
     """
-    from mcap.reader import make_reader
-    from mcap.writer import Writer
-
     with source.open("rb") as read, replace_file(target) as draft, draft.open("wb") as written:
         reader, writer = make_reader(read), Writer(written)
         header = reader.get_header()

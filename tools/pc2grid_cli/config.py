@@ -1,4 +1,4 @@
-"""`pc2grid config schema`: the JSON Schemas of the documents of the commands, and of the settings."""
+"""`pc2grid config`: all settings with their values and meanings, and the JSON Schemas of the documents."""
 
 from __future__ import annotations
 
@@ -7,8 +7,20 @@ from typing import Annotated
 import typer
 
 from pc2grid.errors import ConfigError
+from pc2grid.settings import dump_settings
 from pc2grid_cli import console
 from pc2grid_cli.json_schemas import documents, schema
+from pc2grid_cli.options import Assignments, ConfigFile, Preset, PresetName, make_config
+
+
+def config_dump_command(
+    config: ConfigFile = None, set_: Assignments = None, preset: Preset = PresetName.default
+) -> None:
+    """Print every setting with its value and meaning as TOML, ready for --config.
+
+    Example: pc2grid config dump > mine.toml
+    """
+    print(dump_settings(make_config(config, set_, preset=preset)), end="")
 
 
 def config_schema_command(
