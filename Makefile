@@ -18,10 +18,10 @@ help:
 	@echo 'make demo    simulate two robots, map with one, find the other; leaves a picture in demo_out/'
 	@echo 'make test    run the tests (PYTEST_ARGS="-k name" for some of them)'
 	@echo 'make check   lint, format, types, import order'
-	@echo 'make bench   measure against the goals and the peers (BENCH_ARGS="--only convert --quick" for some of it)'
+	@echo 'make bench   measure against the goals (BENCH_ARGS="--only convert --quick" for some of it)'
 	@echo 'make real    every real recording, against examples/real.md (QUICK=1: some of them); data: PC2GRID_DATA'
 	@echo 'make fuzz    20,000 mutations of every kind of input; then kill -9 and crowds, 200 times and a minute'
-	@echo 'make picture draw the modules and what they import: examples/architecture.svg'
+	@echo 'make picture list the modules by what they import, in CONTRIBUTING.md'
 	@echo 'make docs    the documentation site: site/index.html'
 	@echo 'make clean   remove .venv and everything that was made'
 	@echo 'All of them work from a fresh clone. PYTHON=/path/to/python3 chooses the interpreter for .venv.'
@@ -63,7 +63,7 @@ fuzz: $(READY)
 		tests/pc2grid_cli/test_view.py -k fuzz
 
 picture: $(READY)
-	PYTHONPATH=tools $(BIN)/python tools/architecture.py examples/architecture.svg
+	PYTHONPATH=tools $(BIN)/python tools/architecture.py CONTRIBUTING.md
 
 docs: $(READY)
 	@$(BIN)/python -c "from pc2grid.extras import require; require({'docs': 'make docs'})"

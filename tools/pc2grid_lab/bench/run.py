@@ -24,10 +24,8 @@ from pc2grid_lab.bench import (
     large_database,
     live,
     locating,
-    peers,
     points,
     reading,
-    recordings,
     space,
     submaps,
 )
@@ -62,8 +60,6 @@ MEASURES: dict[str, Measure] = {
     "relocalize": locating.relocalize_time,
     "live": live.lag,
     "hour": live.memory,
-    "real": recordings.against_table,
-    "peers": peers.compare,
     "fleet": fleet_reading,
 }
 
