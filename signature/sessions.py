@@ -175,11 +175,11 @@ def on_floors(
     own = list(dict.fromkeys(part.floor for part in maps if part.floor is not None))
     if not own:
         return tuple(maps), (origin,) * len(maps)
-    label, asked = origin.label, origin.label.floor
-    given = [] if asked is None else [word.strip() for word in asked.split(",")]
-    if asked is not None and len(given) != len(own):
+    label, wanted = origin.label, origin.label.floor
+    given = [] if wanted is None else [word.strip() for word in wanted.split(",")]
+    if wanted is not None and len(given) != len(own):
         warning = (
-            f"the floor {asked!r} is not used: the recording reaches {len(own)} floors; name each, in this "
+            f"the floor {wanted!r} is not used: the recording reaches {len(own)} floors; name each, in this "
             f"order, with commas between: {', '.join(own)}"
         )
         report = replace(maps[0].report, warnings=(*maps[0].report.warnings, warning))

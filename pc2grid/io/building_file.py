@@ -31,6 +31,8 @@ CLOUD_SUFFIXES = (".pcd", ".ply", ".xyz", ".pts")
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 
 _BLOCK_POINTS = 1_000_000  # 24 MB
+_SPACING_SAMPLE = 2000
+"""Points of a cloud of which the distance to the nearest neighbour is measured."""
 _SAMPLES_PER_M2 = 1600.0  # of the surface of a mesh: one every 2.5 cm
 _HEADER_BYTES = 1 << 16
 _DIGEST_BYTES = 1 << 20
@@ -238,3 +240,11 @@ def _quietly() -> Any:
     from pc2grid.open3d_core import o3d
 
     return o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
+
+
+def neighbour_distances_m(points_m: F64) -> F64:
+    """Distance (M,) of some points of a cloud (N, 3), evenly chosen, to their nearest neighbour."""
+    from scipy.spatial import cKDTree
+
+    sample = points_m[:: max(len(points_m) // _SPACING_SAMPLE, 1)]
+    return np.asarray(cKDTree(points_m).query(sample, k=2)[0][:, 1])

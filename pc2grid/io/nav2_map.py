@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from pc2grid.arrays import hand_over
@@ -21,7 +22,7 @@ from pc2grid.errors import MapFileError
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.map_image import GreyImage, encode_image, read_image
 from pc2grid.io.messages.types import FARTHEST_M
-from pc2grid.model import UNKNOWN, OccupancyGrid
+from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 MapMode = Literal["trinary", "scale", "raw"]
 
@@ -101,8 +102,8 @@ def _cell_of(
         span = (occupied_thresh - free_thresh) or 1.0
         between = (occupancy >= free_thresh) & (occupancy <= occupied_thresh)
         cells[between] = np.rint((occupancy[between] - free_thresh) / span * 100.0).astype(np.int8)
-    cells[occupancy > occupied_thresh] = 100
-    cells[occupancy < free_thresh] = 0
+    cells[occupancy > occupied_thresh] = OCCUPIED
+    cells[occupancy < free_thresh] = FREE
     if mode == "scale":
         cells[alpha < 1.0] = UNKNOWN
     return cells
@@ -165,8 +166,6 @@ def save_map(
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    import yaml
-
     try:
         with path.open("rb") as file:
             text = file.read(_MAX_YAML_BYTES + 1)

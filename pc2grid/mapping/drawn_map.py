@@ -12,14 +12,19 @@ from pc2grid.arrays import F64, freeze
 from pc2grid.config import Config
 from pc2grid.errors import MapFileError
 from pc2grid.geometry import transform_points
-from pc2grid.io.building_file import building_points, digest_of_building, is_building_file, kind_of
+from pc2grid.io.building_file import (
+    building_points,
+    digest_of_building,
+    is_building_file,
+    kind_of,
+    neighbour_distances_m,
+)
 from pc2grid.io.nav2_map import is_map_file, load_map
 from pc2grid.mapping.cloud_map import check_plausible, level_cloud, map_cloud, voxel_cloud
 from pc2grid.model import OccupancyGrid
 
 _SPARSE_M = 0.12
 """Median distance of neighbouring points above which walls have gaps in a grid of 5 cm; chosen by hand."""
-_SPACING_SAMPLE = 2000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,10 +111,7 @@ def _digest_of_nav2_map(path: Path, grid: OccupancyGrid) -> str:
 
 def _sparse(path: Path, points: F64) -> tuple[str, ...]:
     """A warning if the points (V, 3) are too far from each other to draw walls without gaps."""
-    from scipy.spatial import cKDTree
-
-    sample = points[:: max(len(points) // _SPACING_SAMPLE, 1)]
-    spacing_m = float(np.median(cKDTree(points).query(sample, k=2)[0][:, 1]))
+    spacing_m = float(np.median(neighbour_distances_m(points)))
     if spacing_m <= _SPARSE_M:
         return ()
     return (

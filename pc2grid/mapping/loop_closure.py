@@ -33,7 +33,7 @@ from pc2grid.mapping.parts import PARTS, Conflict, PartParameters, conflicts_of,
 from pc2grid.mapping.place_recognition import PlaceRecognizer
 from pc2grid.mapping.pose_graph import Edge, Solution
 from pc2grid.mapping.session_graph import SessionGraph
-from pc2grid.mapping.settled import SettledKeyframes, spread
+from pc2grid.mapping.settled import SettledKeyframes, interpolate_corrections
 from pc2grid.mapping.stretches import Stretches
 from pc2grid.mapping.tracked_keyframes import TrackedKeyframes
 from pc2grid.model import Loop
@@ -273,7 +273,9 @@ class LoopCloser:
             ends = [k for k, at in ((run[0], run.start), (run[-1], run.stop)) if at in restarts]
             for k in sorted({anchor, *ends}):
                 known[k] = correction @ pose_at(tracked, k)
-        return spread(tracked, list(known), np.array([(p.x, p.y, p.yaw) for p in known.values()]))
+        return interpolate_corrections(
+            tracked, list(known), np.array([(p.x, p.y, p.yaw) for p in known.values()])
+        )
 
     # --- segments and parts -------------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ from pc2grid.mapping.keyframe_points import KeyframePoints
 from pc2grid.mapping.keyframes import Keyframes, grid_of
 from pc2grid.mapping.parts import PARTS
 from pc2grid.mapping.precision import precision_of
-from pc2grid.mapping.settled import SettledKeyframes, spread
+from pc2grid.mapping.settled import SettledKeyframes, interpolate_corrections
 from pc2grid.mapping.track import Track, chosen
 from pc2grid.model import Consistency, Loop, OccupancyGrid, OdometryCheck, PointMap, Precision, Trajectory
 from pc2grid.odometry.overruled import check_odometry
@@ -120,7 +120,7 @@ def _settled(tracked: Trajectory, closed: SettledKeyframes) -> tuple[I64, F64]:
     for segment in np.unique(closed.segments):
         scans = np.flatnonzero(closed.segments[keyframe] == segment)
         known = closed.segments == segment
-        poses = spread(planar[scans], closed.scans[known] - scans[0], closed.poses[known])
+        poses = interpolate_corrections(planar[scans], closed.scans[known] - scans[0], closed.poses[known])
         T_session_base[scans] = _moved_in_plane(T_session_base[scans], planar[scans], poses)
     part: I64 = closed.parts[keyframe]
     for number in range(1, int(part.max()) + 1):

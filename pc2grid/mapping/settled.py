@@ -47,7 +47,7 @@ class SettledKeyframes:
         return replace(self, segments=together, parts=together)
 
 
-def spread(tracked: F64, known: Sequence[int] | I64, corrected: F64) -> F64:
+def interpolate_corrections(tracked: F64, known: Sequence[int] | I64, corrected: F64) -> F64:
     """Poses (N, 3) of all scans, from the corrected poses (K, 3) of those of them that are `known`.
 
     Between two of these the correction passes linearly from one to the other, so the motion that was

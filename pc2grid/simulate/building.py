@@ -12,13 +12,19 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pc2grid.arrays import F64
 from pc2grid.config import ReadConfig
 from pc2grid.errors import MapFileError
 from pc2grid.geometry import transform_points
-from pc2grid.io.building_file import building_points, is_building_file, kind_of, load_mesh, sampled
+from pc2grid.io.building_file import (
+    building_points,
+    is_building_file,
+    kind_of,
+    load_mesh,
+    neighbour_distances_m,
+    sampled,
+)
 from pc2grid.io.nav2_map import is_map_file, load_map
 from pc2grid.mapping.cloud_map import check_plausible, drivable_plan, level_cloud, voxel_cloud
 from pc2grid.model import OccupancyGrid
@@ -29,7 +35,6 @@ _VOXEL_M = 0.05  # smallest voxel of a cloud that rays hit
 # random points lie on a square metre, this distance is 0.47 / sqrt(n) and 3 % of such voxels stay empty.
 _SPACINGS = 4.0
 _LATTICE = 1.01  # the points of a lattice are equally far from their neighbours, within 1 %
-_SPACING_SAMPLE = 2000  # points of which the spacing is measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,9 +92,7 @@ def voxel_m(points_m: F64) -> float:
 
     The points of a lattice, such as the centres of the voxels of an octree, keep its spacing.
     """
-    sample = points_m[:: max(len(points_m) // _SPACING_SAMPLE, 1)]
-    spacing = cKDTree(points_m).query(sample, k=2)[0][:, 1]
-    low, median, high = np.quantile(spacing, (0.1, 0.5, 0.9))
+    low, median, high = np.quantile(neighbour_distances_m(points_m), (0.1, 0.5, 0.9))
     lattice = low > 0.0 and high < _LATTICE * low
     return max(float(median) * (1.0 if lattice else _SPACINGS), _VOXEL_M)
 

@@ -42,8 +42,8 @@ def store(target: Place, entries: Iterable[Entry], *, keep: bool, force: bool = 
 def _other_parts(target: Place, names: Collection[str]) -> list[str]:
     """The stored sessions that are other parts of the recordings which these sessions were made from."""
     with open_database(target) as database:
-        asked = [part_name(name, k) for name in names for k in range(_MOST_PARTS)]
-        known = {info.name: info.provenance.digest for info in database.sessions(asked)}
+        parts = [part_name(name, k) for name in names for k in range(_MOST_PARTS)]
+        known = {info.name: info.provenance.digest for info in database.sessions(parts)}
     return [
         part
         for part, digest in known.items()

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64
+from pc2grid.io.messages.types import FARTHEST_M
 from pc2grid.model import POINT_STEPS, Loop, OccupancyGrid, PointMap, Trajectory
 from signature.boundary import boundary_bins
 from signature.freespace import freespace_bins
@@ -27,8 +28,6 @@ MOST_VOXELS = 1 << 21
 """Voxels along an axis; 104 km of 5 cm."""
 MAX_GRAPH_POINTS = 10_000_000
 """Points of the largest junction graph; 260 times that of the map killian, 250 m x 200 m."""
-FARTHEST_M = 1e8
-"""Largest coordinate: two and a half times around the earth."""
 MOST = 1e15
 """Largest area in square metres, path in metres, or time in seconds."""
 _NOT_NEGATIVE, _SHARE = (0.0, MOST), (0.0, 1.0)

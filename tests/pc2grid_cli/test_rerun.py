@@ -159,7 +159,7 @@ def test_a_file_holds_all_that_was_shown(
 def test_the_viewer_opens_above_the_map_with_loops_off_and_a_fixed_axis() -> None:
     from pc2grid_cli.rerun_layout import layout
 
-    world, curve = layout(office(), asked=True, hidden=["query/evidence/2"]).root_container.contents
+    world, curve = layout(office(), has_query=True, hidden=["query/evidence/2"]).root_container.contents
     eye = world.properties["EyeControls3D"]
     position, target, up = (
         values.as_arrow_array().flatten().to_pylist()

@@ -81,11 +81,11 @@ def demo_command(
     terminal.note("3/4 relocalize the depth camera's recording in it")
     truth_map, truth_query = read_tum(lidar.with_suffix(".tum")), read_tum(depth.with_suffix(".tum"))
     with open_database(database) as opened, open_log(depth, config.read) as query:
-        asked: list[Moment] = []
+        moments: list[Moment] = []
 
         def watch(_: RegisteredScan, moment: Moment | None) -> None:
             if moment is not None:
-                asked.append(moment)
+                moments.append(moment)
 
         answer, poses = locate(
             query, opened, config, observer=terminal.observer(), watch=watch, on_the_way=ON_THE_WAY
@@ -98,7 +98,7 @@ def demo_command(
         truth_m = np.array([(p.x, p.y) for p in true_poses])
         draw_answer(picture, opened, answer, poses, truth_m)
         about = about_log(depth, query, answer, scans=len(poses))
-        found = Found(answer=answer, poses=poses, about=about, on_the_way=tuple(asked))
+        found = Found(answer=answer, poses=poses, about=about, on_the_way=tuple(moments))
         write_report(page, opened, found=found, accept=config.relocalize.accept, truth_m=truth_m)
     scans, submaps = counted(len(session.trajectory), "lidar scan"), counted(len(session.submaps), "submap")
     print(f"map: {scans}, {submaps}: {database}")

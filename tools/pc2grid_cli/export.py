@@ -179,10 +179,10 @@ class _Outputs:
             require_target(self.rerun, self.force)
 
 
-def _session_name(database: SubmapDatabase, asked: str | None) -> str:
-    """The session to write. Raises DatabaseError if none is asked for and there is not exactly one."""
-    if asked is not None:
-        return asked
+def _session_name(database: SubmapDatabase, named: str | None) -> str:
+    """The session to write. Raises DatabaseError if none is named and there is not exactly one."""
+    if named is not None:
+        return named
     names = [info.name for info in database.sessions()]
     if len(names) != 1:
         raise DatabaseError(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import yaml
 
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2, quat_xyzw_from_pose
@@ -59,8 +60,6 @@ def read_pose(path: Path) -> MapPose:
 
     Raises ConfigError if the file cannot be read or holds no such message.
     """
-    import yaml
-
     advice = "`pc2grid relocalize --initialpose OUT.json` writes one; --near X Y RADIUS needs none"
     try:
         if path.stat().st_size > _MOST_BYTES:

@@ -61,11 +61,11 @@ class _Outputs:
     def refuse(self, reason: str, rerun: str | None) -> None:
         """Raises ConfigError if there is any."""
         files = ("trajectory", "initialpose", "output", "plot", "report")
-        asked = [f"--{option}" for option in files if getattr(self, option) is not None]
+        given = [f"--{option}" for option in files if getattr(self, option) is not None]
         if rerun is not None:
-            asked.append("--rerun")
-        if asked:
-            raise ConfigError(f"{asked[0]}: {reason}", hint="leave it out, or ask without --check")
+            given.append("--rerun")
+        if given:
+            raise ConfigError(f"{given[0]}: {reason}", hint="leave it out, or ask without --check")
 
 
 def relocalize_command(
@@ -217,8 +217,8 @@ def _check_not_swapped(log: Path, database: str) -> None:
 
 def _check_options_for_maps(log: Path, outputs: _Outputs, rerun: str | None) -> None:
     """Raises ConfigError for options that need a robot, if the query is a map."""
-    asked = {"--trajectory": outputs.trajectory, "--initialpose": outputs.initialpose, "--rerun": rerun}
-    for option, value in asked.items():
+    given = {"--trajectory": outputs.trajectory, "--initialpose": outputs.initialpose, "--rerun": rerun}
+    for option, value in given.items():
         if value is not None and is_drawn_map(log):
             raise ConfigError(
                 f"{option}: there is no robot in a map", hint="--json and --output have its pose"

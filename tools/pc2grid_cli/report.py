@@ -263,7 +263,7 @@ def _answer(found: Found, database: SubmapDatabase, accept: float, truth_m: F64 
             {"path_m": m.path_m, "status": m.status, "confidence": m.confidence}
             for m in (*(found.on_the_way or answer.history[:-1]), answer.history[-1])
         ],
-        "asked": len(found.on_the_way),
+        "moments": len(found.on_the_way),
         "path": runs(found.poses),
         "truth": [] if truth_m is None else _short(np.ravel(truth_m), 2),
     }

@@ -20,11 +20,11 @@ _MAP_SHARE = 5
 """The view of the map is so many times as high as that of the confidence."""
 
 
-def layout(grid: OccupancyGrid | None, *, asked: bool = False, hidden: Collection[str] = ()) -> Any:
+def layout(grid: OccupancyGrid | None, *, has_query: bool = False, hidden: Collection[str] = ()) -> Any:
     """The blueprint of a viewer.
 
     grid : the map that is shown, to look at from above its middle; None if it is still being made.
-    asked : whether a recording is being located, so that there is a confidence to show.
+    has_query : whether a recording is being located, so that there is a confidence to show.
     hidden : entities that are off until they are switched on, beside the loops, the junction graph and the
         grid, which would cover the rest.
     """
@@ -47,7 +47,7 @@ def layout(grid: OccupancyGrid | None, *, asked: bool = False, hidden: Collectio
             position=(x, y, height_m), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)
         ),
     )
-    if not asked:
+    if not has_query:
         return rrb.Blueprint(world, collapse_panels=True)
     curve = rrb.TimeSeriesView(
         origin=f"/{CONFIDENCE}",

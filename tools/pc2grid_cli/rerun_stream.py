@@ -148,7 +148,7 @@ class Search:
             self._show(sessions[0].name)
 
     def watch(self, registered: RegisteredScan, moment: Moment | None) -> None:
-        """The next scan, and the state of the answer if the database was asked after it."""
+        """The next scan, and the state of the answer if the database was searched after it."""
         rr = require_rerun()
         if moment is not None:
             _set_time(self._recording, moment.stamp_ns)
@@ -199,12 +199,12 @@ class Search:
             )
             self._recording.log(f"{entities[-1]}/missed", missed, static=True)
         grid = self._database.grid(session)
-        self._recording.send_blueprint(layout(grid, asked=True, hidden=entities[1:]))
+        self._recording.send_blueprint(layout(grid, has_query=True, hidden=entities[1:]))
 
     def _show(self, session: str) -> None:
         """Show the map of one session at a time, because each has a frame of its own."""
         if session != self._shown:
-            self._recording.send_blueprint(layout(self._database.grid(session), asked=True))
+            self._recording.send_blueprint(layout(self._database.grid(session), has_query=True))
             _log_stored(self._recording, self._database, session)
             self._shown = session
 

@@ -11,7 +11,6 @@ from urllib.parse import urlsplit
 
 from pc2grid import extras
 from pc2grid.errors import OutputError
-from pc2grid.io.atomic import require_writable
 
 VIEWER = "viewer"
 """In place of an address or a file: the viewer of this machine, which is started if necessary."""
@@ -45,6 +44,8 @@ def require_target(target: str, force: bool) -> None:
 
     Raises ConfigError without rerun; OutputError if the file exists, nobody answers, or there is no display.
     """
+    from pc2grid.io.atomic import require_writable
+
     require_rerun()
     url = url_of(target)
     if url is None:

@@ -1,4 +1,4 @@
-"""What a database holds already of the sessions that `convert` is asked for."""
+"""What a database holds already of the sessions that `convert` would make."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def _refuse_others(
 
 
 def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
-    """How a stored session differs from the one that is asked for, as the end of a sentence; empty: not.
+    """How a stored session differs from the one that would be made, as the end of a sentence; empty: not.
 
     The content of the input is compared only if there is one input; of several, each job compares its own.
     """
@@ -90,34 +90,34 @@ def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
 
 def _made_otherwise(was: Provenance, job: Job) -> str:
     """How a stored session differs from a job but for the input, as the end of a sentence; empty: not."""
-    asked = job.made_from(was.digest)
-    if not _label_kept(was.label, asked.label):
+    wanted = job.made_from(was.digest)
+    if not _label_kept(was.label, wanted.label):
         return (
             f"; its session {job.name!r} has the label {str(was.label)!r}, this one would have"
-            f" {str(asked.label)!r} (--building, --floor)"
+            f" {str(wanted.label)!r} (--building, --floor)"
         )
-    if (was.start_s, was.duration_s) != (asked.start_s, asked.duration_s):
+    if (was.start_s, was.duration_s) != (wanted.start_s, wanted.duration_s):
         return f", {job.name!r} made from another part of the recording (--start, --duration)"
-    made_with = [*_other_settings(was.config, job.config), *_other_versions(was.versions, asked.versions)]
+    made_with = [*_other_settings(was.config, job.config), *_other_versions(was.versions, wanted.versions)]
     return f", {job.name!r} made with {made_with[0]}" if made_with else ""
 
 
-def _other_settings(was: Config, asked: Config) -> list[str]:
+def _other_settings(was: Config, wanted: Config) -> list[str]:
     """The settings that differ."""
     return [
         f"{section}.{key} = {old!r}, not {value!r}"
-        for section, settings in asked
+        for section, settings in wanted
         for key, value in settings
         if (old := getattr(getattr(was, section), key)) != value
     ]
 
 
-def _other_versions(was: Mapping[str, str], asked: Mapping[str, str]) -> list[str]:
+def _other_versions(was: Mapping[str, str], wanted: Mapping[str, str]) -> list[str]:
     """The libraries that differ, in alphabetical order."""
     return [
-        f"{library} {was.get(library)}, not {asked.get(library)}"
-        for library in sorted({*was, *asked})
-        if was.get(library) != asked.get(library)
+        f"{library} {was.get(library)}, not {wanted.get(library)}"
+        for library in sorted({*was, *wanted})
+        if was.get(library) != wanted.get(library)
     ]
 
 
@@ -129,11 +129,11 @@ def _changed(was: Provenance, job: Job) -> bool:
         return False  # the input cannot be read; with --force its error is shown
 
 
-def _label_kept(was: Label, asked: Label) -> bool:
-    """Whether a stored session, the first of its recording, has the label that is asked for.
+def _label_kept(was: Label, wanted: Label) -> bool:
+    """Whether a stored session, the first of its recording, has the label of the options.
 
     The floors of a recording may have got names of their own; several names may be given, see `on_floors`.
     """
-    if was.told_apart or (asked.floor is not None and was.floor == asked.floor.split(",")[0].strip()):
-        return was.building == asked.building
-    return was == asked
+    if was.told_apart or (wanted.floor is not None and was.floor == wanted.floor.split(",")[0].strip()):
+        return was.building == wanted.building
+    return was == wanted

@@ -121,7 +121,7 @@ class Progress:
     _base: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def see(self, registered: RegisteredScan, moment: Moment | None) -> None:
-        """The next scan, and the state of the answer if the database was asked after it."""
+        """The next scan, and the state of the answer if the database was searched after it."""
         self.add(registered)
         if moment is not None:
             self.tell(

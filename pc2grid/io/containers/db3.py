@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
+import apsw
+
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogError, LogTruncated, NotALog
 from pc2grid.io.containers.decompress import plain_message
@@ -143,8 +145,6 @@ class Db3Source:
     @contextlib.contextmanager
     def _explained(self) -> Iterator[None]:
         """Turn what the body raises into a LogError."""
-        import apsw
-
         try:
             yield
         except (LogError, MemoryError):
@@ -165,8 +165,6 @@ class Db3Source:
 
 def _connect(path: Path, most_bytes: int, unfinished: bool) -> apsw.Connection:
     """A connection that changes no file."""
-    import apsw
-
     place = f"file:{quote(os.fsencode(path.absolute()))}"
     if unfinished:
         found = apsw.Connection(f"{place}?mode=rw", apsw.SQLITE_OPEN_READWRITE | apsw.SQLITE_OPEN_URI)

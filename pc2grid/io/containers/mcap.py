@@ -231,7 +231,7 @@ class McapSource:
 
     def _loose_messages(self, wanted: frozenset[int], times: _TimeRange) -> Iterator[RawMessage]:
         """Messages outside of chunks, in file order; only the data section's checksum protects them."""
-        spans = self._index.loose
+        spans = self._index.outside_chunks
         if spans and not self._loose_checked:
             self._check_data_section()
         for start, end in spans:
@@ -263,7 +263,7 @@ class McapSource:
                 return
         if not self._recover:
             raise Damage(index.data_end, "the checksum (CRC) of the data section is wrong")
-        doubtful = sum(end - start for start, end in index.loose)
+        doubtful = sum(end - start for start, end in index.outside_chunks)
         self.tally.bytes_lost += doubtful
         self.tally.warn(f"{doubtful} bytes of messages fail their checksum and may be wrong")
 

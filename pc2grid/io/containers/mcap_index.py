@@ -23,14 +23,14 @@ from pc2grid.io.containers.mcap_records import Damage, Definitions
 class McapIndex:
     """What is where in an MCAP file.
 
-    chunks : whole chunks, by offset. loose : byte spans that hold messages outside of chunks.
+    chunks : whole chunks, by offset. outside_chunks : byte spans that hold messages outside of chunks.
     counts : messages per channel id, complete if `counted`. start_ns, end_ns : first and last log time.
     data_end, data_crc : end and checksum of the data section (0: none).
     """
 
     definitions: Definitions = field(default_factory=Definitions)
     chunks: list[ChunkIndex] = field(default_factory=list)
-    loose: list[tuple[int, int]] = field(default_factory=list)
+    outside_chunks: list[tuple[int, int]] = field(default_factory=list)
     counts: dict[int, int] = field(default_factory=dict)
     counted: bool = True
     start_ns: int = 0
@@ -64,12 +64,12 @@ def read_index(stream: BinaryIO, size: int, limits: rec.Limits) -> McapIndex | s
     for chunk in chunks:
         _check(chunk, summary, summary_at)
     chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
-    loose, data_end, data_crc = _between_chunks(stream, chunks, summary_at, limits)
+    outside_chunks, data_end, data_crc = _between_chunks(stream, chunks, summary_at, limits)
     counts = statistics.channel_message_counts
     return McapIndex(
         definitions=definitions,
         chunks=chunks,
-        loose=loose,
+        outside_chunks=outside_chunks,
         counts=counts,
         counted=sum(counts.values()) == statistics.message_count,
         start_ns=statistics.message_start_time,
@@ -132,7 +132,7 @@ def _between_chunks(
     if not chunks:  # everything is one span; following its records would mean to read all of them
         end_of_data, crc = _data_end(stream, data_end)
         return [(len(rec.MAGIC), end_of_data)], end_of_data, crc
-    loose: list[tuple[int, int]] = []
+    outside_chunks: list[tuple[int, int]] = []
     at, end_of_data, crc = len(rec.MAGIC), data_end, 0
     for stop, behind in [*((c.chunk_start_offset, _behind(c)) for c in chunks), (data_end, data_end)]:
         if stop < at:
@@ -140,10 +140,10 @@ def _between_chunks(
         for record in rec.read_records(stream, at, stop, limits, wanted=frozenset({Opcode.DATA_END})):
             if record.opcode == Opcode.DATA_END:
                 end_of_data, crc = record.offset, rec.parsed(DataEnd.read, record).data_section_crc
-            elif record.opcode == Opcode.MESSAGE and (not loose or loose[-1] != (at, stop)):
-                loose.append((at, stop))
+            elif record.opcode == Opcode.MESSAGE and (not outside_chunks or outside_chunks[-1] != (at, stop)):
+                outside_chunks.append((at, stop))
         at = behind
-    return loose, end_of_data, crc
+    return outside_chunks, end_of_data, crc
 
 
 def _data_end(stream: BinaryIO, summary_at: int) -> tuple[int, int]:

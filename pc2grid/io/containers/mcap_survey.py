@@ -111,7 +111,7 @@ class _Surveyor:
                 found.warnings.append(f"{damage.what}, at byte {damage.offset}: {lost} bytes were skipped")
                 found.bytes_lost += lost
                 found.holes |= at < self._size
-        found.index.loose = _joined(found.index.loose)
+        found.index.outside_chunks = _joined(found.index.outside_chunks)
 
     def _walk(self, at: int) -> int:
         """Read records from `at` on until the end of the file; returns where it stopped."""
@@ -150,7 +150,7 @@ class _Surveyor:
                 index.definitions.take(rec.parsed(Channel.read, record), record.offset)
             case Opcode.MESSAGE:
                 self._count([rec.parsed_message(record)], record.offset)
-                index.loose.append((record.offset, record.offset + record.size))
+                index.outside_chunks.append((record.offset, record.offset + record.size))
             case Opcode.STATISTICS:
                 self._compare(record)
             case Opcode.DATA_END:

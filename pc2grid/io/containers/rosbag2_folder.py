@@ -8,6 +8,8 @@ import re
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
+import yaml
+
 from pc2grid.errors import LogCorrupt, LogNotFound, NotALog
 from pc2grid.io.containers.cloud_folder import natural
 from pc2grid.io.containers.split_recording import SplitSource
@@ -121,8 +123,6 @@ def listed_files(metadata: Path) -> list[str]:
 
     Raises LogCorrupt if it cannot be read.
     """
-    import yaml
-
     if metadata.stat().st_size > _MAX_YAML_BYTES:
         raise LogCorrupt(f"{metadata}: larger than {_MAX_YAML_BYTES} bytes", hint=_REINDEX)
     content = metadata.read_bytes()

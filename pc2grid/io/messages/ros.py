@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.serde import SerdeError
+from rosbags.typesys.base import TypesysError
 
 from pc2grid.errors import PointCloudError, UnsupportedSchema
 from pc2grid.io.message_source import TopicInfo
@@ -228,9 +230,6 @@ def decoder_for(channel: TopicInfo) -> Callable[[Bytes], Any]:
 
 def _by_rosbags(channel: TopicInfo, ros1: bool, text: str) -> Callable[[Bytes], Any]:
     """The decoder of a message by its definition in the log, or that of ROS if the text is empty."""
-    from rosbags.serde import SerdeError
-    from rosbags.typesys.base import TypesysError
-
     known = channel.type if text else _name_of(channel)
     store = ros_definitions.store_of(known, ros1, channel.schema_encoding, text)
     name, convert = known.replace("/", "/msg/"), _CONVERTERS[channel.type]

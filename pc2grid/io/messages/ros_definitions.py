@@ -16,6 +16,10 @@ import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import get_types_from_idl, get_types_from_msg
+from rosbags.typesys.store import Typestore
+
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import Typesdict
     from rosbags.typesys.store import Typestore
@@ -183,8 +187,6 @@ def store_of(type_name: str, ros1: bool, encoding: str = "", text: str = "") -> 
 
     encoding, text : of the schema in the log, of which `layout_of` must be known; empty: as ROS defines it.
     """
-    from rosbags.typesys.store import Typestore
-
     store = Typestore(max_sequence_length=_MOST_ITEMS)
     store.register(_parsed(short_name(type_name), encoding, text) if text else _of_ros(ros1))
     return store
@@ -203,9 +205,6 @@ def _parsed(name: str, encoding: str, text: str) -> Typesdict:
 
     Raises ValueError.
     """
-    from rosbags.interfaces import Nodetype
-    from rosbags.typesys import get_types_from_idl, get_types_from_msg
-
     if len(text) > _MOST_CHARACTERS:
         raise ValueError(f"{name}: a definition of {len(text)} characters")
     try:
@@ -277,8 +276,6 @@ def _flatten(top: str, types: Typesdict) -> Layout:
 
 def _inside(path: str, fields: list[tuple[str, Any]]) -> Iterator[tuple[Any, str]]:
     """The fields of a type with their paths; of an array or sequence what it holds. Raises ValueError."""
-    from rosbags.interfaces import Nodetype
-
     for name, (node, content) in fields:
         inner, array = (node, content), ""
         if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
@@ -291,6 +288,4 @@ def _inside(path: str, fields: list[tuple[str, Any]]) -> Iterator[tuple[Any, str
 
 def _named() -> Any:
     """What rosbags calls a field that is a message."""
-    from rosbags.interfaces import Nodetype
-
     return Nodetype.NAME

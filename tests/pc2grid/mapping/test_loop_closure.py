@@ -18,7 +18,7 @@ from pc2grid.mapping.loop_closure import LoopCloser
 from pc2grid.mapping.loop_parameters import LoopParameters
 from pc2grid.mapping.place_recognition import Recognition, Stretch
 from pc2grid.mapping.pose_graph import Edge, optimise
-from pc2grid.mapping.settled import SettledKeyframes, spread
+from pc2grid.mapping.settled import SettledKeyframes, interpolate_corrections
 from pc2grid.odometry.point_to_line import Match
 
 Wall = tuple[tuple[float, float], tuple[float, float]]
@@ -97,8 +97,9 @@ def test_no_edges_nothing_moves() -> None:
 def test_corrections_pass_smoothly_between_keyframes() -> None:
     tracked = np.column_stack((np.arange(5.0), np.zeros(5), np.zeros(5)))
     corrected = np.array([[0.0, 0.0, 0.0], [4.0, 0.4, 0.0]])
-    assert spread(tracked, [0, 4], corrected)[:, 1] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
-    assert spread(tracked, [0, 2], np.array([[0, 0, 0], [2, 1.0, 0]]))[4] == pytest.approx((4, 1, 0))
+    assert interpolate_corrections(tracked, [0, 4], corrected)[:, 1] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
+    beyond = interpolate_corrections(tracked, [0, 2], np.array([[0, 0, 0], [2, 1.0, 0]]))
+    assert beyond[4] == pytest.approx((4, 1, 0))
 
 
 def scan_of(pose: SE2, walls: list[Wall]) -> PlanarScan:
@@ -133,7 +134,7 @@ def closed(
         keyframes.append(Keyframe(k, planar_scan, pose, restart=k == restart))
         closer.extend(keyframes[k])
     found = closer.finish()
-    return spread(array(poses), found.scans, found.poses), found
+    return interpolate_corrections(array(poses), found.scans, found.poses), found
 
 
 BLOCK: list[Wall] = [

@@ -112,7 +112,11 @@ def test_each_sensor_is_followed(sensor, limit_m):
     assert len(registered) == len(pairs)
     assert errors(pairs, [r.T_session_base for r in registered]).max() < limit_m
     assert sum(r.health is Health.LOST for r in registered) == 0
-    assert np.array_equal(registered[0].T_session_base, np.eye(4)) or sensor != "laser"
+    first = registered[0].T_session_base  # the session begins here; the others level it by the floor they see
+    assert first[:2, 3] == pytest.approx((0.0, 0.0), abs=1e-9)
+    # Levelling turns it about a horizontal axis: of the tilt, 1e-3, the heading changes in second order.
+    assert SE2.from_matrix(first).yaw == pytest.approx(0.0, abs=1e-5)
+    assert np.array_equal(first, np.eye(4)) == (sensor == "laser")
 
 
 def test_a_camera_keeps_its_heading_where_wheels_turn_a_tenth_too_far():
@@ -174,7 +178,10 @@ def test_odometry_with_the_wrong_sign_is_overruled(laser):
 def test_laser_without_odometry_is_followed_or_reported_lost(laser):
     registered = follow(blind(scan) for scan, _ in laser)
     lost = [r.health is Health.LOST for r in registered]
-    assert any(lost) or errors(laser, [r.T_session_base for r in registered]).max() < 0.05
+    followed = [*lost, True].index(True)
+    # Until it is said to be lost, a pose is off by less than a cell of the map.
+    assert followed > 0.5 * len(lost)  # all of them today
+    assert errors(laser, [r.T_session_base for r in registered[:followed]]).max() < 0.05
 
 
 def test_odometry_bridges_a_scan_without_any_at_the_edge_of_a_gap(laser):

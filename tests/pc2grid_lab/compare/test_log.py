@@ -20,7 +20,7 @@ from tests.helpers.recordings import STEP, T0, ros, write_mcap
 from tests.helpers.trials import trial
 
 
-class Asked:
+class RecordedReplay:
     """In place of `Replay`: keeps what it is asked, and knows no truth."""
 
     spans: ClassVar[list[TimeSpan]] = []
@@ -41,8 +41,8 @@ class Asked:
 @pytest.fixture
 def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A log of 17.5 s, with its truth."""
-    monkeypatch.setattr(compare_log, "Replay", Asked)
-    Asked.spans = []
+    monkeypatch.setattr(compare_log, "Replay", RecordedReplay)
+    RecordedReplay.spans = []
     (tmp_path / "a.tum").write_text("1 0 0 0 0 0 0 1\n")
     (tmp_path / "a.relations").write_text("5 6 1 0 0 0 0 0\n")
     return write_mcap(
@@ -61,7 +61,7 @@ def test_the_default_fits_the_length_of_the_log(log: Path) -> None:
     document = json.loads(done.stdout)
     assert document["map_s"] == pytest.approx([0.0, 8.75])
     assert document["length_s"] == pytest.approx(4.375)
-    assert [(s.start_s, s.duration_s) for s in Asked.spans] == [
+    assert [(s.start_s, s.duration_s) for s in RecordedReplay.spans] == [
         pytest.approx(pair) for pair in ((0.0, 8.75), (8.75, 4.375), (13.125, 4.375))
     ]
     assert "map: 0.0..8.8 s; queries last 4.4 s" in done.stderr
@@ -73,8 +73,8 @@ def test_each_row_says_what_it_counts_as_and_the_sums_agree(
 ) -> None:
     """A row that is 5 cm off may lie outside of the map, and is not among those that had a right answer."""
     monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.setattr(Asked, "up", "-y")
-    Asked.trials = [
+    monkeypatch.setattr(RecordedReplay, "up", "-y")
+    RecordedReplay.trials = [
         trial(seed=1),
         trial(seed=2, right=False),
         trial(seed=3, status="ambiguous"),
@@ -108,7 +108,7 @@ def test_a_map_that_leaves_nothing_to_locate_is_refused_before_any_work(log: Pat
     assert isinstance(error, ConfigError)
     assert error.message == "--map 0..600: nothing is left to locate, the log lasts 17.5 s"
     assert error.hint == "for example --map 0..9"
-    assert Asked.spans == []
+    assert RecordedReplay.spans == []
 
 
 def test_relations_are_not_taken_for_poses(log: Path) -> None:

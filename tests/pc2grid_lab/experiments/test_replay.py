@@ -20,7 +20,7 @@ from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.compare import log as compare_log
 from pc2grid_lab.experiments.metrics import QueryCounts
-from pc2grid_lab.experiments.replay import MappedPart, Replay, spread, with_z_up
+from pc2grid_lab.experiments.replay import MappedPart, Replay, evenly_spaced, with_z_up
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from signature.config import Config
 from tests.helpers.simulated_drives import office
@@ -28,10 +28,10 @@ from tests.helpers.trials import trial
 
 
 def test_parts_are_spread_over_the_time_left() -> None:
-    spans = spread(600.0, 1060.0, 10, 40.0)
+    spans = evenly_spaced(600.0, 1060.0, 10, 40.0)
     assert [span.start_s for span in spans[:2]] == pytest.approx([600.0, 600.0 + 420.0 / 9])
     assert {span.duration_s for span in spans} == {40.0} and spans[-1].start_s == pytest.approx(1020.0)
-    assert len({span.start_s for span in spread(100.0, 110.0, 3, 40.0)}) == 1
+    assert len({span.start_s for span in evenly_spaced(100.0, 110.0, 3, 40.0)}) == 1
 
 
 def test_queries_outside_the_map_are_counted_separately() -> None:

@@ -30,7 +30,7 @@ from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.experiments.selection import (
     TRAVELS_M,
     VOTED,
-    Asked,
+    PlacedQuery,
     queries_of,
     recall_at_scale,
     tally_at_scale,
@@ -82,7 +82,7 @@ def floors_of(folder: Path) -> Iterator[PlaceBlock]:
             yield PlaceBlock(seen, stored["center_m"], stored["session"])
 
 
-def stretches_of(folder: Path) -> Iterator[Asked]:
+def stretches_of(folder: Path) -> Iterator[PlacedQuery]:
     """The stretches of the log after each of `TRAVELS_M`, in the frame of the scan."""
     T_floor_log = SE2(*json.loads((folder / "real.json").read_text())["T_floor_log"])
     for number, path in enumerate(sorted((folder / "sessions").glob("*.own.npz"))):

@@ -23,6 +23,7 @@ from pc2grid.pipeline import follow
 from pc2grid.simulate import SimulationConfig, iter_session, office_floorplan, simulate_session
 from pc2grid_lab.bench import fixtures
 from pc2grid_lab.bench.measure import Row
+from pc2grid_lab.experiments.plan_drives import MAP_SEED
 from pc2grid_lab.experiments.sensor_matrix import query_start
 from signature.config import Config
 from signature.database import open_database
@@ -34,7 +35,6 @@ from signature.sessions import add_sessions, build_session
 VOXEL_M = 0.05
 _NEAR_M = 4.0
 """The frame of the map at a place is that of its path so far around it."""
-_MAP_SEED = 1000
 _HALL_MAP = 22  # the scans of the hall, of 36, that its map is made of
 _HALL_RANGE_M = 20.0
 
@@ -58,7 +58,7 @@ def poses(folder: Path, quick: bool) -> Iterator[Row]:
     """A simulated lidar and a depth camera, located in a lidar's map with points."""
     config = _with_points()
     plan = office_floorplan(0)
-    mapping = _simulation(20.0 if quick else 80.0, _MAP_SEED)
+    mapping = _simulation(20.0 if quick else 80.0, MAP_SEED)
     simulate_session(folder / "map.mcap", sensor="lidar", grid=plan, config=mapping)
     made = build_session(folder / "map.mcap", "office", config)
     add_sessions(folder / "office.submaps", [made], config, keep=False)

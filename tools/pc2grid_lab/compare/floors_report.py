@@ -23,8 +23,9 @@ from pc2grid_lab.experiments.floors import (
     FloorTask,
     share_of,
 )
+from pc2grid_lab.experiments.trial import JUDGEMENT
 
-Asked = tuple[FloorTask, FloorResult]
+House = tuple[FloorTask, FloorResult]
 
 _LIGHT_BLUE = "#A6CBE6"
 _COLOURS: dict[FloorStatus, str] = {
@@ -42,10 +43,6 @@ _SHOWN: dict[FloorStatus, str] = {
 _EXPLAINED: dict[FloorStatus, str] = {**_SHOWN, "ambiguous": "ambiguous: several places fit"}
 
 
-_MAPPED = 0.5
-"""A query is in the map if the map of its floor shows so much of what it saw of walls. By hand."""
-
-
 def mapped(result: FloorResult, grids: Mapping[str, OccupancyGrid]) -> FloorResult:
     """The result without the queries from where the map of their floor shows nothing, or little.
 
@@ -60,12 +57,12 @@ def mapped(result: FloorResult, grids: Mapping[str, OccupancyGrid]) -> FloorResu
             inside = np.all((cells >= 0) & (cells < grid.cells.shape), axis=1)
             known = grid.cells[tuple(cells[inside].T)] != UNKNOWN
             shares.append(known.sum() / max(len(cells), 1))
-        return max(shares, default=0.0) >= _MAPPED
+        return max(shares, default=0.0) >= JUDGEMENT.mapped
 
     return replace(result, answers=tuple(filter(is_in_the_map, result.answers)))
 
 
-def floors_table(houses: Sequence[Asked], in_the_map: Sequence[Asked]) -> Table:
+def floors_table(houses: Sequence[House], in_the_map: Sequence[House]) -> Table:
     """A row for each way and kind of furniture. in_the_map : the same houses, as `mapped` has them."""
     counts = ("houses", "told apart", "named", *(_SHOWN[status] for status in STATUSES), "misplaced")
     made = table(
@@ -87,12 +84,12 @@ def _row(results: Sequence[FloorResult]) -> list[str]:
     named = (sum(result.told_apart for result in results), sum(result.named for result in results))
     counts = [sum(result.count(status) for result in results) for status in STATUSES]
     misplaced = sum(result.misplaced for result in results)
-    wrong, asked = counts[STATUSES.index("wrong")], sum(len(result.answers) for result in results)
-    bound = binomtest(wrong, asked).proportion_ci(method="wilson").high
+    wrong, queries = counts[STATUSES.index("wrong")], sum(len(result.answers) for result in results)
+    bound = binomtest(wrong, queries).proportion_ci(method="wilson").high
     return [*map(str, (len(results), *named, *counts, misplaced)), f"{bound:.1%}"]
 
 
-def _share(there: Sequence[Asked]) -> tuple[str, str]:
+def _share(there: Sequence[House]) -> tuple[str, str]:
     """Queries in the map, and the share of them that is right or ambiguous with its interval."""
     count = sum(len(result.answers) for _, result in there)
     share = "{:.3f} [{:.3f}, {:.3f}]".format(*share_of(there, ("right", "ambiguous"))) if count else ""
@@ -103,13 +100,13 @@ def _furniture(alike: bool) -> str:
     return "alike" if alike else "differs"
 
 
-def draw(path: Path, houses: Sequence[Asked], grids: Mapping[str, OccupancyGrid], example: Asked) -> None:
+def draw(path: Path, houses: Sequence[House], grids: Mapping[str, OccupancyGrid], example: House) -> None:
     """The answers in each house, a panel for each way, and below them one query on the map of each floor.
 
     example : the house of that query. grids : of the sessions of its database.
     """
 
-    of_way: dict[str, list[Asked]] = {}
+    of_way: dict[str, list[House]] = {}
     for house in houses:
         of_way.setdefault(house[0].way, []).append(house)
     task, result = example
@@ -129,7 +126,7 @@ def draw(path: Path, houses: Sequence[Asked], grids: Mapping[str, OccupancyGrid]
         )
 
 
-def example_of(houses: Sequence[Asked]) -> Asked:
+def example_of(houses: Sequence[House]) -> House:
     """The house that says most: the first with a wrong answer, else the first with an ambiguous one, else
     the first."""
     for status in _BY_INTEREST:
@@ -147,7 +144,7 @@ def example_answer(result: FloorResult) -> FloorAnswer:
 _BY_INTEREST: tuple[FloorStatus, ...] = ("wrong", "ambiguous", "right", "not_found")
 
 
-def _draw_bars(figure: Any, of_way: Mapping[Any, Sequence[Asked]]) -> None:
+def _draw_bars(figure: Any, of_way: Mapping[Any, Sequence[House]]) -> None:
     """A panel for each way, and above them how many answers name a wrong floor."""
     panels = figure.subplots(1, len(of_way), squeeze=False)[0]
     for ax, (way, houses) in zip(panels, of_way.items(), strict=True):
@@ -155,15 +152,15 @@ def _draw_bars(figure: Any, of_way: Mapping[Any, Sequence[Asked]]) -> None:
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     results = [result for houses in of_way.values() for _, result in houses]
     wrong = sum(result.count("wrong") for result in results)
-    asked = sum(result.count(status) for result in results for status in _COLOURS)
+    queries = sum(result.count(status) for result in results for status in _COLOURS)
     figure.suptitle(
-        f"floors with one plan: {wrong} of {asked} answers name a wrong floor"
+        f"floors with one plan: {wrong} of {queries} answers name a wrong floor"
         " (houses with furniture alike (a) or different (d) on each floor; x: floors not told apart)",
         fontsize=10,
     )
 
 
-def _draw_answers(ax: Any, way: str, houses: Sequence[Asked]) -> None:
+def _draw_answers(ax: Any, way: str, houses: Sequence[House]) -> None:
     """A bar for each house."""
     names = [f"{task.seed}{'a' if task.alike else 'd'}" for task, _ in houses]
     rows, before = range(len(houses)), [0] * len(houses)

@@ -17,7 +17,7 @@ from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.tables import show, table
 from pc2grid_lab.experiments.metrics import QueryCounts
-from pc2grid_lab.experiments.replay import MappedPart, Replay, spread
+from pc2grid_lab.experiments.replay import MappedPart, Replay, evenly_spaced
 from pc2grid_lab.experiments.stored import in_processes
 from pc2grid_lab.experiments.trial import JUDGEMENT, Trial
 
@@ -62,11 +62,11 @@ def compare_log_command(
     Example: pc2grid compare log fr079.mcap --truth fr079_corrected.tum --map 0..600 --queries 10
     """
     settings = options.make_config(config, set_, topic=topic, odometry=odometry)
-    asked = None if map_ is None else _seconds(map_)
+    wanted = None if map_ is None else _seconds(map_)
     _refuse_relations(truth)
     terminal = console.of(context)
     with open_log(log, settings.read) as opened:
-        mapped, length_s, end_s = _spans(opened, asked, length)
+        mapped, length_s, end_s = _spans(opened, wanted, length)
         to_s = mapped.start_s + (mapped.duration_s or 0.0)
         terminal.note(f"map: {mapped.start_s:.1f}..{to_s:.1f} s; queries last {length_s:.1f} s")
         replay = Replay(opened, read_tum(truth), settings, of_base=of_base)
@@ -74,7 +74,7 @@ def compare_log_command(
             console.warn(f"{truth.name}: {replay.up} points up in it; its poses are turned so that z does")
         part = _mapped(replay, mapped, terminal)
         with terminal.progress("locate") as advance:
-            spans = [(span, part) for span in spread(to_s, end_s, queries, length_s)]
+            spans = [(span, part) for span in evenly_spaced(to_s, end_s, queries, length_s)]
             trials = in_processes(replay.locate, spans, jobs=1, advance=advance)
     judged = [trial for trial in trials if trial is not None]
     about = {"log": log.name, "map_s": [mapped.start_s, to_s], "length_s": length_s}
@@ -96,11 +96,11 @@ def _document(trials: list[Trial], unknown: int, about: dict[str, Any]) -> dict[
 
 
 def _spans(
-    log: Log, asked: tuple[float, float] | None, length_s: float | None
+    log: Log, wanted: tuple[float, float] | None, length_s: float | None
 ) -> tuple[TimeSpan, float, float]:
     """What becomes the map, the length of a query, and the end of the log. Raises ConfigError."""
     end_s = (log.info.end_ns - log.info.start_ns) * 1e-9
-    from_s, to_s = asked or (0.0, min(_MAP_S, end_s / 2))
+    from_s, to_s = wanted or (0.0, min(_MAP_S, end_s / 2))
     if to_s >= end_s:
         raise ConfigError(
             f"--map {from_s:g}..{to_s:g}: nothing is left to locate, the log lasts {end_s:.1f} s",

@@ -81,8 +81,8 @@ def compare_paper_command(
     cells, map_paths = out / "cells", _maps(maps)
     make_folder(cells)
     choices = (ABLATION if ablation else ()) + (OPEN_CHOICES if open_choices else ())
-    asked: dict[str, Any] = {"methods": chosen, "offsets_m": offsets_m, "queries": queries, "seed": seed}
-    tasks = list(paper_tasks(map_paths, **asked, choices=choices, speckle_sigma_m=speckles))
+    setting: dict[str, Any] = {"methods": chosen, "offsets_m": offsets_m, "queries": queries, "seed": seed}
+    tasks = list(paper_tasks(map_paths, **setting, choices=choices, speckle_sigma_m=speckles))
     run_tasks(tasks, cells, jobs, of(context))
     results = _results(tasks, cells)
     document = _write(results, out, queries, seed)

@@ -1,4 +1,4 @@
-"""`pc2grid compare peers`: other programs that locate a robot, asked with the same maps and queries."""
+"""`pc2grid compare peers`: other programs that locate a robot, with the same maps and queries."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def compare_peers_command(
     """Other programs and pc2grid locate later parts of real recordings in maps of earlier parts.
 
     MRPT's particle filter gets recordings of a laser; KISS-Matcher, MapClosures and Open3D's FPFH + RANSAC
-    those of a lidar. Each query is also asked in another building, where every answer is wrong.
+    those of a lidar. Each query is also located in another building, where every answer is wrong.
 
     Example: pc2grid compare peers intel.mcap fr079.mcap hall.mcap --mapped intel=900 --mapped fr079=600
     """
@@ -70,8 +70,8 @@ def compare_peers_command(
         prepare = [(r, out / "sites", queries, travel, seconds.get(r.stem), of_base) for r in recordings]
         sites = in_processes(_site, prepare, jobs=1, advance=advance)
     with terminal.progress("locate") as advance:
-        asking = [(task, where, out / "trials") for task in tasks(sites, where)]
-        found = in_processes(run, asking, jobs=1, advance=advance)
+        waiting = [(task, where, out / "trials") for task in tasks(sites, where)]
+        found = in_processes(run, waiting, jobs=1, advance=advance)
     trials = list(itertools.chain.from_iterable(found))
     document = {
         "schema_version": 1,
@@ -117,12 +117,12 @@ def _site(
     if not recording.exists():
         raise LogNotFound(f"{recording}: no such file")
     config = Config()
-    asked: dict[str, Any] = {"queries": queries, "travel_m": travel_m}
+    setting: dict[str, Any] = {"queries": queries, "travel_m": travel_m}
     known: dict[str, Any] = {"mapped_s": mapped_s, "of_base": of_base}
-    made = folder / site_name(recording, config, **asked, **known)
+    made = folder / site_name(recording, config, **setting, **known)
     if is_building_file(recording):
-        return simulated_site(recording, made, config, **asked)
-    return recorded_site(recording, made, config, **asked, **known)
+        return simulated_site(recording, made, config, **setting)
+    return recorded_site(recording, made, config, **setting, **known)
 
 
 def _environment(folder: Path | None, install: bool) -> PeerEnvironment:

@@ -170,16 +170,16 @@ def _compare(setting: Setting, terminal: Console, jobs: int | None, as_json: boo
     out = setting.out
     for folder in ("maps", "sessions"):
         make_folder(out / folder)
-    asking = _asking(setting)
+    queries = _queries(setting)
     for what, function, tasks in (
         # The camera takes longest to map and the log's parts wait for its poses, so these come first.
         ("map", _make_map, [(setting, name) for name in ("depth", _LOG, "lidar", _SCAN)]),
-        ("drive", _register, [(setting, *task) for task in asking]),
-        ("locate", _locate, [(setting, *task) for task in asking]),
+        ("drive", _register, [(setting, *task) for task in queries]),
+        ("locate", _locate, [(setting, *task) for task in queries]),
     ):
         with terminal.progress(what) as advance:
-            asked = in_processes(function, tasks, jobs=jobs, advance=advance)
-    found: list[RealQuery] = list(filter(None, asked))
+            answered = in_processes(function, tasks, jobs=jobs, advance=advance)
+    found: list[RealQuery] = list(filter(None, answered))
     maps = {name: _map(setting, name) for name in _MAPS}
     agreement = Agreement.of(found, maps)
     trials = judge_all(found, maps, agreement)
@@ -201,13 +201,13 @@ def _refuse(setting: Setting) -> None:
         raise LogNotFound(f"{setting.log}: no such file")
 
 
-def _asking(setting: Setting) -> list[tuple[str, int]]:
+def _queries(setting: Setting) -> list[tuple[str, int]]:
     """Sensor and seed of each query; of the laser, the first second of its window of the log."""
     with open_log(setting.log, Config().read) as opened:
         length_s = (opened.info.end_ns - opened.info.start_ns) * 1e-9
     windows = int(max(length_s - setting.window_s, 0.0) // setting.every_s) + 1
-    asking = [("laser", round(k * setting.every_s)) for k in range(windows)]
-    return asking + [(sensor, setting.seed + k) for k in range(setting.queries) for sensor in _DRIVEN]
+    queries = [("laser", round(k * setting.every_s)) for k in range(windows)]
+    return queries + [(sensor, setting.seed + k) for k in range(setting.queries) for sensor in _DRIVEN]
 
 
 def _document(setting: Setting, agreement: Agreement, trials: Sequence[Trial]) -> dict[str, Any]:

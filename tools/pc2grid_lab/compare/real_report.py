@@ -96,11 +96,11 @@ def draw(
         for ax, name in zip(axes, _MAPS, strict=True):
             ax.plot(*walls_m[name].T, ".", color="0.35", ms=1.0, mew=0)
             for query in queries:
-                asked = "laser-earlier" if name == query.sensor == "laser" else name
-                if asked in query.answers:
-                    T_floor_map = frames[asked] @ maps[asked].T_plan_map
+                of_map = "laser-earlier" if name == query.sensor == "laser" else name
+                if of_map in query.answers:
+                    T_floor_map = frames[of_map] @ maps[of_map].T_plan_map
                     is_first = (name, query.sensor, query.seed) in first
-                    _draw_answer(ax, query, query.answers[asked], T_floor_map, T_floor_log, is_first)
+                    _draw_answer(ax, query, query.answers[of_map], T_floor_map, T_floor_log, is_first)
             ax.set_title(f"{_TITLES[name]}; located and right: {_counts(name, cells)}", fontsize=9)
             ax.set(xlim=(x0 - 0.5, x1 + 0.5), ylim=(y0 - 0.5, y1 + 0.5), aspect="equal")
             ax.tick_params(labelsize=7)

@@ -33,7 +33,7 @@ def compare_sensors_command(
     context: typer.Context,
     plans: Annotated[
         list[Path],
-        typer.Argument(help="Floor plans: MAP.yaml files; of several, each query is also asked in another."),
+        typer.Argument(help="Floor plans: MAP.yaml files; of several, each query is also sought in another."),
     ],
     out: options.OutputFolder = Path("sensor-matrix"),
     queries: options.QuerySessions = 10,
@@ -83,11 +83,11 @@ def _asked(
     drives: PlanDrives, plans: Sequence[Path], seeds: Sequence[int], terminal: Console, jobs: int | None
 ) -> list[Trial]:
     """The trials of all query sessions, after the maps are made and the sessions driven."""
-    asking = [(drives, plan, sensor, seed) for seed in seeds for plan in plans for sensor in SENSORS]
+    sessions = [(drives, plan, sensor, seed) for seed in seeds for plan in plans for sensor in SENSORS]
     for what, function, tasks in (
         ("map", _map, [(drives, plan, sensor) for plan in plans for sensor in SENSORS]),
-        ("drive", _drive, asking),
-        ("locate", _locate, [(*task, plans) for task in asking]),
+        ("drive", _drive, sessions),
+        ("locate", _locate, [(*task, plans) for task in sessions]),
     ):
         with terminal.progress(what) as advance:
             found = in_processes(function, tasks, jobs=jobs, advance=advance)
@@ -203,8 +203,8 @@ def _locate(
     file = drives.file("trials", plan.stem, sensor, seed, suffix="json")
     if not file.exists():
         others = [p for p in plans if p != plan]
-        asked = [plan, *others[seed % len(others) :][:1]] if others else [plan]
-        maps = [_mapped(drives, p.stem, s) for p in asked for s in SENSORS]
+        searched = [plan, *others[seed % len(others) :][:1]] if others else [plan]
+        maps = [_mapped(drives, p.stem, s) for p in searched for s in SENSORS]
         session = drives.drive(plan.stem, partial(load_map, plan), sensor, seed)
         write_text(file, json.dumps([asdict(t) for t in query_trials(plan.stem, seed, session, maps)]))
     return [Trial(**row) for row in json.loads(file.read_text())]

@@ -30,7 +30,7 @@ from pc2grid_lab.experiments.selection import (
     MEASURED,
     SELECTORS,
     TRAVELS_M,
-    Asked,
+    PlacedQuery,
     Recalled,
     Selected,
     Selection,
@@ -147,7 +147,7 @@ class _Run:
         """A query session."""
         return self.drives.drive(name, lambda: self.plans[name], sensor, seed)
 
-    def asked(self, name: str) -> Iterator[Asked]:
+    def queries(self, name: str) -> Iterator[PlacedQuery]:
         """The queries in a plan."""
         for sensor, seed in itertools.product(SENSORS, self.seeds):
             for query in queries_of(self.drive(name, sensor, seed), Config()):
@@ -181,16 +181,16 @@ def _recalled(run: _Run, maps: Mapping[str, Sequence[SensorMap]], scale: Sequenc
     """The queries in each plan among very many places."""
     found: list[Recalled] = []
     for name, (own, *_) in maps.items():
-        asked = list(run.asked(name))
+        queries = list(run.queries(name))
         for count in scale:
-            found += recall_at_scale(own, _floors(run.drives.out, count), asked)
+            found += recall_at_scale(own, _floors(run.drives.out, count), queries)
     return found
 
 
 def _fit(path: Path, run: _Run) -> int:
     """Learn the weights of what was seen from sessions in these plans; returns the number of pairs."""
 
-    def asked(step: Callable[[], None]) -> Iterator[tuple[QueryMap, SE2, list[SensorMap]]]:
+    def queries(step: Callable[[], None]) -> Iterator[tuple[QueryMap, SE2, list[SensorMap]]]:
         for name in run.plans:
             maps = run.maps(name, step)
             for sensor, seed in itertools.product(SENSORS, run.seeds):
@@ -200,7 +200,7 @@ def _fit(path: Path, run: _Run) -> int:
 
     floors = [office_floor(_FIRST_FLOOR_OF_FIT + number) for number in range(_FLOORS_OF_FIT)]
     with run.terminal.progress("fit") as advance:
-        pairs = pairs_of(asked(run.steps(advance)), floors, Config())
+        pairs = pairs_of(queries(run.steps(advance)), floors, Config())
     SeenStatistics.of(pairs).save(path)
     return len(pairs.queries)
 
@@ -317,10 +317,10 @@ def _select(
     locate: bool,
 ) -> list[Selected]:
     found = []
-    asked = list(queries_of(drive, Config()))
+    queries = list(queries_of(drive, Config()))
     for scope, index in indexes.items():
         selection = Selection(index, scope, share, seed)
-        for travel_m, query, T_plan_query in asked:
+        for travel_m, query, T_plan_query in queries:
             T_map_query = own.T_plan_map.inverse() @ T_plan_query
             about: dict[str, Any] = {
                 "plan": own.name,

@@ -78,8 +78,8 @@ def ranks(
         true_m = T_map_query.apply(np.array([view.center_m]))[0]
         right[i] = np.hypot(*(places.table.center_m - true_m).T) <= within_m
         for name, distance in part_distances(view.signature, places.table, config).items():
-            spread = float(distance.std())
-            z_scores[name][i] = (distance.mean() - distance) / spread if spread > 0 else 0.0
+            deviation = float(distance.std())
+            z_scores[name][i] = (distance.mean() - distance) / deviation if deviation > 0 else 0.0
     found = {}
     for name, z_score in z_scores.items():
         order = np.argsort(-z_score.max(axis=0), kind="stable")

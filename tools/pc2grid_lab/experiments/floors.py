@@ -82,7 +82,7 @@ class FloorTask:
 
     @property
     def house_name(self) -> str:
-        """A name for the house and its database, whatever is asked there."""
+        """A name for the house and its database, whatever the queries are."""
         visits, furniture = "".join(map(str, self.visits)), "alike" if self.alike else "differs"
         return f"{self.sensor}.{self.way}.{visits}.{furniture}.{self.seed}.{self.length_m:g}m"
 
@@ -215,8 +215,8 @@ def database_file(task: FloorTask, folder: Path) -> Path:
 
 def stored_floors(task: FloorTask, folder: Path) -> FloorResult:
     """What became of a house; computed unless this version of the program has stored it in the folder."""
-    asked = f"{task.query_m:g}m.{task.queries}"
-    file = folder / f"{task.house_name}.{asked}.{program_digest()}.json"
+    queries = f"{task.query_m:g}m.{task.queries}"
+    file = folder / f"{task.house_name}.{queries}.{program_digest()}.json"
     if not file.exists():
         run_floors(task, database_file(task, folder)).save(file)
     return FloorResult.load(file)
@@ -251,10 +251,10 @@ def share_of(
 ) -> tuple[float, float, float]:
     """The share of the queries that were answered so, and its 5th and 95th percentile when whole plans are
     drawn anew: houses with one plan, and queries in a house, are not independent."""
-    asked = [(str(task.seed), answer) for task, result in results for answer in result.answers]
+    queries = [(str(task.seed), answer) for task, result in results for answer in result.answers]
     counted = set(statuses)
-    yes = np.array([answer.status in counted for _, answer in asked])
-    return share_by_session([plan for plan, _ in asked], yes)
+    yes = np.array([answer.status in counted for _, answer in queries])
+    return share_by_session([plan for plan, _ in queries], yes)
 
 
 def _simulation(task: FloorTask, seed: int, length_m: float) -> SimulationConfig:

@@ -1,4 +1,4 @@
-"""How poses differ, and how frames lie to each other by the poses that are known in both."""
+"""Which pose belongs to a scan, how poses differ, and how frames lie to each other by poses known in both."""
 
 from __future__ import annotations
 
@@ -7,7 +7,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pc2grid.arrays import I64
 from pc2grid.geometry import SE2, wrap_angle
+
+_SAME_NS = 1_000_000
+"""A true pose belongs to a scan if their stamps differ by no more than this."""
+
+
+def number_at(stamps_ns: I64, stamp_ns: int) -> int | None:
+    """The first of the stamps (N,), increasing, that is the one of a scan; None if there is none."""
+    k = int(np.searchsorted(stamps_ns, stamp_ns - _SAME_NS))
+    return k if k < len(stamps_ns) and stamps_ns[k] <= stamp_ns + _SAME_NS else None
 
 
 def apart(a: SE2, b: SE2) -> tuple[float, float]:

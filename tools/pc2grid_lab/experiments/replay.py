@@ -22,6 +22,7 @@ from pc2grid.observer import Observer
 from pc2grid.pipeline import build_map
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.answers import localize
+from pc2grid_lab.experiments.frames import number_at
 from pc2grid_lab.experiments.judgement import judge
 from pc2grid_lab.experiments.registered_session import RegisteredSession, register
 from pc2grid_lab.experiments.sensor_map import SensorMap
@@ -31,8 +32,6 @@ from signature.localization.map_index import MapIndex
 from signature.localization.place_recognition import recognizer_for
 from signature.sessions import describe_all
 from signature.similarity import SignatureTable
-
-_SAME_NS = 1_000_000  # a true pose belongs to a scan if their stamps differ by no more than this
 
 _AROUND_M = 10.0
 """Scans of the map this near a query place it there: its walls were seen from them, and 2 cm of noise in
@@ -74,7 +73,7 @@ class MappedPart:
         return math.hypot(apart.x, apart.y)
 
 
-def spread(first_s: float, last_s: float, count: int, duration_s: float) -> tuple[TimeSpan, ...]:
+def evenly_spaced(first_s: float, last_s: float, count: int, duration_s: float) -> tuple[TimeSpan, ...]:
     """`count` parts of `duration_s`, evenly distributed over the time from `first_s` to `last_s`."""
     starts_s = np.linspace(first_s, max(last_s - duration_s, first_s), count)
     return tuple(TimeSpan(float(start_s), duration_s) for start_s in starts_s)
@@ -118,10 +117,8 @@ class Replay:
 
     def truth(self, stamp_ns: int) -> SE2 | None:
         """True pose T_world_base of the scan with that stamp; None if it is not known."""
-        i = int(np.searchsorted(self._stamps_ns, stamp_ns - _SAME_NS))
-        if i == len(self._stamps_ns) or self._stamps_ns[i] > stamp_ns + _SAME_NS:
-            return None
-        return self._T_world_base[i]
+        i = number_at(self._stamps_ns, stamp_ns)
+        return None if i is None else self._T_world_base[i]
 
     def map(self, span: TimeSpan, observer: Observer = Observer()) -> MappedPart:
         """The map made of one part. Raises ConfigError if fewer than two of its scans have a true pose."""

@@ -50,7 +50,7 @@ LOCATED_BY = (ALL, VOTED, PAPER, RANDOM)
 MEASURED = ("selector", "looked_at", "found", "located", "right", "processor_ms")
 """The fields of `Selected` that `Selection.measure` yields."""
 TRAVELS_M = (1.0, 3.0, 8.0)
-"""Metres of travel after which a query is asked."""
+"""Metres of travel after which a query is located."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,7 +182,7 @@ class Selection:
             processor_ms = 1000.0 * (time.process_time() - begin)
             found, located, well = bool(right[rows].any()), None, None
             if locate and selector in LOCATED_BY:
-                self.index.places.around(rows)  # as if these places had been asked for before
+                self.index.places.around(rows)  # so that building the block is not timed
                 begin = time.process_time()
                 base_m = (query.T_odom_base.x, query.T_odom_base.y)
                 retrieve(
@@ -257,13 +257,13 @@ class Recalled:
         return f"{self.plan}.{self.query_sensor}.{self.seed}"
 
 
-Asked = tuple[SensorKind, int, float, QueryMap, SE2]
+PlacedQuery = tuple[SensorKind, int, float, QueryMap, SE2]
 """A query: sensor and seed of its session, metres of travel, what has been seen, its true frame in the
 plan."""
 
 
 def recall_at_scale(
-    own: SensorMap, others: Iterable[PlaceBlock], queries: Iterable[Asked], least_mapped: float = 0.0
+    own: SensorMap, others: Iterable[PlaceBlock], queries: Iterable[PlacedQuery], least_mapped: float = 0.0
 ) -> Iterator[Recalled]:
     """Whether the right places of queries are selected among those of the map and `others`, by what was seen.
 

@@ -80,7 +80,7 @@ def query_trials(
 ) -> list[Trial]:
     """One query session in each of `maps`, answered after each of `travels_m` that it has travelled.
 
-    name : the building of the session. In maps of other buildings there is no right answer; they are asked
+    name : the building of the session. In maps of other buildings there is no right answer; they are located
     for the longest travel only.
     """
     own = [m for m in maps if m.name == name]

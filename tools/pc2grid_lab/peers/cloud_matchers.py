@@ -171,7 +171,7 @@ def answer_stream() -> TextIO:
 
 
 def serve(locate: Callable[[str], Found], answers: TextIO, *, compiles: bool = False) -> None:
-    """Answer the queries of the standard input until it ends. compiles : the first one is asked twice."""
+    """Answer the queries of the standard input until it ends. compiles : the first one is located twice."""
     for number, line in enumerate(sys.stdin):
         query = line.rstrip("\n")
         if compiles and number == 0:

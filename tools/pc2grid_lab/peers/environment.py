@@ -17,9 +17,9 @@ from pc2grid.errors import Pc2GridError
 from pc2grid.model import SensorKind
 from pc2grid_lab.experiments.program import digest_of_sources
 from pc2grid_lab.peers import particle_filter
-from pc2grid_lab.peers.asked import MATCHERS, OWN, digest
 from pc2grid_lab.peers.particle_filter import PROGRAMS, ParticleFilter
 from pc2grid_lab.peers.peer_process import Peer, PeerProcess
+from pc2grid_lab.peers.request_digest import MATCHERS, OWN, digest
 
 PINS = ("map-closures==2.2.0", "kiss-matcher==1.0.2")
 """The versions that the parameters of `cloud_matchers` were chosen for."""

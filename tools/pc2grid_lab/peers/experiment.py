@@ -1,4 +1,4 @@
-"""Every peer asked with every query: in the map of its own building, and in that of another one."""
+"""Every peer locates every query: in the map of its own building, and in that of another one."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def run(task: Task, environment: PeerEnvironment, folder: Path) -> list[PeerTria
     judged again in any case.
     """
     kind, site, map_site = task
-    asked = (kind.name, site.folder.name, "in", map_site.folder.name, environment.version(kind))
-    file = folder / (".".join(asked) + ".json")
+    named = (kind.name, site.folder.name, "in", map_site.folder.name, environment.version(kind))
+    file = folder / (".".join(named) + ".json")
     answers = _kept(file)
     queries = site.queries()
     rest = [number for number in queries if number not in answers]

@@ -103,7 +103,7 @@ class PeerCell:
     queries; right_low, right_high: 5 and 95 % of the share that is right. uncovered_wrong: of the uncovered
     ones. elsewhere_wrong: answers in another building's map, all wrong. median_error_m: of the right answers,
     null if there are none. cpu_s, elsewhere_cpu_s: median of an answer in the own and in another building's
-    map; null if nothing was asked there. peak_mb: largest of its process.
+    map; null without queries there. peak_mb: largest of its process.
     """
 
     peer: str
@@ -151,7 +151,7 @@ def counted(trials: Sequence[PeerTrial]) -> list[PeerCell]:
 
 def _cell(trials: Sequence[PeerTrial], threshold: float | None) -> PeerCell:
     lowest = -math.inf if threshold is None else threshold
-    asked = Counter(trial.place for trial in trials)
+    of_place = Counter(trial.place for trial in trials)
     wrong = Counter(t.place for t in trials if t.answered(lowest) and not t.right)
     right = [t for t in trials if t.answered(lowest) and t.right and t.place == "covered"]
     low, high = _interval([t in right for t in trials if t.place == "covered"])
@@ -159,15 +159,15 @@ def _cell(trials: Sequence[PeerTrial], threshold: float | None) -> PeerCell:
         peer=trials[0].peer,
         site=trials[0].site,
         threshold=threshold if math.isfinite(lowest) else None,
-        covered=asked["covered"],
+        covered=of_place["covered"],
         right=len(right),
         wrong=wrong["covered"],
-        unanswered=asked["covered"] - len(right) - wrong["covered"],
+        unanswered=of_place["covered"] - len(right) - wrong["covered"],
         right_low=low,
         right_high=high,
-        uncovered=asked["uncovered"],
+        uncovered=of_place["uncovered"],
         uncovered_wrong=wrong["uncovered"],
-        elsewhere=asked["elsewhere"],
+        elsewhere=of_place["elsewhere"],
         elsewhere_wrong=wrong["elsewhere"],
         median_error_m=_median([t.error_m for t in right]),
         cpu_s=_median_cpu_s(trials, elsewhere=False),

@@ -1,4 +1,4 @@
-"""A peer in a process of its own, which is asked query by query.
+"""A peer in a process of its own, which locates one query after the other.
 
 The process gets its name and the stem of the map as arguments, and the stem of a query in each line of its
 standard input; to each it writes one line of JSON, the fields of `PeerAnswer`.

@@ -33,12 +33,14 @@ from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind, Traje
 from pc2grid.odometry.tracker import Tracker
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.simulate import load_building
-from pc2grid_lab.experiments.frames import apart
+from pc2grid_lab.experiments.frames import apart, number_at
+from pc2grid_lab.experiments.plan_drives import MAP_SEED
 from pc2grid_lab.experiments.program import digest_of_sources
 from pc2grid_lab.experiments.registered_session import register
 from pc2grid_lab.experiments.sensor_matrix import query_start
 from pc2grid_lab.experiments.stored import write_arrays, write_text
-from pc2grid_lab.peers.asked import PREPARES, digest
+from pc2grid_lab.experiments.trial import JUDGEMENT
+from pc2grid_lab.peers.request_digest import PREPARES, digest
 from pc2grid_lab.worlds import WorldConfig, iter_session
 from signature.config import Config
 from signature.sessions import digest_of
@@ -54,12 +56,10 @@ class SiteParameters:
     keyframe_m, keyframe_rad : a scan of the map is used if the robot has moved or turned so far; of a lidar,
         which sees all around, after `lidar_keyframe_m`.
     cloud_voxel_m : edge of the voxels that clouds are thinned to; each matcher thins further as it needs.
-    same_ns : a true pose belongs to a scan if their stamps differ by no more than this.
-    near_m, covered : a query is covered if this share of its last planar scan lies so near to a wall of the
-        map. Only for covered queries an answer is asked for.
+    near_m : a query is covered if the share `JudgementParameters.mapped` of its last planar scan lies so near
+        to a wall of the map. Only covered queries have a right answer.
     map_length_m, rate_hz, columns, clutter : of the lidar that is simulated in a 3D scan, as in
         `compare real`.
-    map_seed : of its mapping drive; queries have 1, 2, ...
     """
 
     mapped: float = 0.55
@@ -70,14 +70,11 @@ class SiteParameters:
     lidar_keyframe_m: float = 0.5
     keyframe_rad: float = 0.1
     cloud_voxel_m: float = 0.1
-    same_ns: int = 1_000_000
     near_m: float = 0.2
-    covered: float = 0.5
     map_length_m: float = 150.0
     rate_hz: float = 5.0
     columns: int = 720
     clutter: int = 15
-    map_seed: int = 1000
 
 
 SITE = SiteParameters()
@@ -136,9 +133,8 @@ class TruePoses:
 
     def at(self, scan: Scan) -> F64 | None:
         """T_world_base (4, 4) at a scan; None where it is not known."""
-        stamps_ns = self.trajectory.stamps_ns
-        i = int(np.searchsorted(stamps_ns, scan.stamp_ns - SITE.same_ns))
-        if i == len(stamps_ns) or stamps_ns[i] > scan.stamp_ns + SITE.same_ns:
+        i = number_at(self.trajectory.stamps_ns, scan.stamp_ns)
+        if i is None:
             return None
         T_world: F64 = self.trajectory.T_session_base[i]
         return T_world if self.of_base else T_world @ np.linalg.inv(scan.T_base_sensor)
@@ -218,7 +214,7 @@ def simulated_site(
     """The site of a lidar that is simulated in a real 3D scan of a building (PLY, PCD or a mesh)."""
     building = load_building(building_file)
     site = Site(name=building_file.stem, sensor="lidar", folder=folder)
-    mapping = _simulation(SITE.map_length_m, SITE.map_seed)
+    mapping = _simulation(SITE.map_length_m, MAP_SEED)
 
     def drive(simulation: WorldConfig) -> Iterator[PosedScan]:
         for scan, truth in iter_session(sensor="lidar", grid=building, config=simulation):
@@ -345,7 +341,7 @@ def is_covered(grid: OccupancyGrid, planar_hits_m: F32, T_map_base: SE2) -> bool
     if not len(hits_m) or not len(walls_m):
         return False
     distance_m, _ = cKDTree(walls_m).query(hits_m)
-    return float(np.mean(distance_m <= SITE.near_m)) >= SITE.covered
+    return float(np.mean(distance_m <= SITE.near_m)) >= JUDGEMENT.mapped
 
 
 def save_beams(path: Path, scans: list[Scan]) -> None:

@@ -16,7 +16,7 @@ from pc2grid_lab.experiments.recordings import judging
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.children import Finished
 from pc2grid_lab.experiments.recordings.drive import Drive
-from pc2grid_lab.experiments.recordings.judging import Asked, Judge, known_share
+from pc2grid_lab.experiments.recordings.judging import Judge, LocatedWindow, known_share
 from pc2grid_lab.experiments.recordings.run import Folder
 
 T_A_B, T_PLAN_A = SE2(3.0, -1.0, 0.4), SE2(20.0, 8.0, -1.2)
@@ -33,7 +33,7 @@ def pose(window: int) -> SE2:
     return SE2(4.0 * window, 1.0 * window, 0.5 * window)
 
 
-def asked(query: str, window: int, found: SE2 | None, *, status: str = "located") -> Asked:
+def located(query: str, window: int, found: SE2 | None, *, status: str = "located") -> LocatedWindow:
     """A window that says `found`; None: its scan has no pose in the drive."""
     said = found or SE2()
     document = {
@@ -44,13 +44,13 @@ def asked(query: str, window: int, found: SE2 | None, *, status: str = "located"
     }
     done = Finished(code=0, cpu_s=1.0, wall_s=1.0, peak_mb=1.0, document=document)
     where = None if found is None else (0, pose(window))
-    return Asked(query, window, TimeSpan(float(window), 1.0), done, where, np.zeros((1, 2)))
+    return LocatedWindow(query, window, TimeSpan(float(window), 1.0), done, where, np.zeros((1, 2)))
 
 
 class Known(Judge):
     """A judge who is told the answers."""
 
-    def __init__(self, answers: Mapping[Pair, list[Asked]]) -> None:
+    def __init__(self, answers: Mapping[Pair, list[LocatedWindow]]) -> None:
         catalogue = Catalogue(recordings=RECORDINGS, mapped=(), pairs=tuple(answers))
         super().__init__(catalogue, Folder(Path("/data"), Path("/work")))
         self._windows.update(answers)
@@ -63,19 +63,19 @@ class Known(Judge):
         return {"map": OccupancyGrid(cells=free, resolution_m=0.2, origin_m=(-40.0, -40.0))}
 
 
-def answers(*, a: tuple[SE2, ...], b: tuple[SE2, ...]) -> dict[Pair, list[Asked]]:
-    """b is located in a; both are asked in the plan, where they say these transforms."""
+def answers(*, a: tuple[SE2, ...], b: tuple[SE2, ...]) -> dict[Pair, list[LocatedWindow]]:
+    """b is located in a; both are located in the plan, where they say these transforms."""
     return {
-        B_IN_A: [asked("b", k, T_A_B @ pose(k)) for k in range(4)],
-        A_IN_PLAN: [asked("a", k, T @ pose(k)) for k, T in enumerate(a)],
-        B_IN_PLAN: [asked("b", k, T @ T_A_B @ pose(k)) for k, T in enumerate(b)],
+        B_IN_A: [located("b", k, T_A_B @ pose(k)) for k in range(4)],
+        A_IN_PLAN: [located("a", k, T @ pose(k)) for k, T in enumerate(a)],
+        B_IN_PLAN: [located("b", k, T @ T_A_B @ pose(k)) for k, T in enumerate(b)],
     }
 
 
 def test_two_drives_of_two_answers_each_judge_each_other() -> None:
     wrong = SE2(-5.0, 2.0, 2.0)
     known = answers(a=(T_PLAN_A, T_PLAN_A), b=(T_PLAN_A, wrong, T_PLAN_A))
-    known[B_IN_PLAN].append(asked("b", 3, None))
+    known[B_IN_PLAN].append(located("b", 3, None))
     first, second = Known(known).row(A_IN_PLAN), Known(known).row(B_IN_PLAN)
     assert (first.truth, first.agreeing) == (second.truth, second.agreeing) == ("agreement", 4)
     assert [query.right for query in first.queries] == [True, True]
@@ -98,7 +98,7 @@ def test_drives_that_contradict_each_other_are_not_judged() -> None:
 
 def test_elsewhere_nothing_is_right() -> None:
     pair = Pair(query="b", map="plan", kind="elsewhere", window_s=1.0, windows=2)
-    row = Known({pair: [asked("b", 0, SE2()), asked("b", 1, SE2(), status="not_found")]}).row(pair)
+    row = Known({pair: [located("b", 0, SE2()), located("b", 1, SE2(), status="not_found")]}).row(pair)
     assert row.counts.wrong == 1 and row.counts.refused == 1
 
 

@@ -1,1 +1,1 @@
-"""`pc2grid compare recordings`: what is asked, how it is judged, what changed, and the page."""
+"""`pc2grid compare recordings`: what is run, how it is judged, what changed, and the page."""

@@ -11,7 +11,7 @@ from fnmatch import fnmatch
 from typing import Literal
 
 from pc2grid.time_span import TimeSpan
-from pc2grid_lab.experiments.replay import spread
+from pc2grid_lab.experiments.replay import evenly_spaced
 
 Kind = Literal["later part", "fewer scans", "other day", "other sensor", "published map", "elsewhere"]
 """How the query of a pair differs from what its map was made from. "elsewhere": it is of another building."""
@@ -330,5 +330,5 @@ class Catalogue:
         first_s, last_s = self.recordings[pair.query].span_s(length_s)
         if pair.map == pair.query and pair.until_s is not None:
             first_s = pair.until_s
-        numbered = list(enumerate(spread(first_s, last_s, pair.windows, pair.window_s)))
+        numbered = list(enumerate(evenly_spaced(first_s, last_s, pair.windows, pair.window_s)))
         return numbered[:: _QUICK_EVERY if self.quick else 1]

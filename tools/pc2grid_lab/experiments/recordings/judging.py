@@ -62,7 +62,7 @@ def judged_table(
 
 
 @dataclass(frozen=True)
-class Asked:
+class LocatedWindow:
     """A window, its answer, and what it has last seen.
 
     answer : the document of `relocalize`; None if it failed. where : the part of the drive, and the pose of
@@ -96,7 +96,7 @@ class Judge:
         self._catalogue, self._folder = catalogue, folder
         self._drives: dict[str, Drive] = {}
         self._grids: dict[str, dict[str, OccupancyGrid]] = {}
-        self._windows: dict[Pair, list[Asked]] = {}
+        self._windows: dict[Pair, list[LocatedWindow]] = {}
 
     def row(self, pair: Pair) -> PairRow:
         """The row of a pair; what cannot be judged is a row that says why."""
@@ -118,15 +118,15 @@ class Judge:
         if problem:
             return PairRow(**row, problem=problem)
         if pair.kind == "elsewhere":
-            queries = tuple(_elsewhere(one) for one in self._asked(pair))
+            queries = tuple(_elsewhere(one) for one in self._located_windows(pair))
             return PairRow(**row, truth="elsewhere", queries=queries)
-        truth, asked, frames = self._frames(pair, query, map_)
+        truth, windows, frames = self._frames(pair, query, map_)
         grids = self._grids_of(pair.map_name)
         return PairRow(
             **row,
             truth=truth,
             agreeing=sum(len(f.clues) for f in frames.values()) if truth == "agreement" else None,
-            queries=tuple(_judged(one, frames, grids) for one in asked),
+            queries=tuple(_judged(one, frames, grids) for one in windows),
         )
 
     def _problem(self, pair: Pair) -> str:
@@ -139,7 +139,7 @@ class Judge:
             return f"{pair.map_name}: {NOT_RUN}"
         return f"no map: {done.error}" if done.failed else ""
 
-    def _asked(self, pair: Pair) -> list[Asked]:
+    def _located_windows(self, pair: Pair) -> list[LocatedWindow]:
         """The windows of a pair with their answers."""
         if pair not in self._windows:
             query = self._catalogue.recordings[pair.query]
@@ -147,13 +147,13 @@ class Judge:
             self._windows[pair] = [self._one(pair, query, number, span) for number, span in windows]
         return self._windows[pair]
 
-    def _one(self, pair: Pair, query: Recording, number: int, span: TimeSpan) -> Asked:
+    def _one(self, pair: Pair, query: Recording, number: int, span: TimeSpan) -> LocatedWindow:
         done = kept(self._folder.answer(pair, span))
         if done is None or done.failed:
-            return Asked(pair.query, number, span, done)
+            return LocatedWindow(pair.query, number, span, done)
         stamp_ns = int(done.document["query"]["stamp_ns"])
         if pair.kind == "elsewhere":
-            return Asked(pair.query, number, span, done)
+            return LocatedWindow(pair.query, number, span, done)
         if pair.query not in self._drives:
             self._drives[pair.query] = Drive.of(query, self._folder)
         drive = self._drives[pair.query]
@@ -163,7 +163,7 @@ class Judge:
         else:
             true = drive.true_pose(stamp_ns)
             where = None if true is None else (-1, true)
-        return Asked(pair.query, number, span, done, where, self._last_hits(query, span, stamp_ns))
+        return LocatedWindow(pair.query, number, span, done, where, self._last_hits(query, span, stamp_ns))
 
     def _last_hits(self, query: Recording, span: TimeSpan, stamp_ns: int) -> F64:
         """(N, 2) walls that the last scan of a window shows, in the axes of the base."""
@@ -179,15 +179,15 @@ class Judge:
 
     def _frames(
         self, pair: Pair, query: Recording, map_: Recording
-    ) -> tuple[Truth | None, list[Asked], Frames]:
+    ) -> tuple[Truth | None, list[LocatedWindow], Frames]:
         """The windows, and how the parts of the drive lie in the sessions of the map: by true poses, else by
         the answers.
         """
-        asked = self._asked(pair)
+        windows = self._located_windows(pair)
         if query.poses is not None and query.poses == map_.poses:
             return (
                 "poses",
-                asked,
+                windows,
                 {
                     (-1, session): frame
                     for session, trajectory in sessions(self._folder, pair.map_name).items()
@@ -195,10 +195,10 @@ class Judge:
                 },
             )
         shared = self._shared(pair) if map_.sensor == "map" else None
-        asked, frames = shared or (asked, _agreed(asked))
-        return ("agreement" if frames else None), asked, frames
+        windows, frames = shared or (windows, _agreed(windows))
+        return ("agreement" if frames else None), windows, frames
 
-    def _shared(self, pair: Pair) -> tuple[list[Asked], Frames] | None:
+    def _shared(self, pair: Pair) -> tuple[list[LocatedWindow], Frames] | None:
         """The same of several drives in one map, whose answers judge each other: those that are known to lie
         in the trajectory of one of them, or of another recording of the building.
 
@@ -211,23 +211,23 @@ class Judge:
                 continue
             drives = {p.query: moved for p in in_map if (moved := self._in_root(p, root.name)) is not None}
             if pair.query in drives and len(drives) > 1:
-                return drives[pair.query], _agreed([one for asked in drives.values() for one in asked])
+                return drives[pair.query], _agreed([one for windows in drives.values() for one in windows])
         return None
 
-    def _in_root(self, pair: Pair, root: str) -> list[Asked] | None:
+    def _in_root(self, pair: Pair, root: str) -> list[LocatedWindow] | None:
         """The windows of a pair, in the trajectory of the recording `root`; None if not located there."""
         if pair.query == root:
-            return self._asked(pair)
+            return self._located_windows(pair)
         wanted = (pair.query, root, None)
         link = next((p for p in self._catalogue.pairs if (p.query, p.map, p.until_s) == wanted), None)
         if link is None or self._problem(link):
             return None
-        frame = _agreed(self._asked(link)).get((0, _SESSION))
+        frame = _agreed(self._located_windows(link)).get((0, _SESSION))
         if frame is None:
             return None
         return [
             replace(one, where=(0, frame.place(one.where[1])[0]) if one.where and one.where[0] == 0 else None)
-            for one in self._asked(pair)
+            for one in self._located_windows(pair)
         ]
 
     def _true_frame(self, query: str, trajectory: Trajectory) -> Frame | None:
@@ -250,10 +250,10 @@ class Judge:
         return self._grids[name]
 
 
-def _agreed(asked: Iterable[Asked]) -> Frames:
+def _agreed(windows: Iterable[LocatedWindow]) -> Frames:
     """How the parts of drives lie in the sessions of a map, by the best place of every answer."""
     groups: dict[tuple[int, str], list[Clue]] = {}
-    for one in asked:
+    for one in windows:
         if one.where is not None and one.places and one.answer is not None:
             session, T_map_base, _ = one.places[0]
             clue = Clue(one.where[1], T_map_base, (one.query, one.window), float(one.answer["confidence"]))
@@ -262,7 +262,7 @@ def _agreed(asked: Iterable[Asked]) -> Frames:
     return {key: frame for key, frame in found if frame is not None}
 
 
-def _answered(one: Asked) -> dict[str, Any]:
+def _answered(one: LocatedWindow) -> dict[str, Any]:
     """What a row says of an answer before it is judged."""
     row: dict[str, Any] = {"window": one.window, "start_s": one.span.start_s}
     if one.done is None:
@@ -280,12 +280,12 @@ def _answered(one: Asked) -> dict[str, Any]:
     }
 
 
-def _elsewhere(one: Asked) -> QueryRow:
+def _elsewhere(one: LocatedWindow) -> QueryRow:
     """An answer in the map of another building, where nothing is right."""
     return QueryRow(**_answered(one), right=None if one.answer is None else False, covered=False)
 
 
-def _judged(one: Asked, frames: Frames, grids: Mapping[str, OccupancyGrid]) -> QueryRow:
+def _judged(one: LocatedWindow, frames: Frames, grids: Mapping[str, OccupancyGrid]) -> QueryRow:
     """An answer judged by where the query is in the sessions of the map."""
     row = _answered(one)
     if one.answer is None or one.where is None:

@@ -127,7 +127,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairRow:
-    """The windows of one recording in one map. problem : why nothing was asked.
+    """The windows of one recording in one map. problem : why nothing was located.
 
     truth : how they are judged; None if they cannot be. agreeing : answers that agree, if they judge each
     other.

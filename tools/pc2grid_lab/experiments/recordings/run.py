@@ -1,4 +1,4 @@
-"""All recordings become maps and all windows are asked for: what the commands answered, in a folder.
+"""All recordings become maps and all windows are located: the results of the commands, in a folder.
 
 Nothing is judged here. A command that fails is a result like any other, and a result that the folder holds
 already is not computed again.
@@ -55,8 +55,8 @@ class Folder:
 
     def answer(self, pair: Pair, window: TimeSpan) -> Path:
         """The result of `relocalize` for a window."""
-        asked = f"{_plain(pair.query)}.in.{_plain(pair.map_name)}"
-        return self.work / "answers" / f"{asked}.{window.start_s:.2f}s.{window.duration_s:g}s.json"
+        named = f"{_plain(pair.query)}.in.{_plain(pair.map_name)}"
+        return self.work / "answers" / f"{named}.{window.start_s:.2f}s.{window.duration_s:g}s.json"
 
     def missing(self, recording: Recording) -> bool:
         """Whether the data folder lacks the recording, so that it is a gap of the page."""
@@ -99,12 +99,12 @@ def run_all(
     """
     pairs = [p for p in catalogue.pairs if not _gap(catalogue, folder, p)]
     tasks = _made(catalogue, folder, pairs)
-    asked = sum(pair.windows for pair in pairs)
+    windows = sum(pair.windows for pair in pairs)
     for done in _run(tasks, jobs):
-        advance(done / (len(tasks) + asked))
+        advance(done / (len(tasks) + windows))
     questions = [task for pair in pairs for task in _questions(catalogue, folder, pair)]
     for done in _run(questions, jobs):
-        advance((len(tasks) + done) / (len(tasks) + asked))
+        advance((len(tasks) + done) / (len(tasks) + windows))
 
 
 def _made(catalogue: Catalogue, folder: Folder, pairs: Sequence[Pair]) -> list[_Task]:

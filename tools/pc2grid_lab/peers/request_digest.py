@@ -1,4 +1,4 @@
-"""What was asked, as a digest: what was made or answered before is used again only if it is the same."""
+"""A digest of all that a result depends on: a stored result is used again only if it is the same."""
 
 from __future__ import annotations
 
