@@ -83,7 +83,7 @@ class SignatureTable:
         )
 
     def without_histograms(self) -> SignatureTable:
-        """The rows with what says where they are, and no bins: 36 bytes instead of some 400 each."""
+        """The rows with their ids and positions, and no bins: 36 bytes instead of some 400 each."""
         none = np.empty((len(self), 0), np.float32)
         return replace(self, boundary=none, freespace=none)
 

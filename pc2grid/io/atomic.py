@@ -24,11 +24,11 @@ _MARK = ".pc2grid-"
 def replace_file(path: str | Path, *, alone: bool = False) -> Iterator[Path]:
     """Give the body a temporary path; when it ends well, that file becomes `path`.
 
-    The body may open, write and close the temporary file as it likes. If the body raises, or the process
+    The body opens, writes and closes the temporary file. If the body raises, or the process
     dies, `path` keeps its old content; the temporary is removed (after a kill: by the next writer of the
     same target). A symbolic link is followed, not replaced.
 
-    Whether the writer of a temporary file still works is told by its lock on that file. Its number tells
+    The writer of a temporary file holds a lock on that file as long as it works. Its number tells
     nothing: processes of two containers that share a folder may both be number 1.
 
     alone : the caller keeps all other writers of `path` away. Then every other temporary file was left over,

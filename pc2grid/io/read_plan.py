@@ -271,7 +271,7 @@ class _Planner:
         raise frames.missing(sensor_frame, base or "the base")
 
     def _tf_may_be_lost(self) -> bool:
-        """Whether tf may be among what is lost: then a guess would shift every scan."""
+        """Whether tf may be among what is lost: a wrong base frame would shift every scan."""
         tally = self._source.tally
         if tally.topics_lost or self._frames.warnings:
             return True

@@ -46,8 +46,8 @@ class StreamParameters:
     patience : number of undecodable scans, with no other before them, at which reading stops.
     max_bad_share : share of undecodable scans above which the log counts as damaged.
     eager : a scan waits no longer than until the odometry for all of its points is known.
-    sweep_ns : time from the stamp of a scan to its last point, as long as no scan has told it; a lidar turns
-    ten times a second.
+    sweep_ns : time from the stamp of a scan to its last point, until a scan has times of its points; a lidar
+    turns ten times a second.
     """
 
     wait_ns: int = 500_000_000
@@ -214,7 +214,7 @@ class _Poses:
         return take
 
     def _child_to_base(self, child: str) -> F64:
-        """`T_child_base` of the odometry's child frame; identity if it is the base, or if tf is silent."""
+        """`T_child_base` of the odometry's child frame; identity if it is the base, or not in tf."""
         base, frames = self._plan.choice.base_frame, self._frames
         if not child or child == base or self._plan.sensor_is_base:
             return np.eye(4)

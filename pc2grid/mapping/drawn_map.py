@@ -80,10 +80,8 @@ def load_drawn_map(path: str | Path, config: Config = Config()) -> DrawnMap:
         points = voxel_cloud(building_points(path, config.read, check_plausible), config.projection)
         T_map_file = level_cloud(points, floor_z=config.read.floor_z)
         level = transform_points(T_map_file, points)
-        # `drivable_plan(level)` would be the other way. Of 21 windows of a real laser log in a 3D scan of the
-        # same floor, the map by viewpoints located 15 (the right place first for 19, off by 6.7 cm), the plan
-        # 16 (18, 7.7 cm), both none wrongly: no difference that so few windows show. Viewpoints also know the
-        # ground that furniture hid, as the map of a robot does.
+        # Viewpoints, unlike `drivable_plan(level)`, also know the ground that furniture hides from above, as
+        # the map of a robot does; `examples/sensors.md` compares the two.
         grid = map_cloud(level, config.projection, origin_m=T_map_file[:3, 3])
     except MapFileError as error:
         if str(path) in error.message:

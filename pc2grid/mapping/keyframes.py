@@ -28,7 +28,7 @@ class Keyframe:
     """A planar scan that becomes part of the map, because the robot had moved since the one before.
 
     index : number of its scan in the session. T_session_base : as tracked, before loops are closed.
-    restart : the first keyframe after tracking was lost: its pose relative to those before is a guess.
+    restart : the first keyframe after tracking was lost: its pose relative to those before is not measured.
     unseen_hits_m : (N, 2) in its frame, hits of the scans up to the next keyframe in cells where this
         keyframe has none (see `UnseenHits`).
     """

@@ -1,9 +1,9 @@
 """Which recognised places are loops: those that agree with the drift of tracking and with each other.
 
 A recognition alone may be wrong with high confidence: buildings repeat themselves, and some look alike when
-they are turned by 180 degrees. Two things that the recognizer does not know tell such a place from the right
-one. Tracking drifts, but only so far. And what is recognised on two stretches must fit together with the
-travel between them (pairwise consistency, Mangelson et al., "Pairwise consistent measurement set
+they are turned by 180 degrees. Two facts that the recognizer does not use distinguish such a place from the
+right one. Tracking drifts, but only so far. And what is recognised on two stretches must fit together with
+the travel between them (pairwise consistency, Mangelson et al., "Pairwise consistent measurement set
 maximization for robust multi-robot map merging", 2018). A recognition that is not accepted remains a
 candidate, because later ones may support it.
 """

@@ -1,4 +1,4 @@
-"""What the report of a session map says: scans that are not in it, and warnings with what to do."""
+"""The report of a session map: scans that are not in it, and warnings with what to do."""
 
 from __future__ import annotations
 

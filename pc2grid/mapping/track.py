@@ -1,4 +1,4 @@
-"""What tracking says of the scans of a session, and which of them become keyframes."""
+"""The tracked scans of a session, and which of them become keyframes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Track:
-    """What tracking says of all scans of a session.
+    """The results of tracking for all scans of a session.
 
     trajectory : before loops are closed. disagreements : of odometry, at each scan. riding : (N,) scans on a
     ride from floor to floor. storey : (N,) number of the floor of each in `storeys`. carried : see

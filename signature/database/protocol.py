@@ -1,4 +1,4 @@
-"""What a submap database says of its sessions, and its format."""
+"""The description of the sessions of a submap database, and its format."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Label:
     """Where a session was recorded; None: not known.
 
     building, floor : in the user's words.
-    told_apart : the floor is not in the user's words: its recording reaches several floors, which got names
-        of their own. It tells the sessions of that recording apart, and says nothing of other recordings.
+    told_apart : the name of the floor was generated, because its recording reaches several floors; it is
+        comparable only within that recording.
     floor_height_m : of the floor above the lowest one of its recording, where stairs or ramps join them.
     """
 

@@ -267,7 +267,7 @@ class Rows(ABC):
 
 @functools.lru_cache(maxsize=256)
 def _info(document: str) -> SessionInfo:
-    """What a document says of its session. Cached: every part that is read is compared with it."""
+    """The description of a session in its document. Cached: every part that is read is compared with it."""
     info: SessionInfo = stored.decode("info", _content(document), {}, {})
     return info
 

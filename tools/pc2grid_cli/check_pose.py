@@ -1,4 +1,4 @@
-"""`relocalize --check`, `--check-topic`, `watch --check-topic`: is the pose the robot believes in right?"""
+"""`relocalize --check`, `--check-topic`, `watch --check-topic`: is the robot's own pose right?"""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _document(checked: PoseCheck, log: Log, path: Path, where: str, scans: int) 
 
 
 def live_document(look: PoseLook, live: LiveLog, where: str) -> WatchCheck:
-    """What one look at a running robot said of the pose that it believes in."""
+    """The document of one check of a running robot's own pose."""
     return {
         **_judgement(look.checked, where),
         "path_m": look.checked.path_m,

@@ -59,7 +59,7 @@ class KnownPose:
             raise ConfigError("--check: expected x and y in metres and the heading in degrees")
 
     def region(self) -> Prior | None:
-        """The region of `--near`; None if nothing is said about it. Raises ConfigError."""
+        """The region of `--near`; None if none is given. Raises ConfigError."""
         self.validate(is_map=False)
         if self.near is None:
             return None
@@ -67,7 +67,7 @@ class KnownPose:
         return Prior.around(x_m, y_m, radius_m, session=self.session)
 
     def prior(self, log: Log, span: TimeSpan) -> Prior | None:
-        """The region that the pose is in; None if nothing is said about it.
+        """The region that the pose is in; None if none is given.
 
         Raises ConfigError, or what `Log.map_pose` raises.
         """

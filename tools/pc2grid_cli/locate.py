@@ -1,4 +1,4 @@
-"""Queries as the command line knows them: a recording or a map, and the answer to it."""
+"""Queries of the command line: a recording or a map, and the answer to it."""
 
 from __future__ import annotations
 
@@ -221,7 +221,7 @@ def followed(poses: Trajectory, answer: Answer) -> Trajectory:
         return poses
     planar = poses.planar()
     travel_m = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(planar[:, :2], axis=0).T))))
-    # Scans of a robot that stands are told apart, too.
+    # Scans of a standing robot get increasing values, too.
     travel_m += 1e-9 * np.arange(len(travel_m))
     health = poses.health or (Health.FINE,) * len(poses)
     part = np.cumsum([h is Health.LOST for h in health])

@@ -1,4 +1,4 @@
-"""What a session map says of itself, as the JSON documents of `convert` and `db info` show it."""
+"""The description of a session map in the JSON documents of `convert` and `db info`."""
 
 from __future__ import annotations
 

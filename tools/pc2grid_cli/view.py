@@ -117,7 +117,7 @@ def _serve(
 
 
 class Locator:
-    """Locates one recording after another in a database, and tells the pages how it goes."""
+    """Locates one recording after another in a database, and reports the progress to the pages."""
 
     def __init__(self, database: SubmapDatabase, settings: Config) -> None:
         self._database, self._settings = database, settings
@@ -155,7 +155,7 @@ class Locator:
                 self._database, found=found, accept=self._settings.relocalize.accept
             )
         except Pc2GridError as error:
-            # The user knows the recording by its name, not by the place of our copy.
+            # Messages name the recording as the user does, not the place of our copy.
             error.message = error.message.replace(str(path), path.name)
             events.publish("end", {"source": path.name, "error": error.message, "hint": error.hint})
             raise

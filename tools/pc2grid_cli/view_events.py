@@ -108,7 +108,7 @@ def _put(page: queue.Queue[bytes | None], event: bytes | None) -> None:
 
 @dataclass
 class Progress:
-    """Publishes the scans of one query, and what the database said of it.
+    """Publishes the scans of one query, and its answers.
 
     Events: `scans`, a list of x, y, yaw in the query's own frame, and 1 where another such frame begins,
     because registration was lost; `moment`, the state of the answer with the pose in the map and the base in

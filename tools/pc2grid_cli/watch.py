@@ -243,7 +243,7 @@ def _check(following: _Following, topic: str, session: str | None, *, as_json: b
 class ResetPolicy:
     """When the robot may be told a new place: not too often, and not for ever.
 
-    A program that resets a robot again and again keeps it from ever coming to rest.
+    Limits how often a new pose is published: repeated resets would keep navigation from continuing.
 
     pause_s : least time between two resets. most : resets until the robot has been located for `calm_s`.
     """

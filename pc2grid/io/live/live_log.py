@@ -33,12 +33,12 @@ class LiveParameters:
     """When the plan is made, and what is reported; chosen by hand.
 
     hold_s : log time behind the first scan that is held back for the plan; most transforms are published
-    several times in it. retry_s, most_tries : after a plan that failed, how long until the next one, and how
-    many are made. poll_s : longest time without a look at the clock. silent_s : time after which a topic that
-    says nothing is named. catch_up_s : time for the scans that were held back to be used up, before scans are
-    dropped. clock_scans : so many scans in a row with stamps that go back or jump mean that the clock was
-    set. gap_s : after a longer time without scans, the pose of a robot without odometry is not known any
-    more.
+    several times in it. retry_s, most_tries : after a plan that failed, how long until the next one, and
+    how many are made. poll_s : longest time without a look at the clock. silent_s : time after which a
+    topic without messages is named. catch_up_s : time for the scans that were held back to be used up,
+    before scans are dropped. clock_scans : so many scans in a row with stamps that go back or jump mean
+    that the clock was set. gap_s : after a longer time without scans, the pose of a robot without
+    odometry is not known any more.
     """
 
     hold_s: float = 3.0
@@ -340,7 +340,7 @@ class LiveLog:
         self._begin_anew(reading)
 
     def _is_gap(self, message: RawMessage, last_scan_ns: int, stream: Stream) -> bool:
-        """Whether nothing says how the robot moved since the last scan."""
+        """Whether the motion since the last scan is unknown: no scans, and no odometry."""
         gap_s = (message.log_time_ns - last_scan_ns) * 1e-9
         if gap_s <= self._parameters.gap_s or stream.newest_odometry_ns() is not None:
             return False
@@ -380,7 +380,7 @@ class LiveLog:
             self.keeps_up = True
             self.feed.keep_up()
 
-    # --- the pose that the robot believes in ----------------------------------------------------------
+    # --- the pose by the robot's own localization ----------------------------------------------------------
 
     @property
     def believed(self) -> MapPose | None:
@@ -411,7 +411,7 @@ class LiveLog:
                 self._tell_late(error, reading)
 
     def _tell_late(self, error: Pc2GridError, reading: _Reading) -> None:
-        """Tell of what is still missing, unless it may still come."""
+        """Report what is still missing, after `silent_s` or at the end of the feed."""
         if self._clock() - reading.planned_s > self._parameters.silent_s or self.feed.ended:
             self.feed.news.tell(str(error))
 
@@ -438,7 +438,7 @@ class LiveLog:
     # --- what the user should know --------------------------------------------------------------------
 
     def _name_silent(self, now_s: float) -> None:
-        """Name the topic that says nothing."""
+        """Name the topic without messages."""
         silent_s = now_s - self._heard_s
         if silent_s < self._parameters.silent_s or not self.feed.connected:
             return
