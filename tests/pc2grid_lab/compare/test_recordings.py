@@ -78,6 +78,7 @@ def compare(data: Path, out: Path, *options: str) -> Any:
     return done
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_a_small_run(data: Path, tmp_path: Path) -> None:
     document = json.loads(compare(data, tmp_path, "--json").stdout)

@@ -78,11 +78,11 @@ def test_transform_is_the_one_that_most_answers_agree_with() -> None:
 
 
 def test_no_answer_is_judged_by_itself() -> None:
-    asked = queries(3, 0)
-    agreement = Agreement.of(asked, maps())
-    alone = Agreement.of(asked[1:], maps())
+    made = queries(3, 0)
+    agreement = Agreement.of(made, maps())
+    alone = Agreement.of(made[1:], maps())
     assert agreement.without(0) == alone.T_floor_log
-    assert Agreement.of(asked[:1], maps()).without(0) is None
+    assert Agreement.of(made[:1], maps()).without(0) is None
     assert Agreement.of([], maps()).T_floor_log is None
 
 
@@ -120,6 +120,7 @@ def test_interval_resamples_whole_sessions() -> None:
     assert share_interval([trial()]) == (1.0, 1.0)
 
 
+@pytest.mark.slow
 def test_small_run(tmp_path: Path) -> None:
     """The mesh of an office is the 3D scan; a simulated laser in the same office writes the log."""
     import open3d as o3d
@@ -139,7 +140,7 @@ def test_small_run(tmp_path: Path) -> None:
     )
     command = (
         f"compare real {tmp_path / 'floor.obj'} {tmp_path / 'log.mcap'} --out {tmp_path / 'out'} --json"
-        " --queries 1 --query-time 8 --window 12 --every 25 --map-length 18 --clutter 0 --rate 3 --jobs 1"
+        " --queries 1 --query-time 8 --window 12 --every 25 --map-length 18 --clutter 0 --rate 2 --jobs 1"
     )
     done = CliRunner().invoke(app, command.split(), catch_exceptions=False)
     assert done.exit_code == 0, done.stderr
