@@ -15,7 +15,7 @@ from pc2grid.simulate.drive import Drive
 
 
 @dataclass(frozen=True, slots=True)
-class Odometry:
+class SimulatedOdometry:
     """Odometry as the robot publishes it, starting at the identity.
 
     times_s : (N,) since the session's start. poses : (N, 3) x, y, yaw of the base in the odom frame, metres
@@ -44,7 +44,7 @@ def _slip(steps: int, error: float, step_s: float, memory_s: float, rng: np.rand
     return slip
 
 
-def odometry_of(drive: Drive, config: OdometryConfig, rng: np.random.Generator) -> Odometry:
+def odometry_of(drive: Drive, config: OdometryConfig, rng: np.random.Generator) -> SimulatedOdometry:
     """Integrate the steps of the drive with the errors of wheel odometry.
 
     Three relative errors are added to the distance and rotation of each step: slip, which is correlated over
@@ -72,4 +72,4 @@ def odometry_of(drive: Drive, config: OdometryConfig, rng: np.random.Generator) 
     middle = poses[:-1, 2] + turn / 2
     poses[1:, 0] = np.cumsum(forward * np.cos(middle))
     poses[1:, 1] = np.cumsum(forward * np.sin(middle))
-    return Odometry(times_s, poses)
+    return SimulatedOdometry(times_s, poses)

@@ -17,7 +17,7 @@ from pc2grid.io.trajectory import write_tum
 from pc2grid.model import OccupancyGrid, SensorKind, Trajectory
 from pc2grid.simulate.building import Building
 from pc2grid.simulate.config import DepthConfig, LaserConfig, SimulationConfig
-from pc2grid.simulate.odometry import Odometry
+from pc2grid.simulate.odometry import SimulatedOdometry
 from pc2grid.simulate.sensors import Sensor, depth_intrinsics, laser_angle_min, laser_time_increment
 from pc2grid.simulate.session import EPOCH_NS, Reading, prepare_session
 
@@ -76,7 +76,7 @@ class Recordable(Protocol):
         """The true motion."""
 
     @property
-    def odometry(self) -> Odometry | None:
+    def odometry(self) -> SimulatedOdometry | None:
         """What the wheels measure."""
 
     @property

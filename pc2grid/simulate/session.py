@@ -15,7 +15,7 @@ from pc2grid.simulate.clutter import Furniture, covered, place_clutter
 from pc2grid.simulate.config import SimulationConfig
 from pc2grid.simulate.drive import Drive, drive_along
 from pc2grid.simulate.floorplan import office_floorplan
-from pc2grid.simulate.odometry import Odometry, odometry_of
+from pc2grid.simulate.odometry import SimulatedOdometry, odometry_of
 from pc2grid.simulate.route import plan_route
 from pc2grid.simulate.scene import Mesh, Scene, extrude
 from pc2grid.simulate.sensors import Sensor, make_sensor
@@ -66,7 +66,7 @@ class Session:
     grid: OccupancyGrid
     clutter: tuple[Furniture, ...]
     drive: Drive
-    odometry: Odometry | None
+    odometry: SimulatedOdometry | None
     config: SimulationConfig
     shell: Mesh | None = None
     added: tuple[Furniture, ...] = ()
@@ -126,7 +126,7 @@ class Session:
             yield self.scan(reading), self.drive.pose(reading.time_s)
 
 
-def scan_of(reading: Reading, sensor: Sensor, odometry: Odometry | None) -> Scan:
+def scan_of(reading: Reading, sensor: Sensor, odometry: SimulatedOdometry | None) -> Scan:
     """A reading as the scan that `pc2grid.io` decodes from the recording."""
     T = sensor.T_base_sensor
     kept = np.isfinite(reading.values_m)

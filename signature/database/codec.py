@@ -386,8 +386,8 @@ def row_crc(values: Iterable[Value]) -> int:
     return crc
 
 
-class Damage(DatabaseCorrupt):
-    """Damage at a known place: in which database, where in it, and what."""
+class DatabaseDamage(DatabaseCorrupt):
+    """DatabaseDamage at a known place: in which database, where in it, and what."""
 
     def __init__(self, location: Path | str, where: str, what: str) -> None:
         super().__init__(f"{location}: damaged: {where}: {what}", hint=SALVAGE)
@@ -396,10 +396,10 @@ class Damage(DatabaseCorrupt):
 
 @contextlib.contextmanager
 def explained(location: Path | str, where: str) -> Iterator[None]:
-    """Turn every exception that decoding damaged content can raise into Damage."""
+    """Turn every exception that decoding damaged content can raise into DatabaseDamage."""
     try:
         yield
     except (ValueError, TypeError, ArithmeticError, LookupError, AttributeError, RecursionError) as error:
         # The message of our own ValueErrors is complete; others are understood only with their type.
         what = str(error) if type(error) is ValueError else f"{type(error).__name__}: {error}"
-        raise Damage(location, where, what) from error
+        raise DatabaseDamage(location, where, what) from error

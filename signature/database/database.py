@@ -261,7 +261,7 @@ class SubmapDatabase(ABC):
         self._left_out |= damaged.keys()
         problems = (*damaged.values(), *self._rows.orphans())
         if problems and next(self._known(), None) is None:
-            raise codec.Damage(self.location, problems[0].where, problems[0].what)
+            raise codec.DatabaseDamage(self.location, problems[0].where, problems[0].what)
         return problems
 
     # --- rows and parts -------------------------------------------------------------------------------

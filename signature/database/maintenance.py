@@ -9,7 +9,7 @@ from pathlib import Path
 from pc2grid.errors import DatabaseCorrupt, DatabaseError
 from pc2grid.model import is_part_of, part_name
 from signature.database import engine_of, open_database, refuse_existing
-from signature.database.codec import Damage, clean
+from signature.database.codec import DatabaseDamage, clean
 from signature.database.postgres.server import is_url, location
 from signature.database.protocol import Entry, Place, Problem, SessionInfo
 from signature.database.rows import Rows, no_session, refuse_other_settings
@@ -98,7 +98,7 @@ def copy(source: Place, target: Place, *, recover: bool = False, force: bool = F
     problems = check(source)
     if problems and not recover:
         more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
-        raise Damage(shown(source), problems[0].where, problems[0].what + more)
+        raise DatabaseDamage(shown(source), problems[0].where, problems[0].what + more)
     _write(target, [(source, None)], recover=bool(problems))
     return problems
 

@@ -95,7 +95,7 @@ class Rows(ABC):
         """
         where = f"session {row.id}"
         if not row.sound:
-            raise codec.Damage(self.location, where, "wrong checksum")
+            raise codec.DatabaseDamage(self.location, where, "wrong checksum")
         with codec.explained(self.location, where):
             filed = tuple(validation.text(getattr(row, name), name) for name in ("name", "building", "floor"))
             document = validation.text(row.document, "document")
@@ -115,7 +115,7 @@ class Rows(ABC):
         """
         arrays = {}
         for name, array in self._arrays(row, part):
-            if isinstance(array, codec.Damage):
+            if isinstance(array, codec.DatabaseDamage):
                 raise array
             arrays[name] = array
         with codec.explained(self.location, f"{part} of session {row.name!r}"):
@@ -126,17 +126,19 @@ class Rows(ABC):
         known: dict[str, Any] = {}
         try:
             known["info"] = self.info(row)
-        except codec.Damage as error:
+        except codec.DatabaseDamage as error:
             yield error.problem
         except DatabaseVersion as error:
             yield Problem(f"session {row.id}", error.message)
         for part in parts[1:]:
             try:
-                damaged = [a.problem for _, a in self._arrays(row, part) if isinstance(a, codec.Damage)]
+                damaged = [
+                    a.problem for _, a in self._arrays(row, part) if isinstance(a, codec.DatabaseDamage)
+                ]
                 yield from damaged
                 if not damaged and "info" in known:
                     known[part] = self.part(row, part, known)
-            except codec.Damage as error:
+            except codec.DatabaseDamage as error:
                 yield error.problem
 
     def strays(self, row: SessionRow) -> Iterator[Problem]:
@@ -156,17 +158,17 @@ class Rows(ABC):
         for (number,) in self.select(_ORPHANS):
             yield Problem(f"arrays of session {number}", "belong to no session")
 
-    def _arrays(self, row: SessionRow, part: str) -> Iterator[tuple[str, codec.Array | codec.Damage]]:
+    def _arrays(self, row: SessionRow, part: str) -> Iterator[tuple[str, codec.Array | codec.DatabaseDamage]]:
         """The arrays of a part by their names, or what is wrong with them."""
         for *values, crc in self.select(_ARRAYS, row.building, row.id, len(part) + 1, f"{part}."):
             _, _, name, *packed = values
-            found: codec.Array | codec.Damage
+            found: codec.Array | codec.DatabaseDamage
             try:
                 with codec.explained(self.location, f"{name} of session {row.name!r}"):
                     if codec.row_crc(values) != crc:
                         raise ValueError("wrong checksum")
                     found = codec.unpack(codec.Packed(*packed))
-            except codec.Damage as error:
+            except codec.DatabaseDamage as error:
                 found = error
             yield name, found
 

@@ -9,7 +9,7 @@ from typing_extensions import TypedDict
 
 from pc2grid_lab.experiments.metrics import ConfidenceError, MatrixCell, QueryCounts
 from pc2grid_lab.experiments.real_sensors import RealCell
-from pc2grid_lab.experiments.recordings.changes import Change
+from pc2grid_lab.experiments.recordings.changes import RowChange
 from pc2grid_lab.experiments.recordings.rows import MapRow, PairRow
 from pc2grid_lab.experiments.trial import Trial
 from pc2grid_lab.peers.outcome import PeerCell, PeerTrial
@@ -120,7 +120,7 @@ class CompareRecordings(TypedDict):
     cpu_s: float
     maps: list[MapRow]
     pairs: list[PairRow]
-    changes: list[Change]
+    changes: list[RowChange]
 
 
 class CompareReal(TypedDict):

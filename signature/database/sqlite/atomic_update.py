@@ -20,7 +20,7 @@ from pathlib import Path
 
 from pc2grid.errors import DatabaseBusy, OutputError
 from pc2grid.io.atomic import is_at, replace_file
-from signature.database.codec import Damage
+from signature.database.codec import DatabaseDamage
 from signature.database.protocol import BUSY_TIMEOUT_S
 from signature.database.sqlite import schema
 from signature.database.sqlite.connection import BoundedConnection
@@ -71,7 +71,7 @@ def _explained(error: Exception, path: Path, kept: bool) -> Exception:
     if isinstance(error, sqlite3.OperationalError) and (not kept or _cannot_write(error)):
         return OutputError(f"{path}: cannot write: {error}", hint="free some space, or write to another disk")
     if kept:
-        return Damage(path, "file", str(error))
+        return DatabaseDamage(path, "file", str(error))
     return error  # what this process wrote itself is not damaged: an error of the program
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError
-from signature.database.codec import Damage
+from signature.database.codec import DatabaseDamage
 from signature.database.database import SubmapDatabase
 from signature.database.protocol import Place, Problem, no_utf8
 from signature.database.rows import Rows
@@ -44,7 +44,7 @@ class SqliteRows(Rows):
         except sqlite3.ProgrammingError:
             raise  # the use of a closed database is a mistake of the caller, not damage
         except schema.DAMAGE as error:
-            raise Damage(self.location, "file", f"{type(error).__name__}: {error}") from error
+            raise DatabaseDamage(self.location, "file", f"{type(error).__name__}: {error}") from error
 
     def execute(self, statement: str, *values: Any) -> None:
         """Change rows. Raises sqlite3.Error, which `rewrite` explains."""
@@ -103,7 +103,7 @@ class SqliteDatabase(SubmapDatabase):
             try:
                 problems += database._damaged_structure()
                 problems += database._damaged_rows()
-            except Damage as error:
+            except DatabaseDamage as error:
                 problems.append(error.problem)
         return tuple(dict.fromkeys(problems))
 
@@ -158,7 +158,7 @@ def _connect(path: Path) -> sqlite3.Connection:
             connection.execute(f"PRAGMA mmap_size = {_MAPPED_BYTES}")
             schema.inspect_tables(connection, path)
         except schema.DAMAGE as error:
-            raise Damage(path, "header", f"{type(error).__name__}: {error}") from error
+            raise DatabaseDamage(path, "header", f"{type(error).__name__}: {error}") from error
         undo.pop_all()
     return connection
 

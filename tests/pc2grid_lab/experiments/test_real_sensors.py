@@ -19,7 +19,13 @@ from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid.simulate.scene import extrude
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app
-from pc2grid_lab.experiments.real_sensors import Agreement, RealQuery, frame_of, real_cells, share_interval
+from pc2grid_lab.experiments.real_sensors import (
+    FrameAgreement,
+    RealQuery,
+    frame_of,
+    real_cells,
+    share_interval,
+)
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from tests.helpers.json_schema import closed
 from tests.helpers.simulated_drives import office
@@ -69,7 +75,7 @@ def queries(right: int, wrong: int) -> list[RealQuery]:
 
 
 def test_transform_is_the_one_that_most_answers_agree_with() -> None:
-    agreement = Agreement.of(queries(8, 12), maps())
+    agreement = FrameAgreement.of(queries(8, 12), maps())
     assert agreement.agreeing == 8 and len(agreement.clues) == 20
     found = agreement.T_floor_log
     assert found is not None
@@ -79,11 +85,11 @@ def test_transform_is_the_one_that_most_answers_agree_with() -> None:
 
 def test_no_answer_is_judged_by_itself() -> None:
     made = queries(3, 0)
-    agreement = Agreement.of(made, maps())
-    alone = Agreement.of(made[1:], maps())
+    agreement = FrameAgreement.of(made, maps())
+    alone = FrameAgreement.of(made[1:], maps())
     assert agreement.without(0) == alone.T_floor_log
-    assert Agreement.of(made[:1], maps()).without(0) is None
-    assert Agreement.of([], maps()).T_floor_log is None
+    assert FrameAgreement.of(made[:1], maps()).without(0) is None
+    assert FrameAgreement.of([], maps()).T_floor_log is None
 
 
 def test_only_the_laser_is_in_the_frame_of_the_log() -> None:

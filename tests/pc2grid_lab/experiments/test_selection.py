@@ -23,8 +23,8 @@ from pc2grid_lab.experiments.selection import (
     SELECTORS,
     SIGNATURES,
     VOTED,
-    Selected,
     Selection,
+    SelectionTrial,
     tally,
 )
 from pc2grid_lab.experiments.sensor_map import SensorMap
@@ -87,7 +87,7 @@ def test_a_query_from_elsewhere_is_not_counted() -> None:
 
 
 def test_shares_have_intervals_by_session() -> None:
-    one = Selected(
+    one = SelectionTrial(
         plan="a", query_sensor="laser", seed=0, travel_m=1.0, scope="city", places=100, selector=ALL,
         looked_at=5, found=True, located=True, right=True, processor_ms=3.0,
     )  # fmt: skip

@@ -15,7 +15,14 @@ from pc2grid_cli.tables import show, table
 from pc2grid_lab.compare.picture import picture
 from pc2grid_lab.experiments.paper_experiment import MatchMeasures, largest_right_share
 from pc2grid_lab.experiments.paper_tables import MAPS, SUBMAPS, TABLE_3, TABLE_4, Measures
-from pc2grid_lab.experiments.paper_task import ABLATION, OPEN_CHOICES, RADII_M, Choice, PaperCell, Reading
+from pc2grid_lab.experiments.paper_task import (
+    ABLATION,
+    OPEN_CHOICES,
+    RADII_M,
+    PaperCell,
+    Reading,
+    SettingChoice,
+)
 
 _LEVELS = ("without noise", "noise level 1", "noise level 2")
 
@@ -157,7 +164,7 @@ def _print_choices(
     results: Sequence[PaperCell],
     columns: Sequence[Column],
     title: str,
-    choices: Sequence[Choice],
+    choices: Sequence[SettingChoice],
     where: str,
 ) -> None:
     """A table of some choices: what the paper says, what the default does, and what the choice moves."""

@@ -30,7 +30,7 @@ from pc2grid_lab.compare import options as options
 from pc2grid_lab.compare.real_report import draw, print_table
 from pc2grid_lab.experiments.answers import localize
 from pc2grid_lab.experiments.plan_drives import MAP_SEED
-from pc2grid_lab.experiments.real_sensors import Agreement, RealQuery, judge_all, real_cells
+from pc2grid_lab.experiments.real_sensors import FrameAgreement, RealQuery, judge_all, real_cells
 from pc2grid_lab.experiments.registered_session import RegisteredSession, register
 from pc2grid_lab.experiments.replay import Replay
 from pc2grid_lab.experiments.sensor_map import MapKind, SensorMap, is_saved, save_map
@@ -181,7 +181,7 @@ def _compare(setting: Setting, terminal: Console, jobs: int | None, as_json: boo
             answered = in_processes(function, tasks, jobs=jobs, advance=advance)
     found: list[RealQuery] = list(filter(None, answered))
     maps = {name: _map(setting, name) for name in _MAPS}
-    agreement = Agreement.of(found, maps)
+    agreement = FrameAgreement.of(found, maps)
     trials = judge_all(found, maps, agreement)
     document = _document(setting, agreement, trials)
     write_text(out / "real.json", json_text(document) + "\n")
@@ -210,7 +210,7 @@ def _queries(setting: Setting) -> list[tuple[str, int]]:
     return queries + [(sensor, setting.seed + k) for k in range(setting.queries) for sensor in _DRIVEN]
 
 
-def _document(setting: Setting, agreement: Agreement, trials: Sequence[Trial]) -> dict[str, Any]:
+def _document(setting: Setting, agreement: FrameAgreement, trials: Sequence[Trial]) -> dict[str, Any]:
     transform = agreement.T_floor_log
     return {
         "schema_version": 1,

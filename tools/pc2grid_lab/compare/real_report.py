@@ -14,7 +14,7 @@ from pc2grid.geometry import SE2
 from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
 from pc2grid_cli.tables import show, table
 from pc2grid_lab.compare.picture import picture
-from pc2grid_lab.experiments.real_sensors import Agreement, RealCell, RealQuery
+from pc2grid_lab.experiments.real_sensors import FrameAgreement, RealCell, RealQuery
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from pc2grid_lab.experiments.trial import Trial
 from signature.localization.answer import Answer
@@ -28,7 +28,7 @@ _SIZES = {"lidar": 9.0, "depth": 5.5, "laser": 7.0}  # lidar and camera drive th
 _DRAWN_AT_MOST = 30_000  # wall points of a map; more would only make the picture heavier
 
 
-def print_table(cells: Sequence[RealCell], agreement: Agreement) -> None:
+def print_table(cells: Sequence[RealCell], agreement: FrameAgreement) -> None:
     """Print a row for each pair of sensors."""
     title = "one real floor, maps by each sensor, queries by each"
     counts = ("queries", "located, right", "right first", "in the map", "share right")
@@ -75,7 +75,7 @@ def draw(
     path: Path,
     queries: Sequence[RealQuery],
     maps: Mapping[str, SensorMap],
-    agreement: Agreement,
+    agreement: FrameAgreement,
     cells: Sequence[RealCell],
     trials: Sequence[Trial],
 ) -> None:

@@ -32,8 +32,8 @@ from pc2grid_lab.experiments.selection import (
     TRAVELS_M,
     PlacedQuery,
     Recalled,
-    Selected,
     Selection,
+    SelectionTrial,
     described_floor,
     floor_session,
     office_floor,
@@ -162,7 +162,7 @@ def _trials(
     locate: bool,
     named: str,
     step: Callable[[], None],
-) -> list[Selected]:
+) -> list[SelectionTrial]:
     """The trials in one plan. named : the end of the names of their files."""
     own, trials = maps[0], []
     indexes: dict[str, MapIndex] = {}
@@ -172,7 +172,7 @@ def _trials(
             indexes = indexes or {"building": own.index, "city": with_floors(own, city, Config())}
             found = _select(own, indexes, run.drive(own.name, sensor, seed), seed, share, locate)
             write_text(path, json.dumps([asdict(trial) for trial in found]))
-        trials += [Selected(**row) for row in json.loads(path.read_text())]
+        trials += [SelectionTrial(**row) for row in json.loads(path.read_text())]
         step()
     return trials
 
@@ -315,7 +315,7 @@ def _select(
     seed: int,
     share: float,
     locate: bool,
-) -> list[Selected]:
+) -> list[SelectionTrial]:
     found = []
     queries = list(queries_of(drive, Config()))
     for scope, index in indexes.items():
@@ -331,5 +331,5 @@ def _select(
                 "places": len(index.places.table),
             }
             measured = selection.measure(query, T_map_query, locate=locate)
-            found += [Selected(**about | dict(zip(MEASURED, row, strict=True))) for row in measured]
+            found += [SelectionTrial(**about | dict(zip(MEASURED, row, strict=True))) for row in measured]
     return found

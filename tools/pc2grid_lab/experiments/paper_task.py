@@ -51,7 +51,7 @@ TOGETHER = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
+class SettingChoice:
     """Another setting of the proposed method, to measure what it moves.
 
     name : in a few words. paper : what the paper says of it. ours : what the default does instead.
@@ -67,25 +67,25 @@ class Choice:
 _NO_SYMMETRY = ("symmetry_sigma", 1e6)
 
 ABLATION = (
-    Choice(
+    SettingChoice(
         name="boundary and free space",
         paper="Eq. 6 with Omega = 1",
         ours="Eq. 6",
         overrides=(_NO_SYMMETRY,),
     ),
-    Choice(
+    SettingChoice(
         name="boundary alone",
         paper="omega_b = 1, Omega = 1",
         ours="Eq. 6",
         overrides=(("weight_boundary", 1.0), _NO_SYMMETRY),
     ),
-    Choice(
+    SettingChoice(
         name="free space alone",
         paper="omega_b = 0, Omega = 1",
         ours="Eq. 6",
         overrides=(("weight_boundary", 0.0), _NO_SYMMETRY),
     ),
-    Choice(
+    SettingChoice(
         name="symmetry made to count",
         paper="sigma = 120",
         ours="sigma = 120; here 4",
@@ -95,7 +95,7 @@ ABLATION = (
 """What each signature adds."""
 
 OPEN_CHOICES = (
-    Choice(
+    SettingChoice(
         name="to the letter",
         paper="all of the next five",
         ours="none of them",
@@ -103,54 +103,62 @@ OPEN_CHOICES = (
             (key, value) for key, value in SignatureConfig.paper() if value != getattr(SignatureConfig(), key)
         ),
     ),
-    Choice(
+    SettingChoice(
         name="-ln BC",
         paper="Bhattacharyya distance",
         ours="sqrt(1 - BC), which OpenCV calls so",
         overrides=(("histogram_distance", "bhattacharyya"),),
     ),
-    Choice(
+    SettingChoice(
         name="Zhang-Suen thinning",
         paper="thinning, not which one",
         ours="Guo-Hall in the signatures",
         overrides=(("thinning", "zhang_suen"),),
     ),
-    Choice(
+    SettingChoice(
         name="full resolution",
         paper="skeleton of the map",
         ours="free-space skeleton on blocks of 0.1 m",
         overrides=(("freespace_cell_m", 0.05),),
     ),
-    Choice(
+    SettingChoice(
         name="no limit in S^G",
         paper="no limit",
         ours="cut at 34, the value of a straight line",
         overrides=(("symmetry_limited", False),),
     ),
-    Choice(
+    SettingChoice(
         name="plain vote",
         paper="voting on the angles",
         ours="by length, blurred, refined",
         overrides=(("axis_vote", "plain"),),
     ),
-    Choice(name="boundary points 0.05 m", paper="-", ours="0.1 m", overrides=(("boundary_spacing_m", 0.05),)),
-    Choice(name="boundary points 0.2 m", paper="-", ours="0.1 m", overrides=(("boundary_spacing_m", 0.2),)),
-    Choice(name="nodes 0.4 m apart", paper="-", ours="0.6 m", overrides=(("freespace_spacing_m", 0.4),)),
-    Choice(name="nodes 1.0 m apart", paper="-", ours="0.6 m", overrides=(("freespace_spacing_m", 1.0),)),
-    Choice(
+    SettingChoice(
+        name="boundary points 0.05 m", paper="-", ours="0.1 m", overrides=(("boundary_spacing_m", 0.05),)
+    ),
+    SettingChoice(
+        name="boundary points 0.2 m", paper="-", ours="0.1 m", overrides=(("boundary_spacing_m", 0.2),)
+    ),
+    SettingChoice(
+        name="nodes 0.4 m apart", paper="-", ours="0.6 m", overrides=(("freespace_spacing_m", 0.4),)
+    ),
+    SettingChoice(
+        name="nodes 1.0 m apart", paper="-", ours="0.6 m", overrides=(("freespace_spacing_m", 1.0),)
+    ),
+    SettingChoice(
         name="eroded by 0.3 m",
         paper="erosion, not how much",
         ours="0.2 m",
         overrides=(("freespace_clearance_m", 0.3),),
     ),
-    Choice(
+    SettingChoice(
         name="nodes joined to 1.5 m",
         paper="all that see each other",
         ours="the same",
         overrides=(("freespace_join_m", 1.5),),
     ),
-    Choice(name="S^G peaks at 255", paper="-", ours="34", overrides=(("symmetry_peak", 255.0),)),
-    Choice(name="omega_b = 0.7", paper="0.9", ours="0.9", overrides=(("weight_boundary", 0.7),)),
+    SettingChoice(name="S^G peaks at 255", paper="-", ours="34", overrides=(("symmetry_peak", 255.0),)),
+    SettingChoice(name="omega_b = 0.7", paper="0.9", ours="0.9", overrides=(("weight_boundary", 0.7),)),
 )
 """Where the default departs from the paper, and other values of what the paper leaves open."""
 
@@ -209,7 +217,7 @@ def paper_tasks(
     offsets_m: Sequence[float] = (1.0, 0.5),
     queries: int = 2000,
     seed: int = 1,
-    choices: Sequence[Choice] = (),
+    choices: Sequence[SettingChoice] = (),
     speckle_sigma_m: float = NOISE_LEVELS[0].speckle_sigma_m,
 ) -> Iterator[PaperTask]:
     """Every task of Tables III and IV, and those that measure other `choices`.
@@ -230,7 +238,9 @@ def paper_tasks(
             )
 
 
-def _cells_of(path: Path, group: tuple[str, ...], choices: Sequence[Choice]) -> Iterator[dict[str, Any]]:
+def _cells_of(
+    path: Path, group: tuple[str, ...], choices: Sequence[SettingChoice]
+) -> Iterator[dict[str, Any]]:
     """Reading, level, radius and overrides of the tasks of some methods on a map."""
     plain: dict[str, Any] = {"reading": "paper", "radius_m": 8.0}
     for level in range(len(NOISE_LEVELS)):

@@ -33,7 +33,7 @@ Frame = Literal["floor", "log"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AgreementParameters:
+class FrameAgreementParameters:
     """How the transform between the two frames is found. All chosen by hand.
 
     near_m, near_rad : an answer agrees with a transform within this. Maps of two sensors and years differ by
@@ -52,7 +52,7 @@ class AgreementParameters:
     resamples: int = 2000
 
 
-AGREEMENT = AgreementParameters()
+AGREEMENT = FrameAgreementParameters()
 
 
 def frame_of(sensor: MapKind) -> Frame:
@@ -97,7 +97,7 @@ class _Clue:
 
 
 @dataclass(frozen=True, slots=True)
-class Agreement:
+class FrameAgreement:
     """The rigid transform between the frames.
 
     T_floor_log : fitted to all answers that agree with it; None without an answer across the frames.
@@ -109,7 +109,7 @@ class Agreement:
     clues: tuple[_Clue, ...]
 
     @staticmethod
-    def of(queries: Sequence[RealQuery], maps: Mapping[str, SensorMap]) -> Agreement:
+    def of(queries: Sequence[RealQuery], maps: Mapping[str, SensorMap]) -> FrameAgreement:
         """Of the best hypothesis of every answer across the frames, whatever its status is.
 
         Each implies a transform; the one that most answers agree with is kept and fitted to them.
@@ -121,7 +121,7 @@ class Agreement:
             if answer.hypotheses and frame_of(query.sensor) != frame_of(maps[name].sensor)
         )
         if not clues:
-            return Agreement(None, 0, clues)
+            return FrameAgreement(None, 0, clues)
 
         def agreeing(T_floor_log: SE2) -> list[_Clue]:
             return [clue for clue in clues if clue.agrees(T_floor_log)]
@@ -129,7 +129,7 @@ class Agreement:
         best = max((clue.T_floor_log for clue in clues), key=lambda T: len(agreeing(T)))
         for _ in range(AGREEMENT.rounds):
             best = _fit(agreeing(best)) or best
-        return Agreement(best, len(agreeing(best)), clues)
+        return FrameAgreement(best, len(agreeing(best)), clues)
 
     def without(self, query: int) -> SE2 | None:
         """The same transform fitted without the answers to one query, so that none is judged by itself."""
@@ -154,7 +154,7 @@ def _fit(clues: Sequence[_Clue]) -> SE2 | None:
 
 
 def judge_all(
-    queries: Sequence[RealQuery], maps: Mapping[str, SensorMap], agreement: Agreement
+    queries: Sequence[RealQuery], maps: Mapping[str, SensorMap], agreement: FrameAgreement
 ) -> list[Trial]:
     """Every answer with its truth. Answers across the frames are left out where no transform is known."""
     trials = []

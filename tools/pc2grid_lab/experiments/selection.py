@@ -48,13 +48,13 @@ SELECTORS = (ALL, VOTED, *SEEN_SELECTORS, PAPER, RANDOM)
 LOCATED_BY = (ALL, VOTED, PAPER, RANDOM)
 """The selectors for which queries are also located, which takes most of the time."""
 MEASURED = ("selector", "looked_at", "found", "located", "right", "processor_ms")
-"""The fields of `Selected` that `Selection.measure` yields."""
+"""The fields of `SelectionTrial` that `Selection.measure` yields."""
 TRAVELS_M = (1.0, 3.0, 8.0)
 """Metres of travel after which a query is located."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Selected:
+class SelectionTrial:
     """A query, and the places that were selected for it.
 
     plan, query_sensor, seed, travel_m : the query. scope : "building" or "city". places : how many there are.
@@ -253,7 +253,7 @@ class Recalled:
 
     @property
     def session(self) -> str:
-        """As of `Selected`."""
+        """As of `SelectionTrial`."""
         return f"{self.plan}.{self.query_sensor}.{self.seed}"
 
 
@@ -338,10 +338,10 @@ def tally_at_scale(trials: Sequence[Recalled], *, draws: int = 1000) -> list[Map
     ]
 
 
-def tally(trials: Sequence[Selected], *, draws: int = 1000) -> list[Mapping[str, object]]:
+def tally(trials: Sequence[SelectionTrial], *, draws: int = 1000) -> list[Mapping[str, object]]:
     """For each scope, selector and travel: shares found and located rightly, with their 5th and 95th
     percentiles over sessions drawn anew (bootstrap), the share located wrongly, and the median time."""
-    groups: dict[tuple[str, str, float], list[Selected]] = {}
+    groups: dict[tuple[str, str, float], list[SelectionTrial]] = {}
     for trial in trials:
         groups.setdefault((trial.scope, trial.selector, trial.travel_m), []).append(trial)
     return [
@@ -361,12 +361,14 @@ def tally(trials: Sequence[Selected], *, draws: int = 1000) -> list[Mapping[str,
     ]
 
 
-def _share(members: Sequence[Selected | Recalled], field: str, draws: int) -> tuple[float, float, float]:
+def _share(
+    members: Sequence[SelectionTrial | Recalled], field: str, draws: int
+) -> tuple[float, float, float]:
     yes = np.array([bool(getattr(m, field)) for m in members])
     return share_by_session([m.session for m in members], yes, draws=draws)
 
 
-def _located(members: Sequence[Selected], draws: int) -> dict[str, object]:
+def _located(members: Sequence[SelectionTrial], draws: int) -> dict[str, object]:
     """Shares located rightly and wrongly of those that were tried; None if none was."""
     tried = [m for m in members if m.right is not None]
     if not tried:

@@ -27,7 +27,7 @@ Found = tuple[Matrix, float] | None
 """T_map_base (4, 4) and a score, or None."""
 
 
-class Matcher(Protocol):
+class CloudMatcher(Protocol):
     """A program that has the map, and is given queries."""
 
     def locate(self, points_m: Cloud) -> Found:
@@ -40,7 +40,7 @@ SUBMAP_M = 15.0
 DENSITY_M = 0.15
 """Pixel of the density maps of MapClosures; its default is 0.5 m."""
 VOXEL_M = 0.3
-"""Of KISS-Matcher; 0.15 m takes three times as long and finds no more."""
+"""Of KISS-CloudMatcher; 0.15 m takes three times as long and finds no more."""
 FPFH_VOXEL_M = 0.3
 """Of Open3D's FPFH; with 0.2 m a query takes 18 s, most of it for the matches of features."""
 SEED = 0
@@ -196,7 +196,7 @@ def main() -> None:
     with np.load(f"{map_stem}.npz") as file:
         path, points_m, count = file["T_map_base"], file["points_m"], file["count"]
     clouds = np.split(points_m, np.cumsum(count)[:-1])
-    matchers: dict[str, Callable[[Matrix, list[Cloud]], Matcher]] = {
+    matchers: dict[str, Callable[[Matrix, list[Cloud]], CloudMatcher]] = {
         "map-closures": MapClosures,
         "kiss-matcher": KissMatcher,
         "fpfh-ransac": FpfhRansac,

@@ -26,7 +26,7 @@ from pc2grid.simulate.clutter import Furniture, covered, place_clutter
 from pc2grid.simulate.config import SimulationConfig
 from pc2grid.simulate.drive import RATE_HZ, Drive, drive_along
 from pc2grid.simulate.floorplan import OUTER_WALL_M, office_floorplan
-from pc2grid.simulate.odometry import Odometry, odometry_of
+from pc2grid.simulate.odometry import SimulatedOdometry, odometry_of
 from pc2grid.simulate.passage import clearance_m
 from pc2grid.simulate.route import Route, plan_route, plan_way
 from pc2grid.simulate.scene import Mesh, Scene, extrude, quads
@@ -320,7 +320,7 @@ class HouseSession:
     clutter: tuple[Furniture, ...]
     scenes: tuple[Mesh, ...]
     drive: SpatialDrive
-    odometry: Odometry | None
+    odometry: SimulatedOdometry | None
     config: SimulationConfig
 
     @property
@@ -532,7 +532,9 @@ def _raised(mesh: Mesh, height_m: float) -> Mesh:
     return Mesh(transform_points(T, mesh.vertices_m).astype(np.float32), mesh.triangles)
 
 
-def _odometry(drive: SpatialDrive, config: SimulationConfig, rng: np.random.Generator) -> Odometry | None:
+def _odometry(
+    drive: SpatialDrive, config: SimulationConfig, rng: np.random.Generator
+) -> SimulatedOdometry | None:
     """Wheels measure the distance along a slope, not in the plan."""
     if not config.odometry.enabled:
         return None

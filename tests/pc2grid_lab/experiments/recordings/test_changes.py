@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from pc2grid_lab.experiments.recordings.chance import by_chance, clopper_pearson
-from pc2grid_lab.experiments.recordings.changes import Change, changes
+from pc2grid_lab.experiments.recordings.changes import RowChange, changes
 from pc2grid_lab.experiments.recordings.page import page
 from pc2grid_lab.experiments.recordings.rows import MapRow, PairRow, QueryRow, Table
 from pc2grid_lab.experiments.recordings.warned import warned
@@ -94,7 +94,7 @@ def test_the_same_again_is_no_change() -> None:
 )
 def test_a_map_that_changed_is_told(now: dict[str, Any], text: str, worse: bool) -> None:
     found = changes(table(map_row()), table(map_row(**now)))
-    assert found == [Change(row="hall", text=text, worse=worse)]
+    assert found == [RowChange(row="hall", text=text, worse=worse)]
 
 
 @pytest.mark.parametrize("now", [{"error_m": 0.036}, {"error_m": 0.032}, {"cpu_s": 11.0}])
@@ -174,7 +174,7 @@ def test_the_page_shows_each_row() -> None:
         pair_row(problem="laser/x.mcap: not in the data folder", query="x"),
         pair_row("wrong", kind="elsewhere", truth="elsewhere", building="intel"),
     )
-    text = page(table(*rows), [Change(row="hall", text="error 0.030 -> 0.730 m", worse=True)])
+    text = page(table(*rows), [RowChange(row="hall", text="error 0.030 -> 0.730 m", worse=True)])
     (bent,) = [line for line in text.splitlines() if line.startswith("| hall | hall | lidar")]
     assert "bent (false)" in bent and "| 0.030 |" in bent
     assert "| wean\\|3 |" in text and "internal error: KeyError |" in text

@@ -15,7 +15,7 @@ from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.recordings import judging
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.children import Finished
-from pc2grid_lab.experiments.recordings.drive import Drive
+from pc2grid_lab.experiments.recordings.drive import RecordedDrive
 from pc2grid_lab.experiments.recordings.judging import Judge, LocatedWindow, known_share
 from pc2grid_lab.experiments.recordings.run import Folder
 
@@ -119,15 +119,15 @@ def trajectory(*stamps_s: float) -> Trajectory:
 
 def test_true_poses_are_interpolated_or_carried() -> None:
     own = trajectory(*np.arange(0.0, 30.0, 0.25))
-    dense = Drive((), trajectory(0.0, 0.2, 0.4), SE2())
+    dense = RecordedDrive((), trajectory(0.0, 0.2, 0.4), SE2())
     between = dense.true_pose(100_000_000)
     assert between is not None and (between.x, between.y) == pytest.approx((0.1, 0.01))
-    sparse = Drive((own,), trajectory(0.0, 1.0, 8.0), SE2())
+    sparse = RecordedDrive((own,), trajectory(0.0, 1.0, 8.0), SE2())
     carried = sparse.true_pose(6_000_000_000)
     assert carried is not None and (carried.x, carried.yaw) == pytest.approx((6.0, 0.3))
     assert sparse.true_pose(25_000_000_000) is None  # 17 s from the last true pose
-    assert Drive((), trajectory(0.0, 8.0), SE2()).true_pose(6_000_000_000) is None
-    shifted = Drive((), trajectory(0.0, 0.2), SE2(-0.1, 0.0, 0.0)).true_pose(0)
+    assert RecordedDrive((), trajectory(0.0, 8.0), SE2()).true_pose(6_000_000_000) is None
+    shifted = RecordedDrive((), trajectory(0.0, 0.2), SE2(-0.1, 0.0, 0.0)).true_pose(0)
     assert shifted is not None and shifted.x == pytest.approx(-0.1)
 
 

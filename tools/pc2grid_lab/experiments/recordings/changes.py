@@ -28,7 +28,7 @@ CHANGE = ChangeParameters()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Change:
+class RowChange:
     """A line of what changed. row : of the page. worse : by more than chance."""
 
     row: str
@@ -36,7 +36,7 @@ class Change:
     worse: bool = False
 
 
-def changes(before: Table, after: Table) -> list[Change]:
+def changes(before: Table, after: Table) -> list[RowChange]:
     """What changed in the rows that both runs have; times relative to the change that half of them exceed."""
     maps = [(old, new) for new in after.maps for old in before.maps if old.name == new.name]
     pairs = [(old, new) for new in after.pairs for old in before.pairs if _key(old) == _key(new)]
@@ -63,13 +63,13 @@ def _pace(maps: Sequence[tuple[MapRow, MapRow]]) -> float:
     return median(ratios) if ratios else 1.0
 
 
-def _map_changes(old: MapRow, new: MapRow, pace: float) -> Iterator[Change]:
+def _map_changes(old: MapRow, new: MapRow, pace: float) -> Iterator[RowChange]:
     if old.problem != new.problem:
         yield _problem(new.name, old.problem, new.problem, "mapped")
         return
     for text, was, is_, told in _figures(old, new, pace):
         if told:
-            yield Change(row=new.name, text=text, worse=is_ > was)
+            yield RowChange(row=new.name, text=text, worse=is_ > was)
     verdicts = [{warning.about: warning.verdict for warning in row.warnings} for row in (old, new)]
     for words, some, others, bad in (
         ("new warning", verdicts[1], verdicts[0], "false"),
@@ -77,7 +77,7 @@ def _map_changes(old: MapRow, new: MapRow, pace: float) -> Iterator[Change]:
     ):
         for about in sorted(some.keys() - others.keys()):
             verdict = some[about]
-            yield Change(row=new.name, text=f"{words}: {about} ({verdict})", worse=verdict == bad)
+            yield RowChange(row=new.name, text=f"{words}: {about} ({verdict})", worse=verdict == bad)
 
 
 def _figures(old: MapRow, new: MapRow, pace: float) -> Iterator[tuple[str, float, float, bool]]:
@@ -101,9 +101,9 @@ def _moved(old: float, new: float, least: float) -> bool:
     return abs(new - old) >= least and not 1 / share < ratio < share
 
 
-def _problem(row: str, old: str, new: str, without: str) -> Change:
+def _problem(row: str, old: str, new: str, without: str) -> RowChange:
     """Two problems that differ. without : the word for none."""
-    return Change(row=row, text=f"{old or without} -> {new or without}", worse=bool(new) and not old)
+    return RowChange(row=row, text=f"{old or without} -> {new or without}", worse=bool(new) and not old)
 
 
 def _same_windows(
@@ -126,23 +126,23 @@ def _same_windows(
 
 def _pair_changes(
     name: str, old_problem: str, new_problem: str, windows: Sequence[tuple[QueryRow, QueryRow]]
-) -> Iterator[Change]:
+) -> Iterator[RowChange]:
     if old_problem != new_problem:
         yield _problem(name, old_problem, new_problem, "asked")
     before, after = (Counter(_outcome(pair[k]) for pair in windows) for k in (0, 1))
     for what in ("right", "wrong", "refused", "not judged", "failed"):
         if before[what] != after[what]:
             text = f"{what} {before[what]} -> {after[what]} of {len(windows)}"
-            yield Change(row=name, text=text, worse=what == "failed" and after[what] > before[what])
+            yield RowChange(row=name, text=text, worse=what == "failed" and after[what] > before[what])
     for old, new in windows:
         if _outcome(new) == "wrong" != _outcome(old):
             sure = f" at {new.confidence:.3f}" if new.confidence is not None else ""
             off = f", {new.error_m:.2f} m off" if new.error_m is not None else ""
             text = f"newly wrong: the window from {old.start_s:.1f} s{off}{sure} ({_outcome(old)} before)"
-            yield Change(row=name, text=text, worse=True)
+            yield RowChange(row=name, text=text, worse=True)
 
 
-def _worse(name: str, windows: Sequence[tuple[QueryRow, QueryRow]]) -> Iterator[Change]:
+def _worse(name: str, windows: Sequence[tuple[QueryRow, QueryRow]]) -> Iterator[RowChange]:
     """Whether fewer are located and right, by a sign test over the windows that changed."""
     counts = Counter((_outcome(a) == "right", _outcome(b) == "right") for a, b in windows)
     lost, won = counts[True, False], counts[False, True]
@@ -151,7 +151,7 @@ def _worse(name: str, windows: Sequence[tuple[QueryRow, QueryRow]]) -> Iterator[
     chance = by_chance(max(lost, won), min(lost, won))
     text = f"{won} windows more are located and right, {lost} are no longer (p {chance:.3f})"
     if chance < ALPHA or name == "all queries":
-        yield Change(row=name, text=text, worse=lost > won and chance < ALPHA)
+        yield RowChange(row=name, text=text, worse=lost > won and chance < ALPHA)
 
 
 def _outcome(query: QueryRow) -> str:

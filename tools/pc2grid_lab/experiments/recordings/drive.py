@@ -44,7 +44,7 @@ def mount(folder: Folder, recording: Recording) -> SE2:
 
 
 @dataclass(frozen=True)
-class Drive:
+class RecordedDrive:
     """A recording as it was driven: its own trajectories, and true poses if there are any.
 
     parts : the sessions of the map of the whole recording; none for a map that is no recording.
@@ -56,12 +56,12 @@ class Drive:
     T_sensor_base: SE2
 
     @staticmethod
-    def of(recording: Recording, folder: Folder) -> Drive:
+    def of(recording: Recording, folder: Folder) -> RecordedDrive:
         """Of a recording whose whole map is in the folder."""
         parts = tuple(sessions(folder, recording.name).values())
         truth = None if recording.poses is None else read_tum(folder.data / recording.poses)
         T_base_sensor = SE2() if recording.of_base or truth is None else mount(folder, recording)
-        return Drive(parts, truth, T_base_sensor.inverse())
+        return RecordedDrive(parts, truth, T_base_sensor.inverse())
 
     def own_pose(self, stamp_ns: int) -> tuple[int, SE2] | None:
         """The part and T_part_base of the scan with that stamp; None if no part has it."""

@@ -18,7 +18,7 @@ from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_frame, is_right
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.children import Finished, kept
-from pc2grid_lab.experiments.recordings.drive import Drive, config_of, sessions
+from pc2grid_lab.experiments.recordings.drive import RecordedDrive, config_of, sessions
 from pc2grid_lab.experiments.recordings.mapped import MISSING, map_row, said
 from pc2grid_lab.experiments.recordings.rows import NOT_RUN, PairRow, QueryRow, Table, Truth
 from pc2grid_lab.experiments.recordings.run import Folder
@@ -94,7 +94,7 @@ class Judge:
 
     def __init__(self, catalogue: Catalogue, folder: Folder) -> None:
         self._catalogue, self._folder = catalogue, folder
-        self._drives: dict[str, Drive] = {}
+        self._drives: dict[str, RecordedDrive] = {}
         self._grids: dict[str, dict[str, OccupancyGrid]] = {}
         self._windows: dict[Pair, list[LocatedWindow]] = {}
 
@@ -155,7 +155,7 @@ class Judge:
         if pair.kind == "elsewhere":
             return LocatedWindow(pair.query, number, span, done)
         if pair.query not in self._drives:
-            self._drives[pair.query] = Drive.of(query, self._folder)
+            self._drives[pair.query] = RecordedDrive.of(query, self._folder)
         drive = self._drives[pair.query]
         where: tuple[int, SE2] | None
         if drive.truth is None:

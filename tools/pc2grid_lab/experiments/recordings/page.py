@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from pc2grid_lab.experiments.recordings.catalogue import KINDS
 from pc2grid_lab.experiments.recordings.chance import clopper_pearson
-from pc2grid_lab.experiments.recordings.changes import Change
+from pc2grid_lab.experiments.recordings.changes import RowChange
 from pc2grid_lab.experiments.recordings.rows import NOT_RUN, Counts, MapRow, PairRow, Table
 
 _MARKS = {"right": "", "false": " (false)", "unknown": " (?)"}
@@ -14,7 +14,7 @@ _READING = ("no tf", "gaps", "empty scans")
 """Warnings about the file, that say nothing of the map."""
 
 
-def page(table: Table, changed: Sequence[Change] = ()) -> str:
+def page(table: Table, changed: Sequence[RowChange] = ()) -> str:
     """The page in Markdown. changed : against the run before."""
     return "\n".join(
         [
@@ -253,13 +253,13 @@ def _failures(table: Table) -> list[str]:
     return found + (["## Failed", "", *problems, ""] if problems else [])
 
 
-def _changed(changed: Sequence[Change]) -> list[str]:
+def _changed(changed: Sequence[RowChange]) -> list[str]:
     if not changed:
         return []
     return ["## Changed since the run before", "", *change_lines(changed), ""]
 
 
-def change_lines(changed: Sequence[Change]) -> list[str]:
+def change_lines(changed: Sequence[RowChange]) -> list[str]:
     """A line for each change; what became worse by more than chance is marked."""
     return [f"- {'**worse** ' if change.worse else ''}{change.row}: {change.text}" for change in changed]
 
