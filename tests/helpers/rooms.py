@@ -9,6 +9,8 @@ from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, Submap
 from pc2grid.submaps.partition import submap_at
 
 RESOLUTION_M = 0.05
+"""Edge of a cell, as in the default settings. Bounds on positions are whole cells: a map shows no less, and
+two sensors, or a map and the truth, may differ by the cell that each rounds to and one of noise."""
 
 
 def canvas(size_m: float = 16.05) -> np.ndarray:

@@ -26,6 +26,7 @@ from pc2grid.simulate.session import Session
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab import worlds
 from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
+from tests.helpers.rooms import RESOLUTION_M
 
 Mapped = tuple[Session, list[tuple[Scan, SE2]], OccupancyGrid, Trajectory]
 
@@ -87,7 +88,7 @@ def mapped(session: Session) -> Mapped:
 def test_trajectory_and_grid_agree_with_the_true_plan(mapped: Mapped) -> None:
     session, pairs, grid, trajectory = mapped
     truth = np.array([(p.x, p.y) for _, p in pairs])
-    assert ate_m(trajectory.planar()[:, :2], truth) < 0.05
+    assert ate_m(trajectory.planar()[:, :2], truth) < RESOLUTION_M
     first = pairs[0][1]
     rows, columns = np.nonzero(grid.free)
     inside = session.grid.to_cell(first.apply(grid.to_point(np.column_stack((rows, columns)))))
@@ -138,7 +139,7 @@ def test_a_robot_that_was_carried_elsewhere_makes_two_maps(
     assert np.allclose(maps[1].trajectory.planar()[0], 0.0)
     # Found without odometry at the first scan in both cases, so the maps are equal but for some cells.
     apart = alone.trajectory.planar()[-1] - maps[1].trajectory.planar()[-1]
-    assert np.hypot(*apart[:2]) < 0.1
+    assert np.hypot(*apart[:2]) < 2 * RESOLUTION_M
     (said, *_) = [w for w in maps[0].report.warnings if "falls into 2 parts" in w]
     assert "robot#2 from 3" in said and "come back to known places" in said
     assert "odometry" not in said  # it has that

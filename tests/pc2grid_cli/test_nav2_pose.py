@@ -15,6 +15,7 @@ from pc2grid.io.nav2_map import save_map
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli import console
 from pc2grid_cli.main import app
+from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import cut, office
 
 
@@ -96,12 +97,16 @@ def test_a_map_is_located_and_laid_over_the_other(
     assert code == 0, err
     document = json.loads(out)
     assert document["status"] == "located" and document["query"]["sensor"] == "map"
-    assert (document["T_map_odom"]["x"], document["T_map_odom"]["y"]) == pytest.approx((4, 3), abs=0.05)
+    assert (document["T_map_odom"]["x"], document["T_map_odom"]["y"]) == pytest.approx(
+        (4, 3), abs=RESOLUTION_M
+    )
     told = messages(mcap)
     assert told["/query_map"][0].header.frame_id == "query_map"
     (edge,) = told["/tf_static"][0].transforms
     assert (edge.header.frame_id, edge.child_frame_id) == ("map", "query_map")
-    assert (edge.transform.translation.x, edge.transform.translation.y) == pytest.approx((4, 3), abs=0.05)
+    assert (edge.transform.translation.x, edge.transform.translation.y) == pytest.approx(
+        (4, 3), abs=RESOLUTION_M
+    )
     assert "/initialpose" not in told
     code, out, err = pc2grid(capsys, *where)
     assert code == 0 and out.startswith("located in office: x 4.0") and "travel" not in out

@@ -38,6 +38,9 @@ from tests.helpers.simulated_drives import cut, office, plan
 NASTY = "</script><b>&"
 RADIUS_M = Config().partition.radius_m
 
+ROUNDED_M = 0.006
+"""The page shows centimetres: half of one, and a little for the float32 of the table."""
+
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> SubmapDatabase:
@@ -88,7 +91,7 @@ def test_submaps_graph_and_path_are_those_of_the_database(database: SubmapDataba
     table = database.signatures()
     rows = np.flatnonzero(table.session_index == 0)
     assert [s["id"] for s in first["submaps"]] == table.submap_id[rows].tolist()
-    assert np.allclose([s["xy"] for s in first["submaps"]], table.center_m[rows], atol=0.006)
+    assert np.allclose([s["xy"] for s in first["submaps"]], table.center_m[rows], atol=ROUNDED_M)
     assert np.allclose([s["boundary"] for s in first["submaps"]], table.boundary[rows], atol=1e-4)
     nodes, edges = first["graph"]["nodes"], first["graph"]["edges"]
     assert len(nodes) > 5 and len(edges) > 5
@@ -131,7 +134,7 @@ def test_loops_join_the_places_that_they_are_between(database: SubmapDatabase) -
     first, second = contents(database)["sessions"]
     places = way().planar()[:, :2]
     wanted = [[*places[loop.older], *places[loop.newer], loop.accepted] for loop in LOOPS]
-    assert np.allclose(first["loops"], wanted, atol=0.006)
+    assert np.allclose(first["loops"], wanted, atol=ROUNDED_M)
     assert second["loops"] == []
 
 
@@ -150,7 +153,7 @@ def test_where_map_and_scans_disagree_is_marked_on_the_path(tmp_path: Path) -> N
     with open_database(tmp_path / "bent.submaps") as database:
         shown = contents(database)["sessions"][0]
     assert (shown["agreement"], shown["bent"]) == (0.7, True)
-    assert np.allclose(shown["contradicted"], [way().planar()[5:10, :2].ravel()], atol=0.006)
+    assert np.allclose(shown["contradicted"], [way().planar()[5:10, :2].ravel()], atol=ROUNDED_M)
 
 
 def test_how_exactly_places_are_known_is_drawn_along_the_path(tmp_path: Path) -> None:
@@ -170,7 +173,7 @@ def test_how_exactly_places_are_known_is_drawn_along_the_path(tmp_path: Path) ->
     assert shown["worst_m"] == 0.75
     ((sigma_m, *xy),) = shown["loose"]  # the first piece is known better than a path is wide
     assert sigma_m == 0.4
-    assert np.allclose((xy[:2], xy[-2:]), way().planar()[[4, 9], :2], atol=0.006)
+    assert np.allclose((xy[:2], xy[-2:]), way().planar()[[4, 9], :2], atol=ROUNDED_M)
 
 
 def test_an_answer_comes_with_how_exactly_the_map_is_known_there(tmp_path: Path, found: Found) -> None:

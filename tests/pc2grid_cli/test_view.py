@@ -37,6 +37,7 @@ from pc2grid_cli.view_server import Options, ViewServer, safe_name
 from signature.config import Config
 from signature.database import open_database
 from tests.helpers.interruptible import interruptible
+from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import office
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -538,7 +539,7 @@ def test_a_robot_is_followed(desk: Path, tmp_path: Path) -> None:
     moments = [data for kind, data in told if kind == "moment" and data["status"] == "located"]
     assert moments
     for moment in moments:
-        assert np.hypot(*(truth[:, :2] - moment["pose"][:2]).T).min() < 0.1
+        assert np.hypot(*(truth[:, :2] - moment["pose"][:2]).T).min() < 2 * RESOLUTION_M
     assert np.hypot(*(truth[-1, :2] - moments[-1]["pose"][:2])) < 1.5
 
 

@@ -23,6 +23,7 @@ from pc2grid.mapping.cloud_map import (
 from pc2grid.mapping.drawn_map import load_drawn_map
 from pc2grid.model import OccupancyGrid
 from tests.helpers.building_clouds import ROOM_M, box_surface, room_cloud
+from tests.helpers.rooms import RESOLUTION_M
 
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
 FLOOR = DATA / "lidar" / "fr079_floor.ply"
@@ -39,7 +40,7 @@ def test_floor_is_levelled(height_m: float, tilt_deg: float) -> None:
     floor = level[np.abs(level[:, 2]) < 0.3]
     assert len(floor) > 15_000
     assert np.median(np.abs(floor[:, 2])) < 0.01
-    assert level[:, 2].max() == pytest.approx(2.5, abs=0.05)
+    assert level[:, 2].max() == pytest.approx(2.5, abs=RESOLUTION_M)
 
 
 def test_plan_is_free_where_floor_is_seen_and_nothing_stands() -> None:

@@ -70,7 +70,7 @@ def test_point_map_keeps_one_point_a_voxel_within_a_millimetre() -> None:
     points = PointMap.of(CLOUD, 0.05)
     assert len(points) == len(np.unique(np.floor((CLOUD - CLOUD.min(axis=0)) / 0.05), axis=0))
     away_m = np.linalg.norm(points.points_m()[:, None] - CLOUD[None], axis=2).min(axis=1)
-    assert away_m.max() < 0.05 / POINT_STEPS
+    assert away_m.max() < 0.05 / POINT_STEPS  # a step of a voxel of 5 cm
     again = PointMap.of(points.points_m(), 0.05, points.origin_m)
     assert np.array_equal(again.steps, points.steps)
     assert len(PointMap.of(np.empty((0, 3)), 0.05)) == 0

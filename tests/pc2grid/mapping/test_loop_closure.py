@@ -20,6 +20,7 @@ from pc2grid.mapping.place_recognition import Recognition, Stretch
 from pc2grid.mapping.pose_graph import Edge, optimise
 from pc2grid.mapping.settled import SettledKeyframes, interpolate_corrections
 from pc2grid.odometry.point_to_line import Match
+from tests.helpers.rooms import RESOLUTION_M
 
 Wall = tuple[tuple[float, float], tuple[float, float]]
 """A segment from one point to another."""
@@ -159,7 +160,7 @@ def test_two_laps_around_a_block_with_drift_agree_after_closing() -> None:
     for loop in found.loops:
         assert loop.older < loop.newer
         apart = (truth[loop.older].inverse() @ truth[loop.newer]).inverse() @ loop.T_older_newer
-        assert math.hypot(apart.x, apart.y) < 0.1 and abs(apart.yaw) < 0.03
+        assert math.hypot(apart.x, apart.y) < 2 * RESOLUTION_M and abs(apart.yaw) < 0.03
         # The information is right about the size of that error: 16 is beyond 0.1 % of what it promises.
         error = np.array([apart.x, apart.y, apart.yaw])
         assert error @ loop.information @ error < 16.0 and np.linalg.eigvalsh(loop.information)[0] > 10.0
@@ -174,7 +175,7 @@ def test_a_lost_stretch_is_a_guess_and_its_error_stays_in_it() -> None:
     settled, found = closed(poses, [scan_of(pose, BLOCK) for pose in truth], restart=100)
     assert {99, 100} <= set(found.scans.tolist())
     apart = np.linalg.norm(settled[:, :2] - array(truth)[:, :2], axis=1)
-    assert apart.max() < 0.1
+    assert apart.max() < 2 * RESOLUTION_M
 
 
 def test_work_and_loops_grow_with_the_way_and_not_with_its_square(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -284,7 +285,7 @@ def test_improbable_recognitions_are_left_out() -> None:
     settled, found = closed(truth, planar_scans, recognizer=improbable)
     assert len(improbable.stretches) > 1
     assert len(found.loops) == len(alone.loops)
-    assert farthest(settled, truth) < 0.05
+    assert farthest(settled, truth) < RESOLUTION_M
 
 
 def test_a_stretch_over_known_ground_is_not_asked_for() -> None:

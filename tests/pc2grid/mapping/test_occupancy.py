@@ -14,6 +14,7 @@ from pc2grid.errors import LimitExceeded
 from pc2grid.geometry import SE2
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid
+from tests.helpers.rooms import RESOLUTION_M
 
 
 def disc(radius_m: float, *, hits: bool = True) -> PlanarScan:
@@ -44,7 +45,7 @@ def test_round_room_is_free_inside_occupied_at_its_wall_unknown_outside() -> Non
     assert grid.free[distance < 1.9].all()
     assert (grid.cells[distance > 2.1] == -1).all()
     wall = grid.occupied
-    assert wall.sum() > 200 and np.abs(distance[wall] - 2.0).max() < 0.05
+    assert wall.sum() > 200 and np.abs(distance[wall] - 2.0).max() < RESOLUTION_M
 
 
 def test_a_person_who_has_left_is_cleared() -> None:

@@ -29,6 +29,7 @@ from pc2grid.model import (
     RegisteredScan,
     Trajectory,
 )
+from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import drive, office
 
 LAP_M = [(2.0, 7.0), (11.0, 7.0), (11.0, 3.0), (9.5, 5.0), (9.5, 7.0), (18.5, 7.0), (16.5, 4.0), (16.5, 7.0)]
@@ -124,7 +125,7 @@ def test_a_restart_that_loops_join_gives_one_part() -> None:
     _, closed, (part,) = mapped(keyframes, trajectory, LoopParameters())
     assert closed.segments.max() == 1 and not closed.parts.any()
     assert any(loop.accepted for loop in part.loops)
-    assert wrong_m(part, truths) < 0.1
+    assert wrong_m(part, truths) < 2 * RESOLUTION_M
 
 
 def test_a_map_that_contradicts_itself_is_divided_into_parts_that_do_not() -> None:

@@ -21,6 +21,7 @@ from pc2grid.submaps.isovist import (
     polygon_mask,
     visible_submap,
 )
+from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import plan
 
 
@@ -28,7 +29,7 @@ def test_rays_in_a_square_room_end_on_its_walls() -> None:
     room = plan(6, 6, [])
     view = isovist(room, (3.0, 3.0), 10.0)
     assert (view.ends == WALL).all()
-    assert view.ranges_m[0] == view.ranges_m.min() or abs(view.ranges_m[0] - 3.0) < 0.15
+    assert view.ranges_m[0] == view.ranges_m.min() or abs(view.ranges_m[0] - 3.0) < 3 * RESOLUTION_M
     assert abs(view.ranges_m[45] - 3.0 * math.sqrt(2)) < 0.2
     assert view.observed == 1.0
     assert abs(view.area_m2 - 36.0) < 2.5
@@ -39,8 +40,8 @@ def test_rays_beyond_the_sight_are_open_and_into_the_unknown_hidden() -> None:
     cells[:, 150:] = UNKNOWN
     grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0))
     view = isovist(grid, (5.0, 5.0), 3.0)
-    assert view.ends[180] == OPEN and abs(view.ranges_m[180] - 3.0) < 0.05
-    assert view.ends[0] == HIDDEN and abs(view.ranges_m[0] - 2.5) < 0.1
+    assert view.ends[180] == OPEN and abs(view.ranges_m[180] - 3.0) < RESOLUTION_M
+    assert view.ends[0] == HIDDEN and abs(view.ranges_m[0] - 2.5) < 2 * RESOLUTION_M
     assert abs(view.observed - (1 - 2 * math.acos(2.5 / 3) / (2 * math.pi))) < 0.03
 
 
@@ -49,7 +50,7 @@ def test_a_few_unobserved_cells_do_not_hide_the_wall_behind_them() -> None:
     cells = room.cells.copy()
     cells[:, 80] = UNKNOWN
     view = isovist(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0)), (3.0, 3.0), 10.0)
-    assert view.ends[0] == WALL and abs(view.ranges_m[0] - 3.0) < 0.15
+    assert view.ends[0] == WALL and abs(view.ranges_m[0] - 3.0) < 3 * RESOLUTION_M
 
 
 def test_a_visible_submap_hides_the_next_room_and_keeps_the_wall() -> None:
