@@ -6,7 +6,7 @@ where an obstacle is, and how far the floor is free before it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -37,6 +37,8 @@ class PlanarScan:
     origin_m : (2,) float64, position of the sensor.
     free_m : (B,) float32, how far from `origin_m` the plane is known to be free, for B equal bearings
         around it (entry 0 looks along +x, counter-clockwise); 0 where nothing is known.
+    low_m : (L, 2) float32, things on the floor that are no walls (tables, chairs), about one point per grid
+        cell: the sensor looks over them, so they do not end what is free. Empty where heights are not known.
     """
 
     stamp_ns: int
@@ -44,6 +46,7 @@ class PlanarScan:
     normal_rad: F32
     origin_m: F64
     free_m: F32
+    low_m: F32 = field(default_factory=lambda: np.empty((0, 2), np.float32))
 
     @staticmethod
     def of_hits(*, stamp_ns: int, hits_m: F32, origin_m: F64, free_m: F32) -> PlanarScan:

@@ -19,8 +19,8 @@ from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid
 
 IN_MEMORY_BYTES = 32 << 20  # chosen by hand: about an hour of a 2D laser
-# index, stamp, restart; T_session_base; origin of the sensor; hits, bearings and unseen_hits
-_HEADER = struct.Struct("<qqq 3d 2d 3q")
+# index, stamp, restart; T_session_base; origin of the sensor; hits, bearings, low things and unseen_hits
+_HEADER = struct.Struct("<qqq 3d 2d 4q")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +61,12 @@ class Keyframes:
         start, end = self._starts[number], self._starts[number + 1]
         self._file.seek(start)
         data = self._file.read(end - start)
-        index, stamp_ns, restart, x, y, yaw, origin_x, origin_y, hits, bearings, unseen_hits = (
+        index, stamp_ns, restart, x, y, yaw, origin_x, origin_y, hits, bearings, low, unseen_hits = (
             _HEADER.unpack_from(data)
         )
         values = np.frombuffer(data, np.float32, offset=_HEADER.size)
-        hits_m, normal_rad, free_m, unseen_hits_m = np.split(
-            values, (2 * hits, 3 * hits, 3 * hits + bearings)
-        )
+        ends = np.cumsum((2 * hits, hits, bearings, 2 * low))
+        hits_m, normal_rad, free_m, low_m, unseen_hits_m = np.split(values, ends)
         return Keyframe(
             index,
             PlanarScan(
@@ -76,6 +75,7 @@ class Keyframes:
                 origin_m=np.array([origin_x, origin_y]),
                 normal_rad=normal_rad,
                 free_m=free_m,
+                low_m=low_m.reshape(-1, 2),
             ),
             SE2(x, y, yaw),
             bool(restart),
@@ -91,9 +91,13 @@ class Keyframes:
             keyframe.restart,
             *(pose.x, pose.y, pose.yaw),
             *planar_scan.origin_m,
-            *(len(planar_scan.hits_m), len(planar_scan.free_m), len(keyframe.unseen_hits_m)),
+            *(len(a) for a in (planar_scan.hits_m, planar_scan.free_m, planar_scan.low_m)),
+            len(keyframe.unseen_hits_m),
         )
-        arrays = (planar_scan.hits_m, planar_scan.normal_rad, planar_scan.free_m, keyframe.unseen_hits_m)
+        arrays = (
+            *(planar_scan.hits_m, planar_scan.normal_rad, planar_scan.free_m, planar_scan.low_m),
+            keyframe.unseen_hits_m,
+        )
         data = header + b"".join(np.ascontiguousarray(a, np.float32).tobytes() for a in arrays)
         try:
             self._file.seek(self._starts[-1])

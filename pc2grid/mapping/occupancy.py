@@ -92,6 +92,10 @@ class GridBuilder:
         # The outline runs through cells of obstacles, most of all along a wall that is seen at a small angle:
         # these cells are not drawn as free.
         cv2.polylines(update, _rims(corners, planar_scan.free_m), False, 0, shift=_SUBPIXEL_BITS)
+        # Things that the sensor looks over say little of a place and stay unknown.
+        things = np.floor(T_grid_base.apply(planar_scan.low_m) / resolution).astype(np.int64)
+        things = things[((things >= low) & (things < high)).all(axis=1)]
+        update[things[:, 1] - low[1], things[:, 0] - low[0]] = 0
         update[hits[:, 1] - low[1], hits[:, 0] - low[0]] = self._parameters.hit
         body_cells = round(self._parameters.body_m / resolution)
         cv2.circle(update, (here - low).tolist(), body_cells, 2 * self._parameters.miss, -1)

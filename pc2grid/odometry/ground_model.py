@@ -1,4 +1,4 @@
-"""The floor under a moving sensor: fixed to a robot on wheels, moving against a sensor in the hand."""
+"""The floor under a robot on wheels, which is fixed to it; and whether a sensor is on wheels."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from pc2grid.arrays import F32, F64
 from pc2grid.clouds.ground import Ground, assumed_ground, find_ground
 from pc2grid.clouds.sampling import random_subset
-from pc2grid.geometry import SE2, invert_pose
+from pc2grid.geometry import SE2
 from pc2grid.model import Scan
 from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.sensor_model import SENSOR_MODELS
@@ -77,29 +77,11 @@ class GroundModel:
                 self._looks += 1
                 self.ground = self.ground.toward(found, max(1.0 / self._looks, self._parameters.rolling_gain))
 
-    def follow_moving(self, points_m: F32, scan: Scan, motion: F64) -> None:
-        """Update the floor under a sensor in the hand by the points (N, 3) of a scan after a motion (4, 4)
-        T_last_now.
-
-        The motion is the registered one: at the beginning, or when the hand turns, a predicted one is several
-        degrees off, and points of the floor would become walls. A floor that is fixed stays as it is.
-        """
-        if self.ground is None or self.rolling:
-            return
-        expected = self.ground.moved(invert_pose(motion))
-        found = find_ground(points_m, scan.T_base_sensor[:3, 3], expected)
-        self.ground = expected if found is None else expected.toward(found, self._parameters.carried_gain)
-
     def remove(self, points_m: F32) -> F32:
-        """Return the points (N, 3) that KISS-ICP is given: a sample, without floor and ceiling.
-
-        A sensor in the hand keeps floor and ceiling: they determine its tilt and height.
-        """
+        """Return the points (N, 3) that KISS-ICP is given: a sample, without floor and ceiling."""
         if self.ground is None or not len(points_m):
             return points_m
         p = self._parameters
-        if not self.rolling:
-            return points_m[random_subset(len(points_m), p.icp_points_carried)]
         points = points_m[random_subset(len(points_m), p.icp_points)]
         heights = self.ground.heights(points)
         slack = p.floor_slack_m + p.floor_slack_per_m * np.hypot(points[:, 0], points[:, 1])
@@ -114,8 +96,6 @@ class GroundModel:
 
     def hold(self, pose: F64) -> F64:
         """Return a pose (4, 4) with tilt and height from the floor, since walls alone let them drift."""
-        if not self.rolling:
-            return pose
         planar = SE2.from_matrix(pose)
         if self.ground is None:
             return planar.lift()

@@ -5,21 +5,18 @@ from __future__ import annotations
 from pc2grid.model import Health
 from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.odometry.point_to_line import Match
+from pc2grid.odometry.surface_map import Placement
 
 
 class HealthJudge:
-    """Judges each scan, and counts the poor ones in a row.
+    """Judges each scan, and counts the poor ones in a row."""
 
-    rolling : whether the base stands on the floor, so that the plane shows most of what the sensor sees.
-    """
-
-    def __init__(self, *, rolling: bool, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
+    def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
         self._parameters = parameters
-        self._min_overlap = parameters.min_overlap if rolling else parameters.min_overlap_carried
         self._poor_scans = 0
         self._lost_scans = 0
 
-    def judge(self, match: Match | None, measured: bool) -> Health:
+    def judge(self, match: Match | Placement | None, measured: bool) -> Health:
         """Judge a scan by its match, None if it had too few hits. measured : odometry predicted its pose.
 
         A scan that shows too little is bridged by odometry for a while (DEGENERATE). A scan that does not
@@ -27,7 +24,7 @@ class HealthJudge:
         its position is not determined, FINE otherwise.
         """
         p = self._parameters
-        if match is None or match.overlap < self._min_overlap or match.residual_m > p.max_residual_m:
+        if match is None or match.overlap < p.min_overlap or match.residual_m > p.max_residual_m:
             self._poor_scans += 1
             lost = not measured or self._poor_scans > p.bridged_scans
             self._lost_scans += lost

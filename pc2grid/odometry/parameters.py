@@ -41,17 +41,13 @@ class TrackingParameters:
     Points:
 
     max_points : of a scan, chosen at random; a depth image has 300 000.
-    icp_points : of these, those given to KISS-ICP where a refinement follows, floor and ceiling included.
-    icp_points_carried : the same for a carried sensor, whose pose is KISS-ICP's. With all 40 000 points the
-        poses are no better (hall.mcap: 0.023 m both, kitchen.mcap: 0.026 m instead of 0.034 m) and take 1.4
-        times as long.
+    icp_points : of these, those given to KISS-ICP floor and ceiling included.
     icp_min_points : fewer than this above the floor: the floor is left in.
     floor_slack_m, floor_slack_per_m : height up to which points count as floor, and its growth with the
         horizontal range (0.01 is an error of the tilt of 0.6 degrees).
 
     Ground:
 
-    carried_gain : share by which the floor moves towards what a scan shows of it.
     rolling_gain : the same where the floor is fixed to the robot; more at first, so that it is the mean of
         what was seen. With a larger one, the floor under a camera followed a ramp that it saw ahead.
     rolling_every : scans from one look at the floor to the next where it is fixed to the robot.
@@ -88,8 +84,7 @@ class TrackingParameters:
     residual_weight_per_m : of two placements the one with the larger overlap - weight * residual is taken.
     disagree_m, disagree_rad : where KISS-ICP and the prediction differ by more, both start a refinement.
     sure_overlap : least overlap of a placement that alone decides between odometry and the motion before;
-        with less, placements are searched for if the prediction leaves enough open. In space, a scan that was
-        searched for and overlaps less is lost (in the hall the right pose has 0.57 to 0.97, wrong ones 0.5).
+        with less, placements are searched for if the prediction leaves enough open.
     search_sigmas : half width of that search in standard deviations of the predicted motion.
     search_above_m, search_above_rad : it is made only if the half width exceeds one of these; a refinement
         alone converges over less.
@@ -108,8 +103,7 @@ class TrackingParameters:
 
     Health:
 
-    min_overlap, min_overlap_carried : least share of the hits that meet a line of the local map. It is
-        smaller for a carried sensor, since the plane shows less of a scene when the sensor tilts.
+    min_overlap : least share of the hits that meet a line of the local map, or of the points a surface.
     max_residual_m : largest mean distance of the hits from their lines.
     bridged_scans : poor scans in a row that odometry may bridge.
     give_up_scans : lost scans in a row after which tracking starts again.
@@ -119,7 +113,7 @@ class TrackingParameters:
     icp_range_factor, icp_range_percentile : its range is this times that percentile of the first ranges,
         within `icp_range_m`.
     icp_voxels_per_range : its voxel is the 75th percentile of the first ranges over this, within
-        `icp_voxel_m` (rolling) or `icp_voxel_carried_m`.
+        `icp_voxel_m`.
     brisk_mps, icp_max_reach_m : partners of points are looked for no farther than a voxel away, so a voxel
         spans at least the motion of a person between two scans, up to a limit.
     icp_* otherwise : a rolling base is refined afterwards, so a coarse and quick solution is enough.
@@ -127,13 +121,11 @@ class TrackingParameters:
 
     max_points: int = 40_000
     icp_points: int = 6_000
-    icp_points_carried: int = 15_000
     icp_min_points: int = 100
     floor_slack_m: float = 0.1
     floor_slack_per_m: float = 0.01
 
     rolling_gain: float = 0.02
-    carried_gain: float = 0.3
     rolling_every: int = 8
 
     steady_s: float = 0.3
@@ -184,7 +176,6 @@ class TrackingParameters:
     map_travel_m: float = 5.0
 
     min_overlap: float = 0.3
-    min_overlap_carried: float = 0.1
     max_residual_m: float = 0.1
     bridged_scans: int = 30
     give_up_scans: int = 10
@@ -195,7 +186,6 @@ class TrackingParameters:
     icp_range_m: tuple[float, float] = (10.0, 100.0)
     icp_voxels_per_range: float = 40.0
     icp_voxel_m: tuple[float, float] = (0.3, 1.0)
-    icp_voxel_carried_m: tuple[float, float] = (0.05, 1.0)
     brisk_mps: float = 1.0
     icp_max_reach_m: float = 0.5
     icp_points_per_voxel: int = 10

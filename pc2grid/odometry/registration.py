@@ -9,50 +9,37 @@ floor move with the sensor and pull point-to-point ICP towards standing still.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pc2grid.arrays import F64
 from pc2grid.config import RegistrationConfig
-from pc2grid.geometry import invert_pose, pose_from_rotation_vector, rotation_vector
+from pc2grid.geometry import pose_from_rotation_vector, rotation_vector
 from pc2grid.model import Scan
 from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
-from pc2grid.odometry.wheel_odometry import is_plausible
 
 _EXACT = 1e-12
 """A rotation matrix times its transpose differs from 1 by less; products of a few of them do, too."""
-
-_FEW = 4
-"""One of so many points is registered from each further guess; by hand, for speed."""
 
 
 class KissRegistration:
     """KISS-ICP with a given initial guess, in one thread and hence repeatable.
 
-    carried : the sensor is hand-held: six degrees of freedom, found by ICP alone.
-    fits : False if the last scan overlaps too little with the local map wherever it was looked for.
-
     Voxel and range come from the first scan with returns and the time to the next one, unless `config`
-    fixes them. A hand-held sensor in a room needs voxels of 0.1 m, in a hall or at two scans a second
-    larger ones. A robot on wheels, where a refinement follows, needs only coarse voxels and few iterations.
+    fixes them. As a refinement follows, coarse voxels and few iterations are enough.
     """
 
     def __init__(
         self,
         config: RegistrationConfig,
         *,
-        carried: bool = False,
         parameters: TrackingParameters = TRACKING_PARAMETERS,
     ) -> None:
         self._config = config
-        self._carried = carried
         self._parameters = parameters
         self._first: tuple[F64, F64] | None = None  # points and pose of the first scan
-        self.fits = True
         self._pending: F64 | None = None  # the last scan, downsampled, until its pose is final
         self._kiss_config: Any = None
         self._registration: Any = None
@@ -65,23 +52,17 @@ class KissRegistration:
         T_session_last: F64,
         predicted_motion: F64,
         period_s: float,
-        other_guesses: Callable[[], list[F64]] | None = None,
     ) -> F64:
         """Align one scan to the local map.
 
         points_m : (N, 3) deskewed, without floor and ceiling, in the base frame.
         T_session_last : (4, 4) final pose of the scan before.
         predicted_motion : (4, 4) T_last_now. period_s : time since that scan.
-        other_guesses : gives more initial guesses T_session_base (4, 4), where the prediction leaves much
-            open. Of the poses found from all of them that a motion since the last scan explains, the one
-            with the largest overlap with the local map is returned; `fits` says whether it is large enough.
 
-        Returns T_session_base (4, 4); the prediction for the first scan, for scans without enough points and
-        where the scan fits nowhere.
+        Returns T_session_base (4, 4); the prediction for the first scan and for scans without enough points.
         The scan becomes part of the local map only by `update_map`.
         """
         self._pending = None
-        self.fits = True
         guess = _proper(T_session_last @ predicted_motion)
         if len(points_m) < self._parameters.icp_min_frame:
             return guess
@@ -95,9 +76,7 @@ class KissRegistration:
         frame = self._downsample(points[near])
         source = self._downsample(frame, 1.5)
         pose = self._align(source, guess)
-        if other_guesses is not None:
-            pose = self._best(frame, source, pose, other_guesses, T_session_last, period_s)
-        if not self.fits or not np.isfinite(pose).all():
+        if not np.isfinite(pose).all():
             return guess
         self._threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
         self._pending = frame
@@ -114,39 +93,6 @@ class KissRegistration:
             kernel=sigma,
         )
         return pose
-
-    def _best(
-        self,
-        frame: F64,
-        source: F64,
-        pose: F64,
-        other_guesses: Callable[[], list[F64]],
-        T_session_last: F64,
-        period_s: float,
-    ) -> F64:
-        """Of a pose (4, 4) and those from other guesses, that where most points of `frame` meet the map.
-
-        A point meets the map if a point of the map is nearer than half a voxel.
-        """
-        p = self._parameters
-        tree = cKDTree(self._map.point_cloud())
-        reach_m = 0.5 * self._kiss_config.mapping.voxel_size
-
-        def overlap(pose: F64) -> float:
-            if not np.isfinite(pose).all():
-                return 0.0
-            if not is_plausible(invert_pose(T_session_last) @ pose, period_s, period_s, p):
-                return 0.0
-            distance_m, _ = tree.query(frame @ pose[:3, :3].T + pose[:3, 3], distance_upper_bound=reach_m)
-            return float(np.isfinite(distance_m).mean())
-
-        # A few of the points tell which guess is right; all of them then give the pose.
-        few = source[::_FEW]
-        best = max([pose, *(self._align(few, guess) for guess in other_guesses())], key=overlap)
-        if best is not pose:
-            best = max([pose, self._align(source, best)], key=overlap)
-        self.fits = overlap(best) >= p.sure_overlap
-        return best
 
     def update_map(self, T_session_base: F64) -> None:
         """Add the scan registered last to the local map, at its final pose (4, 4)."""
@@ -178,15 +124,12 @@ class KissRegistration:
             float(np.percentile(ranges, 75)) / p.icp_voxels_per_range,
             min(p.brisk_mps * period_s, p.icp_max_reach_m),
         )
-        config.mapping.voxel_size = self._config.voxel_m or float(
-            np.clip(finest_m, *(p.icp_voxel_carried_m if self._carried else p.icp_voxel_m))
-        )
+        config.mapping.voxel_size = self._config.voxel_m or float(np.clip(finest_m, *p.icp_voxel_m))
         config.registration.max_num_threads = 1
-        if not self._carried:
-            config.mapping.max_points_per_voxel = p.icp_points_per_voxel
-            config.registration.max_num_iterations = p.icp_iterations
-            config.registration.convergence_criterion = p.icp_converged
-            config.adaptive_threshold.initial_threshold = p.icp_initial_threshold_m
+        config.mapping.max_points_per_voxel = p.icp_points_per_voxel
+        config.registration.max_num_iterations = p.icp_iterations
+        config.registration.convergence_criterion = p.icp_converged
+        config.adaptive_threshold.initial_threshold = p.icp_initial_threshold_m
         self._kiss_config = config
         self._registration = get_registration(config)
         self._threshold = get_threshold_estimator(config)

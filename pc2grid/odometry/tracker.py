@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from pc2grid.clouds.sampling import random_subset
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.geometry import SE2, invert_pose
 from pc2grid.model import Health, RegisteredScan, Scan, Storey
+from pc2grid.odometry.carried import CarriedSensor, first_pose
 from pc2grid.odometry.ground_model import DECIDING_SCANS, GroundModel, is_rolling
 from pc2grid.odometry.health import HealthJudge
 from pc2grid.odometry.matching_maps import MatchingMaps
@@ -37,7 +37,6 @@ from pc2grid.odometry.parameters import (
 from pc2grid.odometry.point_to_line import Match
 from pc2grid.odometry.registration import KissRegistration
 from pc2grid.odometry.rides import Ride, RideWatch
-from pc2grid.odometry.surface_map import SurfaceMap
 from pc2grid.sensor_model import SENSOR_MODELS
 
 
@@ -86,13 +85,13 @@ class Tracker:
         self._motion = MotionModel(parameters)
         self._rides = RideWatch()
         self._restarted = False  # no keyframe has been reported since tracking started again
-        # These six depend on the sensor and on how it is carried; `start` makes them from the first scan.
+        # These depend on the sensor and on how it is carried; `start` makes them from the first scan.
         self._ground = GroundModel(None, rolling=True, parameters=parameters)
         self._maps = MatchingMaps(self._projection.max_range_m, parameters)
         self._camera_on_wheels = False
-        self._surfaces: SurfaceMap | None = None
+        self._carried: CarriedSensor | None = None  # None on wheels
         self._depth_limit = DepthLimit()
-        self._health = HealthJudge(rolling=True, parameters=parameters)
+        self._health = HealthJudge(parameters)
         self.kiss = KissRegistration(registration, parameters=parameters)
 
     @property
@@ -121,11 +120,16 @@ class Tracker:
             self._parameters,
             CAMERA_MATCHING if self._camera_on_wheels else MATCHING_PARAMETERS,
         )
-        self._health = HealthJudge(rolling=self._ground.rolling, parameters=self._parameters)
+        self._health = HealthJudge(self._parameters)
         self.kiss = self._new_kiss()
-        self._surfaces = SurfaceMap() if narrow and not self._ground.rolling else None
+        self._carried = None
+        if not self._ground.rolling:
+            self._carried = CarriedSensor(self._projection)
+            pose = at.lift() @ first_pose(scan, points)
+            self._carried.place(scan, points, pose, Prediction(motion=np.eye(4), seconds=0.0))
+            return self._finish_carried(scan, points, pose, Health.FINE)
         pose = at.lift() @ self._ground.start_pose()
-        self._register(scan, points, pose, Prediction(motion=np.eye(4), seconds=0.0))
+        self._register(points, pose, Prediction(motion=np.eye(4), seconds=0.0))
         planar_scan = self._project(points, scan, _split(pose)[1])
         return self._finish(scan, points, planar_scan, pose, Health.FINE)
 
@@ -139,34 +143,56 @@ class Tracker:
         if self._ground.rolling and self._scans < DECIDING_SCANS and not is_rolling(scan, self._first):
             at = SE2.from_matrix(self._motion.last_pose @ prediction.motion)
             return self._begin(scan, at, rolling=False)
-        if self._maps and not self._motion.is_plausible(prediction):
+        if self._carried is not None and not self._motion.is_plausible(prediction):
+            prediction = self._motion.continued(prediction.seconds)
+        elif self._maps and not self._motion.is_plausible(prediction):
             prediction = self._examine(scan, prediction)
             self._motion.forget_window()
+        if self._carried is not None:
+            return self._track_carried(scan, prediction)
         last_pose = self._motion.last_pose
         predicted = SE2.from_matrix(last_pose @ prediction.motion)
         # 2. Undo the motion within the scan.
         points = self._deskewed(scan, *self._motion.within(scan, prediction))
         # 3. Follow a floor that is fixed to the robot: KISS-ICP is not given its points.
         self._ground.follow_fixed(points, scan)
-        # 4. Let KISS-ICP bring the scan near, in space; a camera in the hand on to the surfaces seen before.
-        pose = self._register(scan, points, last_pose, prediction)
-        self._ground.follow_moving(points, scan, invert_pose(last_pose) @ pose)
+        # 4. Let KISS-ICP bring the scan near, in space.
+        pose = self._register(points, last_pose, prediction)
         planar, T_level_base = _split(self._ground.hold(pose))
         # 5. Reduce the scan to the plane.
         planar_scan = self._project(points, scan, T_level_base)
-        # 6. Refine the pose in the plane; a carried sensor keeps the one with six degrees of freedom.
+        # 6. Refine the pose in the plane.
         health = Health.FINE
         if self._maps:
-            refined, match = self._refine(planar_scan, planar, predicted, prediction)
-            planar = refined if self._ground.rolling else planar
+            planar, match = self._refine(planar_scan, planar, predicted, prediction)
             # 7. Judge the pose.
-            health = self._health.judge(match if self.kiss.fits else None, prediction.odometry is not None)
+            health = self._health.judge(match, prediction.odometry is not None)
         if not prediction.credible:
             health = Health.LOST
         # 8. Start again if nothing fits any more, else extend the local maps.
         if not prediction.credible or self._health.gives_up:
             self._restart()
         return self._finish(scan, points, planar_scan, planar.lift() @ T_level_base, health, prediction)
+
+    def _track_carried(self, scan: Scan, prediction: Prediction) -> Tracked:
+        """Track the next scan of a sensor in the hand, in space."""
+        assert self._carried is not None
+        points = self._deskewed(scan, *self._motion.within(scan, prediction))
+        placed = self._carried.place(scan, points, self._motion.last_pose, prediction)
+        health = self._health.judge(placed, prediction.odometry is not None)
+        if self._health.gives_up:
+            self._restart()
+        return self._finish_carried(scan, points, placed.pose, health, prediction)
+
+    def _finish_carried(
+        self, scan: Scan, points: F32, pose: F64, health: Health, prediction: Prediction | None = None
+    ) -> Tracked:
+        """Extend the maps in space by a scan, cut its planar scan, and remember its pose."""
+        assert self._carried is not None
+        if health is not Health.LOST:
+            self._carried.extend(scan, points, pose)
+        planar_scan = self._carried.cut(scan, pose)
+        return self._finish(scan, points, planar_scan, pose, health, prediction)
 
     def _finish(
         self,
@@ -186,10 +212,8 @@ class Tracker:
             and len(planar_scan.hits_m) > 0
             and self._maps.extend(planar_scan, SE2.from_matrix(pose))
         )
-        if extended:
+        if extended and self._carried is None:
             self.kiss.update_map(pose)
-        if self._surfaces is not None and health is not Health.LOST:
-            self._surfaces.extend(pose)
         mapped = not (ride.riding or ride.tilting)
         keyframe = extended and mapped
         restart = keyframe and self._restarted
@@ -233,33 +257,14 @@ class Tracker:
         self._motion.heading_variance = 0.0  # the next local map has the heading of the last pose
         self._health.restart()
         self.kiss = self._new_kiss()
-        self._surfaces = None if self._surfaces is None else SurfaceMap()
+        if self._carried is not None:
+            self._carried.restart()
         self._restarted = True
 
-    def _register(self, scan: Scan, points: F32, last_pose: F64, prediction: Prediction) -> F64:
+    def _register(self, points: F32, last_pose: F64, prediction: Prediction) -> F64:
         """The pose (4, 4) in space of the points (N, 3) of a scan after the last pose (4, 4)."""
         kept = self._ground.remove(points)
-        others = None
-        window = self._search_window(prediction) if self._maps and not self._ground.rolling else None
-        if window is not None:
-            others = partial(self._placements, scan, points, last_pose @ prediction.motion, window[0])
-        pose = self.kiss.register(kept, last_pose, prediction.motion, prediction.seconds, others)
-        if self._surfaces is None:
-            return pose
-        return self._surfaces.refine(kept, scan.T_base_sensor[:3, 3], pose)
-
-    def _placements(self, scan: Scan, points: F32, predicted: F64, window_m: float) -> list[F64]:
-        """Poses (4, 4) near a predicted one at which the points (N, 3) of a carried scan may lie.
-
-        They are searched for in the plane, in all headings: a hand turns faster than any prediction. Tilt
-        and height are those of the prediction.
-        """
-        planar, T_level_base = _split(predicted)
-        planar_scan = self._project(points, scan, T_level_base)
-        if not len(planar_scan.hits_m):
-            return []
-        found = self._maps.search(planar_scan, planar, window_m, math.pi)
-        return [pose.lift() @ T_level_base for pose in found]
+        return self.kiss.register(kept, last_pose, prediction.motion, prediction.seconds)
 
     def _search_window(self, prediction: Prediction) -> tuple[float, float] | None:
         """How far (m, rad) a scan is searched for around the predicted pose; None if little is open."""
@@ -275,7 +280,7 @@ class Tracker:
         return match.overlap >= p.sure_overlap and match.residual_m <= p.max_residual_m
 
     def _new_kiss(self) -> KissRegistration:
-        return KissRegistration(self._config, carried=not self._ground.rolling, parameters=self._parameters)
+        return KissRegistration(self._config, parameters=self._parameters)
 
     def _examine(self, scan: Scan, prediction: Prediction) -> Prediction:
         """Decide on odometry that a restarted driver may have started again.

@@ -1,4 +1,4 @@
-"""The floor under a sensor in the hand, and under a robot on wheels."""
+"""The floor under a robot on wheels, and which sensors are on wheels."""
 
 from __future__ import annotations
 
@@ -37,34 +37,6 @@ def scan_of(points_m: F64, *, mounted_m: float) -> Scan:
         points_m=np.asarray(points_m, np.float32),
         T_base_sensor=T_base_sensor,
     )
-
-
-@pytest.mark.parametrize("tilt_deg", [2.0, 6.0, 12.0])
-def test_a_moving_floor_is_followed_by_the_registered_motion(tilt_deg: float) -> None:
-    floor, walls = hall()
-    first = scan_of(np.concatenate((floor, walls)), mounted_m=0.0)
-    ground = GroundModel.start(first.points_m, first)
-    assert not ground.rolling
-    T_last_now = pose_from_rotation_vector((math.radians(tilt_deg), 0.0, 0.0), (0.2, 0.0, 0.0))
-    back = np.linalg.inv(T_last_now)
-    now = np.concatenate((floor, walls)) @ back[:3, :3].T + back[:3, 3]
-    scan = scan_of(now, mounted_m=0.0)
-    ground.follow_fixed(scan.points_m, scan)  # is for robots on wheels
-    ground.follow_moving(scan.points_m, scan, T_last_now)
-    assert ground.ground is not None
-    heights = ground.ground.heights(scan.points_m[: len(floor)])
-    assert np.abs(heights).max() < 0.03
-
-
-def test_the_floor_of_a_robot_on_wheels_does_not_follow_its_motion() -> None:
-    floor, walls = hall()
-    points = np.concatenate((floor, walls)) + np.array((0.0, 0.0, 1.0))
-    scan = scan_of(points, mounted_m=1.0)
-    ground = GroundModel.start(scan.points_m, scan)
-    assert ground.rolling and ground.ground is not None
-    before = ground.ground
-    ground.follow_moving(scan.points_m, scan, pose_from_rotation_vector((0.2, 0.0, 0.0)))
-    assert ground.ground is before
 
 
 def shaft(slope_deg: float) -> F64:

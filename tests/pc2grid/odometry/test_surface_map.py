@@ -1,75 +1,113 @@
-"""Registration of a camera in the hand to the surfaces that it has seen."""
+"""Registration of a carried sensor to the surfaces that it has seen."""
+
+from __future__ import annotations
 
 import numpy as np
 
+from pc2grid.arrays import F64
 from pc2grid.geometry import invert_pose, pose_from_rotation_vector, transform_points
-from pc2grid.odometry.surface_map import SURFACES, SurfaceMap
+from pc2grid.odometry import _surface_kernels as kernels
+from pc2grid.odometry.surface_map import PosePrior, SurfaceMap
 from pc2grid.odometry.wheel_odometry import motion_size
 
-SENSOR = np.zeros(3)
+EDGE_M = 0.15
+NO_PRIOR = np.zeros((6, 6))
 
 
-def corner(seed):
-    """Points (N, 3) of a floor and two walls, with 5 mm of noise; each seed has points of its own."""
+def corner(seed: int, faces: tuple[int, ...] = (0, 1, 2)) -> F64:
+    """Points (N, 3) of two walls (faces 0 and 1) and a floor (2), 5 mm of noise; each seed has its own."""
     rng = np.random.default_rng(seed)
-    faces = rng.uniform(-1.0, 1.0, (3, 5000, 3))
+    points = rng.uniform(-1.0, 1.0, (3, 5000, 3))
     for axis, at_m in enumerate((1.5, 1.5, -1.0)):
-        faces[axis, :, axis] = at_m
-    return faces.reshape(-1, 3) + 0.005 * rng.standard_normal((15000, 3))
+        points[axis, :, axis] = at_m
+    chosen: F64 = points[list(faces)].reshape(-1, 3)
+    return chosen + 0.005 * rng.standard_normal(chosen.shape)
 
 
-def pose_of(translation_m, rotation_rad):
-    pose = pose_from_rotation_vector(np.array(rotation_rad))
-    pose[:3, 3] = translation_m
-    return pose
-
-
-def seen_once():
-    surfaces = SurfaceMap()
-    start = np.eye(4)
-    assert np.array_equal(surfaces.refine(corner(0), SENSOR, start), start)
-    surfaces.extend(start)
+def seen(points_m: F64) -> SurfaceMap:
+    surfaces = SurfaceMap(EDGE_M, 20.0)
+    surfaces.add(points_m, np.eye(4))
     return surfaces
 
 
-def test_three_faces_fix_all_six_degrees_of_freedom():
-    true = pose_of((0.03, -0.02, 0.02), (0.01, -0.02, 0.02))
+def test_three_faces_fix_all_six_degrees_of_freedom() -> None:
+    true = pose_from_rotation_vector((0.03, -0.06, 0.05), (0.1, -0.08, 0.05))
     points = transform_points(invert_pose(true), corner(1))
-    found = seen_once().refine(points, SENSOR, np.eye(4))
-    guessed_m, guessed_rad = motion_size(invert_pose(true))
-    off_m, off_rad = motion_size(invert_pose(true) @ found)
-    assert guessed_m > 0.04 and guessed_rad > 0.02
-    assert off_m < 0.002 and off_rad < 0.002
+    found = seen(corner(0)).match(points, np.ones(len(points)), np.eye(4), PosePrior(np.eye(4), NO_PRIOR))
+    off_m, off_rad = motion_size(invert_pose(true) @ found.pose)
+    assert off_m < 0.003 and off_rad < 0.003  # of a guess that is 0.14 m and 0.08 rad off
+    assert found.measured and found.overlap > 0.95
 
 
-def test_a_scan_of_another_place_keeps_its_guess():
-    elsewhere = corner(1) + np.array([0.0, 0.0, 3.0])
-    guess = pose_of((0.01, 0.0, 0.0), (0.0, 0.0, 0.0))
-    assert np.array_equal(seen_once().refine(elsewhere, SENSOR, guess), guess)
+def test_along_a_wall_the_prior_decides_and_the_information_says_so() -> None:
+    """A floor and one wall across x: hardly anything fixes y, and everything else is fixed."""
+    wall_and_floor = (0, 2)
+    true = pose_from_rotation_vector((0.0, 0.0, 0.0), (0.06, 0.0, 0.03))
+    points = transform_points(invert_pose(true), corner(1, wall_and_floor))
+    expected = pose_from_rotation_vector((0.0, 0.0, 0.0), (0.0, 0.04, 0.0))
+    prior = PosePrior(expected, np.diag([0.05**-2] * 3 + [0.05**-2] * 3))
+    found = seen(corner(0, wall_and_floor)).match(points, np.ones(len(points)), expected, prior)
+    assert np.abs(found.pose[[0, 2], 3] - (0.06, 0.03)).max() < 0.005
+    assert abs(found.pose[1, 3] - 0.04) < 0.02  # the ends of the wall, 2 m apart, hold a little
+    x, y, z = np.diag(found.information)[3:]
+    assert y < 0.2 * min(x, z)
 
 
-def test_far_points_count_only_where_there_are_no_near_ones():
-    near, far = corner(1), corner(2) * 4.0
-    surfaces, alone = seen_once(), seen_once()
-    both = surfaces.refine(np.concatenate((near, far)), SENSOR, np.eye(4))
-    assert np.array_equal(both, alone.refine(near, SENSOR, np.eye(4)))
-    hall = SurfaceMap()
-    hall.refine(far, SENSOR, np.eye(4))
-    hall.extend(np.eye(4))
-    shifted = pose_of((0.03, 0.0, 0.0), (0.0, 0.0, 0.0))
-    found = hall.refine(transform_points(invert_pose(shifted), far), SENSOR, np.eye(4))
-    assert motion_size(invert_pose(shifted) @ found)[0] < 0.01
+def test_a_floor_alone_does_not_measure_the_position() -> None:
+    points = corner(1, (2,))
+    middle = points[(np.abs(points[:, :2]) < 0.5).all(axis=1)]
+    found = seen(corner(0, (2,))).match(
+        middle[:100], np.ones(100), np.eye(4), PosePrior(np.eye(4), np.eye(6))
+    )
+    assert found.overlap == 1.0 and not found.measured
 
 
-def test_every_run_gives_the_same_pose():
-    surfaces, points = seen_once(), corner(1) + 0.01
-    assert len({surfaces.refine(points, SENSOR, np.eye(4)).tobytes() for _ in range(50)}) == 1
+def test_a_scan_of_another_place_does_not_overlap() -> None:
+    elsewhere = corner(1) + np.array([0.0, 0.0, 9.0])
+    found = seen(corner(0)).match(
+        elsewhere, np.ones(len(elsewhere)), np.eye(4), PosePrior(np.eye(4), np.eye(6))
+    )
+    assert found.overlap == 0.0
+    assert np.allclose(found.pose, np.eye(4))  # nothing moves it from where it is expected
 
 
-def test_only_the_latest_keyframes_are_kept():
-    surfaces = seen_once()
-    for k in range(1, SURFACES.keyframes + 5):
-        pose = pose_of((0.15 * k, 0.0, 0.0), (0.0, 0.0, 0.0))
-        surfaces.refine(corner(k)[::50], SENSOR, pose)
-        surfaces.extend(pose)
-    assert len(surfaces._keyframes) == SURFACES.keyframes
+def test_what_is_far_behind_is_forgotten() -> None:
+    """Five rooms, ten metres from one to the next, and a reach of eight: those of one and a half stay."""
+    surfaces, sizes = SurfaceMap(EDGE_M, 8.0), []
+    for k in range(5):
+        surfaces.add(corner(k), pose_from_rotation_vector((0.0, 0.0, 0.0), (10.0 * k, 0.0, 0.0)))
+        sizes.append(len(surfaces.fine))
+    assert sizes[-1] < 1.5 * sizes[0]
+    assert surfaces.fine.shapes[:, 0].min() > 29.0
+
+
+def test_every_run_gives_the_same_bytes() -> None:
+    def pose() -> bytes:
+        points = corner(1) + 0.01
+        prior = PosePrior(np.eye(4), np.eye(6))
+        return seen(corner(0)).match(points, np.ones(len(points)), np.eye(4), prior).pose.tobytes()
+
+    assert pose() == pose()
+
+
+def test_the_equations_are_those_of_points_and_planes() -> None:
+    """One voxel with a plane x = 0.5: H, g and the distances by numpy, as the textbook says."""
+    rng = np.random.default_rng(3)
+    inside = np.column_stack((np.full(400, 0.5), rng.uniform(0.01, 0.99, (400, 2))))
+    surfaces = SurfaceMap(1.0, 20.0)
+    surfaces.add(inside, np.eye(4))
+    points = np.array([(0.6, 0.4, 0.5), (0.45, 0.6, 0.6)])
+    H, g, found, distance_m = surfaces.fine.equations(points, np.ones(2), np.eye(4), 1e6)
+    held = 1.0 - 0.02**2 / (inside[:, 1:].var(axis=0).max() + 0.02**2)  # less what the widest direction has
+    normal, mean = np.array((1.0, 0.0, 0.0)), inside.mean(axis=0)
+    J = np.hstack((np.cross(points, normal), np.tile(normal, (2, 1))))
+    r = (points - mean) @ normal
+    assert found == 2.0
+    assert np.allclose(H, held * J.T @ J, atol=0.01)
+    assert np.allclose(g, held * J.T @ r, atol=0.01)
+    assert abs(distance_m - np.sqrt(held) * np.abs(r).sum()) < 0.01
+
+
+def test_the_first_point_of_each_voxel_is_kept() -> None:
+    points = np.array([(0.1, 0.1, 0.1), (0.2, 0.2, 0.2), (1.1, 0.1, 0.1), (-0.1, 0.1, 0.1)], np.float32)
+    assert kernels.first_per_voxel(points, 1.0).tolist() == [0, 2, 3]

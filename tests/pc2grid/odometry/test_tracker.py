@@ -149,7 +149,7 @@ def facing_a_wall(scans, apart_ns=100_000_000):
 def test_a_camera_without_odometry_does_not_follow_kiss_icp_along_a_wall(monkeypatch):
     """KISS-ICP, which knows a quarter of the surroundings, slides by up to half a metre a scan."""
 
-    def sliding(self, points, T_session_last, predicted_motion, period_s, other_guesses):
+    def sliding(self, points, T_session_last, predicted_motion, period_s):
         return SE2(0.0, 0.3, 0.0).lift() @ T_session_last @ predicted_motion
 
     monkeypatch.setattr(KissRegistration, "register", sliding)

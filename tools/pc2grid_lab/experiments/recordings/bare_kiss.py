@@ -16,8 +16,7 @@ from kiss_icp.kiss_icp import KissICP
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Trajectory
-from pc2grid.odometry.registration import BareKissIcp
-from pc2grid.odometry.tracker import Tracker
+from pc2grid.odometry.registration import BareKissIcp, KissRegistration
 from pc2grid_lab.experiments.trajectory_error import trajectory_error
 from signature.config import Config
 
@@ -30,11 +29,12 @@ def main() -> None:
     """
     log, truth = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None
     with open_log(log) as opened:
-        tracker = Tracker(Config().registration)
-        for scan in islice(opened.scans(), 3):
-            tracker.track(scan)
+        chosen, last_ns = KissRegistration(Config().registration), 0
+        for scan in islice(opened.scans(), 2):
+            chosen.register(scan.points_m, np.eye(4), np.eye(4), (scan.stamp_ns - last_ns) * 1e-9)
+            last_ns = scan.stamp_ns
         config: Any = KISSConfig()
-        voxel_and_range_m: Any = tracker.kiss.voxel_and_range_m
+        voxel_and_range_m: Any = chosen.voxel_and_range_m
         config.mapping.voxel_size, config.data.max_range = voxel_and_range_m
         config.data.deskew = False
         config.registration.max_num_threads = 1

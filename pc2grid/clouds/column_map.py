@@ -1,0 +1,185 @@
+"""The last metres in space as columns of cells, out of which planar scans are cut.
+
+Where a surface is measured a cell is hit, and along the ray to it cells are free. What a column is follows
+from its cells between the floor and 1.8 m: a wall is occupied over most of the height that was observed; a
+table, a chair or a lintel only in a part of it, while rays pass over it. The planar scan of a place is what
+is visible from there: the walls, and how far the floor before them is known. So one view of a tilted camera
+shows the wall above it and the floor below it that other views have seen.
+
+Hornung et al., "OctoMap" (2013) for the evidence; memory is that of the window, whatever the length.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pc2grid.arrays import F32, F64, I64
+from pc2grid.clouds import _column_kernels as kernels
+from pc2grid.clouds.normals import planar_normals
+from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan, mean_per_cell
+from pc2grid.config import ProjectionConfig
+from pc2grid.geometry import SE2
+from pc2grid.model import SensorKind
+from pc2grid.sensor_model import SENSOR_MODELS
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColumnParameters:
+    """Numbers of the columns. Chosen by hand, unless noted.
+
+    layer_m : height of a cell. layers : of the window, most of them below the sensor.
+    below : share of the layers that lie below the sensor.
+    hit, miss : evidence of a scan for a surface in a cell, and against. limits : of the evidence, so that
+        what has gone is forgotten after a few scans.
+    margin_m, margin_sigmas : a ray ends so far before its point, and this many standard deviations of it.
+    wall_share, wall_layers : a wall is occupied in so large a share of the observed cells between
+        `band_min_m` and `band_max_m`, and in so many at least.
+    gap_m : unknown ground that free ground continues behind.
+    depth_m : thickness of a wall that becomes one line; the noise of the sensor comes on top.
+    """
+
+    layer_m: float = 0.1
+    layers: int = 48
+    below: float = 0.6
+    hit: int = 2
+    miss: int = 1
+    limits: tuple[int, int] = (-6, 12)
+    margin_m: float = 0.1
+    margin_sigmas: float = 2.0
+    wall_share: float = 0.5
+    wall_layers: int = 3
+    gap_m: float = 0.3
+    depth_m: float = 0.1
+
+
+COLUMNS = ColumnParameters()
+_STAMPS = 250
+"""Scans after which the stamps of cells begin again; they are of one byte."""
+
+
+class ColumnMap:
+    """The columns around a sensor, in the session frame (z up).
+
+    reach_m : from the sensor; what lies beyond is forgotten.
+    """
+
+    def __init__(
+        self,
+        reach_m: float,
+        sensor: SensorKind,
+        config: ProjectionConfig,
+        parameters: ColumnParameters = COLUMNS,
+    ) -> None:
+        self._reach_m, self._config, self._parameters = reach_m, config, parameters
+        self._noise_per_m2 = SENSOR_MODELS[sensor].noise_per_m2
+        size = 2 * math.ceil(1.25 * reach_m / config.resolution_m)
+        self._evidence = np.zeros((size, size, parameters.layers), np.int8)
+        self._seen = np.zeros((size, size, parameters.layers), np.uint8)
+        self._touched = np.zeros((size, size), np.uint8)
+        self._state = np.zeros((size, size), np.uint8)
+        self._sums = np.zeros((size, size, 3), np.float32)
+        self._low: I64 = np.zeros(3, np.int64)  # lowest cell of the window
+        self._stamp = 0
+        self._floor_m = math.nan  # z of the floor that the states are for
+
+    def add(self, points_m: F64, rays_m: F64, sensor_m: F64, floor_m: float) -> None:
+        """Enter a scan at its place in the session frame.
+
+        points_m : (N, 3) returns. rays_m : (M, 3) of these, those whose rays clear what is before them.
+        sensor_m : (3,) origin of the rays. floor_m : z of the floor.
+        """
+        p, edge_m = self._parameters, self._config.resolution_m
+        self._center(sensor_m)
+        self._stamp += 1
+        if self._stamp > _STAMPS:
+            self._stamp = 1
+            self._seen[:] = 0
+            self._touched[:] = 0
+        noise_m = p.margin_sigmas * self._noise_per_m2
+        kernels.observe(
+            self._evidence, self._seen, self._touched, self._sums, self._low, points_m, rays_m, sensor_m,
+            (edge_m, p.layer_m), self._band_m(floor_m), self._stamp, p.hit, p.miss, p.limits,
+            (p.margin_m, noise_m),
+        )  # fmt: skip
+        same_floor = abs(floor_m - self._floor_m) < 0.5 * p.layer_m
+        if not same_floor:
+            self._floor_m = floor_m
+        low, high = (round(z / p.layer_m) for z in self._band_m(self._floor_m))
+        changed = self._stamp if same_floor else 0
+        kernels.classify(
+            self._evidence, self._state, self._touched, self._sums, self._low, changed,
+            math.floor(self._floor_m / p.layer_m), (low, high), p.wall_share, p.wall_layers,
+        )  # fmt: skip
+
+    def cut(self, T_session_base: SE2, sensor_m: F64, stamp_ns: int) -> PlanarScan:
+        """The planar scan at a place: what a sensor at (3,), session frame, sees of walls and floor.
+
+        T_session_base : planar pose of the base, in whose frame the planar scan is.
+        """
+        p, pose = self._parameters, T_session_base
+        to_base = pose.inverse()
+        origin = to_base.apply(sensor_m[None, :2])[0]
+        if not self._stamp:
+            nothing = np.empty((0, 2), np.float32)
+            return PlanarScan.of_hits(
+                stamp_ns=stamp_ns, hits_m=nothing, origin_m=origin, free_m=np.zeros(BEARINGS, np.float32)
+            )
+        edge_m = self._config.resolution_m
+        free_m, sums, low_m = kernels.view(
+            self._state, self._sums, self._low, sensor_m[:2], pose.yaw, self._reach_m, edge_m, p.gap_m,
+            (p.depth_m, 4.0 * self._noise_per_m2), BEARINGS,
+        )  # fmt: skip
+        hits: F32 = np.empty((0, 2), np.float32)
+        if len(sums):
+            hits = to_base.apply(mean_per_cell(sums, edge_m)).astype(np.float32)
+        return PlanarScan(
+            stamp_ns=stamp_ns,
+            hits_m=hits,
+            normal_rad=planar_normals(hits, origin),
+            origin_m=origin,
+            free_m=free_m.astype(np.float32),
+            low_m=to_base.apply(low_m).astype(np.float32) if len(low_m) else np.empty((0, 2), np.float32),
+        )
+
+    def agreement(self, points_m: F64) -> tuple[float, float]:
+        """How points (N, 3), session frame, agree with surfaces and observed free space, -1..1.
+
+        The share of points on surfaces less that in free space: of the points in observed cells, and of all
+        in the window.
+        """
+        if not self._stamp:
+            return 0.0, 0.0
+        cell = self._config.resolution_m, self._parameters.layer_m
+        met, against, inside = kernels.agreement(self._evidence, self._low, points_m, cell)
+        return (met - against) / max(met + against, 1), (met - against) / max(inside, 1)
+
+    def walls(self, sigma_m: float) -> tuple[F32, F64]:
+        """The likelihood field (H, W), 0..1, of what stands, rows along y, and the corner (2,) of it."""
+        import cv2
+
+        edge_m = self._config.resolution_m
+        walls = np.roll(self._state >= kernels.LOW, (-self._low[:2] % len(self._state)).tolist(), (0, 1)).T
+        away_m = edge_m * cv2.distanceTransform((~walls).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
+        field: F32 = np.exp(np.float32(-0.5 / sigma_m**2) * away_m**2)
+        return field, edge_m * self._low[:2].astype(np.float64)
+
+    def _band_m(self, floor_m: float) -> tuple[float, float]:
+        return floor_m + self._config.band_min_m, floor_m + self._config.band_max_m
+
+    def _center(self, sensor_m: F64) -> None:
+        """Move the window if the sensor is no longer near its middle."""
+        p, edge_m = self._parameters, self._config.resolution_m
+        size = self._state.shape[0]
+        cell = np.array([edge_m, edge_m, p.layer_m])
+        half = np.array([size // 2, size // 2, round(p.below * p.layers)])
+        low = np.floor(sensor_m / cell).astype(np.int64) - half
+        if not self._stamp:
+            self._low = low
+        slack = np.array([size // 10, size // 10, p.layers // 10])
+        if (np.abs(low - self._low) > slack).any():
+            kernels.clear(self._evidence, self._sums, self._low, low)
+            self._low = low
+            self._floor_m = math.nan  # states are made again

@@ -1,0 +1,134 @@
+"""The map of columns: a room with a table, seen by a camera at the height of a hand that looks down."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pc2grid.arrays import F64
+from pc2grid.clouds.column_map import ColumnMap
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.config import ProjectionConfig
+from pc2grid.geometry import SE2
+from pc2grid.simulate.scene import Mesh, Scene
+
+EYE = np.array((1.0, 2.0, 1.5))
+CONFIG = ProjectionConfig()
+
+
+def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Mesh:
+    """The six faces of a box."""
+    import open3d as o3d
+
+    mesh = o3d.geometry.TriangleMesh.create_box(*(b - a for a, b in zip(low, high, strict=True)))
+    mesh.translate(low)
+    return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
+
+
+def room() -> Scene:
+    """5 x 4 m and 2.5 m high, with a table: its top is 1 x 2 m, 0.72 m high, and 2 m from the eye."""
+    return Scene(Mesh.join([box((0.0, 0.0, 0.0), (5.0, 4.0, 2.5)), box((3.0, 1.0, 0.70), (4.0, 3.0, 0.72))]))
+
+
+def looks(scene: Scene, pitches_deg: tuple[float, ...], yaws_deg: tuple[float, ...]) -> list[F64]:
+    """Points (N, 3) of images of 64 x 48 degrees, pitched down, seen from `EYE`."""
+    up, side = np.meshgrid(
+        np.tan(np.radians(np.linspace(-24, 24, 97))), np.tan(np.radians(np.linspace(-32, 32, 129)))
+    )
+    images = []
+    for pitch in np.radians(pitches_deg):
+        for yaw in np.radians(yaws_deg):
+            forward = np.array(
+                (math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), -math.sin(pitch))
+            )
+            left = np.array((-math.sin(yaw), math.cos(yaw), 0.0))
+            rays = forward + side.reshape(-1, 1) * left + up.reshape(-1, 1) * np.cross(forward, left)
+            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+            away = scene.cast(np.hstack((np.tile(EYE, (len(rays), 1)), rays)).astype(np.float32))
+            images.append(EYE + away[np.isfinite(away), None] * rays[np.isfinite(away)])
+    return images
+
+
+@pytest.fixture(scope="module")
+def planar_scan() -> PlanarScan:
+    columns = ColumnMap(6.0, "depth", CONFIG)
+    for points in looks(room(), (0.0, 20.0, 40.0), tuple(range(-180, 180, 30))):
+        columns.add(points, points, EYE, 0.0)
+    return columns.cut(SE2(), EYE, 7)
+
+
+def test_the_walls_of_the_room_are_hits_and_the_table_is_not(planar_scan: PlanarScan) -> None:
+    x, y = planar_scan.hits_m.T
+    off_m = np.minimum.reduce([np.abs(x), np.abs(x - 5.0), np.abs(y), np.abs(y - 4.0)])
+    assert len(x) > 250 and off_m.max() < 0.05  # 18 m of walls, a cell of 0.05 m
+
+
+def test_the_table_is_low(planar_scan: PlanarScan) -> None:
+    x, y = planar_scan.low_m.T
+    on_table = (x > 2.9) & (x < 4.1) & (y > 0.9) & (y < 3.1)
+    assert on_table.mean() > 0.9
+    assert on_table.sum() * CONFIG.resolution_m**2 > 1.0  # of 2 m2; its far side is seen at a small angle
+
+
+def test_the_floor_is_free_up_to_the_walls_over_the_table(planar_scan: PlanarScan) -> None:
+    """Ahead the eye looks over the table to the wall at x = 5, 4 m away; behind it is the wall at x = 0."""
+    count = len(planar_scan.free_m)
+    assert planar_scan.free_m[0] == pytest.approx(4.0, abs=0.1)
+    assert planar_scan.free_m[count // 4] == pytest.approx(2.0, abs=0.1)
+    assert planar_scan.free_m[count // 2] == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_step_is_low_and_no_wall() -> None:
+    """A platform of 0.3 m, from x = 3 to the wall: its edge is an obstacle of little height."""
+    scene = Scene(Mesh.join([box((0.0, 0.0, 0.0), (5.0, 4.0, 2.5)), box((3.0, 0.0, 0.0), (5.0, 4.0, 0.3))]))
+    columns = ColumnMap(6.0, "depth", CONFIG)
+    for points in looks(scene, (0.0, 25.0, 45.0), (-30.0, 0.0, 30.0)):
+        columns.add(points, points, EYE, 0.0)
+    found = columns.cut(SE2(), EYE, 0)
+    inside = (np.abs(found.hits_m - (2.5, 2.0)) < (2.3, 1.8)).all(axis=1)
+    assert not inside.any()
+    assert (np.abs(found.low_m[:, 0] - 3.1) < 0.2).any()
+
+
+def test_what_has_gone_is_forgotten() -> None:
+    """A cupboard stands 2 m ahead; it is carried away, and the wall behind it is seen a few times."""
+    with_cupboard = Scene(
+        Mesh.join([box((0.0, 0.0, 0.0), (5.0, 4.0, 2.5)), box((3.0, 1.5, 0.0), (3.5, 2.5, 2.0))])
+    )
+    without = Scene(box((0.0, 0.0, 0.0), (5.0, 4.0, 2.5)))
+    columns = ColumnMap(6.0, "depth", CONFIG)
+    free_m = []
+    for scene, times in ((with_cupboard, 3), (without, 20)):
+        for _ in range(times):
+            for points in looks(scene, (0.0, 20.0), (0.0,)):
+                columns.add(points, points, EYE, 0.0)
+        free_m.append(float(columns.cut(SE2(), EYE, 0).free_m[0]))
+    assert free_m == pytest.approx([2.0, 4.0], abs=0.1)
+
+
+def test_the_window_moves_with_the_sensor_and_memory_does_not_grow() -> None:
+    """Along a corridor of 40 m with a reach of 4 m: the walls beside the sensor are always seen."""
+    columns, counts = ColumnMap(4.0, "lidar", CONFIG), []
+    held = columns._evidence.nbytes
+    z, x = np.meshgrid(np.linspace(0.0, 2.4, 49), np.linspace(-4.0, 4.0, 401))
+    for k in range(80):
+        eye = np.array((0.5 * k, 0.0, 1.0))
+        walls = [
+            np.column_stack((x.ravel() + eye[0], np.full(x.size, side), z.ravel())) for side in (-1.02, 1.02)
+        ]
+        points = np.concatenate(walls)
+        columns.add(points, points, eye, 0.0)
+        counts.append(len(columns.cut(SE2(float(eye[0]), 0.0, 0.0), eye, 0).hits_m))
+    assert columns._evidence.nbytes == held
+    assert min(counts[10:]) > 0.8 * max(counts)
+
+
+def test_agreement_tells_a_place_from_free_space() -> None:
+    columns = ColumnMap(6.0, "depth", CONFIG)
+    points = np.concatenate(looks(room(), (20.0,), (0.0, 40.0, -40.0)))
+    columns.add(points, points, EYE, 0.0)
+    assert columns.agreement(points)[0] > 0.95
+    nearer = EYE + 0.6 * (points - EYE)
+    assert columns.agreement(nearer)[0] < -0.5

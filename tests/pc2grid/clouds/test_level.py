@@ -1,0 +1,54 @@
+"""The floor in what several views have shown together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pc2grid.arrays import F64
+from pc2grid.clouds.level import floor_height
+from pc2grid.odometry.surface_map import SurfaceMap
+
+EDGE_M = 0.15
+SENSOR = np.array((0.0, 0.0, 1.5))
+
+
+def slab(low: tuple[float, float], high: tuple[float, float], z: float, seed: int = 0) -> F64:
+    """Points (N, 3) of a level surface, 4,000 a square metre, 5 mm of noise."""
+    rng = np.random.default_rng(seed)
+    count = int(4000 * (high[0] - low[0]) * (high[1] - low[1]))
+    points = np.column_stack((rng.uniform(low, high, (count, 2)), np.full(count, z)))
+    return points + 0.005 * rng.standard_normal(points.shape)
+
+
+def wall(x: float, seed: int = 1) -> F64:
+    """Points (N, 3) of a wall across x, 4 m long and 2 m high."""
+    upright = slab((0.0, -2.0), (2.0, 2.0), x, seed)
+    return upright[:, [2, 1, 0]]
+
+
+def shapes_of(*points_m: F64) -> F64:
+    surfaces = SurfaceMap(EDGE_M, 20.0)
+    surfaces.add(np.concatenate(points_m), np.eye(4))
+    return surfaces.fine.shapes
+
+
+TABLE = slab((0.5, -0.5), (2.0, 0.5), 0.72)
+FLOOR = slab((-1.0, -1.0), (1.0, 1.0), 0.0)
+REFLECTION = slab((1.0, 0.0), (1.3, 0.3), -0.8)
+
+
+@pytest.mark.parametrize(
+    ("surfaces", "height_m"),
+    [
+        ((FLOOR, wall(2.0)), 0.0),
+        ((FLOOR, TABLE), 0.0),  # the table is as large as the floor that is seen, but higher
+        ((FLOOR, TABLE, REFLECTION), 0.0),  # below a glossy floor, and small
+        ((TABLE,), 0.72),  # of a table alone nobody can tell
+        ((wall(2.0),), None),
+        ((slab((-1.0, -1.0), (1.0, 1.0), 1.4),), None),  # a shelf at the height of the eyes
+    ],
+)
+def test_the_floor_is_the_lowest_large_level(surfaces: tuple[F64, ...], height_m: float | None) -> None:
+    found = floor_height(shapes_of(*surfaces), EDGE_M, SENSOR)
+    assert found == (None if height_m is None else pytest.approx(height_m, abs=0.02))
