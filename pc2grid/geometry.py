@@ -180,3 +180,10 @@ def interpolate_pose(T_a: F64, T_b: F64, fraction: float) -> F64:
     relative = invert_pose(T_a) @ T_b
     step = pose_from_rotation_vector(fraction * rotation_vector(relative), fraction * relative[:3, 3])
     return T_a @ step
+
+
+def motion_size(motion: F64) -> tuple[float, float]:
+    """The distance (m) and the angle (rad) of a motion (4, 4)."""
+    (xx, xy, xz, x), (yx, yy, yz, y), (zx, zy, zz, z), _ = motion.tolist()
+    twice_sine = math.hypot(zy - yz, xz - zx, yx - xy)
+    return math.hypot(x, y, z), math.atan2(twice_sine, xx + yy + zz - 1.0)

@@ -125,3 +125,73 @@ def placement_scores(
                     if 0 <= at_column < width:
                         scores[a, r, c] += field[at_row, at_column]
     return scores / np.float32(max(points.shape[0], 1))
+
+
+@njit(cache=True)
+def add_factors(
+    rows: NDArray[np.intp], error: F64, jacobian: F64, information: F64, kernel: F64, H: F64, g: F64
+) -> float:
+    """See `graph.add_factors_plain`."""
+    cost = 0.0
+    dimension, unknowns = jacobian.shape[1], jacobian.shape[2]
+    Le, LJ = np.empty(dimension), np.empty((dimension, unknowns))
+    for f in range(rows.shape[0]):
+        chi2 = 0.0
+        for a in range(dimension):
+            Le[a] = 0.0
+            for b in range(dimension):
+                Le[a] += information[f, a, b] * error[f, b]
+            chi2 += error[f, a] * Le[a]
+        weight = 1.0 / (1.0 + chi2 / kernel[f] ** 2)
+        cost += chi2 if math.isinf(kernel[f]) else kernel[f] ** 2 * math.log1p(chi2 / kernel[f] ** 2)
+        for a in range(dimension):
+            for k in range(unknowns):
+                LJ[a, k] = 0.0
+                for b in range(dimension):
+                    LJ[a, k] += information[f, a, b] * jacobian[f, b, k]
+        for j in range(unknowns):
+            row = rows[f, j]
+            for a in range(dimension):
+                left = weight * jacobian[f, a, j]
+                if left == 0.0:
+                    continue
+                g[row] += left * Le[a]
+                for k in range(unknowns):
+                    H[row, rows[f, k]] += left * LJ[a, k]
+    return cost
+
+
+@njit(cache=True)
+def steps(first: F64, second: F64) -> tuple[F64, F64, F64]:
+    """See `manifold.steps_plain`."""
+    count = first.shape[0]
+    step, by_first, by_second = np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
+    turn, right = np.empty((3, 3)), np.empty((3, 3))
+    for n in range(count):
+        A, B = first[n], second[n]
+        for i in range(3):
+            for k in range(3):
+                step[n, i] += A[k, i] * (B[k, 3] - A[k, 3])
+                turn[i, k] = A[0, i] * B[0, k] + A[1, i] * B[1, k] + A[2, i] * B[2, k]
+        x, y, z = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
+        twice_sine = math.sqrt(x * x + y * y + z * z)
+        angle = math.atan2(twice_sine, turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0)
+        ratio = 0.5 if twice_sine < 1e-9 else angle / twice_sine
+        rx, ry, rz = ratio * x, ratio * y, ratio * z
+        step[n, 3], step[n, 4], step[n, 5] = rx, ry, rz
+        right[0] = 1.0, -0.5 * rz, 0.5 * ry
+        right[1] = 0.5 * rz, 1.0, -0.5 * rx
+        right[2] = -0.5 * ry, 0.5 * rx, 1.0
+        tx, ty, tz = step[n, 0], step[n, 1], step[n, 2]
+        J = by_first[n]
+        J[0, 0] = J[1, 1] = J[2, 2] = -1.0
+        J[0, 4], J[0, 5], J[1, 5] = -tz, ty, -tx
+        J[1, 3], J[2, 3], J[2, 4] = tz, -ty, tx
+        for i in range(3):
+            for k in range(3):
+                by_second[n, i, k] = turn[i, k]
+                by_second[n, 3 + i, 3 + k] = right[i, k]
+                J[3 + i, 3 + k] = -(
+                    right[i, 0] * turn[k, 0] + right[i, 1] * turn[k, 1] + right[i, 2] * turn[k, 2]
+                )
+    return step, by_first, by_second

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,20 +20,20 @@ from pc2grid.arrays import F32, F64
 from pc2grid.clouds.ground import Ground, find_ground
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
+from pc2grid.geometry import SE2
 from pc2grid.model import Scan
-from pc2grid.odometry.motion_model import Prediction
+from pc2grid.odometry.manifold import moved, steps
 from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.odometry.placed import Placed
+from pc2grid.odometry.smoother import SMOOTHER, SPATIAL, Belief
 from pc2grid.odometry.space_map import SpaceMap, ThinnedScan
 from pc2grid.odometry.surface_map import Placement, PosePrior
-from pc2grid.odometry.wheel_odometry import motion_size
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CarriedParameters:
     """Numbers of carried sensors. Chosen by hand, unless noted.
 
-    drift, turn_drift : deviation of odometry in six degrees of freedom, as shares of the distance and of the
-        turn. drift_m, drift_rad : on top, over no motion at all.
     sure_agreement : a scan long after the one before that agrees less with the map is searched for. In a
         hall, right poses have 0.89 and more, wrong ones 0.66 to 0.88 (lidar/hall).
     least_agreement : with less at the best place that is found, the scan is lost.
@@ -40,10 +41,6 @@ class CarriedParameters:
         standard deviation: more than a step of the search.
     """
 
-    drift: float = 0.02
-    turn_drift: float = 0.02
-    drift_m: float = 0.004
-    drift_rad: float = 0.003
     sure_agreement: float = 0.9
     least_agreement: float = 0.85
     starts: int = 10
@@ -55,6 +52,8 @@ CARRIED = CarriedParameters()
 
 class CarriedSensor:
     """Places the scans of a sensor in the hand, one after another, in the session frame: z up."""
+
+    free = SPATIAL
 
     def __init__(
         self,
@@ -76,57 +75,71 @@ class CarriedSensor:
         """Forget the map: the next scan begins a new one."""
         self._map = None
 
-    def place(self, scan: Scan, points_m: F32, last: F64, prediction: Prediction) -> Placement:
-        """Place the deskewed points (N, 3) of a scan after the last pose (4, 4) T_session_base.
+    def start(self, scan: Scan, points_m: F32, at: SE2) -> F64:
+        """Begin with a scan whose base is at a place of the session frame; returns its pose (4, 4),
+        levelled."""
+        self._map = SpaceMap(scan, points_m, self._projection)
+        self._thinned = self._map.thin(scan, points_m)
+        self._found = at.lift() @ first_pose(scan, points_m)
+        return self._found
 
-        A scan that fits nowhere, or shows nothing, is placed where it is predicted, with an overlap of 0.
+    def levelled(self, pose: F64) -> F64:
+        """A pose (4, 4) in space has its tilt and its height already."""
+        return pose
+
+    def place(self, scan: Scan, points_m: F32, seconds: float, expected: Sequence[Belief]) -> Placed:
+        """Place the deskewed points (N, 3) of a scan, `seconds` after the one before.
+
+        expected : where the base may be, the most credible first. A scan that fits nowhere, or shows nothing,
+        is placed there.
         """
-        prior = self._prior(last, prediction)
+        first = expected[0]
+        axes = _axes(first.pose)
+        prior = PosePrior(first.pose, axes @ np.linalg.inv(first.covariance) @ axes.T)
         if self._map is None:
             self._map = SpaceMap(scan, points_m, self._projection)
         self._thinned = thinned = self._map.thin(scan, points_m)
         if not self._map or not len(thinned.points_m):
-            begins = float(not self._map)
             self._found = prior.pose
-            return Placement(prior.pose, np.zeros((6, 6)), begins, 0.0, bool(begins))
+            return Placed(prior.pose, first=not self._map)
         found = self._map.match(thinned, prior.pose, prior)
-        if self._is_doubtful(found, prediction, self._map):
+        alone_s = 0.0 if scan.T_odom_base is not None else seconds  # without any word of its motion
+        if self._is_doubtful(found, alone_s, self._map):
             found = self._search(prior, found, self._map)
-        if found.overlap > 0.0:
+        fits = found.overlap > 0.0
+        if fits:
             self._found = found.pose
-        return found
+        return Placed(
+            found.pose,
+            _alone(found, prior) if fits else None,
+            found.overlap,
+            found.residual_m,
+            found.measured,
+            sure=found.overlap >= self._tracking.sure_overlap,
+        )
 
-    def extend(self, scan: Scan, points_m: F32, pose: F64) -> None:
-        """Add the scan placed last to the map at its final pose (4, 4)."""
-        if self._map is not None:
-            self._map.extend(scan, points_m, self._thinned, pose)
+    def extend(self, pose: F64) -> None:
+        """Scans join the map in space oftener than keyframes begin, see `cut`."""
 
-    def cut(self, scan: Scan, pose: F64) -> PlanarScan:
-        """The planar scan of the scan placed last, at its final pose (4, 4), in the levelled base frame."""
+    def cut(self, scan: Scan, points_m: F32, pose: F64, *, lost: bool) -> PlanarScan:
+        """Add the scan placed last to the map at its final pose (4, 4), and cut its planar scan out of it.
+
+        The planar scan is in the levelled base frame.
+        """
         if self._map is None:
             raise ValueError("no scan has been placed")
+        if not lost:
+            self._map.extend(scan, points_m, self._thinned, pose)
         return self._map.cut(scan, pose)
 
-    def _is_doubtful(self, found: Placement, prediction: Prediction, space: SpaceMap) -> bool:
+    def _is_doubtful(self, found: Placement, seconds: float, space: SpaceMap) -> bool:
         """Whether the scan placed last may lie elsewhere: it does not fit, or hardly, after a long time."""
         t = self._tracking
         if found.overlap < t.sure_overlap:
             return True
-        turned_rad = t.search_sigmas * t.unsteady_radps * prediction.seconds
-        if prediction.odometry is not None or turned_rad < t.search_above_rad:
+        if t.search_sigmas * SMOOTHER.unsteady_radps * seconds < t.search_above_rad:
             return False
         return space.agreement(self._thinned, found.pose)[0] < self._parameters.sure_agreement
-
-    def _prior(self, last: F64, prediction: Prediction) -> PosePrior:
-        """Where the scan is expected, and how surely."""
-        p, t = self._parameters, self._tracking
-        sigma_m = max(t.unsteady_mps * prediction.seconds, p.drift_m)
-        sigma_rad = max(t.unsteady_radps * prediction.seconds, p.drift_rad)
-        if prediction.odometry is not None:
-            moved_m, turned_rad = motion_size(prediction.motion)
-            sigma_m = p.drift_m + p.drift * moved_m
-            sigma_rad = p.drift_rad + p.turn_drift * turned_rad
-        return PosePrior(last @ prediction.motion, np.diag([sigma_rad**-2] * 3 + [sigma_m**-2] * 3))
 
     def _search(self, prior: PosePrior, found: Placement, space: SpaceMap) -> Placement:
         """The best placement in all headings around the last pose that was found, with its height and tilt.
@@ -146,6 +159,23 @@ class CarriedSensor:
         if space.agreement(self._thinned, best.pose)[0] < p.least_agreement:
             return Placement(prior.pose, np.zeros((6, 6)), 0.0, 0.0, False)
         return best
+
+
+def _axes(pose: F64) -> F64:
+    """The matrix (6, 6) from a change in the axes of the base, shift first, to one as in `Placement`."""
+    axes = np.zeros((6, 6))
+    axes[:3, 3:] = axes[3:, :3] = pose[:3, :3]
+    return axes
+
+
+def _alone(found: Placement, prior: PosePrior) -> tuple[F64, F64]:
+    """The pose (4, 4) by the points alone, with its information (6, 6) in the axes of the base."""
+    axes = _axes(found.pose)
+    away, _, _ = steps(prior.pose[None], found.pose[None])
+    pulled = axes.T @ prior.information @ axes @ away[0]
+    information = axes.T @ found.information @ axes
+    change = np.linalg.solve(information + 1e-3 * np.eye(6), pulled)
+    return moved(found.pose[None], change[None])[0], information
 
 
 def first_pose(scan: Scan, points_m: F32) -> F64:

@@ -1,4 +1,4 @@
-"""The floor under a robot on wheels, which is fixed to it; and whether a sensor is on wheels."""
+"""The floor under a base on wheels, and whether a base is on wheels at all."""
 
 from __future__ import annotations
 
@@ -23,52 +23,39 @@ DECIDING_SCANS = 20
 
 
 class GroundModel:
-    """Follows the floor from scan to scan, in the base frame.
+    """The floor in the base frame, which is the mean of what the scans show of it.
 
-    ground : the floor in the base frame; None for a planar laser, which sees none.
-    rolling : whether the base stands on the floor, so that the floor keeps its place in the base frame.
+    ground : the floor; None for a planar laser, which sees none.
     """
 
-    def __init__(
-        self, ground: Ground | None, *, rolling: bool, parameters: TrackingParameters = TRACKING_PARAMETERS
-    ) -> None:
+    def __init__(self, ground: Ground | None, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
         self.ground = ground
-        self.rolling = rolling
         self._parameters = parameters
         self._scans = 0
         self._looks = int(ground is not None and ground.seen)  # that have shown the floor
 
     @classmethod
     def start(
-        cls,
-        points_m: F32,
-        scan: Scan,
-        parameters: TrackingParameters = TRACKING_PARAMETERS,
-        *,
-        rolling: bool | None = None,
+        cls, points_m: F32, scan: Scan, parameters: TrackingParameters = TRACKING_PARAMETERS
     ) -> GroundModel:
         """Find the floor in the first scan.
 
         It is looked for where the mounting of the sensor puts it, then as the lowest level plane; else it
-        is assumed. points_m : (N, 3) points of the scan that are used, base frame. rolling : by default what
-        `is_rolling` says.
+        is assumed. points_m : (N, 3) points of the scan that are used, base frame.
         """
         if SENSOR_MODELS[scan.sensor].planar:
-            return cls(None, rolling=True, parameters=parameters)
+            return cls(None, parameters)
         sensor_m = scan.T_base_sensor[:3, 3]
         assumed = assumed_ground(scan.T_base_sensor)
         found = find_ground(points_m, sensor_m, assumed) if assumed.offset_m == 0.0 else None
-        ground = found or find_ground(points_m, sensor_m) or assumed
-        return cls(ground, rolling=is_rolling(scan) if rolling is None else rolling, parameters=parameters)
+        return cls(found or find_ground(points_m, sensor_m) or assumed, parameters)
 
-    def follow_fixed(self, points_m: F32, scan: Scan) -> None:
-        """Update a floor that is fixed to the robot by the points (N, 3) of a scan.
+    def follow(self, points_m: F32, scan: Scan) -> None:
+        """Update the floor by the points (N, 3) of a scan; it is looked for in some of the scans only.
 
-        It is looked for only in some of the scans, before they are registered, as `remove` needs it. The
-        floor is the mean of what was seen: wheels do not tilt against it, and a ramp ahead soon passes. A
-        floor that is not fixed stays as it is.
+        Wheels do not tilt against the floor, and a ramp ahead soon passes.
         """
-        if self.ground is None or not self.rolling:
+        if self.ground is None:
             return
         self._scans += 1
         if self._scans % self._parameters.rolling_every == 0:
@@ -78,7 +65,7 @@ class GroundModel:
                 self.ground = self.ground.toward(found, max(1.0 / self._looks, self._parameters.rolling_gain))
 
     def remove(self, points_m: F32) -> F32:
-        """Return the points (N, 3) that KISS-ICP is given: a sample, without floor and ceiling."""
+        """The points (N, 3) that KISS-ICP is given: a sample, without floor and ceiling."""
         if self.ground is None or not len(points_m):
             return points_m
         p = self._parameters
@@ -90,20 +77,15 @@ class GroundModel:
             keep &= heights < self.ground.ceiling_m - slack
         return points[keep] if keep.sum() > p.icp_min_points else points
 
-    def start_pose(self) -> F64:
-        """Return T_session_base (4, 4) of the first scan: the session frame is the base, levelled."""
-        return np.eye(4) if self.ground is None else self.ground.leveling()
-
-    def hold(self, pose: F64) -> F64:
-        """Return a pose (4, 4) with tilt and height from the floor, since walls alone let them drift."""
-        planar = SE2.from_matrix(pose)
+    def T_level_base(self) -> F64:
+        """Tilt and height (4, 4) of the base over the floor. The heading of the base stays."""
         if self.ground is None:
-            return planar.lift()
-        held: F64 = planar.lift() @ self.ground.leveling()
+            return np.eye(4)
+        level = self.ground.leveling()
         # Levelling is the smallest rotation, which may change the heading: turn it back.
-        turn = SE2(0.0, 0.0, planar.yaw - SE2.from_matrix(held).yaw).lift()
-        held[:3, :3] = turn[:3, :3] @ held[:3, :3]
-        return held
+        turn = SE2(0.0, 0.0, -SE2.from_matrix(level).yaw).lift()
+        level[:3, :3] = turn[:3, :3] @ level[:3, :3]
+        return level
 
 
 def is_rolling(scan: Scan, first: Scan | None = None) -> bool:

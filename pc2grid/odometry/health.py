@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pc2grid.model import Health
 from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
-from pc2grid.odometry.point_to_line import Match
-from pc2grid.odometry.surface_map import Placement
+from pc2grid.odometry.placed import Placed
 
 
 class HealthJudge:
@@ -16,21 +15,23 @@ class HealthJudge:
         self._poor_scans = 0
         self._lost_scans = 0
 
-    def judge(self, match: Match | Placement | None, measured: bool) -> Health:
-        """Judge a scan by its match, None if it had too few hits. measured : odometry predicted its pose.
+    def judge(self, placed: Placed, *, bridged: bool) -> Health:
+        """Judge a scan by where it was placed. bridged : odometry says where it is.
 
         A scan that shows too little is bridged by odometry for a while (DEGENERATE). A scan that does not
         fit, without odometry or for too long, is LOST. A scan that fits is DEGENERATE if one direction of
         its position is not determined, FINE otherwise.
         """
         p = self._parameters
-        if match is None or match.overlap < p.min_overlap or match.residual_m > p.max_residual_m:
+        if placed.first:
+            return Health.FINE
+        if placed.overlap < p.min_overlap or placed.residual_m > p.max_residual_m:
             self._poor_scans += 1
-            lost = not measured or self._poor_scans > p.bridged_scans
+            lost = not bridged or self._poor_scans > p.bridged_scans
             self._lost_scans += lost
             return Health.LOST if lost else Health.DEGENERATE
         self._poor_scans = self._lost_scans = 0
-        return Health.FINE if match.measured else Health.DEGENERATE
+        return Health.FINE if placed.measured else Health.DEGENERATE
 
     @property
     def gives_up(self) -> bool:

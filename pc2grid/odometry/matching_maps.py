@@ -22,7 +22,6 @@ class MatchingMaps:
     """Two overlapping local maps: scans are matched with the older one, and the younger replaces it in time.
 
     reach_m : range of the hits of a scan. matching : numbers of the matching, which depend on the sensor.
-    restarts : how often the maps were started again.
     """
 
     def __init__(
@@ -35,29 +34,11 @@ class MatchingMaps:
         self._parameters = parameters
         self._matching = matching
         self._maps: list[tuple[PointGrid, float]] = []  # each with the travel at which it was begun
-        self._last_keyframe: SE2 | None = None
+        self._last: SE2 | None = None  # where a scan was added last
         self._travel_m = 0.0
-        self.restarts = 0
 
     def __bool__(self) -> bool:
         return bool(self._maps)
-
-    def fit(self, planar_scan: PlanarScan, guess: SE2) -> Match:
-        """Match a planar scan from a guess T_session_base, by its hits alone."""
-        return self._match(planar_scan, guess, guess, np.zeros((3, 3)))
-
-    def refine(
-        self, planar_scan: PlanarScan, guesses: list[SE2], prior: SE2, information: F64
-    ) -> Match | None:
-        """Match a planar scan from some guesses and return the better result.
-
-        prior, information : pose T_session_base that the result is held to, and its information (3, 3).
-        Returns None for a scan with too few hits.
-        """
-        if len(planar_scan.hits_m) < self._parameters.min_hits:
-            return None
-        matches = [self._match(planar_scan, guess, prior, information) for guess in guesses]
-        return max(matches, key=self.quality)
 
     def search(self, planar_scan: PlanarScan, guess: SE2, window_m: float, window_rad: float) -> list[SE2]:
         """Return the best placements of a planar scan around a guess T_session_base, to be refined."""
@@ -71,24 +52,22 @@ class MatchingMaps:
         """What placements of one scan are compared by."""
         return match.overlap - self._parameters.residual_weight_per_m * match.residual_m
 
-    def _match(self, planar_scan: PlanarScan, guess: SE2, prior: SE2, information: F64) -> Match:
+    def match(self, planar_scan: PlanarScan, guess: SE2, prior: SE2, information: F64) -> Match:
+        """Match a planar scan from a guess T_session_base.
+
+        prior, information : pose that the result is held to, and its information (3, 3) of x, y, yaw.
+        """
         chosen = evenly(len(planar_scan.hits_m), self._parameters.matched_hits)
         hits, normals = planar_scan.hits_m[chosen], planar_scan.normal_rad[chosen]
         return self._maps[0][0].match(hits, normals, guess, prior, information)
 
-    def extend(self, planar_scan: PlanarScan, pose: SE2) -> bool:
-        """Add a planar scan at its final pose T_session_base, if the robot has moved enough since the last.
-
-        Returns whether it was added, as a keyframe: a robot that stands still adds nothing.
-        """
-        p = self._parameters
-        if self._last_keyframe is not None:
-            step = self._last_keyframe.inverse() @ pose
-            distance_m = math.hypot(step.x, step.y)
-            if distance_m < p.keyframe_travel_m and abs(step.yaw) < p.keyframe_turn_rad:
-                return False
-            self._travel_m += distance_m
-        if not self._maps or self._travel_m - self._maps[-1][1] > p.map_travel_m:
+    def extend(self, planar_scan: PlanarScan, pose: SE2) -> None:
+        """Add a planar scan at its final pose T_session_base."""
+        if self._last is not None:
+            step = self._last.inverse() @ pose
+            self._travel_m += math.hypot(step.x, step.y)
+        self._last = pose
+        if not self._maps or self._travel_m - self._maps[-1][1] > self._parameters.map_travel_m:
             middle = np.array([pose.x, pose.y])
             low_m, high_m = middle - self._half_m, middle + self._half_m
             self._maps.append((PointGrid(low_m, high_m, parameters=self._matching), self._travel_m))
@@ -96,10 +75,7 @@ class MatchingMaps:
             del self._maps[0]
         for grid, _ in self._maps:
             grid.add(pose.apply(planar_scan.hits_m), planar_scan.normal_rad + pose.yaw)
-        self._last_keyframe = pose
-        return True
 
     def restart(self) -> None:
-        """Forget the maps: the next keyframe begins new ones."""
-        self._maps, self._last_keyframe = [], None
-        self.restarts += 1
+        """Forget the maps: the next scan begins new ones."""
+        self._maps, self._last = [], None

@@ -10,8 +10,12 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pc2grid.arrays import F64
+from pc2grid.geometry import invert_pose, motion_size
 from pc2grid.model import OdometryCheck, Overruled
 
+_INEXACT_M, _INEXACT_RAD, _INEXACT_SHARE = 0.1, 0.1, 0.1
+"""Odometry that differs by less, or by less than this share of the motion, is merely inexact; by hand."""
 _TOGETHER_NS = 10**9
 """Overruled scans that follow each other within this time are one stretch; chosen by hand."""
 _SHOWN = 20
@@ -36,6 +40,16 @@ class Disagreement:
     overrules: bool
     reported_m: float = 0.0
     moved_m: float = 0.0
+
+
+def disagreement(reported: F64, moved: F64) -> Disagreement:
+    """By how much the motion (4, 4) that odometry reports differs from that of the poses."""
+    distance_m, turn_rad = motion_size(invert_pose(reported) @ moved)
+    (reported_m, reported_rad), (moved_m, moved_rad) = motion_size(reported), motion_size(moved)
+    overrules = distance_m > _INEXACT_M + _INEXACT_SHARE * max(
+        reported_m, moved_m
+    ) or turn_rad > _INEXACT_RAD + _INEXACT_SHARE * max(reported_rad, moved_rad)
+    return Disagreement(distance_m, turn_rad, overrules, reported_m=reported_m, moved_m=moved_m)
 
 
 @dataclass(frozen=True, slots=True)

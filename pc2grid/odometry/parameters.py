@@ -41,47 +41,33 @@ class TrackingParameters:
     Points:
 
     max_points : of a scan, chosen at random; a depth image has 300 000.
-    icp_points : of these, those given to KISS-ICP floor and ceiling included.
+    icp_points : of these, those given to KISS-ICP, floor and ceiling included.
     icp_min_points : fewer than this above the floor: the floor is left in.
     floor_slack_m, floor_slack_per_m : height up to which points count as floor, and its growth with the
         horizontal range (0.01 is an error of the tilt of 0.6 degrees).
 
     Ground:
 
-    rolling_gain : the same where the floor is fixed to the robot; more at first, so that it is the mean of
-        what was seen. With a larger one, the floor under a camera followed a ramp that it saw ahead.
-    rolling_every : scans from one look at the floor to the next where it is fixed to the robot.
-
-    Motion without odometry:
-
-    steady_s : the motion before is taken over this time, so that an error of one pose does not come back
-        in the next with the other sign.
-    steady_sigma_m, steady_sigma_rad : standard deviations of a pose that KISS-ICP found, as a prior.
+    rolling_gain : share by which the floor under wheels moves towards what a scan shows of it; more at first,
+        so that it is the mean of what was seen. With a larger one, the floor under a camera followed a ramp
+        that it saw ahead.
+    rolling_every : scans from one look at the floor to the next.
 
     Odometry:
 
-    gap_s, gap_intervals : odometry over a longer time than `gap_s`, and than so many times the interval at
-        which the scans of this log follow, is tested against the local map before it is used.
-    usual_intervals : that interval is the median of so many.
-    fastest_mps, fastest_radps : the same for odometry that claims a faster motion, with an allowance of
+    gap_s, gap_intervals : odometry does not go on over a longer time than `gap_s`, and than so many times the
+        usual interval between scans, which is the median of `usual_intervals`.
+    fastest_mps, fastest_radps : odometry that reports a faster motion is not believed, with an allowance of
         `jump_m` and `jump_rad` for noise.
-    slip_sigma : share of the distance and of the turn that is the standard deviation of unknown odometry.
-    slip_sigma_m_per_rad : the same of the position, for a turn.
-    odometry_floor_m, odometry_floor_rad : standard deviations of odometry over no motion at all.
-    window_s : odometry that reports a motion late reports it over this time all the same.
-    owed_m, owed_rad : if the motion of a step and that of the window differ by more than this, odometry owes
-        a motion or repeats one, and counts less by the difference.
-    trust_window_m : travel over which odometry is compared with the poses; the difference must stand out
-        from the noise of the poses.
-    trust_windows, trust_min_windows : windows that are remembered, and that an estimate needs.
-    trust_safety : factor on the root mean square of the differences in the windows.
-    trust_best, trust_worst : bounds of the factor that the standard deviations are multiplied by.
+    steady_sigma_m, steady_sigma_rad : standard deviations of the motion that KISS-ICP finds, without
+        odometry.
 
     Refinement in the plane:
 
     min_hits : with fewer hits no refinement is made.
     matched_hits : hits of a scan that are matched, at most, evenly chosen.
     residual_weight_per_m : of two placements the one with the larger overlap - weight * residual is taken.
+    scan_weight : a scan of some hundred hits, which are not independent, tells as much as so many that are.
     disagree_m, disagree_rad : where KISS-ICP and the prediction differ by more, both start a refinement.
     sure_overlap : least overlap of a placement that alone decides between odometry and the motion before;
         with less, placements are searched for if the prediction leaves enough open.
@@ -91,10 +77,6 @@ class TrackingParameters:
     search_most_m, search_most_rad : largest half width.
     search_sigma_m : of the likelihood field that is searched; its steps are 0.2 m and 2 degrees.
     search_hits : hits that are searched with, at most, evenly chosen.
-    unsteady_mps, unsteady_radps : without odometry, the standard deviation of the motion is this times the
-        time since the last scan: a robot indoors starts, stops and turns.
-    leap_sigmas, firm : a camera that seems to be off the predicted position by more, where it sees least, is
-        matched again there, held by so many times the information; without odometry it is not believed.
 
     Local maps and keyframes:
 
@@ -128,7 +110,6 @@ class TrackingParameters:
     rolling_gain: float = 0.02
     rolling_every: int = 8
 
-    steady_s: float = 0.3
     steady_sigma_m: float = 0.03
     steady_sigma_rad: float = 0.01
 
@@ -139,23 +120,11 @@ class TrackingParameters:
     fastest_radps: float = 4.0
     jump_m: float = 0.2
     jump_rad: float = 0.3
-    slip_sigma: float = 0.1
-    slip_sigma_m_per_rad: float = 0.05
-    odometry_floor_m: float = 0.01
-    odometry_floor_rad: float = 0.01
-    window_s: float = 1.0
-    owed_m: float = 0.1
-    owed_rad: float = 0.1
-    trust_window_m: float = 2.0
-    trust_windows: int = 5
-    trust_min_windows: int = 3
-    trust_safety: float = 2.0
-    trust_best: float = 0.25
-    trust_worst: float = 1.0
 
     min_hits: int = 10
     matched_hits: int = 700
     residual_weight_per_m: float = 5.0
+    scan_weight: float = 100.0
     disagree_m: float = 0.03
     disagree_rad: float = 0.02
     sure_overlap: float = 0.6
@@ -166,10 +135,6 @@ class TrackingParameters:
     search_most_rad: float = math.radians(60.0)
     search_sigma_m: float = 0.15
     search_hits: int = 200
-    unsteady_mps: float = 0.4
-    unsteady_radps: float = 0.4
-    leap_sigmas: float = 2.0
-    firm: float = 100.0
 
     keyframe_travel_m: float = 0.2
     keyframe_turn_rad: float = math.radians(10.0)

@@ -11,7 +11,6 @@ Biber and Strasser's normal distributions transform (2003).
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -27,28 +26,19 @@ from pc2grid.odometry.parameters import MATCHING_PARAMETERS, MatchingParameters
 class Match:
     """Placement of a point set on a map.
 
-    pose : T_map_points. information : (3, 3) of x, y, yaw in the map frame, from the points alone.
+    pose : T_map_points. by_points : the same by the points alone, without the prior; where they measure
+        nothing
+    that is anywhere. information : (3, 3) of x, y, yaw in the map frame, from the points alone.
     overlap : share of the points that found a line. residual_m : mean distance of those from their lines.
     measured : whether the points fix every direction of the position.
     """
 
     pose: SE2
+    by_points: SE2
     information: F64
     overlap: float
     residual_m: float
     measured: bool
-
-    def measures_more_than(self, information: F64) -> bool:
-        """Whether the points say more of every direction of the position than `information` (3, 3) does."""
-        weakest, direction = _weakest(self.information)
-        return weakest > float(direction @ information[:2, :2] @ direction)
-
-    def held_along_weakest(self, prior: SE2) -> Match:
-        """The same with the position of a prior T_map_points where the points measure least."""
-        _, direction = _weakest(self.information)
-        off = direction @ (prior.x - self.pose.x, prior.y - self.pose.y) * direction
-        pose = SE2(self.pose.x + float(off[0]), self.pose.y + float(off[1]), self.pose.yaw)
-        return dataclasses.replace(self, pose=pose)
 
 
 class PointGrid:
@@ -143,25 +133,25 @@ class PointGrid:
             # Cauchy weight: wheels slip, so a prior that disagrees with the points counts less.
             weight = prior_information / (1.0 + (away @ prior_information @ away) / p.prior_scale**2)
             step = np.linalg.solve(information + weight + damping, -(unit * g + weight @ away))
+            alone = pose - np.linalg.solve(information + unit * damping, unit * g)
             pose = pose + step
             if radius == steps[-1] and np.abs(step).sum() < p.converged:
                 break
         return Match(
             SE2(float(pose[0]), float(pose[1]), wrap_angle(float(pose[2]))),
+            SE2(float(alone[0]), float(alone[1]), wrap_angle(float(alone[2]))),
             information,
             found / max(len(points), 1),
             distance / max(found, 1),
-            _weakest(information)[0] > unit * p.least_points,
+            _weakest(information) > unit * p.least_points,
         )
 
 
-def _weakest(information: F64) -> tuple[float, F64]:
-    """Information on the position in its weakest direction, the yaw eliminated (Schur complement), and that
-    direction (2,)."""
+def _weakest(information: F64) -> float:
+    """Information on the position in its weakest direction, the yaw eliminated (Schur complement)."""
     J = information
     across = J[:2, :2] - np.outer(J[:2, 2], J[2, :2]) / max(J[2, 2], 1e-9)
-    values, directions = np.linalg.eigh(across)
-    return float(values[0]), directions[:, 0]
+    return float(np.linalg.eigvalsh(across)[0])
 
 
 def sector_of(normal_rad: F64, sectors: int) -> NDArray[np.int64]:

@@ -27,43 +27,36 @@ _EXACT = 1e-12
 class KissRegistration:
     """KISS-ICP with a given initial guess, in one thread and hence repeatable.
 
+    registered : whether the last scan was registered, and not only predicted.
+
     Voxel and range come from the first scan with returns and the time to the next one, unless `config`
-    fixes them. As a refinement follows, coarse voxels and few iterations are enough.
+    fixes them. A refinement in the plane follows, so coarse voxels and few iterations are enough.
     """
 
     def __init__(
-        self,
-        config: RegistrationConfig,
-        *,
-        parameters: TrackingParameters = TRACKING_PARAMETERS,
+        self, config: RegistrationConfig, parameters: TrackingParameters = TRACKING_PARAMETERS
     ) -> None:
         self._config = config
         self._parameters = parameters
         self._first: tuple[F64, F64] | None = None  # points and pose of the first scan
+        self.registered = False
         self._pending: F64 | None = None  # the last scan, downsampled, until its pose is final
         self._kiss_config: Any = None
         self._registration: Any = None
         self._threshold: Any = None
         self._map: Any = None
 
-    def register(
-        self,
-        points_m: NDArray[np.floating],
-        T_session_last: F64,
-        predicted_motion: F64,
-        period_s: float,
-    ) -> F64:
+    def register(self, points_m: NDArray[np.floating], guess: F64, period_s: float) -> F64:
         """Align one scan to the local map.
 
-        points_m : (N, 3) deskewed, without floor and ceiling, in the base frame.
-        T_session_last : (4, 4) final pose of the scan before.
-        predicted_motion : (4, 4) T_last_now. period_s : time since that scan.
+        points_m : (N, 3) deskewed, without floor and ceiling, in the base frame. guess : (4, 4) initial
+        T_session_base. period_s : time since the last scan.
 
-        Returns T_session_base (4, 4); the prediction for the first scan and for scans without enough points.
+        Returns T_session_base (4, 4); the guess for the first scan, and for scans without enough points.
         The scan becomes part of the local map only by `update_map`.
         """
-        self._pending = None
-        guess = _proper(T_session_last @ predicted_motion)
+        self._pending, self.registered = None, False
+        guess = _proper(guess)
         if len(points_m) < self._parameters.icp_min_frame:
             return guess
         points = np.ascontiguousarray(points_m, dtype=np.float64)
@@ -74,12 +67,11 @@ class KissRegistration:
             self._start(*self._first, period_s)
         near = np.einsum("ij,ij->i", points, points) < self._kiss_config.data.max_range**2
         frame = self._downsample(points[near])
-        source = self._downsample(frame, 1.5)
-        pose = self._align(source, guess)
+        pose = self._align(self._downsample(frame, 1.5), guess)
         if not np.isfinite(pose).all():
             return guess
         self._threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
-        self._pending = frame
+        self._pending, self.registered = frame, True
         return pose
 
     def _align(self, source: F64, guess: F64) -> F64:

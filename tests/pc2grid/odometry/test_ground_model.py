@@ -13,7 +13,7 @@ from pc2grid.arrays import F64
 from pc2grid.config import RegistrationConfig
 from pc2grid.geometry import pose_from_rotation_vector
 from pc2grid.model import Scan
-from pc2grid.odometry.ground_model import GroundModel
+from pc2grid.odometry.ground_model import GroundModel, is_rolling
 from pc2grid.odometry.tracker import Tracker
 from pc2grid.simulate import SimulationConfig, iter_session
 from pc2grid.simulate.config import LidarConfig
@@ -55,7 +55,7 @@ def test_the_floor_of_a_robot_on_wheels_does_not_follow_a_ramp_ahead() -> None:
     ground = GroundModel.start(level.points_m, level)
     for scan, scans in ((level, 200), (ramp, 80)):  # before the ramp for eight seconds
         for _ in range(scans):
-            ground.follow_fixed(scan.points_m, scan)
+            ground.follow(scan.points_m, scan)
     assert ground.ground is not None
     assert math.acos(ground.ground.normal[2]) < math.radians(1.0)
 
@@ -79,9 +79,7 @@ def test_a_base_that_is_a_little_off_its_footprint_is_on_wheels(
     points = np.concatenate((floor, walls)) + np.array((0.0, 0.0, 1.0 - height_m))
     T_odom_base = pose_from_rotation_vector((0.0, math.radians(pitch_deg), 0.0), (0.0, 0.0, height_m))
     scan = replace(scan_of(points, mounted_m=1.0 - height_m), T_odom_base=T_odom_base)
-    ground = GroundModel.start(scan.points_m, scan)
-    assert ground.rolling is rolling
-    assert ground.ground is not None
+    assert is_rolling(scan) is rolling
 
 
 def moved(scan: Scan, height_m: float, pitch_deg: float) -> Scan:

@@ -31,7 +31,7 @@ def main() -> None:
     with open_log(log) as opened:
         chosen, last_ns = KissRegistration(Config().registration), 0
         for scan in islice(opened.scans(), 2):
-            chosen.register(scan.points_m, np.eye(4), np.eye(4), (scan.stamp_ns - last_ns) * 1e-9)
+            chosen.register(scan.points_m, np.eye(4), (scan.stamp_ns - last_ns) * 1e-9)
             last_ns = scan.stamp_ns
         config: Any = KISSConfig()
         voxel_and_range_m: Any = chosen.voxel_and_range_m

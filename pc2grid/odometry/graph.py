@@ -1,0 +1,71 @@
+"""Robust least squares over factors: the one solver of tracking, of the pose graph and of what follows them.
+
+A factor is a residual that depends on few of the unknowns. Gauss-Newton with Cauchy weights (iteratively
+reweighted least squares); the unknowns are numbered rows, and what they mean is known to the factors alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.arrays import F64
+from pc2grid.odometry import _kernels
+
+
+@dataclass(frozen=True, slots=True)
+class Factors:
+    """F factors of one kind, linearised.
+
+    rows : (F, K) unknowns that each depends on. error : (F, M) residuals. jacobian : (F, M, K) of these.
+    information : (F, M, M) inverse covariance of each residual.
+    kernel : (F,) scale of the Cauchy weight, standard deviations; infinite: the weight is 1.
+    """
+
+    rows: NDArray[np.intp]
+    error: F64
+    jacobian: F64
+    information: F64
+    kernel: F64
+
+
+def normal_equations(factors: Iterable[Factors], count: int) -> tuple[F64, F64, float]:
+    """The matrix (N, N) and the gradient (N,) of all factors over N = `count` unknowns, and their robust
+    cost."""
+    H, g, cost = np.zeros((count, count)), np.zeros(count), 0.0
+    for kind in factors:
+        cost += _kernels.add_factors(
+            kind.rows, kind.error, kind.jacobian, kind.information, kind.kernel, H, g
+        )
+    return H, g, cost
+
+
+def add_factors_plain(
+    rows: NDArray[np.intp], error: F64, jacobian: F64, information: F64, kernel: F64, H: F64, g: F64
+) -> float:
+    """Add factors, see `Factors`, to the normal equations; returns their robust cost.
+
+    The definition of the compiled form, in numpy.
+    """
+    chi2 = np.einsum("fa,fab,fb->f", error, information, error)
+    weight = 1.0 / (1.0 + chi2 / kernel**2)
+    JtL = jacobian.transpose(0, 2, 1) @ (information * weight[:, None, None])
+    np.add.at(H, (rows[:, :, None], rows[:, None, :]), JtL @ jacobian)
+    np.add.at(g, rows, np.einsum("fka,fa->fk", JtL, error))
+    robust = np.isfinite(kernel)
+    bounded = kernel[robust] ** 2 * np.log1p(chi2[robust] / kernel[robust] ** 2)
+    return float(chi2[~robust].sum() + bounded.sum())
+
+
+def without(H: F64, g: F64, old: NDArray[np.intp]) -> tuple[F64, F64]:
+    """The information (N - O, N - O) and the gradient on the other unknowns when those in `old` (O,) are
+    marginalised: the Schur complement."""
+    rest = np.setdiff1d(np.arange(len(H)), old)
+    A = H[np.ix_(old, old)] + 1e-9 * np.eye(len(old))
+    solved = np.linalg.solve(A, np.column_stack((H[np.ix_(old, rest)], g[old])))
+    B = H[np.ix_(rest, old)]
+    reduced = H[np.ix_(rest, rest)] - B @ solved[:, :-1]
+    return 0.5 * (reduced + reduced.T), g[rest] - B @ solved[:, -1]

@@ -1,0 +1,91 @@
+"""Poses as unknowns of least squares: many at once, with the derivatives of the steps between them.
+
+A pose changes by a vector (6,) in its own axes, translation (m) and rotation vector (rad): the translation is
+added, the rotation multiplied (Sola et al., "A micro Lie theory for state estimation in robotics", 2018).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pc2grid.arrays import F64
+from pc2grid.odometry import _kernels
+
+
+class Steps(NamedTuple):
+    """The steps from poses to others, in the axes of the first.
+
+    step : (N, 6). by_first, by_second : (N, 6, 6) its Jacobians with respect to changes of both.
+    """
+
+    step: F64
+    by_first: F64
+    by_second: F64
+
+
+def moved(poses: F64, changes: F64) -> F64:
+    """Poses (N, 4, 4) after changes (N, 6) in their own axes."""
+    result = poses.copy()
+    result[:, :3, 3] += np.einsum("nab,nb->na", poses[:, :3, :3], changes[:, :3])
+    result[:, :3, :3] = poses[:, :3, :3] @ _rotations(changes[:, 3:])
+    return result
+
+
+def steps(first: F64, second: F64) -> Steps:
+    """The steps from poses (N, 4, 4) to others."""
+    return Steps(*_kernels.steps(first, second))
+
+
+def steps_plain(first: F64, second: F64) -> Steps:
+    """The definition of `steps`, in numpy."""
+    R = first[:, :3, :3].transpose(0, 2, 1)
+    turn = R @ second[:, :3, :3]
+    step = np.empty((len(first), 6))
+    step[:, :3] = np.einsum("nab,nb->na", R, second[:, :3, 3] - first[:, :3, 3])
+    step[:, 3:] = _rotation_vectors(turn)
+    # Of the rotation vector only the first term of the series is needed: steps are small, or count little.
+    right = np.eye(3) + 0.5 * _skew(step[:, 3:])
+    by_first, by_second = np.zeros((len(first), 6, 6)), np.zeros((len(first), 6, 6))
+    by_first[:, :3, :3] = -np.eye(3)
+    by_first[:, :3, 3:] = _skew(step[:, :3])
+    by_first[:, 3:, 3:] = -right @ turn.transpose(0, 2, 1)
+    by_second[:, :3, :3] = turn
+    by_second[:, 3:, 3:] = right
+    return Steps(step, by_first, by_second)
+
+
+def carried_on(motion: F64) -> F64:
+    """How a change of a pose changes the pose after a motion (4, 4), a matrix (6, 6)."""
+    R = motion[:3, :3].T
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = R
+    result[:3, 3:] = -R @ _skew(motion[None, :3, 3])[0]
+    return result
+
+
+def _skew(vectors: F64) -> F64:
+    """The matrices (N, 3, 3) of the cross products with vectors (N, 3)."""
+    result = np.zeros((len(vectors), 3, 3))
+    result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -vectors[:, 2], vectors[:, 1], -vectors[:, 0]
+    return result - result.transpose(0, 2, 1)
+
+
+def _rotations(vectors: F64) -> F64:
+    """Rotation matrices (N, 3, 3) of rotation vectors (N, 3), by Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    K = _skew(vectors)
+    result: F64 = np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * (K @ K)
+    return result
+
+
+def _rotation_vectors(rotations: F64) -> F64:
+    """Rotation vectors (N, 3) of rotation matrices (N, 3, 3)."""
+    R = rotations
+    twice = np.stack((R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]), axis=1)
+    twice_sine = np.linalg.norm(twice, axis=1)
+    angle = np.arctan2(twice_sine, np.einsum("naa->n", R) - 1.0)
+    small = twice_sine < 1e-9
+    result: F64 = twice * np.where(small, 0.5, angle / np.where(small, 1.0, twice_sine))[:, None]
+    return result

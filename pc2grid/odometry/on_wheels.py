@@ -1,0 +1,223 @@
+"""A sensor on wheels: KISS-ICP brings a scan near, point-to-line matching in the plane places it.
+
+KISS-ICP in space has a wide reach. A scan in the plane knows the pose to millimetres, but only across the
+walls that it shows; how far it knows each direction is measured, and the smoother does the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pc2grid.arrays import F32, F64
+from pc2grid.clouds.depth_limit import DepthLimit
+from pc2grid.clouds.ground import Ground
+from pc2grid.clouds.planar_scan import PlanarScan, project_to_plane
+from pc2grid.config import ProjectionConfig, RegistrationConfig
+from pc2grid.geometry import SE2
+from pc2grid.model import Scan
+from pc2grid.odometry.ground_model import GroundModel
+from pc2grid.odometry.matching_maps import MatchingMaps
+from pc2grid.odometry.parameters import (
+    CAMERA_MATCHING,
+    MATCHING_PARAMETERS,
+    TRACKING_PARAMETERS,
+    TrackingParameters,
+)
+from pc2grid.odometry.placed import Placed
+from pc2grid.odometry.point_to_line import Match
+from pc2grid.odometry.registration import KissRegistration
+from pc2grid.odometry.smoother import PLANAR, Belief
+from pc2grid.sensor_model import SENSOR_MODELS
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class _Candidate:
+    """A match, and its score: the logarithm of its posterior density but for a constant.
+
+    settled : nothing else needs to be tried, since the scan fits, and where it is expected.
+    """
+
+    score: float
+    match: Match = field(compare=False)
+    settled: bool = field(compare=False)
+
+
+class SensorOnWheels:
+    """Places the scans of a sensor whose base stands on the floor.
+
+    ground : the floor in the base frame; None for a planar laser.
+    """
+
+    free = PLANAR
+
+    def __init__(
+        self,
+        registration: RegistrationConfig,
+        projection: ProjectionConfig,
+        parameters: TrackingParameters = TRACKING_PARAMETERS,
+    ) -> None:
+        self._registration, self._projection, self._parameters = registration, projection, parameters
+        self._depth_limit = DepthLimit()
+        self._floor = GroundModel(None, parameters)
+        self._maps = MatchingMaps(projection.max_range_m, parameters)
+        self.kiss = KissRegistration(registration, parameters)
+        self._planar_scan: PlanarScan | None = None  # of the scan placed last
+        self._last = SE2()  # its final pose
+
+    @property
+    def ground(self) -> Ground | None:
+        """The floor in the base frame."""
+        return self._floor.ground
+
+    def start(self, scan: Scan, points_m: F32, at: SE2) -> F64:
+        """Begin with a scan whose base is at a place of the session frame; returns its pose (4, 4),
+        levelled."""
+        self._floor = GroundModel.start(points_m, scan, self._parameters)
+        matching = CAMERA_MATCHING if SENSOR_MODELS[scan.sensor].narrow else MATCHING_PARAMETERS
+        self._maps = MatchingMaps(self._projection.max_range_m, self._parameters, matching)
+        pose = self.levelled(at.lift())
+        self.kiss.register(self._floor.remove(points_m), pose, 0.0)
+        self._planar_scan = self._project(scan, points_m)
+        return pose
+
+    def restart(self) -> None:
+        """Forget the local maps: the next keyframe begins new ones."""
+        self._maps.restart()
+        self.kiss = KissRegistration(self._registration, self._parameters)
+
+    def levelled(self, pose: F64) -> F64:
+        """A pose (4, 4) in the plane with tilt and height from the floor: walls alone let them drift."""
+        return pose @ self._floor.T_level_base()
+
+    def place(self, scan: Scan, points_m: F32, seconds: float, expected: Sequence[Belief]) -> Placed:
+        """Place the deskewed points (N, 3) of a scan.
+
+        seconds : since the scan before. expected : where the base may be, the most credible first.
+        """
+        self._floor.follow(points_m, scan)
+        near = self.kiss.register(self._floor.remove(points_m), self.levelled(expected[0].pose), seconds)
+        registered = SE2.from_matrix(near)
+        self._planar_scan = planar_scan = self._project(scan, points_m)
+        motion = None
+        if scan.T_odom_base is None and self.kiss.registered and not SENSOR_MODELS[scan.sensor].narrow:
+            p = self._parameters
+            motion = (
+                (self._last.inverse() @ registered).lift(),
+                np.array([p.steady_sigma_m, p.steady_sigma_m, p.steady_sigma_rad]),
+            )
+        if not self._maps:
+            return Placed(expected[0].pose, first=True)
+        if len(planar_scan.hits_m) < self._parameters.min_hits:
+            return Placed(expected[0].pose, motion=motion)
+        match = self._match(planar_scan, registered, expected)
+        alone = match.by_points.lift(), _turned(match.information, match.by_points.yaw)
+        fits = match.overlap >= self._parameters.min_overlap
+        return Placed(
+            match.pose.lift() if fits else expected[0].pose,
+            alone if fits else None,
+            match.overlap,
+            match.residual_m,
+            match.measured,
+            sure=self._is_sure(match),
+            motion=motion,
+        )
+
+    def _match(self, planar_scan: PlanarScan, registered: SE2, expected: Sequence[Belief]) -> Match:
+        """The best match of a planar scan with the local map.
+
+        It begins where the base is expected and where KISS-ICP puts it. If the scan fits nowhere there, it
+        begins where else the base may be, and at last it is searched for. Of all matches the most probable
+        one is taken: KISS-ICP, which slides along walls, does not count where the scan fits as well without
+        it.
+        """
+        p, first, found = self._parameters, expected[0], []
+        for belief in expected:
+            prior = SE2.from_matrix(belief.pose)
+            near = self._is_near(registered, prior)
+            found.append(self._candidate(planar_scan, registered if near else prior, belief))
+            if belief is first and not near:
+                found.append(self._candidate(planar_scan, registered, belief))
+            if max(found).settled:
+                return max(found).match
+        window_m, window_rad = p.search_sigmas * np.sqrt(first.covariance.diagonal()[1:])
+        wide = window_m > p.search_above_m or window_rad > p.search_above_rad
+        if wide and not self._is_sure(max(found).match):
+            window = min(window_m, p.search_most_m), min(window_rad, p.search_most_rad)
+            guesses = self._maps.search(planar_scan, SE2.from_matrix(first.pose), *window)
+            found.extend(self._candidate(planar_scan, guess, first) for guess in guesses)
+        return max(found).match
+
+    def _candidate(self, planar_scan: PlanarScan, guess: SE2, belief: Belief) -> _Candidate:
+        """A match of a planar scan that begins at a guess and is held to a belief."""
+        information = _in_map_axes(belief)
+        match = self._maps.match(planar_scan, guess, SE2.from_matrix(belief.pose), information)
+        p = self._parameters
+        of_scan = p.scan_weight * self._maps.quality(match)
+        pose = match.pose.lift()
+        settled = self._is_sure(match) and belief.chi2(pose) < p.search_sigmas**2
+        return _Candidate(of_scan + belief.log_density(pose), match, settled)
+
+    def _is_sure(self, match: Match) -> bool:
+        """Whether a scan fits so well that nothing else needs to be tried."""
+        p = self._parameters
+        return match.overlap >= p.sure_overlap and match.residual_m <= p.max_residual_m
+
+    def _is_near(self, a: SE2, b: SE2) -> bool:
+        apart = a.inverse() @ b
+        p = self._parameters
+        return math.hypot(apart.x, apart.y) <= p.disagree_m and abs(apart.yaw) <= p.disagree_rad
+
+    def cut(self, scan: Scan, points_m: F32, pose: F64, *, lost: bool) -> PlanarScan:
+        """The planar scan of the scan placed last."""
+        del scan, points_m, lost
+        self._last = SE2.from_matrix(pose)
+        assert self._planar_scan is not None
+        return self._planar_scan
+
+    def extend(self, pose: F64) -> None:
+        """Add the scan placed last to the local maps at its final pose (4, 4)."""
+        assert self._planar_scan is not None
+        self._maps.extend(self._planar_scan, SE2.from_matrix(pose))
+        self.kiss.update_map(pose)
+
+    def _project(self, scan: Scan, points_m: F32) -> PlanarScan:
+        """Reduce points (N, 3) of the base frame to the plane."""
+        T_level_base = self._floor.T_level_base()
+        noisy = SENSOR_MODELS[scan.sensor].noise_per_m2 > 0.0
+        if noisy:
+            self._depth_limit.observe(points_m, scan.T_base_sensor)
+        sensor_m, ground = scan.T_base_sensor[:3, 3], self._floor.ground
+        if ground is not None:
+            R = T_level_base.copy()
+            R[:3, 3] = 0.0  # a planar scan keeps the base's own origin; heights are relative to the ground
+            points_m = points_m @ R[:3, :3].T.astype(np.float32)
+            sensor_m, ground = R[:3, :3] @ sensor_m, ground.moved(R)
+        planar_scan = project_to_plane(
+            points_m,
+            stamp_ns=scan.stamp_ns,
+            sensor_m=sensor_m,
+            ground=ground,
+            config=self._projection,
+            sensor=scan.sensor,
+        )
+        if not noisy:
+            return planar_scan
+        return self._depth_limit.before(planar_scan, T_level_base @ scan.T_base_sensor)
+
+
+def _turned(matrix: F64, yaw_rad: float) -> F64:
+    """A covariance or information (3, 3) of x, y, yaw in axes that are turned."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    turned: F64 = R @ matrix @ R.T
+    return turned
+
+
+def _in_map_axes(belief: Belief) -> F64:
+    """The information (3, 3) of a belief, in the axes of the session frame."""
+    information = np.asarray(np.linalg.inv(belief.covariance), np.float64)
+    return _turned(information, -SE2.from_matrix(belief.pose).yaw)

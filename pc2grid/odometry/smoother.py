@@ -1,0 +1,507 @@
+"""A fixed-lag smoother over the pose of the sensor's carrier and over what its odometry should read.
+
+The state of each of the last scans is the pose of the base in the session frame, and the pose that odometry
+without errors would report. Between two scans both move alike, but for the drift of the odometry; a reading
+lies near the second, but for noise. A reading that comes late or twice is then an outlier of that noise, a
+driver that starts again is an outlier of the drift, and in both cases later readings count again. Where the
+odometry frame lies in the session frame (`map -> odom` of REP-105) is the difference of the two poses.
+
+Further unknowns are the systematic errors of odometry, which are the same in every step: of the distance, of
+its direction, of the turn on each metre, and of a turn, as in Censi et al., "Simultaneous calibration of
+odometry and sensor parameters for mobile robots" (2013).
+
+All kinds of evidence are factors with Cauchy weights (Suenderhauf and Protzel, "Switchable constraints",
+2012; Agarwal et al., 2013); the oldest scan is marginalised (Sibley, Matthies and Sukhatme, "Sliding window
+filter with application to planetary landing", 2010). On wheels three of six degrees of freedom are free.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from pc2grid.arrays import F64
+from pc2grid.geometry import invert_pose, wrap_angle
+from pc2grid.odometry.graph import Factors, normal_equations, without
+from pc2grid.odometry.manifold import Steps, carried_on, moved, steps
+
+PLANAR = (0, 1, 5)
+"""The free directions of a base on wheels: x, y, and the turn about z, in the base frame."""
+SPATIAL = (0, 1, 2, 3, 4, 5)
+"""The free directions of a sensor in the hand: x, y, z, and the turns about them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SmootherParameters:
+    """Numbers of the smoother; chosen by hand.
+
+    lag : scans whose states are estimated together.
+    reading_m, reading_rad : standard deviations of a reading of odometry: resolution, and jitter of its time.
+    drift : standard deviation of odometry over one metre (m), over one radian and, for the turn, over one
+        metre (rad); it grows with the square root of the way. drift_turn_m : that of the position over a turn
+        of one radian.
+    unsteady_mps, unsteady_radps : without odometry, the change of the motion from one scan to the next is
+        this times the time between them: a robot indoors starts, stops and turns.
+    steady_s : the motion before is taken over this time, so that an error of one pose does not come back in
+        the next with the other sign.
+    scale, direction_rad, yaw_rad_per_m, turn : standard deviations, over robots, of the systematic errors.
+    kernel : standard deviations at which evidence counts half.
+    iterations : of Gauss-Newton, at most. converged : they end when no unknown changes by more.
+    """
+
+    lag: int = 12
+    reading_m: float = 0.01
+    reading_rad: float = 0.004
+    drift: float = 0.05
+    drift_turn_m: float = 0.03
+    unsteady_mps: float = 0.4
+    unsteady_radps: float = 0.4
+    steady_s: float = 0.3
+    scale: float = 0.05
+    direction_rad: float = math.radians(2.0)
+    yaw_rad_per_m: float = math.radians(2.0)
+    turn: float = 0.05
+    kernel: float = 3.0
+    iterations: int = 5
+    converged: float = 1e-2
+
+
+SMOOTHER = SmootherParameters()
+IN_THE_HAND = SmootherParameters(
+    reading_m=0.002, reading_rad=0.001, drift=0.005, drift_turn_m=0.005,
+    scale=1e-6, direction_rad=1e-6, yaw_rad_per_m=1e-6, turn=1e-6,
+)  # fmt: skip
+"""For odometry in six degrees of freedom, which is visual and inertial: it is exact to millimetres from image
+to image, drifts by a percent, and has no wheels whose errors are always the same. Chosen by hand."""
+
+T = TypeVar("T")
+
+_ERRORS = 4  # systematic errors of odometry
+_DAMPING = 1e-9  # so that unknowns without evidence can be solved for
+_CERTAIN = np.array([np.inf])  # kernel of a factor whose weight is 1
+_UNKNOWN = 1e3  # standard deviation of what is not known
+_LEAST_S = 1e-3  # scans follow each other no faster
+_LEAST_DRIFT = 1e-3  # standard deviation of odometry that reports no motion
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """A pose (4, 4) T_session_base with its covariance (D, D) in the free directions (D,) of the base
+    frame."""
+
+    pose: F64
+    covariance: F64
+    free: NDArray[np.intp]
+
+    def log_density(self, pose: F64, kernel: float = SMOOTHER.kernel) -> float:
+        """Logarithm of the density at a pose (4, 4), but for a constant; far off it falls as slowly as
+        evidence."""
+        _, log_volume = np.linalg.slogdet(self.covariance)
+        return -0.5 * (kernel**2 * math.log1p(self.chi2(pose) / kernel**2) + float(log_volume))
+
+    def chi2(self, pose: F64) -> float:
+        """Squared Mahalanobis distance of a pose (4, 4)."""
+        step, _, _ = steps(self.pose[None], pose[None])
+        away = step[0, self.free]
+        return float(away @ np.linalg.solve(self.covariance, away))
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What one scan adds.
+
+    seconds : since the scan before. T_odom_base : (4, 4) the reading of odometry, None if there is none.
+    continues : whether that reading goes on from the one before. match : where the scan lies on the local
+    map, a pose (4, 4) with its information (D, D); None if it fits nowhere. motion : (4, 4) T_last_now by
+    registration, with its standard deviations (D,); None if it is not measured.
+    """
+
+    seconds: float
+    T_odom_base: F64 | None = None
+    continues: bool = True
+    match: tuple[F64, F64] | None = None
+    motion: tuple[F64, F64] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    """What is estimated of the last N scans.
+
+    poses : (N, 4, 4) T_session_base. readings : (N, 4, 4) T_odom_base as odometry without errors would
+        report.
+    errors : (4,) systematic errors of odometry: scale, direction, yaw per metre, turn.
+    """
+
+    poses: F64
+    readings: F64
+    errors: F64
+
+    def changed(self, errors: F64, changes: F64) -> _State:
+        """After changes of the errors (4,), and (N, 2, 6) of poses and readings."""
+        return _State(
+            moved(self.poses, changes[:, 0]), moved(self.readings, changes[:, 1]), self.errors + errors
+        )
+
+    def part(self, begin: int, end: int) -> _State:
+        """Of the scans from `begin` to before `end`."""
+        return _State(self.poses[begin:end], self.readings[begin:end], self.errors)
+
+
+@dataclass(frozen=True, slots=True)
+class _Prior:
+    """What the marginalised scans say: the first unknowns are those of `about`, less `shift` (P,)."""
+
+    about: _State
+    shift: F64
+    information: F64
+
+
+@dataclass(frozen=True, slots=True)
+class _Solution:
+    """A state with the information matrix on its unknowns, and the robust cost of all evidence."""
+
+    state: _State
+    information: F64
+    cost: float
+
+
+class Smoother:
+    """Adds scans one by one, and keeps the states of the last ones.
+
+    free : directions that can change, `PLANAR` or `SPATIAL`: D of them.
+    """
+
+    def __init__(self, free: tuple[int, ...] = PLANAR, parameters: SmootherParameters = SMOOTHER) -> None:
+        self._parameters = parameters
+        self._free = np.array(free)
+        self._evidence: list[Evidence] = []
+
+    # ------------------------------------------------------------------------------------------ prediction
+
+    def start(self, T_session_base: F64, T_odom_base: F64 | None) -> None:
+        """Begin with a pose (4, 4), which defines the session frame, and a reading of odometry."""
+        p, d = self._parameters, len(self._free)
+        reading = T_session_base if T_odom_base is None else T_odom_base
+        self._state = _State(T_session_base[None].copy(), reading[None].copy(), np.zeros(_ERRORS))
+        self._evidence = [Evidence(seconds=0.0)]
+        errors = np.array([p.scale, p.direction_rad, p.yaw_rad_per_m, p.turn])
+        own = np.concatenate((np.full(d, 1e-4), self._noise(p.reading_m, p.reading_rad)))
+        information = np.diag(np.concatenate((errors, own)) ** -2)
+        self._prior = _Prior(self._state, np.zeros(len(information)), information)
+        self._covariance = np.diag(own[:d] ** 2)
+        self._drift_scale = 1.0  # of the drift that the last steps show, in its standard deviations
+
+    @property
+    def belief(self) -> Belief:
+        """The pose of the last scan."""
+        return Belief(self._state.poses[-1], self._covariance, self._free)
+
+    def by_odometry(self, T_odom_base: F64) -> Belief:
+        """The next pose if a reading (4, 4) of odometry is right."""
+        p = self._parameters
+        reported, _, _ = steps(self._state.readings[-1:], T_odom_base[None])
+        corrected, _, _ = self._corrected(reported, self._state.errors)
+        variance = self._drift_variance(reported)[0] + 2.0 * self._noise(p.reading_m, p.reading_rad) ** 2
+        return self._after(moved(np.eye(4)[None], corrected)[0], variance)
+
+    def by_motion(self, motion: F64, sigmas: F64) -> Belief:
+        """The next pose after a motion (4, 4) T_last_now with standard deviations (D,)."""
+        return self._after(motion, sigmas**2)
+
+    def by_steadiness(self, seconds: float) -> Belief:
+        """The next pose, `seconds` later, if the motion before goes on."""
+        p, k, span_s = self._parameters, len(self._evidence) - 1, 0.0
+        while k > 0 and span_s < p.steady_s:
+            span_s += self._evidence[k].seconds
+            k -= 1
+        step, _, _ = steps(self._state.poses[k : k + 1], self._state.poses[-1:])
+        share = min(seconds / span_s, 1.0) if span_s > 0.0 else 0.0
+        sigmas = self._unsteadiness(seconds)
+        return self._after(moved(np.eye(4)[None], share * step)[0], sigmas**2)
+
+    def _after(self, motion: F64, variance: F64) -> Belief:
+        """The last pose after a motion (4, 4) with variances (D,) of its own."""
+        F = carried_on(motion)[np.ix_(self._free, self._free)]
+        return Belief(
+            self._state.poses[-1] @ motion, F @ self._covariance @ F.T + np.diag(variance), self._free
+        )
+
+    # ---------------------------------------------------------------------------------------------- update
+
+    def add(self, guess: F64, evidence: Evidence) -> Belief:
+        """Add a scan: estimate its pose and, again, those of the scans before it.
+
+        guess : (4, 4) T_session_base where the estimate begins, such as where the scan fits.
+
+        Without odometry, the sensor is taken to stand at the beginning.
+
+        Where the last reading contradicts those before, there are two explanations: readings are wrong, or
+        the odometry frame has jumped. Both are tried. A jump is rarer than a wrong reading, so it is believed
+        if several readings speak for it.
+        """
+        before, read = self._state, evidence.T_odom_base
+        reading = before.readings[-1] @ invert_pose(before.poses[-1]) @ guess
+        if read is not None and not evidence.continues:
+            reading = read
+        if len(self._evidence) == 1 and read is None and evidence.motion is None:
+            evidence = dataclasses.replace(evidence, motion=(np.eye(4), self._unsteadiness(evidence.seconds)))
+        self._evidence = [*self._evidence, evidence]
+        state = _State(
+            np.concatenate((before.poses, guess[None])),
+            np.concatenate((before.readings, reading[None])),
+            before.errors,
+        )
+        solution = self._solved(state)
+        if read is not None and self._is_contradicted(read, solution.state.readings[-1]):
+            jumped = self._solved(_State(state.poses, self._as_read(state.readings), state.errors))
+            if jumped.cost + self._parameters.kernel**2 < solution.cost:
+                solution = jumped
+        self._state = solution.state
+        self._covariance = self._last_covariance(solution.information)
+        if len(self._evidence) > self._parameters.lag:
+            self._marginalise()
+        return self.belief
+
+    def _is_contradicted(self, read: F64, reading: F64) -> bool:
+        """Whether a reading (4, 4) is so far from what it should be that it counts less than half."""
+        p = self._parameters
+        step, _, _ = steps(read[None], reading[None])
+        off = step[0, self._free] / self._noise(p.reading_m, p.reading_rad)
+        return bool(off @ off > p.kernel**2)
+
+    def _as_read(self, readings: F64) -> F64:
+        """The readings (N, 4, 4) as they were read, but for the first, and where there was none."""
+        result = readings.copy()
+        for k, evidence in enumerate(self._evidence):
+            if k and evidence.T_odom_base is not None:
+                result[k] = evidence.T_odom_base
+        return result
+
+    def _solved(self, state: _State) -> _Solution:
+        """Gauss-Newton from a state."""
+        p, n = self._parameters, len(state.poses)
+        count = _ERRORS + 2 * len(self._free) * n
+        for _ in range(p.iterations):
+            H, g, cost = normal_equations(self._factors(state), count)
+            H[np.diag_indices(count)] += _DAMPING
+            delta = -cho_solve(cho_factor(H, check_finite=False), g, check_finite=False)
+            changes = np.zeros((n, 2, 6))
+            changes[:, :, self._free] = delta[_ERRORS:].reshape(n, 2, -1)
+            state = state.changed(delta[:_ERRORS], changes)
+            if np.abs(delta).max() < p.converged:
+                break
+        return _Solution(state, H, cost)
+
+    def _last_covariance(self, information: F64) -> F64:
+        """The covariance (D, D) of the last pose."""
+        count, d = len(information), len(self._free)
+        last = np.zeros((count, d))
+        last[count - 2 * d : count - d] = np.eye(d)
+        solved = cho_solve(cho_factor(information, check_finite=False), last, check_finite=False)
+        covariance: F64 = solved[count - 2 * d : count - d]
+        return covariance
+
+    def _marginalise(self) -> None:
+        """Replace the first scan by what it says of the next two."""
+        d = len(self._free)
+        few = self._state.part(0, 3)
+        H, g, _ = normal_equations(self._factors(few, first=True), _ERRORS + 2 * d * len(few.poses))
+        information, gradient = without(H, g, _ERRORS + np.arange(2 * d))
+        shift = np.asarray(
+            np.linalg.solve(information + _DAMPING * np.eye(len(gradient)), gradient), np.float64
+        )
+        self._prior = _Prior(few.part(1, 3), shift, information)
+        self._state = self._state.part(1, len(self._evidence))
+        self._evidence = self._evidence[1:]
+
+    # --------------------------------------------------------------------------------------------- factors
+
+    def _factors(self, state: _State, *, first: bool = False) -> Iterator[Factors]:
+        """All factors at a state; `first`: those alone that its first scan takes part in."""
+        used = 1 if first else len(state.poses)
+        yield self._prior_factor(state)
+        yield from self._reading_factors(state.readings[:used])
+        yield from self._match_factors(state.poses[:used])
+        if len(state.poses) > 1:
+            of_poses = steps(state.poses[:-1], state.poses[1:])
+            of_readings = steps(state.readings[:-1], state.readings[1:])
+            yield self._drift_factors(
+                Steps(*(a[:used] for a in of_poses)), Steps(*(a[:used] for a in of_readings)), state.errors
+            )
+            yield from self._motion_factors(Steps(*(a[:used] for a in of_poses)))
+            yield from self._steadiness_factors(of_poses, used)
+
+    def _known(self, count: int, what: Callable[[Evidence], T | None]) -> list[tuple[int, T]]:
+        """Of the first scans, those that have some evidence, with it."""
+        found = ((k, what(evidence)) for k, evidence in enumerate(self._evidence[:count]))
+        return [(k, value) for k, value in found if value is not None]
+
+    def _prior_factor(self, state: _State) -> Factors:
+        """What the marginalised scans say of errors and first states."""
+        about, m = self._prior.about, len(self._prior.about.poses)
+        poses, readings = steps(about.poses, state.poses[:m]), steps(about.readings, state.readings[:m])
+        off = np.stack((poses.step, readings.step), axis=1)[:, :, self._free]
+        error = np.concatenate((state.errors - about.errors, off.ravel())) + self._prior.shift
+        identity, rows = np.eye(len(error)), np.arange(len(error))
+        return Factors(rows[None], error[None], identity[None], self._prior.information[None], _CERTAIN)
+
+    def _reading_factors(self, readings: F64) -> Iterator[Factors]:
+        """A reading of odometry lies near what it should be."""
+        read = self._known(len(readings), lambda evidence: evidence.T_odom_base)
+        if read:
+            p, known = self._parameters, [k for k, _ in read]
+            off = steps(np.array([T for _, T in read]), readings[known])
+            sigmas = np.tile(self._noise(p.reading_m, p.reading_rad), (len(known), 1))
+            rows = self._rows(known, of_reading=True)
+            yield self._factor(rows, off.step, off.by_second[:, :, self._free], sigmas)
+
+    def _match_factors(self, poses: F64) -> Iterator[Factors]:
+        """A pose lies near where the scan fits the local map."""
+        matched = self._known(len(poses), lambda evidence: evidence.match)
+        if matched:
+            known, information = [k for k, _ in matched], np.array([L for _, (_, L) in matched])
+            off = steps(np.array([T for _, (T, _) in matched]), poses[known])
+            jacobian = off.by_second[:, self._free[:, None], self._free]
+            kernel = np.full(len(known), self._parameters.kernel)
+            yield Factors(self._rows(known), off.step[:, self._free], jacobian, information, kernel)
+
+    def _drift_factors(self, of_poses: Steps, of_readings: Steps, errors: F64) -> Factors:
+        """From scan to scan the pose moves as odometry should report it, but for its errors and its drift."""
+        moved_by, reported = of_poses.step, of_readings.step
+        corrected, by_report, by_errors = self._corrected(reported, errors)
+        scans = np.arange(len(moved_by))
+        rows = np.concatenate(
+            (
+                np.tile(np.arange(_ERRORS), (len(scans), 1)),
+                self._rows(scans), self._rows(scans + 1),
+                self._rows(scans, of_reading=True), self._rows(scans + 1, of_reading=True),
+            ),
+            axis=1,
+        )  # fmt: skip
+        sigmas = np.sqrt(self._drift_variance(reported))
+        jumps = [not e.continues for e in self._evidence[1 : 1 + len(scans)]]
+        sigmas[jumps] = _UNKNOWN
+        error = _wrapped(moved_by - corrected)
+        chi2 = ((error[:, self._free] / sigmas) ** 2).sum(axis=1)
+        if len(scans) > 1:
+            self._drift_scale = math.sqrt(max(float(chi2.mean()) / len(self._free), 1.0))
+        sigmas = self._drift_scale * sigmas
+        # What slips, or comes late, says nothing of errors that are the same in every step.
+        weight = 1.0 / (1.0 + chi2 / (self._drift_scale * self._parameters.kernel) ** 2)
+        by_errors = by_errors * weight[:, None, None]
+        jacobians = (
+            of_poses.by_first,
+            of_poses.by_second,
+            -by_report @ of_readings.by_first,
+            -by_report @ of_readings.by_second,
+        )
+        free = [a[:, :, self._free] for a in jacobians]
+        return self._factor(rows, error, np.concatenate((-by_errors, *free), axis=2), sigmas)
+
+    def _motion_factors(self, of_poses: Steps) -> Iterator[Factors]:
+        """A pose follows the one before by the motion that registration measured."""
+        motions = [(k, value) for k, value in self._known(1 + len(of_poses.step), lambda e: e.motion) if k]
+        if motions:
+            scans = np.array([k - 1 for k, _ in motions])
+            measured = steps(np.tile(np.eye(4), (len(scans), 1, 1)), np.array([T for _, (T, _) in motions]))
+            rows = np.concatenate((self._rows(scans), self._rows(scans + 1)), axis=1)
+            jacobian = np.concatenate((of_poses.by_first[scans], of_poses.by_second[scans]), axis=2)
+            jacobian = jacobian[:, :, np.concatenate((self._free, 6 + self._free))]
+            sigmas = np.array([sigma for _, (_, sigma) in motions])
+            yield self._factor(rows, _wrapped(of_poses.step[scans] - measured.step), jacobian, sigmas)
+
+    def _steadiness_factors(self, of_poses: Steps, used: int) -> Iterator[Factors]:
+        """Where nothing else measures it, the motion goes on as it was."""
+        p = self._parameters
+        known = [
+            k for k, e in enumerate(self._evidence[2 : len(of_poses.step) + 1])
+            if k < used and e.motion is None and self._unmeasured(e)
+        ]  # fmt: skip
+        if not known:
+            return
+        scans = np.array(known)
+        seconds = np.array([max(e.seconds, _LEAST_S) for e in self._evidence])
+        ratio = (seconds[scans + 2] / seconds[scans + 1])[:, None]
+        rows = np.concatenate([self._rows(scans + k) for k in range(3)], axis=1)
+        of_first = -ratio[:, :, None] * of_poses.by_first[scans]
+        of_second = of_poses.by_first[scans + 1] - ratio[:, :, None] * of_poses.by_second[scans]
+        of_third = of_poses.by_second[scans + 1]
+        jacobian = np.concatenate([J[:, :, self._free] for J in (of_first, of_second, of_third)], axis=2)
+        sigmas = seconds[scans + 2, None] * self._noise(p.unsteady_mps, p.unsteady_radps)
+        error = _wrapped(of_poses.step[scans + 1] - ratio * of_poses.step[scans])
+        yield self._factor(rows, error, jacobian, sigmas, kernel=np.inf)
+
+    @staticmethod
+    def _unmeasured(evidence: Evidence) -> bool:
+        """Whether neither odometry nor, where that does not go on, a match says where a scan lies."""
+        if evidence.T_odom_base is None:
+            return True
+        return not evidence.continues and evidence.match is None
+
+    def _factor(
+        self, rows: NDArray[np.intp], error: F64, jacobian: F64, sigmas: F64, kernel: float | None = None
+    ) -> Factors:
+        """Factors of residuals (F, 6), of which the free directions count, with standard deviations (F,
+        D)."""
+        information = (sigmas**-2)[:, :, None] * np.eye(len(self._free))
+        scale = np.full(len(rows), self._parameters.kernel if kernel is None else kernel)
+        return Factors(rows, error[:, self._free], jacobian[:, self._free], information, scale)
+
+    def _rows(self, scans: NDArray[np.intp] | list[int], *, of_reading: bool = False) -> NDArray[np.intp]:
+        """The numbers (F, D) of the unknowns of the poses, or of the readings, of scans (F,)."""
+        d = len(self._free)
+        rows: NDArray[np.intp] = _ERRORS + (2 * np.asarray(scans)[:, None] + of_reading) * d + np.arange(d)
+        return rows
+
+    # --------------------------------------------------------------------------------------------- odometry
+
+    def _noise(self, sigma_m: float, sigma_rad: float) -> F64:
+        """Standard deviations (D,) of the free directions."""
+        return np.where(self._free < 3, sigma_m, sigma_rad)
+
+    def _unsteadiness(self, seconds: float) -> F64:
+        """Standard deviations (D,) of the change of the motion from one scan to the next."""
+        p = self._parameters
+        return seconds * self._noise(p.unsteady_mps, p.unsteady_radps)
+
+    def _drift_variance(self, reported: F64) -> F64:
+        """Variances (N, D) of the drift over steps (N, 6)."""
+        p = self._parameters
+        distance_m = np.linalg.norm(reported[:, :3], axis=1)[:, None]
+        turn_rad = np.linalg.norm(reported[:, 3:], axis=1)[:, None]
+        of_position = p.drift**2 * distance_m + p.drift_turn_m**2 * turn_rad
+        of_turn = p.drift**2 * (turn_rad + distance_m)
+        variance: F64 = np.where(self._free < 3, of_position, of_turn) + _LEAST_DRIFT**2
+        return variance
+
+    def _corrected(self, reported: F64, errors: F64) -> tuple[F64, F64, F64]:
+        """Steps (N, 6) that odometry reports, without its systematic errors (4,).
+
+        Returns them with their Jacobians with respect to the steps, (6, 6), and to the errors, (N, 6, 4).
+        """
+        scale, direction, yaw_per_m, turn = errors.tolist()
+        c, s = (1.0 + scale) * math.cos(direction), (1.0 + scale) * math.sin(direction)
+        by_report = np.eye(6)
+        by_report[:2, :2], by_report[5, 5] = [[c, -s], [s, c]], 1.0 + turn
+        corrected = reported @ by_report.T
+        distance_m = np.hypot(reported[:, 0], reported[:, 1])
+        by_errors = np.zeros((len(reported), 6, _ERRORS))
+        by_errors[:, :2, 0] = corrected[:, :2] / (1.0 + scale)
+        by_errors[:, 0, 1], by_errors[:, 1, 1] = -corrected[:, 1], corrected[:, 0]
+        by_errors[:, 5, 2], by_errors[:, 5, 3] = distance_m, reported[:, 5]
+        corrected[:, 5] += yaw_per_m * distance_m
+        return corrected, by_report, by_errors
+
+
+def _wrapped(steps_between: F64) -> F64:
+    """Differences (N, 6) of steps, the turn about z within half a turn."""
+    result = steps_between.copy()
+    result[:, 5] = wrap_angle(result[:, 5])
+    return result
