@@ -15,8 +15,8 @@ from pc2grid.model import OccupancyGrid
 from signature.database.protocol import Label
 from signature.localization.answer_json import AnswerDocument, document
 from signature.localization.answer_json import Status as Status
-from signature.localization.confidence import Evidence
 from signature.localization.hypotheses import Hypothesis
+from signature.localization.posterior import Evidence
 
 SpaceStatus = Literal["agrees", "unsure", "contradicts"]
 
@@ -56,10 +56,10 @@ class PoseInSpace:
 class Verdict:
     """The decision over all hypotheses.
 
-    confidence : probability that the best hypothesis is right.
-    hypotheses : all that fit, best first. places : parallel to them, which of them are the same place, seen
-    in the maps of different sessions; numbered from 0, best first.
-    evidence : what the confidence rests on: the best hypothesis of each place.
+    confidence : mass of the first place, see `signature.localization.posterior`.
+    hypotheses : all that fit, by the mass of their places. places : parallel to them, which of them are the
+    same place, seen in the maps of different sessions; numbered from 0, best first.
+    evidence : what tells for the first place.
     """
 
     status: Status

@@ -20,8 +20,8 @@ from pc2grid.matching.icp_in_space import RAYS, SpatialFit, SpatialView, registe
 from pc2grid.model import PointMap
 from signature.database import SubmapDatabase
 from signature.localization.answer import Answer, Moment, PoseInSpace, SpaceStatus
-from signature.localization.confidence import LIMITS
 from signature.localization.hypotheses import Hypothesis
+from signature.localization.posterior import POSTERIOR
 from signature.localization.query import QueryInSpace
 
 
@@ -124,7 +124,7 @@ def _rivals(answer: Answer) -> list[Hypothesis]:
     first: dict[int, Hypothesis] = {}
     for hypothesis, place in zip(answer.hypotheses, answer.places, strict=True):
         first.setdefault(place, hypothesis)
-    least = answer.hypotheses[0].fit.score - LIMITS.longest_lead
+    least = (1.0 - POSTERIOR.longest_lead) * max(hypothesis.fit.score for hypothesis in first.values())
     return [hypothesis for hypothesis in first.values() if hypothesis.fit.score >= least]
 
 

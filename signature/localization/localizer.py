@@ -306,19 +306,16 @@ def _by_last_metres(
 ) -> tuple[QueryMap, Verdict]:
     """The first of the shorter queries that is located, with its verdict; the query itself if none is.
 
-    A stretch through rooms that the map lacks or shows otherwise spoils the whole query, even after the
-    robot is back. Each further attempt may be wrong, so with the n-th one the probability of an error
-    counts n times (Bonferroni's correction).
+    A stretch through rooms that the map lacks or shows otherwise spoils the whole query, even after the robot
+    is back. That only the last metres lie in this map is less probable beforehand, and each further attempt
+    may be wrong, so the odds of the n-th one are 1 / n.
     """
     for attempts, shorter in enumerate(last_metres, start=2):
         found = index.look_up(shorter, verdict.hypotheses)
-        for judge in (index.judge, index.judge_whole_maps):
-            by_last = judge(shorter, found)
-            confidence = 1.0 - attempts * (1.0 - by_last.confidence)
-            if confidence < index.config.accept:
-                break
-        else:
-            return shorter, replace(by_last, confidence=confidence)
+        if index.judge(shorter, found, 1.0 / attempts).status == "located":
+            by_last = index.decide(shorter, found, 1.0 / attempts)
+            if by_last.status == "located":
+                return shorter, by_last
     return query, verdict
 
 

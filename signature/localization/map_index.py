@@ -11,33 +11,40 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pc2grid.arrays import F64, I64, BoolGrid
+from pc2grid.arrays import F64, I64
 from pc2grid.errors import ConfigError, DatabaseCorrupt
 from pc2grid.geometry import SE2
 from pc2grid.matching.refinement import refine
-from pc2grid.matching.two_way_score import Fit, score_fit
-from pc2grid.matching.walls import Walls
+from pc2grid.matching.two_way_score import score_fit
 from pc2grid.matching.window_search import SearchMap
-from pc2grid.model import UNKNOWN, OccupancyGrid, same_recording
+from pc2grid.model import OccupancyGrid, same_recording
 from pc2grid.observer import Observer
 from signature.config import Config
 from signature.database.protocol import Label
 from signature.localization.answer import Status, Verdict
-from signature.localization.confidence import CALIBRATION, LIMITS, PRESENCE, RIVALS, SAME_PLACE, Evidence
 from signature.localization.hypotheses import (
     HYPOTHESES,
     Hypothesis,
     coarse_score,
     distinct,
     fitted,
-    same_pose,
     search_whole_map,
     verify,
 )
 from signature.localization.in_space import PointsOf, points_reader
 from signature.localization.lazy_maps import DatabaseGrids, LazySequence
+from signature.localization.posterior import (
+    NO_EVIDENCE,
+    POSTERIOR,
+    alike,
+    evidence_of,
+    in_the_map,
+    masses,
+    tail_of,
+)
 from signature.localization.prior import PRIOR, Prior
 from signature.localization.query import QueryMap, query_of
+from signature.localization.same_place import same_place, share_known, surroundings_agree
 from signature.retrieval.viewpoints import AT_ONCE_M2, Places
 from signature.retrieval.vote import retrieve
 from signature.seen_places import SeenPlaces
@@ -48,46 +55,36 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DecisionParameters:
-    """Which hypotheses are kept, and when two of them are one place. Chosen on fr079 and intel.
+class AlikeFloors:
+    """When the maps of two floors look alike, and when the query may have been made on either. By hand.
 
-    keep : hypotheses scoring below this share of the best are dropped.
-    near_best : whole maps are first searched for what reaches this share of the best coarse score. With 0.9 a
-        search takes half as long as with `coarse_keep`; with 0.95 not less.
-    rival_score : a hypothesis whose score is lower than the best by more than this takes no part in the
-        decision.
-    around_m : two maps show the same place if they agree this far around it: farther than a query has seen,
-        so that two equal rooms are distinguished by what lies around them.
-    wall_m : what the query has seen is widened by this, so that the far side of a wall does not count as
-        unseen.
-    equal : two places fit equally well if their scores differ by no more: twice the spread of the score
-        between two equal places.
-    in_the_map : least probability that the query lies in the map to answer `ambiguous`, not `not_found`.
-    alike_agreement, alike_overlap : the maps of two floors look alike if so much of what both know agrees,
-        and so much of the walls of one is known to the other. By hand: simulated floors with one plan and
-        other furniture reach 0.82 and 0.45; a mirrored plan reaches 0.88, but 0.24.
+    agreement, overlap : the maps of two floors look alike if so much of what both know agrees, and so much of
+        the walls of one is known to the other. Simulated floors with one plan and other furniture reach 0.82
+        and 0.45; a mirrored plan reaches 0.88, but 0.24.
     seen_there : where two floors look alike, and the map of the other one shows less than this share of what
         the query has seen, the query may have been made there as well; and so it may if what is known there
-        agrees with it as well as here, by `equal`.
-    same, same_labelled : least probability, by what surrounds them, that two places that fit the query are
-        one; the second applies if the labels of their sessions say that they are of one floor.
+        agrees with it as well as here.
     """
 
-    keep: float = 0.6
-    near_best: float = 0.9
-    rival_score: float = 0.2
-    around_m: float = 10.0
-    wall_m: float = 0.4
-    equal: float = 2.0 * LIMITS.equal_lead
-    in_the_map: float = 0.5
-    alike_agreement: float = 0.8
-    alike_overlap: float = 0.35
+    agreement: float = 0.8
+    overlap: float = 0.35
     seen_there: float = 0.6
-    same: float = 0.5
-    same_labelled: float = 0.1
 
 
-DECISION = DecisionParameters()
+ALIKE_FLOORS = AlikeFloors()
+_KEEP = 0.6
+"""Hypotheses scoring below this share of the best are dropped: a place so far behind has no mass."""
+_BEYOND_M = 3.0
+"""A robot is found no farther than this beyond the ground that a map knows. By hand: of 300 right answers to
+real recordings the farthest is 2.6 m beyond it."""
+SEARCHED = 0.9
+"""Whole maps are searched for what reaches this share of the best coarse score: takes half as long as 0.8."""
+_COMPARED = 5
+"""Places that hypotheses of other sessions are compared with; further ones have no mass."""
+
+
+NOTHING = Verdict(status="not_found", confidence=0.0, hypotheses=(), places=(), evidence=NO_EVIDENCE)
+"""The verdict on a query for which nothing is found."""
 
 
 class MapIndex:
@@ -281,19 +278,16 @@ class MapIndex:
         return self._worth_keeping(found, query)
 
     def search_whole_maps(
-        self,
-        query: QueryMap,
-        known: tuple[Hypothesis, ...],
-        least: float = 0.0,
-        keep: float | None = None,
+        self, query: QueryMap, known: tuple[Hypothesis, ...], least: float = 0.0
     ) -> tuple[Hypothesis, ...]:
         """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole; in
         a large database, on those that look most like the query. With a prior: anywhere in its region.
 
-        least, keep : what has a lower coarse score is left out, see `hypotheses.search_whole_map`.
+        least : what has a lower coarse score is left out, see `hypotheses.search_whole_map`; and so is what
+        has less than the share `SEARCHED` of the best.
         """
         found = list(known)
-        config = self.config if keep is None else self.config.model_copy(update={"coarse_keep": keep})
+        config = self.config.model_copy(update={"coarse_keep": SEARCHED})
         region = self._region(query)
         if region is not None:
             index, free = region
@@ -307,55 +301,44 @@ class MapIndex:
                 )
         return self._worth_keeping(tuple(found), query)
 
-    def judge(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> Verdict:
-        """What the hypotheses, best first, amount to.
+    def judge(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...], odds: float = 1.0) -> Verdict:
+        """The posterior over the hypotheses, see `signature.localization.posterior`.
 
-        A place that the prior excludes is no answer. But it shows what wrong places score for this query, so
+        odds : prior of each place, relative to that of "not in this map".
+
+        A place that the prior excludes has no mass. But it shows what wrong places score for this query, so
         it remains a rival, unless it fits as well as the best one that is allowed: between equal places the
         prior decides. Otherwise any place in a small region, which has few rivals, would look certain.
         """
-        places = self._places(query, hypotheses)
         allowed = {id(h) for h in self.allowed(hypotheses, query)}
-        kept = [(h, k) for h, k in zip(hypotheses, places, strict=True) if id(h) in allowed]
-        numbers = list(dict.fromkeys(k for _, k in kept))
-        best = [hypotheses[places.index(k)] for k in dict.fromkeys(places)]
-        rivals = [h for h, _ in kept[:1]]
-        rivals += [
-            h
-            for k, h in zip(dict.fromkeys(places), best, strict=True)
-            if kept and k != kept[0][1] and (k in numbers or not same_score(h.fit, kept[0][0].fit))
-        ]
-        field = self.maps[rivals[0].session_index].field if rivals else None
-        evidence = Evidence.of(rivals, query, field)
-        confidence = CALIBRATION.probability(evidence)
-        status: Status = "not_found"
-        if confidence >= self.config.accept:
-            status = "located"
-        elif max(confidence, PRESENCE.probability(evidence)) >= DECISION.in_the_map:
-            status = "ambiguous"
-        found, found_at = [h for h, _ in kept], [numbers.index(k) for _, k in kept]
-        if status == "located" and self.prior is None:
-            unseen = self._unseen_alike(query, found[0])
-            if unseen:
-                status = "ambiguous"
-                base = query.T_odom_base
-                unseen = [
-                    h
-                    for h in unseen
-                    if not any(
-                        h.session_index == other.session_index
-                        and same_pose(h.fit.T_map_query @ base, other.fit.T_map_query @ base)
-                        for other in found
-                    )
-                ]
-                found_at += range(max(found_at) + 1, max(found_at) + 1 + len(unseen))
-                found += unseen
+        places: list[list[Hypothesis]] = []
+        excluded: list[list[Hypothesis]] = []
+        for group in self._places(query, hypotheses):
+            inside = [h for h in group if id(h) in allowed]
+            (places if inside else excluded).append(inside or group)
+        if not places:
+            return NOTHING
+        highest = max(place[0].fit.score for place in places)
+        rivals = [place[0].fit for place in excluded if not alike(place[0].fit.score, highest)]
+        told = evidence_of([place[0].fit for place in places], query, rivals)
+        by_mass = sorted(zip(told, places, strict=True), key=lambda known: -known[0].log_odds())
+        evidence, places = [one for one, _ in by_mass], [place for _, place in by_mass]
+        best = places[0][0]
+        tail = tail_of(query, best.fit, self.maps[best.session_index].field)
+        evidence[0] = replace(evidence[0], tail=tail)
+        # The same place on a floor that looks alike and is not contradicted has the same mass.
+        settled = self.prior is not None or evidence[0].log_odds() < 0.0
+        unseen = [] if settled else self._unseen_alike(query, best)
+        mass = masses([evidence[0]] * len(unseen) + evidence, [odds] * (len(unseen) + len(evidence)))
+        confidence = float(mass[len(unseen)])
+        places += [[h] for h in unseen if not any(same_place(query, h, o) for place in places for o in place)]
+        status: Status = "ambiguous" if in_the_map(evidence) >= POSTERIOR.in_the_map else "not_found"
         return Verdict(
-            status=status,
+            status="located" if confidence >= self.config.accept else status,
             confidence=confidence,
-            hypotheses=tuple(found),
-            places=tuple(found_at),
-            evidence=evidence,
+            hypotheses=tuple(h for place in places for h in place),
+            places=tuple(number for number, place in enumerate(places) for _ in place),
+            evidence=evidence[0],
         )
 
     def _unseen_alike(self, query: QueryMap, best: Hypothesis) -> list[Hypothesis]:
@@ -365,7 +348,7 @@ class MapIndex:
         A score tells the two apart by what is unknown there, which says nothing.
         """
         here, base = best.session_index, query.T_odom_base
-        least = best.fit.known_agreement_both_ways - DECISION.equal
+        least = best.fit.known_agreement_both_ways - POSTERIOR.alike
         found = []
         for there in self.places.sessions(query.views, self.made_with.signature, self.config):
             if not self._other_floor(here, there):
@@ -374,7 +357,7 @@ class MapIndex:
             if T_there_here is None:
                 continue
             target, pose = self.maps[there], T_there_here @ best.fit.T_map_query
-            unseen = share_known(self.grids[there], query.grid, pose) < DECISION.seen_there
+            unseen = share_known(self.grids[there], query.grid, pose) < ALIKE_FLOORS.seen_there
             refined, covariance = refine(target.field, query.walls.points_m, pose, (base.x, base.y))
             fit = score_fit(target.walls, query.walls, refined, covariance)
             if unseen or fit.known_agreement_both_ways >= least:
@@ -398,36 +381,34 @@ class MapIndex:
             alike = [
                 fit
                 for fit in fits
-                if fit.known_agreement_both_ways >= DECISION.alike_agreement
-                and fit.overlap >= DECISION.alike_overlap
+                if fit.known_agreement_both_ways >= ALIKE_FLOORS.agreement
+                and fit.overlap >= ALIKE_FLOORS.overlap
             ]
             self._alike[here, there] = alike[0].T_map_query if alike else None
         return self._alike[here, there]
 
-    def decide(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> Verdict:
+    def decide(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...], odds: float = 1.0) -> Verdict:
         """The final verdict: all maps are searched as a whole, so that neither the right place nor a rival is
         left out.
 
         Where the proposals settled it, only for what the coarse search scores as high as the best one, which
-        is faster: a wrong place among few proposals may lead by far, if the right one was not proposed. Where
-        they did not, first for what comes near the best that is found. A rival never makes an answer surer,
-        so the others are searched for only if this settles it without them.
+        is faster: a wrong place among few proposals may lead by far, if the right one was not proposed.
         """
-        verdict = self.judge(query, hypotheses)
+        verdict = self.judge(query, hypotheses, odds)
+        least = 0.0
         if verdict.status == "located":
             best = verdict.hypotheses[0]
-            score = coarse_score(query, self.maps[best.session_index], best.fit.T_map_query)
-            return self.judge(query, self.search_whole_maps(query, hypotheses, score))
-        verdict = self.judge(query, self.search_whole_maps(query, hypotheses, keep=DECISION.near_best))
-        return self.judge_whole_maps(query, hypotheses) if verdict.status == "located" else verdict
-
-    def judge_whole_maps(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> Verdict:
-        """What the hypotheses amount to, together with all that fits anywhere on the maps."""
-        return self.judge(query, self.search_whole_maps(query, hypotheses))
+            least = coarse_score(query, self.maps[best.session_index], best.fit.T_map_query)
+        found = self.search_whole_maps(query, hypotheses, least)
+        return self.judge(query, found, odds)
 
     def _worth_keeping(self, found: tuple[Hypothesis, ...], query: QueryMap) -> tuple[Hypothesis, ...]:
-        """Best first, what scores enough beside the best one; what a prior excludes is kept beside it."""
-        distinct_ones = distinct(found, query.T_odom_base)
+        """Best first, what lies on the map and scores enough beside the best one; what a prior excludes is
+        kept beside it."""
+        known = [
+            h for h in found if self._knows_ground(h.session_index, h.fit.T_map_query @ query.T_odom_base)
+        ]
+        distinct_ones = distinct(known, query.T_odom_base)
         inside = {id(h) for h in self.allowed(distinct_ones, query)}
         groups = (
             [h for h in distinct_ones if id(h) in inside],
@@ -435,103 +416,39 @@ class MapIndex:
         )
         kept = []
         for group in groups:
-            floor = DECISION.keep * group[0].fit.score if group else 0.0
+            floor = _KEEP * group[0].fit.score if group else 0.0
             kept += [h for h in group if h.fit.score >= floor][: self.config.hypotheses]
         return tuple(sorted(kept, key=lambda h: -h.fit.score))
 
-    def _places(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> tuple[int, ...]:
-        """The place of each hypothesis, numbered from 0 in their order; a place has one hypothesis a session.
+    def _knows_ground(self, session: int, T_map_base: SE2) -> bool:
+        """Whether a map knows free ground around the base; where it knows none is no place of it."""
+        around = self.grids[session].crop((T_map_base.x, T_map_base.y), _BEYOND_M)
+        return bool(around.free.any())
 
-        All sessions of one floor contain the right place, and must not make each other ambiguous. Hypotheses
-        with a much lower score than the best, or after the first few places, are not compared and count as
-        places of their own: they take no part in the decision.
-        """
-        least = hypotheses[0].fit.score - DECISION.rival_score if hypotheses else 0.0
-        members: list[list[Hypothesis]] = []
-        numbers = []
+    def _places(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> list[list[Hypothesis]]:
+        """The hypotheses by place, best first; a place has one hypothesis a session."""
+        groups: list[list[Hypothesis]] = []
         for h in hypotheses:
-            number = next(
-                (
-                    k
-                    for k, place in enumerate(members[:RIVALS])
-                    if h.fit.score >= least
-                    and all(h.session_index != other.session_index for other in place)
-                    and any(self._one_place(query, h, other) for other in place)
-                ),
-                len(members),
-            )
-            if number == len(members):
-                members.append([])
-            members[number].append(h)
-            numbers.append(number)
-        return tuple(numbers)
+            same = next((g for g in groups[:_COMPARED] if self._belongs(query, h, g)), None)
+            if same is None:
+                groups.append([h])
+            else:
+                same.append(h)
+        return groups
+
+    def _belongs(self, query: QueryMap, h: Hypothesis, place: list[Hypothesis]) -> bool:
+        in_other_maps = all(h.session_index != other.session_index for other in place)
+        return in_other_maps and any(self._one_place(query, h, other) for other in place)
 
     def _one_place(self, query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
-        """Whether two hypotheses in two maps are one place.
-
-        They are if the surroundings in one map, placed on the other as the hypotheses say, fit there too.
-        What the query has seen fits in both, so only what lies beyond it counts. Labels that contradict each
-        other rule it out; labels that agree lower the probability that is needed.
-        """
+        """Whether two hypotheses in two maps are one place, see `signature.localization.same_place`."""
         label, other = self.labels[a.session_index], self.labels[b.session_index]
         one_recording = same_recording(self.sessions[a.session_index], self.sessions[b.session_index])
         if label.contradicts(other, one_recording=one_recording):
             return False
-        at = query.T_odom_base
-        there = b.fit.T_map_query @ at
-        beyond = unseen_by(
-            query,
-            self.grids[b.session_index].crop((there.x, there.y), DECISION.around_m),
-            b.fit.T_map_query,
-        )
-        around = Walls.of(beyond)
-        target = self.maps[a.session_index]
-        T_a_b = a.fit.T_map_query @ b.fit.T_map_query.inverse()
-        refined, covariance = refine(target.field, around.points_m, T_a_b, (there.x, there.y))
-        if not same_pose(T_a_b @ there, refined @ there):
-            return False
-        fit = score_fit(target.walls, around, refined, covariance)
         labelled = label.agrees(other, one_recording=one_recording)
-        if not fit.overlap:  # nothing beyond is in both maps
-            return labelled
-        # Ground that only one of the maps knows does not count here, and neither map may contradict the
-        # other.
-        agreement = fit.known_agreement_both_ways
-        needed = DECISION.same_labelled if labelled else DECISION.same
-        return SAME_PLACE.probability(agreement, fit.overlap * around.weight) >= needed
-
-
-def share_known(grid: OccupancyGrid, seen: OccupancyGrid, T_map_query: SE2) -> float:
-    """The share of what a query has seen that a map knows, if the query lies at a pose."""
-    cells = np.argwhere(seen.cells != UNKNOWN)
-    at = grid.to_cell(T_map_query.apply(seen.to_point(cells)))
-    inside: BoolGrid = np.all((at >= 0) & (at < grid.cells.shape), axis=1)
-    inside[inside] = grid.cells[at[inside, 0], at[inside, 1]] != UNKNOWN
-    return float(inside.mean()) if len(inside) else 0.0
-
-
-def same_score(a: Fit, b: Fit) -> bool:
-    """Whether two places fit equally well, for all that their scores tell."""
-    return abs(a.score - b.score) <= DECISION.equal
-
-
-def unseen_by(query: QueryMap, grid: OccupancyGrid, T_map_query: SE2) -> OccupancyGrid:
-    """A map, or a part of one, in which all that the query has seen, placed at a pose, is made unknown.
-
-    What it has seen is widened by `DecisionParameters.wall_m`.
-    """
-    import cv2
-
-    known = query.grid.cells != UNKNOWN
-    n = math.ceil(DECISION.wall_m / grid.resolution_m)
-    known = cv2.dilate(known.astype(np.uint8), np.ones((2 * n + 1, 2 * n + 1), np.uint8)).astype(bool)
-    cells = np.argwhere(grid.cells != UNKNOWN)
-    at = query.grid.to_cell(T_map_query.inverse().apply(grid.to_point(cells)))
-    inside: BoolGrid = np.all((at >= 0) & (at < query.grid.cells.shape), axis=1)
-    inside[inside] = known[at[inside, 0], at[inside, 1]]
-    left = grid.cells.copy()
-    left[cells[inside, 0], cells[inside, 1]] = UNKNOWN
-    return replace(grid, cells=left)
+        on, grid = self.maps[a.session_index], self.grids[b.session_index]
+        return surroundings_agree(query, a, on, b, grid, labelled=labelled)
 
 
 def free_squares(grid: OccupancyGrid, side_m: float = HYPOTHESES.square_m) -> F64:

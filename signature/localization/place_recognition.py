@@ -20,10 +20,10 @@ from pc2grid.mapping.place_recognition import Recognition, Stretch
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
-from signature.localization.confidence import SAME_PLACE
 from signature.localization.hypotheses import Hypothesis, verify
 from signature.localization.lazy_maps import LazySequence
 from signature.localization.query import QueryMap, query_of
+from signature.localization.same_place import SAME_PLACE
 from signature.retrieval.viewpoints import Places
 from signature.retrieval.vote import retrieve
 from signature.similarity import SignatureTable

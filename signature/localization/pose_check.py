@@ -4,7 +4,8 @@ The last metres are asked twice, with the same calibrated probability as any que
 prior, so equal rooms elsewhere are no rivals), and everywhere. The pose is
 
 - fine, if the best place, of all or near the pose, is certain, and the pose lies within the tolerance of it;
-- lost, if another place is certain, or if the map around the pose contradicts what the robot has seen;
+- lost, if another place is certain, or if the map at the pose contradicts what the robot has seen: its
+  likelihood is less than that of a wrong place;
 - unsure otherwise: the map knows too little there, or several places fit equally well.
 
 `check_pose` asks this of a recording; a `PoseWatch` asks it of a running robot again and again: after every
@@ -29,10 +30,10 @@ from pc2grid.io.map_pose import MapPose
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
-from signature.localization.confidence import LIMITS
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.localizer import Localizer, answer_query
 from signature.localization.map_index import MapIndex
+from signature.localization.posterior import POSTERIOR, evidence_of
 from signature.localization.prior import Prior
 
 if TYPE_CHECKING:
@@ -52,8 +53,6 @@ class CheckParameters:
         as the oldest, at 40 scans a second two minutes.
     most_waiting : so many beliefs wait for their scans; of more, the oldest are left out.
     nearest_s : a belief counts at the scan that is nearest to it in time, if it is as near as this.
-    clearly : a place elsewhere speaks against a pose if its two-way score is higher by more than this:
-        twice the spread of the score between two equal places.
     """
 
     tolerance_m: float = 0.3
@@ -63,7 +62,6 @@ class CheckParameters:
     most_scans: int = 5000
     most_waiting: int = 50
     nearest_s: float = 0.5
-    clearly: float = 2.0 * LIMITS.equal_lead
 
 
 CHECK = CheckParameters()
@@ -176,16 +174,15 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
             return judged("fine", everywhere.confidence)
         return judged("lost", 1.0 - everywhere.confidence, everywhere)
     elsewhere = _best_score(everywhere.hypotheses) - _best_score(near.hypotheses)
-    if near.status == "located" and elsewhere <= CHECK.clearly:
+    if near.status == "located" and elsewhere <= POSTERIOR.alike:
         if is_there:
             return judged("fine", near.confidence)
         return judged("lost", 1.0 - near.confidence, near)
     # The pose fits no better than the best place near it, so it is no more probable; and if that one is
     # another place, they exclude each other.
     at_most = near.confidence if is_there else min(near.confidence, 1.0 - near.confidence)
-    known_walls = here.overlap * seen.walls.weight
-    contradicted = near.status == "not_found" and known_walls >= LIMITS.few_walls
-    contradicted = contradicted and at_most <= 1.0 - index.config.accept
+    (at_pose,) = evidence_of([here], seen)
+    contradicted = at_pose.log_likelihood < 0.0 and at_most <= 1.0 - index.config.accept
     return judged("lost" if contradicted else "unsure", at_most)
 
 

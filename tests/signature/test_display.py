@@ -13,8 +13,8 @@ from pc2grid.model import OccupancyGrid
 from signature.database import Label, open_database
 from signature.database.maintenance import store
 from signature.localization.answer import Answer
-from signature.localization.confidence import NO_EVIDENCE
 from signature.localization.hypotheses import Hypothesis
+from signature.localization.posterior import NO_EVIDENCE
 from tests.helpers.databases import make_entry
 
 LONGEST_LINE = 200

@@ -13,9 +13,9 @@ from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import Health, OccupancyGrid, PointMap
 from signature.database import Label
 from signature.localization.answer import Answer
-from signature.localization.confidence import NO_EVIDENCE
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.in_space import settle_in_space
+from signature.localization.posterior import NO_EVIDENCE
 from signature.localization.query import QueryInSpace
 from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, furnished_map, twin_map
 

@@ -22,9 +22,9 @@ from signature.database import Label
 from signature.describe import Signature, describe
 from signature.localization import query as query_module
 from signature.localization.answer import Moment, Verdict
-from signature.localization.confidence import NO_EVIDENCE
 from signature.localization.hypotheses import Hypothesis, fitted
 from signature.localization.localizer import Answer, Localizer, MapIndex, answer_query, locate_in
+from signature.localization.posterior import NO_EVIDENCE
 from signature.localization.query import Query, QueryMap
 from tests.helpers.simulated_drives import building, drive, office, plan
 
@@ -240,7 +240,7 @@ def test_the_json_document_keeps_its_contract() -> None:
 
 
 class Judged:
-    """An index whose verdict on a query is given by its `path_m`: a confidence."""
+    """An index whose verdict on a query is given by its `path_m`: a confidence at even odds."""
 
     config, sessions, labels = Config().relocalize, ("a",), (Label(),)
     places = SimpleNamespace(table=SimpleNamespace(submap_id=[0]))
@@ -258,24 +258,25 @@ class Judged:
         )
         return (Hypothesis(session_index=0, row=0, fit=fit),)
 
-    def judge(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> Verdict:
+    def judge(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...], odds: float = 1.0) -> Verdict:
+        confidence = odds * query.path_m / (odds * query.path_m + 1.0 - query.path_m)
         return Verdict(
-            status="located" if query.path_m >= self.config.accept else "ambiguous",
-            confidence=query.path_m,
+            status="located" if confidence >= self.config.accept else "ambiguous",
+            confidence=confidence,
             hypotheses=hypotheses,
             places=(0,),
             evidence=NO_EVIDENCE,
         )
 
-    judge_whole_maps = decide = judge
+    decide = judge
 
 
 @pytest.mark.parametrize(
     ("whole", "shorter", "expected", "asked"),
     [
         (0.95, [0.99, 0.99], (0.95, 0.95), 0),
-        (0.5, [0.98, 0.99], (0.98, 0.96), 1),  # the second attempt: an error counts twice
-        (0.5, [0.94, 0.98], (0.98, 0.94), 2),  # 0.94 is not enough for a second attempt
+        (0.5, [0.98, 0.99], (0.98, 0.49 / 0.51), 1),  # the second attempt: its odds count half
+        (0.5, [0.94, 0.99], (0.99, 0.33 / 0.34), 2),  # 0.94 is not enough for a second attempt
         (0.5, [0.94, 0.96], (0.5, 0.5), 2),
         (0.5, [], (0.5, 0.5), 0),
     ],
@@ -352,4 +353,5 @@ def test_a_query_whose_last_scans_contradict_the_others_is_not_located(slip_deg:
         localizer.add(replace(registered, T_session_base=T.lift()), planar_scan)
     answer = localizer.answer()
     assert (answer.status == "located") == (slip_deg == 0.0)
-    assert (answer.evidence.worst_scan < -1.5) == (slip_deg != 0.0)
+    # Most of the mass is "tracking slipped", not "nowhere".
+    assert (answer.evidence.slipped() > 1.0) == (slip_deg != 0.0)

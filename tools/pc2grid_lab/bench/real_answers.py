@@ -23,7 +23,8 @@ from pc2grid_lab.experiments.answers import localize
 from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.peers.site import is_covered
 from signature.localization.answer import Answer
-from signature.localization.map_index import MapIndex, share_known
+from signature.localization.map_index import MapIndex
+from signature.localization.same_place import share_known
 
 TRAVEL_M = (0.0, 3.0, 10.0)
 ELSEWHERE_M = (1.0, 3.0, 5.0, 8.0)

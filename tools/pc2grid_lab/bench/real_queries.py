@@ -8,7 +8,7 @@ map lacks, in a building that it knows.
     python -m pc2grid_lab.bench.real_queries DATA OUT.json [--logs fr079,intel] [--queries 24]
 
 DATA holds `laser/NAME.mcap` and `laser/NAME_corrected.tum`; the registered queries are kept beside OUT.
-`real_answers` counts what is answered, `fit_confidence` fits the confidence.
+`real_answers` counts what is answered, `fit_posterior` fits the posterior.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import argparse
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +35,11 @@ from pc2grid_lab.experiments.registered_session import RegisteredSession, regist
 from pc2grid_lab.experiments.replay import Replay
 from signature.config import Config
 from signature.describe import describe
-from signature.localization.confidence import Evidence
-from signature.localization.map_index import MapIndex, unseen_by
+from signature.localization.hypotheses import Hypothesis
+from signature.localization.map_index import MapIndex
+from signature.localization.posterior import evidence_of, tail_of
 from signature.localization.query import Query, QueryMap
+from signature.localization.same_place import unseen_by
 from signature.similarity import SignatureTable
 
 MAPPED_S = {"fr079": 600.0, "intel": 900.0, "csail": 250.0, "killian": 900.0}
@@ -141,9 +143,18 @@ def _looks(
         poses = [h.fit.T_map_query @ query.T_odom_base for h in found]
         yield row | {
             "stage": stage,
-            "evidence": asdict(Evidence.of(found, query)),
+            "evidence": evidence_list(index, query, found),
             "errors": [_error(pose, truth) for pose in poses],
         }
+
+
+def evidence_list(index: MapIndex, query: QueryMap, found: tuple[Hypothesis, ...]) -> list[dict[str, Any]]:
+    """What tells for each hypothesis, and for the best one, what its last scans tell."""
+    evidence = list(evidence_of([h.fit for h in found], query))
+    if found:
+        field = index.maps[found[0].session_index].field
+        evidence[0] = replace(evidence[0], tail=tail_of(query, found[0].fit, field))
+    return [asdict(one) for one in evidence]
 
 
 def _error(pose: SE2, truth: SE2 | None) -> tuple[float, float]:

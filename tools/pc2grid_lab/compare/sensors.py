@@ -26,7 +26,7 @@ from pc2grid_lab.experiments.sensor_matrix import SENSORS, TRAVELS_M, query_tria
 from pc2grid_lab.experiments.stored import in_processes, write_text
 from pc2grid_lab.experiments.trial import Trial
 from pc2grid_lab.worlds import prepare_session
-from signature.localization.confidence import FITTED_ON
+from signature.localization.posterior import FITTED_ON
 
 
 def compare_sensors_command(

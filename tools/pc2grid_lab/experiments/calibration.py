@@ -1,9 +1,9 @@
-"""Fits the confidence to answers whose truth is known, and judges it on buildings that were left out."""
+"""Fits the posterior to queries whose truth is known, and judges it on buildings that were left out."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,67 +11,111 @@ from scipy.optimize import minimize
 from scipy.stats import mannwhitneyu
 
 from pc2grid.arrays import F64
-from signature.localization.confidence import Calibration, Evidence
+from signature.localization.posterior import POSTERIOR, Evidence, PosteriorParameters, masses
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Known:
-    """An answer whose truth is known.
+    """A query whose truth is known, asked in one map.
 
     buildings : of the query and of the map; the answer is judged by a fit without any answer of these.
-    right : whether the best hypothesis is where the query truly was. session : the drive it belongs to;
-    answers of one drive depend on each other. weight : of the answer in a fit.
+    session : the drive it belongs to; answers of one drive depend on each other.
+    places : what tells for each place that was found, best first. first : number of the place that was
+    truly the query's, None if it was none of them. weight : of the answer in a fit.
     """
 
     buildings: frozenset[str]
     session: str
-    evidence: Evidence
-    right: bool
+    places: tuple[Evidence, ...]
+    first: int | None
     weight: float = 1.0
 
+    @property
+    def right(self) -> bool:
+        """Whether the best place is where the query truly was."""
+        return self.first == 0
 
-def fit(answers: Sequence[Known], share_right: float | None = None) -> Calibration:
-    """Coefficients of highest likelihood (logistic regression), none of them but the bias below 0.
+    def probability(self, p: PosteriorParameters) -> float:
+        """Mass of the best place."""
+        return float(masses(self.places, p=p)[0]) if self.places else 0.0
 
-    share_right : the right answers weigh so much of all together, 0..1, however many of each there are; None:
-    as much as their weights say. Raises ValueError unless there are both right and wrong answers.
+
+def fit(answers: Sequence[Known], share_found: float | None = None) -> PosteriorParameters:
+    """The parameters bias, fit, lead and slip under which the truth is likeliest; fit and lead are not
+    negative.
+
+    share_found : the answers whose true place was found weigh so much of all together, 0..1, however many of
+    each there are; None: as much as their weights say. Raises ValueError unless there are both kinds.
     """
-    right = np.array([answer.right for answer in answers])
-    if right.all() or not right.any():
-        raise ValueError("a fit needs right and wrong answers")
-    terms = np.array([answer.evidence.terms for answer in answers])
-    sign = np.where(right, 1.0, -1.0)
+    found = np.array([answer.first is not None for answer in answers])
+    if found.all() or not found.any():
+        raise ValueError("a fit needs queries whose place was found and others")
     weights = np.array([answer.weight for answer in answers])
     weights /= weights.sum()
-    if share_right is not None:
-        share = float(weights[right].sum())
-        weights = weights * np.where(right, share_right / share, (1.0 - share_right) / (1.0 - share))
+    if share_found is not None:
+        share = float(weights[found].sum())
+        weights = weights * np.where(found, share_found / share, (1.0 - share_found) / (1.0 - share))
+    likelihood = _Likelihood.of(answers)
 
-    def loss(x: F64) -> tuple[float, F64]:
-        margin = sign * (terms @ x)
-        slope = -weights * sign / (1.0 + np.exp(np.clip(margin, -500.0, 500.0)))
-        penalty = _PENALTY * x
-        return float(weights @ np.logaddexp(0.0, -margin) + 0.5 * penalty @ x), slope @ terms + penalty
+    def loss(x: F64) -> float:
+        p = (1.0 - _LAPSE) * likelihood.of_truth(x) + _LAPSE
+        return float(-weights @ np.log(p) + 0.5 * _PENALTY * x[:3] @ x[:3])
 
-    bounds = [(None, None), (0.0, None), (0.0, None)]
-    found = minimize(loss, np.array([0.0, 1.0, 1.0]), jac=True, bounds=bounds, method="L-BFGS-B")
-    bias, support, clearance = found.x.tolist()
-    return Calibration(bias=bias, support=support, clearance=clearance)
+    start = np.array([POSTERIOR.bias, POSTERIOR.fit, POSTERIOR.lead, np.log(POSTERIOR.slip)])
+    bounds = [(None, None), (0.0, None), (0.0, None), (None, 0.0)]
+    bias, fit_, lead, slip = minimize(loss, start, bounds=bounds, method="L-BFGS-B").x.tolist()
+    return replace(POSTERIOR, bias=bias, fit=fit_, lead=lead, slip=float(np.exp(slip)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Likelihood:
+    """Of N answers with up to K places: terms (N, K, 3), tails (N, T) of the best place, and the number of
+    the true place (N,), K for none. Places that are missing or without walls have terms (inf, 0, 0), missing
+    tails are inf."""
+
+    terms: F64
+    tails: F64
+    first: NDArray[np.intp]
+
+    @staticmethod
+    def of(answers: Sequence[Known]) -> _Likelihood:
+        most = max((len(a.places) for a in answers), default=0)
+        longest = max((len(e.tail) for a in answers for e in a.places), default=0)
+        terms = np.tile((np.inf, 0.0, 0.0), (len(answers), most, 1))
+        tails = np.full((len(answers), longest), np.inf)
+        for n, answer in enumerate(answers):
+            for k, evidence in enumerate(answer.places):
+                if evidence.walls:
+                    terms[n, k] = evidence.terms
+                tails[n, : len(evidence.tail)] = evidence.tail
+        first = np.array([most if a.first is None else a.first for a in answers])
+        return _Likelihood(terms, tails, first)
+
+    def of_truth(self, x: F64) -> F64:
+        """(N,) probability of what is true, by bias, fit, lead and the logarithm of slip."""
+        given = np.isfinite(self.terms[:, :, 0])
+        z = np.where(given, np.nan_to_num(self.terms, posinf=0.0) @ x[:3], -700.0)
+        odds = np.exp(np.clip(z, -700.0, 300.0))
+        lost = np.exp(x[3] - x[1] * np.minimum(self.tails, 700.0)).sum(axis=1) * odds[:, :1].sum(axis=1)
+        every = np.column_stack((odds, np.ones(len(odds))))
+        lost_or_nowhere = np.where(self.first == odds.shape[1], lost, 0.0)
+        truth = every[np.arange(len(odds)), self.first] + lost_or_nowhere
+        return np.asarray(truth / (every.sum(axis=1) + lost))
 
 
 def left_out(
-    answers: Sequence[Known], share_right: float | None = None, *, fitted_to: Sequence[Known] | None = None
+    answers: Sequence[Known], share_found: float | None = None, *, fitted_to: Sequence[Known] | None = None
 ) -> F64:
-    """(N,) probability of each answer by the coefficients fitted (see `fit`) to the answers in which neither
-    query nor map is of one of its buildings.
+    """(N,) mass of the best place of each answer by the parameters fitted (see `fit`) to the answers in which
+    neither query nor map is of one of its buildings.
 
-    fitted_to : answers that the coefficients are fitted to; None: `answers`.
+    fitted_to : answers that the parameters are fitted to; None: `answers`.
     """
     models = {
-        buildings: fit([a for a in fitted_to or answers if not a.buildings & buildings], share_right)
+        buildings: fit([a for a in fitted_to or answers if not a.buildings & buildings], share_found)
         for buildings in {answer.buildings for answer in answers}
     }
-    return np.array([models[answer.buildings].probability(answer.evidence) for answer in answers])
+    return np.array([answer.probability(models[answer.buildings]) for answer in answers])
 
 
 def log_losses(answers: Sequence[Known], probabilities: F64) -> F64:
@@ -122,6 +166,9 @@ def share_by_session(
     return float(np.mean(yes)), low, high
 
 
-_PENALTY = 1e-4
-"""Weight of the squared coefficients in the loss: keeps them finite where the answers can be told apart
-without error."""
+_LAPSE = 0.1
+"""Share of the truths that are taken to be none: a query whose map is wrong, or whose place no equation would
+find, does not decide the fit."""
+_PENALTY = 1e-3
+"""Weight of the squared bias, fit and lead in the loss: keeps them finite where the answers can be told apart
+without error. By hand; with a tenth of it, what is judged on buildings that were left out is too sure."""

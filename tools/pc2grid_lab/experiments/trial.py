@@ -40,7 +40,7 @@ class Trial:
     error of the best hypothesis is small enough. rank: of the first right place among those retrieved, -1 if
     there is none; alone: the same by each combination of signatures, without isovists. forward, walls,
     backward, looked_at, lead, likeness: the evidence of the decision, see
-    `signature.localization.confidence`; agreement: the better one of forward and backward. In the results
+    `signature.localization.posterior`; agreement: the better one of forward and backward. In the results
     of earlier versions, forward, backward, looked_at and likeness are null. map_bent_m: how far the map
     around the true place lies from where the map as a whole puts it; null in simulation. query_building: of
     the query; null in the results of earlier versions.

@@ -1,15 +1,15 @@
-"""Fits the confidence to answers whose truth is known, and judges it on buildings that were left out.
+"""Fits the posterior to queries whose truth is known, and judges it on buildings that were left out.
 
-    python -m pc2grid_lab.bench.fit_confidence EVIDENCE.json ...
+    python -m pc2grid_lab.bench.fit_posterior EVIDENCE.json ...
 
-Each file is one that `real_queries` has written, one of the folder trials/ of `pc2grid compare sensors`, or
-the document of `compare real` or `compare log --json`. An answer is judged by a fit without all answers whose
-query or map is of one of its buildings. Prints the coefficients for `signature.localization.confidence`,
-the log loss, and by kind of pair and distance how many answers are right, and how many would be located by
-the coefficients in use and by those fitted without the building, rightly and wrongly.
+Each file is one that `real_queries` or `recorded_queries` has written, one of the folder trials/ of `pc2grid
+compare sensors`, or the document of `compare real` or `compare log --json`. An answer is judged by a fit
+without all answers whose query or map is of one of its buildings. Prints the parameters for
+`signature.localization.posterior`, the log loss, and by kind of pair and distance how many answers are right,
+and how many would be located by the parameters in use and by those fitted without the building, rightly and
+wrongly.
 
-Right and wrong answers weigh the same in the fit, however many of each there are. Queries whose place is not
-in the map of their building, and the likeness of a query to itself, judge the fit and take no part in it.
+Queries whose place was found and all others weigh the same in the fit, however many of each there are.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import argparse
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +27,16 @@ import numpy as np
 from pc2grid.arrays import F64
 from pc2grid_lab.experiments.calibration import Known, fit, left_out, log_loss, roc_area, share_by_session
 from signature.config import Config
-from signature.localization.confidence import CALIBRATION, Evidence
+from signature.localization.posterior import POSTERIOR, Evidence
 
 RIGHT_M, RIGHT_RAD = 0.5, math.radians(5.0)
 """Errors of answers to real logs at the right place. How precise they are is not the question here; the poses
 that count as true are good to some centimetres."""
 NEAR_M = 1.0
 """Answers so near to the place of a query that is not in the map are left out: neither right nor wrong."""
-SHARE_RIGHT = 0.5
-"""Weight of the right answers together. So the probability holds for queries half of which lie in the map."""
+SHARE_FOUND = 0.5
+"""Weight of the queries whose place was found. So the probability holds for queries half of which lie in the
+map."""
 PARTS_OF = {"floor": "fr079", "fr079_floor": "fr079"}
 """Physical building of what `compare real` and the data call otherwise: the 3D scan is one floor of fr079."""
 
@@ -47,7 +48,6 @@ class Answered:
     kind: str
     travel_m: float
     known: Known
-    blanked: bool = False
 
 
 def physical(*names: str) -> frozenset[str]:
@@ -61,9 +61,14 @@ def of_rows(rows: list[dict[str, Any]]) -> Iterator[Answered]:
         own, blanked = row["log"] == row["map"], row["place"] == "blanked"
         if not row["errors"] or (own and not math.isfinite(row["errors"][0][0])):
             continue
-        error_m, error_rad = row["errors"][0]
-        if blanked and error_m < NEAR_M:
+        errors_m = [error_m for error_m, _ in row["errors"]]
+        if blanked and min(errors_m) < NEAR_M:
             continue
+        right = [
+            k
+            for k, (error_m, error_rad) in enumerate(row["errors"])
+            if own and not blanked and error_m <= RIGHT_M and error_rad <= RIGHT_RAD
+        ]
         where = "its own building" if own else "another building"
         yield Answered(
             f"laser log in {where}{', place blanked' if blanked else ''}",
@@ -71,10 +76,9 @@ def of_rows(rows: list[dict[str, Any]]) -> Iterator[Answered]:
             Known(
                 buildings=physical(row["log"], row["map"]),
                 session=f"{row['log']} {row['start']}",
-                evidence=Evidence(**row["evidence"]),
-                right=own and not blanked and error_m <= RIGHT_M and error_rad <= RIGHT_RAD,
+                places=tuple(Evidence(**evidence) for evidence in row["evidence"]),
+                first=right[0] if right else None,
             ),
-            blanked,
         )
 
 
@@ -91,8 +95,8 @@ def of_trials(trials: list[dict[str, Any]]) -> Iterator[Answered]:
             Known(
                 buildings=physical(trial["building"], trial["query_building"]),
                 session=f"{trial['query_building']} {trial['query_sensor']} {trial['seed']}",
-                evidence=Evidence(**{name: trial[name] for name in names}),
-                right=trial["right"],
+                places=(Evidence(**{name: trial[name] for name in names}, apart=trial["lead"]),),
+                first=0 if trial["right"] else None,
             ),
         )
 
@@ -107,18 +111,6 @@ def read(file: Path) -> list[Answered]:
     if any("place" not in row for row in document):
         raise SystemExit(f"{file}: evidence of an earlier version; collect it again by real_queries.py")
     return list(of_rows(document))
-
-
-def fitted_to(answered: list[Answered]) -> list[Known]:
-    """The answers that the coefficients are fitted to: not those of blanked places, and as if no query were
-    like itself.
-
-    Otherwise larger coefficients make up for what the likeness takes from a lead, also where nothing is
-    alike, and blanked places, which are rare, lower the confidence everywhere. Both judge the fit.
-    """
-    return [
-        replace(a.known, evidence=replace(a.known.evidence, likeness=0.0)) for a in answered if not a.blanked
-    ]
 
 
 @dataclass(slots=True)
@@ -140,21 +132,21 @@ def main() -> None:
     answered = [a for file in parser.parse_args().files for a in read(file)]
     known = [a.known for a in answered]
     refuse(known)
-    in_use = np.array([CALIBRATION.probability(k.evidence) for k in known])
-    refitted = left_out(known, SHARE_RIGHT, fitted_to=fitted_to(answered))
+    in_use = np.array([k.probability(POSTERIOR) for k in known])
+    refitted = left_out(known, SHARE_FOUND)
     print_counts(answered, in_use, refitted)
     print_sums(known, "in use", in_use)
     print_sums(known, "fitted without the building", refitted)
-    print(fit(fitted_to(answered), SHARE_RIGHT))
+    print(fit(known, SHARE_FOUND))
 
 
 def refuse(known: list[Known]) -> None:
     """Raises SystemExit if a building cannot be left out."""
     for buildings in {k.buildings for k in known}:
-        if len({k.right for k in known if not k.buildings & buildings}) < 2:
+        if len({k.first is None for k in known if not k.buildings & buildings}) < 2:
             raise SystemExit(
                 "the fit is judged by leaving buildings out, and without"
-                f" {' and '.join(sorted(buildings))} there are no right and wrong answers"
+                f" {' and '.join(sorted(buildings))} not both kinds of queries are left: found and not"
             )
 
 

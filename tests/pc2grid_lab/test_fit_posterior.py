@@ -1,20 +1,20 @@
-"""`pc2grid_lab.bench.fit_confidence`, run as its users run it, on made answers whose model is known."""
+"""`pc2grid_lab.bench.fit_posterior`, run as its users run it, on made answers whose model is known."""
 
 import json
 import os
 import re
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from signature.localization.confidence import Calibration, Evidence
+from signature.localization.posterior import POSTERIOR, Evidence, masses
 
-SCRIPT = Path(__file__).parents[2] / "tools" / "pc2grid_lab" / "bench" / "fit_confidence.py"
-TRUTH = Calibration(bias=-5.0, support=4.0, clearance=1.5)
+SCRIPT = Path(__file__).parents[2] / "tools" / "pc2grid_lab" / "bench" / "fit_posterior.py"
+TRUTH = replace(POSTERIOR, bias=-4.0, fit=2.0, lead=4.0)
 
 
 def made(count: int, seed: int) -> list[tuple[Evidence, bool]]:
@@ -26,10 +26,11 @@ def made(count: int, seed: int) -> list[tuple[Evidence, bool]]:
             walls=float(rng.uniform(30, 300)),
             backward=float(rng.uniform(0.4, 0.99)),
             looked_at=float(rng.uniform(30, 300)),
-            lead=float(rng.uniform(0.05, 0.15)),
+            lead=float(rng.uniform(0.02, 0.15)),
+            apart=0.15,
             likeness=float(rng.uniform(0.0, 1.0)),
         )
-        found.append((evidence, bool(rng.random() < TRUTH.probability(evidence))))
+        found.append((evidence, bool(rng.random() < masses([evidence], p=TRUTH)[0])))
     return found
 
 
@@ -44,7 +45,7 @@ def row(log: str, i: int, evidence: Evidence, error: list[float], **changes: Any
         "window_m": 15.0,
         "stage": "proposed",
         "covered": 0.8,
-        "evidence": asdict(evidence),
+        "evidence": [asdict(evidence)],
         "errors": [error],
     }
     return one | changes
@@ -55,7 +56,9 @@ def evidence_files(folder: Path) -> list[Path]:
     for log, seed in (("a", 0), ("b", 1)):
         for i, (evidence, right) in enumerate(made(1500, seed)):
             rows.append(row(log, i, evidence, [0.1, 0.01] if right else [7.0, 0.0]))
-    poor = Evidence(forward=0.4, walls=100.0, backward=0.4, looked_at=100.0, lead=0.01, likeness=0.5)
+    poor = Evidence(
+        forward=0.4, walls=100.0, backward=0.4, looked_at=100.0, lead=0.01, apart=0.01, likeness=0.5
+    )
     rows += [
         row("a", 0, poor, [float("inf"), 3.0], map="b", place="elsewhere"),
         row("a", 0, poor, [9.0, 0.0], place="blanked"),
@@ -73,7 +76,7 @@ def evidence_files(folder: Path) -> list[Path]:
                 "seed": i // 4,
                 "travel_m": 10.0,
                 "right": right,
-                **asdict(evidence),
+                **{name: value for name, value in asdict(evidence).items() if name not in ("apart", "tail")},
             }
         )
     files = [folder / "real.json", folder / "sensors.json"]
@@ -84,7 +87,7 @@ def evidence_files(folder: Path) -> list[Path]:
 
 def run(*files: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(SCRIPT), *map(str, files)]
-    path = {**os.environ, "PYTHONPATH": str(SCRIPT.parents[2])}
+    path = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (SCRIPT.parents[3], SCRIPT.parents[2])))}
     return subprocess.run(command, capture_output=True, text=True, timeout=120, env=path)
 
 
@@ -93,7 +96,8 @@ def test_one_command_fits_and_judges(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     fitted = {k: float(v) for k, v in re.findall(r"(\w+)=(-?[\d.]+)", lines[-1])}
-    assert abs(fitted["support"] - TRUTH.support) < 0.8 and abs(fitted["clearance"] - TRUTH.clearance) < 0.5
+    # 4500 answers of known probability: the parameters are found to a tenth or so.
+    assert abs(fitted["fit"] - TRUTH.fit) < 0.4 and abs(fitted["lead"] - TRUTH.lead) < 0.8
     counts = {line[:50].strip(): line[50:].split()[:3] for line in lines[1:-3]}
     right = sum(is_right for seed in (0, 1) for _, is_right in made(1500, seed))
     assert counts["laser log in its own building"] == ["3", "3000", str(right)]
@@ -107,7 +111,7 @@ def test_one_command_fits_and_judges(tmp_path: Path) -> None:
 def test_old_evidence_and_a_single_building_are_refused(tmp_path: Path) -> None:
     real, sensors = evidence_files(tmp_path)
     alone = run(sensors)
-    assert alone.returncode != 0 and "without c there are no right and wrong answers" in alone.stderr
+    assert alone.returncode != 0 and "without c not both kinds" in alone.stderr
     old = [{k: v for k, v in one.items() if k != "place"} for one in json.loads(real.read_text())[:3]]
     real.write_text(json.dumps(old))
     refused = run(real)
@@ -123,4 +127,4 @@ def test_a_scan_and_a_log_of_one_building_are_left_out_together(tmp_path: Path) 
     real.write_text(json.dumps(rows))
     sensors.write_text(json.dumps(trials))  # a list, as `compare sensors` keeps them for each drive
     refused = run(real, sensors)
-    assert refused.returncode != 0 and "without fr079 there are no right and wrong answers" in refused.stderr
+    assert refused.returncode != 0 and "without fr079 not both kinds" in refused.stderr

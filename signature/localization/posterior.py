@@ -1,0 +1,219 @@
+"""The posterior over places and "not in this map": one equation decides every answer.
+
+    mass(h)  =  prior(h) exp(z_h) / N                        the query lies at h
+    lost(h)  =  prior(h) exp(z_h) sum_k s exp(-c r_hk) / N   it lay there until tracking slipped before scan k
+    nowhere  =  1 / N                                        it lies at no place of this map
+    N        =  1 + sum_h prior(h) exp(z_h) (1 + sum_k s exp(-c r_hk))
+
+    z_h = b + c (f_h + g_h) + d t_h,    f = l(a_f) n_f / (n_f + few_f),    g = l(a_b) n_b / (n_b + few_b)
+    l(a) = ln a - ln(1.2 - a),          t = min(score - rival, q score) sqrt(min(n_f, most) (1 - like^2))
+
+- f and g are the log-likelihood of the wall points of the query on ground that the map knows, and of the
+  map's on ground that the query knows, as log-odds against a wrong place, where 0.6 agree. Divided by
+  (n + few) instead of 1, because neighbouring points repeat each other and all share what has been moved in
+  the building (`n_eff`). Ground that one side does not know says nothing.
+- t is what wrong places tell. However well a place fits, "not in this map" explains the query as well if
+  another place fits nearly so well: then such a fit is nothing special. The score (`two_way_score`) is a
+  mean, which varies by chance as 1 / sqrt(n). No lead counts as longer than the share q of the score: what
+  scores less is not searched for, so there may always be a rival so near.
+- like, how well the query fits onto itself, slid along (`pc2grid.matching.self_likeness`): the walls of a
+  bare corridor tell no place along it from another.
+- r_hk, the log-likelihood of the scans from k on, f of these alone: where tracking slips, the scans before
+  fit and those after do not, and nothing tells where the robot is now. s is the rate of slips, per scan.
+
+`located` means that one place has at least the mass `RelocalizeConfig.accept`; `not_found`, that the query
+more likely than not is at no place of the map, `ambiguous` all else.
+
+`pc2grid_lab.experiments.calibration` fits b, c, d and s to queries whose truth is known, and judges them on
+buildings that were left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pc2grid.arrays import F64
+from pc2grid.matching.likelihood_field import LikelihoodField
+from pc2grid.matching.two_way_score import Fit
+from signature.localization.query import QueryMap
+
+FITTED_ON = frozenset(
+    {"fr079", "intel", "csail", "aces", "wean", "kidnap", "workshop", "birmingham", "hall", "jarvis"}
+)
+"""Buildings that `POSTERIOR` was fitted on."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PosteriorParameters:
+    """What the equation above is made of.
+
+    bias, fit, lead, slip : b, c, d and s.
+    few_walls, few_looked_at : few_f and few_b, wall points (0.1 m apart, by weight). Chosen by hand; from
+        half to twice of it the likelihood is as high.
+    most_walls : most; more do not make a lead surer, as what has been moved and similar rooms do not average
+        out. By hand.
+    longest_lead : q. By hand; searches report what is nearer.
+    slack, least_agreement : keep the log-odds finite at an agreement of 1 and of 0.
+    alike : places whose scores differ by less fit equally well: twice the spread of the score between two
+        equal places (simulated twin rooms, which differ by the paths that they were seen from).
+    in_the_map : least mass of all places together, of those that fit equally well as of one, to answer
+        `ambiguous`, not `not_found`.
+    """
+
+    bias: float = -5.67
+    fit: float = 2.76
+    lead: float = 4.39
+    slip: float = 0.0005
+    few_walls: float = 30.0
+    few_looked_at: float = 100.0
+    most_walls: float = 300.0
+    longest_lead: float = 0.2
+    slack: float = 0.2
+    least_agreement: float = 0.01
+    alike: float = 0.02
+    in_the_map: float = 0.5
+
+
+POSTERIOR = PosteriorParameters()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """What tells for one place.
+
+    forward : `pc2grid.matching.two_way_score.Fit.known_agreement`. walls : wall points of the query that lie
+    on ground known to the map, weighted by `pc2grid.matching.walls.steadiness`.
+    backward, looked_at : the same the other way round.
+    lead : score less that of the best other place, at most `longest_lead` of it. apart : the same, but places
+    that fit equally well do not count as others.
+    likeness : `pc2grid.matching.self_likeness` of the query.
+    tail : r_k, log-likelihood of the scans from the k-th one on, the last one first.
+    """
+
+    forward: float
+    walls: float
+    backward: float
+    looked_at: float
+    lead: float
+    apart: float
+    likeness: float
+    tail: tuple[float, ...] = ()
+
+    @property
+    def agreement(self) -> float:
+        """0..1, the better of the two directions."""
+        return max(self.forward, self.backward)
+
+    @property
+    def log_likelihood(self) -> float:
+        """f + g: below 0 the place fits less than wrong places do."""
+        p = POSTERIOR
+        forward = tempered(self.forward, self.walls, p.few_walls)
+        return forward + tempered(self.backward, self.looked_at, p.few_looked_at)
+
+    @property
+    def terms(self) -> tuple[float, float, float]:
+        """What b, c and d are multiplied with."""
+        return 1.0, self.log_likelihood, self.lead * self._sharpness
+
+    @property
+    def _sharpness(self) -> float:
+        return math.sqrt(min(self.walls, POSTERIOR.most_walls) * (1.0 - self.likeness**2))
+
+    def log_odds(self, p: PosteriorParameters = POSTERIOR) -> float:
+        """z: logarithm of the mass of the place over that of "nowhere"; minus infinity without walls."""
+        if not self.walls:
+            return -math.inf
+        return float(np.dot((p.bias, p.fit, p.lead), self.terms))
+
+    def log_odds_alike(self, p: PosteriorParameters = POSTERIOR) -> float:
+        """z of the place or one that fits equally well."""
+        return self.log_odds(p) + p.lead * (self.apart - self.lead) * self._sharpness
+
+    def slipped(self, p: PosteriorParameters = POSTERIOR) -> float:
+        """Mass of "it lay here, but tracking slipped", as a multiple of the mass of the place."""
+        return float(p.slip * np.exp(-p.fit * np.array(self.tail)).sum())
+
+
+NO_EVIDENCE = Evidence(forward=0.0, walls=0.0, backward=0.0, looked_at=0.0, lead=0.0, apart=0.0, likeness=0.0)
+
+
+def evidence_of(fits: Sequence[Fit], query: QueryMap, rivals: Sequence[Fit] = ()) -> tuple[Evidence, ...]:
+    """Evidence of places, one fit each. rivals : of places that are no answers, but as good an example of
+    what wrong places score."""
+    scores = np.array([fit.score for fit in (*fits, *rivals)])
+    found = []
+    for k, fit in enumerate(fits):
+        others = np.delete(scores, k)
+        lower = others[others < fit.score - POSTERIOR.alike]
+        higher = others[others > fit.score + POSTERIOR.alike]
+        found.append(
+            Evidence(
+                forward=fit.known_agreement,
+                walls=fit.overlap * query.walls.weight,
+                backward=fit.backward,
+                looked_at=fit.looked_at,
+                lead=_lead(fit.score, others),
+                apart=_lead(fit.score, higher if len(higher) else lower),
+                likeness=query.likeness,
+            )
+        )
+    return tuple(found)
+
+
+def alike(score: float, other: float) -> bool:
+    """Whether two places fit equally well, for all that their scores tell."""
+    return abs(score - other) <= POSTERIOR.alike
+
+
+def _lead(score: float, others: F64) -> float:
+    longest = POSTERIOR.longest_lead * score
+    return min(longest, score - float(others.max())) if len(others) else longest
+
+
+def masses(
+    evidence: Sequence[Evidence], prior: Sequence[float] | None = None, p: PosteriorParameters = POSTERIOR
+) -> F64:
+    """(H,) probability of each place; what is missing to 1 is "nowhere" and "tracking slipped".
+
+    prior : relative to that of "nowhere"; None: 1 each.
+    """
+    if not evidence:
+        return np.empty(0)
+    log_odds = np.array([e.log_odds(p) for e in evidence])
+    log_odds += np.log(np.maximum(np.ones(len(evidence)) if prior is None else prior, 1e-300))
+    highest = max(float(log_odds.max()), 0.0)
+    odds = np.exp(log_odds - highest)
+    lost = odds * [e.slipped(p) for e in evidence]
+    return np.asarray(odds / (math.exp(-highest) + odds.sum() + lost.sum()))
+
+
+def in_the_map(evidence: Sequence[Evidence], p: PosteriorParameters = POSTERIOR) -> float:
+    """Probability that the query lies at the best of the places or at one that fits equally well."""
+    best = max((e.log_odds_alike(p) for e in evidence), default=-math.inf)
+    return 1.0 / (1.0 + math.exp(min(-best, 700.0)))
+
+
+def tail_of(query: QueryMap, fit: Fit, field: LikelihoodField) -> tuple[float, ...]:
+    """`Evidence.tail` of a query at a pose on a map; empty for a drawn map."""
+    likelihood = points = 0.0
+    tail = []
+    for count, keyframe in enumerate(reversed(query.keyframes), start=1):
+        hits_m = (fit.T_map_query @ keyframe.T_odom_base).apply(keyframe.planar_scan.hits_m)
+        values, known = field.at(hits_m)
+        likelihood += float(values[known].sum())
+        points += float(np.count_nonzero(known))
+        mean = likelihood / points if points else 0.0
+        tail.append(tempered(mean, points / count, POSTERIOR.few_walls))
+    return tuple(tail)
+
+
+def tempered(agreement: float, points: float, few: float) -> float:
+    """Log-likelihood of wall points that agree so well, tempered by their number."""
+    p = POSTERIOR
+    a = min(max(agreement, p.least_agreement), 1.0)
+    return (math.log(a) - math.log(1.0 + p.slack - a)) * points / (points + few)
