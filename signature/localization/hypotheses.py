@@ -37,6 +37,10 @@ class HypothesisParameters:
     refined : share of `RelocalizeConfig.hypotheses` that is refined; some of these will merge.
     half_coarse_rad : of a pose whose coarse score is asked for; about half a step of heading of the search.
     same_m, same_rad : two hypotheses nearer than this are one.
+    map_m, map_rad : standard deviations of where a map shows what is around a place: half a cell, and over
+        the range of a laser as an angle. They are added to those of the alignment, which are of some
+        millimetres: without them the errors of 148 right answers to real recordings are 2.2 times what is
+        stated (median), with them 1.0.
     """
 
     half_t_m: float = 0.4
@@ -50,6 +54,8 @@ class HypothesisParameters:
     half_coarse_rad: float = math.radians(0.8)
     same_m: float = 0.5
     same_rad: float = math.radians(10.0)
+    map_m: float = 0.025
+    map_rad: float = 0.002
 
 
 HYPOTHESES = HypothesisParameters()
@@ -166,6 +172,7 @@ def coarse_score(query: QueryMap, target: SearchMap, T_map_query: SE2) -> float:
 def fitted(query: QueryMap, session_index: int, row: int, target: SearchMap, T_map_query: SE2) -> Hypothesis:
     """The hypothesis that the query lies at a pose, which is refined first."""
     pose, covariance = refine(target.field, query.walls.points_m, T_map_query, query.center_m)
+    covariance = covariance + np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))
     fit = score_fit(target.walls, query.walls, pose, covariance)
     return Hypothesis(session_index=session_index, row=row, fit=fit)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ from pc2grid.arrays import F64, I64
 from pc2grid.errors import ConfigError, DatabaseCorrupt
 from pc2grid.geometry import SE2
 from pc2grid.matching.refinement import refine
-from pc2grid.matching.two_way_score import score_fit
+from pc2grid.matching.two_way_score import Fit, score_fit
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid, same_recording
 from pc2grid.observer import Observer
@@ -36,6 +36,7 @@ from signature.localization.lazy_maps import DatabaseGrids, LazySequence
 from signature.localization.posterior import (
     NO_EVIDENCE,
     POSTERIOR,
+    Evidence,
     alike,
     evidence_of,
     in_the_map,
@@ -310,43 +311,49 @@ class MapIndex:
         it remains a rival, unless it fits as well as the best one that is allowed: between equal places the
         prior decides. Otherwise any place in a small region, which has few rivals, would look certain.
         """
-        allowed = {id(h) for h in self.allowed(hypotheses, query)}
-        places: list[list[Hypothesis]] = []
-        excluded: list[list[Hypothesis]] = []
-        for group in self._places(query, hypotheses):
-            inside = [h for h in group if id(h) in allowed]
-            (places if inside else excluded).append(inside or group)
+        places, rivals = self._places_by_prior(query, hypotheses)
         if not places:
             return NOTHING
-        highest = max(place[0].fit.score for place in places)
-        rivals = [place[0].fit for place in excluded if not alike(place[0].fit.score, highest)]
+        evidence, places = self._evidence(query, places, rivals)
+        # The same place on a floor that looks alike and is not contradicted has the same mass.
+        unseen = self._unseen_alike(query, places[0][0]) if evidence[0].log_odds() > 0.0 else []
+        mass = masses([evidence[0]] * len(unseen) + evidence, odds)
+        named = [h for h in unseen if not any(same_place(query, h, o) for place in places for o in place)]
+        return _verdict(
+            [*places, *([h] for h in named)], evidence, float(mass[len(unseen)]), self.config.accept
+        )
+
+    def _places_by_prior(
+        self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]
+    ) -> tuple[list[list[Hypothesis]], list[Fit]]:
+        """The places that the prior allows, and fits of others that tell what wrong places score."""
+        allowed = {id(h) for h in self.allowed(hypotheses, query)}
+        groups = self._places(query, hypotheses)
+        places = [inside for group in groups if (inside := [h for h in group if id(h) in allowed])]
+        highest = max((place[0].fit.score for place in places), default=0.0)
+        excluded = [group[0].fit for group in groups if not any(id(h) in allowed for h in group)]
+        return places, [fit for fit in excluded if not alike(fit.score, highest)]
+
+    def _evidence(
+        self, query: QueryMap, places: list[list[Hypothesis]], rivals: list[Fit]
+    ) -> tuple[list[Evidence], list[list[Hypothesis]]]:
+        """What tells for each place, and the places, both by mass; what the last scans tell, of the first."""
         told = evidence_of([place[0].fit for place in places], query, rivals)
         by_mass = sorted(zip(told, places, strict=True), key=lambda known: -known[0].log_odds())
-        evidence, places = [one for one, _ in by_mass], [place for _, place in by_mass]
-        best = places[0][0]
+        evidence, ordered = [one for one, _ in by_mass], [place for _, place in by_mass]
+        best = ordered[0][0]
         tail = tail_of(query, best.fit, self.maps[best.session_index].field)
-        evidence[0] = replace(evidence[0], tail=tail)
-        # The same place on a floor that looks alike and is not contradicted has the same mass.
-        settled = self.prior is not None or evidence[0].log_odds() < 0.0
-        unseen = [] if settled else self._unseen_alike(query, best)
-        mass = masses([evidence[0]] * len(unseen) + evidence, [odds] * (len(unseen) + len(evidence)))
-        confidence = float(mass[len(unseen)])
-        places += [[h] for h in unseen if not any(same_place(query, h, o) for place in places for o in place)]
-        status: Status = "ambiguous" if in_the_map(evidence) >= POSTERIOR.in_the_map else "not_found"
-        return Verdict(
-            status="located" if confidence >= self.config.accept else status,
-            confidence=confidence,
-            hypotheses=tuple(h for place in places for h in place),
-            places=tuple(number for number, place in enumerate(places) for _ in place),
-            evidence=evidence[0],
-        )
+        return [replace(evidence[0], tail=tail), *evidence[1:]], ordered
 
     def _unseen_alike(self, query: QueryMap, best: Hypothesis) -> list[Hypothesis]:
         """The same place on other floors of the building that look alike, where what their maps show does not
         contradict the query: they show too little of it, or agree with it as well as the best floor does.
+        None with a prior, which names the floor.
 
         A score tells the two apart by what is unknown there, which says nothing.
         """
+        if self.prior is not None:
+            return []
         here, base = best.session_index, query.T_odom_base
         least = best.fit.known_agreement_both_ways - POSTERIOR.alike
         found = []
@@ -449,6 +456,20 @@ class MapIndex:
         labelled = label.agrees(other, one_recording=one_recording)
         on, grid = self.maps[a.session_index], self.grids[b.session_index]
         return surroundings_agree(query, a, on, b, grid, labelled=labelled)
+
+
+def _verdict(
+    places: Sequence[Sequence[Hypothesis]], evidence: Sequence[Evidence], confidence: float, accept: float
+) -> Verdict:
+    """The verdict on places by mass. evidence : of each that is found. confidence : mass of the first."""
+    status: Status = "ambiguous" if in_the_map(evidence) >= POSTERIOR.in_the_map else "not_found"
+    return Verdict(
+        status="located" if confidence >= accept else status,
+        confidence=confidence,
+        hypotheses=tuple(h for place in places for h in place),
+        places=tuple(number for number, place in enumerate(places) for _ in place),
+        evidence=evidence[0],
+    )
 
 
 def free_squares(grid: OccupancyGrid, side_m: float = HYPOTHESES.square_m) -> F64:

@@ -176,20 +176,17 @@ def _lead(score: float, others: F64) -> float:
 
 
 def masses(
-    evidence: Sequence[Evidence], prior: Sequence[float] | None = None, p: PosteriorParameters = POSTERIOR
+    evidence: Sequence[Evidence], prior: float | Sequence[float] = 1.0, p: PosteriorParameters = POSTERIOR
 ) -> F64:
     """(H,) probability of each place; what is missing to 1 is "nowhere" and "tracking slipped".
 
-    prior : relative to that of "nowhere"; None: 1 each.
+    prior : of each place, relative to that of "nowhere".
     """
-    if not evidence:
-        return np.empty(0)
-    log_odds = np.array([e.log_odds(p) for e in evidence])
-    log_odds += np.log(np.maximum(np.ones(len(evidence)) if prior is None else prior, 1e-300))
-    highest = max(float(log_odds.max()), 0.0)
+    log_odds = np.array([e.log_odds(p) for e in evidence]) + np.log(prior)
+    highest = max(0.0, *log_odds, 0.0)
     odds = np.exp(log_odds - highest)
-    lost = odds * [e.slipped(p) for e in evidence]
-    return np.asarray(odds / (math.exp(-highest) + odds.sum() + lost.sum()))
+    lost = odds @ np.array([e.slipped(p) for e in evidence])
+    return np.asarray(odds / (math.exp(-highest) + odds.sum() + lost))
 
 
 def in_the_map(evidence: Sequence[Evidence], p: PosteriorParameters = POSTERIOR) -> float:

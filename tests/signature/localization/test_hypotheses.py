@@ -1,11 +1,16 @@
-"""Which wall points the coarse search takes."""
+"""Which wall points the coarse search takes, and how exactly a place is known."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from pc2grid.arrays import F32
-from signature.localization.hypotheses import HYPOTHESES, coarse_points
+from pc2grid.geometry import SE2
+from pc2grid.matching.window_search import SearchMap
+from signature.config import Config
+from signature.localization.hypotheses import HYPOTHESES, coarse_points, fitted
+from signature.localization.query import query_of
+from tests.helpers.simulated_drives import office
 
 CENTER_M = (3.0, -2.0)
 
@@ -30,3 +35,12 @@ def test_a_room_has_near_walls_only() -> None:
     chosen = coarse_points(ring(4.0, 400), CENTER_M)
     assert 0 < len(chosen) <= HYPOTHESES.few_points
     assert coarse_points(np.empty((0, 2), np.float32), CENTER_M).shape == (0, 2)
+
+
+def test_a_pose_is_not_stated_more_exactly_than_the_map_is_drawn() -> None:
+    """The map on itself: the alignment alone states 2 to 4 cm along rooms and some millimetres across."""
+    query = query_of(office(), np.empty((0, 2)), Config(), Config().relocalize)
+    fit = fitted(query, 0, -1, SearchMap.of(office()), SE2(0.04, -0.03, 0.01)).fit
+    stated = np.sqrt(np.diag(fit.covariance))
+    assert np.all(stated >= (HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad))
+    assert np.all(stated < (0.1, 0.1, 0.01))  # a tenth of a robot's width: what is aligned is known

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -112,6 +112,24 @@ class Judge:
             return self._judged(pair, query, map_, row)
         except Exception as error:
             return PairRow(**row, problem=said(error))
+
+    def truths(self, pair: Pair) -> Iterator[tuple[TimeSpan, dict[str, SE2], bool]]:
+        """The windows of a pair whose place is known: the window, the base at its end in each session of the
+        map that shows it, and whether the map knows what is seen there.
+
+        Of a pair with another building, every window, and no place.
+        """
+        query, map_ = (self._catalogue.recordings[name] for name in (pair.query, pair.map))
+        if pair.kind == "elsewhere":
+            yield from ((one.span, {}, False) for one in self._asked(pair))
+            return
+        _, asked, frames = self._frames(pair, query, map_)
+        grids = self._grids_of(pair.map_name)
+        for one in asked:
+            expected = _expected(one, frames)
+            if expected:
+                poses = {session: pose for session, (pose, _) in expected.items()}
+                yield one.span, poses, _covered(one, expected, grids)
 
     def _judged(self, pair: Pair, query: Recording, map_: Recording, row: dict[str, Any]) -> PairRow:
         problem = self._problem(pair)
@@ -290,19 +308,31 @@ def _judged(one: LocatedWindow, frames: Frames, grids: Mapping[str, OccupancyGri
     row = _answered(one)
     if one.answer is None or one.where is None:
         return QueryRow(**row)
+    expected = _expected(one, frames)
+    if not expected:
+        return QueryRow(**row)
+    return QueryRow(**row, covered=_covered(one, expected, grids), **_best(one.places, expected))
+
+
+def _expected(one: Asked, frames: Frames) -> dict[str, tuple[SE2, float]]:
+    """Where the base is at the end of a window, by session of the map, and how far a right answer may be."""
+    if one.where is None:
+        return {}
     part, T_drive_base = one.where
-    expected = {
+    return {
         session: frame.place(T_drive_base, without=(one.query, one.window))
         for (of_part, session), frame in frames.items()
         if of_part == part
     }
-    if not expected:
-        return QueryRow(**row)
-    covered = any(
+
+
+def _covered(
+    one: Asked, expected: Mapping[str, tuple[SE2, float]], grids: Mapping[str, OccupancyGrid]
+) -> bool:
+    return any(
         known_share(grids[session], T_map_base.apply(one.hits_m)) >= JUDGEMENT.mapped
         for session, (T_map_base, _) in expected.items()
     )
-    return QueryRow(**row, covered=covered, **_best(one.places, expected))
 
 
 def _best(
