@@ -1,0 +1,43 @@
+"""A window asked in its map, in another building, with its place blanked, and standing."""
+
+import math
+
+from pc2grid.time_span import TimeSpan
+from pc2grid_lab.bench.fit_posterior import of_rows
+from pc2grid_lab.bench.recorded_queries import Window, rows
+from pc2grid_lab.experiments.recordings.catalogue import Catalogue
+from signature.config import Config
+from signature.localization.query import Query
+from tests.helpers.simulated_drives import building, drive, office, plan
+
+OTHER = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
+
+
+def test_each_question_says_what_tells_for_its_places() -> None:
+    whole, last = (Query(Config(), Config().relocalize) for _ in range(2))
+    for registered, planar_scan, truth in drive(office(), [(1.5, 7.0), (9.5, 7.0), (9.5, 4.0)]):
+        whole.add(registered, planar_scan)
+        end = truth
+    last.add(registered, planar_scan)
+    catalogue = Catalogue.of()
+    pair = next(pair for pair in catalogue.pairs if (pair.query, pair.map) == ("wean 1", "wean 2"))
+    window = Window(pair, TimeSpan(0.0, 20.0), whole.map(), last.map(), {"office": end}, True)
+    asked = list(
+        rows(window, building({"office": office()}), ("fr079", building({"other": OTHER})), catalogue)
+    )
+    assert [(row["place"], row["map"]) for row in asked] == [
+        ("in the map", "wean"),
+        ("elsewhere", "fr079"),
+        ("in the map", "wean"),
+        ("blanked", "wean"),
+    ]
+    inside, elsewhere, standing, blanked = asked
+    assert inside["errors"][0][0] < 0.1 and inside["travel_m"] > 10.0
+    assert standing["travel_m"] == 0.0 and len(standing["evidence"][0]["tail"]) == 1
+    assert len(inside["evidence"][0]["tail"]) > 50  # a scan every 0.1 m
+    assert all(error_m == math.inf for error_m, _ in elsewhere["errors"])
+    assert all(error_m > 0.5 for error_m, _ in blanked["errors"])
+    known = {answered.kind: answered.known for answered in of_rows([inside, elsewhere])}
+    assert known["laser log in its own building"].first == 0
+    assert known["laser log in another building"].first is None
+    assert known["laser log in another building"].buildings == {"wean", "fr079"}
