@@ -307,13 +307,13 @@ def _by_last_metres(
     """The first of the shorter queries that is located, with its verdict; the query itself if none is.
 
     A stretch through rooms that the map lacks or shows otherwise spoils the whole query, even after the robot
-    is back. That only the last metres lie in this map is less probable beforehand, and each further attempt
-    may be wrong, so the odds of the n-th one are 1 / n.
+    is back. The odds of the n-th attempt are 1 / n^2 beforehand: 1 / n, because each further attempt may be
+    wrong, and 1 / n again, because a query of which only the last metres lie in this map is rarer.
     """
     for attempts, shorter in enumerate(last_metres, start=2):
-        found = index.look_up(shorter, verdict.hypotheses)
-        if index.judge(shorter, found, 1.0 / attempts).status == "located":
-            by_last = index.decide(shorter, found, 1.0 / attempts)
+        found, odds = index.look_up(shorter, verdict.hypotheses), attempts**-2
+        if index.judge(shorter, found, odds).status == "located":
+            by_last = index.decide(shorter, found, odds)
             if by_last.status == "located":
                 return shorter, by_last
     return query, verdict

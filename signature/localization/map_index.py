@@ -41,6 +41,7 @@ from signature.localization.posterior import (
     evidence_of,
     in_the_map,
     masses,
+    off_map,
     tail_of,
 )
 from signature.localization.prior import PRIOR, Prior
@@ -75,9 +76,6 @@ class AlikeFloors:
 ALIKE_FLOORS = AlikeFloors()
 _KEEP = 0.6
 """Hypotheses scoring below this share of the best are dropped: a place so far behind has no mass."""
-_BEYOND_M = 3.0
-"""A robot is found no farther than this beyond the ground that a map knows. By hand: of 300 right answers to
-real recordings the farthest is 2.6 m beyond it."""
 SEARCHED = 0.9
 """Whole maps are searched for what reaches this share of the best coarse score: takes half as long as 0.8."""
 _COMPARED = 5
@@ -338,7 +336,12 @@ class MapIndex:
         self, query: QueryMap, places: list[list[Hypothesis]], rivals: list[Fit]
     ) -> tuple[list[Evidence], list[list[Hypothesis]]]:
         """What tells for each place, and the places, both by mass; what the last scans tell, of the first."""
-        told = evidence_of([place[0].fit for place in places], query, rivals)
+        told = [
+            replace(one, off_map=off_map(query, h.fit, self.maps[h.session_index].field))
+            for one, (h, *_) in zip(
+                evidence_of([place[0].fit for place in places], query, rivals), places, strict=True
+            )
+        ]
         by_mass = sorted(zip(told, places, strict=True), key=lambda known: -known[0].log_odds())
         evidence, ordered = [one for one, _ in by_mass], [place for _, place in by_mass]
         best = ordered[0][0]
@@ -410,12 +413,8 @@ class MapIndex:
         return self.judge(query, found, odds)
 
     def _worth_keeping(self, found: tuple[Hypothesis, ...], query: QueryMap) -> tuple[Hypothesis, ...]:
-        """Best first, what lies on the map and scores enough beside the best one; what a prior excludes is
-        kept beside it."""
-        known = [
-            h for h in found if self._knows_ground(h.session_index, h.fit.T_map_query @ query.T_odom_base)
-        ]
-        distinct_ones = distinct(known, query.T_odom_base)
+        """Best first, what scores enough beside the best one; what a prior excludes is kept beside it."""
+        distinct_ones = distinct(found, query.T_odom_base)
         inside = {id(h) for h in self.allowed(distinct_ones, query)}
         groups = (
             [h for h in distinct_ones if id(h) in inside],
@@ -426,11 +425,6 @@ class MapIndex:
             floor = _KEEP * group[0].fit.score if group else 0.0
             kept += [h for h in group if h.fit.score >= floor][: self.config.hypotheses]
         return tuple(sorted(kept, key=lambda h: -h.fit.score))
-
-    def _knows_ground(self, session: int, T_map_base: SE2) -> bool:
-        """Whether a map knows free ground around the base; where it knows none is no place of it."""
-        around = self.grids[session].crop((T_map_base.x, T_map_base.y), _BEYOND_M)
-        return bool(around.free.any())
 
     def _places(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> list[list[Hypothesis]]:
         """The hypotheses by place, best first; a place has one hypothesis a session."""

@@ -5,8 +5,9 @@
     nowhere  =  1 / N                                        it lies at no place of this map
     N        =  1 + sum_h prior(h) exp(z_h) (1 + sum_k s exp(-c r_hk))
 
-    z_h = b + c (f_h + g_h) + d t_h,    f = l(a_f) n_f / (n_f + few_f),    g = l(a_b) n_b / (n_b + few_b)
-    l(a) = ln a - ln(1.2 - a),          t = min(score - rival, q score) sqrt(min(n_f, most) (1 - like^2))
+    z_h = b + c (f_h + g_h) + d t_h - e u_h
+    f = l(a_f) n_f / (n_f + few_f),    g = l(a_b) n_b / (n_b + few_b),    l(a) = ln a - ln(1.2 - a)
+    t = min(score - rival, q score) sqrt(min(n_f, most) (1 - like^2))
 
 - f and g are the log-likelihood of the wall points of the query on ground that the map knows, and of the
   map's on ground that the query knows, as log-odds against a wrong place, where 0.6 agree. Divided by
@@ -16,6 +17,8 @@
   another place fits nearly so well: then such a fit is nothing special. The score (`two_way_score`) is a
   mean, which varies by chance as 1 / sqrt(n). No lead counts as longer than the share q of the score: what
   scores less is not searched for, so there may always be a rival so near.
+- u, the share of the scans that were taken where the map knows nothing: a robot that is in the map has
+  mostly driven where it knows the ground, and what lies beside a map fits at many places along its edge.
 - like, how well the query fits onto itself, slid along (`pc2grid.matching.self_likeness`): the walls of a
   bare corridor tell no place along it from another.
 - r_hk, the log-likelihood of the scans from k on, f of these alone: where tracking slips, the scans before
@@ -24,8 +27,8 @@
 `located` means that one place has at least the mass `RelocalizeConfig.accept`; `not_found`, that the query
 more likely than not is at no place of the map, `ambiguous` all else.
 
-`pc2grid_lab.experiments.calibration` fits b, c, d and s to queries whose truth is known, and judges them on
-buildings that were left out.
+`pc2grid_lab.experiments.calibration` fits b, c, d, e and s to queries whose truth is known, and judges them
+on buildings that were left out.
 """
 
 from __future__ import annotations
@@ -51,7 +54,7 @@ FITTED_ON = frozenset(
 class PosteriorParameters:
     """What the equation above is made of.
 
-    bias, fit, lead, slip : b, c, d and s.
+    bias, fit, lead, off_map, slip : b, c, d, e and s.
     few_walls, few_looked_at : few_f and few_b, wall points (0.1 m apart, by weight). Chosen by hand; from
         half to twice of it the likelihood is as high.
     most_walls : most; more do not make a lead surer, as what has been moved and similar rooms do not average
@@ -64,10 +67,11 @@ class PosteriorParameters:
         `ambiguous`, not `not_found`.
     """
 
-    bias: float = -5.67
-    fit: float = 2.76
-    lead: float = 4.39
-    slip: float = 0.0005
+    bias: float = -5.07
+    fit: float = 2.66
+    lead: float = 4.49
+    off_map: float = 2.30
+    slip: float = 0.0006
     few_walls: float = 30.0
     few_looked_at: float = 100.0
     most_walls: float = 300.0
@@ -91,6 +95,7 @@ class Evidence:
     lead : score less that of the best other place, at most `longest_lead` of it. apart : the same, but places
     that fit equally well do not count as others.
     likeness : `pc2grid.matching.self_likeness` of the query.
+    off_map : u, share of the scans that were taken where the map knows nothing, 0..1; 0 of a drawn map.
     tail : r_k, log-likelihood of the scans from the k-th one on, the last one first.
     """
 
@@ -101,6 +106,7 @@ class Evidence:
     lead: float
     apart: float
     likeness: float
+    off_map: float = 0.0
     tail: tuple[float, ...] = ()
 
     @property
@@ -116,9 +122,9 @@ class Evidence:
         return forward + tempered(self.backward, self.looked_at, p.few_looked_at)
 
     @property
-    def terms(self) -> tuple[float, float, float]:
-        """What b, c and d are multiplied with."""
-        return 1.0, self.log_likelihood, self.lead * self._sharpness
+    def terms(self) -> tuple[float, float, float, float]:
+        """What b, c, d and e are multiplied with."""
+        return 1.0, self.log_likelihood, self.lead * self._sharpness, -self.off_map
 
     @property
     def _sharpness(self) -> float:
@@ -128,7 +134,7 @@ class Evidence:
         """z: logarithm of the mass of the place over that of "nowhere"; minus infinity without walls."""
         if not self.walls:
             return -math.inf
-        return float(np.dot((p.bias, p.fit, p.lead), self.terms))
+        return float(np.dot((p.bias, p.fit, p.lead, p.off_map), self.terms))
 
     def log_odds_alike(self, p: PosteriorParameters = POSTERIOR) -> float:
         """z of the place or one that fits equally well."""
@@ -163,6 +169,14 @@ def evidence_of(fits: Sequence[Fit], query: QueryMap, rivals: Sequence[Fit] = ()
             )
         )
     return tuple(found)
+
+
+def off_map(query: QueryMap, fit: Fit, field: LikelihoodField) -> float:
+    """`Evidence.off_map` of a query at a pose on a map."""
+    if not query.keyframes:
+        return 0.0
+    path_m = np.array([(k.T_odom_base.x, k.T_odom_base.y) for k in query.keyframes])
+    return 1.0 - float(field.at(fit.T_map_query.apply(path_m))[1].mean())
 
 
 def alike(score: float, other: float) -> bool:

@@ -275,8 +275,8 @@ class Judged:
     ("whole", "shorter", "expected", "asked"),
     [
         (0.95, [0.99, 0.99], (0.95, 0.95), 0),
-        (0.5, [0.98, 0.99], (0.98, 0.49 / 0.51), 1),  # the second attempt: its odds count half
-        (0.5, [0.94, 0.99], (0.99, 0.33 / 0.34), 2),  # 0.94 is not enough for a second attempt
+        (0.5, [0.98, 0.99], (0.98, 0.245 / 0.265), 1),  # the second attempt: a quarter of its odds
+        (0.5, [0.94, 0.99], (0.99, 0.11 / 0.12), 2),  # 0.94 is not enough for a second attempt
         (0.5, [0.94, 0.96], (0.5, 0.5), 2),
         (0.5, [], (0.5, 0.5), 0),
     ],

@@ -83,7 +83,7 @@ def test_what_neither_side_knows_says_nothing() -> None:
 def test_a_place_where_fewer_points_agree_than_at_wrong_ones_speaks_against_itself() -> None:
     poor = replace(USUAL, forward=0.4, backward=0.4)
     assert poor.log_likelihood < 0.0 < USUAL.log_likelihood
-    assert mass(poor) < 0.6 < 0.9 < mass(USUAL)
+    assert mass(poor) < 0.9 < mass(USUAL)
 
 
 def test_a_lead_says_the_less_the_more_the_query_is_like_itself() -> None:

@@ -61,15 +61,15 @@ def ask(scans: list[tuple[RegisteredScan, PlanarScan]], index: MapIndex) -> Answ
 
 def test_a_place_that_the_proposals_lack_is_found_before_the_answer_is_certain() -> None:
     """The wrong place, half a turn and 8 m off, scores 0.85; the right one 0.88, by 1.05 in the coarse
-    search."""
+    search. So near a rival need not be located, but the right place comes first."""
     path, truth = data("laser/csail.mcap"), read_tum(data("laser/csail_corrected.tum"))
     with open_log(path) as log:
         index = map_of(log.scans(0.0, 250.0), truth)
         answer = ask(list(follow(islice(log.scans(326.6, 5.0), 6), CONFIG)), index)
         last = list(islice(log.scans(326.6, 5.0), 6))[-1]
     expected = true_pose(truth, last)
-    assert answer.status == "located" and answer.T_map_base is not None and expected is not None
-    pose = answer.T_map_base
+    assert answer.status != "not_found" and expected is not None
+    pose = answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base
     assert math.dist((pose.x, pose.y), (expected.x, expected.y)) < 0.1
     assert abs(math.remainder(pose.yaw - expected.yaw, 2.0 * math.pi)) < math.radians(2.0)
 

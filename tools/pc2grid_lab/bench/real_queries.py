@@ -37,7 +37,7 @@ from signature.config import Config
 from signature.describe import describe
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import evidence_of, tail_of
+from signature.localization.posterior import evidence_of, off_map, tail_of
 from signature.localization.query import Query, QueryMap
 from signature.localization.same_place import unseen_by
 from signature.similarity import SignatureTable
@@ -150,10 +150,13 @@ def _looks(
 
 def evidence_list(index: MapIndex, query: QueryMap, found: tuple[Hypothesis, ...]) -> list[dict[str, Any]]:
     """What tells for each hypothesis, and for the best one, what its last scans tell."""
-    evidence = list(evidence_of([h.fit for h in found], query))
+    fields = [index.maps[h.session_index].field for h in found]
+    evidence = [
+        replace(one, off_map=off_map(query, h.fit, field))
+        for one, h, field in zip(evidence_of([h.fit for h in found], query), found, fields, strict=True)
+    ]
     if found:
-        field = index.maps[found[0].session_index].field
-        evidence[0] = replace(evidence[0], tail=tail_of(query, found[0].fit, field))
+        evidence[0] = replace(evidence[0], tail=tail_of(query, found[0].fit, fields[0]))
     return [asdict(one) for one in evidence]
 
 
