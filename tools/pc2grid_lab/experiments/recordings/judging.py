@@ -121,11 +121,11 @@ class Judge:
         """
         query, map_ = (self._catalogue.recordings[name] for name in (pair.query, pair.map))
         if pair.kind == "elsewhere":
-            yield from ((one.span, {}, False) for one in self._asked(pair))
+            yield from ((one.span, {}, False) for one in self._located_windows(pair))
             return
-        _, asked, frames = self._frames(pair, query, map_)
+        _, windows, frames = self._frames(pair, query, map_)
         grids = self._grids_of(pair.map_name)
-        for one in asked:
+        for one in windows:
             expected = _expected(one, frames)
             if expected:
                 poses = {session: pose for session, (pose, _) in expected.items()}
@@ -314,7 +314,7 @@ def _judged(one: LocatedWindow, frames: Frames, grids: Mapping[str, OccupancyGri
     return QueryRow(**row, covered=_covered(one, expected, grids), **_best(one.places, expected))
 
 
-def _expected(one: Asked, frames: Frames) -> dict[str, tuple[SE2, float]]:
+def _expected(one: LocatedWindow, frames: Frames) -> dict[str, tuple[SE2, float]]:
     """Where the base is at the end of a window, by session of the map, and how far a right answer may be."""
     if one.where is None:
         return {}
@@ -327,7 +327,7 @@ def _expected(one: Asked, frames: Frames) -> dict[str, tuple[SE2, float]]:
 
 
 def _covered(
-    one: Asked, expected: Mapping[str, tuple[SE2, float]], grids: Mapping[str, OccupancyGrid]
+    one: LocatedWindow, expected: Mapping[str, tuple[SE2, float]], grids: Mapping[str, OccupancyGrid]
 ) -> bool:
     return any(
         known_share(grids[session], T_map_base.apply(one.hits_m)) >= JUDGEMENT.mapped
