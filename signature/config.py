@@ -136,22 +136,15 @@ class RelocalizeConfig(Section):
     step_m: float = Field(1.0, gt=0, description="metres of travel between two searches of the database")
     views: int = Field(8, gt=0, description="number of views that describe a query, along its path")
     view_spacing_m: float = Field(1.2, gt=0, description="least distance of two views")
-    all_places: int = Field(
-        10_000, ge=0, description="in a database of up to so many places, the isovists of all are compared"
-    )
     shortlist: int = Field(
-        400,
-        gt=0,
-        description="in a larger one, so many places are selected for each view, by signatures and isovists",
+        50, gt=0, description="at least so many places are selected for a query, by their signatures"
     )
+    shortlist_share: float = Field(
+        0.05, ge=0, le=1, description="of many places, this share is selected; only these are verified"
+    )
+    shortlist_most: int = Field(3200, gt=0, description="but no more than so many")
     select_by: SelectBy = Field(
         "seen", description="signatures of what was seen, hidden rays left out; paper: Eq. 6"
-    )
-    signature_weight: float = Field(
-        0.0,
-        ge=0,
-        description="weight of the signatures relative to the isovists there; 0, at which most queries of 1 "
-        "to 3 m were right: the signatures select places, the isovists decide",
     )
     top_k: int = Field(50, gt=0, description="placements that retrieval passes to alignment")
     coarse_floor: float = Field(

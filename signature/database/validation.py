@@ -16,7 +16,7 @@ from pc2grid.io.messages.types import FARTHEST_M
 from pc2grid.model import POINT_STEPS, Loop, OccupancyGrid, PointMap, Trajectory
 from signature.boundary import boundary_bins
 from signature.freespace import freespace_bins
-from signature.seen_places import PROFILE_BEARINGS, SIGNATURE_COLUMNS
+from signature.seen_places import SIGNATURE_COLUMNS
 
 if TYPE_CHECKING:
     from pc2grid.submaps.junction_graph import GraphArrays
@@ -96,7 +96,7 @@ def check_grid(grid: OccupancyGrid) -> None:
         raise ValueError("a cell outside -1..100")
 
 
-def check_near(points_m: F64, what: str) -> None:
+def check_near(points_m: F64 | F32, what: str) -> None:
     """Points (N, 2 or 3) are at plausible coordinates."""
     far = (np.abs(points_m) > FARTHEST_M).any(axis=1)
     if far.any():
@@ -178,11 +178,15 @@ def check_points(points: PointMap | None) -> None:
         raise ValueError(f"voxel {int(back.argmax()) + 1} is not after the one before")
 
 
-def check_seen(seen: SeenPlaces) -> None:
-    """What is seen from places has the rays and columns that queries are compared by."""
-    rays, columns = seen.ranges.shape[1], seen.signatures.shape[1]
-    if (rays, columns) != (PROFILE_BEARINGS, SIGNATURE_COLUMNS):
-        raise ValueError(f"isovists of {rays} rays and {columns} columns")
+def check_seen(seen: SeenPlaces, places: int) -> None:
+    """What is seen from places has the columns that queries are compared by; each of the places has a
+    viewpoint, and they are in order."""
+    columns = seen.signatures.shape[1]
+    if columns != SIGNATURE_COLUMNS:
+        raise ValueError(f"signatures of {columns} columns")
+    check_near(seen.at_m, "viewpoint")
+    if not np.array_equal(np.unique(seen.place), np.arange(places)) or (np.diff(seen.place) < 0).any():
+        raise ValueError(f"viewpoints that do not belong to {places} places, in their order")
 
 
 def check_histograms(histograms: F32, what: str) -> None:

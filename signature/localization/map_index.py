@@ -176,12 +176,9 @@ class MapIndex:
         if is_large and not by_paper:
             table = table.without_histograms()
         made_with = database.config()
-        selects = not by_paper and (is_large or len(table) > config.relocalize.all_places)
-        index = MapIndex(
-            grids, table, made_with, config, labels, areas_m2, stored if selects else lambda name: None
-        )
+        index = MapIndex(grids, table, made_with, config, labels, areas_m2, stored)
         index.points_of = points_reader(database)
-        if not selects:
+        if by_paper:
             return index
         with observer.step("prepare places"):
             index.places.index(observer.on_progress)

@@ -34,16 +34,14 @@ class RecognitionParameters:
     """Numbers of place recognition within a session, chosen by the time of `convert` on killian (1.9 km).
 
     views : places of a stretch that are described. They are both what is asked and what is asked for.
-    all_places : up to so many earlier places are all compared by their isovists.
-    shortlist : of more, so many for each view are, those that are nearest by their signatures.
+    shortlist : so many earlier places are compared with it, those that are likeliest by their signatures.
     placements : placements that are aligned.
     maps : prepared maps of earlier stretches that stay in memory, about 4 MB each.
     least : hypotheses that are less probable are not reported.
     """
 
     views: int = 12
-    all_places: int = 500
-    shortlist: int = 100
+    shortlist: int = 10
     placements: int = 30
     maps: int = 16
     least: float = 0.3
@@ -70,7 +68,7 @@ class SessionRecognizer:
             update={
                 "views": parameters.views,
                 "shortlist": parameters.shortlist,
-                "all_places": parameters.all_places,
+                "shortlist_share": 0.0,
                 "top_k": parameters.placements,
             }
         )

@@ -1,4 +1,4 @@
-"""Compiled twins of the comparisons of isovists."""
+"""Compiled twins of the comparisons of viewpoints and isovists."""
 
 from __future__ import annotations
 
@@ -56,35 +56,36 @@ def compare_rotated(
 
 
 @numba.njit(cache=True, nogil=True)
-def compare_beside(
-    turned: NDArray[np.uint8],
-    ranges: NDArray[np.uint8],
-    shift: I64,
-    beside: I64,
-    width: int,
-    doubt: float,
-    out: F64,
+def best_headings(
+    scores: F32,
+    squares: F32,
+    block: NDArray[np.int32],
+    low: I64,
+    shape: I64,
+    first: I64,
+    at: NDArray[np.int32],
+    viewpoint: I64,
+    view: I64,
+    steps: F64,
+    out: F32,
 ) -> None:
-    """Twin of `place_index.plain_likeness_beside`, into `out` (C, V).
-
-    turned (V, B, B) : ranges of each view at each rotation. 255 stands for a hidden one.
-    """
-    placements, views = beside.shape
-    bearings = ranges.shape[1]
-    full, unseen = np.int16(width), np.int16(255)
-    for placement in range(placements):
-        for view in range(views):
-            if beside[placement, view] < 0:
-                continue
-            place = ranges[beside[placement, view]]
-            for turn in range(-1, 2):
-                mine = turned[view, (shift[placement] + turn) % bearings]
-                total, count = np.int16(0), np.int16(0)
-                for k in range(bearings):
-                    a, b = np.int16(mine[k]), np.int16(place[k])
-                    both = np.int16(a != unseen) & np.int16(b != unseen)
-                    total += both * max(np.int16(full - abs(np.int16(a - b))), np.int16(0))
-                    count += both
-                likeness = total / full / (count + doubt)
-                if likeness > out[placement, view]:
-                    out[placement, view] = likeness
+    """Twin of `place_index.plain_best_headings`, into `out` (P,)."""
+    headings, views = steps.shape[0], steps.shape[1]
+    for pose in range(len(viewpoint)):
+        here, own = viewpoint[pose], view[pose]
+        number = block[here]
+        rows, columns = shape[number, 0], shape[number, 1]
+        best = -np.inf
+        for heading in range(headings):
+            total = scores[here, own]
+            for other in range(views):
+                if other == own:
+                    continue
+                x = np.int64(np.rint(squares[here, 0] + steps[heading, own, other, 0])) - low[number, 0]
+                y = np.int64(np.rint(squares[here, 1] + steps[heading, own, other, 1])) - low[number, 1]
+                if 0 <= x < rows and 0 <= y < columns:
+                    beside = at[first[number] + x * columns + y]
+                    if beside >= 0:
+                        total += scores[beside, other]
+            best = max(best, total)
+        out[pose] = best

@@ -1,46 +1,36 @@
-"""The places of a database, each with the isovists of many viewpoints around it.
+"""The places of a database: which of them a query is compared with, and what is seen around those.
 
-Signatures change little within half a metre; isovists in a cluttered room change a lot. So a place has one
-signature and several viewpoints, close enough together for every view of a query to have one beside it.
-Isovists are computed when a place is first on a shortlist.
+Signatures of viewpoints select places. Only around these are isovists compared at every rotation, which says
+how the query lies there; they are computed when a place is first selected.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64, BoolGrid
+from pc2grid.arrays import F32, F64, I64
 from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.isovist import HIDDEN, look_around
 from signature.config import RelocalizeConfig, SignatureConfig
 from signature.retrieval.place_index import PlaceBlock, PlaceIndex
-from signature.retrieval.seen_index import SeenIndex
 from signature.retrieval.signature_index import Nearest, SignatureIndex, sessions_by_likeness
 from signature.retrieval.view import View
-from signature.seen_places import PROFILE_BEARINGS, SeenPlaces
+from signature.seen_places import LATTICE_M, PROFILE_BEARINGS, SeenPlaces
 from signature.similarity import SignatureTable
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 T = TypeVar("T")
 
-LATTICE_M = 0.4
-"""Distance of viewpoints: a view is at most 0.28 m from one of them, about the scale of `LIKENESS`."""
 AT_ONCE_M2 = 200_000.0
 """So much free floor is searched at once; of a larger database, the sessions that look likeliest. Chosen by
 the time of a look-up."""
-_KEPT_PLACES, _KEPT_GROUNDS = 50_000, 200
-"""Places whose viewpoints are kept, and sessions whose grounds are: 150 MB each, of floors of 40 x 60 m."""
-_AROUND_M = 1.2
-"""A viewpoint farther than this from every place is left out: places are 1 m apart by default."""
-_CLEARANCE_M = 0.2
-"""A viewpoint is at least so far from walls and unknown cells."""
+_KEPT_PLACES, _KEPT_SESSIONS = 50_000, 1000
+"""Places whose isovists are kept, and sessions whose viewpoints are: 0.5 MB each, of floors of 40 x 60 m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,11 +81,10 @@ class Viewpoints:
 
 @dataclass(frozen=True, slots=True)
 class Selected:
-    """The places, ascending, that are compared with a query; for each view those of them with the nearest
-    signatures; and the sessions that are searched, likeliest first."""
+    """The places, ascending, that are compared with a query, and the sessions that are searched, likeliest
+    first."""
 
     rows: I64
-    near: tuple[Nearest, ...]
     sessions: I64
 
 
@@ -104,7 +93,7 @@ class Places:
 
     table : their signatures. sight_m : length of the rays of their isovists.
 
-    The viewpoints of a place are computed when it is first selected, so that a large database answers its
+    The isovists around a place are computed when it is first selected, so that a large database answers its
     first question soon and places that are not asked for take no memory.
     """
 
@@ -129,16 +118,11 @@ class Places:
         self._index: PlaceIndex | None = None
         self._described: dict[int, SeenPlaces] = {} if fewer is None else dict(fewer._described)
         self._areas_m2 = np.asarray(areas_m2, np.float64)
-        self._grounds: dict[int, _Ground] = {} if fewer is None else dict(fewer._grounds)
         self._known: dict[int, tuple[F64, F32, NDArray[np.bool_]]] = (
             {} if fewer is None else dict(fewer._known)
         )
         self._last: tuple[I64, Viewpoints] | None = None
         self._selected: tuple[Sequence[View], RelocalizeConfig, Selected] | None = None
-
-    def may_all_be_compared(self, most: int) -> bool:
-        """Whether there are at most `most` places, and at most `AT_ONCE_M2` of free floor."""
-        return len(self.table) <= most and not self.is_large
 
     @property
     def is_large(self) -> bool:
@@ -146,9 +130,9 @@ class Places:
         return bool(self._areas_m2.sum() > AT_ONCE_M2)
 
     def select(self, views: Sequence[View], signature: SignatureConfig, config: RelocalizeConfig) -> Selected:
-        """The places to compare with a query, `config.shortlist` for each view, by `PlaceIndex.select`; by
-        Eq. 6 alone where `config.select_by` says so. The sessions are those of the places, in a large
-        database up to `AT_ONCE_M2`.
+        """The places to compare with a query, `shortlist_size` of them, by `PlaceIndex.select`; by Eq. 6
+        alone where `config.select_by` says so. The sessions are those of the places, in a large database up
+        to `AT_ONCE_M2`.
         """
         if self._selected is None or self._selected[0] is not views or self._selected[1] is not config:
             self._selected = views, config, self._select(views, signature, config)
@@ -157,18 +141,19 @@ class Places:
     def _select(
         self, views: Sequence[View], signature: SignatureConfig, config: RelocalizeConfig
     ) -> Selected:
-        session_index = self.table.session_index
+        session_index, most = self.table.session_index, shortlist_size(len(self.table), config)
         if config.select_by == "paper":
-            near = self.nearest_by_paper(views, config.shortlist, signature)
+            near = self.nearest_by_paper(views, max(1, most // max(1, len(views))), signature)
             rows = np.unique(np.concatenate([found.rows for found in near]))
             sessions = sessions_by_likeness(near, session_index)
         else:
-            near = self.index().nearest_to_each(views)
-            best = self.index().select(views, near, config.shortlist * len(views))
+            best = self.index().select(views, most)
             rows, sessions = np.sort(best), _in_order(session_index[best])
+        if not self.is_large or not len(sessions):
+            return Selected(rows, sessions)
         areas_m2 = self._areas_m2[sessions]
         sessions = sessions[np.cumsum(areas_m2) <= max(AT_ONCE_M2, areas_m2[0])]
-        return Selected(rows, tuple(found.only(np.isin(found.rows, rows)) for found in near), sessions)
+        return Selected(rows[np.isin(session_index[rows], sessions)], sessions)
 
     def nearest_by_paper(
         self, views: Sequence[View], k: int, signature: SignatureConfig
@@ -178,36 +163,39 @@ class Places:
             self._paper = SignatureIndex.of(self.table)
         return self._paper.nearest_to_each([view.signature for view in views], k, signature)
 
-    def seen(self) -> SeenIndex:
-        """The places by the signatures of what was seen."""
-        return self.index().seen
-
     def index(self, on_progress: Callable[[float], None] = lambda share: None) -> PlaceIndex:
-        """The places by the signatures of what was seen and their isovists; made when first asked for.
+        """The viewpoints of all places with their signatures; made when first asked for.
 
         on_progress : is told the share of the places that is done.
         """
         if self._index is None:
-            self._index = PlaceIndex.of(self._blocks(on_progress), self.sight_m)
+            self._index = PlaceIndex.of(self.blocks(on_progress))
         return self._index
 
-    def described(self) -> PlaceBlock:
-        """What is seen from each place."""
-        return PlaceBlock.concatenated(list(self._blocks()))
+    def blocks(self, on_progress: Callable[[float], None] = lambda share: None) -> Iterator[PlaceBlock]:
+        """What is seen from the places of each session: as stored, or else computed from the map."""
+        starts = np.flatnonzero(np.diff(self.table.session_index, prepend=-1))
+        for begin in starts.tolist():
+            seen = self._seen(int(self.table.session_index[begin]))
+            on_progress((begin + len(np.unique(seen.place))) / len(self.table))
+            yield PlaceBlock(seen, begin)
+        on_progress(1.0)
 
-    def _blocks(self, on_progress: Callable[[float], None] = lambda share: None) -> Iterator[PlaceBlock]:
-        """What is seen from each place, session by session: as stored, or else computed from the map and
-        kept."""
-        session_index, centers_m = self.table.session_index, self.table.center_m
-        first = np.flatnonzero(np.diff(session_index, prepend=-1))
-        for begin, end in zip(first.tolist(), [*first[1:].tolist(), len(session_index)], strict=False):
-            session = int(session_index[begin])
-            seen = self._described.get(begin) or self._stored(session)
-            if seen is None or len(seen) != end - begin:
-                seen = SeenPlaces.of(self._grids[session], centers_m[begin:end], self.sight_m)
-                self._described[begin] = seen
-            on_progress(end / len(session_index))
-            yield PlaceBlock(seen, centers_m[begin:end], session_index[begin:end].astype(np.int64))
+    def _seen(self, session: int) -> SeenPlaces:
+        """What is seen from the places of a session; kept."""
+        if session not in self._described:
+            rows = self._rows(session)
+            seen = self._stored(session)
+            if seen is None or (len(seen) and seen.place[-1] >= rows.stop - rows.start):
+                seen = SeenPlaces.of(self._grids[session], self.table.center_m[rows], self.sight_m)
+            _forget(self._described, _KEPT_SESSIONS - 1)
+            self._described[session] = seen
+        return self._described[session]
+
+    def _rows(self, session: int) -> slice:
+        """The places of a session in the table, which are side by side."""
+        first, end = np.searchsorted(self.table.session_index, (session, session + 1))
+        return slice(int(first), int(end))
 
     def sessions(
         self, views: Sequence[View], signature: SignatureConfig, config: RelocalizeConfig
@@ -218,12 +206,10 @@ class Places:
         return self.select(views, signature, config).sessions.tolist() if views else []
 
     def around(self, rows: I64) -> Viewpoints:
-        """The viewpoints at the places `rows` (R,) of the table."""
+        """The viewpoints at the places `rows` (R,) of the table, with their isovists."""
         if self._last is not None and np.array_equal(self._last[0], rows):
             return self._last[1]
-        for row in rows.tolist():
-            if row not in self._known:
-                self._known[row] = self._look_around(row)
+        self._look_around(np.array([row for row in rows.tolist() if row not in self._known], np.int64))
         found = [self._known[row] for row in rows.tolist()]
         counts = np.array([len(at) for at, _, _ in found], np.int64)
         at_m, ranges_m, seen = (np.concatenate(part) for part in zip(*found, strict=True))
@@ -234,47 +220,24 @@ class Places:
         _forget(self._known, _KEPT_PLACES)
         return viewpoints
 
-    def _look_around(self, row: int) -> tuple[F64, F32, NDArray[np.bool_]]:
-        """Viewpoints of a place: its centre, and the points of a lattice over its map that it is nearest to.
-
-        Returns their positions (K, 2), ranges (K, B) and whether the ends of the rays are known (K, B).
-        """
-        center, session = self.table.center_m[row], int(self.table.session_index[row])
-        grid = self._grids[session]
-        if session not in self._grounds:
-            _forget(self._grounds, _KEPT_GROUNDS - 1)
-            self._grounds[session] = _Ground.of(grid, self.table, session)
-        ground = self._grounds[session]
-        steps = np.arange(np.floor(-_AROUND_M / LATTICE_M), np.ceil(_AROUND_M / LATTICE_M) + 1)
-        lattice = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-        points = (np.round(center / LATTICE_M) + lattice) * LATTICE_M
-        distance, owner = ground.places.query(points)
-        cells = grid.to_cell(points)
-        inside = ((cells >= 0) & (cells < grid.cells.shape)).all(axis=1)
-        inside &= (ground.rows[owner] == row) & (distance <= _AROUND_M)
-        inside[inside] = ground.roomy[cells[inside, 0], cells[inside, 1]]
-        at_m = np.concatenate((center[None], points[inside]))
-        ranges_m, ends = look_around(grid, at_m, self.sight_m, bearings=PROFILE_BEARINGS)
-        return at_m, ranges_m, ends != HIDDEN
+    def _look_around(self, rows: I64) -> None:
+        """Cast the rays at the viewpoints of places: positions (K, 2), ranges (K, B) and whether the ends of
+        the rays are known (K, B), for each."""
+        for session in np.unique(self.table.session_index[rows]).tolist():
+            seen, first = self._seen(session), self._rows(session).start
+            asked = np.sort(rows[self.table.session_index[rows] == session])
+            chosen = np.flatnonzero(np.isin(seen.place, asked - first))
+            at_m = seen.at_m[chosen].astype(np.float64)
+            ranges_m, ends = look_around(self._grids[session], at_m, self.sight_m, bearings=PROFILE_BEARINGS)
+            known = ends != HIDDEN
+            bounds = np.searchsorted(seen.place[chosen] + first, asked, side="left").tolist()
+            for row, begin, end in zip(asked.tolist(), bounds, [*bounds[1:], len(chosen)], strict=True):
+                self._known[row] = at_m[begin:end], ranges_m[begin:end], known[begin:end]
 
 
-@dataclass(frozen=True, slots=True)
-class _Ground:
-    """Where viewpoints of a session may lie, and which place each belongs to.
-
-    roomy : (H, W) cells with free cells around them. rows : (N,) its places. places : search tree of them.
-    """
-
-    roomy: BoolGrid
-    rows: I64
-    places: cKDTree
-
-    @staticmethod
-    def of(grid: OccupancyGrid, table: SignatureTable, session: int) -> _Ground:
-        from scipy.spatial import cKDTree
-
-        rows = np.flatnonzero(table.session_index == session)
-        return _Ground(_roomy(grid), rows, cKDTree(table.center_m[rows]))
+def shortlist_size(places: int, config: RelocalizeConfig) -> int:
+    """How many places are compared with a query."""
+    return max(config.shortlist, min(math.ceil(config.shortlist_share * places), config.shortlist_most))
 
 
 def _in_order(sessions: NDArray[np.int32]) -> I64:
@@ -287,11 +250,3 @@ def _forget(kept: dict[int, T], most: int) -> None:
     """Leave the `most` entries that were added last."""
     for key in list(kept)[: max(0, len(kept) - most)]:
         del kept[key]
-
-
-def _roomy(grid: OccupancyGrid) -> BoolGrid:
-    import cv2
-
-    n = round(_CLEARANCE_M / grid.resolution_m)
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * n + 1, 2 * n + 1))
-    return np.asarray(cv2.erode(grid.free.astype(np.uint8), kernel), bool)

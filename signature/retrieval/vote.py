@@ -1,13 +1,8 @@
-"""Which places of the database look like the query's views?
+"""How may the query lie at the places that its signatures selected?
 
-Three steps, each slower and better than the one before:
-
-1. in a large database, places are selected (`place_index`): by the three signatures of what was seen, which
-   contain no direction and are compared fast, and by one isovist of each place;
-2. at these places the ranges of the isovists are compared at every rotation, from many viewpoints; rays that
-   either side has not observed are left out;
-3. the best matches of each view are placements of the whole query. Each placement predicts where the other
-   views lie, and all views vote on it.
+Signatures say where, and little about the heading. So at the selected places the ranges of the isovists are
+compared at every rotation; rays that either side has not observed are left out. The best matches of each view
+are placements of the whole query. Each placement predicts where the other views lie, and all views vote.
 """
 
 from __future__ import annotations
@@ -22,7 +17,6 @@ from pc2grid.arrays import F32, F64, I64
 from pc2grid.submaps.isovist import HIDDEN
 from signature.config import RelocalizeConfig, SignatureConfig
 from signature.retrieval.likeness import peaks, rotate_and_compare
-from signature.retrieval.signature_index import Nearest
 from signature.retrieval.view import View
 from signature.retrieval.viewpoints import Places, Viewpoints
 
@@ -77,27 +71,19 @@ def retrieve(
     """The `top_k` (default `config.top_k`) most promising placements of the query, no two alike.
 
     views : of the query. base_m : (x, y) in the query's frame; placements are alike if they put this point
-    and the heading at the same place. rows : places to compare, instead of all or of those that the
-    signatures select.
+    and the heading at the same place. rows : places to compare, instead of those that the signatures
+    select.
 
     Ties are broken by order, so equal inputs give equal answers.
     """
     if not views or not len(places.table) or (rows is not None and not len(rows)):
         return ()
-    shortlists: Sequence[Nearest] = ()
-    if rows is not None:
-        pass
-    elif places.may_all_be_compared(config.all_places):
-        rows = np.arange(len(places.table))
-    else:
-        selected = places.select(views, signature, config)
-        rows, shortlists = selected.rows, selected.near
+    if rows is None:
+        rows = places.select(views, signature, config).rows
     stand = places.around(rows)
     ranges = np.stack([v.profile.ranges_m for v in views])
     seen = np.stack([v.profile.ends != HIDDEN for v in views])
     likeness = rotate_and_compare(ranges, seen, stand.ranges_m, stand.seen)
-    if shortlists and config.signature_weight > 0.0:
-        likeness *= _signature_weights(shortlists, rows, config.signature_weight)[:, None, stand.place]
     best = likeness.max(axis=1)
     mean = best.mean(axis=1, dtype=np.float64)
     spread = best.std(axis=1, dtype=np.float64) + VOTE.spread_floor
@@ -119,21 +105,6 @@ def retrieve(
         )
         for i in chosen
     )
-
-
-def _signature_weights(shortlists: Sequence[Nearest], rows: I64, sharpness: float) -> F32:
-    """(V, R) factor of the likeness of each view at each of the places `rows` by their signatures.
-
-    A place that is not on the shortlist of a view gets the weight of the last one on it.
-    """
-    weight = np.ones((len(shortlists), len(rows)), np.float32)
-    for view, shortlist in enumerate(shortlists):
-        if not len(shortlist.rows):
-            continue
-        apart = np.exp(-sharpness * (shortlist.scores - shortlist.mean) / max(shortlist.spread, 1e-12))
-        weight[view] = apart.min()
-        weight[view, np.searchsorted(rows, shortlist.rows)] = apart
-    return weight
 
 
 def _candidates(likeness: F32, best: F32) -> tuple[I64, I64]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pc2grid.arrays import F32
+from signature import seen_likelihood
 from signature.seen import parts
 from signature.seen_likelihood import (
     DIMENSIONS,
@@ -43,8 +44,11 @@ def test_bins_that_tell_places_apart_weigh_more_than_those_that_differ_by_the_se
     first = weights.matrix[:, :10]
     assert np.abs(first[:10]).max() > 10 * np.abs(first[10:]).max()
     queries, same = weights.of_queries(pairs.queries), weights.of_places(pairs.same)
-    # The difference at one place has unit variance along each direction.
-    assert np.var((queries - same)[:, :10], axis=0) == pytest.approx(np.ones(10), rel=0.15)
+    # The difference at one place and the ridge together have unit variance along each direction.
+    within, others = 2.0 * 0.1**2, 2.0
+    ridge = seen_likelihood._RIDGE * (10 * within + (COLUMNS - 10) * others) / COLUMNS
+    expected = np.full(10, within / (within + ridge))
+    assert np.var((queries - same)[:, :10], axis=0) == pytest.approx(expected, rel=0.15)
     # The right one of 3,000 is the nearest.
     nearest = ((queries[:100, None] - same[None]) ** 2).sum(axis=2).argmin(axis=1)
     assert np.mean(nearest == np.arange(100)) > 0.9

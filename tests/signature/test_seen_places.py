@@ -1,4 +1,4 @@
-"""What is seen from places, in 8 bits a number."""
+"""What is seen from the viewpoints of places, in 8 bits a number."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import pytest
 from pc2grid.submaps.isovist import HIDDEN, look_around
 from signature.seen import seen_signatures
 from signature.seen_places import (
+    AROUND_M,
+    LATTICE_M,
     PROFILE_BEARINGS,
-    RANGE_UNITS,
     SIGNATURE_COLUMNS,
-    UNSEEN,
     SeenPlaces,
-    in_units,
+    viewpoints_of,
 )
 from tests.helpers.simulated_drives import office
 
@@ -21,30 +21,41 @@ SIGHT_M = 5.0
 CENTERS_M = np.array([(x, y) for x in (1.5, 5.0, 9.0) for y in (2.0, 6.5)])
 
 
-def test_ranges_and_signatures_are_those_of_the_isovists_but_for_rounding() -> None:
+def test_signatures_are_those_of_the_isovists_but_for_rounding() -> None:
     grid = office().crop((6.0, 5.0), 4.5)
     seen = SeenPlaces.of(grid, CENTERS_M, SIGHT_M)
-    ranges_m, ends = look_around(grid, CENTERS_M, SIGHT_M, bearings=PROFILE_BEARINGS)
-    hidden = ends == HIDDEN
-    assert hidden.any() and not hidden.all()
-    assert np.array_equal(seen.ranges == UNSEEN, hidden)
-    step_m = SIGHT_M / RANGE_UNITS
-    np.testing.assert_allclose(seen.ranges[~hidden] * step_m, ranges_m[~hidden], atol=0.5 * step_m + 1e-5)
-    signatures = seen_signatures(ranges_m, ends, SIGHT_M)
-    assert seen.signatures.shape == (len(CENTERS_M), SIGNATURE_COLUMNS)
-    np.testing.assert_allclose(seen.shares, signatures, atol=0.5 / 255 + 1e-6)
+    at_m = seen.at_m.astype(np.float64)
+    ranges_m, ends = look_around(grid, at_m, SIGHT_M, bearings=PROFILE_BEARINGS)
+    assert (ends == HIDDEN).any() and not (ends == HIDDEN).all()
+    assert seen.signatures.shape == (len(seen), SIGNATURE_COLUMNS)
+    np.testing.assert_allclose(seen.shares, seen_signatures(ranges_m, ends, SIGHT_M), atol=0.5 / 255 + 1e-6)
 
 
-def test_the_longest_range_is_not_taken_for_a_hidden_one() -> None:
-    assert in_units(np.array([[0.0, 5.0, 5.02]], np.float32), 5.0).tolist() == [[0, 254, 254]]
+def test_viewpoints_are_a_lattice_on_free_ground_around_each_place() -> None:
+    grid = office()
+    at_m, place = viewpoints_of(grid, CENTERS_M)
+    squares = at_m / LATTICE_M
+    np.testing.assert_allclose(squares, np.rint(squares), atol=1e-4)
+    cells = grid.to_cell(at_m.astype(np.float64))
+    assert grid.free[cells[:, 0], cells[:, 1]].all()
+    apart = np.hypot(*(at_m[:, None] - CENTERS_M[None]).transpose(2, 0, 1))
+    assert np.array_equal(place, apart.argmin(axis=1)) and apart.min(axis=1).max() <= AROUND_M + 1e-6
+    assert np.array_equal(np.unique(place), np.arange(len(CENTERS_M))) and (np.diff(place) >= 0).all()
+    # A disc of 1.2 m has 28 squares of 0.4 m; walls are in the way of some.
+    assert 10 < np.bincount(place).mean() < 30
 
 
-def test_parts_make_the_whole() -> None:
+def test_a_place_without_room_is_its_own_viewpoint() -> None:
+    in_the_wall = np.array([[0.02, 3.33]])
+    at_m, place = viewpoints_of(office(), np.concatenate((CENTERS_M, in_the_wall)))
+    mine = at_m[place == len(CENTERS_M)]
+    assert len(mine) >= 1
+    at_m, place = viewpoints_of(office(), np.array([[-50.0, -50.0]]))
+    assert at_m.tolist() == [[-50.0, -50.0]] and place.tolist() == [0]
+    assert len(viewpoints_of(office(), np.empty((0, 2)))[0]) == 0
+
+
+def test_each_viewpoint_has_its_signatures() -> None:
     whole = SeenPlaces.of(office(), CENTERS_M, SIGHT_M)
-    joined = SeenPlaces.concatenated(
-        [SeenPlaces.of(office(), CENTERS_M[part], SIGHT_M) for part in (slice(0, 2), slice(2, None))]
-    )
-    assert np.array_equal(joined.ranges, whole.ranges) and np.array_equal(joined.signatures, whole.signatures)
-    assert len(joined) == len(CENTERS_M) and joined.sight_m == SIGHT_M
     with pytest.raises(ValueError):
-        SeenPlaces(sight_m=5.0, ranges=whole.ranges, signatures=whole.signatures[:2])
+        SeenPlaces(at_m=whole.at_m, place=whole.place, signatures=whole.signatures[:2])

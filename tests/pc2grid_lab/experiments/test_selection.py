@@ -18,19 +18,18 @@ from pc2grid_lab.compare import signatures as compare_signatures
 from pc2grid_lab.experiments.ablation import seen_independence
 from pc2grid_lab.experiments.selection import (
     ALL,
-    PAPER,
+    LOCATED_BY,
     RANDOM,
     SELECTORS,
+    SHUFFLED,
     SIGNATURES,
-    VOTED,
     Selection,
     SelectionTrial,
     tally,
 )
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from signature.localization.query import Query
-from signature.retrieval.place_index import PlaceBlock
-from signature.seen_places import SeenPlaces
+from signature.seen_places import SIGNATURE_COLUMNS, SeenPlaces
 from tests.helpers.json_schema import closed
 from tests.helpers.simulated_drives import building, drive, office, plan
 
@@ -56,28 +55,29 @@ def test_each_selector_looks_at_its_share_and_all_places_find_the_right_one() ->
     places = len(OFFICE.places.table)
     for selector, (looked_at, hit, located, right, processor_ms) in found.items():
         assert looked_at == places if selector == ALL else 0 < looked_at <= 0.3 * places + 1
-        assert (located is None) == (selector not in (ALL, VOTED, PAPER, RANDOM))
+        assert (located is None) == (selector not in LOCATED_BY)
         assert right is None or located or not right
         assert processor_ms > 0 and isinstance(hit, bool)
-    assert found[ALL][1] and found[VOTED][1] and found[SIGNATURES][1]
+    assert found[ALL][1] and found[SIGNATURES][1]
     assert found[ALL][3]
 
 
 def test_places_are_selected_without_locating_the_query() -> None:
     seen, T_map_query = query()
     selection = Selection(OFFICE, "building", 0.3)
-    rows = list(selection.measure(seen, T_map_query, (ALL, VOTED), locate=False))  # type: ignore[arg-type]
-    assert [row[0] for row in rows] == [ALL, VOTED]
+    rows = list(selection.measure(seen, T_map_query, (ALL, SIGNATURES), locate=False))  # type: ignore[arg-type]
+    assert [row[0] for row in rows] == [ALL, SIGNATURES]
     assert all(row[2] and row[3] is None and row[4] is None for row in rows)
 
 
-def made_up_floor(seed: int, _: object) -> PlaceBlock:
+def made_up_floor(seed: int, _: object) -> SeenPlaces:
     """500 places that look like nothing."""
-    rng, known = np.random.default_rng(seed), OFFICE.places.described().seen
-    signatures = rng.integers(200, 256, (500, known.signatures.shape[1]))
-    ranges = rng.integers(10, 255, (500, known.ranges.shape[1]))
-    seen = SeenPlaces(sight_m=known.sight_m, ranges=ranges, signatures=signatures)
-    return PlaceBlock(seen, rng.uniform(0, 20, (500, 2)), np.full(500, seed))
+    rng, columns = np.random.default_rng(seed), SIGNATURE_COLUMNS
+    return SeenPlaces(
+        at_m=rng.uniform(0, 20, (500, 2)).astype(np.float32),
+        place=np.arange(500),
+        signatures=rng.integers(200, 256, (500, columns)).astype(np.uint8),
+    )
 
 
 def test_a_query_from_elsewhere_is_not_counted() -> None:
@@ -128,10 +128,14 @@ def test_the_command_uses_what_it_has_stored(tmp_path: Path, monkeypatch: pytest
     jsonschema.validate(document, closed(schema("compare-signatures")))
     assert document["plans"] == ["a"] and (tmp_path / "signatures.png").stat().st_size > 10_000
     assert {row["scope"] for row in document["rows"]} == {"building", "city"}
-    nearly_all = [row for row in document["scale"] if row["share"] == 0.05 and row["travel_m"] == 8.0]
+    nearly_all = [
+        row
+        for row in document["scale"]
+        if row["share"] == 0.05 and row["travel_m"] == 8.0 and row["selector"] == SIGNATURES
+    ]
     assert nearly_all and all(row["found"][0] == 1.0 for row in nearly_all)
     assert {row["places"] for row in document["scale"]} == {2000}
-    assert {row["selector"] for row in document["scale"]} == {VOTED, SIGNATURES}
+    assert {row["selector"] for row in document["scale"]} == {SIGNATURES, SHUFFLED, RANDOM}
     monkeypatch.setattr(compare_signatures, "_select", None)  # nothing is selected again
     assert json.loads(CliRunner().invoke(app, arguments).stdout)["rows"] == document["rows"]
     table = CliRunner().invoke(app, [a for a in arguments if a != "--json"])

@@ -88,7 +88,7 @@ def read_all(file: maintenance.Place) -> dict[str, str]:
             digest.update(repr(database.loops(info.name)).encode())
             digest.update(repr(database.graph(info.name).edges(data=True)).encode())
             seen = database.seen_places(info.name)
-            digest.update(seen.ranges.tobytes() + seen.signatures.tobytes())
+            digest.update(seen.place.tobytes() + seen.signatures.tobytes())
             points = database.points(info.name)
             digest.update(b"" if points is None else points.points_m().tobytes())
             for submap in database.submaps(info.name):
@@ -494,7 +494,7 @@ GONE = {
     "loops.T_older_newer.yaw": lambda database: database.loops("monday"),
     "graph.kind": lambda database: database.graph("monday"),
     "points.steps": lambda database: database.points("monday"),
-    "seen.ranges": lambda database: database.seen_places("monday"),
+    "seen.place": lambda database: database.seen_places("monday"),
     "submaps.boundary": lambda database: list(database.submaps("monday")),
 }
 
@@ -521,7 +521,7 @@ def test_an_array_that_is_gone_is_missed_by_name(path: Path, tmp_path: Path, eng
         assert_holds(database, make_entry("tuesday", 1, submaps=5))
 
 
-@pytest.mark.parametrize("name", ["document", "loops.newer", "graph.kind", "points.steps", "seen.ranges"])
+@pytest.mark.parametrize("name", ["document", "loops.newer", "graph.kind", "points.steps", "seen.place"])
 def test_merging_takes_nothing_from_a_damaged_file(path: Path, tmp_path: Path, name: str) -> None:
     other, target = tmp_path / "other.submaps", tmp_path / "target.submaps"
     store(other, [make_entry("friday", 5)], keep=False)
@@ -589,7 +589,7 @@ def test_what_follows_from_the_map_is_made_again(path: Path, tmp_path: Path, eng
         (2, "submaps.center_m"),
         (2, "submaps.boundary"),
         (2, "graph.edges"),
-        (2, "seen.ranges"),
+        (2, "seen.place"),
         (3, "points.steps"),
         (3, "seen.signatures"),
     ):
@@ -600,7 +600,7 @@ def test_what_follows_from_the_map_is_made_again(path: Path, tmp_path: Path, eng
     with open_database(good) as database:
         assert [info.name for info in database.sessions()] == ["house", "tuesday"]
         assert_holds(database, entry)
-        assert np.array_equal(database.seen_places("house").ranges, before.ranges)
+        assert np.array_equal(database.seen_places("house").signatures, before.signatures)
         tuesday = make_entry("tuesday", 1, submaps=5)
         assert_holds(database, (dataclasses.replace(tuesday[0], points=None), *tuesday[1:]))
 

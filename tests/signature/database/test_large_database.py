@@ -57,8 +57,8 @@ class _Counted(Mapping[str, OccupancyGrid]):
         return len(MAPS)
 
 
-FEW = Config(relocalize=RelocalizeConfig(shortlist=1))
-"""The best eight places are compared, one for each view."""
+FEW = Config(relocalize=RelocalizeConfig(shortlist=8, shortlist_share=0.0))
+"""The best eight places are compared."""
 
 
 def test_few_maps_are_read_and_the_answer_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,7 +153,7 @@ def test_places_are_selected_by_what_is_stored_and_computed_where_it_is_not(tmp_
     """A database of more places than are all compared, of which only a share is selected."""
     file, copied = tmp_path / "damaged.submaps", tmp_path / "copied.submaps"
     store_maps(file, MAPS)
-    settings = ALL.made_with.relocalize.model_copy(update={"all_places": 0, "shortlist": 2})
+    settings = ALL.made_with.relocalize.model_copy(update={"shortlist": 16, "shortlist_share": 0.0})
     config = ALL.made_with.model_copy(update={"relocalize": settings})
     sql(file, "DELETE FROM \"array\" WHERE name LIKE 'seen.%'")
     maintenance.copy(file, copied, recover=True)
@@ -175,12 +175,11 @@ def test_damage_to_what_is_seen_costs_no_answer(tmp_path: Path) -> None:
     file = tmp_path / "x.submaps"
     store_maps(file, {"office": MAPS["office"]})
     sql(file, "UPDATE \"array\" SET crc32 = crc32 + 1 WHERE name LIKE 'seen.%'")
-    settings = ALL.made_with.relocalize.model_copy(update={"all_places": 0})
     with open_database(file) as database:
         assert database.leave_out_damaged() == ()
         with pytest.raises(DatabaseCorrupt, match="wrong checksum"):
             database.seen_places("office")
         news = News()
-        index = MapIndex.of(database, ALL.made_with.model_copy(update={"relocalize": settings}), news)
+        index = MapIndex.of(database, ALL.made_with, news)
         assert locate_map(PART, index).status == "located"
     assert len(news.warnings) == 1

@@ -331,7 +331,7 @@ def test_views_are_described_by_signatures_only_where_these_select(
 
     monkeypatch.setattr(query_module, "describe", counted)
     config = Config()
-    few = {"all_places": 10, "shortlist": 5, "select_by": select_by}
+    few = {"shortlist": 40, "shortlist_share": 0.0, "select_by": select_by}
     settings = config.model_copy(update={"relocalize": config.relocalize.model_copy(update=few)})
     index = MapIndex({"office": office()}, OFFICE.places.table, config, settings)
     answer, _ = ask(index, office(), ROUTE)

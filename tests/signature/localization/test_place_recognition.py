@@ -13,10 +13,11 @@ from signature.config import Config
 from signature.localization.place_recognition import RecognitionParameters, SessionRecognizer
 
 
-def rooms(seed: int, *, size_m: float = 9.0) -> OccupancyGrid:
-    """A furnished hall between walls, unlike that of any other seed; the origin lies in its middle."""
+def rooms(seed: int) -> OccupancyGrid:
+    """A furnished hall between walls, 0.8 m wider than that of the seed before; the origin lies in its
+    middle. (Halls of one outline are one place, as far as their walls go.)"""
     rng = np.random.default_rng(seed)
-    n = round(size_m / 0.05)
+    n = round((9.0 + 0.8 * seed) / 0.05)
     cells = np.full((n + 40, n + 40), UNKNOWN, np.int8)
     cells[20:-20, 20:-20] = FREE
     cells[[20, 21, -22, -21], 20:-20] = OCCUPIED

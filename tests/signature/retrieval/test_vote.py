@@ -62,25 +62,19 @@ def test_the_right_place_is_among_the_first_twenty(field_deg: float) -> None:
             assert max(abs(a.x - b.x), abs(a.y - b.y)) > 0.7 or turn > math.radians(14)
 
 
-def test_all_places_are_compared_unless_there_are_too_many() -> None:
+def test_isovists_are_compared_only_at_the_places_that_the_signatures_select() -> None:
     seen, _ = window([(1.5, 7.0), (9.5, 7.0)])
-    made_with = OFFICE.made_with
     query = seen.map()
-
-    def rows_compared(**changes: float) -> tuple[list[int], float]:
-        config = OFFICE.config.model_copy(update=changes)
+    for shortlist in (5, 20):
+        config = OFFICE.config.model_copy(update={"shortlist": shortlist, "shortlist_share": 0.0})
         base_m = (query.T_odom_base.x, query.T_odom_base.y)
-        found = retrieve(query.views, base_m, OFFICE.places, signature=made_with.signature, config=config)
+        found = retrieve(
+            query.views, base_m, OFFICE.places, signature=OFFICE.made_with.signature, config=config
+        )
+        selected = np.sort(OFFICE.places.index().select(query.views, shortlist))
         assert OFFICE.places._last is not None
-        return OFFICE.places._last[0].tolist(), found[0].likeness
-
-    every = list(range(len(OFFICE.places.table)))
-    few = {"all_places": 10, "shortlist": 5}
-    assert rows_compared(shortlist=5)[0] == every
-    assert rows_compared(shortlist=5) == rows_compared(shortlist=5, signature_weight=0.2)
-    assert 5 <= len(rows_compared(**few)[0]) < len(every)
-    assert rows_compared(**few) == rows_compared(**few, signature_weight=0.0)
-    assert rows_compared(**few)[1] != rows_compared(**few, signature_weight=0.2)[1]
+        assert np.array_equal(OFFICE.places._last[0], selected)
+        assert {proposal.row for proposal in found} <= set(selected.tolist())
 
 
 def test_every_view_has_a_viewpoint_beside_it_that_belongs_to_the_nearest_place() -> None:
@@ -90,7 +84,8 @@ def test_every_view_has_a_viewpoint_beside_it_that_belongs_to_the_nearest_place(
     cells = grid.to_cell(stand.at_m)
     assert grid.free[cells[:, 0], cells[:, 1]].all()
     apart = np.hypot(*(stand.at_m[:, None] - places.table.center_m[None]).transpose(2, 0, 1))
-    assert (apart[np.arange(len(apart)), stand.place] <= apart.min(axis=1) + 1e-9).all()
+    # Viewpoints are kept to a thousandth of a millimetre.
+    assert (apart[np.arange(len(apart)), stand.place] <= apart.min(axis=1) + 1e-5).all()
     rng = np.random.default_rng(0)
     on_the_way = rng.uniform((0.5, 6.6), (19.5, 7.4), (50, 2))
     found = stand.beside(on_the_way, np.zeros(50, np.int64))

@@ -28,16 +28,16 @@ from pc2grid.geometry import SE2
 from pc2grid_lab.experiments.ablation import independence, seen_independence
 from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.experiments.selection import (
+    SIGNATURES,
     TRAVELS_M,
-    VOTED,
     PlacedQuery,
     queries_of,
     recall_at_scale,
+    stored_floors,
     tally_at_scale,
 )
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from signature.config import Config
-from signature.retrieval.place_index import PlaceBlock
 from signature.seen_places import SeenPlaces
 
 PAIRS = (("lidar", "laser"), ("depth", "laser"), ("lidar", "depth"))
@@ -72,14 +72,11 @@ def rows_of(maps: dict[str, SensorMap]) -> Iterator[str]:
             yield f"| {' and '.join(pair)} | {names} | {whole} | {paper[names]:.3f} | {same:,} / {other:,} |"
 
 
-def floors_of(folder: Path) -> Iterator[PlaceBlock]:
-    """The places of office floors, a file at a time."""
+def floors_of(folder: Path) -> Iterator[SeenPlaces]:
+    """What is seen from the places of office floors, a file at a time."""
     for path in sorted(folder.glob("*.npz")):
         with np.load(path) as stored:
-            seen = SeenPlaces(
-                sight_m=Config().partition.radius_m, ranges=stored["ranges"], signatures=stored["signatures"]
-            )
-            yield PlaceBlock(seen, stored["center_m"], stored["session"])
+            yield from stored_floors(stored)
 
 
 def stretches_of(folder: Path) -> Iterator[PlacedQuery]:
@@ -96,7 +93,9 @@ def selected_rows(folder: Path, floors: Path) -> Iterator[str]:
     yield "|---|---|---|---|---|"
     own, stretches = maps_of(folder)["lidar"], list(stretches_of(folder))
     for least in (0.0, 0.5):
-        found = [r for r in recall_at_scale(own, floors_of(floors), stretches, least) if r.selector == VOTED]
+        found = [
+            r for r in recall_at_scale(own, floors_of(floors), stretches, least) if r.selector == SIGNATURES
+        ]
         for row in tally_at_scale(found):
             if row["query_sensor"] == "all":
                 share, low, high = row["found"]  # type: ignore[misc]

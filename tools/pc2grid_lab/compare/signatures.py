@@ -39,6 +39,7 @@ from pc2grid_lab.experiments.selection import (
     office_floor,
     queries_of,
     recall_at_scale,
+    stored_floors,
     tally,
     tally_at_scale,
     with_floors,
@@ -49,7 +50,6 @@ from pc2grid_lab.experiments.stored import write_arrays, write_text
 from signature.config import Config
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
-from signature.retrieval.place_index import PlaceBlock
 from signature.seen_likelihood import SeenStatistics
 from signature.seen_places import SeenPlaces
 from signature.sessions import add_sessions, provenance
@@ -280,32 +280,29 @@ def _describe_floors(out: Path, count: int, advance: Callable[[float], None]) ->
         if not path.exists():
             first = _FIRST_FLOOR_OF_SCALE + number * _FLOORS_AT_ONCE
             floors = [described_floor(first + k, Config()) for k in range(_FLOORS_AT_ONCE)]
-            block = PlaceBlock.concatenated(floors)
             write_arrays(
                 path,
-                ranges=block.seen.ranges,
-                signatures=block.seen.signatures,
-                center_m=block.center_m,
-                session=block.session,
+                at_m=np.concatenate([seen.at_m for seen in floors]),
+                place=np.concatenate([seen.place for seen in floors]),
+                signatures=np.concatenate([seen.signatures for seen in floors]),
+                floor=np.repeat(np.arange(len(floors)), [len(seen) for seen in floors]),
             )
         with np.load(path) as stored:
-            so_far += len(stored["session"])
+            so_far += sum(int(seen.place[-1]) + 1 for seen in stored_floors(stored))
         number += 1
         advance(min(so_far / count, 1.0))
 
 
-def _floors(out: Path, count: int) -> Iterator[PlaceBlock]:
-    """The first `count` places of `_describe_floors`, a block at a time."""
+def _floors(out: Path, count: int) -> Iterator[SeenPlaces]:
+    """The first floors of `_describe_floors`, until they have `count` places."""
     for number in itertools.count():
         with np.load(_block_file(out, number)) as stored:
-            columns = {name: stored[name][:count] for name in stored.files}
-        seen = SeenPlaces(
-            sight_m=Config().partition.radius_m, ranges=columns["ranges"], signatures=columns["signatures"]
-        )
-        yield PlaceBlock(seen, columns["center_m"], columns["session"])
-        count -= len(seen)
-        if count <= 0:
-            return
+            floors = list(stored_floors(stored))
+        for seen in floors:
+            yield seen
+            count -= int(seen.place[-1]) + 1
+            if count <= 0:
+                return
 
 
 def _select(

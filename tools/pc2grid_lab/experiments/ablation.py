@@ -196,7 +196,8 @@ def _seen_pairs(buildings: Sequence[Sequence[SensorMap]]) -> tuple[Rows, Rows]:
     for maps in buildings:
         for one in maps:
             places = one.index.places
-            mine, centers = places.described().seen.shares, places.table.center_m
+            centers = places.table.center_m
+            mine = _described(one, centers)
             a, b = np.nonzero(cdist(centers, centers) >= FAR_M)
             other.append((mine[a], mine[b], first + a))
             for two in maps:
@@ -205,13 +206,18 @@ def _seen_pairs(buildings: Sequence[Sequence[SensorMap]]) -> tuple[Rows, Rows]:
                 T_two_one = two.T_plan_map.inverse() @ one.T_plan_map
                 there = T_two_one.apply(centers)
                 free = np.array([_is_free(two.index.grids[0], point) for point in there], bool)
-                seen = look_around(two.index.grids[0], there[free], places.sight_m, bearings=PROFILE_BEARINGS)
-                theirs = seen_signatures(*seen, places.sight_m)
-                same.append((mine[free], theirs, first + np.flatnonzero(free)))
+                same.append((mine[free], _described(two, there[free]), first + np.flatnonzero(free)))
             first += len(centers)
     return tuple(
         tuple(np.concatenate(column) for column in zip(*rows, strict=True)) for rows in (same, other)
     )  # type: ignore[return-value]
+
+
+def _described(sensor_map: SensorMap, points_m: F64) -> F32:
+    """The signatures (N, C) of what is seen from points of a map."""
+    sight_m = sensor_map.index.places.sight_m
+    seen = look_around(sensor_map.index.grids[0], points_m, sight_m, bearings=PROFILE_BEARINGS)
+    return seen_signatures(*seen, sight_m)
 
 
 def _is_free(grid: OccupancyGrid, point_m: F64) -> bool:

@@ -16,11 +16,13 @@ from signature.config import Config
 from signature.localization.query import QueryMap, best_observed
 from signature.seen import seen_signatures
 from signature.seen_likelihood import Pairs
-from signature.seen_places import PROFILE_BEARINGS
+from signature.seen_places import PROFILE_BEARINGS, viewpoints_of
 
 _VIEWS = 16
 """Views of each query, closer together than those that are looked up."""
 _VIEW_SPACING_M = 0.6
+_EVERY = 3
+"""Viewpoints of other places: one of so many is as good as all."""
 _BESIDE_M = 0.3
 """The place of the map lies up to so far from the view along each axis: places are a metre apart."""
 
@@ -35,14 +37,15 @@ def pairs_of(
     """Views of queries, and what the maps show at the same points.
 
     queries : each with its true frame in the plan, and the maps of that plan. floors : maps of other
-    buildings.
+    buildings, taken at their viewpoints.
     """
     rng = np.random.default_rng(seed)
     sight_m = config.partition.radius_m
     closer = config.relocalize.model_copy(update={"views": _VIEWS, "view_spacing_m": _VIEW_SPACING_M})
 
-    def described(grid: OccupancyGrid, points_m: F64) -> F32:
-        return seen_signatures(*look_around(grid, points_m, sight_m, bearings=PROFILE_BEARINGS), sight_m)
+    def described(grid: OccupancyGrid, points_m: F64 | F32) -> F32:
+        at_m = points_m.astype(np.float64)
+        return seen_signatures(*look_around(grid, at_m, sight_m, bearings=PROFILE_BEARINGS), sight_m)
 
     found: list[F32] = []
     same: list[F32] = []
@@ -62,5 +65,8 @@ def pairs_of(
             if free.any():
                 found.append(views[free])
                 same.append(described(grid, there[free]))
-    other = [described(grid, submap_centers(grid, config.partition)) for grid in floors]
+    other = [
+        described(grid, viewpoints_of(grid, submap_centers(grid, config.partition))[0][::_EVERY])
+        for grid in floors
+    ]
     return Pairs(np.concatenate(found), np.concatenate(same), np.concatenate(other))

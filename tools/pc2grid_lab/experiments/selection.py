@@ -7,14 +7,15 @@ those it selects, and useful if more queries are located than with as many place
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from pc2grid.arrays import I64
@@ -32,20 +33,19 @@ from signature.database import open_database
 from signature.localization.map_index import MapIndex
 from signature.localization.query import Query, QueryMap
 from signature.retrieval.place_index import PlaceBlock, PlaceIndex
-from signature.retrieval.seen_index import SeenIndex
 from signature.retrieval.vote import retrieve
-from signature.seen_likelihood import COMBINATIONS, seen_weights
+from signature.seen_likelihood import COMBINATIONS, SeenWeights, Spread, seen_spread, seen_weights
 from signature.seen_places import SeenPlaces
 from signature.similarity import SignatureTable
 
-ALL, VOTED, PAPER, RANDOM = "all places", "signatures, then isovists", "paper (Eq. 6)", "random"
-"""VOTED is what the program does: the signatures of what was seen, then isovists and a vote of all views
-(`PlaceIndex`)."""
+ALL, SHUFFLED, PAPER, RANDOM = "all places", "shuffled signatures", "paper (Eq. 6)", "random"
+"""SHUFFLED : every viewpoint has the signatures of another one, so that everything but they is the same."""
 SEEN_SELECTORS = {"+".join(names): names for names in reversed(COMBINATIONS)}
 """The signatures of what was seen, all and some of them: name -> names of the signatures."""
 SIGNATURES = next(iter(SEEN_SELECTORS))
-SELECTORS = (ALL, VOTED, *SEEN_SELECTORS, PAPER, RANDOM)
-LOCATED_BY = (ALL, VOTED, PAPER, RANDOM)
+"""What the program does."""
+SELECTORS = (ALL, *SEEN_SELECTORS, SHUFFLED, PAPER, RANDOM)
+LOCATED_BY = (ALL, SIGNATURES, SHUFFLED, PAPER, RANDOM)
 """The selectors for which queries are also located, which takes most of the time."""
 MEASURED = ("selector", "looked_at", "found", "located", "right", "processor_ms")
 """The fields of `SelectionTrial` that `Selection.measure` yields."""
@@ -150,11 +150,12 @@ class Selection:
         """scope : what the index is called in the results. share : of the places, 0..1, that is selected."""
         self.index, self.scope, self.share = index, scope, share
         self._rng = np.random.default_rng(seed)
-        index.places.index()
-        described = index.places.described().seen.shares
+        blocks = list(index.places.blocks())
         self._seen = {
-            name: SeenIndex.of(described, seen_weights(*names)) for name, names in SEEN_SELECTORS.items()
+            name: PlaceIndex.of(blocks, seen_weights(*names), seen_spread(*names))
+            for name, names in SEEN_SELECTORS.items()
         }
+        self._seen[SHUFFLED] = shuffled(self._seen[SIGNATURES], self._rng)
 
     def measure(
         self,
@@ -217,15 +218,17 @@ class Selection:
             return np.arange(count)
         if selector == RANDOM:
             return np.sort(self._rng.choice(count, most, replace=False))
-        if selector == VOTED:
-            placed = places.index()
-            return np.sort(placed.select(query.views, placed.nearest_to_each(query.views), most))
-        each = max(1, most // len(query.views))
         if selector == PAPER:
-            found = places.nearest_by_paper(query.views, each, self.index.made_with.signature)
-        else:
-            found = self._seen[selector].nearest_to_each([view.profile for view in query.views], each)
-        return np.unique(np.concatenate([near.rows for near in found]))
+            each = max(1, most // len(query.views))
+            near = places.nearest_by_paper(query.views, each, self.index.made_with.signature)
+            return np.unique(np.concatenate([found.rows for found in near]))
+        return np.sort(self._seen[selector].select(query.views, most))
+
+
+def shuffled(index: PlaceIndex, rng: np.random.Generator) -> PlaceIndex:
+    """The same viewpoints, each with the signatures of another one."""
+    order = rng.permutation(len(index))
+    return replace(index, vectors=index.vectors[order], hidden=index.hidden[order])
 
 
 SHARES = (0.05, 0.01, 0.002)
@@ -236,9 +239,9 @@ SHARES = (0.05, 0.01, 0.002)
 class Recalled:
     """A query among very many places.
 
-    plan, query_sensor, seed, travel_m : the query. places : how many there are. selector : VOTED or
-    SIGNATURES. share : of the places, selected. found : whether the right one is among those. processor_ms :
-    of the selection.
+    plan, query_sensor, seed, travel_m : the query. places : how many there are. selector : SIGNATURES,
+    SHUFFLED or RANDOM. share : of the places, selected. found : whether the right one is among those.
+    processor_ms : of the selection.
     """
 
     plan: str
@@ -263,54 +266,75 @@ plan."""
 
 
 def recall_at_scale(
-    own: SensorMap, others: Iterable[PlaceBlock], queries: Iterable[PlacedQuery], least_mapped: float = 0.0
+    own: SensorMap,
+    others: Iterable[SeenPlaces],
+    queries: Iterable[PlacedQuery],
+    least_mapped: float = 0.0,
+    *,
+    weights: SeenWeights | None = None,
+    spread: Spread | None = None,
 ) -> Iterator[Recalled]:
     """Whether the right places of queries are selected among those of the map and `others`, by what was seen.
 
-    others : places of other maps. Queries from where the map has no place are left out, and those of which
-    less than the share `least_mapped` of the views has one.
+    others : what is seen from the places of other maps. Queries from where the map has no place are left out,
+    and those of which less than the share `least_mapped` of the views has one. weights, spread : as of
+    `PlaceIndex.of`.
     """
-    places = own.index.places
-    index = PlaceIndex.of(itertools.chain([places.described()], others), places.sight_m)
+    places, rng = own.index.places, np.random.default_rng(0)
+    index = PlaceIndex.of(_blocks_of(own, others), weights, spread)
+    indexes = {SIGNATURES: index, SHUFFLED: shuffled(index, rng)}
+    count = int(index.row.max()) + 1
     for sensor, seed, travel_m, query, T_plan_query in queries:
         views_m = (own.T_plan_map.inverse() @ T_plan_query).apply(
             np.array([view.center_m for view in query.views]).reshape(-1, 2)
         )
-        apart = cdist(views_m, places.table.center_m)
-        near = apart <= JUDGEMENT.retrieved_m
+        near = cdist(views_m, places.table.center_m) <= JUDGEMENT.retrieved_m
         right = np.flatnonzero(near.any(axis=0))
         if not len(right) or near.any(axis=1).mean() < least_mapped:
             continue
-        for selector in (VOTED, SIGNATURES):
+        for selector in (SIGNATURES, SHUFFLED, RANDOM):
+            begin = time.process_time()
+            most = max(1, round(max(SHARES) * count))
+            if selector == RANDOM:
+                rows = rng.choice(count, most, replace=False)
+            else:
+                rows = indexes[selector].select(query.views, most)
+            processor_ms = 1000.0 * (time.process_time() - begin)
             for share in SHARES:
-                most = max(1, round(share * len(index)))
-                begin = time.process_time()
-                if selector == VOTED:
-                    rows = index.select(query.views, index.nearest_to_each(query.views), most)
-                else:
-                    profiles = [view.profile for view in query.views]
-                    near = index.seen.nearest_to_each(profiles, max(1, most // len(profiles)))
-                    rows = np.unique(np.concatenate([n.rows for n in near]))
-                processor_ms = 1000.0 * (time.process_time() - begin)
                 yield Recalled(
                     plan=own.name,
                     query_sensor=sensor,
                     seed=seed,
                     travel_m=travel_m,
-                    places=len(index),
+                    places=count,
                     selector=selector,
                     share=share,
-                    found=bool(np.isin(rows, right).any()),
+                    found=bool(np.isin(rows[: max(1, round(share * count))], right).any()),
                     processor_ms=processor_ms,
                 )
 
 
-def described_floor(seed: int, config: Config) -> PlaceBlock:
-    """What is seen from the places of `office_floor`; its seed is the number of the session."""
+def _blocks_of(own: SensorMap, others: Iterable[SeenPlaces]) -> Iterator[PlaceBlock]:
+    """The places of the map first, then those of the others."""
+    yield from own.index.places.blocks()
+    row = len(own.index.places.table)
+    for seen in others:
+        yield PlaceBlock(seen, row)
+        row += int(seen.place.max(initial=-1)) + 1
+
+
+def described_floor(seed: int, config: Config) -> SeenPlaces:
+    """What is seen from the places of `office_floor`."""
     grid = office_floor(seed)
-    centers_m = submap_centers(grid, config.partition)
-    seen = SeenPlaces.of(grid, centers_m, config.partition.radius_m)
-    return PlaceBlock(seen, centers_m, np.full(len(centers_m), seed))
+    return SeenPlaces.of(grid, submap_centers(grid, config.partition), config.partition.radius_m)
+
+
+def stored_floors(arrays: Mapping[str, NDArray[Any]]) -> Iterator[SeenPlaces]:
+    """The floors of a file that `pc2grid compare signatures --scale` has written."""
+    columns = {name: np.asarray(arrays[name]) for name in ("at_m", "place", "signatures", "floor")}
+    floor = columns.pop("floor")
+    for number in range(int(floor[-1]) + 1):
+        yield SeenPlaces(**{name: column[floor == number] for name, column in columns.items()})
 
 
 def tally_at_scale(trials: Sequence[Recalled], *, draws: int = 1000) -> list[Mapping[str, object]]:

@@ -1,0 +1,213 @@
+"""Do the signatures find the place? Real logs, beside a shortlist drawn at random and none at all.
+
+    python -m pc2grid_lab.bench.real_retrieval DATA FOLDER [--logs csail,...] [--floors 24] [--locate]
+
+The map of a building is that of the first part of its log at true poses, the queries are later parts after
+1, 3 and 8 m. The other places are of office floors. FOLDER holds `without_NAME.npz` for each log: statistics
+that `fit_signatures` has learned without this building. For each selector, printed is the share of queries
+of which a right place is selected among 0.64 % and 5 % (at least 50) of the places.
+
+--locate : prints instead what is located, and rightly, with the selected 5 %, and the processor time of the
+look-up with the decision on what it found; "none": the maps are searched as a whole. To be compared with few
+floors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from pc2grid.arrays import F64, I64
+from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.model import OccupancyGrid
+from pc2grid.submaps.partition import submap_centers
+from pc2grid_lab.bench.fit_signatures import queries_with_truth
+from pc2grid_lab.bench.real_queries import MAPPED_S, Drawn, read
+from pc2grid_lab.experiments.selection import TRAVELS_M, office_floor, shuffled
+from pc2grid_lab.experiments.trial import JUDGEMENT
+from signature.config import Config
+from signature.describe import Signature
+from signature.localization.map_index import MapIndex
+from signature.localization.query import QueryMap
+from signature.retrieval.place_index import PlaceIndex
+from signature.retrieval.viewpoints import shortlist_size
+from signature.seen_likelihood import COMBINATIONS, SeenStatistics, SeenWeights
+from signature.similarity import SignatureTable
+
+_FIRST_FLOOR = 1000
+_ALL = "+".join(COMBINATIONS[-1])
+RANDOM, SHUFFLED, NONE, EVERY = "random", "shuffled", "none", "all places"
+_FEW = 0.0064
+"""102 of 16,000 places, as in earlier measurements."""
+
+
+Row = tuple[str, float, int, bool, bool, float, str]
+"""Selector, metres of travel, which size of shortlist, located, right, processor time in ms, and log."""
+
+
+@dataclass(frozen=True, slots=True)
+class Building:
+    """A log's map as the first session, floors of other buildings, and what places are compared by."""
+
+    name: str
+    index: MapIndex
+    indexes: dict[str, PlaceIndex]
+
+    @staticmethod
+    def of(name: str, grids: Sequence[OccupancyGrid], statistics: SeenStatistics, config: Config) -> Building:
+        """grids : the map of the log, then the floors."""
+        centers = [submap_centers(grid, config.partition) for grid in grids]
+        index = MapIndex(
+            {f"{name}.{k}": grid for k, grid in enumerate(grids)}, _table(centers), config, config
+        )
+        blocks = list(index.places.blocks())
+        indexes = {
+            "+".join(names): PlaceIndex.of(
+                blocks, SeenWeights.of(statistics, names), statistics.spread(names)
+            )
+            for names in COMBINATIONS
+            if len(names) in (1, 3)
+        }
+        whole = indexes[_ALL]
+        indexes[SHUFFLED] = shuffled(whole, np.random.default_rng(0))
+        return Building(name, index, indexes)
+
+    def rows(self, selector: str, query: QueryMap, most: int, rng: np.random.Generator) -> I64:
+        """The places that are selected, likeliest first."""
+        count = len(self.index.places.table)
+        if selector in (RANDOM, EVERY):
+            return rng.permutation(count)[: count if selector == EVERY else most]
+        return self.indexes[selector].select(query.views, most)
+
+
+def _table(centers: Sequence[F64]) -> SignatureTable:
+    """Places without the signatures of the paper, which are not compared here."""
+    nothing = Signature(
+        boundary=np.zeros(1, np.float32), freespace=np.zeros(1, np.float32), symmetry=np.zeros(2, np.float32)
+    )
+    at_m = np.concatenate(centers)
+    session = np.repeat(np.arange(len(centers)), [len(c) for c in centers])
+    return SignatureTable.of([nothing] * len(at_m), at_m, session_index=session)
+
+
+def right_places(query: QueryMap, T_map_query: SE2, places: SignatureTable) -> I64:
+    """The places where a view of the query truly lies; none if half of the views lie at none."""
+    views_m = T_map_query.apply(np.array([view.center_m for view in query.views]).reshape(-1, 2))
+    own = np.flatnonzero(places.session_index == 0)
+    near = cdist(views_m, places.center_m[own]) <= JUDGEMENT.retrieved_m
+    return own[near.any(axis=0)] if near.any(axis=1).mean() >= 0.5 else own[:0]
+
+
+def asked_of(
+    drawn: Drawn, places: SignatureTable, config: Config
+) -> Iterator[tuple[float, QueryMap, SE2, I64]]:
+    """The queries on the map: metres of travel, what was seen, its true frame, and the right places."""
+    for session in drawn[1]:
+        for travel_m, query, T_map_query in queries_with_truth(session, config):
+            right = right_places(query, T_map_query, places) if query.views else np.empty(0, np.int64)
+            if len(right):
+                yield travel_m, query, T_map_query, right
+
+
+def recalls(
+    building: Building, drawn: Drawn, config: Config
+) -> Iterator[tuple[str, float, int, bool, float]]:
+    """Selector, metres of travel, places selected, whether a right one is, processor time in ms."""
+    places, rng = building.index.places.table, np.random.default_rng(0)
+    sizes = (round(_FEW * len(places)), shortlist_size(len(places), config.relocalize))
+    for travel_m, query, _, right in asked_of(drawn, places, config):
+        for selector in (*building.indexes, RANDOM):
+            begin = time.process_time()
+            rows = building.rows(selector, query, max(sizes), rng)
+            took_ms = 1000.0 * (time.process_time() - begin)
+            for size in sizes:
+                yield selector, travel_m, size, bool(np.isin(rows[:size], right).any()), took_ms
+
+
+def answers(
+    building: Building, drawn: Drawn, config: Config
+) -> Iterator[tuple[str, float, bool, bool, float]]:
+    """Selector, metres of travel, located, rightly, processor time in ms."""
+    index, rng = building.index, np.random.default_rng(0)
+    index.maps[0], index.places.around(np.arange(len(index.places.table)))
+    most = shortlist_size(len(index.places.table), config.relocalize)
+    for travel_m, query, T_map_query, _ in asked_of(drawn, index.places.table, config):
+        for selector in (_ALL, RANDOM, EVERY, NONE):
+            begin = time.process_time()
+            if selector == NONE:
+                found = index.search_whole_maps(query, ())
+            else:
+                found = index.look_up(query, rows=np.sort(building.rows(selector, query, most, rng)))
+            verdict = index.judge(query, found)
+            took_ms = 1000.0 * (time.process_time() - begin)
+            located = verdict.status == "located"
+            well = False
+            if located:
+                best, base = verdict.hypotheses[0], query.T_odom_base
+                error = (T_map_query @ base).inverse() @ (best.fit.T_map_query @ base)
+                near = math.hypot(error.x, error.y) <= JUDGEMENT.right_m
+                turned = abs(float(wrap_angle(error.yaw)))
+                well = best.session_index == 0 and near and turned <= JUDGEMENT.right_rad
+            yield selector, travel_m, located, well, took_ms
+
+
+def _mean(found: Sequence[Row], selector: str, rank: int, name: str) -> float:
+    """The share of right ones of a log."""
+    return float(np.mean([r[4] for r in found if (r[0], r[2], r[6]) == (selector, rank, name)]))
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", type=Path)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--logs", default=",".join(MAPPED_S))
+    parser.add_argument("--queries", type=int, default=24)
+    parser.add_argument("--floors", type=int, default=24)
+    parser.add_argument("--locate", action="store_true")
+    options = parser.parse_args()
+    config, kept = Config(), options.folder / "drives"
+    kept.mkdir(parents=True, exist_ok=True)
+    floors = [office_floor(_FIRST_FLOOR + number) for number in range(options.floors)]
+    found: list[Row] = []
+    places = []
+    for name in options.logs.split(","):
+        drawn = read(options.data, name, options.queries, kept, config)
+        statistics = SeenStatistics.load(options.folder / f"without_{name}.npz")
+        building = Building.of(name, [drawn[0], *floors], statistics, config)
+        places.append(len(building.index.places.table))
+        if options.locate:
+            found += [
+                (s, t, 0, hit, well, ms, name) for s, t, hit, well, ms in answers(building, drawn, config)
+            ]
+        else:
+            sizes: dict[int, int] = {}
+            for s, t, size, hit, ms in recalls(building, drawn, config):
+                rank = sizes.setdefault(size, len(sizes))
+                found.append((s, t, rank, hit, hit, ms, name))
+    for rank in sorted({row[2] for row in found}):
+        what = "located, rightly" if options.locate else ("0.64 %", "5 %, at least 50")[rank]
+        print(f"\n{what} of {min(places):,} to {max(places):,} places, {', '.join(options.logs.split(','))}")
+        for selector in dict.fromkeys(row[0] for row in found):
+            cells = []
+            for travel_m in TRAVELS_M:
+                rows = [r for r in found if r[0] == selector and r[1] == travel_m and r[2] == rank]
+                wrong = sum(r[3] and not r[4] for r in rows)
+                said = f" ({wrong} wrong)" if options.locate else ""
+                cells.append(f"{np.mean([r[4] for r in rows]):.2f}{said} of {len(rows)}")
+            took = np.median([r[5] for r in found if r[0] == selector])
+            by_log = [f"{name} {_mean(found, selector, rank, name):.2f}" for name in options.logs.split(",")]
+            print(f"| {selector} | {' | '.join(cells)} | {took:.0f} ms | {', '.join(by_log)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
