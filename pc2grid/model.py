@@ -87,7 +87,7 @@ class Health(enum.Enum):
 
     FINE : in every direction, and odometry, if there is any, agrees. DEGENERATE : some direction rests on
     odometry or the motion before. LOST : not at all; the scan is not mapped. OVERRULED : as FINE, but
-    odometry says something else (`pc2grid.odometry.overruled`).
+    odometry says something else (`pc2grid.estimation.overruled`).
     """
 
     FINE = "fine"
@@ -488,7 +488,7 @@ class Overruled:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryCheck:
-    """What the scans of a session say of its odometry (`pc2grid.odometry.overruled`).
+    """What the scans of a session say of its odometry (`pc2grid.estimation.overruled`).
 
     compared : scans that were tracked and have odometry. overruled : of these, scans that fit the map where
         odometry does not lead.

@@ -39,9 +39,9 @@ from pc2grid.submaps.partition import divide
 from pc2grid.time_span import TimeSpan
 
 if TYPE_CHECKING:
+    from pc2grid.estimation.tracker import Tracker
     from pc2grid.io import Log
     from pc2grid.mapping.place_recognition import PlaceRecognizer
-    from pc2grid.odometry.tracker import Tracker
 
 _SHARE_BEFORE_LOOPS = 0.8
 """Share of the work of `build_map` that is done when the last scan has been tracked; chosen by hand."""
@@ -299,6 +299,6 @@ def _track(
 
 def _tracker(config: Config) -> Tracker:
     """A tracker with these settings; loading it takes as long as scipy."""
-    from pc2grid.odometry.tracker import Tracker
+    from pc2grid.estimation.tracker import Tracker
 
     return Tracker(config.registration, config.projection)

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F64, I64
+from pc2grid.estimation.point_to_line import Match, PointGrid, best_placements
 from pc2grid.geometry import SE2
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.matching.likelihood_field import LikelihoodField, LikelihoodParameters
-from pc2grid.odometry.point_to_line import Match, PointGrid, best_placements
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,11 +11,11 @@ import math
 import numpy as np
 
 from pc2grid.arrays import F64
+from pc2grid.estimation.point_to_line import Match, evenly
 from pc2grid.geometry import SE2
 from pc2grid.mapping.local_maps import LocalMap, LocalMaps
 from pc2grid.mapping.loop_parameters import LoopParameters
 from pc2grid.mapping.pose_graph import Edge
-from pc2grid.odometry.point_to_line import Match, evenly
 
 
 class LoopVerification:

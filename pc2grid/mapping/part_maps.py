@@ -9,6 +9,7 @@ import numpy as np
 
 from pc2grid.arrays import F64, I64
 from pc2grid.config import ProjectionConfig
+from pc2grid.estimation.overruled import check_odometry
 from pc2grid.geometry import SE2
 from pc2grid.mapping.consistency import measure_consistency
 from pc2grid.mapping.keyframe_points import KeyframePoints
@@ -18,7 +19,6 @@ from pc2grid.mapping.precision import precision_of
 from pc2grid.mapping.settled import SettledKeyframes, interpolate_corrections
 from pc2grid.mapping.track import Track, chosen
 from pc2grid.model import Consistency, Loop, OccupancyGrid, OdometryCheck, PointMap, Precision, Trajectory
-from pc2grid.odometry.overruled import check_odometry
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

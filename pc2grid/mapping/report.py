@@ -8,14 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from pc2grid.errors import TrackingLost
+from pc2grid.estimation.overruled import stalls
+from pc2grid.estimation.rides import RIDES
 from pc2grid.mapping.consistency import consistency_warning
 from pc2grid.mapping.part_maps import PartMap
 from pc2grid.mapping.parts import PARTS
 from pc2grid.mapping.precision import precision_warning
 from pc2grid.mapping.track import Track
 from pc2grid.model import Health, ReadReport, Trajectory, part_name
-from pc2grid.odometry.overruled import stalls
-from pc2grid.odometry.rides import RIDES
 
 _MOST_LOST = 0.2
 """Share of lost scans above which a laser without odometry gives no map: its parts do not hang together.

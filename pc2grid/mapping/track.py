@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import I64
 from pc2grid.config import ProjectionConfig
+from pc2grid.estimation.overruled import Disagreement
 from pc2grid.geometry import SE2
 from pc2grid.mapping.keyframe_points import KeyframePoints
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.loop_closure import LoopCloser
 from pc2grid.mapping.unseen_hits import UnseenHits
 from pc2grid.model import Health, Scan, Storey, Trajectory
-from pc2grid.odometry.overruled import Disagreement
 from pc2grid.sensor_model import SENSOR_MODELS
 
 if TYPE_CHECKING:
-    from pc2grid.odometry.tracker import Tracked, Tracker
+    from pc2grid.estimation.tracker import Tracked, Tracker
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

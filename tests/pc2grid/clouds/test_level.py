@@ -7,7 +7,7 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.clouds.level import floor_height
-from pc2grid.odometry.surface_map import SurfaceMap
+from pc2grid.estimation.surface_map import SurfaceMap
 
 EDGE_M = 0.15
 SENSOR = np.array((0.0, 0.0, 1.5))

@@ -10,6 +10,7 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
+from pc2grid.estimation.point_to_line import Match
 from pc2grid.geometry import SE2
 from pc2grid.mapping import loop_verification
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
@@ -19,7 +20,6 @@ from pc2grid.mapping.loop_parameters import LoopParameters
 from pc2grid.mapping.place_recognition import Recognition, Stretch
 from pc2grid.mapping.pose_graph import Edge, optimise
 from pc2grid.mapping.settled import SettledKeyframes, interpolate_corrections
-from pc2grid.odometry.point_to_line import Match
 from tests.helpers.rooms import RESOLUTION_M
 
 Wall = tuple[tuple[float, float], tuple[float, float]]

@@ -63,7 +63,7 @@ SERVER.set_forkserver_preload(
     [
         "pc2grid_cli.main",
         "pc2grid.pipeline",
-        "pc2grid.odometry.tracker",
+        "pc2grid.estimation.tracker",
         "pc2grid.submaps.partition",
         "pc2grid.io.containers.mcap",
         "signature.sessions",

@@ -98,7 +98,7 @@ import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 from pc2grid.io import open_log
-from pc2grid.odometry.tracker import Tracker
+from pc2grid.estimation.tracker import Tracker
 from signature.config import Config
 
 path, duration = sys.argv[1], float(sys.argv[2]) or None

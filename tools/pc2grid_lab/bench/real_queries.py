@@ -23,13 +23,13 @@ from typing import Any
 
 import numpy as np
 
+from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import OccupancyGrid
-from pc2grid.odometry.tracker import Tracker
 from pc2grid.submaps.partition import partition
 from pc2grid_lab.experiments.registered_session import RegisteredSession, register
 from pc2grid_lab.experiments.replay import Replay

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pc2grid.arrays import F64
+from pc2grid.estimation.registration import BareKissIcp
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, OccupancyGrid, Scan, Trajectory
-from pc2grid.odometry.registration import BareKissIcp
 from pc2grid.pipeline import map_scans
 from pc2grid.simulate import Session
 from pc2grid_lab.experiments.true_floor import GridQuality, TrueFloor

@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 
 from pc2grid.arrays import F32, F64
 from pc2grid.errors import ConfigError, LogNotFound
+from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2, transform_points
 from pc2grid.io import Log, open_log
 from pc2grid.io.building_file import is_building_file
@@ -30,7 +31,6 @@ from pc2grid.io.nav2_map import load_map, save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind, Trajectory
-from pc2grid.odometry.tracker import Tracker
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.simulate import load_building
 from pc2grid_lab.experiments.frames import apart, number_at

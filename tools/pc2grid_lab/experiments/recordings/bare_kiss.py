@@ -13,10 +13,10 @@ import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 
+from pc2grid.estimation.registration import BareKissIcp, KissRegistration
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Trajectory
-from pc2grid.odometry.registration import BareKissIcp, KissRegistration
 from pc2grid_lab.experiments.trajectory_error import trajectory_error
 from signature.config import Config
 

@@ -18,9 +18,9 @@ from pc2grid.clouds.ground import Ground
 from pc2grid.clouds.parameters import CLOUD_PARAMETERS
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.upright import CAMERA_UPRIGHT, UPRIGHT, vertical_of
+from pc2grid.estimation.floor_ahead import FloorAhead
 from pc2grid.geometry import SE2
 from pc2grid.model import Scan, SensorKind, Storey
-from pc2grid.odometry.floor_ahead import FloorAhead
 from pc2grid.sensor_model import SENSOR_MODELS
 
 

@@ -20,14 +20,14 @@ from pc2grid.arrays import F32, F64
 from pc2grid.clouds.ground import Ground, find_ground
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
+from pc2grid.estimation.manifold import moved, steps
+from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.estimation.placed import Placed
+from pc2grid.estimation.smoother import SMOOTHER, SPATIAL, Belief
+from pc2grid.estimation.space_map import SpaceMap, ThinnedScan
+from pc2grid.estimation.surface_map import Placement, PosePrior
 from pc2grid.geometry import SE2
 from pc2grid.model import Scan
-from pc2grid.odometry.manifold import moved, steps
-from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
-from pc2grid.odometry.placed import Placed
-from pc2grid.odometry.smoother import SMOOTHER, SPATIAL, Belief
-from pc2grid.odometry.space_map import SpaceMap, ThinnedScan
-from pc2grid.odometry.surface_map import Placement, PosePrior
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F64
-from pc2grid.odometry import _kernels
+from pc2grid.estimation import _kernels
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pc2grid.arrays import F32, F64
+from pc2grid.estimation.parameters import MATCHING_PARAMETERS, MatchingParameters
 from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.odometry.parameters import MATCHING_PARAMETERS, MatchingParameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ class PointGrid:
         The iterations start at `guess` and are held to `prior` by `prior_information` (3, 3) of x, y, yaw.
         radii : half widths of the neighbourhood, as `MatchingParameters.radii_cells`, its default.
         """
-        from pc2grid.odometry._kernels import normal_equations
+        from pc2grid.estimation._kernels import normal_equations
 
         p, steps = self._parameters, radii or self._parameters.radii_cells
         points, normals = np.asarray(points_m, np.float64), np.asarray(normal_rad, np.float64)
@@ -227,7 +227,7 @@ def best_placements(
     Returns the best `count` placements no two of which are neighbours, best first, each with the mean
     likelihood of the points.
     """
-    from pc2grid.odometry._kernels import placement_scores
+    from pc2grid.estimation._kernels import placement_scores
 
     steps = math.ceil(window_m / step_m)
     across = step_m * np.arange(-steps, steps + 1, dtype=np.float64)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from pc2grid.arrays import F64
+from pc2grid.estimation import _kernels
+from pc2grid.estimation.graph import Factors, add_factors_plain, normal_equations, without
+from pc2grid.estimation.manifold import moved, steps, steps_plain
+from pc2grid.estimation.smoother import PLANAR, SPATIAL, Belief, Evidence, Smoother
 from pc2grid.geometry import SE2, invert_pose, motion_size, pose_from_rotation_vector
-from pc2grid.odometry import _kernels
-from pc2grid.odometry.graph import Factors, add_factors_plain, normal_equations, without
-from pc2grid.odometry.manifold import moved, steps, steps_plain
-from pc2grid.odometry.smoother import PLANAR, SPATIAL, Belief, Evidence, Smoother
 
 Odometry = list[F64] | list[None]
 WALLS_ALL_AROUND = np.diag([0.01**-2, 0.01**-2, 0.004**-2])

@@ -10,7 +10,7 @@ from pc2grid.arrays import F64
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A scan placed on the local map; D directions of the pose are free, see `pc2grid.odometry.smoother`.
+    """A scan placed on the local map; D directions of the pose are free, see `pc2grid.estimation.smoother`.
 
     pose : (4, 4) T_session_base, from which the smoother begins.
     alone : the pose by the points alone, with its information (D, D) in the axes of the base; None if the

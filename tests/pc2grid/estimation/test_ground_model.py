@@ -11,10 +11,10 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.config import RegistrationConfig
+from pc2grid.estimation.ground_model import GroundModel, is_rolling
+from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import pose_from_rotation_vector
 from pc2grid.model import Scan
-from pc2grid.odometry.ground_model import GroundModel, is_rolling
-from pc2grid.odometry.tracker import Tracker
 from pc2grid.simulate import SimulationConfig, iter_session
 from pc2grid.simulate.config import LidarConfig
 

@@ -14,12 +14,12 @@ from pc2grid.clouds.ground import Ground
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.upright import CAMERA_UPRIGHT, vertical_of
 from pc2grid.config import ProjectionConfig, RegistrationConfig
+from pc2grid.estimation.rides import RIDES, RideWatch
+from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
 from pc2grid.mapping.floors import floor_heights, floor_names
 from pc2grid.model import Scan, SensorKind, Storey
-from pc2grid.odometry.rides import RIDES, RideWatch
-from pc2grid.odometry.tracker import Tracker
 from pc2grid.simulate import SimulationConfig
 from pc2grid.simulate.config import DepthConfig, LidarConfig
 from pc2grid_lab.worlds import HouseConfig, HouseSession, prepare_house_session

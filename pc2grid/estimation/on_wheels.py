@@ -17,20 +17,20 @@ from pc2grid.clouds.depth_limit import DepthLimit
 from pc2grid.clouds.ground import Ground
 from pc2grid.clouds.planar_scan import PlanarScan, project_to_plane
 from pc2grid.config import ProjectionConfig, RegistrationConfig
-from pc2grid.geometry import SE2
-from pc2grid.model import Scan
-from pc2grid.odometry.ground_model import GroundModel
-from pc2grid.odometry.matching_maps import MatchingMaps
-from pc2grid.odometry.parameters import (
+from pc2grid.estimation.ground_model import GroundModel
+from pc2grid.estimation.matching_maps import MatchingMaps
+from pc2grid.estimation.parameters import (
     CAMERA_MATCHING,
     MATCHING_PARAMETERS,
     TRACKING_PARAMETERS,
     TrackingParameters,
 )
-from pc2grid.odometry.placed import Placed
-from pc2grid.odometry.point_to_line import Match
-from pc2grid.odometry.registration import KissRegistration
-from pc2grid.odometry.smoother import PLANAR, Belief
+from pc2grid.estimation.placed import Placed
+from pc2grid.estimation.point_to_line import Match
+from pc2grid.estimation.registration import KissRegistration
+from pc2grid.estimation.smoother import PLANAR, Belief
+from pc2grid.geometry import SE2
+from pc2grid.model import Scan
 from pc2grid.sensor_model import SENSOR_MODELS
 
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64, I64, BoolGrid
 from pc2grid.clouds.sampling import random_subset
+from pc2grid.estimation import _surface_kernels as kernels
 from pc2grid.geometry import pose_from_rotation_vector, rotation_vector
-from pc2grid.odometry import _surface_kernels as kernels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

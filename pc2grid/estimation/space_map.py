@@ -17,10 +17,10 @@ from pc2grid.clouds.column_map import ColumnMap
 from pc2grid.clouds.level import floor_height
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
+from pc2grid.estimation.point_to_line import best_placements, evenly
+from pc2grid.estimation.surface_map import Placement, PosePrior, SurfaceMap
 from pc2grid.geometry import SE2, invert_pose, motion_size
 from pc2grid.model import Scan
-from pc2grid.odometry.point_to_line import best_placements, evenly
-from pc2grid.odometry.surface_map import Placement, PosePrior, SurfaceMap
 from pc2grid.sensor_model import SENSOR_MODELS
 
 

@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from pc2grid.arrays import F64
+from pc2grid.estimation.graph import Factors, normal_equations, without
+from pc2grid.estimation.manifold import Steps, carried_on, moved, steps
 from pc2grid.geometry import invert_pose, wrap_angle
-from pc2grid.odometry.graph import Factors, normal_equations, without
-from pc2grid.odometry.manifold import Steps, carried_on, moved, steps
 
 PLANAR = (0, 1, 5)
 """The free directions of a base on wheels: x, y, and the turn about z, in the base frame."""

@@ -8,14 +8,14 @@ import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.geometry import SE2
-from pc2grid.odometry.parameters import (
+from pc2grid.estimation.parameters import (
     MATCHING_PARAMETERS,
     TRACKING_PARAMETERS,
     MatchingParameters,
     TrackingParameters,
 )
-from pc2grid.odometry.point_to_line import Match, PointGrid, best_placements, evenly
+from pc2grid.estimation.point_to_line import Match, PointGrid, best_placements, evenly
+from pc2grid.geometry import SE2
 
 
 class MatchingMaps:

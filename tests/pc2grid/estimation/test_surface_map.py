@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from pc2grid.arrays import F64
+from pc2grid.estimation import _surface_kernels as kernels
+from pc2grid.estimation.surface_map import PosePrior, SurfaceMap
 from pc2grid.geometry import invert_pose, motion_size, pose_from_rotation_vector, transform_points
-from pc2grid.odometry import _surface_kernels as kernels
-from pc2grid.odometry.surface_map import PosePrior, SurfaceMap
 
 EDGE_M = 0.15
 NO_PRIOR = np.zeros((6, 6))

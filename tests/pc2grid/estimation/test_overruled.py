@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from pc2grid.config import Config
+from pc2grid.estimation.overruled import Disagreement, check_odometry, stalls
+from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, OdometryCheck, Overruled, Scan
-from pc2grid.odometry.overruled import Disagreement, check_odometry, stalls
-from pc2grid.odometry.tracker import Tracker
 from pc2grid.simulate import SimulationConfig, prepare_session
 
 SLIGHT, LARGE, LARGER = (

@@ -14,11 +14,11 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.config import Config, RegistrationConfig
+from pc2grid.estimation.tracker import Tracked, Tracker
 from pc2grid.geometry import invert_pose, motion_size, pose_from_rotation_vector
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Health, OccupancyGrid, Scan
-from pc2grid.odometry.tracker import Tracked, Tracker
 from pc2grid.pipeline import map_scans
 from pc2grid.simulate.scene import Mesh, Scene, prism
 from pc2grid.simulate.sensors import OPTICAL

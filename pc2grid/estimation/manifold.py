@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pc2grid.arrays import F64
-from pc2grid.odometry import _kernels
+from pc2grid.estimation import _kernels
 
 
 class Steps(NamedTuple):

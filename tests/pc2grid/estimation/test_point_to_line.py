@@ -7,15 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from pc2grid.geometry import SE2
-from pc2grid.odometry._kernels import normal_equations, placement_scores
-from pc2grid.odometry.parameters import CAMERA_MATCHING, MATCHING_PARAMETERS
-from pc2grid.odometry.point_to_line import (
+from pc2grid.estimation._kernels import normal_equations, placement_scores
+from pc2grid.estimation.parameters import CAMERA_MATCHING, MATCHING_PARAMETERS
+from pc2grid.estimation.point_to_line import (
     PointGrid,
     best_placements,
     normal_equations_plain,
     placement_scores_plain,
 )
+from pc2grid.geometry import SE2
 
 
 def test_points_beside_a_map_are_no_part_of_it_and_a_heap_is_no_line() -> None:

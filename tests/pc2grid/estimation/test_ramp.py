@@ -12,10 +12,10 @@ import pytest
 from pc2grid.arrays import F64
 from pc2grid.clouds.ground import Ground
 from pc2grid.config import RegistrationConfig
+from pc2grid.estimation.floor_ahead import FloorAhead
+from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2
 from pc2grid.model import Scan
-from pc2grid.odometry.floor_ahead import FloorAhead
-from pc2grid.odometry.tracker import Tracker
 from pc2grid.pipeline import map_scans
 from pc2grid.simulate.scene import Mesh, Scene, prism, quads
 from signature.config import Config

@@ -20,16 +20,16 @@ from pc2grid.clouds.deskew import deskew
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.config import ProjectionConfig, RegistrationConfig
+from pc2grid.estimation.carried import CarriedSensor
+from pc2grid.estimation.ground_model import DECIDING_SCANS, is_rolling
+from pc2grid.estimation.health import HealthJudge
+from pc2grid.estimation.on_wheels import SensorOnWheels
+from pc2grid.estimation.overruled import Disagreement, disagreement
+from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.estimation.rides import Ride, RideWatch
+from pc2grid.estimation.smoother import IN_THE_HAND, PLANAR, SMOOTHER, Evidence, Smoother
 from pc2grid.geometry import SE2, invert_pose, motion_size
 from pc2grid.model import Health, RegisteredScan, Scan, Storey
-from pc2grid.odometry.carried import CarriedSensor
-from pc2grid.odometry.ground_model import DECIDING_SCANS, is_rolling
-from pc2grid.odometry.health import HealthJudge
-from pc2grid.odometry.on_wheels import SensorOnWheels
-from pc2grid.odometry.overruled import Disagreement, disagreement
-from pc2grid.odometry.parameters import TRACKING_PARAMETERS, TrackingParameters
-from pc2grid.odometry.rides import Ride, RideWatch
-from pc2grid.odometry.smoother import IN_THE_HAND, PLANAR, SMOOTHER, Evidence, Smoother
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pc2grid.config import RegistrationConfig
+from pc2grid.estimation.registration import KissRegistration
 from pc2grid.geometry import pose_from_rotation_vector
-from pc2grid.odometry.registration import KissRegistration
 
 
 def test_a_matrix_that_is_nearly_a_rotation_does_not_end_the_process() -> None:
