@@ -1,7 +1,9 @@
-"""Robust least squares over factors: the one solver of tracking, of the pose graph and of what follows them.
+"""Robust least squares over factors, dense: the solver of the smoother.
 
 A factor is a residual that depends on few of the unknowns. Gauss-Newton with Cauchy weights (iteratively
 reweighted least squares); the unknowns are numbered rows, and what they mean is known to the factors alone.
+The pose graph of a session has thousands of unknowns and a sparse solver of its own
+(`pc2grid.mapping.pose_graph`).
 """
 
 from __future__ import annotations

@@ -211,10 +211,6 @@ class Smoother:
         variance = self._drift_variance(reported)[0] + 2.0 * self._noise(p.reading_m, p.reading_rad) ** 2
         return self._after(moved(np.eye(4)[None], corrected)[0], variance)
 
-    def by_motion(self, motion: F64, sigmas: F64) -> Belief:
-        """The next pose after a motion (4, 4) T_last_now with standard deviations (D,)."""
-        return self._after(motion, sigmas**2)
-
     def by_steadiness(self, seconds: float) -> Belief:
         """The next pose, `seconds` later, if the motion before goes on."""
         p, k, span_s = self._parameters, len(self._evidence) - 1, 0.0
