@@ -38,12 +38,13 @@ from pc2grid.sensor_model import SENSOR_MODELS
 class _Candidate:
     """A match, and its score: the logarithm of its posterior density but for a constant.
 
-    settled : nothing else needs to be tried, since the scan fits, and where it is expected.
+    sure : the scan fits well. near : it lies where it is expected. If both, nothing else needs to be tried.
     """
 
     score: float
     match: Match = field(compare=False)
-    settled: bool = field(compare=False)
+    sure: bool = field(compare=False)
+    near: bool = field(compare=False)
 
 
 class SensorOnWheels:
@@ -113,20 +114,22 @@ class SensorOnWheels:
             return Placed(expected[0].pose, first=True)
         if len(planar_scan.hits_m) < self._parameters.min_hits:
             return Placed(expected[0].pose, motion=motion)
-        match = self._match(planar_scan, registered, expected)
+        found = self._match(planar_scan, registered, expected)
+        match = found.match
         alone = match.by_points.lift(), _turned(match.information, match.by_points.yaw)
-        fits = match.overlap >= self._parameters.min_overlap
+        # Half of what a camera sees while it turns may be new: where that fits badly, it says nothing.
+        fits = match.overlap >= self._parameters.min_overlap and (found.sure or found.near)
         return Placed(
             match.pose.lift() if fits else expected[0].pose,
             alone if fits else None,
             match.overlap,
             match.residual_m,
             match.measured,
-            sure=self._is_sure(match),
+            sure=found.sure,
             motion=motion,
         )
 
-    def _match(self, planar_scan: PlanarScan, registered: SE2, expected: Sequence[Belief]) -> Match:
+    def _match(self, planar_scan: PlanarScan, registered: SE2, expected: Sequence[Belief]) -> _Candidate:
         """The best match of a planar scan with the local map.
 
         It begins where the base is expected and where KISS-ICP puts it. If the scan fits nowhere there, it
@@ -141,15 +144,15 @@ class SensorOnWheels:
             found.append(self._candidate(planar_scan, registered if near else prior, belief))
             if belief is first and not near:
                 found.append(self._candidate(planar_scan, registered, belief))
-            if max(found).settled:
-                return max(found).match
+            if max(found).sure and max(found).near:
+                return max(found)
         window_m, window_rad = p.search_sigmas * np.sqrt(first.covariance.diagonal()[1:])
         wide = window_m > p.search_above_m or window_rad > p.search_above_rad
-        if wide and not self._is_sure(max(found).match):
+        if wide and not max(found).sure:
             window = min(window_m, p.search_most_m), min(window_rad, p.search_most_rad)
             guesses = self._maps.search(planar_scan, SE2.from_matrix(first.pose), *window)
             found.extend(self._candidate(planar_scan, guess, first) for guess in guesses)
-        return max(found).match
+        return max(found)
 
     def _candidate(self, planar_scan: PlanarScan, guess: SE2, belief: Belief) -> _Candidate:
         """A match of a planar scan that begins at a guess and is held to a belief."""
@@ -158,8 +161,8 @@ class SensorOnWheels:
         p = self._parameters
         of_scan = p.scan_weight * self._maps.quality(match)
         pose = match.pose.lift()
-        settled = self._is_sure(match) and belief.chi2(pose) < p.search_sigmas**2
-        return _Candidate(of_scan + belief.log_density(pose), match, settled)
+        near = belief.chi2(pose) < p.search_sigmas**2
+        return _Candidate(of_scan + belief.log_density(pose), match, self._is_sure(match), near)
 
     def _is_sure(self, match: Match) -> bool:
         """Whether a scan fits so well that nothing else needs to be tried."""

@@ -88,7 +88,7 @@ class SpaceMap:
         self.floor_m: float | None = None
 
     def __bool__(self) -> bool:
-        return self._added_at is not None
+        return self._added_at is not None and bool(self.surfaces)
 
     @property
     def surfaces(self) -> SurfaceMap:

@@ -141,13 +141,14 @@ class Tracker:
         estimate = self._smoother.add(placed.pose, evidence)
         # 4. Judge the pose, and start again if nothing fits any more.
         health = self._health.judge(placed, bridged=reading is not None and continues)
-        if reading is not None and not (continues or placed.sure or placed.first):
-            health = Health.LOST  # nothing says where this scan lies to those before
-            self._restart()
-        if self._health.gives_up:
-            self._restart()
+        apart = reading is not None and not (continues or placed.sure or placed.first)
+        if apart:  # nothing says where this scan lies to those before
+            health = Health.LOST
         self._intervals_s.append(seconds)
-        return self._finish(scan, points, self._sensor.levelled(estimate.pose), health)
+        tracked = self._finish(scan, points, self._sensor.levelled(estimate.pose), health)
+        if apart or self._health.gives_up:
+            self._restart()
+        return tracked
 
     def _finish(self, scan: Scan, points: F32, pose: F64, health: Health) -> Tracked:
         """Extend the maps by a scan if it is worth it, and remember its final pose."""

@@ -129,12 +129,20 @@ class Ros:
         return self.message(topic, stamp_ns, content)
 
     def tf(
-        self, stamp_ns: int, parent: str, child: str, x_m: float, *, topic: str = "/tf", late_ns: int = 0
+        self,
+        stamp_ns: int,
+        parent: str,
+        child: str,
+        x_m: float,
+        *,
+        z_m: float = 0.0,
+        topic: str = "/tf",
+        late_ns: int = 0,
     ) -> Message:
         """One transform without rotation; recorded `late_ns` after its stamp."""
         transform = self.make(
             "geometry_msgs/Transform",
-            self.make("geometry_msgs/Vector3", x_m, 0.0, 0.0),
+            self.make("geometry_msgs/Vector3", x_m, 0.0, z_m),
             self.make("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0),
         )
         edge = self.make("geometry_msgs/TransformStamped", self.header(stamp_ns, parent), child, transform)

@@ -185,7 +185,9 @@ def test_check_of_the_right_pose(expected: tuple[Path, Expected]) -> None:
     last = relocalize_at_once(folder)
     pose = last["pose"]
     document = relocalize_at_once(folder, "--check", pose["x"], pose["y"], math.degrees(pose["yaw"]))
-    assert (document["status"], document["probability"]) == ("fine", rounded(last["confidence"]))
+    # The pose was typed with the digits of the document: micrometres off, which the mass of a place shows.
+    assert document["status"] == "fine"
+    assert document["probability"] == pytest.approx(last["confidence"], abs=1e-5)
     # The best place near the pose is found in space, too: it is the pose itself.
     assert document["off_m"] == pytest.approx(0.0, abs=1e-6)
 

@@ -372,7 +372,7 @@ def test_strangers_trigger_is_refused(path: Path) -> None:
         "loops.information",
         "graph.path_m",
         "points.steps",
-        "seen.place",
+        "seen.signatures",
         "submaps.boundary",
         "submaps.center_m",
     ],
