@@ -145,15 +145,22 @@ class Tracker:
         if apart:  # nothing says where this scan lies to those before
             health = Health.LOST
         self._intervals_s.append(seconds)
-        tracked = self._finish(scan, points, self._sensor.levelled(estimate.pose), health)
+        tracked = self._finish(
+            scan, points, self._sensor.levelled(estimate.pose), health, continues=continues
+        )
         if apart or self._health.gives_up:
             self._restart()
         return tracked
 
-    def _finish(self, scan: Scan, points: F32, pose: F64, health: Health) -> Tracked:
-        """Extend the maps by a scan if it is worth it, and remember its final pose."""
+    def _finish(
+        self, scan: Scan, points: F32, pose: F64, health: Health, *, continues: bool = True
+    ) -> Tracked:
+        """Extend the maps by a scan if it is worth it, and remember its final pose.
+
+        continues : whether odometry goes on from where it was last known.
+        """
         planar_scan = self._sensor.cut(scan, points, pose, lost=health is Health.LOST)
-        ride = self._ride(scan, points, planar_scan, pose)
+        ride = self._ride(scan, points, planar_scan, pose, continues)
         if ride.arrived:
             self._restart()
         extended = health is not Health.LOST and len(planar_scan.hits_m) > 0 and self._is_due(pose)
@@ -190,16 +197,16 @@ class Tracker:
         p, step = self._parameters, self._keyframe.inverse() @ SE2.from_matrix(pose)
         return math.hypot(step.x, step.y) >= p.keyframe_travel_m or abs(step.yaw) >= p.keyframe_turn_rad
 
-    def _ride(self, scan: Scan, points: F32, planar_scan: PlanarScan, pose: F64) -> Ride:
+    def _ride(self, scan: Scan, points: F32, planar_scan: PlanarScan, pose: F64, continues: bool) -> Ride:
         """Look whether the robot leaves its floor. A sensor in the hand tilts as it likes.
 
         The travel is that of the wheels where they are known: tracking in the plane errs on stairs.
         """
         if not isinstance(self._sensor, SensorOnWheels):
             return Ride()
-        last_scan, last_pose = self._last or (scan, pose)
         step = self._reported(scan)
-        if step is None or not self._continues(scan, (scan.stamp_ns - last_scan.stamp_ns) * 1e-9):
+        if step is None or not continues:
+            _, last_pose = self._last or (scan, pose)
             step = invert_pose(last_pose) @ pose
         return self._rides.observe(scan, points, planar_scan, pose, float(step[0, 3]), self._sensor.ground)
 
