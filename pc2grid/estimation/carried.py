@@ -115,7 +115,6 @@ class CarriedSensor:
             found.overlap,
             found.residual_m,
             found.measured,
-            sure=found.overlap >= self._tracking.sure_overlap,
         )
 
     def extend(self, pose: F64) -> None:

@@ -1,43 +1,45 @@
-"""What the pose of a scan is worth, judged by its match with the local map."""
+"""What the pose of a scan is worth: by how the scan fits the local map, and by the smoother's covariance."""
 
 from __future__ import annotations
 
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.estimation.placed import Placed
+from pc2grid.estimation.smoother import Belief
 from pc2grid.model import Health
 
 
 class HealthJudge:
-    """Judges each scan, and counts the poor ones in a row."""
+    """Judges each scan, and counts the lost ones in a row."""
 
     def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
         self._parameters = parameters
-        self._poor_scans = 0
         self._lost_scans = 0
+        self._out_of_reach = False
 
-    def judge(self, placed: Placed, *, bridged: bool) -> Health:
-        """Judge a scan by where it was placed. bridged : odometry says where it is.
+    def judge(self, placed: Placed, belief: Belief, *, bridged: bool) -> Health:
+        """Judge a scan by where it was placed, and by the pose that the smoother found.
 
-        A scan that shows too little is bridged by odometry for a while (DEGENERATE). A scan that does not
-        fit, without odometry or for too long, is LOST. A scan that fits is DEGENERATE if one direction of
-        its position is not determined, FINE otherwise.
+        bridged : odometry goes on from the scan before.
+
+        A scan that fits is FINE; DEGENERATE if one direction of its position is not determined. One that does
+        not fit is DEGENERATE, too, where odometry tells where it is from a scan that was not lost; else LOST.
         """
         p = self._parameters
-        if placed.first:
-            return Health.FINE
-        if placed.overlap < p.min_overlap or placed.residual_m > p.max_residual_m:
-            self._poor_scans += 1
-            lost = not bridged or self._poor_scans > p.bridged_scans
-            self._lost_scans += lost
-            return Health.LOST if lost else Health.DEGENERATE
-        self._poor_scans = self._lost_scans = 0
-        return Health.FINE if placed.measured else Health.DEGENERATE
+        fits = placed.alone is not None and placed.overlap >= p.min_overlap
+        if placed.first or (fits and placed.residual_m <= p.max_residual_m):
+            self.restart()
+            return Health.FINE if placed.first or placed.measured else Health.DEGENERATE
+        if bridged and not self._lost_scans:
+            return Health.DEGENERATE
+        self._lost_scans += 1
+        self._out_of_reach = belief.sigmas[0] > p.search_most_m
+        return Health.LOST
 
     @property
     def gives_up(self) -> bool:
-        """Whether so many scans in a row were lost that tracking must start again."""
-        return self._lost_scans > self._parameters.give_up_scans
+        """Whether tracking must start again: so many scans in a row were lost, or no search would reach."""
+        return self._out_of_reach or self._lost_scans > self._parameters.give_up_scans
 
     def restart(self) -> None:
         """Start to count again."""
-        self._lost_scans = 0
+        self._lost_scans, self._out_of_reach = 0, False

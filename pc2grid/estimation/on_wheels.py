@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -125,7 +125,6 @@ class SensorOnWheels:
             match.overlap,
             match.residual_m,
             match.measured,
-            sure=found.sure,
             motion=motion,
         )
 
@@ -140,39 +139,50 @@ class SensorOnWheels:
         p, first, found = self._parameters, expected[0], []
         for belief in expected:
             prior = SE2.from_matrix(belief.pose)
-            near = self._is_near(registered, prior)
+            near = _is_near(registered, prior, p.disagree_m, p.disagree_rad)
             found.append(self._candidate(planar_scan, registered if near else prior, belief))
             if belief is first and not near:
                 found.append(self._candidate(planar_scan, registered, belief))
-            if max(found).sure and max(found).near:
+            if max(found).sure and max(found).near and not self._is_vague(belief):
                 return max(found)
-        window_m, window_rad = p.search_sigmas * np.sqrt(first.covariance.diagonal()[1:])
-        wide = window_m > p.search_above_m or window_rad > p.search_above_rad
-        if wide and not max(found).sure:
-            window = min(window_m, p.search_most_m), min(window_rad, p.search_most_rad)
+        if self._is_vague(first) and not max(found).sure:
+            window_m, window_rad = (p.search_sigmas * sigma for sigma in first.sigmas)
+            window = min(window_m, p.search_most_m), min(window_rad, math.pi)
             guesses = self._maps.search(planar_scan, SE2.from_matrix(first.pose), *window)
-            found.extend(self._candidate(planar_scan, guess, first) for guess in guesses)
-        return max(found)
+            searched = (self._candidate(planar_scan, guess, first) for guess in guesses)
+            found.extend(replace(candidate, near=False) for candidate in searched)
+        return self._believed(found)
+
+    def _believed(self, found: list[_Candidate]) -> _Candidate:
+        """The best of several matches; it says nothing where another place is nearly as probable."""
+        p, best = self._parameters, max(found)
+        rivals = [
+            math.exp(other.score - best.score)
+            for other in found
+            if not _is_near(other.match.pose, best.match.pose, p.search_above_m, p.search_above_rad)
+        ]
+        alone = 1.0 / (1.0 + sum(rivals)) >= p.least_mass
+        return best if alone else replace(best, sure=False, near=False)
 
     def _candidate(self, planar_scan: PlanarScan, guess: SE2, belief: Belief) -> _Candidate:
         """A match of a planar scan that begins at a guess and is held to a belief."""
         information = _in_map_axes(belief)
         match = self._maps.match(planar_scan, guess, SE2.from_matrix(belief.pose), information)
         p = self._parameters
-        of_scan = p.scan_weight * self._maps.quality(match)
+        of_scan = p.hit_weight * min(len(planar_scan.hits_m), p.matched_hits) * self._maps.quality(match)
         pose = match.pose.lift()
         near = belief.chi2(pose) < p.search_sigmas**2
         return _Candidate(of_scan + belief.log_density(pose), match, self._is_sure(match), near)
+
+    def _is_vague(self, belief: Belief) -> bool:
+        """Whether a refinement alone does not reach all that a belief holds possible."""
+        p, (sigma_m, sigma_rad) = self._parameters, belief.sigmas
+        return p.search_sigmas * max(sigma_m / p.search_above_m, sigma_rad / p.search_above_rad) > 1.0
 
     def _is_sure(self, match: Match) -> bool:
         """Whether a scan fits so well that nothing else needs to be tried."""
         p = self._parameters
         return match.overlap >= p.sure_overlap and match.residual_m <= p.max_residual_m
-
-    def _is_near(self, a: SE2, b: SE2) -> bool:
-        apart = a.inverse() @ b
-        p = self._parameters
-        return math.hypot(apart.x, apart.y) <= p.disagree_m and abs(apart.yaw) <= p.disagree_rad
 
     def cut(self, scan: Scan, points_m: F32, pose: F64, *, lost: bool) -> PlanarScan:
         """The planar scan of the scan placed last."""
@@ -210,6 +220,11 @@ class SensorOnWheels:
         if not noisy:
             return planar_scan
         return self._depth_limit.before(planar_scan, T_level_base @ scan.T_base_sensor)
+
+
+def _is_near(a: SE2, b: SE2, limit_m: float, limit_rad: float) -> bool:
+    apart = a.inverse() @ b
+    return math.hypot(apart.x, apart.y) <= limit_m and abs(apart.yaw) <= limit_rad
 
 
 def _turned(matrix: F64, yaw_rad: float) -> F64:

@@ -67,14 +67,15 @@ class TrackingParameters:
     min_hits : with fewer hits no refinement is made.
     matched_hits : hits of a scan that are matched, at most, evenly chosen.
     residual_weight_per_m : of two placements the one with the larger overlap - weight * residual is taken.
-    scan_weight : a scan of some hundred hits, which are not independent, tells as much as so many that are.
+    hit_weight : what a hit tells as a share of one that is independent of its neighbours.
     disagree_m, disagree_rad : where KISS-ICP and the prediction differ by more, both start a refinement.
     sure_overlap : least overlap of a placement that alone decides between odometry and the motion before;
         with less, placements are searched for if the prediction leaves enough open.
     search_sigmas : half width of that search in standard deviations of the predicted motion.
     search_above_m, search_above_rad : it is made only if the half width exceeds one of these; a refinement
         alone converges over less.
-    search_most_m, search_most_rad : largest half width.
+    search_most_m : largest half width. Tracking starts again if the position is known to less.
+    least_mass : share of the probability of all matches that the best one must have.
     search_sigma_m : of the likelihood field that is searched; its steps are 0.2 m and 2 degrees.
     search_hits : hits that are searched with, at most, evenly chosen.
 
@@ -87,7 +88,6 @@ class TrackingParameters:
 
     min_overlap : least share of the hits that meet a line of the local map, or of the points a surface.
     max_residual_m : largest mean distance of the hits from their lines.
-    bridged_scans : poor scans in a row that odometry may bridge.
     give_up_scans : lost scans in a row after which tracking starts again.
 
     KISS-ICP (Vizzo et al. 2023; its defaults are for cars):
@@ -124,7 +124,7 @@ class TrackingParameters:
     min_hits: int = 10
     matched_hits: int = 700
     residual_weight_per_m: float = 5.0
-    scan_weight: float = 100.0
+    hit_weight: float = 0.3
     disagree_m: float = 0.03
     disagree_rad: float = 0.02
     sure_overlap: float = 0.6
@@ -132,7 +132,7 @@ class TrackingParameters:
     search_above_m: float = 0.3
     search_above_rad: float = 0.2
     search_most_m: float = 3.0
-    search_most_rad: float = math.radians(60.0)
+    least_mass: float = 0.9
     search_sigma_m: float = 0.15
     search_hits: int = 200
 
@@ -142,7 +142,6 @@ class TrackingParameters:
 
     min_overlap: float = 0.3
     max_residual_m: float = 0.1
-    bridged_scans: int = 30
     give_up_scans: int = 10
 
     icp_min_frame: int = 10

@@ -17,7 +17,6 @@ class Placed:
         scan fits nowhere.
     overlap : share of the points that meet the map. residual_m : their mean distance from it. measured :
         whether they fix every direction of the position.
-    sure : whether it fits so well that nothing else needs to say where it is.
     first : there is no local map yet, nor any since tracking started again.
     motion : (4, 4) T_last_now by registration, with its standard deviations (D,), where that counts.
     """
@@ -27,6 +26,5 @@ class Placed:
     overlap: float = 0.0
     residual_m: float = math.inf
     measured: bool = False
-    sure: bool = False
     first: bool = False
     motion: tuple[F64, F64] | None = None

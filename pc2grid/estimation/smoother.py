@@ -106,6 +106,14 @@ class Belief:
         _, log_volume = np.linalg.slogdet(self.covariance)
         return -0.5 * (kernel**2 * math.log1p(self.chi2(pose) / kernel**2) + float(log_volume))
 
+    @property
+    def sigmas(self) -> tuple[float, float]:
+        """Largest standard deviation of the position (m) and of the turn (rad)."""
+        position = self.free < 3
+        largest = (np.linalg.eigvalsh(self.covariance[np.ix_(k, k)])[-1] for k in (position, ~position))
+        of_position_m, of_turn_rad = (math.sqrt(variance) for variance in largest)
+        return of_position_m, of_turn_rad
+
     def chi2(self, pose: F64) -> float:
         """Squared Mahalanobis distance of a pose (4, 4)."""
         step, _, _ = steps(self.pose[None], pose[None])
@@ -424,7 +432,8 @@ class Smoother:
             return
         scans = np.array(known)
         seconds = np.array([max(e.seconds, _LEAST_S) for e in self._evidence])
-        ratio = (seconds[scans + 2] / seconds[scans + 1])[:, None]
+        for_s = np.minimum(seconds[scans + 2], np.maximum(seconds[scans + 1], p.steady_s))
+        ratio = (for_s / seconds[scans + 1])[:, None]
         rows = np.concatenate([self._rows(scans + k) for k in range(3)], axis=1)
         of_first = -ratio[:, :, None] * of_poses.by_first[scans]
         of_second = of_poses.by_first[scans + 1] - ratio[:, :, None] * of_poses.by_second[scans]

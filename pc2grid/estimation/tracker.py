@@ -140,15 +140,12 @@ class Tracker:
         evidence = Evidence(seconds, reading, continues, placed.alone, placed.motion)
         estimate = self._smoother.add(placed.pose, evidence)
         # 4. Judge the pose, and start again if nothing fits any more.
-        health = self._health.judge(placed, bridged=reading is not None and continues)
-        apart = reading is not None and not (continues or placed.sure or placed.first)
-        if apart:  # nothing says where this scan lies to those before
-            health = Health.LOST
+        health = self._health.judge(placed, estimate, bridged=reading is not None and continues)
         self._intervals_s.append(seconds)
         tracked = self._finish(
             scan, points, self._sensor.levelled(estimate.pose), health, continues=continues
         )
-        if apart or self._health.gives_up:
+        if self._health.gives_up:
             self._restart()
         return tracked
 
