@@ -59,13 +59,14 @@ class Verdict:
     confidence : mass of the first place, see `signature.localization.posterior`.
     hypotheses : all that fit, by the mass of their places. places : parallel to them, which of them are the
     same place, seen in the maps of different sessions; numbered from 0, best first.
-    evidence : what tells for the first place.
+    masses : of each place, by its number. evidence : what tells for the first place.
     """
 
     status: Status
     confidence: float
     hypotheses: tuple[Hypothesis, ...]
     places: tuple[int, ...]
+    masses: tuple[float, ...]
     evidence: Evidence
 
 
@@ -93,7 +94,8 @@ class Answer:
     T_map_base : base at the query's last scan. covariance : (3, 3) of x, y, yaw.
     T_map_odom : puts the whole query trajectory into the map.
     confidence : probability that the best hypothesis is right.
-    hypotheses : all that fit, best first. places : the place each of them is at, see `Verdict`.
+    hypotheses : all that fit, best first. places : the place each of them is at; masses : of each place, see
+    `Verdict`.
     history : how the answer came to be. evidence : what the confidence rests on.
     local_map : what the query has seen, in its odom frame: what the hypotheses were compared with.
     sessions, labels : all of the database, that `Hypothesis.session_index` counts.
@@ -122,6 +124,7 @@ class Answer:
     evidence: Evidence
     local_map: OccupancyGrid
     timing_ms: dict[str, float] = field(default_factory=dict)
+    masses: tuple[float, ...] = ()
     prior: Literal["used", "lapsed"] | None = None
     excluded: Moment | None = None
     in_space: PoseInSpace | None = None

@@ -1,110 +1,147 @@
-"""Where a running robot is believed to be: a state machine over the answers of a `Localizer`.
+"""The posterior filtered over time, with a rate of kidnapping.
 
-Once the robot is located, its odometry says where the next answer must be. An answer elsewhere, or none for
-several metres, means that the robot was carried away, or that the first answer was wrong: the search begins
-again, and one answer is not enough then.
+    prior_t(h)  =  1 + (1 - k) mass_s(h) / (1 - (1 - k) sum_g mass_s(g)),    k = 1 - (1 - slip)^n
+    mass_t(h)   =  prior_t(h) exp(z_h) / N        (`signature.localization.posterior`)
+
+The scans of a look are those of the last metres, so the looks overlap. The prior of look t follows from the
+latest look s that lies before all scans of t. Then each scan counts once, however far the robot has driven,
+and a look costs the same after 80 m as after 15 m. The odometry carries the places on: the pose of a query in
+the map is that of its odometry frame, which does not move.
+
+At each of the n scans of t, odometry may fail or the robot may be carried away, at the rate `slip`. This
+share of the mass joins "anywhere", of which each place has the mass of "nowhere" again, as at the beginning.
+So the past makes a place at most 1 / k times as likely, and a place that the robot was never believed to be
+at has the prior 1.
+
+Fox, Burgard and Thrun 1999, "Markov localization for mobile robots in dynamic environments"; Thrun, Burgard
+and Fox, "Probabilistic Robotics", chapter 8.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from pc2grid.geometry import SE2
+from signature.localization.answer import Answer, Verdict
+from signature.localization.hypotheses import Hypothesis, same_pose
+from signature.localization.posterior import POSTERIOR
+from signature.localization.query import QueryMap
 
 State = Literal["searching", "located", "doubtful", "lost", "recovered"]
-"""searching: not located yet. located: where the odometry says that it must be. doubtful: not confirmed by
-this look. lost: not where it was. recovered: located again after that, by two looks that agree."""
+"""searching: not located yet. located: one place has at least the mass `RelocalizeConfig.accept`. doubtful:
+none has, but the robot is more likely than not where it was. lost: it is not. recovered: located elsewhere,
+or again after it was lost."""
 
 
-@dataclass(frozen=True, slots=True)
-class WatchParameters:
-    """When a located robot counts as lost; chosen by hand.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Masses:
+    """The masses of places at one moment.
 
-    same_m, same_rad : answers agree if they differ by no more from what odometry says,
-    same_share : and by this share of the way between them.
-    doubtful_looks : so many looks in a row without an answer make a located robot lost.
-    lost_scans : so do so many scans in a row that cannot be registered.
-    standing_s : a robot that does not move is looked for once, after this time.
-    standing_m : a robot that has moved less stands.
+    part : of the query, see `QueryMap.part`. place : of each hypothesis, number of its mass.
     """
 
-    same_m: float = 0.5
-    same_rad: float = math.radians(10.0)
-    same_share: float = 0.05
-    doubtful_looks: int = 5
-    lost_scans: int = 20
-    standing_s: float = 2.0
-    standing_m: float = 0.3
+    part: int
+    path_m: float
+    T_odom_base: SE2
+    hypotheses: tuple[Hypothesis, ...] = ()
+    places: tuple[int, ...] = ()
+    masses: tuple[float, ...] = ()
 
+    @staticmethod
+    def of(query: QueryMap, found: Verdict | Answer) -> Masses:
+        """The masses that a query gives."""
+        return Masses(
+            part=query.part,
+            path_m=query.path_m,
+            T_odom_base=query.T_odom_base,
+            hypotheses=found.hypotheses,
+            places=found.places,
+            masses=found.masses,
+        )
 
-WATCH = WatchParameters()
+    def mass(self, place: Sequence[Hypothesis]) -> float:
+        """Mass of the places that put the robot, at this moment, where one of these hypotheses does."""
+        at = [(h.session_index, h.fit.T_map_query @ self.T_odom_base) for h in place]
+        found = {
+            number
+            for h, number in zip(self.hypotheses, self.places, strict=True)
+            for session, base in at
+            if h.session_index == session and same_pose(h.fit.T_map_query @ self.T_odom_base, base)
+        }
+        return sum(self.masses[number] for number in found)
 
+    def prior(self, query: QueryMap, place: Sequence[Hypothesis]) -> float:
+        """Prior of a place, relative to that of "nowhere", for a query of later scans."""
+        kept = (1.0 - POSTERIOR.slip) ** max(len(query.keyframes), 1)
+        return 1.0 + kept * self.mass(place) / (1.0 - kept * sum(self.masses))
 
-@dataclass(frozen=True, slots=True)
-class Place:
-    """A place in a map: the map, the base in it and in the frame of the registered scans, and metres driven
-    when it was found."""
-
-    session: str
-    T_map_base: SE2
-    T_session_base: SE2
-    driven_m: float
-
-    def agrees(self, later: Place, p: WatchParameters) -> bool:
-        """Whether two places are one, by the motion between them."""
-        expected = self.T_map_base @ self.T_session_base.inverse() @ later.T_session_base
-        apart = expected.inverse() @ later.T_map_base
-        limit_m = p.same_m + p.same_share * (later.driven_m - self.driven_m)
-        near = math.hypot(apart.x, apart.y) <= limit_m and abs(apart.yaw) <= p.same_rad
-        return self.session == later.session and near
+    def or_else(self, other: Verdict) -> Verdict:
+        """The verdict on a part of the same scans, with the mass of its first place if the one or the other
+        explanation holds: their odds against "nowhere" add up."""
+        first = [h for h, number in zip(other.hypotheses, other.places, strict=True) if number == 0]
+        nowhere, elsewhere = 1.0 - sum(other.masses), 1.0 - sum(self.masses)
+        odds = sum(other.masses[:1]) / nowhere + self.mass(first) / elsewhere
+        confidence = odds / (1.0 / nowhere + 1.0 / elsewhere - 1.0)
+        return replace(other, confidence=confidence, masses=(confidence, *other.masses[1:]))
 
 
 class Belief:
-    """The place of the robot, if it is located, and a place that one look has found elsewhere.
+    """The masses of the looks since the start of the last window, and what they say of a running robot."""
 
-    place : None while the last looks do not agree on where the robot is. candidate : to be confirmed.
-    """
-
-    def __init__(self, parameters: WatchParameters = WATCH) -> None:
-        self._parameters = parameters
+    def __init__(self) -> None:
+        self._looks: deque[Masses] = deque()
+        self._place: tuple[int, tuple[Hypothesis, ...]] | None = None  # part and place of the last "located"
         self._was_located = False
-        self.restart()
+
+    @property
+    def located(self) -> bool:
+        """Whether the robot is more likely than not where it was located last."""
+        return self._place is not None
+
+    @property
+    def session_index(self) -> int | None:
+        """Of the map in which it was located last."""
+        return self._place[1][0].session_index if self._place else None
 
     def restart(self) -> None:
         """The scans do not go on from those before. It is remembered that the robot was located once."""
-        self.place: Place | None = None
-        self.candidate: Place | None = None
-        self._doubtful = 0
+        self._looks.clear()
+        self._place = None
 
-    def update(self, found: Place | None, gives_up: bool = False) -> State:
-        """The state after a look. gives_up : an answer that does not confirm the place ends it."""
-        if self.place is None:
-            return self._search(found)
-        if found is not None and self.place.agrees(found, self._parameters):
-            return self._confirm(found, "located")
-        if found is not None and self.candidate and self.candidate.agrees(found, self._parameters):
-            return self._confirm(found, "recovered")
-        self._doubtful += 1
-        if gives_up or self._doubtful >= self._parameters.doubtful_looks:
-            self.restart()
-            return "lost"
-        self.candidate = found
-        return "doubtful"
+    def prior(self, query: QueryMap, place: Sequence[Hypothesis]) -> float:
+        """Prior of a place, relative to that of "nowhere", by the looks before the scans of a query."""
+        before = None
+        for look in self._looks:
+            if query.keyframes and look.part == query.part and look.path_m < query.keyframes[0].path_m:
+                before = look
+        return 1.0 if before is None else before.prior(query, place)
 
-    def _search(self, found: Place | None) -> State:
-        """The state of a robot that is not located before this look."""
-        before, self.candidate = self.candidate, found
-        if found is None:
-            return "lost" if self._was_located else "searching"
-        if not self._was_located:
-            return self._confirm(found, "located")
-        # One answer was wrong, or the robot was moved: this time a second one must confirm it.
-        if before is not None and before.agrees(found, self._parameters):
-            return self._confirm(found, "recovered")
-        return "doubtful"
+    def add(self, query: QueryMap, found: Verdict | Answer) -> Masses:
+        """Keep the masses of a look; those that no later query follows from are forgotten."""
+        look = Masses.of(query, found)
+        first_m = query.keyframes[0].path_m if query.keyframes else query.path_m
+        looks = self._looks
+        while len(looks) > 1 and (looks[1].path_m < first_m or looks[0].part != query.part):
+            looks.popleft()
+        self._looks.append(look)
+        return look
 
-    def _confirm(self, found: Place, state: State) -> State:
-        self.place, self.candidate, self._doubtful, self._was_located = found, None, 0, True
-        return state
+    def follow(self, look: Masses, best: Hypothesis | None) -> State:
+        """The state of a running robot after a look. best : the hypothesis that it is located at."""
+        here = 0.0
+        if self._place is not None and self._place[0] == look.part:
+            here = look.mass(self._place[1])
+        if best is not None:
+            place = look.places[0]
+            goes_on = not self._was_located or here >= POSTERIOR.in_the_map
+            self._was_located = True
+            all_of = (h for h, number in zip(look.hypotheses, look.places, strict=True) if number == place)
+            self._place = look.part, (best, *(h for h in all_of if h is not best))
+            return "located" if goes_on else "recovered"
+        if here >= POSTERIOR.in_the_map:
+            return "doubtful"
+        self._place = None
+        return "lost" if self._was_located else "searching"

@@ -157,6 +157,7 @@ def _refused(answer: Answer, in_space: PoseInSpace) -> Answer:
         covariance=None,
         T_map_odom=None,
         confidence=confidence,
+        masses=tuple(0.0 for _ in answer.masses),
         history=_ending(answer.history, status="not_found", confidence=confidence),
         in_space=in_space,
     )
@@ -198,6 +199,7 @@ def _located(
             answer.history, status="located", session=session, pose=T_map_base, confidence=confidence
         ),
         places=tuple(numbers[known] for known in places),
+        masses=(confidence, *(0.0 for _ in range(1, len(numbers)))),
         submap_ids=tuple(answer.submap_ids[k] for k in order),
         in_space=in_space,
     )

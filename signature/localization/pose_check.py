@@ -1,11 +1,11 @@
 """Is a pose that the robot believes in still right?
 
-The last metres are asked twice, with the same calibrated probability as any query: near the pose (which is a
-prior, so equal rooms elsewhere are no rivals), and everywhere. The pose is
+The same posterior as that of any query, with the robot's belief as the prior: before what it has seen lately,
+the mass was where the robot believes to be (`signature.localization.belief`). The pose is
 
-- fine, if the best place, of all or near the pose, is certain, and the pose lies within the tolerance of it;
-- lost, if another place is certain, or if the map at the pose contradicts what the robot has seen: its
-  likelihood is less than that of a wrong place;
+- fine, if the place within its tolerance has the mass that is needed to be located;
+- lost, if another place has it, or if the map at the pose contradicts what the robot has seen: its likelihood
+  is less than that of a wrong place;
 - unsure otherwise: the map knows too little there, or several places fit equally well.
 
 `check_pose` asks this of a recording; a `PoseWatch` asks it of a running robot again and again: after every
@@ -17,8 +17,9 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -30,11 +31,12 @@ from pc2grid.io.map_pose import MapPose
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
+from signature.localization.belief import Masses
 from signature.localization.hypotheses import Hypothesis
-from signature.localization.localizer import Localizer, answer_query
+from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import POSTERIOR, evidence_of
-from signature.localization.prior import Prior
+from signature.localization.posterior import evidence_of
+from signature.localization.prior import Prior, Region
 
 if TYPE_CHECKING:
     from signature.localization.localizer import Watch
@@ -117,7 +119,9 @@ def check_pose(
     >>> checked.status, checked.off_m < 0.1
     ('fine', True)
     """
-    index.within(_around(T_map_base, session))  # raises what is wrong with the session before any work
+    Region.of(
+        _around(T_map_base, session), index.sessions
+    )  # raises what is wrong with the session before any work
     localizer = Localizer(index, prior_ns=stamp_ns)
     for registered, planar_scan in scans:
         localizer.take(registered, planar_scan)
@@ -141,49 +145,48 @@ def check_pose(
 
 def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None) -> PoseCheck:
     """Whether a pose at the query's last scan is right. Raises the errors of `check_pose`."""
-    index = localizer.index
-    restricted = index.within(_around(T_map_base, session))
-    query, seen = localizer.query, localizer.query.map()
-    session = session or index.sessions[0]
-    number = index.sessions.index(session)
+    index, seen = localizer.index, localizer.query.map()
+    region = Region.of(_around(T_map_base, session), index.sessions)
+    number = region.session_index
     T_map_query = T_map_base @ seen.T_odom_base.inverse()
-    here = score_fit(index.maps[number].walls, seen.walls, T_map_query, np.zeros((3, 3)))
-    found = restricted.look_up(seen, (Hypothesis(session_index=number, row=-1, fit=here),))
-    near = answer_query(restricted, query, seen, found, look_outside=False)
-    everywhere = localizer.answer(near.hypotheses)
-    best_near = _bases(near, number)[:1]
-    off_m, off_rad = _apart(T_map_base, best_near[0]) if best_near else (None, None)
-    is_there = any(_within_tolerance(T_map_base, base) for base in best_near)
-
-    def judged(status: CheckStatus, probability: float, better: Answer | None = None) -> PoseCheck:
-        return PoseCheck(
-            status=status,
-            probability=probability,
-            T_map_base=T_map_base,
-            session=session,
-            stamp_ns=seen.stamp_ns,
-            path_m=seen.path_m,
-            off_m=off_m,
-            off_rad=off_rad,
-            better=better,
-        )
-
-    if everywhere.status == "located":
-        # The place may have been seen by several sessions; that whose frame the pose is in counts.
-        if any(_within_tolerance(T_map_base, base) for base in _bases(everywhere, number)):
-            return judged("fine", everywhere.confidence)
-        return judged("lost", 1.0 - everywhere.confidence, everywhere)
-    elsewhere = _best_score(everywhere.hypotheses) - _best_score(near.hypotheses)
-    if near.status == "located" and elsewhere <= POSTERIOR.alike:
-        if is_there:
-            return judged("fine", near.confidence)
-        return judged("lost", 1.0 - near.confidence, near)
-    # The pose fits no better than the best place near it, so it is no more probable; and if that one is
-    # another place, they exclude each other.
-    at_most = near.confidence if is_there else min(near.confidence, 1.0 - near.confidence)
-    (at_pose,) = evidence_of([here], seen)
-    contradicted = at_pose.log_likelihood < 0.0 and at_most <= 1.0 - index.config.accept
-    return judged("lost" if contradicted else "unsure", at_most)
+    fit = score_fit(index.maps[number].walls, seen.walls, T_map_query, np.zeros((3, 3)))
+    believed = Hypothesis(session_index=number, row=-1, fit=fit)
+    before = Masses(
+        part=seen.part,
+        path_m=seen.path_m,
+        T_odom_base=seen.T_odom_base,
+        hypotheses=(believed,),
+        places=(0,),
+        masses=(1.0,),
+    )
+    near = index.within(region.prior).look_up(seen, (believed,))
+    answer = localizer.answer(near, partial(before.prior, seen))
+    bases = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
+    in_frame = [
+        (base, place)
+        for base, place, h in zip(bases, answer.places, answer.hypotheses, strict=True)
+        if h.session_index == number and region.prior.allows(base)
+    ]
+    here = {place for base, place in in_frame if _within_tolerance(T_map_base, base)}
+    mass_here = sum(answer.masses[place] for place in here)
+    elsewhere = sum(answer.masses) - mass_here
+    # Where the map knows too little to contradict the pose, "at no place of this map" does not exclude it.
+    (evidence,) = evidence_of([fit], seen)
+    at_most = mass_here if evidence.log_likelihood < 0.0 else 1.0 - elsewhere
+    status: CheckStatus = "lost" if at_most <= 1.0 - index.config.accept else "unsure"
+    status = "fine" if mass_here >= index.config.accept else status
+    off_m, off_rad = _apart(T_map_base, in_frame[0][0]) if in_frame else (None, None)
+    return PoseCheck(
+        status=status,
+        probability=mass_here if status == "fine" else at_most,
+        T_map_base=T_map_base,
+        session=index.sessions[number],
+        stamp_ns=seen.stamp_ns,
+        path_m=seen.path_m,
+        off_m=off_m,
+        off_rad=off_rad,
+        better=answer if status == "lost" and answer.status == "located" else None,
+    )
 
 
 def _around(T_map_base: SE2, session: str | None) -> Prior:
@@ -195,19 +198,6 @@ def _around(T_map_base: SE2, session: str | None) -> Prior:
         half_yaw_rad=CHECK.near_rad,
         session=session,
     )
-
-
-def _bases(answer: Answer, session_index: int) -> list[SE2]:
-    """The base at the best place of an answer, by the map of a session; none if that does not show it."""
-    return [
-        h.fit.T_map_query @ answer.T_odom_base
-        for h, place in zip(answer.hypotheses, answer.places, strict=True)
-        if place == answer.places[0] and h.session_index == session_index
-    ]
-
-
-def _best_score(hypotheses: Sequence[Hypothesis]) -> float:
-    return hypotheses[0].fit.score if hypotheses else 0.0
 
 
 def _apart(a: SE2, b: SE2) -> tuple[float, float]:

@@ -172,11 +172,11 @@ def evidence_of(fits: Sequence[Fit], query: QueryMap, rivals: Sequence[Fit] = ()
 
 
 def off_map(query: QueryMap, fit: Fit, field: LikelihoodField) -> float:
-    """`Evidence.off_map` of a query at a pose on a map."""
+    """`Evidence.off_map` of a query at a pose on a map. Scans that it leaves out count as off the map."""
     if not query.keyframes:
         return 0.0
     path_m = np.array([(k.T_odom_base.x, k.T_odom_base.y) for k in query.keyframes])
-    return 1.0 - float(field.at(fit.T_map_query.apply(path_m))[1].mean())
+    return 1.0 - (1.0 - query.left_out) * float(field.at(fit.T_map_query.apply(path_m))[1].mean())
 
 
 def alike(score: float, other: float) -> bool:
@@ -203,9 +203,11 @@ def masses(
     return np.asarray(odds / (math.exp(-highest) + odds.sum() + lost))
 
 
-def in_the_map(evidence: Sequence[Evidence], p: PosteriorParameters = POSTERIOR) -> float:
+def in_the_map(
+    evidence: Sequence[Evidence], prior: float | Sequence[float] = 1.0, p: PosteriorParameters = POSTERIOR
+) -> float:
     """Probability that the query lies at the best of the places or at one that fits equally well."""
-    best = max((e.log_odds_alike(p) for e in evidence), default=-math.inf)
+    best = np.max(np.array([e.log_odds_alike(p) for e in evidence]) + np.log(prior), initial=-math.inf)
     return 1.0 / (1.0 + math.exp(min(-best, 700.0)))
 
 

@@ -2,13 +2,15 @@
 
 A prior excludes: a place outside has probability 0 and is no answer. Between places that fit equally well it
 decides. But what scores differently outside still shows what wrong places score for this query, so it remains
-evidence (`MapIndex.judge`): a place that fits poorly is not certain because few others are in the region, and
-if another place fits better by far, nothing inside is. That place is reported (`Answer.excluded`).
+evidence (`signature.localization.decision`): a place that fits poorly is not certain because few others are
+in the region, and if another place fits better by far, nothing inside is. That place is reported
+(`Answer.excluded`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +19,7 @@ from numpy.typing import ArrayLike
 from pc2grid.arrays import F64, BoolGrid
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2, wrap_angle
+from signature.localization.query import QueryMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,3 +147,47 @@ class Prior:
         reach = self.radius_m + moved_m + PRIOR.drift * since_m + side_m * math.sqrt(0.5)
         center = (self.T_map_base.x, self.T_map_base.y)
         return np.asarray(np.hypot(*(squares_m - center).T) <= reach)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Region:
+    """A prior on the map of one of several sessions. session_index : number of that session."""
+
+    prior: Prior
+    session_index: int
+
+    @staticmethod
+    def of(prior: Prior, sessions: Sequence[str]) -> Region:
+        """Raises ConfigError if the prior does not name its session where there are several, or an unknown
+        one."""
+        names = ", ".join(sessions[:12]) + (", ..." if len(sessions) > 12 else "")
+        if prior.session is None and len(sessions) > 1:
+            raise ConfigError(
+                f"near: the database holds {len(sessions)} sessions, each with a map frame of its own",
+                hint=f"--session NAME says whose frame is meant: {names}",
+            )
+        if prior.session is not None and prior.session not in sessions:
+            raise ConfigError(
+                f"near: no session {prior.session!r} where it is looked for", hint=f"there is: {names}"
+            )
+        return Region(
+            prior=prior, session_index=0 if prior.session is None else sessions.index(prior.session)
+        )
+
+    def T_odom_prior(self, query: QueryMap) -> SE2 | None:
+        """The base at the time that the prior is about; None if the motion since is not known."""
+        return query.T_odom_base if self.prior.stamp_ns is None else query.T_odom_prior
+
+    def allows(self, query: QueryMap, T_map_query: SE2) -> bool:
+        """Whether the query can lie at a pose. The motion since the time of the prior must be known."""
+        T_odom_prior = self.T_odom_prior(query)
+        assert T_odom_prior is not None
+        return self.prior.allows(T_map_query @ T_odom_prior, query.since_prior_m)
+
+    def squares(self, query: QueryMap, free_m: F64, side_m: float) -> F64:
+        """Those of the squares of `side_m` around (K, 2) that may hold the base now."""
+        T_odom_prior = self.T_odom_prior(query)
+        assert T_odom_prior is not None
+        step = T_odom_prior.inverse() @ query.T_odom_base
+        moved_m = math.hypot(step.x, step.y)
+        return np.asarray(free_m[self.prior.may_hold(free_m, side_m, moved_m, query.since_prior_m)])

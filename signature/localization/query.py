@@ -83,6 +83,7 @@ class QueryMap:
     T_odom_prior : the base at the time that a prior is about; None if it is not known in this odom frame.
     since_prior_m : metres driven since that time.
     keyframes : the scans that it was drawn from, oldest first, and the last scan; none of a drawn map.
+    left_out : 0..1, of the scans of the last metres, the share that it was not drawn from.
     """
 
     stamp_ns: int
@@ -96,6 +97,7 @@ class QueryMap:
     T_odom_prior: SE2 | None = None
     since_prior_m: float = 0.0
     keyframes: tuple[Keyframe, ...] = ()
+    left_out: float = 0.0
 
     @cached_property
     def likeness(self) -> float:
@@ -270,6 +272,7 @@ class Query:
             T_odom_prior=None if at_prior is None else at_prior.T_odom_base,
             since_prior_m=0.0 if at_prior is None else newest.path_m - at_prior.path_m,
             keyframes=(*keyframes, *(() if newest is keyframes[-1] else (newest,))),
+            left_out=1.0 - len(keyframes) / max(len(self._keyframes), 1),
         )
 
 

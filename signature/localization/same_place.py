@@ -9,6 +9,7 @@ out; labels that agree lower the probability that is needed.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,8 +20,9 @@ from pc2grid.matching.refinement import refine
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import SearchMap
-from pc2grid.model import UNKNOWN, OccupancyGrid
+from pc2grid.model import UNKNOWN, OccupancyGrid, same_recording
 from signature.localization.hypotheses import Hypothesis, same_pose
+from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
 
 
@@ -54,12 +56,39 @@ class SamePlace:
 
 
 SAME_PLACE = SamePlace()
+_COMPARED = 5
+"""Places that hypotheses of other sessions are compared with; further ones have no mass."""
 
 
-def same_place(query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
-    """Whether two hypotheses in one session put the query at one place."""
-    bases = [h.fit.T_map_query @ query.T_odom_base for h in (a, b)]
-    return a.session_index == b.session_index and same_pose(*bases)
+def places_of(
+    index: MapIndex, query: QueryMap, hypotheses: Iterable[Hypothesis]
+) -> list[tuple[Hypothesis, ...]]:
+    """The hypotheses by place, best first; a place has one hypothesis a session."""
+    places: list[tuple[Hypothesis, ...]] = []
+    for h in hypotheses:
+        for number, place in enumerate(places[:_COMPARED]):
+            if _belongs(index, query, h, place):
+                places[number] = (*place, h)
+                break
+        else:
+            places.append((h,))
+    return places
+
+
+def _belongs(index: MapIndex, query: QueryMap, h: Hypothesis, place: Sequence[Hypothesis]) -> bool:
+    in_other_maps = h.session_index not in {other.session_index for other in place}
+    return in_other_maps and any(_one_place(index, query, h, other) for other in place)
+
+
+def _one_place(index: MapIndex, query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
+    """Whether two hypotheses in two maps are one place."""
+    label, other = index.labels[a.session_index], index.labels[b.session_index]
+    one_recording = same_recording(index.sessions[a.session_index], index.sessions[b.session_index])
+    if label.contradicts(other, one_recording=one_recording):
+        return False
+    labelled = label.agrees(other, one_recording=one_recording)
+    on, grid = index.maps[a.session_index], index.grids[b.session_index]
+    return surroundings_agree(query, a, on, b, grid, labelled=labelled)
 
 
 def surroundings_agree(

@@ -21,9 +21,10 @@ from pc2grid.time_span import TimeSpan
 from pc2grid_cli.known_pose import KnownPose
 from signature.database import open_database
 from signature.files import locate_log, query_config
-from signature.localization.belief import WATCH
+from signature.localization.hypotheses import HYPOTHESES
 from signature.localization.localizer import locate_map
 from signature.localization.map_index import MapIndex
+from signature.localization.prior import PRIOR
 
 if TYPE_CHECKING:
     from pc2grid.arrays import F64, I64
@@ -212,7 +213,7 @@ def followed(poses: Trajectory, answer: Answer) -> Trajectory:
     Between two located moments the correction is interpolated along the travel, in position and heading of
     the base; before the first one it is that of the first. Where registration was lost the motion is not
     known, so nothing is interpolated across. A moment counts if the one before or after it agrees with it, by
-    the motion between them as `pc2grid watch` judges it.
+    the motion between them.
 
     Without an answer: as they are.
     """
@@ -267,8 +268,8 @@ def _located_moments(
             return False
         expected = a[1] @ SE2(*planar[a[0]]).inverse() @ SE2(*planar[b[0]])
         apart_m = math.hypot(expected.x - b[1].x, expected.y - b[1].y)
-        limit_m = WATCH.same_m + WATCH.same_share * (travel_m[b[0]] - travel_m[a[0]])
-        return apart_m <= limit_m and abs(wrap_angle(expected.yaw - b[1].yaw)) <= WATCH.same_rad
+        limit_m = HYPOTHESES.same_m + PRIOR.drift * (travel_m[b[0]] - travel_m[a[0]])
+        return apart_m <= limit_m and abs(wrap_angle(expected.yaw - b[1].yaw)) <= HYPOTHESES.same_rad
 
     agrees = [agree(a, b) for a, b in itertools.pairwise(found)]
     kept = [

@@ -23,7 +23,10 @@ from signature.describe import Signature, describe
 from signature.localization import query as query_module
 from signature.localization.answer import Moment, Verdict
 from signature.localization.hypotheses import Hypothesis, fitted
-from signature.localization.localizer import Answer, Localizer, MapIndex, answer_query, locate_in
+from signature.localization import answering
+from signature.localization.answering import answer_query
+from signature.localization.decision import decide, judge
+from signature.localization.localizer import Answer, Localizer, MapIndex, locate_in
 from signature.localization.posterior import NO_EVIDENCE
 from signature.localization.query import Query, QueryMap
 from tests.helpers.simulated_drives import building, drive, office, plan
@@ -68,13 +71,13 @@ def test_a_better_place_that_was_not_proposed_takes_a_certain_answer_away() -> N
     wrong = tuple(h for h in proposed if math.dist(position(h, seen), (truth.x, truth.y)) > 1.0) or (
         fitted(seen, 0, -1, index.maps[0], SE2(4.0, 3.0, 1.0)),
     )
-    alone = index.judge(seen, wrong[:1])
+    alone = judge(index, seen, wrong[:1])
     assert alone.status == "located"
-    verdict = index.decide(seen, wrong[:1])
+    verdict = decide(index, seen, wrong[:1])
     assert math.dist(position(verdict.hypotheses[0], seen), (truth.x, truth.y)) < 0.1
     # Nothing is found that would shake a right answer.
-    right = index.decide(seen, proposed)
-    assert right.hypotheses[0] == proposed[0] and right.confidence == index.judge(seen, proposed).confidence
+    right = decide(index, seen, proposed)
+    assert right.hypotheses[0] == proposed[0] and right.confidence == judge(index, seen, proposed).confidence
 
 
 def position(hypothesis: Hypothesis, query: QueryMap) -> tuple[float, float]:

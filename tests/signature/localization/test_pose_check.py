@@ -27,7 +27,10 @@ from tests.helpers.simulated_drives import building, drive, office, plan
 
 BENT = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]
 TWINS = plan(12, 6, [(6, 0, 6, 6), *BENT, *[(x0 + 6, y0, x1 + 6, y1) for x0, y0, x1, y1 in BENT]])
-OFFICE, ALIKE = building({"office": office()}), building({"twins": TWINS})
+ROOM = [(0, 0, 6, 0), (0, 6, 6, 6), (0, 0, 0, 6), (6, 0, 6, 6), *BENT]
+EQUAL = plan(18, 9, [(x0 + x, y0 + 1, x1 + x, y1 + 1) for x in (1, 10) for x0, y0, x1, y1 in ROOM])
+"""Two equal rooms that stand apart: (x, y) of the one is (x + 9, y) of the other."""
+OFFICE, ALIKE = building({"office": office()}), building({"equal": EQUAL})
 Driven = list[tuple[RegisteredScan, PlanarScan, SE2]]
 
 
@@ -73,10 +76,10 @@ def test_a_wrong_pose_is_lost_and_the_right_one_is_told(off: SE2) -> None:
 def test_of_two_rooms_that_are_alike_the_pose_says_which() -> None:
     """Nothing that the robot sees tells them apart, so neither pose is contradicted; a wrong one in either
     room is."""
-    driven = list(drive(TWINS, [(1.0, 1.0), (5.0, 1.0), (5.0, 2.4)]))
+    driven = list(drive(EQUAL, [(2.0, 2.0), (6.0, 2.0), (6.0, 3.4)]))
     truth = driven[-1][2]
     assert check(ALIKE, driven, SE2()).status == "fine"
-    other_room = SE2(truth.x + 6.0, truth.y, truth.yaw)
+    other_room = SE2(truth.x + 9.0, truth.y, truth.yaw)
     assert check(ALIKE, driven, truth.inverse() @ other_room).status == "fine"
     assert check(ALIKE, driven, SE2(0.6, 0.0, 0.0)).status == "lost"
 

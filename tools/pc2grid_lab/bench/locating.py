@@ -11,6 +11,7 @@ from pc2grid_lab.bench import fixtures
 from pc2grid_lab.bench.measure import Row, median, program, timed
 from pc2grid_lab.bench.reading import bare_kiss
 from signature.config import Config
+from signature.localization.decision import judge
 
 WINDOW_M = 15.0
 
@@ -31,7 +32,7 @@ def look_up_time(folder: Path, quick: bool) -> Iterator[Row]:
 
         def locate(window: list[fixtures.PosedScan] = window, grid: OccupancyGrid = grid) -> None:
             query = fixtures.query_map(window, config, grid)
-            index.judge(query, index.look_up(query))
+            judge(index, query, index.look_up(query))
 
         times.append(timed(locate))
     wall, cpu = median(times).times(1e3)

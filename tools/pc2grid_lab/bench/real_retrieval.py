@@ -34,6 +34,7 @@ from pc2grid_lab.experiments.selection import TRAVELS_M, office_floor, shuffled
 from pc2grid_lab.experiments.trial import JUDGEMENT
 from signature.config import Config
 from signature.describe import Signature
+from signature.localization.decision import judge
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
 from signature.retrieval.place_index import PlaceIndex
@@ -145,7 +146,7 @@ def answers(
                 found = index.search_whole_maps(query, ())
             else:
                 found = index.look_up(query, rows=np.sort(building.rows(selector, query, most, rng)))
-            verdict = index.judge(query, found)
+            verdict = judge(index, query, found)
             took_ms = 1000.0 * (time.process_time() - begin)
             located = verdict.status == "located"
             well = False

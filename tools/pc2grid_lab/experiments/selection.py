@@ -30,6 +30,7 @@ from pc2grid_lab.experiments.sensor_map import SensorMap
 from pc2grid_lab.experiments.trial import JUDGEMENT
 from signature.config import Config
 from signature.database import open_database
+from signature.localization.decision import judge
 from signature.localization.map_index import MapIndex
 from signature.localization.query import Query, QueryMap
 from signature.retrieval.place_index import PlaceBlock, PlaceIndex
@@ -195,7 +196,7 @@ class Selection:
                     rows=rows,
                 )
                 processor_ms += 1000.0 * (time.process_time() - begin)
-                verdict = self.index.judge(query, self.index.look_up(query, rows=rows))
+                verdict = judge(self.index, query, self.index.look_up(query, rows=rows))
                 located = verdict.status == "located"
                 well = False
                 if located:

@@ -1,0 +1,193 @@
+"""From a query and the hypotheses for it to its answer.
+
+By all that it has seen; if that does not settle it, by the last metres; refined and checked in space, where
+both sides have points.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from pc2grid.geometry import SE2
+from pc2grid.model import OccupancyGrid
+from signature.localization.answer import Answer, Moment, Verdict
+from signature.localization.belief import Masses
+from signature.localization.decision import PriorOf, anywhere, decide, judge
+from signature.localization.hypotheses import Hypothesis
+from signature.localization.in_space import settle_in_space
+from signature.localization.map_index import MapIndex
+from signature.localization.query import Query, QueryMap, query_of
+
+
+class Clock:
+    """Adds up elapsed times by name, milliseconds. All time since the last lap belongs to the next one."""
+
+    def __init__(self) -> None:
+        self.total_ms: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        """Add the time since the last lap to `name`."""
+        now = time.perf_counter()
+        self.total_ms[name] = self.total_ms.get(name, 0.0) + 1000.0 * (now - self._last)
+        self._last = now
+
+
+def answer_query(
+    index: MapIndex,
+    query: Query,
+    seen: QueryMap,
+    found: tuple[Hypothesis, ...],
+    *,
+    prior_of: PriorOf = anywhere,
+    history: tuple[Moment, ...] = (),
+    clock: Clock | None = None,
+) -> Answer:
+    """Where a query is.
+
+    seen : `query` drawn. found : hypotheses for it. prior_of : what was known before it, of each place.
+    """
+    clock = clock or Clock()
+    verdict = decide(index, seen, found, prior_of)
+    clock.lap("decide")
+    if verdict.status != "located":
+        seen, verdict = _by_last_metres(index, seen, verdict, query.last_metres(), prior_of)
+        clock.lap("last_metres")
+    answer = _answer(index, seen, verdict, history)
+    if index.whole is not None:
+        answer = _with_prior(index, index.whole, answer, seen)
+        clock.lap("decide")
+    if query.in_space is not None and index.points_of is not None:
+        answer = settle_in_space(answer, query.in_space, index.points_of, index.config.accept)
+        clock.lap("in_space")
+    return replace(answer, timing_ms=dict(clock.total_ms))
+
+
+def _by_last_metres(
+    index: MapIndex, query: QueryMap, verdict: Verdict, last_metres: Iterable[QueryMap], prior_of: PriorOf
+) -> tuple[QueryMap, Verdict]:
+    """The first of the shorter queries that is located, with its verdict; the query itself if none is.
+
+    A stretch through rooms that the map lacks or shows otherwise spoils the whole query, even after the robot
+    is back. The scans that a shorter query leaves out count as taken where the map knows nothing. Either the
+    whole query lies in the map or its last metres do, so the odds of both add up.
+    """
+    whole = Masses.of(query, verdict)
+    for shorter in last_metres:
+        found = index.look_up(shorter, verdict.hypotheses)
+        if judge(index, shorter, found, prior_of).status == "located":
+            by_last = whole.or_else(decide(index, shorter, found, prior_of))
+            if by_last.confidence >= index.config.accept:
+                return shorter, by_last
+    return query, verdict
+
+
+def _with_prior(index: MapIndex, whole: MapIndex, answer: Answer, query: QueryMap) -> Answer:
+    """The answer with what became of the prior.
+
+    Where nothing that it allows is certain, all places are searched. What is certain without the prior is
+    not taken away by it, although a search of the whole region finds more rivals than signatures
+    propose; and a query that certainly is elsewhere is not in the region.
+    """
+    if not index.prior_applies(query):
+        return replace(answer, prior="lapsed")
+    answer = replace(answer, prior="used")
+    if answer.status == "located":
+        return answer
+    verdict = decide(whole, query, whole.look_up(query))
+    if not verdict.hypotheses:
+        return answer
+    if index.allows(query, verdict.hypotheses[0]):
+        if verdict.status == "located":
+            answer = replace(_answer(index, query, verdict, answer.history[:-1]), prior="used")
+        return answer
+    excluded = moment_of(whole, query, verdict)
+    if excluded.status == "located":
+        last = replace(answer.history[-1], status="not_found")
+        answer = replace(answer, status="not_found", history=(*answer.history[:-1], last))
+    return replace(answer, excluded=excluded)
+
+
+def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
+    """Find where a drawn map, for example a nav2 map or a part of one, lies in the building.
+
+    grid : the query, in any frame of its own; cells that it does not know must be unknown, not free.
+
+    There is no robot in it, so the "base" of the answer is the map's own frame: `T_map_base` and
+    `T_map_odom` both are T_map_query, and the travelled path is 0 m long.
+
+    >>> import pc2grid, signature
+    >>> with signature.open_database("plan.submaps") as database:
+    ...     answer = locate_map(pc2grid.load_map("part.yaml"), MapIndex.of(database, database.config()))
+    >>> answer.status, round(answer.T_map_base.x, 1), round(answer.T_map_base.y, 1)
+    ('located', 4.0, 3.0)
+    """
+    clock = Clock()
+    query = query_of(grid, np.empty((0, 2)), index.made_with, index.config)
+    # The origin of a map may lie anywhere, even far outside its walls. Poses turn about the best observed
+    # point instead: it is free, and the walls around it are known.
+    if query.views:
+        center = query.views[0].center_m
+        query = replace(query, T_odom_base=SE2(*center), center_m=center)
+    clock.lap("describe")
+    found = index.look_up(query)
+    clock.lap("look_up")
+    verdict = decide(index, query, found)
+    clock.lap("decide")
+    at_origin = tuple(_at_origin(h, query.T_odom_base) for h in verdict.hypotheses)
+    verdict = replace(verdict, hypotheses=at_origin)
+    answer = _answer(index, replace(query, T_odom_base=SE2()), verdict, ())
+    return replace(answer, timing_ms=clock.total_ms)
+
+
+def _at_origin(hypothesis: Hypothesis, at: SE2) -> Hypothesis:
+    """The hypothesis with its covariance, known for the point `at` of the query, moved to the query's
+    origin."""
+    fit = hypothesis.fit
+    there = fit.T_map_query @ at
+    J = np.eye(3)
+    J[:2, 2] = there.y - fit.T_map_query.y, fit.T_map_query.x - there.x
+    return replace(hypothesis, fit=replace(fit, covariance=J @ fit.covariance @ J.T))
+
+
+def moment_of(index: MapIndex, query: QueryMap, verdict: Verdict) -> Moment:
+    """The state of the answer now."""
+    best = verdict.hypotheses[0] if verdict.hypotheses else None
+    return Moment(
+        stamp_ns=query.stamp_ns,
+        path_m=query.path_m,
+        status=verdict.status,
+        session=index.sessions[best.session_index] if best else None,
+        pose=best.fit.T_map_query @ query.T_odom_base if best else None,
+        confidence=verdict.confidence,
+    )
+
+
+def _answer(index: MapIndex, query: QueryMap, verdict: Verdict, history: tuple[Moment, ...]) -> Answer:
+    located = verdict.hypotheses[0] if verdict.status == "located" else None
+    table = index.places.table
+    T_map_query = located.fit.T_map_query if located else None
+    return Answer(
+        status=verdict.status,
+        session=index.sessions[located.session_index] if located else None,
+        stamp_ns=query.stamp_ns,
+        T_map_base=T_map_query @ query.T_odom_base if T_map_query else None,
+        covariance=located.fit.covariance if located else None,
+        T_map_odom=T_map_query,
+        confidence=verdict.confidence,
+        hypotheses=verdict.hypotheses,
+        places=verdict.places,
+        masses=verdict.masses,
+        history=(*history, moment_of(index, query, verdict)),
+        T_odom_base=query.T_odom_base,
+        path_m=query.path_m,
+        sessions=index.sessions,
+        labels=index.labels,
+        submap_ids=tuple(int(table.submap_id[h.row]) if h.row >= 0 else -1 for h in verdict.hypotheses),
+        evidence=verdict.evidence,
+        local_map=query.grid,
+    )

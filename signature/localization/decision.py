@@ -1,0 +1,121 @@
+"""What is decided of a query: the masses of the places that are found, and the status that they give.
+
+located      one place has at least the mass `RelocalizeConfig.accept`
+ambiguous    the query more likely than not lies at one of the places that fit equally well
+not_found    all else
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from pc2grid.matching.two_way_score import Fit
+from signature.localization.alike_floors import unseen_alike
+from signature.localization.answer import Status, Verdict
+from signature.localization.hypotheses import Hypothesis, coarse_score, same_pose
+from signature.localization.map_index import MapIndex
+from signature.localization.posterior import (
+    NO_EVIDENCE,
+    POSTERIOR,
+    Evidence,
+    alike,
+    evidence_of,
+    in_the_map,
+    masses,
+    off_map,
+    tail_of,
+)
+from signature.localization.query import QueryMap
+from signature.localization.same_place import places_of
+
+Place = tuple[Hypothesis, ...]
+PriorOf = Callable[[Place], float]
+"""Prior of a place, relative to that of "not in this map"."""
+
+NOTHING = Verdict(
+    status="not_found", confidence=0.0, hypotheses=(), places=(), masses=(), evidence=NO_EVIDENCE
+)
+"""The verdict on a query for which nothing is found."""
+
+
+def anywhere(place: Place) -> float:
+    """The prior of a place without any knowledge."""
+    return 1.0
+
+
+def decide(
+    index: MapIndex, query: QueryMap, hypotheses: tuple[Hypothesis, ...], prior_of: PriorOf = anywhere
+) -> Verdict:
+    """The verdict after all maps were searched as a whole, so that neither the right place nor a rival is
+    left out.
+
+    Where the proposals settled it, only for what the coarse search scores as high as the best one, which
+    is faster: a wrong place among few proposals may lead by far, if the right one was not proposed.
+    """
+    verdict, least = judge(index, query, hypotheses, prior_of), 0.0
+    if verdict.status == "located":
+        best = verdict.hypotheses[0]
+        least = coarse_score(query, index.maps[best.session_index], best.fit.T_map_query)
+    return judge(index, query, index.search_whole_maps(query, hypotheses, least), prior_of)
+
+
+def judge(
+    index: MapIndex, query: QueryMap, hypotheses: Sequence[Hypothesis], prior_of: PriorOf = anywhere
+) -> Verdict:
+    """The posterior over the places of the hypotheses, see `signature.localization.posterior`.
+
+    A place that the prior of the index excludes has no mass. But it shows what wrong places score for this
+    query, so it remains a rival, unless it fits as well as the best one that is allowed: between equal places
+    the prior decides. Otherwise any place in a small region, which has few rivals, would look certain.
+    """
+    places, rivals = _allowed(index, query, places_of(index, query, hypotheses))
+    if not places:
+        return NOTHING
+    known = _by_mass(index, query, [(place, prior_of(place)) for place in places], rivals)
+    ordered, prior, evidence = (list(each) for each in zip(*known, strict=True))
+    # The same place on a floor that looks alike and is not contradicted has the same mass.
+    floors = unseen_alike(index, query, ordered[0][0]) if evidence[0].log_odds() > 0.0 else []
+    mass = masses([*evidence, *evidence[:1] * len(floors)], [*prior, *prior[:1] * len(floors)]).tolist()
+    ordered += [(h,) for h in floors if not any(_same(query, h, o) for place in ordered for o in place)]
+    status: Status = "ambiguous" if in_the_map(evidence, prior) >= POSTERIOR.in_the_map else "not_found"
+    return Verdict(
+        status="located" if mass[0] >= index.config.accept else status,
+        confidence=mass[0],
+        hypotheses=tuple(h for place in ordered for h in place),
+        places=tuple(number for number, place in enumerate(ordered) for _ in place),
+        masses=tuple(mass[: len(ordered)]),
+        evidence=evidence[0],
+    )
+
+
+def _allowed(index: MapIndex, query: QueryMap, places: Sequence[Place]) -> tuple[list[Place], list[Fit]]:
+    """The places that the prior of the index allows, and fits of others that tell what wrong places score."""
+    inside = [tuple(h for h in place if index.allows(query, h)) for place in places]
+    allowed = [place for place in inside if place]
+    highest = max((place[0].fit.score for place in allowed), default=0.0)
+    excluded = [place[0].fit for place, left in zip(places, inside, strict=True) if not left]
+    return allowed, [fit for fit in excluded if not alike(fit.score, highest)]
+
+
+def _by_mass(
+    index: MapIndex, query: QueryMap, places: Sequence[tuple[Place, float]], rivals: Sequence[Fit]
+) -> list[tuple[Place, float, Evidence]]:
+    """Places, their priors and what tells for them, by mass; what the last scans tell, of the first."""
+    fits = [place[0].fit for place, _ in places]
+    fields = [index.maps[place[0].session_index].field for place, _ in places]
+    found = [
+        replace(one, off_map=off_map(query, fit, field))
+        for one, fit, field in zip(evidence_of(fits, query, rivals), fits, fields, strict=True)
+    ]
+    order = sorted(range(len(found)), key=lambda k: -found[k].log_odds() - math.log(places[k][1]))
+    best = order[0]
+    found[best] = replace(found[best], tail=tail_of(query, fits[best], fields[best]))
+    return [(*places[k], found[k]) for k in order]
+
+
+def _same(query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
+    """Whether two hypotheses in one session put the query at one place."""
+    bases = [h.fit.T_map_query @ query.T_odom_base for h in (a, b)]
+    return a.session_index == b.session_index and same_pose(*bases)
