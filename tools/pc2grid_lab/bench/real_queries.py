@@ -137,7 +137,8 @@ def evidence_rows(
 def _looks(
     index: MapIndex, query: QueryMap, truth: SE2 | None, row: dict[str, Any]
 ) -> Iterator[dict[str, Any]]:
-    """As in `signature.localization.decision`, two answers: by what is proposed, and by a search of the whole map."""
+    """As `signature.localization.decision`, two answers: by what is proposed, and by a search of the whole
+    map."""
     proposed = index.look_up(query)
     for stage, found in (("proposed", proposed), ("everywhere", index.search_whole_maps(query, proposed))):
         poses = [h.fit.T_map_query @ query.T_odom_base for h in found]
