@@ -28,7 +28,7 @@ from signature.localization.hypotheses import (
 )
 from signature.localization.in_space import PointsOf, points_reader
 from signature.localization.lazy_maps import DatabaseGrids, LazySequence
-from signature.localization.prior import PRIOR, Prior, Region
+from signature.localization.prior import Prior, Region
 from signature.localization.query import QueryMap
 from signature.retrieval.viewpoints import AT_ONCE_M2, Places
 from signature.retrieval.vote import retrieve
@@ -193,10 +193,6 @@ class MapIndex:
             rows=rows,
         )
         found = (*old, *verify(query, proposals, self.places, self.maps, self.config))
-        if self.prior_applies(query):
-            area_m2 = sum(len(free) for _, free in self._searched(query)) * HYPOTHESES.square_m**2
-            if 0.0 < area_m2 <= PRIOR.searched_m2:
-                return self.search_whole_maps(query, found)
         return self._worth_keeping(query, found)
 
     def search_whole_maps(

@@ -159,7 +159,7 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
         places=(0,),
         masses=(1.0,),
     )
-    near = index.within(region.prior).look_up(seen, (believed,))
+    near = index.within(region.prior).search_whole_maps(seen, (believed,))
     answer = localizer.answer(near, partial(before.prior, seen))
     bases = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
     in_frame = [

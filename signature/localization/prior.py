@@ -33,8 +33,6 @@ class PriorParameters:
         hypotheses are one. A smaller one would exclude right places that are drawn a little off.
     drift, drift_rad_m : a region for an earlier time grows by this share of the way since, and turns by this
         much a metre. Chosen by hand: the error of wheel odometry that is not calibrated well.
-    searched_m2 : the free ground of a smaller region is searched as a whole at every look, and nothing in it
-        can be missed; in a larger one, places are proposed by signatures first. Chosen by the time of a look.
     """
 
     sigmas_squared: float = 9.21
@@ -43,7 +41,6 @@ class PriorParameters:
     least_rad: float = math.radians(10.0)
     drift: float = 0.03
     drift_rad_m: float = math.radians(0.3)
-    searched_m2: float = 1000.0
 
 
 PRIOR = PriorParameters()

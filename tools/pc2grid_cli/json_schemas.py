@@ -135,11 +135,11 @@ class WatchedMap(TypedDict):
 class Watch(TypedDict):
     """A line of `pc2grid watch --json`: what one look at the database said. state: searching (not located
     yet), located, doubtful (more likely than not where it was, but not surely), lost, recovered (located
-    elsewhere or again). pose: of the base at `stamp_ns`; null unless the status is `located`. T_map_odom: of the robot's
-    own odometry frame. in_space: null if the map or the scans have no points. confidence: the probability
-    that the best place is right. published: topics on which it was said. lag_s, elapsed_s: seconds from a
-    scan's arrival to its use, and for this look. scans: used so far, dropped: left out because the computer
-    is too slow, reconnected: lost connections made again."""
+    elsewhere or again). pose: of the base at `stamp_ns`; null unless the status is `located`. T_map_odom: of
+    the robot's own odometry frame. in_space: null if the map or the scans have no points. confidence: the
+    probability that the best place is right. published: topics on which it was said. lag_s, elapsed_s:
+    seconds from a scan's arrival to its use, and for this look. scans: used so far, dropped: left out
+    because the computer is too slow, reconnected: lost connections made again."""
 
     schema_version: Version
     state: State

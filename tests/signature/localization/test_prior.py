@@ -17,7 +17,7 @@ from signature.config import Config, RelocalizeConfig
 from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
-from signature.localization.prior import PRIOR, Prior
+from signature.localization.prior import Prior
 from tests.helpers.simulated_drives import building, drive, office, plan
 
 BENT = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]
@@ -79,13 +79,13 @@ def test_a_prior_that_holds_changes_no_right_answer() -> None:
         assert answer.confidence >= free.confidence - 1e-9
 
 
-def test_a_large_region_is_searched_through_proposals(monkeypatch: pytest.MonkeyPatch) -> None:
-    small = replace(PRIOR, searched_m2=1.0)
-    monkeypatch.setattr("signature.localization.map_index.PRIOR", small)
-    answer, truth = ask(OFFICE.within(Prior.around(9.0, 5.0, radius_m=4.0)))
+def test_a_region_that_is_too_large_to_be_searched_as_a_whole_is_searched_through_proposals() -> None:
+    small = RelocalizeConfig(step_m=100.0, exhaustive_m2=1.0)
+    index = building({"office": office()}, Config(relocalize=small))
+    answer, truth = ask(index.within(Prior.around(9.0, 5.0, radius_m=4.0)))
     assert answer.status == "located" and distance(answer.T_map_base, truth) < 0.1
     # Proposals outside are dropped all the same.
-    answer, _ = ask(OFFICE.within(Prior.around(17.0, 2.0, radius_m=2.0)))
+    answer, _ = ask(index.within(Prior.around(17.0, 2.0, radius_m=2.0)))
     assert answer.status == "not_found"
 
 
