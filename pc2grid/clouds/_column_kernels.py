@@ -111,11 +111,13 @@ def classify(
     band: tuple[int, int],
     share: float,
     least: int,
+    over: int,
 ) -> None:
     """Write the state (W, W) of the columns that carry a stamp; 0: of all.
 
     floor : index of the layer of the floor. band : of the first and behind the last layer of an obstacle. A
-    wall is occupied in at least `least` layers, and in so large a `share` of those that were observed.
+    wall is occupied in at least `least` layers, and in so large a `share` of those that were observed, and
+    less than `over` layers above it were observed to be free.
     """
     size, layers = evidence.shape[0], evidence.shape[2]
     first, last = max(band[0], low[2]), min(band[1], low[2] + layers)
@@ -123,15 +125,17 @@ def classify(
         for b in range(size):
             if stamp != 0 and touched[a, b] != stamp:
                 continue
-            occupied, free = 0, 0
+            occupied, free, passed_over = 0, 0, 0
             for k in range(first, last):
                 value = evidence[a, b, k % layers]
                 occupied += value > 0
                 free += value < 0
+                passed_over = 0 if value > 0 else passed_over + (value < 0)
             found = UNKNOWN
             if occupied:
                 found = LOW
-                if occupied >= least and occupied >= share * (occupied + free) and sums[a, b, 2] > 0:
+                tall = occupied >= least and passed_over < over
+                if tall and occupied >= share * (occupied + free) and sums[a, b, 2] > 0:
                     found = WALL
             elif free:
                 found = FREE

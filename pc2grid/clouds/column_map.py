@@ -37,6 +37,8 @@ class ColumnParameters:
     margin_m, margin_sigmas : a ray ends so far before its point, and this many standard deviations of it.
     wall_share, wall_layers : a wall is occupied in so large a share of the observed cells between
         `band_min_m` and `band_max_m`, and in so many at least.
+    over : what rays pass over in so many layers is no wall but a thing. Walls reach up as far as they are
+        observed: of the columns of a real room, walls have 0 or 1 such layers, chairs and persons 2 to 6.
     gap_m : unknown ground that free ground continues behind.
     depth_m : thickness of a wall that becomes one line; the noise of the sensor comes on top.
     """
@@ -51,6 +53,7 @@ class ColumnParameters:
     margin_sigmas: float = 2.0
     wall_share: float = 0.5
     wall_layers: int = 3
+    over: int = 2
     gap_m: float = 0.3
     depth_m: float = 0.1
 
@@ -111,7 +114,7 @@ class ColumnMap:
         changed = self._stamp if same_floor else 0
         kernels.classify(
             self._evidence, self._state, self._touched, self._sums, self._low, changed,
-            math.floor(self._floor_m / p.layer_m), (low, high), p.wall_share, p.wall_layers,
+            math.floor(self._floor_m / p.layer_m), (low, high), p.wall_share, p.wall_layers, p.over,
         )  # fmt: skip
 
     def cut(self, T_session_base: SE2, sensor_m: F64, stamp_ns: int) -> PlanarScan:

@@ -17,7 +17,7 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
 from pc2grid.errors import LimitExceeded
 from pc2grid.geometry import SE2
-from pc2grid.model import FREE, OCCUPIED, OCCUPIED_FROM, UNKNOWN, OccupancyGrid
+from pc2grid.model import FREE, OCCUPIED, OCCUPIED_FROM, THING, UNKNOWN, OccupancyGrid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,18 +54,50 @@ _SUBPIXEL_BITS = 4  # of cv2's polygon corners
 _COLUMN_OFFSET = 1 << 31  # makes column numbers positive, so that row and column fit into one int64
 
 
+class _Tiles:
+    """Log-odds in hundredths, in tiles that are created where there is something to add.
+
+    log_odds, observed : tiles by the row and column of a tile; `observed` is what something was added to.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self.log_odds: dict[tuple[int, int], NDArray[np.int16]] = {}
+        self.observed: dict[tuple[int, int], NDArray[np.bool_]] = {}
+
+    def add(self, update: NDArray[np.int16], x0: int, y0: int) -> None:
+        """Add log-odds (h, w), whose first cell is in column `x0` and row `y0`."""
+        height, width = update.shape
+        for row in range(y0 // _TILE, (y0 + height - 1) // _TILE + 1):
+            for column in range(x0 // _TILE, (x0 + width - 1) // _TILE + 1):
+                r, c = row * _TILE - y0, column * _TILE - x0
+                part = update[max(r, 0) : max(r + _TILE, 0), max(c, 0) : max(c + _TILE, 0)]
+                touched = part != 0
+                if not touched.any():
+                    continue
+                if (row, column) not in self.log_odds:
+                    self.log_odds[row, column] = np.zeros((_TILE, _TILE), dtype=np.int16)
+                    self.observed[row, column] = np.zeros((_TILE, _TILE), dtype=np.bool_)
+                where = np.s_[
+                    max(-r, 0) : max(-r, 0) + part.shape[0], max(-c, 0) : max(-c, 0) + part.shape[1]
+                ]
+                tile = self.log_odds[row, column][where]
+                np.clip(tile + part, -self._limit, self._limit, out=tile)
+                self.observed[row, column][where] |= touched
+
+
 class GridBuilder:
     """Draws planar scans into a growing grid.
 
     Cells are aligned to multiples of the resolution in the session's frame. A cell that no planar scan
-    observed stays unknown.
+    observed stays unknown. Things on the floor that are no walls have evidence of their own: what was taken
+    for a wall until rays passed over it becomes a thing.
     """
 
     def __init__(self, config: ProjectionConfig, parameters: OccupancyParameters = OCCUPANCY) -> None:
         self._config = config
         self._parameters = parameters
-        self._log_odds: dict[tuple[int, int], NDArray[np.int16]] = {}
-        self._observed: dict[tuple[int, int], NDArray[np.bool_]] = {}
+        self._walls, self._things = _Tiles(parameters.limit), _Tiles(parameters.limit)
         self._unseen_hits = np.empty(0, np.int64)  # cells, row and column in one number
         self._new_unseen_hits: list[I64] = []
 
@@ -76,30 +108,34 @@ class GridBuilder:
         """
         import cv2
 
-        resolution = self._config.resolution_m
+        p, resolution = self._parameters, self._config.resolution_m
         outline = T_grid_base.apply(planar_scan.free_polygon()) / resolution
         hits = np.floor(T_grid_base.apply(planar_scan.hits_m) / resolution).astype(np.int64)
         low = np.floor(outline.min(axis=0)).astype(np.int64) - 1
         high = np.floor(outline.max(axis=0)).astype(np.int64) + 2
         here = np.floor(np.array([T_grid_base.x, T_grid_base.y]) / resolution).astype(np.int64)
-        around = math.ceil(self._parameters.body_m / resolution) + 1
+        around = math.ceil(p.body_m / resolution) + 1
         low, high = np.minimum(low, here - around), np.maximum(high, here + around + 1)
         if len(hits):
             low, high = np.minimum(low, hits.min(axis=0)), np.maximum(high, hits.max(axis=0) + 1)
         update = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.int16)
         corners = np.rint((outline - low - 0.5) * (1 << _SUBPIXEL_BITS)).astype(np.int32)
-        cv2.fillPoly(update, [corners], self._parameters.miss, shift=_SUBPIXEL_BITS)
+        cv2.fillPoly(update, [corners], p.miss, shift=_SUBPIXEL_BITS)
         # The outline runs through cells of obstacles, most of all along a wall that is seen at a small angle:
         # these cells are not drawn as free.
         cv2.polylines(update, _rims(corners, planar_scan.free_m), False, 0, shift=_SUBPIXEL_BITS)
-        # Things that the sensor looks over say little of a place and stay unknown.
         things = np.floor(T_grid_base.apply(planar_scan.low_m) / resolution).astype(np.int64)
-        things = things[((things >= low) & (things < high)).all(axis=1)]
-        update[things[:, 1] - low[1], things[:, 0] - low[0]] = 0
-        update[hits[:, 1] - low[1], hits[:, 0] - low[0]] = self._parameters.hit
-        body_cells = round(self._parameters.body_m / resolution)
-        cv2.circle(update, (here - low).tolist(), body_cells, 2 * self._parameters.miss, -1)
-        self._add_window(update, int(low[0]), int(low[1]))
+        things = things[((things >= low) & (things < high)).all(axis=1)] - low
+        update[things[:, 1], things[:, 0]] = p.miss
+        update[hits[:, 1] - low[1], hits[:, 0] - low[0]] = p.hit
+        cv2.circle(update, (here - low).tolist(), round(p.body_m / resolution), 2 * p.miss, -1)
+        if len(things) or self._things.log_odds:
+            standing = np.where(update != 0, np.int16(p.miss), np.int16(0))
+            standing[things[:, 1], things[:, 0]] = p.hit
+            standing[update > 0] = p.miss
+            self._things.add(standing, int(low[0]), int(low[1]))
+        self._walls.add(update, int(low[0]), int(low[1]))
+        self._check_size(len(self._walls.log_odds) * _TILE * _TILE)
 
     def add_unseen_hits(self, hits_m: F64) -> None:
         """Add obstacles (N, 2), metres, that are drawn only in cells that no planar scan observes."""
@@ -115,20 +151,25 @@ class GridBuilder:
 
     def grid(self) -> OccupancyGrid:
         """The map so far: 0..100 where observed, unknown elsewhere, cropped to the observed part."""
-        if not self._log_odds:
+        tiles = self._walls.log_odds
+        if not tiles:
             return OccupancyGrid(
                 cells=np.zeros((0, 0), np.int8), resolution_m=self._config.resolution_m, origin_m=(0.0, 0.0)
             )
-        rows, columns = zip(*self._log_odds, strict=True)
+        rows, columns = zip(*tiles, strict=True)
         height = (max(rows) - min(rows) + 1) * _TILE
         width = (max(columns) - min(columns) + 1) * _TILE
         self._check_size(height * width)
         cells = np.full((height, width), UNKNOWN, dtype=np.int8)
         summed = np.zeros((height, width), dtype=np.int16)
-        for (row, column), log_odds in self._log_odds.items():
+        for (row, column), log_odds in tiles.items():
             percent = np.rint(_percent(log_odds.astype(np.float32))).astype(np.int8)
+            known = np.where(self._walls.observed[row, column], percent, UNKNOWN)
+            if (row, column) in self._things.log_odds:
+                things = self._things.log_odds[row, column]
+                known[(things > 0) & (things >= log_odds)] = THING
             r, c = (row - min(rows)) * _TILE, (column - min(columns)) * _TILE
-            cells[r : r + _TILE, c : c + _TILE] = np.where(self._observed[row, column], percent, UNKNOWN)
+            cells[r : r + _TILE, c : c + _TILE] = known
             summed[r : r + _TILE, c : c + _TILE] = log_odds
         self._erase_lone_hits(cells, summed)
         self._draw_unseen_hits(cells, (min(rows) * _TILE, min(columns) * _TILE))
@@ -163,28 +204,6 @@ class GridBuilder:
         hit = self._parameters.hit
         often = _count_around(log_odds > hit, self._parameters.lone_window)
         cells[(log_odds == hit) & (often >= self._parameters.lone_cells)] = UNKNOWN
-
-    def _add_window(self, update: NDArray[np.int16], x0: int, y0: int) -> None:
-        """Add log-odds (h, w), whose first cell is in column `x0` and row `y0`, to the tiles."""
-        height, width = update.shape
-        limit = self._parameters.limit
-        for row in range(y0 // _TILE, (y0 + height - 1) // _TILE + 1):
-            for column in range(x0 // _TILE, (x0 + width - 1) // _TILE + 1):
-                r, c = row * _TILE - y0, column * _TILE - x0
-                part = update[max(r, 0) : max(r + _TILE, 0), max(c, 0) : max(c + _TILE, 0)]
-                touched = part != 0
-                if not touched.any():
-                    continue
-                if (row, column) not in self._log_odds:
-                    self._check_size((len(self._log_odds) + 1) * _TILE * _TILE)
-                    self._log_odds[row, column] = np.zeros((_TILE, _TILE), dtype=np.int16)
-                    self._observed[row, column] = np.zeros((_TILE, _TILE), dtype=np.bool_)
-                where = np.s_[
-                    max(-r, 0) : max(-r, 0) + part.shape[0], max(-c, 0) : max(-c, 0) + part.shape[1]
-                ]
-                tile = self._log_odds[row, column][where]
-                np.clip(tile + part, -limit, limit, out=tile)
-                self._observed[row, column][where] |= touched
 
     def _check_size(self, cells: int) -> None:
         if cells > self._config.max_cells:

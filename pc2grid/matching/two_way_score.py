@@ -2,6 +2,10 @@
 
 One way alone is not enough. The walls of a small query fit into many places; but at the wrong ones the map
 has walls where the query has seen free space.
+
+Where both sides show things on the floor, such as tables, the edges of those of the query are compared with
+those of the map. Not the other way round: a query that looks over the floor for some seconds has passed over
+many things of the map without showing them.
 """
 
 from __future__ import annotations
@@ -12,7 +16,7 @@ from dataclasses import dataclass
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
 from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField
-from pc2grid.matching.walls import Walls
+from pc2grid.matching.walls import Things, Walls
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,6 +27,7 @@ class Fit:
     forward : 0..1, mean likelihood of the query's walls; neutral where the map is unknown.
     backward : 0..1, mean likelihood of the map's walls on ground that the query knows.
     overlap : 0..1, share of the query's walls on ground that the map knows.
+    compared : number of the query's wall points on ground that the map knows, by weight.
     looked_at : number of the map's wall points on ground that the query knows, by weight.
     score : 0..1, geometric mean of forward and backward; hypotheses are ranked by it.
     covariance : (3, 3) of x, y, yaw from the refinement: wide along a corridor, narrow across it.
@@ -32,6 +37,7 @@ class Fit:
     forward: float
     backward: float
     overlap: float
+    compared: float
     looked_at: float
     score: float
     covariance: F64
@@ -62,6 +68,10 @@ def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) ->
     seen, likelihood = _agreement(query, target.field, T_map_query)
     looked_at, returned = _agreement(target, query.field, T_map_query.inverse())
     weight = query.weight
+    if target.things is not None and query.things is not None:
+        there = _agreement(query.things, target.things.field, T_map_query)
+        seen, likelihood = seen + there[0], likelihood + there[1]
+        weight += query.things.weight
     forward = (likelihood + LIKELIHOOD.neutral * (weight - seen)) / weight if weight else 0.0
     backward = returned / looked_at if looked_at else 0.0
     return Fit(
@@ -69,13 +79,14 @@ def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) ->
         forward=forward,
         backward=backward,
         overlap=seen / weight if weight else 0.0,
+        compared=seen,
         looked_at=looked_at,
         score=math.sqrt(forward * backward),
         covariance=covariance,
     )
 
 
-def _agreement(walls: Walls, field: LikelihoodField, T_field_walls: SE2) -> tuple[float, float]:
+def _agreement(walls: Walls | Things, field: LikelihoodField, T_field_walls: SE2) -> tuple[float, float]:
     """The weight of the wall points on known ground, and the weighted sum of their likelihoods, 0..1,
     there."""
     likelihood, known = field.at(T_field_walls.apply(walls.points_m))

@@ -21,15 +21,54 @@ class WallParameters:
     """How wall points are chosen and weighted.
 
     spacing_m : one point is kept in each square of this side; chosen by hand, twice the usual cell.
+    grain_cells : things are smoothed by a median over squares of so many cells. Chosen by hand.
     fixed_m : an object at least this long is taken to stay where it is: longer than furniture that is moved
         about. Chosen by hand.
     """
 
     spacing_m: float = 0.1
+    grain_cells: int = 5
     fixed_m: float = 2.0
 
 
 WALLS = WallParameters()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Things:
+    """The things on the floor that are no walls, tables above all: what a place is recognised by where few
+    walls are in view.
+
+    field : likelihood field of their cells; ground is known where it is free or a thing.
+    points_m : (K, 2) float32 middles of the cells along their edges, thinned and weighted as those of `Walls`.
+    """
+
+    field: LikelihoodField
+    points_m: F32
+    weights: F32
+
+    @staticmethod
+    def of(grid: OccupancyGrid, parameters: WallParameters = WALLS) -> Things | None:
+        """The things of a grid; None if it shows none, as those of sensors that do not tell heights."""
+        import cv2
+
+        # The middle value around each cell: what is left are things, and no grains of noise.
+        things = cv2.medianBlur(grid.things.astype(np.uint8), parameters.grain_cells) > 0
+        if not things.any():
+            return None
+        beside = cv2.dilate((grid.free & ~things).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        cells = cells_of(things & beside)
+        cells = cells[thin_evenly(grid.to_point(cells), parameters.spacing_m)]
+        return Things(
+            field=LikelihoodField.around(things, things | grid.free, grid.resolution_m, grid.origin_m),
+            points_m=grid.to_point(cells).astype(np.float32),
+            weights=steadiness(things, cells, grid.resolution_m, parameters),
+        )
+
+    @property
+    def weight(self) -> float:
+        """The number of points, by weight."""
+        return float(self.weights.sum(dtype=np.float64))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,11 +79,13 @@ class Walls:
     points_m : (K, 2) float32 centres of occupied cells, one per square of `WallParameters.spacing_m`, in the
         grid's frame.
     weights : (K,) float32, 0..1, how surely each of them stays where it is, see `steadiness`.
+    things : what else stands there; None if the grid shows none.
     """
 
     field: LikelihoodField
     points_m: F32
     weights: F32
+    things: Things | None = None
 
     @staticmethod
     def of(grid: OccupancyGrid, parameters: WallParameters = WALLS, *, margin_m: float = 0.0) -> Walls:
@@ -56,6 +97,7 @@ class Walls:
             field=LikelihoodField.of(padded),
             points_m=padded.to_point(cells).astype(np.float32),
             weights=steadiness(padded.occupied, cells, padded.resolution_m, parameters),
+            things=Things.of(padded, parameters),
         )
 
     @property

@@ -131,7 +131,7 @@ class SessionRecognizer:
 def probability_of(hypothesis: Hypothesis, query: QueryMap) -> float:
     """How probable it is that a map shows the place of the query at all, rivals left aside, 0..1."""
     fit = hypothesis.fit
-    return SAME_PLACE.probability(fit.score, fit.overlap * query.walls.weight)
+    return SAME_PLACE.probability(fit.score, fit.compared)
 
 
 def recognizer_for(config: Config) -> SessionRecognizer | None:

@@ -160,7 +160,7 @@ def evidence_of(fits: Sequence[Fit], query: QueryMap, rivals: Sequence[Fit] = ()
         found.append(
             Evidence(
                 forward=fit.known_agreement,
-                walls=fit.overlap * query.walls.weight,
+                walls=fit.compared,
                 backward=fit.backward,
                 looked_at=fit.looked_at,
                 lead=_lead(fit.score, others),

@@ -110,7 +110,7 @@ def surroundings_agree(
         return labelled
     # Ground that only one of the maps knows does not count here, and neither map may contradict the other.
     needed = SAME_PLACE.needed_labelled if labelled else SAME_PLACE.needed
-    return SAME_PLACE.probability(fit.known_agreement_both_ways, fit.overlap * around.weight) >= needed
+    return SAME_PLACE.probability(fit.known_agreement_both_ways, fit.compared) >= needed
 
 
 def share_known(grid: OccupancyGrid, seen: OccupancyGrid, T_map_query: SE2) -> float:
