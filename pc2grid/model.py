@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -207,6 +207,7 @@ class OccupancyGrid:
         Row 0 holds the smallest y, column 0 the smallest x.
     resolution_m : edge of a cell.
     origin_m : (x, y) in the map frame of the lower-left corner of cell (0, 0).
+    height_m : of the one plane that was observed, above the base; None: of all heights, or not known.
 
     >>> import numpy as np
     >>> grid = OccupancyGrid(cells=np.array([[0, 100], [-1, 0]]), resolution_m=0.5, origin_m=(-1.0, 2.0))
@@ -219,6 +220,7 @@ class OccupancyGrid:
     cells: NDArray[np.int8]
     resolution_m: float
     origin_m: tuple[float, float]
+    height_m: float | None = None
 
     def __post_init__(self) -> None:
         freeze(self, "cells", np.int8, (None, None))
@@ -286,7 +288,7 @@ class OccupancyGrid:
             self.origin_m[0] + (column - n) * self.resolution_m,
             self.origin_m[1] + (row - n) * self.resolution_m,
         )
-        return OccupancyGrid(cells=hand_over(cells), resolution_m=self.resolution_m, origin_m=origin)
+        return replace(self, cells=hand_over(cells), origin_m=origin)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -39,6 +39,7 @@ class PlanarScan:
         around it (entry 0 looks along +x, counter-clockwise); 0 where nothing is known.
     low_m : (L, 2) float32, things on the floor that are no walls (tables, chairs), about one point per grid
         cell: the sensor looks over them, so they do not end what is free. Empty where heights are not known.
+    height_m : of the plane that a planar laser sees, above the base; None of sensors that see all heights.
     """
 
     stamp_ns: int
@@ -47,6 +48,7 @@ class PlanarScan:
     origin_m: F64
     free_m: F32
     low_m: F32 = field(default_factory=lambda: np.empty((0, 2), np.float32))
+    height_m: float | None = None
 
     @staticmethod
     def of_hits(*, stamp_ns: int, hits_m: F32, origin_m: F64, free_m: F32) -> PlanarScan:
@@ -122,6 +124,7 @@ def project_to_plane(
         normal_rad=planar_normals(hits, origin[:2], parameters),
         origin_m=origin[:2].copy(),
         free_m=np.minimum(free, config.max_range_m).astype(np.float32),
+        height_m=float(origin[2]) if ground is None else None,
     )
 
 

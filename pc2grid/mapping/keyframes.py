@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import tempfile
 from array import array
@@ -19,8 +20,8 @@ from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid
 
 IN_MEMORY_BYTES = 32 << 20  # chosen by hand: about an hour of a 2D laser
-# index, stamp, restart; T_session_base; origin of the sensor; hits, bearings, low things and unseen_hits
-_HEADER = struct.Struct("<qqq 3d 2d 4q")
+# index, stamp, restart; T_session_base; origin of the sensor and height (NaN: none); hits, bearings, low things and unseen_hits
+_HEADER = struct.Struct("<qqq 3d 3d 4q")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +62,7 @@ class Keyframes:
         start, end = self._starts[number], self._starts[number + 1]
         self._file.seek(start)
         data = self._file.read(end - start)
-        index, stamp_ns, restart, x, y, yaw, origin_x, origin_y, hits, bearings, low, unseen_hits = (
-            _HEADER.unpack_from(data)
-        )
+        index, stamp_ns, restart, x, y, yaw, *origin, hits, bearings, low, unseen_hits = _HEADER.unpack_from(data)
         values = np.frombuffer(data, np.float32, offset=_HEADER.size)
         ends = np.cumsum((2 * hits, hits, bearings, 2 * low))
         hits_m, normal_rad, free_m, low_m, unseen_hits_m = np.split(values, ends)
@@ -72,10 +71,11 @@ class Keyframes:
             PlanarScan(
                 stamp_ns=stamp_ns,
                 hits_m=hits_m.reshape(-1, 2),
-                origin_m=np.array([origin_x, origin_y]),
+                origin_m=np.array(origin[:2]),
                 normal_rad=normal_rad,
                 free_m=free_m,
                 low_m=low_m.reshape(-1, 2),
+                height_m=None if math.isnan(origin[2]) else origin[2],
             ),
             SE2(x, y, yaw),
             bool(restart),
@@ -91,6 +91,7 @@ class Keyframes:
             keyframe.restart,
             *(pose.x, pose.y, pose.yaw),
             *planar_scan.origin_m,
+            math.nan if planar_scan.height_m is None else planar_scan.height_m,
             *(len(a) for a in (planar_scan.hits_m, planar_scan.free_m, planar_scan.low_m)),
             len(keyframe.unseen_hits_m),
         )

@@ -98,6 +98,7 @@ class GridBuilder:
         self._config = config
         self._parameters = parameters
         self._walls, self._things = _Tiles(parameters.limit), _Tiles(parameters.limit)
+        self._heights_m: tuple[float, float] | None = None  # lowest and highest plane; NaN: not of planes
         self._unseen_hits = np.empty(0, np.int64)  # cells, row and column in one number
         self._new_unseen_hits: list[I64] = []
 
@@ -108,6 +109,9 @@ class GridBuilder:
         """
         import cv2
 
+        height_m = math.nan if planar_scan.height_m is None else planar_scan.height_m
+        low_m, high_m = self._heights_m or (height_m, height_m)
+        self._heights_m = float(np.minimum(low_m, height_m)), float(np.maximum(high_m, height_m))
         p, resolution = self._parameters, self._config.resolution_m
         outline = T_grid_base.apply(planar_scan.free_polygon()) / resolution
         hits = np.floor(T_grid_base.apply(planar_scan.hits_m) / resolution).astype(np.int64)
@@ -182,7 +186,14 @@ class GridBuilder:
             cells=cells[r0:r1, c0:c1].copy(),
             resolution_m=resolution,
             origin_m=((min(columns) * _TILE + c0) * resolution, (min(rows) * _TILE + r0) * resolution),
+            height_m=self._height_m,
         )
+
+    @property
+    def _height_m(self) -> float | None:
+        """Of the plane that all planar scans are of; None if they are not of one."""
+        low_m, high_m = self._heights_m or (math.nan, math.nan)
+        return low_m if high_m - low_m < self._config.resolution_m else None
 
     def _draw_unseen_hits(self, cells: NDArray[np.int8], first: tuple[int, int]) -> None:
         """Draw the unseen hits in unknown cells (H, W); `first` is the cell that is (0, 0) there."""

@@ -7,7 +7,7 @@ occupied cell, exp(-d^2 / 2 sigma^2). Scan matching on it needs no correspondenc
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,10 +85,13 @@ class LikelihoodField:
         values[~known] = np.maximum(values[~known], parameters.neutral_value)
         return LikelihoodField(values=values, known=known, resolution_m=resolution_m, origin_m=origin_m)
 
-    def at(self, points_m: NDArray[np.floating]) -> tuple[F32, NDArray[np.bool_]]:
+    def at(
+        self, points_m: NDArray[np.floating], *, above: bool = False
+    ) -> tuple[F32, NDArray[np.bool_]]:
         """Likelihood (N,) 0..1 in the cells of points (N, 2), and whether these cells are known (N,).
 
-        Both are 0 outside the field.
+        Both are 0 outside the field. above : the field is of a higher plane than the points. Its walls stand
+        on the floor, but its free space passes over things, so that only ground near walls is known.
         """
         height, width = self.values.shape
         cells = np.floor((points_m - np.asarray(self.origin_m)) / self.resolution_m).astype(np.int64)
@@ -96,7 +99,10 @@ class LikelihoodField:
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         flat = np.where(inside, row * width + column, 0)
         known = inside & self.known.reshape(-1)[flat]
-        return np.where(inside, self.values.reshape(-1)[flat], 0) * np.float32(1.0 / 255.0), known
+        values = np.where(inside, self.values.reshape(-1)[flat], 0)
+        if above:
+            known &= values > LIKELIHOOD.neutral_value
+        return values * np.float32(1.0 / 255.0), known
 
 
 def padded_grid(grid: OccupancyGrid, margin_m: float) -> OccupancyGrid:
@@ -104,8 +110,8 @@ def padded_grid(grid: OccupancyGrid, margin_m: float) -> OccupancyGrid:
     n = round(margin_m / grid.resolution_m)
     if not n:
         return grid
-    return OccupancyGrid(
+    return replace(
+        grid,
         cells=np.pad(grid.cells, n, constant_values=UNKNOWN),
-        resolution_m=grid.resolution_m,
         origin_m=(grid.origin_m[0] - n * grid.resolution_m, grid.origin_m[1] - n * grid.resolution_m),
     )

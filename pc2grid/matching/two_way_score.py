@@ -6,6 +6,10 @@ has walls where the query has seen free space.
 Where both sides show things on the floor, such as tables, the edges of those of the query are compared with
 those of the map. Not the other way round: a query that looks over the floor for some seconds has passed over
 many things of the map without showing them.
+
+Two lasers at different heights are compared on what both can see. The walls of the higher one stand on the
+floor; what the lower one has seen need not reach up, so it counts as on unknown ground where the higher one
+sees free space.
 """
 
 from __future__ import annotations
@@ -65,15 +69,19 @@ class Fit:
 
 def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) -> Fit:
     """Score the query at a pose on the map `target`."""
-    seen, likelihood = _agreement(query, target.field, T_map_query)
-    looked_at, returned = _agreement(target, query.field, T_map_query.inverse())
+    above, below = target.is_above(query.height_m), query.is_above(target.height_m)
+    seen, likelihood = _agreement(query, target.field, T_map_query, above)
+    looked_at, returned = _agreement(target, query.field, T_map_query.inverse(), below)
     weight = query.weight
     if target.things is not None and query.things is not None:
         there = _agreement(query.things, target.things.field, T_map_query)
         seen, likelihood = seen + there[0], likelihood + there[1]
         weight += query.things.weight
     forward = (likelihood + LIKELIHOOD.neutral * (weight - seen)) / weight if weight else 0.0
-    backward = returned / looked_at if looked_at else 0.0
+    backward = scored = returned / looked_at if looked_at else 0.0
+    if below:
+        observed, _ = _agreement(target, query.field, T_map_query.inverse())
+        scored = (returned + LIKELIHOOD.neutral * (observed - looked_at)) / observed if observed else 0.0
     return Fit(
         T_map_query=T_map_query,
         forward=forward,
@@ -81,14 +89,16 @@ def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) ->
         overlap=seen / weight if weight else 0.0,
         compared=seen,
         looked_at=looked_at,
-        score=math.sqrt(forward * backward),
+        score=math.sqrt(forward * scored),
         covariance=covariance,
     )
 
 
-def _agreement(walls: Walls | Things, field: LikelihoodField, T_field_walls: SE2) -> tuple[float, float]:
+def _agreement(
+    walls: Walls | Things, field: LikelihoodField, T_field_walls: SE2, above: bool = False
+) -> tuple[float, float]:
     """The weight of the wall points on known ground, and the weighted sum of their likelihoods, 0..1,
-    there."""
-    likelihood, known = field.at(T_field_walls.apply(walls.points_m))
+    there. above : see `LikelihoodField.at`."""
+    likelihood, known = field.at(T_field_walls.apply(walls.points_m), above=above)
     weights = walls.weights[known].astype("f8")
     return float(weights.sum()), float(weights @ likelihood[known])

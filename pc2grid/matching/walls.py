@@ -22,12 +22,15 @@ class WallParameters:
 
     spacing_m : one point is kept in each square of this side; chosen by hand, twice the usual cell.
     grain_cells : things are smoothed by a median over squares of so many cells. Chosen by hand.
+    plane_m : planes so far above each other show different things: one a table, the other what is over it.
+        Chosen by hand.
     fixed_m : an object at least this long is taken to stay where it is: longer than furniture that is moved
         about. Chosen by hand.
     """
 
     spacing_m: float = 0.1
     grain_cells: int = 5
+    plane_m: float = 0.5
     fixed_m: float = 2.0
 
 
@@ -80,12 +83,14 @@ class Walls:
         grid's frame.
     weights : (K,) float32, 0..1, how surely each of them stays where it is, see `steadiness`.
     things : what else stands there; None if the grid shows none.
+    height_m : see `OccupancyGrid.height_m`.
     """
 
     field: LikelihoodField
     points_m: F32
     weights: F32
     things: Things | None = None
+    height_m: float | None = None
 
     @staticmethod
     def of(grid: OccupancyGrid, parameters: WallParameters = WALLS, *, margin_m: float = 0.0) -> Walls:
@@ -98,7 +103,13 @@ class Walls:
             points_m=padded.to_point(cells).astype(np.float32),
             weights=steadiness(padded.occupied, cells, padded.resolution_m, parameters),
             things=Things.of(padded, parameters),
+            height_m=grid.height_m,
         )
+
+    def is_above(self, height_m: float | None) -> bool:
+        """Whether these are walls of one plane that is clearly higher than another plane."""
+        planar = self.height_m is not None and height_m is not None
+        return planar and self.height_m - height_m > WALLS.plane_m
 
     @property
     def weight(self) -> float:

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pc2grid.arrays import F32, F64, I64, U8
-from pc2grid.matching.likelihood_field import LikelihoodField
+from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField
 from pc2grid.matching.walls import Walls
 from pc2grid.model import OccupancyGrid
 
@@ -89,14 +89,20 @@ class SearchMap:
     blocks: U8
 
     @staticmethod
-    def of(grid: OccupancyGrid) -> SearchMap:
-        """Prepare a map. Everything outside it counts as unknown."""
+    def of(grid: OccupancyGrid, *, from_below: bool = False) -> SearchMap:
+        """Prepare a map. Everything outside it counts as unknown.
+
+        from_below : for queries in a lower plane, to which its free space is as unknown ground.
+        """
         import cv2
 
         from pc2grid.matching._kernels import BLOCK_LEVELS, LANES
 
         walls = Walls.of(grid, margin_m=MARGIN_M)
         field = walls.field.values
+        if from_below:
+            lifted = LIKELIHOOD.neutral * 255.0 + (1.0 - LIKELIHOOD.neutral) * field
+            field = np.where(walls.field.known, lifted, field).astype(np.uint8)
         levels = np.empty((len(REACHES_M), *field.shape), np.uint8)
         levels[0] = field
         for level, reach_m in enumerate(REACHES_M[1:], start=1):

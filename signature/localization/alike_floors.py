@@ -49,7 +49,7 @@ def unseen_alike(index: MapIndex, query: QueryMap, best: Hypothesis) -> list[Hyp
     for there, T_there_here in _alike(index, query, best.session_index):
         pose = T_there_here @ best.fit.T_map_query
         unseen = share_known(index.grids[there], query.grid, pose) < ALIKE_FLOORS.seen_there
-        h = fitted(query, there, -1, index.maps[there], pose)
+        h = fitted(query, there, -1, index.maps_for(query)[there], pose)
         if unseen or h.fit.known_agreement_both_ways >= least:
             found.append(h)
     return found

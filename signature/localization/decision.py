@@ -57,7 +57,7 @@ def decide(
     verdict, least = judge(index, query, hypotheses, prior_of), 0.0
     if verdict.status == "located":
         best = verdict.hypotheses[0]
-        least = coarse_score(query, index.maps[best.session_index], best.fit.T_map_query)
+        least = coarse_score(query, index.maps_for(query)[best.session_index], best.fit.T_map_query)
     return judge(index, query, index.search_whole_maps(query, hypotheses, least), prior_of)
 
 
@@ -104,14 +104,14 @@ def _by_mass(
 ) -> list[tuple[Place, float, Evidence]]:
     """Places, their priors and what tells for them, by mass; what the last scans tell, of the first."""
     fits = [place[0].fit for place, _ in places]
-    fields = [index.maps[place[0].session_index].field for place, _ in places]
+    walls = [index.maps[place[0].session_index].walls for place, _ in places]
     found = [
-        replace(one, off_map=off_map(query, fit, field))
-        for one, fit, field in zip(evidence_of(fits, query, rivals), fits, fields, strict=True)
+        replace(one, off_map=off_map(query, fit, there.field))
+        for one, fit, there in zip(evidence_of(fits, query, rivals), fits, walls, strict=True)
     ]
     order = sorted(range(len(found)), key=lambda k: -found[k].log_odds() - math.log(places[k][1]))
     best = order[0]
-    found[best] = replace(found[best], tail=tail_of(query, fits[best], fields[best]))
+    found[best] = replace(found[best], tail=tail_of(query, fits[best], walls[best]))
     return [(*places[k], found[k]) for k in order]
 
 

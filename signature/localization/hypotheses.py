@@ -171,10 +171,28 @@ def coarse_score(query: QueryMap, target: SearchMap, T_map_query: SE2) -> float:
 
 def fitted(query: QueryMap, session_index: int, row: int, target: SearchMap, T_map_query: SE2) -> Hypothesis:
     """The hypothesis that the query lies at a pose, which is refined first."""
-    pose, covariance = refine(target.field, query.walls.points_m, T_map_query, query.center_m)
+    pose, covariance = _refined(query, target, T_map_query)
     covariance = covariance + np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))
     fit = score_fit(target.walls, query.walls, pose, covariance)
     return Hypothesis(session_index=session_index, row=row, fit=fit)
+
+
+def _refined(query: QueryMap, target: SearchMap, T_map_query: SE2) -> tuple[SE2, F64]:
+    """The pose of the query improved, and its covariance (3, 3) at `QueryMap.center_m`, map frame.
+
+    The walls of the query are brought onto those of the map. Of two planes at different heights it is the
+    walls of the higher one, since things near a wall in the lower one would be drawn onto it.
+    """
+    if not target.walls.is_above(query.walls.height_m):
+        return refine(target.field, query.walls.points_m, T_map_query, query.center_m)
+    center_m = T_map_query.apply(np.array([query.center_m]))[0]
+    back, covariance = refine(
+        query.walls.field, target.walls.points_m, T_map_query.inverse(), (center_m[0], center_m[1])
+    )
+    pose = back.inverse()
+    turn = np.eye(3)
+    turn[:2, :2] = pose.lift()[:2, :2]
+    return pose, turn @ covariance @ turn.T
 
 
 def distinct(hypotheses: Sequence[Hypothesis], at: SE2) -> tuple[Hypothesis, ...]:

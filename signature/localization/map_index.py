@@ -95,6 +95,9 @@ class MapIndex:
         self.maps: LazySequence[SearchMap] = LazySequence(
             lambda i: SearchMap.of(self.grids[i]), count, most_prepared
         )
+        self._from_below: LazySequence[SearchMap] = LazySequence(
+            lambda i: SearchMap.of(self.grids[i], from_below=True), count, most_prepared
+        )
         self.alike_floors: dict[tuple[int, int], SE2 | None] = {}  # see `signature.localization.alike_floors`
         self._free: LazySequence[F64] = LazySequence(lambda i: free_squares(self.grids[i]), count)
         self.places = Places(
@@ -192,7 +195,7 @@ class MapIndex:
             config=self.config,
             rows=rows,
         )
-        found = (*old, *verify(query, proposals, self.places, self.maps, self.config))
+        found = (*old, *verify(query, proposals, self.places, self.maps_for(query), self.config))
         return self._worth_keeping(query, found)
 
     def search_whole_maps(
@@ -206,9 +209,21 @@ class MapIndex:
         """
         found = list(known)
         config = self.config.model_copy(update={"coarse_keep": SEARCHED})
+        maps = self.maps_for(query)
         for index, free in self._searched(query):
-            found.extend(search_whole_map(query, index, self.maps[index], free, config, least))
+            found.extend(search_whole_map(query, index, maps[index], free, config, least))
         return self._worth_keeping(query, found)
+
+    def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
+        """The maps as they are searched for a query: to one in a lower plane, their free space is unknown."""
+        height_m = query.walls.height_m
+        if height_m is None:
+            return self.maps
+
+        def facing(i: int) -> SearchMap:
+            return self._from_below[i] if self.maps[i].walls.is_above(height_m) else self.maps[i]
+
+        return LazySequence(facing, len(self.maps), 0)
 
     def _searched(self, query: QueryMap) -> Iterator[tuple[int, F64]]:
         """The maps that are searched as a whole, and the free squares (K, 2) there that may hold the base."""

@@ -42,6 +42,7 @@ import numpy as np
 from pc2grid.arrays import F64
 from pc2grid.matching.likelihood_field import LikelihoodField
 from pc2grid.matching.two_way_score import Fit
+from pc2grid.matching.walls import Walls
 from signature.localization.query import QueryMap
 
 FITTED_ON = frozenset(
@@ -211,13 +212,14 @@ def in_the_map(
     return 1.0 / (1.0 + math.exp(min(-best, 700.0)))
 
 
-def tail_of(query: QueryMap, fit: Fit, field: LikelihoodField) -> tuple[float, ...]:
+def tail_of(query: QueryMap, fit: Fit, walls: Walls) -> tuple[float, ...]:
     """`Evidence.tail` of a query at a pose on a map; empty for a drawn map."""
+    above = walls.is_above(query.walls.height_m)
     likelihood = points = 0.0
     tail = []
     for count, keyframe in enumerate(reversed(query.keyframes), start=1):
         hits_m = (fit.T_map_query @ keyframe.T_odom_base).apply(keyframe.planar_scan.hits_m)
-        values, known = field.at(hits_m)
+        values, known = walls.field.at(hits_m, above=above)
         likelihood += float(values[known].sum())
         points += float(np.count_nonzero(known))
         mean = likelihood / points if points else 0.0

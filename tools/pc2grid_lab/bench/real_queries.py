@@ -151,13 +151,13 @@ def _looks(
 
 def evidence_list(index: MapIndex, query: QueryMap, found: tuple[Hypothesis, ...]) -> list[dict[str, Any]]:
     """What tells for each hypothesis, and for the best one, what its last scans tell."""
-    fields = [index.maps[h.session_index].field for h in found]
+    walls = [index.maps[h.session_index].walls for h in found]
     evidence = [
-        replace(one, off_map=off_map(query, h.fit, field))
-        for one, h, field in zip(evidence_of([h.fit for h in found], query), found, fields, strict=True)
+        replace(one, off_map=off_map(query, h.fit, there.field))
+        for one, h, there in zip(evidence_of([h.fit for h in found], query), found, walls, strict=True)
     ]
     if found:
-        evidence[0] = replace(evidence[0], tail=tail_of(query, found[0].fit, fields[0]))
+        evidence[0] = replace(evidence[0], tail=tail_of(query, found[0].fit, walls[0]))
     return [asdict(one) for one in evidence]
 
 
