@@ -132,3 +132,20 @@ def test_agreement_tells_a_place_from_free_space() -> None:
     assert columns.agreement(points)[0] > 0.95
     nearer = EYE + 0.6 * (points - EYE)
     assert columns.agreement(nearer)[0] < -0.5
+
+
+def test_what_rays_pass_over_is_a_thing_however_much_of_it_is_occupied() -> None:
+    """A cupboard 1.1 m high before a wall that is seen over it: less than half of what is observed there is
+    free. Its ends, over which hardly a ray passes, may look like a wall still."""
+    cupboard = box((3.0, 1.0, 0.0), (3.4, 3.0, 1.1))
+    scene = Scene(Mesh.join([box((0.0, 0.0, 0.0), (5.0, 4.0, 2.5)), cupboard]))
+    columns = ColumnMap(6.0, "depth", CONFIG)
+    for points in looks(scene, (0.0, 20.0, 40.0), (-20.0, 0.0, 20.0)):
+        columns.add(points, points, EYE, 0.0)
+    planar_scan = columns.cut(SE2(), EYE, 7)
+    x, y = planar_scan.low_m.T
+    front = (np.abs(x - 3.0) < 0.1) & (y > 1.1) & (y < 2.9)
+    assert front.sum() * CONFIG.resolution_m > 1.5  # of 1.8 m
+    assert (planar_scan.hits_m[:, 0] > 4.9).sum() > 20  # the wall behind it, 1 m of 4 at least
+    near = planar_scan.hits_m[np.abs(planar_scan.hits_m[:, 0] - 3.0) < 0.1]
+    assert not (np.abs(near[:, 1] - 2.0) < 0.9).any()

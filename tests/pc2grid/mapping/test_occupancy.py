@@ -13,7 +13,7 @@ from pc2grid.config import ProjectionConfig
 from pc2grid.errors import LimitExceeded
 from pc2grid.geometry import SE2
 from pc2grid.mapping.occupancy import GridBuilder
-from pc2grid.model import OccupancyGrid
+from pc2grid.model import THING, OccupancyGrid
 from tests.helpers.rooms import RESOLUTION_M
 
 
@@ -61,6 +61,33 @@ def test_a_person_who_has_left_is_cleared() -> None:
     for _ in range(5):
         builder.add(disc(2.0), SE2())
     assert 0 <= state(builder.grid(), 1.02, 0.02) < 20
+
+
+def test_what_was_taken_for_a_wall_until_rays_passed_over_it_is_a_thing_until_it_has_gone() -> None:
+    """A chair 1 m ahead: a hit as long as nothing behind it is seen, then low, then away."""
+    builder = GridBuilder(ProjectionConfig())
+    chair = np.array([[1.02, 0.02]], np.float32)
+    for _ in range(3):
+        builder.add(dataclasses.replace(disc(2.0), hits_m=chair, normal_rad=np.zeros(1, np.float32)), SE2())
+    assert state(builder.grid(), 1.02, 0.02) >= 65
+    for _ in range(3):
+        builder.add(dataclasses.replace(disc(2.0), low_m=chair), SE2())
+    assert state(builder.grid(), 1.02, 0.02) == THING
+    assert np.count_nonzero(builder.grid().things) == 1
+    for _ in range(6):
+        builder.add(disc(2.0), SE2())
+    assert 0 <= state(builder.grid(), 1.02, 0.02) < 20
+
+
+def test_a_grid_knows_the_plane_of_its_laser() -> None:
+    def drawn(*heights_m: float | None) -> float | None:
+        builder = GridBuilder(ProjectionConfig())
+        for height_m in heights_m:
+            builder.add(dataclasses.replace(disc(2.0), height_m=height_m), SE2())
+        return builder.grid().height_m
+
+    assert drawn(0.3, 0.3) == 0.3
+    assert drawn(0.3, 2.0) is None and drawn(0.3, None) is None and drawn(None) is None
 
 
 def test_a_map_may_span_half_a_kilometre_between_two_rooms() -> None:

@@ -11,7 +11,7 @@ from pc2grid.matching.refinement import refine
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import SearchMap, search_windows
-from pc2grid.model import UNKNOWN, OccupancyGrid
+from pc2grid.model import THING, UNKNOWN, OccupancyGrid
 from tests.helpers.simulated_drives import office, office_part
 
 OFFICE = office()
@@ -65,3 +65,64 @@ def test_empty_and_full_grids_give_an_answer(value: int) -> None:
         SearchMap.of(grid), walls.points_m[:0], np.zeros((1, 3)), half_t_m=0.4, half_a_rad=0.1
     )
     assert len(found) == 0
+
+
+def seen_from_the_middle(height_m: float | None, *boxes: tuple[slice, slice]) -> Walls:
+    """A room of 6 x 4 m and the ground around its middle: its walls, and boxes that stand in it."""
+    cells = np.full((82, 122), 0, np.int8)
+    cells[[0, -1], :] = cells[:, [0, -1]] = 100
+    for box in boxes:
+        cells[box] = 100
+    return Walls.of(
+        OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-3.05, -2.05), height_m=height_m)
+    )
+
+
+def test_what_stands_in_a_lower_plane_does_not_contradict_the_free_space_of_a_higher_one() -> None:
+    """A bench of 4 m that only the lower laser sees: neutral across heights, against the place otherwise."""
+    bench = np.s_[30:32, 20:100]
+    high, low = seen_from_the_middle(2.0), seen_from_the_middle(0.1, bench)
+    same = seen_from_the_middle(2.0, bench)
+    across, back = (score_fit(*pair, SE2(), np.eye(3)) for pair in ((high, low), (low, high)))
+    alike = score_fit(high, same, SE2(), np.eye(3))
+    # 20 m of walls and 8 m along the bench: 0.7 of the points lie on walls.
+    assert across.known_agreement > 0.99 and 0.6 < across.overlap < 0.8
+    assert alike.known_agreement < 0.8 and alike.overlap == 1.0
+    assert back.backward > 0.99 and back.looked_at < 0.8 * alike.compared + 1.0
+    assert across.score == pytest.approx(back.score, abs=0.01)
+    assert across.score > alike.score + 0.02
+
+
+def test_a_wall_of_the_higher_plane_is_missed_in_the_lower_one() -> None:
+    """The higher laser sees a wall across the room, the lower one passes through: not the same place."""
+    wall = np.s_[:, 60:62]
+    high, low = seen_from_the_middle(2.0, wall), seen_from_the_middle(0.1)
+    assert score_fit(high, low, SE2(), np.eye(3)).backward < 0.85
+    assert score_fit(low, high, SE2(), np.eye(3)).known_agreement < 0.85
+
+
+def test_planes_near_to_each_other_and_unknown_heights_are_compared_in_full() -> None:
+    bench = np.s_[30:32, 20:100]
+    with_bench = seen_from_the_middle(0.1, bench)
+    for height_m in (0.4, None):
+        fit = score_fit(seen_from_the_middle(height_m), with_bench, SE2(), np.eye(3))
+        assert fit.overlap == 1.0 and fit.known_agreement < 0.8
+
+
+def with_table(x_m: float) -> Walls:
+    """The same room with a table of 1 x 2 m whose middle is at (x, 0), seen by a camera."""
+    cells = np.full((82, 122), 0, np.int8)
+    cells[[0, -1], :] = cells[:, [0, -1]] = 100
+    column = round((x_m + 3.05) / 0.05)
+    cells[31:51, column - 20 : column + 20] = THING
+    return Walls.of(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-3.05, -2.05)))
+
+
+def test_a_table_tells_where_the_walls_do_not() -> None:
+    """In a room that looks the same turned by 180 degrees, the table at one end decides."""
+    room, turned = with_table(-1.5), SE2(0.0, 0.0, np.pi)
+    right, wrong = (score_fit(room, with_table(-1.5), pose, np.eye(3)) for pose in (SE2(), turned))
+    assert right.score > 0.95 > wrong.score + 0.05
+    no_table = seen_from_the_middle(None)
+    unaware = [score_fit(no_table, with_table(-1.5), pose, np.eye(3)).score for pose in (SE2(), turned)]
+    assert unaware[0] == pytest.approx(unaware[1], abs=0.02) and unaware[1] > 0.95  # a laser's map: neutral

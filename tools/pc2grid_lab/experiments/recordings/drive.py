@@ -49,11 +49,13 @@ class RecordedDrive:
 
     parts : the sessions of the map of the whole recording; none for a map that is no recording.
     truth : poses of the sensor in the world, None without. T_sensor_base : of the base in its frame.
+    late_ns : see `Recording.late_s`.
     """
 
     parts: tuple[Trajectory, ...]
     truth: Trajectory | None
     T_sensor_base: SE2
+    late_ns: int = 0
 
     @staticmethod
     def of(recording: Recording, folder: Folder) -> RecordedDrive:
@@ -61,7 +63,7 @@ class RecordedDrive:
         parts = tuple(sessions(folder, recording.name).values())
         truth = None if recording.poses is None else read_tum(folder.data / recording.poses)
         T_base_sensor = SE2() if recording.of_base or truth is None else mount(folder, recording)
-        return RecordedDrive(parts, truth, T_base_sensor.inverse())
+        return RecordedDrive(parts, truth, T_base_sensor.inverse(), round(recording.late_s * 1e9))
 
     def own_pose(self, stamp_ns: int) -> tuple[int, SE2] | None:
         """The part and T_part_base of the scan with that stamp; None if no part has it."""
@@ -74,6 +76,7 @@ class RecordedDrive:
     def true_pose(self, stamp_ns: int) -> SE2 | None:
         """T_world_base by the true poses; where they are far apart, carried on by the own trajectory."""
         assert self.truth is not None
+        stamp_ns -= self.late_ns
         stamps_ns = self.truth.stamps_ns
         nearest = _nearest(stamps_ns, stamp_ns)
         if nearest is not None and abs(int(stamps_ns[nearest]) - stamp_ns) <= _SAME_NS:
@@ -90,14 +93,14 @@ class RecordedDrive:
     def _carried(self, stamp_ns: int) -> SE2 | None:
         """The own trajectory around a stamp, laid on the true poses there."""
         assert self.truth is not None
-        own = self.own_pose(stamp_ns)
+        own = self.own_pose(stamp_ns + self.late_ns)
         near = np.flatnonzero(np.abs(self.truth.stamps_ns - stamp_ns) <= _CARRIED_NS)
         if own is None or not len(near):
             return None
         pairs = [
             (there[1], SE2.from_matrix(self.truth.T_session_base[k]) @ self.T_sensor_base)
             for k in near.tolist()
-            if (there := self.own_pose(int(self.truth.stamps_ns[k]))) is not None and there[0] == own[0]
+            if (there := self.own_pose(int(self.truth.stamps_ns[k]) + self.late_ns)) is not None and there[0] == own[0]
         ]
         if not pairs:
             return None

@@ -172,9 +172,7 @@ class Judge:
         stamp_ns = int(done.document["query"]["stamp_ns"])
         if pair.kind == "elsewhere":
             return LocatedWindow(pair.query, number, span, done)
-        if pair.query not in self._drives:
-            self._drives[pair.query] = RecordedDrive.of(query, self._folder)
-        drive = self._drives[pair.query]
+        drive = self._drive(query)
         where: tuple[int, SE2] | None
         if drive.truth is None:
             where = drive.own_pose(stamp_ns)
@@ -209,7 +207,7 @@ class Judge:
                 {
                     (-1, session): frame
                     for session, trajectory in sessions(self._folder, pair.map_name).items()
-                    if (frame := self._true_frame(pair.query, trajectory)) is not None
+                    if (frame := self._true_frame(map_, trajectory)) is not None
                 },
             )
         shared = self._shared(pair) if map_.sensor == "map" else None
@@ -248,11 +246,14 @@ class Judge:
             for one in self._located_windows(pair)
         ]
 
-    def _true_frame(self, query: str, trajectory: Trajectory) -> Frame | None:
+    def _drive(self, recording: Recording) -> RecordedDrive:
+        if recording.name not in self._drives:
+            self._drives[recording.name] = RecordedDrive.of(recording, self._folder)
+        return self._drives[recording.name]
+
+    def _true_frame(self, map_: Recording, trajectory: Trajectory) -> Frame | None:
         """The frame of a session of the map in the world, by its own scans, one on each `_STEP_M`."""
-        drive = self._drives.get(query)
-        if drive is None:
-            return None
+        drive = self._drive(map_)
         steps = np.unique((trajectory.path_m() / _STEP_M).astype(int), return_index=True)[1]
         clues = [
             Clue(true, SE2.from_matrix(trajectory.T_session_base[k]))
