@@ -67,6 +67,12 @@ class DepthConfig(Section):
     max_range_m: float = Field(default=6.0, gt=0)
     dropout: float = Field(default=0.01, ge=0, le=1, description="share of the pixels that are lost")
     edge_dropout: float = Field(default=0.3, ge=0, le=1, description="the same at jumps in depth")
+    flying: float = Field(
+        default=0.0, ge=0, le=1, description="share of the pixels at jumps in depth that lie between both sides"
+    )
+    holes: float = Field(
+        default=0.0, ge=0, le=0.9, description="share of the pixels that are lost in patches, as on dark surfaces"
+    )
     mount_m: tuple[float, float, float] = Field(default=(0.2, 0.0, 0.6), description="x, y, z on the base")
 
 
@@ -83,6 +89,17 @@ class LaserConfig(Section):
     mount_m: tuple[float, float, float] = Field(default=(0.15, 0.0, 0.28), description="x, y, z on the base")
 
 
+class HandConfig(Section):
+    """The hand of somebody who carries the sensor; the base is what is in the hand."""
+
+    carried: bool = Field(default=False, description="true: the sensor is carried, false: it is on wheels")
+    height_m: float = Field(default=1.5, gt=0, le=2.5, description="of the base above the floor")
+    height_sway_m: float = Field(default=0.1, ge=0, le=1, description="up and down by at most so much")
+    pitch_deg: float = Field(default=20.0, ge=-60, le=60, description="down, in the mean")
+    pitch_sway_deg: float = Field(default=20.0, ge=0, le=60, description="more and less by at most so much")
+    roll_sway_deg: float = Field(default=5.0, ge=0, le=45, description="to both sides by at most so much")
+
+
 class SimulationConfig(Section):
     """One session. The same configuration gives the same bytes."""
 
@@ -97,3 +114,4 @@ class SimulationConfig(Section):
     lidar: LidarConfig = LidarConfig()
     depth: DepthConfig = DepthConfig()
     laser: LaserConfig = LaserConfig()
+    hand: HandConfig = HandConfig()

@@ -93,6 +93,9 @@ class Recordable(Protocol):
     def pose(self, time_s: float) -> F64:
         """The true T_map_base (4, 4)."""
 
+    def in_space(self, pose: SE2, time_s: float) -> F64:
+        """A pose on the floor as that of the base (4, 4)."""
+
 
 def simulate_session(
     out: str | Path,
@@ -175,7 +178,7 @@ def _write_odometry(log: LogWriter, session: Recordable, sent: int, until_s: flo
     end = int(np.searchsorted(odometry.times_s, until_s, side="right"))
     for time_s, (x, y, yaw) in zip(odometry.times_s[sent:end], odometry.poses[sent:end], strict=True):
         stamp_ns = EPOCH_NS + round(float(time_s) * 1e9)
-        T_odom_base = SE2(float(x), float(y), wrap_angle(float(yaw))).lift()
+        T_odom_base = session.in_space(SE2(float(x), float(y), wrap_angle(float(yaw))), float(time_s))
         log.odometry(ODOMETRY_TOPIC, stamp_ns, T_odom_base, ODOM_FRAME, BASE_FRAME)
         log.tf(stamp_ns, ODOM_FRAME, BASE_FRAME, T_odom_base)
     return end

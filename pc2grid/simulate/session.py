@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pc2grid.arrays import F32, F64
+from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid, Scan, SensorKind
 from pc2grid.simulate.building import Building
@@ -15,6 +16,7 @@ from pc2grid.simulate.clutter import Furniture, covered, place_clutter
 from pc2grid.simulate.config import SimulationConfig
 from pc2grid.simulate.drive import Drive, drive_along
 from pc2grid.simulate.floorplan import office_floorplan
+from pc2grid.simulate.hand import Hand
 from pc2grid.simulate.odometry import SimulatedOdometry, odometry_of
 from pc2grid.simulate.route import plan_route
 from pc2grid.simulate.scene import Mesh, Scene, extrude
@@ -26,7 +28,7 @@ EPOCH_NS = 1_700_000_000_000_000_000
 RAYS_PER_CAST = 300_000  # bounds the memory of one call of the ray caster
 
 # Each purpose has its own stream of random numbers, so that more clutter does not change the noise.
-_CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE = range(5)
+_CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE, _HAND = range(6)
 
 Cast = Callable[[F32, F64, F64, int], F32]
 """Ranges (S, R) of rays (S, R, 6) that are cast at times (S, R) from base poses (S, R, 3); the last argument
@@ -59,7 +61,7 @@ class Session:
     drive : true motion in the plan's map frame.
     odometry : None when switched off. scan_count : scans of the sensor during the drive.
     shell : geometry of a real building; None where the plan is extruded.
-    added : further objects that the plan does not show.
+    added : further objects that the plan does not show. hand : that carries the sensor; None: it is on wheels.
     """
 
     sensor: Sensor
@@ -70,6 +72,7 @@ class Session:
     config: SimulationConfig
     shell: Mesh | None = None
     added: tuple[Furniture, ...] = ()
+    hand: Hand | None = None
 
     @property
     def objects(self) -> tuple[Furniture, ...]:
@@ -106,19 +109,36 @@ class Session:
             indices = np.arange(first, min(first + batch, self.scan_count))
             times_s = indices[:, None] / sensor.rate_hz + sensor.offsets_s
             poses = self.drive.at(times_s)
-            rays = _rays(poses, T[:3, 3], directions)
+            if self.hand is None:
+                rays = _rays(poses, T[:3, 3], directions)
+            else:
+                rays = np.stack([self._carried_rays(float(time_s)) for time_s in times_s[:, 0]])
             true_m = cast(rays, times_s, poses, first)
             for index, ranges in zip(indices, true_m, strict=True):
                 rng = np.random.default_rng([self.config.seed, _NOISE, int(index)])
                 yield Reading(int(index), float(index) / sensor.rate_hz, sensor.measure(ranges, rng))
 
+    def _carried_rays(self, time_s: float) -> F32:
+        """Rays (R, 6) in the map frame of a scan that is taken at one moment."""
+        T = self.pose(time_s) @ self.sensor.T_base_sensor
+        rays = np.empty((len(self.sensor.directions), 6), np.float32)
+        rays[:, :3], rays[:, 3:] = T[:3, 3], self.sensor.directions @ T[:3, :3].T
+        return rays
+
     def pose(self, time_s: float) -> F64:
         """The true T_map_base (4, 4)."""
-        return self.drive.pose(time_s).lift()
+        return self.in_space(self.drive.pose(time_s), time_s)
+
+    def in_space(self, pose: SE2, time_s: float) -> F64:
+        """A pose on the floor as that of the base (4, 4), which a hand may carry."""
+        return pose.lift() if self.hand is None else pose.lift() @ self.hand.at(time_s)
 
     def scan(self, reading: Reading) -> Scan:
         """A reading as the scan that `pc2grid.io` decodes from the recording."""
-        return scan_of(reading, self.sensor, self.odometry)
+        scan = scan_of(reading, self.sensor, self.odometry)
+        if self.hand is None or self.odometry is None:
+            return scan
+        return replace(scan, T_odom_base=self.in_space(self.odometry.at(reading.time_s), reading.time_s))
 
     def scans(self) -> Iterator[tuple[Scan, SE2]]:
         """Scans in the base frame, not deskewed, with the true T_map_base at their stamps."""
@@ -206,7 +226,14 @@ def plan_session(
     )
     drive = drive_along(route, config.drive, stream(_DRIVE))
     odometry = odometry_of(drive, config.odometry, stream(_ODOMETRY)) if config.odometry.enabled else None
-    return Session(make_sensor(sensor, config), plan, clutter, drive, odometry, config, shell, added)
+    carried = make_sensor(sensor, config)
+    hand = Hand.of(config.hand, stream(_HAND)) if config.hand.carried else None
+    if hand is not None and carried.offsets_s.any():
+        raise ConfigError(
+            f"hand.carried: a {sensor} sweeps while the hand moves, which is not simulated",
+            hint="carry a camera: --sensor depth",
+        )
+    return Session(carried, plan, clutter, drive, odometry, config, shell, added, hand)
 
 
 def iter_session(

@@ -339,6 +339,10 @@ class HouseSession:
             T[2, 3] = self.floor_at(time_s) * self.house.config.storey_m
         return T
 
+    def in_space(self, pose: SE2, time_s: float) -> F64:
+        """Odometry of wheels is planar."""
+        return pose.lift()
+
     def readings(self) -> Iterator[Reading]:
         """Cast all scans, several in a call; each ray starts at the robot's pose at the time of the ray."""
         sensor = self.sensor
