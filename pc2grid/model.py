@@ -251,7 +251,8 @@ class OccupancyGrid:
     @property
     def things(self) -> BoolGrid:
         """(H, W) cells of things on the floor that are no walls; none where heights are not known."""
-        return self.cells == THING
+        things: BoolGrid = self.cells == THING
+        return things
 
     @property
     def free_m2(self) -> float:

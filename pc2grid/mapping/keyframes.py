@@ -20,7 +20,8 @@ from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid
 
 IN_MEMORY_BYTES = 32 << 20  # chosen by hand: about an hour of a 2D laser
-# index, stamp, restart; T_session_base; origin of the sensor and height (NaN: none); hits, bearings, low things and unseen_hits
+# index, stamp, restart; T_session_base; origin of the sensor and height of its plane (NaN: none); hits,
+# bearings, low things and unseen_hits
 _HEADER = struct.Struct("<qqq 3d 3d 4q")
 
 
@@ -62,7 +63,9 @@ class Keyframes:
         start, end = self._starts[number], self._starts[number + 1]
         self._file.seek(start)
         data = self._file.read(end - start)
-        index, stamp_ns, restart, x, y, yaw, *origin, hits, bearings, low, unseen_hits = _HEADER.unpack_from(data)
+        index, stamp_ns, restart, x, y, yaw, *origin, hits, bearings, low, unseen_hits = _HEADER.unpack_from(
+            data
+        )
         values = np.frombuffer(data, np.float32, offset=_HEADER.size)
         ends = np.cumsum((2 * hits, hits, bearings, 2 * low))
         hits_m, normal_rad, free_m, low_m, unseen_hits_m = np.split(values, ends)

@@ -85,9 +85,7 @@ class LikelihoodField:
         values[~known] = np.maximum(values[~known], parameters.neutral_value)
         return LikelihoodField(values=values, known=known, resolution_m=resolution_m, origin_m=origin_m)
 
-    def at(
-        self, points_m: NDArray[np.floating], *, above: bool = False
-    ) -> tuple[F32, NDArray[np.bool_]]:
+    def at(self, points_m: NDArray[np.floating], *, above: bool = False) -> tuple[F32, NDArray[np.bool_]]:
         """Likelihood (N,) 0..1 in the cells of points (N, 2), and whether these cells are known (N,).
 
         Both are 0 outside the field. above : the field is of a higher plane than the points. Its walls stand

@@ -43,7 +43,7 @@ class Things:
     walls are in view.
 
     field : likelihood field of their cells; ground is known where it is free or a thing.
-    points_m : (K, 2) float32 middles of the cells along their edges, thinned and weighted as those of `Walls`.
+    points_m, weights : middles of the cells along their edges, thinned and weighted as those of `Walls`.
     """
 
     field: LikelihoodField

@@ -68,10 +68,16 @@ class DepthConfig(Section):
     dropout: float = Field(default=0.01, ge=0, le=1, description="share of the pixels that are lost")
     edge_dropout: float = Field(default=0.3, ge=0, le=1, description="the same at jumps in depth")
     flying: float = Field(
-        default=0.0, ge=0, le=1, description="share of the pixels at jumps in depth that lie between both sides"
+        default=0.0,
+        ge=0,
+        le=1,
+        description="share of the pixels at jumps in depth that lie between both sides",
     )
     holes: float = Field(
-        default=0.0, ge=0, le=0.9, description="share of the pixels that are lost in patches, as on dark surfaces"
+        default=0.0,
+        ge=0,
+        le=0.9,
+        description="share of the pixels that are lost in patches, as on dark surfaces",
     )
     mount_m: tuple[float, float, float] = Field(default=(0.2, 0.0, 0.6), description="x, y, z on the base")
 

@@ -46,7 +46,11 @@ class Hand:
         roll = math.radians(c.roll_sway_deg * lean)
         (cp, sp), (cr, sr) = ((math.cos(a), math.sin(a)) for a in (pitch, roll))
         pose = np.eye(4)
-        pose[:3, :3] = np.array([(cp, 0, sp), (0, 1, 0), (-sp, 0, cp)]) @ [(1, 0, 0), (0, cr, -sr), (0, sr, cr)]
+        pose[:3, :3] = np.array([(cp, 0, sp), (0, 1, 0), (-sp, 0, cp)]) @ [
+            (1, 0, 0),
+            (0, cr, -sr),
+            (0, sr, cr),
+        ]
         pose[2, 3] = c.height_m + c.height_sway_m * rise
         return pose
 

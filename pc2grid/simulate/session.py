@@ -61,7 +61,8 @@ class Session:
     drive : true motion in the plan's map frame.
     odometry : None when switched off. scan_count : scans of the sensor during the drive.
     shell : geometry of a real building; None where the plan is extruded.
-    added : further objects that the plan does not show. hand : that carries the sensor; None: it is on wheels.
+    added : further objects that the plan does not show.
+    hand : what carries the sensor; None: it is on wheels.
     """
 
     sensor: Sensor

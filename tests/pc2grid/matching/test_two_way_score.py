@@ -73,9 +73,7 @@ def seen_from_the_middle(height_m: float | None, *boxes: tuple[slice, slice]) ->
     cells[[0, -1], :] = cells[:, [0, -1]] = 100
     for box in boxes:
         cells[box] = 100
-    return Walls.of(
-        OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-3.05, -2.05), height_m=height_m)
-    )
+    return Walls.of(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-3.05, -2.05), height_m=height_m))
 
 
 def test_what_stands_in_a_lower_plane_does_not_contradict_the_free_space_of_a_higher_one() -> None:

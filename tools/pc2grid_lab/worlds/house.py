@@ -20,7 +20,7 @@ from scipy import ndimage
 from pc2grid.arrays import F32, F64, I64, freeze
 from pc2grid.config import Section
 from pc2grid.errors import ConfigError
-from pc2grid.geometry import transform_points
+from pc2grid.geometry import SE2, transform_points
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, Scan, SensorKind
 from pc2grid.simulate.clutter import Furniture, covered, place_clutter
 from pc2grid.simulate.config import SimulationConfig

@@ -100,7 +100,8 @@ class RecordedDrive:
         pairs = [
             (there[1], SE2.from_matrix(self.truth.T_session_base[k]) @ self.T_sensor_base)
             for k in near.tolist()
-            if (there := self.own_pose(int(self.truth.stamps_ns[k]) + self.late_ns)) is not None and there[0] == own[0]
+            if (there := self.own_pose(int(self.truth.stamps_ns[k]) + self.late_ns)) is not None
+            and there[0] == own[0]
         ]
         if not pairs:
             return None
