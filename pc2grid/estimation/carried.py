@@ -94,7 +94,8 @@ class CarriedSensor:
         is placed there.
         """
         first = expected[0]
-        prior = PosePrior(first.pose, np.linalg.inv(first.covariance))
+        axes = _axes(first.pose)
+        prior = PosePrior(first.pose, axes @ np.linalg.inv(first.covariance) @ axes.T)
         if self._map is None:
             self._map = SpaceMap(scan, points_m, self._projection)
         self._thinned = thinned = self._map.thin(scan, points_m)
@@ -146,8 +147,8 @@ class CarriedSensor:
         """
         p, t = self._parameters, self._tracking
         step_m = float(np.linalg.norm(prior.pose[:3, 3] - self._found[:3, 3]))
-        window_m = min(step_m + t.search_sigmas / math.sqrt(prior.information[0, 0]), t.search_most_m)
-        loose = PosePrior(self._found, np.diag([window_m**-2] * 3 + [p.turned_rad**-2] * 3))
+        window_m = min(step_m + t.search_sigmas / math.sqrt(prior.information[3, 3]), t.search_most_m)
+        loose = PosePrior(self._found, np.diag([p.turned_rad**-2] * 3 + [window_m**-2] * 3))
         placements = [found]
         placements += (
             space.match(self._thinned, guess, dataclasses.replace(loose, pose=guess))
@@ -159,11 +160,21 @@ class CarriedSensor:
         return best
 
 
+def _axes(pose: F64) -> F64:
+    """The matrix (6, 6) from a change in the axes of the base, shift first, to one as in `Placement`."""
+    axes = np.zeros((6, 6))
+    axes[:3, 3:] = axes[3:, :3] = pose[:3, :3]
+    return axes
+
+
 def _alone(found: Placement, prior: PosePrior) -> tuple[F64, F64]:
-    """The pose (4, 4) by the points alone, with its information (6, 6)."""
-    to_prior = steps(found.pose[None], prior.pose[None]).step[0]
-    change = np.linalg.solve(found.information + 1e-3 * np.eye(6), -prior.information @ to_prior)
-    return moved(found.pose[None], change[None])[0], found.information
+    """The pose (4, 4) by the points alone, with its information (6, 6) in the axes of the base."""
+    axes = _axes(found.pose)
+    away, _, _ = steps(prior.pose[None], found.pose[None])
+    pulled = axes.T @ prior.information @ axes @ away[0]
+    information = axes.T @ found.information @ axes
+    change = np.linalg.solve(information + 1e-3 * np.eye(6), pulled)
+    return moved(found.pose[None], change[None])[0], information
 
 
 def first_pose(scan: Scan, points_m: F32) -> F64:

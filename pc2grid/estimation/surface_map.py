@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pc2grid.arrays import F32, F64, I64, BoolGrid
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.estimation import _surface_kernels as kernels
-from pc2grid.estimation.manifold import moved, steps, weakest
+from pc2grid.geometry import pose_from_rotation_vector, rotation_vector
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,8 +67,8 @@ SURFACES = SurfaceParameters()
 class Placement:
     """A scan placed in the map in space.
 
-    pose : (4, 4) T_map_base. information : (6, 6), from the points alone, of a change of the pose as in
-    `pc2grid.estimation.manifold`.
+    pose : (4, 4) T_map_base. information : (6, 6), from the points alone, of a small rotation vector (rad)
+    and a shift (m) of the pose, both in the axes of the map; the rotation is about the origin of the base.
     overlap : share of the points that meet a surface of the map. residual_m : their mean distance from it.
     measured : whether the points fix every direction of the position.
     """
@@ -161,14 +161,11 @@ class VoxelShapes:
     def equations(
         self, points_m: F64, weights: F64, pose: F64, scale_m: float
     ) -> tuple[F64, F64, float, float]:
-        """What points (N, 3) say of a change of their pose (4, 4); see `normal_equations`."""
+        """What points (N, 3) say of a small change of their pose (4, 4); see `normal_equations`."""
         rows = self._rows
-        H, g, found, distance_m = kernels.normal_equations(
+        return kernels.normal_equations(
             self._slots, rows.codes, rows.shapes, points_m, weights, pose, self.edge_m, scale_m
         )
-        to_map = np.zeros((6, 6))  # from the axes of the base, shift first, to those of the kernel
-        to_map[3:, :3] = to_map[:3, 3:] = pose[:3, :3]
-        return to_map.T @ H @ to_map, to_map.T @ g, found, distance_m
 
 
 class SurfaceMap:
@@ -239,12 +236,11 @@ class SurfaceMap:
         for scale_m in rounds:
             H, g, found, distance_m = voxels.equations(points_m, weights, pose, scale_m)
             information = H / sigma_m**2
-            to_prior = steps(pose[None], prior.pose[None]).step[0]
-            step = np.linalg.solve(
+            step = -np.linalg.solve(
                 information + prior.information + 1e-3 * np.eye(6),
-                prior.information @ to_prior - g / sigma_m**2,
+                g / sigma_m**2 + prior.information @ _difference(pose, prior.pose),
             )
-            pose = moved(pose[None], step[None])[0]
+            pose = _moved(pose, step)
             if scale_m == rounds[-1] and np.abs(step).sum() < p.converged:
                 break
         return Placement(
@@ -252,5 +248,27 @@ class SurfaceMap:
             information,
             found / max(len(points_m), 1),
             distance_m / max(found, 1.0),
-            weakest(information, 3) > p.least_points / sigma_m**2,
+            _weakest(information) > p.least_points / sigma_m**2,
         )
+
+
+def _weakest(information: F64) -> float:
+    """Information (6, 6) on the position in its weakest direction, the rotation eliminated (Schur)."""
+    turn, shift, mixed = information[:3, :3], information[3:, 3:], information[:3, 3:]
+    across = shift - mixed.T @ np.linalg.solve(turn + 1e-9 * np.eye(3), mixed)
+    return float(np.linalg.eigvalsh(across)[0])
+
+
+def _difference(pose: F64, other: F64) -> F64:
+    """The small change (6,) from another pose (4, 4) to a pose, as in `Placement.information`."""
+    turn = np.eye(4)
+    turn[:3, :3] = pose[:3, :3] @ other[:3, :3].T
+    return np.concatenate((rotation_vector(turn), pose[:3, 3] - other[:3, 3]))
+
+
+def _moved(pose: F64, step: NDArray[np.floating]) -> F64:
+    """A pose (4, 4) after a small change (6,), as in `Placement.information`."""
+    moved = pose_from_rotation_vector(step[:3])
+    moved[:3, :3] = moved[:3, :3] @ pose[:3, :3]
+    moved[:3, 3] = pose[:3, 3] + step[3:]
+    return moved

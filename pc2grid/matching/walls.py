@@ -108,8 +108,9 @@ class Walls:
 
     def is_above(self, height_m: float | None) -> bool:
         """Whether these are walls of one plane that is clearly higher than another plane."""
-        planar = self.height_m is not None and height_m is not None
-        return planar and self.height_m - height_m > WALLS.plane_m
+        if self.height_m is None or height_m is None:
+            return False
+        return self.height_m - height_m > WALLS.plane_m
 
     @property
     def weight(self) -> float:

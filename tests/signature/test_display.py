@@ -27,6 +27,7 @@ def hypothesis(x: float, session: int, score: float) -> Hypothesis:
         forward=score,
         backward=score,
         overlap=0.9,
+        compared=90.0,
         looked_at=100,
         score=score,
         covariance=np.eye(3),

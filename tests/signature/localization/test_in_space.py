@@ -41,6 +41,7 @@ def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[Que
                 forward=0.9,
                 backward=0.9,
                 overlap=0.9,
+                compared=90.0,
                 score=0.9,
                 looked_at=100.0,
                 covariance=np.eye(3) * 1e-4,

@@ -250,6 +250,7 @@ def verdict_of(confidence: float) -> Verdict:
         forward=1.0,
         backward=1.0,
         overlap=1.0,
+        compared=100.0,
         looked_at=100.0,
         score=1.0,
         covariance=np.eye(3),

@@ -102,7 +102,7 @@ def test_a_corridor_that_the_map_lacks_is_not_located_in_another() -> None:
 
 def found(score: float, agreement: float = 0.9) -> Fit:
     """As much of a fit as the evidence is made of."""
-    known = {"known_agreement": agreement, "overlap": 0.9, "backward": 0.9, "looked_at": 300.0}
+    known = {"known_agreement": agreement, "compared": 270.0, "backward": 0.9, "looked_at": 300.0}
     return cast(Fit, SimpleNamespace(score=score, **known))
 
 
