@@ -228,11 +228,7 @@ def symmetry_seen(ranges_m: F32, ends: NDArray[np.int8]) -> F64:
     and the agreement after half a turn.
     """
     count, bearings = ranges_m.shape
-    seen = ends != HIDDEN
-    agreement = np.empty((count, bearings))
-    rays = np.arange(bearings)
-    for axis in range(bearings):
-        agreement[:, axis] = _agreement(ranges_m, seen, (axis - rays) % bearings)
+    agreement = mirror_agreement(ranges_m, ends)
     best = agreement.argmax(axis=1)
     beside = [
         agreement[
@@ -244,8 +240,17 @@ def symmetry_seen(ranges_m: F32, ends: NDArray[np.int8]) -> F64:
     diagonal = np.sort(beside[2], axis=1)
     columns = [beside[0], beside[1], diagonal, *(b.mean(axis=1, keepdims=True) for b in beside[3:])]
     columns += [agreement.mean(axis=1, keepdims=True), np.quantile(agreement, _QUANTILES, axis=1).T]
-    half_turn = _agreement(ranges_m, seen, (rays + bearings // 2) % bearings)
+    opposite = (np.arange(bearings) + bearings // 2) % bearings
+    half_turn = _agreement(ranges_m, ends != HIDDEN, opposite)
     return np.concatenate([*columns, half_turn[:, None]], axis=1)
+
+
+def mirror_agreement(ranges_m: F32, ends: NDArray[np.int8]) -> F64:
+    """(N, B) agreement, 0..1, of the ranges with their mirror image at each axis through the viewpoint; axis
+    k lies pi k / B from the first ray."""
+    rays, seen = np.arange(ranges_m.shape[1]), ends != HIDDEN
+    at_each = [_agreement(ranges_m, seen, (axis - rays) % len(rays)) for axis in rays]
+    return np.stack(at_each, axis=1)
 
 
 def _agreement(ranges_m: F32, seen: NDArray[np.bool_], partner: NDArray[np.intp]) -> F64:

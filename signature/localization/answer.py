@@ -97,7 +97,8 @@ class Answer:
     hypotheses : all that fit, best first. places : the place each of them is at; masses : of each place, see
     `Verdict`.
     history : how the answer came to be. evidence : what the confidence rests on.
-    local_map : what the query has seen, in its odom frame: what the hypotheses were compared with.
+    local_map : what the query has seen, in its odom frame: what the hypotheses were compared with. views_m :
+    where it was described by signatures, in that frame.
     sessions, labels : all of the database, that `Hypothesis.session_index` counts.
     prior : what became of the prior, None if there was none; "lapsed": registration was lost after the time
     that it is about, so it was not used. excluded : the best place that the prior excludes, if nothing that
@@ -128,6 +129,7 @@ class Answer:
     prior: Literal["used", "lapsed"] | None = None
     excluded: Moment | None = None
     in_space: PoseInSpace | None = None
+    views_m: tuple[tuple[float, float], ...] = ()
 
     def __repr__(self) -> str:
         sure = f"confidence {probability(self.confidence)}, after {self.path_m:.1f} m"

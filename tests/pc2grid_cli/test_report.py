@@ -25,6 +25,7 @@ from pc2grid_cli.locate import Found, find_map
 from pc2grid_cli.nav2_pose import initialpose
 from pc2grid_cli.relocalize import map_sigma_m
 from pc2grid_cli.report import contents, deviation, runs, write_report
+from pc2grid_cli.signatures_compared import why_here
 from signature.boundary import boundary_histogram
 from signature.config import Config
 from signature.database import SubmapDatabase, open_database
@@ -231,6 +232,37 @@ def test_the_walls_of_the_query_are_weighed_at_each_hypothesis(
         assert unknown + fits + contradicted == pytest.approx(1.0, abs=1e-3)
     # A part of the very map fits it, and is contradicted nowhere.
     assert shown["hypotheses"][0]["shares"][1] > 0.99 and shown["hypotheses"][0]["missed"] == []
+
+
+def test_the_signatures_of_the_query_lie_on_those_of_the_map_where_it_is_and_not_at_the_rival(
+    database: SubmapDatabase, found: Found
+) -> None:
+    """The query is a part of the map: a view in its middle sees the same in both."""
+    shown = contents(database, found=found)["answer"]
+    why = shown["why"]
+    assert [tuple(at) for at in why["views"]] == [
+        pytest.approx(at, abs=ROUNDED_M) for at in found.answer.views_m
+    ]
+    here, *rivals = why["places"]
+    assert here["hypothesis"] == 0 and len(here["views"]) == len(why["views"])
+    apart = []
+    for view in here["views"]:
+        query, there = np.array(view["boundary"])
+        apart.append(np.abs(query - there).sum())
+        assert np.array(view["symmetry"]).shape == (2, 48) and np.array(view["freespace"]).shape[0] == 2
+    # Shares of all pairs differ by at most 2. The query's frame is not that of the cells, so that rays end a
+    # cell earlier or later; a pair then falls into the next bin of 0.25 m. At a wrong place they differ by 1.
+    assert min(apart) < 0.3
+    assert sum(view["log_ratio"] or 0.0 for view in here["views"]) > 0.0
+    for rival in rivals:
+        assert found.answer.places[rival["hypothesis"]] != found.answer.places[0]
+        told = why["told_apart"]
+        assert here["views"][told]["log_ratio"] > rival["views"][told]["log_ratio"]
+
+
+def test_without_a_hypothesis_there_is_nothing_to_explain(database: SubmapDatabase, found: Found) -> None:
+    nowhere = replace(found.answer, hypotheses=(), places=(), status="not_found", T_map_base=None)
+    assert why_here(nowhere, database) is None
 
 
 def test_what_a_changed_query_contradicts_is_where_it_was_changed(

@@ -22,6 +22,7 @@ from pc2grid._version import __version__
 from pc2grid.io.atomic import replace_file
 from pc2grid.matching.agreement import Support
 from pc2grid_cli.picture import agreements, shades
+from pc2grid_cli.signatures_compared import why_here
 from pc2grid_cli.submap_sources import similar_places, sources
 
 if TYPE_CHECKING:
@@ -263,6 +264,7 @@ def _answer(found: Found, database: SubmapDatabase, accept: float, truth_m: F64 
             {"path_m": m.path_m, "status": m.status, "confidence": m.confidence}
             for m in (*(found.on_the_way or answer.history[:-1]), answer.history[-1])
         ],
+        "why": why_here(answer, database),
         "moments": len(found.on_the_way),
         "path": runs(found.poses),
         "truth": [] if truth_m is None else _short(np.ravel(truth_m), 2),
