@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pc2grid.arrays import F32, F64, freeze
+from pc2grid.arrays import F32, F64, I64, freeze
 from pc2grid.io.atomic import replace_file
 from signature.seen import parts, signature_columns
 
@@ -55,10 +55,11 @@ class Pairs(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeenStatistics:
-    """What the weights are made of, for the C columns of `signature.seen.signature_columns`.
+    """What the weights are made of, for the C columns of the three signatures.
 
     query_mean, place_mean (C,) : means over queries and over places of maps. within, between (C, C) :
     covariances, see above. spreads (7, 7) : the numbers of a `Spread` for each of `COMBINATIONS`.
+    sizes (3,) : how many of the columns are of the boundary, the free space and the symmetry.
     """
 
     query_mean: F64
@@ -66,6 +67,7 @@ class SeenStatistics:
     within: F64
     between: F64
     spreads: F64
+    sizes: I64
 
     def __post_init__(self) -> None:
         freeze(self, "query_mean", np.float64, (None,))
@@ -73,10 +75,14 @@ class SeenStatistics:
         for name in ("within", "between"):
             freeze(self, name, np.float64, (len(self.query_mean), len(self.query_mean)))
         freeze(self, "spreads", np.float64, (len(COMBINATIONS), 7))
+        freeze(self, "sizes", np.int64, (len(parts()),))
 
     @staticmethod
-    def of(pairs: Pairs, *, seed: int = 0) -> SeenStatistics:
-        """The weights from pairs of which enough was seen, how much a distance says from all."""
+    def of(pairs: Pairs, sizes: Sequence[int] = (), *, seed: int = 0) -> SeenStatistics:
+        """The weights from pairs of which enough was seen, how much a distance says from all.
+
+        sizes : as above, by default those of `signature.seen.parts`.
+        """
         enough = (pairs.queries[:, -1] >= _LEAST_SEEN) & (pairs.same[:, -1] >= _LEAST_SEEN)
         queries, same = (rows[enough][:, signature_columns()].astype(np.float64) for rows in pairs[:2])
         apart = (queries - queries.mean(axis=0)) - (same - same.mean(axis=0))
@@ -88,8 +94,15 @@ class SeenStatistics:
             within=apart.T @ apart / len(apart),
             between=every.T @ every / len(every),
             spreads=np.zeros((len(COMBINATIONS), 7)),
+            sizes=np.array(sizes or [part.stop - part.start for part in parts().values()], np.int64),
         )
         return replace(statistics, spreads=fitted_spreads(statistics, pairs, seed=seed))
+
+    def columns(self, names: Sequence[str] = ()) -> I64:
+        """The columns of the signatures `names`, by default of all."""
+        numbers = np.split(np.arange(len(self.query_mean)), np.cumsum(self.sizes)[:-1])
+        chosen = [part for name, part in zip(parts(), numbers, strict=True) if not names or name in names]
+        return np.concatenate(chosen)
 
     def spread(self, names: Sequence[str] = ()) -> Spread:
         """How much the distance by some of the signatures says."""
@@ -133,9 +146,7 @@ class SeenWeights:
         """The best weights of the signatures `names`, by default of all of `signature.seen.parts`."""
         from scipy.linalg import eigh
 
-        columns = np.concatenate(
-            [np.r_[part] for name, part in parts().items() if not names or name in names]
-        )
+        columns = statistics.columns(names)
         chosen = np.ix_(columns, columns)
         within = statistics.within[chosen]
         within = within + _RIDGE * np.trace(within) / len(within) * np.eye(len(within))

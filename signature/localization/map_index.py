@@ -135,10 +135,10 @@ class MapIndex:
             return None
 
         table, by_paper = database.signatures(), config.relocalize.select_by == "paper"
-        if is_large and not by_paper:
-            table = table.without_histograms()
         made_with = database.config()
         index = MapIndex(grids, table, made_with, config, labels, areas_m2, stored)
+        if is_large and not by_paper:
+            index.places.without_histograms()
         index.points_of = points_reader(database)
         if by_paper:
             return index

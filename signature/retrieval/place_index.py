@@ -3,7 +3,8 @@
 Each viewpoint has a short vector of its three signatures (`signature.seen_likelihood`), which contain no
 direction. The positions of a query's views relative to each other do contain one. So
 
-1. each view is compared with all viewpoints, by one matrix product, and stands at those that are most alike;
+1. each view is compared with the viewpoints, by one matrix product, and stands at those that are most alike;
+   those of places that a first look leaves out (`signature.retrieval.place_signatures`) are not compared;
 2. each of these, at each of some headings, is a pose of the whole query: it says at which viewpoints the
    other views stand. The log-likelihoods of all views there are added up;
 3. the places with the best poses are selected. They alone are verified.
@@ -19,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64
+from pc2grid.arrays import F32, F64, I64, BoolGrid
 from signature.retrieval.view import View
 from signature.seen import seen_signatures
 from signature.seen_likelihood import SeenWeights, Spread, seen_spread, seen_weights
@@ -144,24 +145,33 @@ class PlaceIndex:
         columns = (self.vectors, self.hidden, self.at_m, self.block, self.row, self.raster.at)
         return sum(column.nbytes for column in columns)
 
-    def select(self, views: Sequence[View], most: int) -> I64:
+    def select(self, views: Sequence[View], most: int, among: BoolGrid | None = None) -> I64:
         """Rows of the at most `most` places where the query most likely lies, best first.
+
+        among : (N,) the places that are compared, by default all.
 
         Equal inputs give equal places. Fewer are returned only if there are fewer.
         """
         if not views or not len(self) or most < 1:
             return np.empty(0, np.int64)
-        scores = self.scores(views)
-        likelihood, viewpoint = self.poses(views, scores)
+        compared = np.arange(len(self)) if among is None else np.flatnonzero(among[self.row])
+        if not len(compared):
+            return np.empty(0, np.int64)
+        scores = self.scores(views, compared)
+        likelihood, viewpoint = self.poses(views, scores, compared)
         best = viewpoint[np.argsort(-likelihood, kind="stable")]
         rows = _first_unique(self.row[best], most)
         if len(rows) < most:
-            others = np.argsort(-scores.max(axis=1), kind="stable")
+            others = compared[np.argsort(-scores[compared].max(axis=1), kind="stable")]
             rows = _first_unique(np.concatenate((rows, self.row[others])), most)
         return rows.astype(np.int64)
 
-    def scores(self, views: Sequence[View]) -> F32:
-        """(K, V) log-likelihood ratio of each viewpoint and each view showing one place, by signatures."""
+    def scores(self, views: Sequence[View], compared: I64 | None = None) -> F32:
+        """(K, V) log-likelihood ratio of each viewpoint and each view showing one place, by signatures.
+
+        compared : (C,) the viewpoints that are compared, by default all; the others have
+        `PoseParameters.least`.
+        """
         signatures = seen_signatures(
             np.stack([view.profile.ranges_m for view in views]),
             np.stack([view.profile.ends for view in views]),
@@ -169,22 +179,23 @@ class PlaceIndex:
         )
         queries, hidden = self.weights.of_queries(signatures), 1.0 - signatures[:, -1]
         squares = np.einsum("vd,vd->v", queries, queries)
-        found = np.empty((len(self), len(views)), np.float32)
-        for at in range(0, len(self), _AT_ONCE):
-            part = slice(at, at + _AT_ONCE)
+        found = np.full((len(self), len(views)), POSES.least, np.float32)
+        every = np.arange(len(self)) if compared is None else compared
+        for at in range(0, len(every), _AT_ONCE):
+            part = every[at : at + _AT_ONCE]
             vectors = self.vectors[part].astype(np.float32)
             squared = squares - 2.0 * (vectors @ queries.T)
             squared += np.einsum("kd,kd->k", vectors, vectors)[:, None]
             found[part] = self.spread.log_ratio(squared, hidden + self.hidden[part, None])
         return found
 
-    def poses(self, views: Sequence[View], scores: F32) -> tuple[F32, I64]:
-        """The log-likelihood (P,) of the best heading of each proposed pose, and the viewpoint that proposed
-        it (P,)."""
+    def poses(self, views: Sequence[View], scores: F32, compared: I64) -> tuple[F32, I64]:
+        """The log-likelihood (P,) of the best heading of each pose that the viewpoints `compared` propose,
+        and the viewpoint that proposed it (P,)."""
         from signature.retrieval._kernels import best_headings
 
-        most = min(POSES.proposed, len(self))
-        likeliest = [np.argpartition(-column, most - 1)[:most] for column in scores.T]
+        most = min(POSES.proposed, len(compared))
+        likeliest = [compared[np.argpartition(-column, most - 1)[:most]] for column in scores[compared].T]
         viewpoint, view = np.concatenate(likeliest), np.repeat(np.arange(len(views)), most)
         found = np.empty(len(viewpoint), np.float32)
         floored = np.maximum(scores, np.float32(POSES.least))

@@ -1,7 +1,8 @@
 """The places of a database: which of them a query is compared with, and what is seen around those.
 
-Signatures of viewpoints select places. Only around these are isovists compared at every rotation, which says
-how the query lies there; they are computed when a place is first selected.
+A first look at the signatures of all places leaves out most, the signatures of viewpoints select from the
+rest. Only around the selected places are isovists compared at every rotation, which says how the query lies
+there; they are computed when a place is first selected.
 """
 
 from __future__ import annotations
@@ -9,16 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64
+from pc2grid.arrays import F32, F64, I64, BoolGrid
 from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.isovist import HIDDEN, look_around
 from signature.config import RelocalizeConfig, SignatureConfig
 from signature.retrieval.place_index import PlaceBlock, PlaceIndex
+from signature.retrieval.place_signatures import PlaceSignatures
 from signature.retrieval.signature_index import Nearest, SignatureIndex, sessions_by_likeness
 from signature.retrieval.view import View
 from signature.seen_places import LATTICE_M, PROFILE_BEARINGS, SeenPlaces
@@ -130,9 +133,9 @@ class Places:
         return bool(self._areas_m2.sum() > AT_ONCE_M2)
 
     def select(self, views: Sequence[View], signature: SignatureConfig, config: RelocalizeConfig) -> Selected:
-        """The places to compare with a query, `shortlist_size` of them, by `PlaceIndex.select`; by Eq. 6
-        alone where `config.select_by` says so. The sessions are those of the places, in a large database up
-        to `AT_ONCE_M2`.
+        """The places to compare with a query, `shortlist_size` of them, by `PlaceSignatures.likely` and then
+        `PlaceIndex.select`; by Eq. 6 alone where `config.select_by` says so. The sessions are those of the
+        places, in a large database up to `AT_ONCE_M2`.
         """
         if self._selected is None or self._selected[0] is not views or self._selected[1] is not config:
             self._selected = views, config, self._select(views, signature, config)
@@ -147,13 +150,28 @@ class Places:
             rows = np.unique(np.concatenate([found.rows for found in near]))
             sessions = sessions_by_likeness(near, session_index)
         else:
-            best = self.index().select(views, most)
+            best = self.index().select(views, most, self.likely(views, most))
             rows, sessions = np.sort(best), _in_order(session_index[best])
         if not self.is_large or not len(sessions):
             return Selected(rows, sessions)
         areas_m2 = self._areas_m2[sessions]
         sessions = sessions[np.cumsum(areas_m2) <= max(AT_ONCE_M2, areas_m2[0])]
         return Selected(rows[np.isin(session_index[rows], sessions)], sessions)
+
+    def likely(self, views: Sequence[View], most: int) -> BoolGrid | None:
+        """The places (N,) that a first look by the signatures of the places leaves; None if it cannot be
+        taken, because they were made with other bins."""
+        return None if self._first_look is None else self._first_look.likely(views, most)
+
+    @cached_property
+    def _first_look(self) -> PlaceSignatures | None:
+        return PlaceSignatures.of(self.table)
+
+    def without_histograms(self) -> None:
+        """Forget the histograms of the places, which a large database has no memory for; their short vectors
+        stay."""
+        assert self._first_look is None or len(self._first_look.vectors) == len(self.table)
+        self.table = self.table.without_histograms()
 
     def nearest_by_paper(
         self, views: Sequence[View], k: int, signature: SignatureConfig

@@ -71,7 +71,8 @@ def test_isovists_are_compared_only_at_the_places_that_the_signatures_select() -
         found = retrieve(
             query.views, base_m, OFFICE.places, signature=OFFICE.made_with.signature, config=config
         )
-        selected = np.sort(OFFICE.places.index().select(query.views, shortlist))
+        selected = OFFICE.places.select(query.views, OFFICE.made_with.signature, config).rows
+        assert len(selected) == shortlist
         assert OFFICE.places._last is not None
         assert np.array_equal(OFFICE.places._last[0], selected)
         assert {proposal.row for proposal in found} <= set(selected.tolist())

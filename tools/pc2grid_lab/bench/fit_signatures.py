@@ -8,6 +8,9 @@ a map of its first part; other places are those of the other logs' maps, of draw
 
     python -m pc2grid_lab.bench.fit_signatures DATA SIMULATED.npz OUT.npz [--without csail] [--maps aces,...]
 
+The weights of the signatures of places, by which the first look is taken, are learned from the same logs, and
+from the place of the map that is nearest to each view; they are written to OUT.places.npz.
+
 DATA is as of `real_queries`; with `maps/NAME.yaml`, maps of buildings without queries. The building that is
 to be judged is left out by --without; `real_retrieval` judges.
 """
@@ -19,6 +22,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from scipy.spatial import cKDTree
+
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import OccupancyGrid
@@ -27,8 +33,12 @@ from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.experiments.seen_pairs import pairs_of
 from pc2grid_lab.experiments.selection import TRAVELS_M, office_floor, queries_of
 from pc2grid_lab.experiments.sensor_map import SensorMap
+from pc2grid_lab.experiments.trial import JUDGEMENT
+from signature.boundary import boundary_bins
 from signature.config import Config
+from signature.freespace import freespace_bins
 from signature.localization.query import QueryMap
+from signature.retrieval.place_signatures import table_rows, view_rows
 from signature.seen_likelihood import Pairs, SeenStatistics, fitted_spreads
 
 _SIMULATED = 0.2
@@ -60,6 +70,34 @@ def pairs_of_logs(logs: dict[str, Drawn], floors: Sequence[OccupancyGrid], confi
                     yield query, T_map_query, [own]
 
     return pairs_of(asked(), [*floors, *(grid for grid, _ in logs.values())], config)
+
+
+def place_pairs_of_logs(logs: dict[str, Drawn], floors: Sequence[OccupancyGrid], config: Config) -> Pairs:
+    """Views of the logs, and the places of their maps that are nearest to each, if within
+    `JudgementParameters.retrieved_m`."""
+    queries, same = [], []
+    maps = {name: index_of(name, grid, config).places.table for name, (grid, _) in logs.items()}
+    for name, (_, driven) in logs.items():
+        tree, rows = cKDTree(maps[name].center_m), table_rows(maps[name])
+        for session in driven:
+            for _, query, T_map_query in queries_with_truth(session, config):
+                if query.views:
+                    views_m = T_map_query.apply(np.array([view.center_m for view in query.views]))
+                    distance_m, nearest = tree.query(views_m)
+                    near = distance_m <= JUDGEMENT.retrieved_m
+                    queries.append(view_rows(query.views)[near])
+                    same.append(rows[nearest[near]])
+    tables = [*maps.values(), *(index_of("", grid, config).places.table for grid in floors)]
+    other = np.concatenate([table_rows(table) for table in tables])
+    return Pairs(np.concatenate(queries), np.concatenate(same), other)
+
+
+def place_statistics_of(pairs: Pairs, config: Config) -> SeenStatistics:
+    """The statistics of `place_pairs_of_logs`."""
+    radius_m, signature = config.partition.radius_m, config.signature
+    return SeenStatistics.of(
+        pairs, (boundary_bins(radius_m, signature), freespace_bins(radius_m, signature), 2)
+    )
 
 
 def statistics_of(pairs: Pairs, simulated: SeenStatistics) -> SeenStatistics:
@@ -94,6 +132,8 @@ def main() -> None:
     floors += [office_floor(_FIRST_FLOOR + number) for number in range(_FLOORS)]
     pairs = pairs_of_logs(logs, floors, config)
     statistics_of(pairs, SeenStatistics.load(options.simulated)).save(options.out)
+    of_places = place_statistics_of(place_pairs_of_logs(logs, floors, config), config)
+    of_places.save(options.out.with_suffix(".places.npz"))
     print(f"{options.out}: learned from {len(pairs.queries):,} pairs and {len(pairs.other):,} other places")
 
 

@@ -3,9 +3,10 @@
     python -m pc2grid_lab.bench.real_retrieval DATA FOLDER [--logs csail,...] [--floors 24] [--locate]
 
 The map of a building is that of the first part of its log at true poses, the queries are later parts after
-1, 3 and 8 m. The other places are of office floors. FOLDER holds `without_NAME.npz` for each log: statistics
-that `fit_signatures` has learned without this building. For each selector, printed is the share of queries
-of which a right place is selected among 0.64 % and 5 % (at least 50) of the places.
+1, 3 and 8 m. The other places are of office floors. FOLDER holds `without_NAME.npz` and
+`without_NAME.places.npz` for each log: statistics that `fit_signatures` has learned without this building.
+For each selector, printed is the share of queries of which a right place is selected among 0.64 % and 5 % (at
+least 50) of the places.
 
 --locate : prints instead what is located, and rightly, with the selected 5 %, and the processor time of the
 look-up with the decision on what it found; "none": the maps are searched as a whole. To be compared with few
@@ -18,26 +19,24 @@ import argparse
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from pc2grid.arrays import F64, I64
+from pc2grid.arrays import I64
 from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.model import OccupancyGrid
-from pc2grid.submaps.partition import submap_centers
 from pc2grid_lab.bench.fit_signatures import queries_with_truth
-from pc2grid_lab.bench.real_queries import MAPPED_S, Drawn, read
+from pc2grid_lab.bench.real_queries import MAPPED_S, Drawn, index_of, read
 from pc2grid_lab.experiments.selection import TRAVELS_M, office_floor, shuffled
 from pc2grid_lab.experiments.trial import JUDGEMENT
 from signature.config import Config
-from signature.describe import Signature
 from signature.localization.decision import judge
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
 from signature.retrieval.place_index import PlaceIndex
+from signature.retrieval.place_signatures import PlaceSignatures
 from signature.retrieval.viewpoints import shortlist_size
 from signature.seen_likelihood import COMBINATIONS, SeenStatistics, SeenWeights
 from signature.similarity import SignatureTable
@@ -45,6 +44,9 @@ from signature.similarity import SignatureTable
 _FIRST_FLOOR = 1000
 _ALL = "+".join(COMBINATIONS[-1])
 RANDOM, SHUFFLED, NONE, EVERY = "random", "shuffled", "none", "all places"
+NO_LOOK, ANY_LOOK = "no first look", "first look at random"
+"""All viewpoints are compared; those of places drawn at random are."""
+_NAMES = tuple("+".join(names) for names in COMBINATIONS)
 _FEW = 0.0064
 """102 of 16,000 places, as in earlier measurements."""
 
@@ -60,14 +62,20 @@ class Building:
     name: str
     index: MapIndex
     indexes: dict[str, PlaceIndex]
+    first_looks: dict[str, PlaceSignatures]
 
     @staticmethod
-    def of(name: str, grids: Sequence[OccupancyGrid], statistics: SeenStatistics, config: Config) -> Building:
-        """grids : the map of the log, then the floors."""
-        centers = [submap_centers(grid, config.partition) for grid in grids]
-        index = MapIndex(
-            {f"{name}.{k}": grid for k, grid in enumerate(grids)}, _table(centers), config, config
-        )
+    def of(name: str, maps: Sequence[MapIndex], learned: Path, config: Config) -> Building:
+        """maps : that of the log, then the floors. learned : the statistics of the viewpoints."""
+        statistics = SeenStatistics.load(learned)
+        of_places = SeenStatistics.load(learned.with_suffix(".places.npz"))
+        tables = [
+            replace(one.places.table, session_index=np.full(len(one.places.table), k, np.int32))
+            for k, one in enumerate(maps)
+        ]
+        grids = {f"{name}.{k}": one.grids[0] for k, one in enumerate(maps)}
+        table = SignatureTable.concatenated(tables)
+        index = MapIndex(grids, table, config, config)
         blocks = list(index.places.blocks())
         indexes = {
             "+".join(names): PlaceIndex.of(
@@ -76,26 +84,28 @@ class Building:
             for names in COMBINATIONS
             if len(names) in (1, 3)
         }
-        whole = indexes[_ALL]
-        indexes[SHUFFLED] = shuffled(whole, np.random.default_rng(0))
-        return Building(name, index, indexes)
+        indexes |= dict.fromkeys((NO_LOOK, ANY_LOOK), indexes[_ALL])
+        indexes[SHUFFLED] = shuffled(indexes[_ALL], np.random.default_rng(0))
+        looks = {
+            names: PlaceSignatures.of(table, of_places, names.split("+"))
+            for names in indexes
+            if names in _NAMES
+        }
+        return Building(
+            name, index, indexes, {names: look for names, look in looks.items() if look is not None}
+        )
 
     def rows(self, selector: str, query: QueryMap, most: int, rng: np.random.Generator) -> I64:
         """The places that are selected, likeliest first."""
         count = len(self.index.places.table)
         if selector in (RANDOM, EVERY):
             return rng.permutation(count)[: count if selector == EVERY else most]
-        return self.indexes[selector].select(query.views, most)
-
-
-def _table(centers: Sequence[F64]) -> SignatureTable:
-    """Places without the signatures of the paper, which are not compared here."""
-    nothing = Signature(
-        boundary=np.zeros(1, np.float32), freespace=np.zeros(1, np.float32), symmetry=np.zeros(2, np.float32)
-    )
-    at_m = np.concatenate(centers)
-    session = np.repeat(np.arange(len(centers)), [len(c) for c in centers])
-    return SignatureTable.of([nothing] * len(at_m), at_m, session_index=session)
+        among = None
+        if selector != NO_LOOK:
+            among = self.first_looks.get(selector, self.first_looks[_ALL]).likely(query.views, most)
+        if among is not None and selector in (SHUFFLED, ANY_LOOK):
+            among = rng.permutation(among)
+        return self.indexes[selector].select(query.views, most, among)
 
 
 def right_places(query: QueryMap, T_map_query: SE2, places: SignatureTable) -> I64:
@@ -178,13 +188,16 @@ def main() -> None:
     options = parser.parse_args()
     config, kept = Config(), options.folder / "drives"
     kept.mkdir(parents=True, exist_ok=True)
-    floors = [office_floor(_FIRST_FLOOR + number) for number in range(options.floors)]
+    floors = [
+        index_of(f"floor {number}", office_floor(_FIRST_FLOOR + number), config)
+        for number in range(options.floors)
+    ]
     found: list[Row] = []
     places = []
     for name in options.logs.split(","):
         drawn = read(options.data, name, options.queries, kept, config)
-        statistics = SeenStatistics.load(options.folder / f"without_{name}.npz")
-        building = Building.of(name, [drawn[0], *floors], statistics, config)
+        own = index_of(name, drawn[0], config)
+        building = Building.of(name, [own, *floors], options.folder / f"without_{name}.npz", config)
         places.append(len(building.index.places.table))
         if options.locate:
             found += [

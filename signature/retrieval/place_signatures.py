@@ -1,0 +1,125 @@
+"""A first look at all places of a database: the three signatures as in the paper, by which most are left out.
+
+A place has one signature (III-B to III-D): its boundary is sampled evenly with a KD-tree, the lengths of its
+shortest paths are those of a `networkx` graph of its free space, and its walls are mirrored. It is stored
+once, where viewpoints, which are compared afterwards, are a dozen a place. A place stays if any view of the
+query is like it.
+
+The bins are weighed as in `signature.seen_likelihood`, by what was learned from places and views of real
+logs. What a view has not seen cannot be left out of these histograms; so the less it has seen, the less its
+distance says.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.arrays import F32, BoolGrid
+from signature.retrieval.view import View
+from signature.seen_likelihood import SeenStatistics, SeenWeights, Spread
+from signature.similarity import SignatureTable
+
+_FILE = Path(__file__).with_name("place_statistics.npz")
+_BRIGHTEST = 255.0
+"""Largest symmetry score: the brightness of a white pixel."""
+_AT_ONCE = 65_536
+"""Places at a time, so that intermediate results stay small."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirstLook:
+    """How many places stay.
+
+    share : of all places. On real logs as many queries find their place as without a first look; of 0.2, a
+        thirtieth fewer.
+    shortlists : but no fewer than so many times as are looked for.
+    """
+
+    share: float = 0.3
+    shortlists: int = 2
+
+
+FIRST_LOOK = FirstLook()
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceSignatures:
+    """The signatures of N places as vectors (N, D), float16, and how far from a view's they usually lie."""
+
+    vectors: NDArray[np.float16]
+    weights: SeenWeights
+    spread: Spread
+
+    @staticmethod
+    def of(
+        table: SignatureTable, statistics: SeenStatistics | None = None, names: Sequence[str] = ()
+    ) -> PlaceSignatures | None:
+        """The places of a table; None if its bins are not those that the weights were learned for (`--preset
+        paper`). names : of the signatures that are compared, by default all."""
+        statistics = statistics or place_statistics()
+        if tuple(statistics.sizes) != columns_of(table):
+            return None
+        weights = SeenWeights.of(statistics, names)
+        parts = [slice(at, at + _AT_ONCE) for at in range(0, len(table), _AT_ONCE)]
+        vectors = [weights.of_places(table_rows(table, part)).astype(np.float16) for part in parts]
+        empty = np.empty((0, weights.matrix.shape[1]), np.float16)
+        return PlaceSignatures(np.concatenate((empty, *vectors)), weights, statistics.spread(names))
+
+    def likely(self, views: Sequence[View], most: int) -> BoolGrid:
+        """Which of the places (N,) stay, if `most` are looked for."""
+        count = len(self.vectors)
+        kept = max(math.ceil(FIRST_LOOK.share * count), FIRST_LOOK.shortlists * most)
+        if kept >= count or not views:
+            return np.ones(count, bool)
+        likeness = self.scores(views)
+        stays = np.zeros(count, bool)
+        stays[np.argpartition(-likeness, kept)[:kept]] = True
+        return stays
+
+    def scores(self, views: Sequence[View]) -> F32:
+        """(N,) the log-likelihood ratio of each place and the view that is most like it."""
+        rows = view_rows(views)
+        queries, hidden = self.weights.of_queries(rows), 1.0 - rows[:, -1]
+        squares = np.einsum("vd,vd->v", queries, queries)
+        found = np.empty(len(self.vectors), np.float32)
+        for at in range(0, len(found), _AT_ONCE):
+            vectors = self.vectors[at : at + _AT_ONCE].astype(np.float32)
+            squared = squares - 2.0 * (vectors @ queries.T) + np.einsum("nd,nd->n", vectors, vectors)[:, None]
+            found[at : at + _AT_ONCE] = self.spread.log_ratio(squared, hidden).max(axis=1)
+        return found
+
+
+@functools.cache
+def place_statistics() -> SeenStatistics:
+    """The statistics that come with the program, by `pc2grid_lab.bench.fit_signatures` of real logs."""
+    return SeenStatistics.load(_FILE)
+
+
+def table_rows(table: SignatureTable, part: slice = slice(None)) -> F32:
+    """Signatures of N places as rows (N, C + 1): square roots of the shares, symmetry up to 1, and a last
+    column of ones: all is known, see `signature.seen.seen_signatures`."""
+    symmetry = table.symmetry[part] / np.float32(_BRIGHTEST)
+    seen = np.ones((len(symmetry), 1), np.float32)
+    return np.concatenate(
+        (np.sqrt(table.boundary[part]), np.sqrt(table.freespace[part]), symmetry, seen), axis=1
+    )
+
+
+def view_rows(views: Sequence[View]) -> F32:
+    """The same of views; the last column is the share of what surrounds each that was seen."""
+    at_m = np.array([view.center_m for view in views])
+    rows = table_rows(SignatureTable.of([view.signature for view in views], at_m))
+    rows[:, -1] = [view.profile.observed for view in views]
+    return rows
+
+
+def columns_of(table: SignatureTable) -> tuple[int, int, int]:
+    """How many columns the boundary, the free space and the symmetry have."""
+    return table.boundary.shape[1], table.freespace.shape[1], table.symmetry.shape[1]
