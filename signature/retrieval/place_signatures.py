@@ -2,12 +2,11 @@
 
 A place has one signature (III-B to III-D): its boundary is sampled evenly with a KD-tree, the lengths of its
 shortest paths are those of a `networkx` graph of its free space, and its walls are mirrored. It is stored
-once, where viewpoints, which are compared afterwards, are a dozen a place. A place stays if any view of the
-query is like it.
+once, where viewpoints, which are compared afterwards, are a dozen a place. A place stays if it is among those
+that are most like any view of the query: views that have seen little are far from all places.
 
 The bins are weighed as in `signature.seen_likelihood`, by what was learned from places and views of real
-logs. What a view has not seen cannot be left out of these histograms; so the less it has seen, the less its
-distance says.
+logs.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, BoolGrid
 from signature.retrieval.view import View
-from signature.seen_likelihood import SeenStatistics, SeenWeights, Spread
+from signature.seen_likelihood import SeenStatistics, SeenWeights
 from signature.similarity import SignatureTable
 
 _FILE = Path(__file__).with_name("place_statistics.npz")
@@ -33,29 +32,17 @@ _AT_ONCE = 65_536
 """Places at a time, so that intermediate results stay small."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FirstLook:
-    """How many places stay.
-
-    share : of all places. On real logs as many queries find their place as without a first look; of 0.2, a
-        thirtieth fewer.
-    shortlists : but no fewer than so many times as are looked for.
-    """
-
-    share: float = 0.3
-    shortlists: int = 2
-
-
-FIRST_LOOK = FirstLook()
+SHARE = 0.1
+"""Each view keeps this share of the places, the nearest; eight views together keep 0.3 of them. With half of
+it a fortieth more of the queries of real logs lose their place; with twice of it, no fewer."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceSignatures:
-    """The signatures of N places as vectors (N, D), float16, and how far from a view's they usually lie."""
+    """The signatures of N places as vectors (N, D), float16, whose distance tells places apart."""
 
     vectors: NDArray[np.float16]
     weights: SeenWeights
-    spread: Spread
 
     @staticmethod
     def of(
@@ -70,29 +57,27 @@ class PlaceSignatures:
         parts = [slice(at, at + _AT_ONCE) for at in range(0, len(table), _AT_ONCE)]
         vectors = [weights.of_places(table_rows(table, part)).astype(np.float16) for part in parts]
         empty = np.empty((0, weights.matrix.shape[1]), np.float16)
-        return PlaceSignatures(np.concatenate((empty, *vectors)), weights, statistics.spread(names))
+        return PlaceSignatures(np.concatenate((empty, *vectors)), weights)
 
     def likely(self, views: Sequence[View], most: int) -> BoolGrid:
-        """Which of the places (N,) stay, if `most` are looked for."""
+        """Which of the places (N,) stay: `SHARE` of them for each view, and no fewer than `most`."""
         count = len(self.vectors)
-        kept = max(math.ceil(FIRST_LOOK.share * count), FIRST_LOOK.shortlists * most)
+        kept = max(math.ceil(SHARE * count), most)
         if kept >= count or not views:
             return np.ones(count, bool)
-        likeness = self.scores(views)
         stays = np.zeros(count, bool)
-        stays[np.argpartition(-likeness, kept)[:kept]] = True
+        for apart in self.distances(views).T:
+            stays[np.argpartition(apart, kept)[:kept]] = True
         return stays
 
-    def scores(self, views: Sequence[View]) -> F32:
-        """(N,) the log-likelihood ratio of each place and the view that is most like it."""
-        rows = view_rows(views)
-        queries, hidden = self.weights.of_queries(rows), 1.0 - rows[:, -1]
-        squares = np.einsum("vd,vd->v", queries, queries)
-        found = np.empty(len(self.vectors), np.float32)
+    def distances(self, views: Sequence[View]) -> F32:
+        """(N, V) squared distance of each place and each view, but for what is the same for all places."""
+        queries = self.weights.of_queries(view_rows(views))
+        found = np.empty((len(self.vectors), len(views)), np.float32)
         for at in range(0, len(found), _AT_ONCE):
             vectors = self.vectors[at : at + _AT_ONCE].astype(np.float32)
-            squared = squares - 2.0 * (vectors @ queries.T) + np.einsum("nd,nd->n", vectors, vectors)[:, None]
-            found[at : at + _AT_ONCE] = self.spread.log_ratio(squared, hidden).max(axis=1)
+            squares = np.einsum("nd,nd->n", vectors, vectors)[:, None]
+            found[at : at + _AT_ONCE] = squares - 2.0 * (vectors @ queries.T)
         return found
 
 

@@ -13,7 +13,7 @@ from signature.config import Config
 from signature.describe import describe
 from signature.localization.query import query_of
 from signature.retrieval.place_signatures import (
-    FIRST_LOOK,
+    SHARE,
     PlaceSignatures,
     columns_of,
     table_rows,
@@ -47,11 +47,12 @@ def test_the_places_of_the_query_stay_and_most_others_do_not() -> None:
     look = PlaceSignatures.of(TABLE)
     assert look is not None
     stays = look.likely(VIEWS, 1)
-    assert stays.sum() == np.ceil(FIRST_LOOK.share * len(TABLE))
+    each = np.ceil(SHARE * len(TABLE))
+    assert each <= stays.sum() <= len(VIEWS) * each
+    assert stays.mean() < 0.6
     views_m = np.array([view.center_m for view in VIEWS])
     apart_m = np.hypot(*(TABLE.center_m[:, None] - views_m[None]).transpose(2, 0, 1)).min(axis=1)
-    # The views see the whole map, so that a place half a metre from one is described almost equally. Of all
-    # places a third stays.
+    # The views see the whole map, so that a place half a metre from one is described almost equally.
     here = (TABLE.session_index == 0) & (apart_m < 0.5)
     assert here.sum() >= 3
     assert stays[here].mean() >= 0.8
@@ -63,17 +64,17 @@ def test_without_the_signatures_of_the_places_the_look_is_worth_nothing() -> Non
     histograms = {name: getattr(TABLE, name)[order] for name in ("boundary", "freespace", "symmetry")}
     look, mixed = PlaceSignatures.of(TABLE), PlaceSignatures.of(replace(TABLE, **histograms))
     assert look is not None and mixed is not None
-    np.testing.assert_array_equal(mixed.scores(VIEWS), look.scores(VIEWS)[order])
+    np.testing.assert_allclose(mixed.distances(VIEWS), look.distances(VIEWS)[order], rtol=1e-4, atol=1e-2)
     assert not np.array_equal(mixed.likely(VIEWS, 1), look.likely(VIEWS, 1))
 
 
-def test_a_view_that_has_seen_little_says_little() -> None:
-    """A histogram of a part is not that of the whole, and the part does not say which it is."""
+def test_each_view_keeps_its_own_places() -> None:
+    """A view of which little was seen does not push out those that the others keep."""
     look = PlaceSignatures.of(TABLE)
     assert look is not None
-    hidden = np.array([0.0, 0.4, 0.8])
-    near, far = (look.spread.log_ratio(np.full(3, squared), hidden) for squared in (5.0, 200.0))
-    assert (np.diff(near - far) < 0.0).all()
+    together = look.likely(VIEWS, 1)
+    one_by_one = np.array([look.likely([view], 1) for view in VIEWS])
+    np.testing.assert_array_equal(together, one_by_one.any(axis=0))
 
 
 def test_no_fewer_places_stay_than_can_be_selected_and_all_without_a_view() -> None:

@@ -223,7 +223,10 @@ class Selection:
             each = max(1, most // len(query.views))
             near = places.nearest_by_paper(query.views, each, self.index.made_with.signature)
             return np.unique(np.concatenate([found.rows for found in near]))
-        return np.sort(self._seen[selector].select(query.views, most))
+        among = places.likely(query.views, most) if selector in (SIGNATURES, SHUFFLED) else None
+        if among is not None and selector == SHUFFLED:
+            among = self._rng.permutation(among)
+        return np.sort(self._seen[selector].select(query.views, most, among))
 
 
 def shuffled(index: PlaceIndex, rng: np.random.Generator) -> PlaceIndex:
