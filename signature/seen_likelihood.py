@@ -18,10 +18,11 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -42,6 +43,9 @@ _TOO_LITTLE = 0.15
 COMBINATIONS = tuple(c for n in (1, 2, 3) for c in itertools.combinations(parts(), n))
 """The names of all combinations of the signatures; the last one is all three."""
 _FILE = Path(__file__).with_name("seen_statistics.npz")
+
+
+FloatArray = TypeVar("FloatArray", F32, F64)
 
 
 class Pairs(NamedTuple):
@@ -241,22 +245,21 @@ class Spread:
         """All seven, in the order of the fields."""
         return (*self.one_place, *self.two_places, self.one_shape, self.two_shape)
 
-    def log_ratio(self, squared: F32 | F64, hidden: F32 | F64) -> F64:
-        """Natural logarithm of the ratio of the likelihoods of one place and of two, elementwise.
+    def log_ratio(self, squared: FloatArray, hidden: FloatArray) -> FloatArray:
+        """Natural logarithm of the ratio of the likelihoods of one place and of two, elementwise, as exact as
+        the arguments: float32 takes a quarter of the time.
 
         squared : D^2. hidden : u, 0..2.
         """
-        from scipy.special import gammaln
-
-        one, two = self.one_shape, self.two_shape
+        one, two, (a, b, c) = self.one_shape, self.two_shape, self.one_place
         # The mean of the logarithm of a gamma variable is about the logarithm of its mean less 1 / (2 k).
         mean_two = self.two_places[0] + self.two_places[1] * hidden + 0.5 / two
-        mean_one = np.polynomial.polynomial.polyval(hidden, self.one_place) + 0.5 / one
-        mean_one = np.minimum(mean_one, mean_two)
+        mean_one = np.minimum(a + hidden * (b + hidden * c) + 0.5 / one, mean_two)
         # The ratio of the gamma densities falls again towards 0; a view that is nearer than most views of one
         # place are is no less likely than these.
         nearest = (one - two) / np.maximum(one * np.exp(-mean_one) - two * np.exp(-mean_two), 1e-9)
         x = np.log(np.maximum(squared, np.maximum(nearest, 1e-3)))
-        same = one * (np.log(one) - mean_one) - gammaln(one) + one * (x - np.exp(x - mean_one))
-        different = two * (np.log(two) - mean_two) - gammaln(two) + two * (x - np.exp(x - mean_two))
-        return np.asarray(same - different)
+        same = one * (math.log(one) - mean_one + x - np.exp(x - mean_one)) - math.lgamma(one)
+        different = two * (math.log(two) - mean_two + x - np.exp(x - mean_two)) - math.lgamma(two)
+        ratio: FloatArray = same - different
+        return ratio
