@@ -332,10 +332,13 @@ def test_the_last_metres_are_drawn_from_the_newest_scans_alone() -> None:
     assert 0 < last.walls.weight < 0.7 * whole.walls.weight
 
 
-@pytest.mark.parametrize("select_by", ["seen", "paper"])
-def test_views_are_described_by_signatures_only_where_these_select(
-    select_by: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("select_by", "shortlist", "uses_them"), [("seen", 40, True), ("seen", 1000, False), ("paper", 40, True)]
+)
+def test_views_are_described_by_the_papers_signatures_only_where_these_leave_places_out(
+    select_by: str, shortlist: int, uses_them: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Of a map with fewer places than are looked for, none can be left out at a first look."""
     described = []
 
     def counted(submap: Submap, config: SignatureConfig) -> Signature:
@@ -344,12 +347,12 @@ def test_views_are_described_by_signatures_only_where_these_select(
 
     monkeypatch.setattr(query_module, "describe", counted)
     config = Config()
-    few = {"shortlist": 40, "shortlist_share": 0.0, "select_by": select_by}
+    few = {"shortlist": shortlist, "shortlist_share": 0.0, "select_by": select_by}
     settings = config.model_copy(update={"relocalize": config.relocalize.model_copy(update=few)})
     index = MapIndex({"office": office()}, OFFICE.places.table, config, settings)
     answer, _ = ask(index, office(), ROUTE)
     assert answer.status == "located"
-    assert bool(described) == (select_by == "paper")
+    assert bool(described) == uses_them
 
 
 @pytest.mark.parametrize("slip_deg", [0.0, 40.0])
