@@ -1,0 +1,279 @@
+"""Do two sessions show one building, and how does one lie to the other?
+
+The junction graphs propose transforms (`graph_matching`); each is searched around, refined and scored by the
+walls of both. What is judged is the part of the source that lies on known ground of the target: it is a query
+that the target is asked for, and the posterior of every other answer decides (`posterior`). The other
+transforms are its rivals, with the same part.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from pc2grid.arrays import F64, BoolGrid, freeze
+from pc2grid.geometry import SE2
+from pc2grid.matching.refinement import refine
+from pc2grid.matching.two_way_score import Fit
+from pc2grid.matching.walls import Walls
+from pc2grid.matching.window_search import SearchMap, SearchParameters, search_windows
+from pc2grid.model import UNKNOWN, OccupancyGrid
+from signature.localization.hypotheses import HYPOTHESES, coarse_points, same_pose
+from signature.localization.joining.graph_matching import Alignment, align_graphs
+from signature.localization.joining.landmarks import Landmarks
+from signature.localization.joining.pieces import PIECES, Piece, PieceFits, align_pieces, pieces_of, rigid
+from signature.localization.posterior import NO_EVIDENCE, POSTERIOR, Evidence, evidence_of, in_the_map, masses
+from signature.localization.query import QueryMap
+from signature.localization.same_place import SAME_PLACE
+
+if TYPE_CHECKING:
+    import networkx as nx
+
+JoinStatus = Literal["joined", "ambiguous", "different"]
+"""different: nothing says that the two show one building."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JoinParameters:
+    """How a transform is verified and judged. By hand.
+
+    around_m, around_rad : a transform of the graphs is searched so far around: two nodes of a way.
+    least_m2 : free ground that both sessions know at least. Two rooms of this size are alike in many buildings.
+    accept : least probability. A wrong answer is one, a wrong join makes all later answers wrong.
+    """
+
+    around_m: float = 1.0
+    around_rad: float = math.radians(10.0)
+    least_m2: float = 20.0
+    accept: float = 0.99
+
+
+JOIN = JoinParameters()
+
+
+@dataclass(frozen=True, kw_only=True)  # no slots, for what is computed once
+class JoinableMap:
+    """The map of a session, prepared to be joined when it first matters.
+
+    graph : its junction graph. sight_m : what is visible is described up to this distance.
+    """
+
+    grid: OccupancyGrid
+    graph: nx.Graph
+    sight_m: float
+
+    @cached_property
+    def landmarks(self) -> Landmarks:
+        """The nodes of the graph, described."""
+        return Landmarks.of(self.grid, self.graph, self.sight_m)
+
+    @cached_property
+    def walls(self) -> Walls:
+        """Its walls."""
+        return Walls.of(self.grid)
+
+    @cached_property
+    def pieces(self) -> tuple[Piece, ...]:
+        """The map cut in pieces."""
+        return pieces_of(self.grid)
+
+    @cached_property
+    def search(self) -> SearchMap:
+        """The map, prepared to be searched."""
+        return SearchMap.of(self.grid)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Join:
+    """How a source session lies in the map of a target session, as far as that is known.
+
+    status : whether they are joined. T_target_source : the best transform; of no meaning if "different".
+    covariance : (3, 3) of its x, y, yaw. probability : 0..1, of the transform being right.
+    agreement : 0..1, of the walls where both know the ground, the lower one of both directions.
+    common_m2 : free ground that both know. nodes : of the two graphs, that agree on the transform.
+    rivals : other transforms that were compared. evidence : what the probability rests on.
+    """
+
+    status: JoinStatus
+    T_target_source: SE2
+    covariance: F64
+    probability: float
+    agreement: float
+    common_m2: float
+    nodes: int
+    rivals: int
+    evidence: Evidence
+
+    def __post_init__(self) -> None:
+        freeze(self, "covariance", np.float64, (3, 3))
+
+
+UNJOINED = Join(
+    status="different",
+    T_target_source=SE2(),
+    covariance=np.zeros((3, 3)),
+    probability=0.0,
+    agreement=0.0,
+    common_m2=0.0,
+    nodes=0,
+    rivals=0,
+    evidence=NO_EVIDENCE,
+)
+"""Two sessions whose graphs propose nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Candidate:
+    """A transform that was made exact by walls. at : middle of its nodes in the source. fits : of each piece of
+    the source. covariance : (3, 3) of the transform at `at`."""
+
+    T_target_source: SE2
+    at: SE2
+    nodes: int
+    fits: tuple[Fit, ...]
+    covariance: F64
+
+
+def join_maps(target: JoinableMap, source: JoinableMap, parameters: JoinParameters = JOIN) -> Join:
+    """Whether two sessions show one building, and how the source lies in the target."""
+    candidates: list[_Candidate] = []
+    for alignment in align_graphs(target.landmarks, source.landmarks):
+        found = _refined(target, source, alignment, parameters)
+        if found is not None and not any(_same(found, other) for other in candidates):
+            candidates.append(found)
+    fits = PieceFits.of([candidate.fits for candidate in candidates], source.pieces)
+    joins = [
+        _judged(target, source, candidates, fits, number, parameters) for number in range(len(candidates))
+    ]
+    return max(joins, key=lambda join: (join.status == "joined", join.probability), default=UNJOINED)
+
+
+def _same(a: _Candidate, b: _Candidate) -> bool:
+    return same_pose(a.T_target_source @ a.at, b.T_target_source @ a.at)
+
+
+def _refined(
+    target: JoinableMap, source: JoinableMap, alignment: Alignment, parameters: JoinParameters
+) -> _Candidate | None:
+    """The transform of the graphs made exact by walls: around the matched nodes, then piece by piece."""
+    points_m, at = source.walls.points_m, SE2(*alignment.at_m)
+    there = alignment.T_target_source @ at
+    found = search_windows(
+        target.search,
+        coarse_points(points_m, alignment.at_m),
+        np.array([[there.x, there.y, there.yaw]]),
+        half_t_m=parameters.around_m,
+        half_a_rad=parameters.around_rad,
+        parameters=SearchParameters(floor=0.0, most=1),
+    )
+    if not len(found) or not source.pieces:
+        return None
+    around = points_m[np.hypot(*(points_m - np.asarray(alignment.at_m, np.float32)).T) < PIECES.side_m]
+    start = SE2(*found[0, :3].tolist()) @ SE2(-at.x, -at.y, 0.0)
+    pose, _ = refine(target.search.field, around, start, alignment.at_m)
+    fits = align_pieces(target.search, source.pieces, pose, alignment.at_m)
+    T_target_source, bend_m = rigid(source.pieces, fits)
+    _, covariance = refine(target.search.field, points_m, T_target_source, alignment.at_m)
+    deviations = (HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)
+    covariance = covariance + np.diag(np.square(deviations)) + np.diag([bend_m**2, bend_m**2, 0.0])
+    return _Candidate(
+        T_target_source=T_target_source, at=at, nodes=alignment.nodes, fits=fits, covariance=covariance
+    )
+
+
+def _judged(
+    target: JoinableMap,
+    source: JoinableMap,
+    candidates: Sequence[_Candidate],
+    fits: PieceFits,
+    number: int,
+    parameters: JoinParameters,
+) -> Join:
+    """The posterior of one of the transforms, by the part of the source that lies in the target."""
+    candidate = candidates[number]
+    part = known_part(source.grid, target.grid, candidate.T_target_source)
+    common_m2 = free_in_both(part, target.grid, candidate.T_target_source)
+    forward, backward, scores = fits.of_part(number)
+    query = QueryMap(
+        stamp_ns=0,
+        path_m=0.0,
+        T_odom_base=SE2(),
+        grid=part,
+        views=(),
+        walls=Walls.of(part),
+        center_m=(candidate.at.x, candidate.at.y),
+    )
+    whole = [
+        Fit(
+            T_map_query=other.T_target_source,
+            forward=forward,
+            backward=backward,
+            overlap=1.0,
+            looked_at=float(fits.looked_at[number].sum()),
+            score=score,
+            covariance=other.covariance,
+        )
+        for other, score in zip(candidates, scores.tolist(), strict=True)
+    ]
+    evidence = evidence_of(whole, query)[number]
+    # The part was chosen: of so many parts of the smaller session, this one fits best.
+    odds = common_m2 / max(min(source.grid.free_m2, target.grid.free_m2), 1e-9)
+    probability = float(masses([evidence], min(odds, 1.0))[0]) if odds else 0.0
+    enough = common_m2 >= parameters.least_m2
+    return Join(
+        status=_status(evidence, probability, enough, parameters),
+        T_target_source=candidate.T_target_source,
+        covariance=moved_to_origin(candidate.covariance, candidate.T_target_source, candidate.at),
+        probability=probability,
+        agreement=min(forward, backward),
+        common_m2=common_m2,
+        nodes=candidate.nodes,
+        rivals=len(candidates) - 1,
+        evidence=evidence,
+    )
+
+
+def _status(evidence: Evidence, probability: float, enough: bool, parameters: JoinParameters) -> JoinStatus:
+    if enough and probability >= parameters.accept:
+        return "joined"
+    return "ambiguous" if in_the_map([evidence]) >= POSTERIOR.in_the_map else "different"
+
+
+def known_part(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE2) -> OccupancyGrid:
+    """The source without what the target does not know, widened by `SamePlace.wall_m` for walls."""
+    import cv2
+
+    n = math.ceil(SAME_PLACE.wall_m / target.resolution_m)
+    known = cv2.dilate((target.cells != UNKNOWN).astype(np.uint8), np.ones((2 * n + 1, 2 * n + 1), np.uint8))
+    cells = np.argwhere(source.cells != UNKNOWN)
+    inside = _looked_up(known.astype(bool), target, T_target_source.apply(source.to_point(cells)))
+    left = source.cells.copy()
+    left[tuple(cells[~inside].T)] = UNKNOWN
+    return replace(source, cells=left)
+
+
+def free_in_both(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE2) -> float:
+    """Square metres that are free in both."""
+    points_m = T_target_source.apply(source.to_point(np.argwhere(source.free)))
+    return float(_looked_up(target.free, target, points_m).sum()) * source.resolution_m**2
+
+
+def _looked_up(mask: BoolGrid, grid: OccupancyGrid, points_m: F64) -> BoolGrid:
+    """(N,) the values of a mask over a grid at points (N, 2); False outside."""
+    at = grid.to_cell(points_m)
+    inside: BoolGrid = np.asarray(((at >= 0) & (at < mask.shape)).all(axis=1))
+    inside[inside] = mask[tuple(at[inside].T)]
+    return inside
+
+
+def moved_to_origin(covariance: F64, T_target_source: SE2, at: SE2) -> F64:
+    """The covariance (3, 3) of a transform at a point of the source, at its origin."""
+    there = T_target_source @ at
+    J = np.eye(3)
+    J[:2, 2] = there.y - T_target_source.y, T_target_source.x - there.x
+    return np.asarray(J @ covariance @ J.T)

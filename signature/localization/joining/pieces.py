@@ -1,0 +1,147 @@
+"""A map in pieces, each aligned by itself: a bent map fits another one piece by piece, and nowhere as a whole.
+
+The pieces are aligned one after the other, from the middle of what the graphs matched outwards. Each begins
+where its nearest neighbour came to lie, so the alignment follows the bend.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pc2grid.arrays import F64
+from pc2grid.geometry import SE2
+from pc2grid.matching.likelihood_field import LIKELIHOOD
+from pc2grid.matching.refinement import refine
+from pc2grid.matching.two_way_score import Fit, score_fit
+from pc2grid.matching.walls import Walls
+from pc2grid.matching.window_search import SearchMap
+from pc2grid.model import UNKNOWN, OccupancyGrid
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PieceParameters:
+    """How a map is cut, and what of it counts. By hand.
+
+    side_m : of a square piece: about what a robot sees from a place. least_walls : wall points of a piece, by
+        weight. follows : a piece that agrees less than this does not say where its neighbours begin; wrong
+        places agree by 0.6, see `signature.localization.posterior`.
+    """
+
+    side_m: float = 12.0
+    least_walls: float = 20.0
+    follows: float = 0.6
+
+
+PIECES = PieceParameters()
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A square of a map. center_m : (x, y) the middle of its walls."""
+
+    walls: Walls
+    center_m: tuple[float, float]
+
+
+def pieces_of(grid: OccupancyGrid) -> tuple[Piece, ...]:
+    """The squares of a map that hold enough walls."""
+    side = round(PIECES.side_m / grid.resolution_m)
+    height, width = grid.cells.shape
+    found = []
+    for row in range(0, height, side):
+        for column in range(0, width, side):
+            cells = grid.cells[row : row + side, column : column + side]
+            if not (cells > UNKNOWN).any():
+                continue
+            x, y = grid.origin_m
+            origin_m = (x + column * grid.resolution_m, y + row * grid.resolution_m)
+            walls = Walls.of(replace(grid, cells=cells, origin_m=origin_m))
+            if walls.weight >= PIECES.least_walls:
+                at_x, at_y = walls.points_m.mean(axis=0).tolist()
+                found.append(Piece(walls, (at_x, at_y)))
+    return tuple(found)
+
+
+def align_pieces(
+    target: SearchMap, pieces: Sequence[Piece], T_target_source: SE2, from_m: tuple[float, float]
+) -> tuple[Fit, ...]:
+    """Where each piece lies in a target. from_m : (x, y) in the source where `T_target_source` is good."""
+    centers_m = np.array([piece.center_m for piece in pieces]).reshape(-1, 2)
+    fits: dict[int, Fit] = {}
+    trusted: list[int] = []
+    for number in np.argsort(np.hypot(*(centers_m - from_m).T), kind="stable").tolist():
+        start = T_target_source
+        if trusted:
+            nearest = np.argmin(np.hypot(*(centers_m[trusted] - centers_m[number]).T))
+            start = fits[trusted[int(nearest)]].T_map_query
+        piece = pieces[number]
+        pose, covariance = refine(target.field, piece.walls.points_m, start, piece.center_m)
+        fits[number] = fit = score_fit(target.walls, piece.walls, pose, covariance)
+        if fit.known_agreement_both_ways >= PIECES.follows:
+            trusted.append(number)
+    return tuple(fits[number] for number in range(len(pieces)))
+
+
+@dataclass(frozen=True, slots=True)
+class PieceFits:
+    """The fits of K pieces under each of H transforms.
+
+    seen, looked_at (H, K) : wall points on known ground, by weight, forward and backward. forward, backward
+    (H, K) : mean likelihood, neutral on unknown ground. agreement (H, K) : forward, on known ground only.
+    """
+
+    seen: F64
+    looked_at: F64
+    forward: F64
+    backward: F64
+    agreement: F64
+
+    @staticmethod
+    def of(fits: Sequence[Sequence[Fit]], pieces: Sequence[Piece]) -> PieceFits:
+        """From the fits of all pieces under each transform."""
+        weights = np.array([piece.walls.weight for piece in pieces])
+
+        def column(name: str) -> F64:
+            return np.array([[getattr(fit, name) for fit in row] for row in fits]).reshape(-1, len(pieces))
+
+        looked_at = column("looked_at")
+        return PieceFits(
+            seen=column("overlap") * weights,
+            looked_at=looked_at,
+            forward=column("forward"),
+            backward=np.where(looked_at > 0.0, column("backward"), LIKELIHOOD.neutral),
+            agreement=column("known_agreement"),
+        )
+
+    def of_part(self, chosen: int) -> tuple[float, float, F64]:
+        """Agreement forward and backward of one transform where both know the ground, and the score (H,) of
+        all transforms for this part of the source."""
+        seen, looked_at = self.seen[chosen], self.looked_at[chosen]
+        if not seen.sum() or not looked_at.sum():
+            return 0.0, 0.0, np.zeros(len(self.seen))
+        forward = self.forward @ seen / seen.sum()
+        forward[chosen] = self.agreement[chosen] @ seen / seen.sum()
+        backward = self.backward @ looked_at / looked_at.sum()
+        return float(forward[chosen]), float(backward[chosen]), np.sqrt(forward * backward)
+
+
+def rigid(pieces: Sequence[Piece], fits: Sequence[Fit]) -> tuple[SE2, float]:
+    """The one transform that is nearest to those of the pieces that agree, and how far (m, rms per axis) these
+    deviate from it."""
+    weights = np.array([fit.overlap * p.walls.weight for p, fit in zip(pieces, fits, strict=True)])
+    agrees = np.array([fit.known_agreement_both_ways >= PIECES.follows for fit in fits])
+    kept = np.flatnonzero(agrees & (weights > 0.0))
+    if not len(kept):
+        kept = np.flatnonzero(weights > 0.0)
+    # Two points of each piece, so that a single one says how it is turned.
+    arms = np.array([(0.25, 0.0), (-0.25, 0.0)]) * PIECES.side_m
+    source_m = np.concatenate([np.add(pieces[k].center_m, arms) for k in kept])
+    target_m = np.concatenate([fits[k].T_map_query.apply(np.add(pieces[k].center_m, arms)) for k in kept])
+    weight = np.repeat(weights[kept], 2)
+    T = SE2.fit(source_m, target_m, weight)
+    off_m = T.apply(source_m) - target_m
+    return T, math.sqrt(float(weight @ (off_m**2).sum(axis=1) / weight.sum() / 2.0))
