@@ -16,7 +16,14 @@ from pc2grid.submaps.junction_graph import graph_from_arrays
 from pc2grid.submaps.partition import view_at
 from signature.config import Config
 from signature.database import codec, stored, validation
-from signature.database.protocol import Place, Problem, Provenance, SessionInfo, none_there
+from signature.database.protocol import (
+    BuildingFrame,
+    Place,
+    Problem,
+    Provenance,
+    SessionInfo,
+    none_there,
+)
 from signature.database.rows import Rows, SessionRow, no_session
 from signature.database.stored import PARTS, StoredSession, SubmapArrays, stored_session
 from signature.similarity import SignatureTable
@@ -181,6 +188,18 @@ class SubmapDatabase(ABC):
         """What is seen from the centre of each submap of a session, by id."""
         seen: SeenPlaces = self._parts(session, "seen")["seen"]
         return seen
+
+    def frame(self, session: str) -> BuildingFrame | None:
+        """Where a session lies in the frame of its building; None if it was not joined with another one."""
+        frame: BuildingFrame | None = self._parts(session, "frame")["frame"]
+        return frame
+
+    def frames(self) -> dict[str, BuildingFrame]:
+        """The same of all sessions that were joined, by name."""
+        found = (
+            (row.name, self._rows.part(row, "frame", {"info": self._rows.info(row)})) for row in self._known()
+        )
+        return {name: frame for name, frame in found if frame is not None}
 
     def submap(self, session: str, submap_id: int) -> Submap:
         """One submap. Raises DatabaseError if the session has none of that number."""

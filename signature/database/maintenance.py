@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError
@@ -11,7 +11,7 @@ from pc2grid.model import is_part_of, part_name
 from signature.database import engine_of, open_database, refuse_existing
 from signature.database.codec import DatabaseDamage, clean
 from signature.database.postgres.server import is_url, location
-from signature.database.protocol import Entry, Place, Problem, SessionInfo
+from signature.database.protocol import BuildingFrame, Entry, Place, Problem, SessionInfo
 from signature.database.rows import Rows, no_session, refuse_other_settings
 from signature.database.stored import StoredSession, stored_session
 
@@ -66,6 +66,15 @@ def rename(target: Place, old: str, new: str) -> None:
     DatabaseBusy, and as `open_database`.
     """
     engine_of(target).change(target, lambda rows: rows.rename(old, new))
+
+
+def place(target: Place, frames: Mapping[str, BuildingFrame | None]) -> None:
+    """Store where sessions lie in their building, by name, all or none; None: nowhere.
+
+    All else stays as it is. Raises DatabaseError for a name that no session has, OutputError, DatabaseBusy,
+    and as `open_database`.
+    """
+    engine_of(target).change(target, lambda rows: rows.place(frames))
 
 
 def exists(target: Place) -> bool:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from pc2grid.display import short
 from pc2grid.errors import DatabaseError, DatabaseVersion
+from pc2grid.geometry import SE2
 from pc2grid.io.containers.detect import SUBMAPS_ID
 from pc2grid.model import (
     Consistency,
@@ -94,6 +95,25 @@ class Provenance:
 
     def __repr__(self) -> str:
         return f"Provenance({short(self.source)}, sha256 {self.digest[:12]}, {short(self.label)})"
+
+
+Covariance = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+"""Of x, y and yaw, row by row; metres and radians."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BuildingFrame:
+    """Where a session lies in the frame of its building, in which joined sessions have their answers.
+
+    name : of the frame: that of the session whose map frame it was when the first sessions were joined. It
+        stays when that session is renamed or removed.
+    T_building_session : the map frame of the session in that of the building. covariance : of it, in the axes
+        of the building.
+    """
+
+    name: str
+    T_building_session: SE2
+    covariance: Covariance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from pc2grid.errors import DatabaseError, DatabaseVersion
 from signature.database import codec, stored, validation
-from signature.database.protocol import Problem, SessionInfo
+from signature.database.protocol import BuildingFrame, Problem, SessionInfo
 from signature.database.stored import PARTS, StoredSession
 
 SESSION_COLUMNS = ("building", "id", "floor", "name", "document")
@@ -201,7 +201,8 @@ class Rows(ABC):
                 refuse_other_settings(other, info, self.location)
             known = self.find(info.name)
             if known is not None:
-                if not force and known.document == document:
+                # Where it lies in the building is no part of what was recorded.
+                if not force and stored.with_frame(known.document, None) == stored.with_frame(document, None):
                     continue
                 if not force:
                     raise DatabaseError(
@@ -236,10 +237,23 @@ class Rows(ABC):
         self.info(row)
         content = json.loads(row.document)
         content["info"]["name"] = new
-        values = (row.building, row.id, row.floor, new, codec.to_json(content))
+        self._update(row, new, codec.to_json(content))
+
+    def place(self, frames: Mapping[str, BuildingFrame | None]) -> None:
+        """Store where sessions lie in their building, by name; None: nowhere. Raises DatabaseError for a name
+        that no session has."""
+        for name, frame in frames.items():
+            row = self.find(name)
+            if row is None:
+                raise no_session(name, self._some_names(), self.location)
+            self._update(row, row.name, stored.with_frame(row.document, frame))
+
+    def _update(self, row: SessionRow, name: str, document: str) -> None:
+        """Give a session another name and document."""
+        values = (row.building, row.id, row.floor, name, document)
         self.execute(
             "UPDATE session SET name = ?, document = ?, crc32 = ? WHERE building = ? AND id = ?",
-            new, values[-1], codec.row_crc(values), row.building, row.id,
+            name, document, codec.row_crc(values), row.building, row.id,
         )  # fmt: skip
 
     def find(self, name: str) -> SessionRow | None:

@@ -6,6 +6,7 @@ into a document and arrays by its fields. A field of one of its types is stored 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
@@ -18,7 +19,7 @@ from pc2grid.model import Loop, OccupancyGrid, PointMap, Trajectory
 from pc2grid.submaps.junction_graph import GraphArrays, graph_from_arrays, graph_to_arrays, junction_graph
 from pc2grid.submaps.partition import divide
 from signature.database import codec, validation
-from signature.database.protocol import Entry, SessionInfo
+from signature.database.protocol import BuildingFrame, Entry, SessionInfo
 from signature.describe import describe
 from signature.seen_places import SeenPlaces
 from signature.similarity import I32, SignatureTable
@@ -81,7 +82,7 @@ class StoredSession:
     """Everything that is stored of a session.
 
     graph : its junction graph. submaps : where they are, and their signatures. seen : what is seen from their
-    centres.
+    centres. frame : where it lies in its building; None if it was not joined with another session.
     """
 
     info: SessionInfo
@@ -92,14 +93,17 @@ class StoredSession:
     points: PointMap | None
     submaps: SubmapArrays = field(metadata=codec.UNCOMPRESSED)
     seen: SeenPlaces
+    frame: BuildingFrame | None = None
 
 
 PARTS = tuple(codec.fields_of(StoredSession))
 """The parts of a session; all but the first are read only when they are asked for."""
 SEARCHED = ("info", "grid", "submaps")
 """The parts that every search reads."""
-RECOVERED = ("graph", "points", "submaps", "seen")
+RECOVERED = ("graph", "points", "submaps", "seen", "frame")
 """The parts that a session can lose: see `completed`."""
+ADDED = ("frame",)
+"""The parts that a session gets after it was stored; without them, nothing in its document tells of them."""
 
 
 def stored_session(entry: Entry) -> StoredSession:
@@ -137,11 +141,15 @@ def stored_session(entry: Entry) -> StoredSession:
 
 def completed(parts: Mapping[str, Any]) -> StoredSession:
     """A session of which parts were lost: those that follow from its grid are computed again, and its points
-    are left out.
+    and its place in the building are left out.
 
     parts : the others, at least info, grid, trajectory and loops.
     """
-    found, grid, config = {"points": None, **parts}, parts["grid"], parts["info"].provenance.config
+    found, grid, config = (
+        {"points": None, "frame": None, **parts},
+        parts["grid"],
+        parts["info"].provenance.config,
+    )
     if not {"graph", "submaps"} <= found.keys():
         graph, submaps = divide(grid, config.partition)
         found.setdefault("graph", graph_to_arrays(graph))
@@ -173,10 +181,21 @@ def encode(session: StoredSession) -> tuple[str, dict[str, codec.Packed]]:
     for part in fields(StoredSession):
         arrays: dict[str, codec.Array] = {}
         value = getattr(session, part.name)
+        if part.name in ADDED and value is None:
+            continue
         content[part.name] = codec.encode(codec.fields_of(StoredSession)[part.name], value, part.name, arrays)
         compress = part.metadata.get("compress", True)
         packed |= {name: codec.pack(array, compress=compress) for name, array in arrays.items()}
     return codec.to_json(content), packed
+
+
+def with_frame(document: str, frame: BuildingFrame | None) -> str:
+    """The document of a session with another place in its building; None: with none."""
+    content = json.loads(document)
+    content.pop("frame", None)
+    if frame is not None:
+        content["frame"] = codec.encode(BuildingFrame, frame, "frame", {})
+    return codec.to_json(content)
 
 
 def decode(part: str, content: Any, arrays: dict[str, codec.Array], others: Mapping[str, Any]) -> Any:
@@ -185,6 +204,8 @@ def decode(part: str, content: Any, arrays: dict[str, codec.Array], others: Mapp
     content : the document. arrays : those of the part, by their path. others : the parts that it is compared
     with: always the info, and the grid if that is known.
     """
+    if isinstance(content, dict) and part in ADDED and part not in content:
+        return None
     if not isinstance(content, dict) or part not in content:
         raise ValueError(f"the document has no {part}")
     value = codec.decode(codec.fields_of(StoredSession)[part], content[part], part, arrays)
@@ -244,5 +265,6 @@ _CHECKS: dict[str, Callable[[Any, SessionInfo, OccupancyGrid | None], None]] = {
     "points": lambda points, info, grid: validation.check_points(points),
     "submaps": _check_submaps,
     "seen": _check_seen,
+    "frame": lambda frame, info, grid: validation.check_frame(frame),
 }
 """What must be true of a part, beside the types of its fields."""

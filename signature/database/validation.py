@@ -21,6 +21,7 @@ from signature.seen_places import SIGNATURE_COLUMNS
 if TYPE_CHECKING:
     from pc2grid.submaps.junction_graph import GraphArrays
     from signature.config import Config
+    from signature.database.protocol import BuildingFrame
     from signature.seen_places import SeenPlaces
 
 # All chosen by hand: wide enough for every real session.
@@ -187,6 +188,17 @@ def check_seen(seen: SeenPlaces, places: int) -> None:
     check_near(seen.at_m, "viewpoint")
     if not np.array_equal(np.unique(seen.place), np.arange(places)) or (np.diff(seen.place) < 0).any():
         raise ValueError(f"viewpoints that do not belong to {places} places, in their order")
+
+
+def check_frame(frame: BuildingFrame | None) -> None:
+    """The covariance of a place in a building is one. None: there is no place."""
+    if frame is None:
+        return
+    covariance = np.array(frame.covariance)
+    scale = float(np.abs(covariance).max())
+    off = float(np.abs(covariance - covariance.T).max())
+    if off > 1e-6 * scale or np.linalg.eigvalsh(covariance)[0] < -1e-6 * scale:
+        raise ValueError("a covariance that is none")
 
 
 def check_histograms(histograms: F32, what: str) -> None:

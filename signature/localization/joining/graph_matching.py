@@ -29,11 +29,11 @@ from signature.seen_likelihood import seen_spread, seen_weights
 class GraphMatchingParameters:
     """How two graphs are matched. By hand.
 
-    partners : nodes of the other graph that a node is paired with, the likeliest by signatures. headings : at
-        which each pair is tried. pairs : the likeliest of all that are compared with each other.
-    near_m, drift, turn_rad : two pairs agree if their nodes are displaced by less than `near_m` plus the share
-        `drift` of the way between them, at headings that differ by less than `turn_rad`: the spacing of nodes,
-        and two rays of their isovists.
+    partners : nodes of the other graph that a node is paired with, the likeliest by signatures.
+    headings : at which each pair is tried. pairs : the likeliest of all that are compared with each other.
+    near_m, drift, turn_rad : two pairs agree if their nodes are displaced by less than `near_m` and the share
+        `drift` of the way between them, at headings that differ by less than `turn_rad`: the spacing of
+        nodes, and two rays of their isovists.
     sets : that are reported at most. least : pairs of a set at least; two nodes agree by chance.
     """
 

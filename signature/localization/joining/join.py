@@ -43,7 +43,7 @@ class JoinParameters:
     """How a transform is verified and judged. By hand.
 
     around_m, around_rad : a transform of the graphs is searched so far around: two nodes of a way.
-    least_m2 : free ground that both sessions know at least. Two rooms of this size are alike in many buildings.
+    least_m2 : free ground that both sessions know at least. Smaller rooms are alike in many buildings.
     accept : least probability. A wrong answer is one, a wrong join makes all later answers wrong.
     """
 
@@ -129,8 +129,8 @@ UNJOINED = Join(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Candidate:
-    """A transform that was made exact by walls. at : middle of its nodes in the source. fits : of each piece of
-    the source. covariance : (3, 3) of the transform at `at`."""
+    """A transform that was made exact by walls. at : middle of its nodes in the source. fits : of each piece
+    of the source. covariance : (3, 3) of the transform at `at`."""
 
     T_target_source: SE2
     at: SE2

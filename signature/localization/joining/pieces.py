@@ -1,4 +1,4 @@
-"""A map in pieces, each aligned by itself: a bent map fits another one piece by piece, and nowhere as a whole.
+"""A map in pieces, each aligned by itself: a bent map fits another one in pieces, and nowhere as a whole.
 
 The pieces are aligned one after the other, from the middle of what the graphs matched outwards. Each begins
 where its nearest neighbour came to lie, so the alignment follows the bend.
@@ -130,13 +130,11 @@ class PieceFits:
 
 
 def rigid(pieces: Sequence[Piece], fits: Sequence[Fit]) -> tuple[SE2, float]:
-    """The one transform that is nearest to those of the pieces that agree, and how far (m, rms per axis) these
-    deviate from it."""
+    """The one transform that is nearest to those of the pieces that agree, and how far (m, rms of an axis)
+    these deviate from it."""
     weights = np.array([fit.overlap * p.walls.weight for p, fit in zip(pieces, fits, strict=True)])
     agrees = np.array([fit.known_agreement_both_ways >= PIECES.follows for fit in fits])
-    kept = np.flatnonzero(agrees & (weights > 0.0))
-    if not len(kept):
-        kept = np.flatnonzero(weights > 0.0)
+    kept = np.flatnonzero(agrees & (weights > 0.0)).tolist() or np.flatnonzero(weights > 0.0).tolist()
     # Two points of each piece, so that a single one says how it is turned.
     arms = np.array([(0.25, 0.0), (-0.25, 0.0)]) * PIECES.side_m
     source_m = np.concatenate([np.add(pieces[k].center_m, arms) for k in kept])

@@ -1,0 +1,226 @@
+"""All sessions of a database joined: pairs of sessions become buildings with one frame each.
+
+Pairs are joined in the order of their probability (Kruskal's algorithm), so each building begins with what
+is surest, and never two sessions into one building whose labels name different buildings or floors. Then one
+pose graph over the sessions, each pair a robust edge, says where they lie, and how exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from pc2grid.arrays import F64
+from pc2grid.geometry import SE2
+from pc2grid.mapping.local_maps import pose_at
+from pc2grid.mapping.pose_graph import Edge, information_matrix, optimise
+from pc2grid.model import same_recording
+from pc2grid.observer import Observer
+from signature.database.protocol import BuildingFrame, Covariance, SessionInfo
+from signature.database.rows import no_session
+from signature.localization.joining.join import Join, JoinableMap, join_maps
+from signature.localization.lazy_maps import LazySequence
+
+if TYPE_CHECKING:
+    import networkx as nx
+
+    from signature.database import SubmapDatabase
+
+_KEPT = 8
+"""Prepared maps that stay in memory."""
+_HELD = 1e10
+"""Information (1/m^2, 1/rad^2) that holds sessions where they are that were joined before."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionPair:
+    """Two sessions that were compared. accepted : whether their join counts: the pair is joined, and neither
+    labels nor the other pairs contradict it."""
+
+    target: str
+    source: str
+    join: Join
+    accepted: bool = False
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Of the two sessions."""
+        return self.target, self.source
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Joined:
+    """What joining the sessions of a database found.
+
+    pairs : all that were compared. frames : of the sessions that were joined with another one, by name.
+    """
+
+    pairs: tuple[SessionPair, ...]
+    frames: Mapping[str, BuildingFrame]
+
+
+def join_sessions(
+    database: SubmapDatabase,
+    *,
+    frame: str | None = None,
+    only: Collection[str] | None = None,
+    observer: Observer = Observer(),
+) -> Joined:
+    """Which sessions of a database show one building, and how they lie in its frame.
+
+    frame : the session whose map frame is that of its building. None: the frame of those that were joined
+    before, else of the session that was stored first. only : sessions that are joined, with the others and
+    with each other; the others stay where they are. None: all are joined anew, which `frame` needs.
+    observer : gets the progress.
+
+    Raises DatabaseError for a name that no session has.
+    """
+    infos = {info.name: info for info in database.sessions()}
+    for name in (*((frame,) if frame else ()), *(only or ())):
+        if name not in infos:
+            raise no_session(name, infos, database.location)
+    known = database.frames()
+    wanted = [
+        (a, b)
+        for a, b in combinations(infos, 2)
+        if (only is None or a in only or b in only) and not _told_apart(infos[a], infos[b])
+    ]
+    pairs = list(_compared(database, list(infos), wanted, observer))
+    stay = {} if only is None else {name: at for name, at in known.items() if name not in only}
+    frames: dict[str, BuildingFrame] = dict(stay)
+    accepted: set[tuple[str, str]] = set()
+    for tree in _buildings(infos, pairs, stay):
+        members = [name for name in infos if name in tree]
+        anchor = _anchor(members, frame, stay or known)
+        within = [p for p in pairs if p.join.status == "joined" and p.target in tree and p.source in tree]
+        placed, counted = _placed(tree, anchor, within, stay)
+        frames = placed | frames
+        accepted |= counted
+    return Joined(
+        pairs=tuple(replace(pair, accepted=pair.names in accepted) for pair in pairs),
+        frames={name: frames[name] for name in infos if name in frames},
+    )
+
+
+def _told_apart(a: SessionInfo, b: SessionInfo) -> bool:
+    """Whether labels say that two sessions are not of one floor of one building."""
+    one_recording = same_recording(a.name, b.name)
+    return a.provenance.label.contradicts(b.provenance.label, one_recording=one_recording)
+
+
+def _compared(
+    database: SubmapDatabase, names: Sequence[str], pairs: Sequence[tuple[str, str]], observer: Observer
+) -> Iterator[SessionPair]:
+    """Each pair joined, as far as it can be."""
+
+    def prepared(number: int) -> JoinableMap:
+        sight_m = database.config().partition.radius_m
+        return JoinableMap(
+            grid=database.grid(names[number]), graph=database.graph(names[number]), sight_m=sight_m
+        )
+
+    maps = LazySequence(prepared, len(names), _KEPT)
+    with observer.step(f"compare {len(pairs)} pairs of sessions"):
+        for done, (a, b) in enumerate(pairs):
+            yield SessionPair(target=a, source=b, join=join_maps(maps[names.index(a)], maps[names.index(b)]))
+            observer.on_progress((done + 1) / len(pairs))
+
+
+def _buildings(
+    infos: Mapping[str, SessionInfo], pairs: Sequence[SessionPair], stay: Mapping[str, BuildingFrame]
+) -> list[nx.Graph]:
+    """The sessions of each building, two at least, as a tree of the surest pairs, its edges with `pair`."""
+    import networkx as nx
+
+    trees = nx.Graph()
+    trees.add_nodes_from(infos)
+    for first, second in combinations(stay, 2):
+        if stay[first].name == stay[second].name:
+            trees.add_edge(first, second)
+    joined = [pair for pair in pairs if pair.join.status == "joined"]
+    for pair in sorted(joined, key=lambda p: (-p.join.probability, -p.join.common_m2)):
+        a, b = (nx.node_connected_component(trees, name) for name in (pair.target, pair.source))
+        if pair.source in a or len({stay[name].name for name in a | b if name in stay}) > 1:
+            continue
+        if not any(_told_apart(infos[one], infos[other]) for one in a for other in b):
+            trees.add_edge(pair.target, pair.source, pair=pair)
+    return [trees.subgraph(members) for members in nx.connected_components(trees) if len(members) > 1]
+
+
+def _anchor(
+    members: Sequence[str], frame: str | None, known: Mapping[str, BuildingFrame]
+) -> tuple[str, BuildingFrame]:
+    """The session that stays where it is, and where that is."""
+    joined = next((name for name in members if name in known), None)
+    if joined is not None and frame not in members:
+        return joined, known[joined]
+    name = frame if frame is not None and frame in members else members[0]
+    return name, BuildingFrame(name=name, T_building_session=SE2(), covariance=_rows(np.zeros((3, 3))))
+
+
+def _placed(
+    tree: nx.Graph,
+    anchor: tuple[str, BuildingFrame],
+    pairs: Sequence[SessionPair],
+    stay: Mapping[str, BuildingFrame],
+) -> tuple[dict[str, BuildingFrame], set[tuple[str, str]]]:
+    """Where the sessions of a building lie, by all its pairs, and the names of those pairs that count."""
+    import networkx as nx
+
+    first, at = anchor
+    poses = {first: at.T_building_session} | {n: stay[n].T_building_session for n in tree if n in stay}
+    for a, b in nx.bfs_edges(tree, first):
+        if b not in poses:
+            pair = tree.edges[a, b]["pair"]
+            T_target_source = pair.join.T_target_source
+            poses[b] = poses[a] @ (T_target_source if pair.target == a else T_target_source.inverse())
+    names = list(poses)
+    edges = [
+        Edge(
+            names.index(pair.target),
+            names.index(pair.source),
+            pair.join.T_target_source,
+            np.asarray(np.linalg.inv(pair.join.covariance), np.float64),
+            loop=True,
+        )
+        for pair in pairs
+    ]
+    held = [
+        Edge(0, names.index(n), poses[first].inverse() @ poses[n], _HELD * np.eye(3))
+        for n in stay
+        if n in tree and n != first
+    ]
+    begin = np.array([(pose.x, pose.y, pose.yaw) for pose in poses.values()])
+    solution = optimise(begin, [*held, *edges])
+    counts = [
+        fits or tree.has_edge(*pair.names)
+        for pair, fits in zip(pairs, solution.accepted[len(held) :], strict=True)
+    ]
+    counted = [edge for edge, count in zip(edges, counts, strict=True) if count]
+    covariances = _covariances(solution.poses, [*held, *counted])
+    found = {
+        name: BuildingFrame(
+            name=at.name,
+            T_building_session=pose_at(solution.poses, k),
+            covariance=at.covariance if k == 0 else _rows(covariances[k - 1]),
+        )
+        for k, name in enumerate(names)
+    }
+    return found, {pair.names for pair, count in zip(pairs, counts, strict=True) if count}
+
+
+def _covariances(poses: F64, edges: Sequence[Edge]) -> F64:
+    """(N - 1, 3, 3) of all poses but the first, which stays where it is."""
+    information = information_matrix(poses, edges).toarray()[3:, 3:]
+    blocks = np.linalg.inv(information).reshape(len(poses) - 1, 3, len(poses) - 1, 3)
+    diagonal = np.arange(len(poses) - 1)
+    return np.asarray(blocks[diagonal, :, diagonal])
+
+
+def _rows(covariance: F64) -> Covariance:
+    rows = (0.5 * (covariance + covariance.T)).tolist()
+    return cast(Covariance, tuple(tuple(row) for row in rows))
