@@ -103,6 +103,8 @@ class Answer:
     prior : what became of the prior, None if there was none; "lapsed": registration was lost after the time
     that it is about, so it was not used. excluded : the best place that the prior excludes, if nothing that
     it allows is certain and this fits better.
+    frames : for each session the frame of its building that poses are in, None: in its map frame; empty: all
+    are in the map frames of their sessions (`signature.localization.in_building`).
     in_space : the pose with six degrees of freedom, and whether the points agree; None if either side has
     none. Of a place that was turned down because they contradict it, the pose there.
     """
@@ -130,6 +132,7 @@ class Answer:
     excluded: Moment | None = None
     in_space: PoseInSpace | None = None
     views_m: tuple[tuple[float, float], ...] = ()
+    frames: tuple[str | None, ...] = ()
 
     def __repr__(self) -> str:
         sure = f"confidence {probability(self.confidence)}, after {self.path_m:.1f} m"
@@ -158,6 +161,15 @@ class Answer:
     def label(self) -> Label:
         """Building and floor of the session it was located in, as far as they are known."""
         return Label() if self.status != "located" else self.labels[self.hypotheses[0].session_index]
+
+    def frame_of(self, hypothesis: Hypothesis) -> str | None:
+        """The frame of the building that a hypothesis is in; None: the map frame of its session."""
+        return self.frames[hypothesis.session_index] if self.frames else None
+
+    @property
+    def frame(self) -> str | None:
+        """The frame of the building that the pose is in; None: the map frame of the session."""
+        return self.frame_of(self.hypotheses[0]) if self.status == "located" else None
 
     def to_json(self) -> AnswerDocument:
         """The answer as plain types: most of what `pc2grid relocalize --json` prints."""

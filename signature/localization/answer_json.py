@@ -34,10 +34,12 @@ class StampedPose(Pose):
 
 
 class Hypothesis(Pose):
-    """A place that fits. Equal `place`: the same place in the maps of different sessions. submap_id is null
-    if the whole map was searched. score and overlap: shares of what both sides see, 0..1."""
+    """A place that fits. Equal `place`: the same place in the maps of different sessions. frame: of the
+    building, in which the pose is; null: the map frame of the session. submap_id is null if the whole map was
+    searched. score and overlap: shares of what both sides see, 0..1."""
 
     session: str
+    frame: str | None
     building: str | None
     floor: str | None
     submap_id: int | None
@@ -112,14 +114,17 @@ class PoseInSpace(TypedDict):
 
 
 class Result(TypedDict):
-    """What is found. T_map_odom puts the query's own frame into the map. confidence: the probability that the
-    best hypothesis is right. hypotheses: best first. prior: null if nothing was known beforehand.
-    in_space: null if the map or the query has no points. floor_height_m: of the floor, above the lowest one
-    that the map's recording reaches by stairs or ramps; null if it reaches one only, and behind a lift."""
+    """What is found. frame: of the building, in which the poses are if the session was joined with others;
+    null: the map frame of the session. T_map_odom puts the query's own frame into it. confidence: the
+    probability that the best hypothesis is right. hypotheses: best first. prior: null if nothing was known
+    beforehand. in_space: null if the map or the query has no points. floor_height_m: of the floor, above the
+    lowest one that the map's recording reaches by stairs or ramps; null if it reaches one only, and behind a
+    lift."""
 
     schema_version: Version
     status: Status
     session: str | None
+    frame: str | None
     building: str | None
     floor: str | None
     floor_height_m: float | None
@@ -150,6 +155,7 @@ def document(answer: answer.Answer) -> AnswerDocument:
         "schema_version": 1,
         "status": answer.status,
         "session": answer.session,
+        "frame": answer.frame,
         "building": answer.label.building,
         "floor": answer.label.floor,
         "floor_height_m": answer.label.floor_height_m,
@@ -159,6 +165,7 @@ def document(answer: answer.Answer) -> AnswerDocument:
         "hypotheses": [
             {
                 "session": answer.sessions[h.session_index],
+                "frame": answer.frame_of(h),
                 "building": answer.labels[h.session_index].building,
                 "floor": answer.labels[h.session_index].floor,
                 "submap_id": submap_id if submap_id >= 0 else None,

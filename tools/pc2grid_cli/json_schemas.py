@@ -136,10 +136,11 @@ class Watch(TypedDict):
     """A line of `pc2grid watch --json`: what one look at the database said. state: searching (not located
     yet), located, doubtful (more likely than not where it was, but not surely), lost, recovered (located
     elsewhere or again). pose: of the base at `stamp_ns`; null unless the status is `located`. T_map_odom: of
-    the robot's own odometry frame. in_space: null if the map or the scans have no points. confidence: the
-    probability that the best place is right. published: topics on which it was said. lag_s, elapsed_s:
-    seconds from a scan's arrival to its use, and for this look. scans: used so far, dropped: left out
-    because the computer is too slow, reconnected: lost connections made again."""
+    the robot's own odometry frame. frame: of the building, in which the pose is; null: the map frame of the
+    session. in_space: null if the map or the scans have no points. confidence: the probability that the best
+    place is right. published: topics on which it was said. lag_s, elapsed_s: seconds from a scan's arrival to
+    its use, and for this look. scans: used so far, dropped: left out because the computer is too slow,
+    reconnected: lost connections made again."""
 
     schema_version: Version
     state: State
@@ -147,6 +148,7 @@ class Watch(TypedDict):
     stamp_ns: int
     path_m: float
     map: WatchedMap | None
+    frame: str | None
     pose: StampedPose | None
     T_map_odom: Pose | None
     in_space: PoseInSpace | None
@@ -326,6 +328,46 @@ class DbWrite(TypedDict):
     left_out: list[Problem]
 
 
+class ComparedSessions(TypedDict):
+    """Two sessions that were compared. status: joined, ambiguous, or different: nothing says that they show
+    one building. accepted: the join counts; other pairs and labels do not contradict it. T_target_source:
+    null if the status is `different`; covariance: (3, 3) of its x, y, yaw. probability: that it is right.
+    agreement: of the walls where both know the ground, 0..1. common_m2: free ground that both know. nodes: of
+    the junction graphs, that agree on it."""
+
+    target: str
+    source: str
+    status: Literal["joined", "ambiguous", "different"]
+    accepted: bool
+    T_target_source: Pose | None
+    covariance: list[list[float]] | None
+    probability: float
+    agreement: float
+    common_m2: float
+    nodes: int
+
+
+class JoinedSession(TypedDict):
+    """Where a session lies in its building. frame: name of the building's frame."""
+
+    session: str
+    frame: str
+    T_building_session: Pose
+    covariance: list[list[float]]
+
+
+class DbJoin(TypedDict):
+    """`pc2grid db join --json`. stored: false with --dry-run. sessions: those that were joined. alone: the
+    names of the others."""
+
+    schema_version: Version
+    database: str
+    stored: bool
+    pairs: list[ComparedSessions]
+    sessions: list[JoinedSession]
+    alone: list[str]
+
+
 class Export(TypedDict):
     """`pc2grid export --json`; session is null if only a report was written."""
 
@@ -340,6 +382,7 @@ DOCUMENTS: dict[str, type] = {
     "db-check": DbCheck,
     "db-copy": DbWrite,
     "db-info": DbInfo,
+    "db-join": DbJoin,
     "db-merge": DbWrite,
     "db-remove": DbWrite,
     "db-rename": DbWrite,

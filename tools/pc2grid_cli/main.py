@@ -26,6 +26,10 @@ DB = {
     "info": ("pc2grid_cli.db:db_info_command", "Show the sessions of a database."),
     "check": ("pc2grid_cli.db:db_check_command", "Read everything and list all damage."),
     "merge": ("pc2grid_cli.db:db_merge_command", "Put the sessions of several databases into one."),
+    "join": (
+        "pc2grid_cli.join:db_join_command",
+        "Find out how sessions of a building lie to each other.",
+    ),
     "copy": ("pc2grid_cli.db:db_copy_command", "Write a compact copy of a database."),
     "split": ("pc2grid_cli.db:db_split_command", "Copy sessions into a database of their own."),
     "rename": ("pc2grid_cli.db:db_rename_command", "Give a session another name."),
@@ -105,7 +109,7 @@ app.add_typer(
 app.add_typer(
     typer.Typer(
         cls=group(DB),
-        help="Look into databases, check, change, merge, split and copy them.",
+        help="Look into databases, check, join, change, merge, split and copy them.",
         no_args_is_help=True,
     ),
     name="db",

@@ -35,6 +35,19 @@ class PresetName(str, enum.Enum):
     paper = "paper"
 
 
+class FrameName(str, enum.Enum):
+    """Which frame poses are in."""
+
+    building = "building"
+    session = "session"
+
+
+Frame = Annotated[
+    FrameName,
+    typer.Option(
+        "--frame", help="of poses: of the building, if sessions are joined (db join); or of the map"
+    ),
+]
 Preset = Annotated[
     PresetName,
     typer.Option("--preset", help="settings to start from; paper: submaps are discs of 8 m at junctions"),

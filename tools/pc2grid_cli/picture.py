@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -113,6 +116,25 @@ def draw_session(path: Path, database: SubmapDatabase, session: str) -> None:
     if len(poses):
         axes.plot(poses[:, 0], poses[:, 1], color=BLUE, lw=1.2, label="path of the map's robot")
     axes.set_title(session, loc="left")
+    _finish(figure, axes, path)
+
+
+def draw_building(path: Path, name: str, maps: Mapping[str, tuple[OccupancyGrid, SE2]]) -> None:
+    """The walls of the sessions of a building over each other, each with its T_building_session.
+
+    name : of the building's frame.
+    """
+    walls = {
+        session: T.apply(grid.to_point(np.argwhere(grid.occupied))) for session, (grid, T) in maps.items()
+    }
+    boxes = [_Box.around(points_m, _CLOSE_MARGIN_M) for points_m in walls.values() if len(points_m)]
+    whole = reduce(_Box.united, boxes or [_Box(0.0, 1.0, 0.0, 1.0)])
+    figure, (axes,) = _panels(whole, None)
+    axes.set_facecolor(_grey("free"))
+    colours = itertools.cycle((BLUE, VERMILLION, GREEN, PURPLE, ORANGE, GREY, YELLOW))
+    for (session, points_m), colour in zip(walls.items(), colours, strict=False):
+        axes.plot(*points_m.T, ".", color=colour, ms=1.5, mew=0, alpha=0.7, label=session)
+    axes.set_title(f"walls of the sessions in the frame of {name}", loc="left")
     _finish(figure, axes, path)
 
 

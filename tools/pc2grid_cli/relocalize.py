@@ -32,6 +32,7 @@ from pc2grid_cli.picture import draw_answer
 from pc2grid_cli.report import write_report
 from pc2grid_cli.rerun_stream import Search, stream_to
 from pc2grid_cli.rerun_target import require_target
+from signature.localization.in_building import answer_in_building
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory
@@ -126,6 +127,7 @@ def relocalize_command(
     report: Annotated[
         Path | None, typer.Option("--report", metavar="OUT.html", help="a page to look into the answer")
     ] = None,
+    frame: options.Frame = options.FrameName.building,
     config: options.ConfigFile = None,
     set_: options.Assignments = None,
     force: options.Force = False,
@@ -188,14 +190,16 @@ def relocalize_command(
             on_the_way=ON_THE_WAY if report is not None or rerun is not None else 0,
         )
         # Printed first: a file that cannot be written must not cost the answer.
-        _print(found, where, left_out, map_sigma_m(found.answer, opened), as_json=json)
-        _write(outputs, opened, found, located, settings)
+        frames = opened.frames() if frame is options.FrameName.building else {}
+        stated = answer_in_building(found.answer, frames)
+        _print(found, stated, where, left_out, map_sigma_m(found.answer, opened), as_json=json)
+        _write(outputs, opened, found, stated, located, settings)
     for path in (trajectory, initialpose, output):
         if path is not None and located is None:
             console.warn(f"{path}: not written, there is no answer to put into it")
     for warning in found.about["warnings"]:
         console.warn(warning)
-    _warn_of_prior(found.answer)
+    _warn_of_prior(stated)
     if found.report is not None and found.report.lossy:
         console.warn(f"{log.name}: {data_loss.sentence(found.report)}")
     for damage in left_out:
@@ -269,16 +273,21 @@ def _write(
     outputs: _Outputs,
     database: SubmapDatabase,
     found: Found,
+    stated: Answer,
     located: Trajectory | None,
     settings: Config,
 ) -> None:
-    """Write the files; without an answer only the picture and the page."""
+    """Write the files; without an answer only the picture and the page.
+
+    stated : the answer as it is given. What shows the map of a session is in the frame of that map, whatever
+    frame the answer is given in.
+    """
     answer = found.answer
     if located is not None:
         if outputs.trajectory is not None:
-            write_trajectory(outputs.trajectory, located)
+            write_trajectory(outputs.trajectory, in_map(found.poses, stated) or located)
         if outputs.initialpose is not None:
-            write_initialpose(outputs.initialpose, answer)
+            write_initialpose(outputs.initialpose, stated)
         if outputs.output is not None:
             if found.drawn is not None:
                 write_located_map(outputs.output, database, answer, found.drawn, outputs.force)
@@ -315,10 +324,18 @@ def _about_map(sigma_m: float | None) -> str:
     )
 
 
-def _print(found: Found, where: str, left_out: list[str], sigma_m: float | None, *, as_json: bool) -> None:
-    """The answer on stdout. sigma_m : of the map where the query is."""
+def _print(
+    found: Found,
+    stated: Answer,
+    where: str,
+    left_out: list[str],
+    sigma_m: float | None,
+    *,
+    as_json: bool,
+) -> None:
+    """The answer on stdout. stated : as it is given. sigma_m : of the map where the query is."""
     if as_json:
-        answer = found.answer.to_json()
+        answer = stated.to_json()
         document: Relocalize = {
             **answer,
             "query": found.about,
@@ -327,7 +344,7 @@ def _print(found: Found, where: str, left_out: list[str], sigma_m: float | None,
         }
         console.print_json(document)
     else:
-        text = as_text(found.answer, is_map=found.drawn is not None)
+        text = as_text(stated, is_map=found.drawn is not None)
         print(text + _about_map(sigma_m), flush=True)
 
 
@@ -355,7 +372,8 @@ def as_text(answer: Answer, *, is_map: bool = False) -> str:
         of_what = "for the map's own frame" if is_map else "at the last scan"
         travel = "" if is_map else f", after {answer.path_m:.1f} m of travel"
         return (
-            f"located in {_named(answer, answer.hypotheses[0])}: x {pose.x:.2f} m, y {pose.y:.2f} m,"
+            f"located in {_named(answer, answer.hypotheses[0])}:{_frame(answer)}"
+            f" x {pose.x:.2f} m, y {pose.y:.2f} m,"
             f" yaw {math.degrees(pose.yaw):.1f} deg {of_what},"
             f" confidence {probability(answer.confidence)}{travel}" + _in_space(answer)
         )
@@ -385,6 +403,12 @@ def _in_space(answer: Answer) -> str:
         f"\n  in space: z {pose.T_map_base[2, 3]:.2f} m, roll {roll:.1f} deg, pitch {pitch:.1f} deg,"
         f" standard deviation {100.0 * sigma_m:.1f} cm; {shares}"
     )
+
+
+def _frame(answer: Answer) -> str:
+    """The frame of the building that the pose is in; nothing if it is in that of the session."""
+    inside = answer.frame is None or answer.frame == answer.session
+    return "" if inside else one_line(f" in the frame of {answer.frame},")
 
 
 def _named(answer: Answer, hypothesis: Hypothesis) -> str:

@@ -7,7 +7,7 @@ import enum
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, TypeVar, cast
 
@@ -28,6 +28,8 @@ from pc2grid_cli.known_pose import KnownPose
 from pc2grid_cli.locate import searched
 from signature.localization.answer_json import in_space_document
 from signature.localization.follower import Follower
+from signature.localization.in_building import look_in_building
+from signature.localization.joining.building import map_of
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseLook, PoseWatch
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
     from pc2grid_cli.json_schemas import Watch
     from signature.config import Config
     from signature.database import SubmapDatabase
-    from signature.database.protocol import SessionInfo
+    from signature.database.protocol import BuildingFrame, SessionInfo
     from signature.localization.localizer import Look
     from signature.localization.prior import Prior
 
@@ -102,6 +104,7 @@ def watch_command(
     map_frame: Annotated[
         str, typer.Option("--map-frame", metavar="FRAME", help="the frame of what is published")
     ] = "map",
+    frame: options.Frame = options.FrameName.building,
     last: Annotated[
         float, typer.Option("--last", min=0.0, metavar="S", help="seconds of a recording to begin with")
     ] = 30.0,
@@ -142,7 +145,8 @@ def watch_command(
         if check_topic is not None:
             good = _check(following, check_topic, session, as_json=json)
         else:
-            with _Robot.of(live, opened, publish, publish_map, map_frame) as robot:
+            frames = opened.frames() if frame is options.FrameName.building else {}
+            with _Robot.of(live, opened, publish, publish_map, map_frame, frames) as robot:
                 good = _search(following, robot, prior, keep or publish is Publish.tf, as_json=json)
         _summarize(live, terminal)
     if not good:
@@ -207,6 +211,7 @@ def _search(
 
         def use(look: Look) -> bool:
             nonlocal located
+            look = look_in_building(look, robot.frames)
             _print(look, live, robot, robot.tell(look, follower.lock), as_json=as_json)
             located = look.state in ("located", "recovered")
             return located and not forever
@@ -273,7 +278,8 @@ class _Robot:
     """The robot that is told where it is.
 
     publisher : None if it is not told anything. pose_is_due : whether it is to be told its pose.
-    map_session : the session whose map was published. sessions : of the database, by name.
+    map_session : the session whose map was published. sessions : of the database, by name. frames : of the
+    buildings that looks are in, by session.
     """
 
     live: LiveLog
@@ -282,6 +288,7 @@ class _Robot:
     publish: Publish
     publish_map: bool
     publisher: Nav2Publisher | None
+    frames: Mapping[str, BuildingFrame]
     resets: ResetPolicy
     pose_is_due: bool = True
     map_session: str | None = None
@@ -289,7 +296,12 @@ class _Robot:
     @staticmethod
     @contextlib.contextmanager
     def of(
-        live: LiveLog, database: SubmapDatabase, publish: Publish, publish_map: bool, map_frame: str
+        live: LiveLog,
+        database: SubmapDatabase,
+        publish: Publish,
+        publish_map: bool,
+        map_frame: str,
+        frames: Mapping[str, BuildingFrame],
     ) -> Iterator[_Robot]:
         """Raises ConfigError if the source takes no messages, LiveError if the robot does not."""
         robot = _Robot(
@@ -299,6 +311,7 @@ class _Robot:
             publish=publish,
             publish_map=publish_map,
             publisher=None,
+            frames=frames,
             resets=ResetPolicy(),
         )
         topics = [f"/{publish.value}"] if publish is not Publish.none else []
@@ -328,7 +341,7 @@ class _Robot:
         if self.publish_map and look.session != self.map_session:
             self.map_session = look.session
             with lock:
-                grid = self.database.grid(look.session)
+                grid = map_of(self.database, look.session, self.frames)
             publisher.map(look.registered.scan.stamp_ns, grid)
             told.append("/map")
         self.pose_is_due = self.pose_is_due or look.state == "recovered"
@@ -412,6 +425,7 @@ def _document(look: Look, live: LiveLog, robot: _Robot, published: list[str]) ->
         "stamp_ns": answer.stamp_ns,
         "path_m": answer.path_m,
         "map": None,
+        "frame": None,
         "pose": None,
         "T_map_odom": None,
         "in_space": in_space_document(answer),
@@ -426,6 +440,7 @@ def _document(look: Look, live: LiveLog, robot: _Robot, published: list[str]) ->
     if look.session is not None and pose is not None and answer.covariance is not None:
         info = robot.sessions[look.session]
         label = info.provenance.label
+        document["frame"] = robot.frames[look.session].name if look.session in robot.frames else None
         document["map"] = {
             "database": robot.database.location,
             "session": look.session,

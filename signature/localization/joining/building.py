@@ -18,10 +18,11 @@ from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
 from pc2grid.mapping.local_maps import pose_at
 from pc2grid.mapping.pose_graph import Edge, information_matrix, optimise
-from pc2grid.model import same_recording
+from pc2grid.model import OccupancyGrid, same_recording
 from pc2grid.observer import Observer
 from signature.database.protocol import BuildingFrame, Covariance, SessionInfo
 from signature.database.rows import no_session
+from signature.localization.joining.building_map import building_map
 from signature.localization.joining.join import Join, JoinableMap, join_maps
 from signature.localization.lazy_maps import LazySequence
 
@@ -224,3 +225,22 @@ def _covariances(poses: F64, edges: Sequence[Edge]) -> F64:
 def _rows(covariance: F64) -> Covariance:
     rows = (0.5 * (covariance + covariance.T)).tolist()
     return cast(Covariance, tuple(tuple(row) for row in rows))
+
+
+def map_of(database: SubmapDatabase, session: str, frames: Mapping[str, BuildingFrame]) -> OccupancyGrid:
+    """The map in whose frame answers in a session are: of its building, or of the session alone.
+
+    frames : of the sessions whose answers are in the frames of their buildings. A building is drawn from all
+    its sessions of the floor, see `signature.localization.joining.building_map`.
+    """
+    if session not in frames:
+        return database.grid(session)
+    infos = {info.name: info for info in database.sessions()}
+    beside = [
+        name
+        for name in infos
+        if name in frames
+        and frames[name].name == frames[session].name
+        and not _told_apart(infos[name], infos[session])
+    ]
+    return building_map([(database.grid(name), frames[name].T_building_session) for name in beside])

@@ -1,0 +1,91 @@
+"""Answers in the frame of a building: poses in the maps of joined sessions, moved into one frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from pc2grid.arrays import F64
+from pc2grid.geometry import SE2
+from signature.database.protocol import BuildingFrame
+from signature.localization.answer import Answer, Moment, PoseInSpace
+from signature.localization.hypotheses import Hypothesis
+from signature.localization.localizer import Look
+
+
+def answer_in_building(answer: Answer, frames: Mapping[str, BuildingFrame]) -> Answer:
+    """An answer with all poses in the frames of the buildings, where their sessions have one.
+
+    frames : of sessions that were joined, by name (`SubmapDatabase.frames`). Covariances contain how exactly
+    the session is known to lie in its building.
+    """
+    if not any(name in frames for name in answer.sessions):
+        return answer
+
+    def moved(hypothesis: Hypothesis) -> Hypothesis:
+        frame = frames.get(answer.sessions[hypothesis.session_index])
+        if frame is None:
+            return hypothesis
+        fit = hypothesis.fit
+        T_building_query = frame.T_building_session @ fit.T_map_query
+        covariance = covariance_in_building(fit.covariance, fit.T_map_query @ answer.T_odom_base, frame)
+        return replace(hypothesis, fit=replace(fit, T_map_query=T_building_query, covariance=covariance))
+
+    excluded = None if answer.excluded is None else _moment(answer.excluded, frames)
+    stated = replace(
+        answer,
+        hypotheses=tuple(map(moved, answer.hypotheses)),
+        history=tuple(_moment(moment, frames) for moment in answer.history),
+        excluded=excluded,
+        frames=tuple(frames[name].name if name in frames else None for name in answer.sessions),
+    )
+    frame = frames.get(answer.session or "")
+    if frame is None or answer.T_map_base is None or answer.T_map_odom is None or answer.covariance is None:
+        return stated
+    T_building_session = frame.T_building_session
+    return replace(
+        stated,
+        T_map_base=T_building_session @ answer.T_map_base,
+        T_map_odom=T_building_session @ answer.T_map_odom,
+        covariance=covariance_in_building(answer.covariance, answer.T_map_base, frame),
+        in_space=None if answer.in_space is None else _in_space(answer.in_space, frame),
+    )
+
+
+def look_in_building(look: Look, frames: Mapping[str, BuildingFrame]) -> Look:
+    """A look at a running robot with all poses in the frames of the buildings."""
+    frame = frames.get(look.session or "")
+    T_map_base = look.T_map_base
+    if frame is not None and T_map_base is not None:
+        T_map_base = frame.T_building_session @ T_map_base
+    return replace(look, answer=answer_in_building(look.answer, frames), T_map_base=T_map_base)
+
+
+def covariance_in_building(covariance: F64, T_session_base: SE2, frame: BuildingFrame) -> F64:
+    """The covariance (3, 3) of a pose in a session's map as one in its building: turned, and with that of the
+    session's own place, whose heading moves the pose the more the farther it is from the session's origin."""
+    T = frame.T_building_session
+    turn = SE2(0.0, 0.0, T.yaw).matrix()
+    there = T @ T_session_base
+    J = np.eye(3)
+    J[:2, 2] = T.y - there.y, there.x - T.x
+    return np.asarray(turn @ covariance @ turn.T + J @ np.array(frame.covariance) @ J.T)
+
+
+def _moment(moment: Moment, frames: Mapping[str, BuildingFrame]) -> Moment:
+    frame = frames.get(moment.session or "")
+    if frame is None or moment.pose is None:
+        return moment
+    return replace(moment, pose=frame.T_building_session @ moment.pose)
+
+
+def _in_space(pose: PoseInSpace, frame: BuildingFrame) -> PoseInSpace:
+    T = frame.T_building_session.lift()
+    turn = np.kron(np.eye(2), T[:3, :3])
+    covariance = turn @ pose.covariance @ turn.T
+    planar = np.ix_((0, 1, 5), (0, 1, 5))
+    nothing = np.zeros((3, 3))
+    covariance[planar] += covariance_in_building(nothing, SE2.from_matrix(pose.T_map_base), frame)
+    return replace(pose, T_map_base=T @ pose.T_map_base, covariance=covariance)

@@ -1,0 +1,180 @@
+"""`pc2grid db join`: which sessions show one building, and how they lie to each other."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pc2grid.display import counted, probability
+from pc2grid.errors import ConfigError, one_line
+from pc2grid_cli import console
+from pc2grid_cli.json_schemas import ComparedSessions, DbJoin, plain
+from pc2grid_cli.options import AsJson, Database, Force
+from pc2grid_cli.output_files import check_file
+from pc2grid_cli.picture import draw_building
+from pc2grid_cli.tables import show, table
+from signature.database import SubmapDatabase, maintenance, open_database
+from signature.localization.joining.building import Joined, SessionPair, join_sessions
+
+if TYPE_CHECKING:
+    from pc2grid.geometry import SE2
+    from signature.database.protocol import BuildingFrame
+    from signature.localization.answer_json import Pose
+
+_SAID = {"joined": "joined", "ambiguous": "ambiguous", "different": "not the same building"}
+
+
+def db_join_command(
+    context: typer.Context,
+    database: Database,
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            "--frame",
+            metavar="SESSION",
+            help="whose frame is the building's; default: as it was, or the oldest",
+        ),
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="only say it; nothing is stored")] = False,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", metavar="OUT.png", help="the maps of a building over each other")
+    ] = None,
+    force: Force = False,
+    json: AsJson = False,
+) -> None:
+    """Find out which sessions show one building, and how they lie to each other.
+
+    Sessions with labels of different buildings or floors are not compared. What is found is stored: from then
+    on, answers in a joined session are in the frame of its building; `--frame session` gives them as before.
+
+    Example: pc2grid db join building.submaps
+    """
+    check_file("plot", plot, force)
+    with open_database(database) as opened:
+        names = [info.name for info in opened.sessions()]
+        if len(names) < 2:
+            raise ConfigError(
+                f"{opened.location}: holds {counted(len(names), 'session')}, and two can be joined",
+                hint="`pc2grid convert LOG --add` adds one, `pc2grid db merge` puts databases together",
+            )
+        found = join_sessions(opened, frame=frame, observer=console.of(context).observer())
+        if plot is not None:
+            draw(plot, opened, found)
+    if not dry_run:
+        store(database, found, names)
+    if json:
+        console.print_json(plain(DbJoin, _document(maintenance.shown(database), found, names, dry_run)))
+    else:
+        report(found, names, dry_run=dry_run)
+
+
+def store(database: str, found: Joined, names: list[str]) -> None:
+    """Store where the sessions lie; those of `names` that lie in no building are no longer in one."""
+    maintenance.place(database, {name: found.frames.get(name) for name in names})
+
+
+def report(found: Joined, names: list[str], *, dry_run: bool = False) -> None:
+    """Print the pairs, and the buildings that they make."""
+    pairs = table(
+        "sessions compared",
+        ("target", "source", ""),
+        ("x, m", "y, m", "turn, deg", "sigma, m", "in common, m2", "agreement", "probability"),
+    )
+    for pair in found.pairs:
+        pairs.add_row(*map(one_line, _row(pair)))
+    show(pairs)
+    for name, sessions in _buildings(found).items():
+        show(f"in the frame of {one_line(name)}:")
+        for session, at in sessions.items():
+            T = at.T_building_session
+            where = f"x {T.x:.2f} m, y {T.y:.2f} m, turned by {math.degrees(T.yaw):.1f} deg"
+            show(one_line(f"  {session}: {where}, sigma {_sigma_m(at.covariance):.2f} m"))
+    alone = [name for name in names if name not in found.frames]
+    if alone:
+        show(one_line(f"alone: {', '.join(alone)}"))
+    if dry_run:
+        show("nothing was stored")
+    elif found.frames:
+        show("from now on answers in these are in the frame of the building; --frame session: as before")
+
+
+def _row(pair: SessionPair) -> tuple[str, ...]:
+    join, T = pair.join, pair.join.T_target_source
+    said = _SAID[join.status]
+    if join.status == "joined" and not pair.accepted:
+        said = "contradicts the others"
+    where = ("", "", "", "")
+    if join.status != "different":
+        turn_deg, sigma_m = math.degrees(T.yaw), _sigma_m(join.covariance.tolist())
+        where = (f"{T.x:.2f}", f"{T.y:.2f}", f"{turn_deg:.1f}", f"{sigma_m:.2f}")
+    measured = (f"{join.common_m2:.0f}", f"{join.agreement:.2f}", probability(join.probability))
+    return (pair.target, pair.source, said, *where, *measured)
+
+
+def _sigma_m(covariance: Sequence[Sequence[float]]) -> float:
+    """The larger standard deviation of x and y."""
+    return math.sqrt(max(covariance[0][0], covariance[1][1]))
+
+
+def _buildings(found: Joined) -> dict[str, dict[str, BuildingFrame]]:
+    """The joined sessions by the frame of their building."""
+    buildings: dict[str, dict[str, BuildingFrame]] = defaultdict(dict)
+    for session, at in found.frames.items():
+        buildings[at.name][session] = at
+    return buildings
+
+
+def draw(path: Path, database: SubmapDatabase, found: Joined) -> None:
+    """A picture of the building with most sessions. Raises ConfigError if nothing is joined."""
+    buildings = _buildings(found)
+    if not buildings:
+        raise ConfigError("--plot: no two sessions are joined, so there is nothing to draw")
+    name = max(buildings, key=lambda name: len(buildings[name]))
+    draw_building(
+        path, name, {s: (database.grid(s), at.T_building_session) for s, at in buildings[name].items()}
+    )
+
+
+def _document(where: str, found: Joined, names: list[str], dry_run: bool) -> DbJoin:
+    return {
+        "schema_version": 1,
+        "database": where,
+        "stored": not dry_run,
+        "pairs": [_compared(pair) for pair in found.pairs],
+        "sessions": [
+            {
+                "session": session,
+                "frame": at.name,
+                "T_building_session": _pose(at.T_building_session),
+                "covariance": [list(row) for row in at.covariance],
+            }
+            for session, at in found.frames.items()
+        ],
+        "alone": [name for name in names if name not in found.frames],
+    }
+
+
+def _compared(pair: SessionPair) -> ComparedSessions:
+    join = pair.join
+    known = join.status != "different"
+    return {
+        "target": pair.target,
+        "source": pair.source,
+        "status": join.status,
+        "accepted": pair.accepted,
+        "T_target_source": _pose(join.T_target_source) if known else None,
+        "covariance": join.covariance.tolist() if known else None,
+        "probability": join.probability,
+        "agreement": join.agreement,
+        "common_m2": join.common_m2,
+        "nodes": join.nodes,
+    }
+
+
+def _pose(pose: SE2) -> Pose:
+    return {"x": pose.x, "y": pose.y, "yaw": pose.yaw}
