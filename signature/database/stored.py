@@ -252,6 +252,11 @@ def _check_seen(seen: SeenPlaces, info: SessionInfo, _: object) -> None:
     validation.check_seen(seen, info.submaps)
 
 
+def _check_frame(frame: BuildingFrame | None, _: SessionInfo, __: object) -> None:
+    if frame is not None:
+        validation.check_covariance(frame.covariance)
+
+
 def _expect(found: int, stored: int, what: str) -> None:
     if found != stored:
         raise ValueError(f"{found} {what} where {stored} were stored")
@@ -265,6 +270,6 @@ _CHECKS: dict[str, Callable[[Any, SessionInfo, OccupancyGrid | None], None]] = {
     "points": lambda points, info, grid: validation.check_points(points),
     "submaps": _check_submaps,
     "seen": _check_seen,
-    "frame": lambda frame, info, grid: validation.check_frame(frame),
+    "frame": _check_frame,
 }
 """What must be true of a part, beside the types of its fields."""

@@ -6,6 +6,7 @@ whole: a million signatures take a fraction of a second.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +22,6 @@ from signature.seen_places import SIGNATURE_COLUMNS
 if TYPE_CHECKING:
     from pc2grid.submaps.junction_graph import GraphArrays
     from signature.config import Config
-    from signature.database.protocol import BuildingFrame
     from signature.seen_places import SeenPlaces
 
 # All chosen by hand: wide enough for every real session.
@@ -190,11 +190,9 @@ def check_seen(seen: SeenPlaces, places: int) -> None:
         raise ValueError(f"viewpoints that do not belong to {places} places, in their order")
 
 
-def check_frame(frame: BuildingFrame | None) -> None:
-    """The covariance of a place in a building is one. None: there is no place."""
-    if frame is None:
-        return
-    covariance = np.array(frame.covariance)
+def check_covariance(rows: Sequence[Sequence[float]]) -> None:
+    """Rows of numbers are a covariance matrix."""
+    covariance = np.array(rows)
     scale = float(np.abs(covariance).max())
     off = float(np.abs(covariance - covariance.T).max())
     if off > 1e-6 * scale or np.linalg.eigvalsh(covariance)[0] < -1e-6 * scale:

@@ -17,13 +17,14 @@ from pc2grid.model import SessionMap
 from pc2grid.observer import Observer, Observers
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
-from pc2grid_cli.json_schemas import Convert, Converted, plain
-from pc2grid_cli.session_documents import session_document
+from pc2grid_cli.json_schemas import Convert, Converted, JoinedSession, plain
+from pc2grid_cli.session_documents import joined_document, session_document
 from signature import conversion_jobs
 from signature.config import Config
 from signature.conversion_jobs import Job
-from signature.database import Label, maintenance
+from signature.database import Label, maintenance, open_database
 from signature.database.protocol import Entry
+from signature.localization.joining.building import join_sessions
 
 if TYPE_CHECKING:
     from pc2grid_cli.rerun_stream import Conversions
@@ -57,13 +58,15 @@ def jobs_of(
 class Done:
     """The results of all inputs so far.
 
-    lossy : data was lost, or an input failed. severe : so much that the exit code is 3.
+    lossy : data was lost, or an input failed. severe : so much that the exit code is 3. joined : where those
+    of the new sessions lie in a building that were joined with others.
     """
 
     sessions: list[Converted] = field(default_factory=list)
     unchanged: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    joined: list[JoinedSession] = field(default_factory=list)
     lossy: bool = False
     severe: bool = False
 
@@ -76,6 +79,7 @@ class Done:
             "sessions": self.sessions,
             "unchanged": self.unchanged,
             "failed": self.failed,
+            "joined": self.joined,
         }
         return plain(Convert, document)
 
@@ -211,6 +215,27 @@ def _as_text(d: Converted) -> str:
     )
     floor = "" if d["floor"] is None else f" (floor {d['floor']})"
     return f"{d['session']}{floor}: {travel}{d['area_m2']:.0f} m2 free, {counted(d['submaps'], 'submap')}"
+
+
+def join_added(output: str, done: Done, terminal: console.Console, *, wanted: bool | None) -> None:
+    """Join the new sessions with those that the database holds.
+
+    wanted : None: only if the database holds sessions that are joined already.
+    """
+    names = [document["session"] for document in done.sessions]
+    if wanted is False or not names:
+        return
+    with open_database(output) as opened:
+        if wanted is None and not opened.frames():
+            return
+        found = join_sessions(opened, only=names, observer=terminal.observer())
+    maintenance.place(output, found.frames)
+    done.joined = [joined_document(name, found.frames[name]) for name in names if name in found.frames]
+    for document in done.joined:
+        terminal.note(f"{document['session']}: joined, in the frame of {document['frame']}")
+    alone = [name for name in names if name not in found.frames]
+    if alone:
+        done.warnings.append(f"{', '.join(alone)}: not joined with another session; see `pc2grid db join`")
 
 
 def conclude(output: str, done: Done, count: int, *, json: bool) -> None:

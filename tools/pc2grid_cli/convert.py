@@ -39,6 +39,10 @@ _Points = Annotated[
     ),
 ]
 _Add = Annotated[bool, typer.Option("--add", help="add to an existing database")]
+_Join = Annotated[
+    bool | None,
+    typer.Option("--join/--no-join", help="join what is new (db join); default: if others are joined"),
+]
 _Dask = Annotated[
     str | None,
     typer.Option("--dask", metavar="[ADDRESS]", help="of a scheduler; none: processes on this machine"),
@@ -61,6 +65,7 @@ def convert_command(
     floor: _Floor = None,
     points: _Points = None,
     add: _Add = False,
+    join: _Join = None,
     dask: _Dask = None,
     jobs: _JobCount = None,
     rerun: options.Rerun = None,
@@ -108,6 +113,7 @@ def convert_command(
         quiet=json,
         strict=strict,
     )
+    conversion.join_added(output, done, console.of(context), wanted=join)
     conversion.conclude(output, done, len(inputs), json=json)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,6 +13,7 @@ import typer
 
 from pc2grid import extras
 from pc2grid.errors import ConfigError, DatabaseError
+from pc2grid.geometry import transform_points
 from pc2grid.io.export.cloud import write_cloud
 from pc2grid.io.export.g2o import write_g2o
 from pc2grid.io.export.graphml import write_graph
@@ -19,18 +21,20 @@ from pc2grid.io.nav2_map import save_map
 from pc2grid.io.trajectory import write_trajectory
 from pc2grid_cli import console
 from pc2grid_cli.foxglove import write_session
-from pc2grid_cli.options import AsJson, Database, Force, Rerun
+from pc2grid_cli.options import AsJson, Building, Database, Floor, Force, Frame, FrameName, Rerun
 from pc2grid_cli.output_files import check_file, map_stem
 from pc2grid_cli.picture import draw_session
 from pc2grid_cli.report import write_report
 from pc2grid_cli.rerun_stream import write_session as stream_session
 from pc2grid_cli.rerun_target import require_target, url_of
 from signature.database import open_database
+from signature.localization.joining.building import floors_of, map_of
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory
     from pc2grid_cli.json_schemas import Export
     from signature.database import SubmapDatabase
+    from signature.database.protocol import BuildingFrame
 
 
 class TrajectoryKind(str, enum.Enum):
@@ -85,10 +89,17 @@ def export_command(
         Path | None, typer.Option("--report", metavar="OUT.html", help="a page to look into the database")
     ] = None,
     session: Annotated[str | None, typer.Option("--session", help="which, if there are several")] = None,
+    building: Building = None,
+    floor: Floor = None,
+    frame: Frame = FrameName.building,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Write a session's map, trajectory or picture, or a page that shows all sessions.
+
+    Of sessions that are joined (`db join`), --map and --cloud write one map of all that are on a floor,
+    unless --session names one. Maps, clouds and trajectories are in the frame of the building; pictures,
+    pages, graphs and the files of other viewers show a session in its own map frame.
 
     Example: pc2grid export building.submaps --map building --trajectory building.tum
     """
@@ -110,9 +121,15 @@ def export_command(
     outputs.check()
     with open_database(database) as opened:
         where = opened.location
-        name = _session_name(opened, session) if outputs.of_session() else None
-        if name is not None:
-            _write_session(outputs, opened, name, terminal)
+        if building is not None or floor is not None:
+            opened.keep_only(building=building, floor=floor)
+        frames = opened.frames() if frame is FrameName.building else {}
+        whole = session is None and outputs.of_building_only() and len(floors_of(opened, frames)) == 1
+        name = _session_name(opened, session) if outputs.of_session() and not whole else None
+        if whole:
+            _write_building(outputs, opened, floors_of(opened, frames)[0], frames, terminal)
+        elif name is not None:
+            _write_session(outputs, opened, name, frames.get(name), terminal)
         if report is not None:
             write_report(report, opened)
     for path in outputs.written():
@@ -157,6 +174,11 @@ class _Outputs:
         """Whether anything is written of a single session."""
         return bool(self.files()) or self.rerun is not None
 
+    def of_building_only(self) -> bool:
+        """Whether all that is written of sessions can be of a whole building."""
+        wanted = [path for path in (self.cloud, *self.map_files()) if path is not None]
+        return bool(wanted) and len(wanted) == len(self.files()) and self.rerun is None
+
     def written(self) -> list[Path]:
         """All files, in the order in which they are listed for the user."""
         paths = self.files() + ([] if self.report is None else [self.report])
@@ -187,21 +209,47 @@ def _session_name(database: SubmapDatabase, named: str | None) -> str:
     if len(names) != 1:
         raise DatabaseError(
             f"{database.location}: holds {len(names)} sessions: {', '.join(names) or 'none'}",
-            hint="choose one with --session",
+            hint="choose one with --session; for one map of all: `pc2grid db join`, --building, --floor",
         )
     return names[0]
 
 
-def _write_session(outputs: _Outputs, database: SubmapDatabase, name: str, terminal: console.Console) -> None:
-    """Write all files of a session."""
+def _write_building(
+    outputs: _Outputs,
+    database: SubmapDatabase,
+    names: Sequence[str],
+    frames: Mapping[str, BuildingFrame],
+    terminal: console.Console,
+) -> None:
+    """Write the map and the cloud of the sessions of a floor, in the frame of their building."""
+    others = [info.name for info in database.sessions() if info.name not in names]
+    if others:
+        console.warn(f"not joined, and left out: {', '.join(others)}")
+    if outputs.map_stem is not None:
+        save_map(map_of(database, names[0], frames), outputs.map_stem)
+    if outputs.cloud is not None:
+        _write_cloud(outputs.cloud, database, names, frames, terminal)
+
+
+def _write_session(
+    outputs: _Outputs,
+    database: SubmapDatabase,
+    name: str,
+    frame: BuildingFrame | None,
+    terminal: console.Console,
+) -> None:
+    """Write all files of a session. frame : of its building; None: its own map frame."""
     # A session without a trajectory is refused before anything is written.
     poses = _poses(database, name) if outputs.trajectory or outputs.g2o else None
+    frames = {} if frame is None else {name: frame}
     if outputs.map_stem is not None:
-        save_map(database.grid(name), outputs.map_stem)
+        save_map(map_of(database, name, frames), outputs.map_stem)
     if outputs.trajectory is not None and poses is not None:
-        write_trajectory(outputs.trajectory, poses, outputs.trajectory_format)
+        T = np.eye(4) if frame is None else frame.T_building_session.lift()
+        moved = replace(poses, T_session_base=T @ poses.T_session_base)
+        write_trajectory(outputs.trajectory, moved, outputs.trajectory_format)
     if outputs.cloud is not None:
-        _write_cloud(outputs.cloud, database, name, terminal)
+        _write_cloud(outputs.cloud, database, [name], frames, terminal)
     if outputs.graph is not None:
         write_graph(outputs.graph, database.graph(name))
     if outputs.g2o is not None and poses is not None:
@@ -223,15 +271,27 @@ def _poses(database: SubmapDatabase, session: str) -> Trajectory:
     return poses
 
 
-def _write_cloud(path: Path, database: SubmapDatabase, session: str, terminal: console.Console) -> None:
-    """The points in space if the session has them, else one point for each occupied cell."""
-
-    points = database.points(session)
-    if points is not None:
-        write_cloud(path, points.points_m())
-        terminal.note(f"{path}: {len(points)} points, one a voxel of {points.voxel_m:g} m")
+def _write_cloud(
+    path: Path,
+    database: SubmapDatabase,
+    sessions: Sequence[str],
+    frames: Mapping[str, BuildingFrame],
+    terminal: console.Console,
+) -> None:
+    """The points in space of the sessions that have them; if none has, a point for each occupied cell."""
+    clouds, walls, voxel_m = [np.empty((0, 3))], [np.empty((0, 3))], 0.0
+    for name in sessions:
+        T = frames[name].T_building_session.lift() if name in frames else np.eye(4)
+        points, grid = database.points(name), database.grid(name)
+        if points is not None:
+            voxel_m = max(voxel_m, points.voxel_m)
+            clouds.append(transform_points(T, points.points_m()))
+        flat = grid.to_point(np.argwhere(grid.occupied))
+        walls.append(transform_points(T, np.column_stack((flat, np.zeros(len(flat))))))
+    cloud, wall = np.concatenate(clouds), np.concatenate(walls)
+    if len(cloud):
+        write_cloud(path, cloud)
+        terminal.note(f"{path}: {len(cloud)} points, one a voxel of {voxel_m:g} m")
         return
-    grid = database.grid(session)
-    walls = grid.to_point(np.argwhere(grid.occupied))
-    write_cloud(path, np.column_stack((walls, np.zeros(len(walls)))))
-    terminal.note(f"{path}: {len(walls)} occupied cells at z = 0; `convert --points 0.05` keeps 3D points")
+    write_cloud(path, wall)
+    terminal.note(f"{path}: {len(wall)} occupied cells at z = 0; `convert --points 0.05` keeps 3D points")

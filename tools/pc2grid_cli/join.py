@@ -17,6 +17,7 @@ from pc2grid_cli.json_schemas import ComparedSessions, DbJoin, plain
 from pc2grid_cli.options import AsJson, Database, Force
 from pc2grid_cli.output_files import check_file
 from pc2grid_cli.picture import draw_building
+from pc2grid_cli.session_documents import joined_document
 from pc2grid_cli.tables import show, table
 from signature.database import SubmapDatabase, maintenance, open_database
 from signature.localization.joining.building import Joined, SessionPair, join_sessions
@@ -146,15 +147,7 @@ def _document(where: str, found: Joined, names: list[str], dry_run: bool) -> DbJ
         "database": where,
         "stored": not dry_run,
         "pairs": [_compared(pair) for pair in found.pairs],
-        "sessions": [
-            {
-                "session": session,
-                "frame": at.name,
-                "T_building_session": _pose(at.T_building_session),
-                "covariance": [list(row) for row in at.covariance],
-            }
-            for session, at in found.frames.items()
-        ],
+        "sessions": [joined_document(session, at) for session, at in found.frames.items()],
         "alone": [name for name in names if name not in found.frames],
     }
 

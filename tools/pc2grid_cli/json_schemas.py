@@ -264,8 +264,18 @@ class Converted(TypedDict):
     report: Report
 
 
+class JoinedSession(TypedDict):
+    """Where a session lies in its building. frame: name of the building's frame."""
+
+    session: str
+    frame: str
+    T_building_session: Pose
+    covariance: list[list[float]]
+
+
 class Convert(TypedDict):
-    """`pc2grid convert --json`. unchanged: sessions that were stored already; failed: inputs left out."""
+    """`pc2grid convert --json`. unchanged: sessions that were stored already; failed: inputs left out.
+    joined: where those of the new sessions lie in a building that were joined with others."""
 
     schema_version: Version
     database: str
@@ -273,6 +283,7 @@ class Convert(TypedDict):
     sessions: list[Converted]
     unchanged: list[str]
     failed: list[str]
+    joined: list[JoinedSession]
 
 
 class StoredInfo(TypedDict):
@@ -345,15 +356,6 @@ class ComparedSessions(TypedDict):
     agreement: float
     common_m2: float
     nodes: int
-
-
-class JoinedSession(TypedDict):
-    """Where a session lies in its building. frame: name of the building's frame."""
-
-    session: str
-    frame: str
-    T_building_session: Pose
-    covariance: list[list[float]]
 
 
 class DbJoin(TypedDict):

@@ -133,7 +133,7 @@ def draw_building(path: Path, name: str, maps: Mapping[str, tuple[OccupancyGrid,
     axes.set_facecolor(_grey("free"))
     colours = itertools.cycle((BLUE, VERMILLION, GREEN, PURPLE, ORANGE, GREY, YELLOW))
     for (session, points_m), colour in zip(walls.items(), colours, strict=False):
-        axes.plot(*points_m.T, ".", color=colour, ms=1.5, mew=0, alpha=0.7, label=session)
+        axes.plot(*points_m.T, ".", color=colour, ms=2.5, mew=0, alpha=0.7, label=session)
     axes.set_title(f"walls of the sessions in the frame of {name}", loc="left")
     _finish(figure, axes, path)
 

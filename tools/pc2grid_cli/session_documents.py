@@ -5,8 +5,9 @@ from __future__ import annotations
 import statistics
 
 from pc2grid.model import Precision, SessionMap
-from pc2grid_cli.json_schemas import Converted, PrecisionSummary
+from pc2grid_cli.json_schemas import Converted, JoinedSession, PrecisionSummary
 from signature.database import Provenance
+from signature.database.protocol import BuildingFrame
 
 
 def session_document(session: SessionMap, origin: Provenance) -> Converted:
@@ -36,6 +37,17 @@ def session_document(session: SessionMap, origin: Provenance) -> Converted:
             "warnings": list(report.warnings),
             "lossy": report.lossy,
         },
+    }
+
+
+def joined_document(session: str, frame: BuildingFrame) -> JoinedSession:
+    """Where a session lies in its building, as `convert` and `db join` describe it."""
+    T = frame.T_building_session
+    return {
+        "session": session,
+        "frame": frame.name,
+        "T_building_session": {"x": T.x, "y": T.y, "yaw": T.yaw},
+        "covariance": [list(row) for row in frame.covariance],
     }
 
 

@@ -227,20 +227,22 @@ def _rows(covariance: F64) -> Covariance:
     return cast(Covariance, tuple(tuple(row) for row in rows))
 
 
-def map_of(database: SubmapDatabase, session: str, frames: Mapping[str, BuildingFrame]) -> OccupancyGrid:
-    """The map in whose frame answers in a session are: of its building, or of the session alone.
+def floors_of(database: SubmapDatabase, frames: Mapping[str, BuildingFrame]) -> tuple[tuple[str, ...], ...]:
+    """The joined sessions of each floor, oldest first. frames : of sessions, by name."""
+    floors: dict[str, list[str]] = {}
+    for info in database.sessions():
+        if info.name in frames:
+            floors.setdefault(frames[info.name].name, []).append(info.name)
+    return tuple(tuple(names) for names in floors.values())
 
-    frames : of the sessions whose answers are in the frames of their buildings. A building is drawn from all
-    its sessions of the floor, see `signature.localization.joining.building_map`.
+
+def map_of(database: SubmapDatabase, session: str, frames: Mapping[str, BuildingFrame]) -> OccupancyGrid:
+    """The map in whose frame answers in a session are: of its floor, or of the session alone.
+
+    frames : of the sessions whose answers are in the frames of their buildings. A floor is drawn from all its
+    sessions, see `signature.localization.joining.building_map`.
     """
     if session not in frames:
         return database.grid(session)
-    infos = {info.name: info for info in database.sessions()}
-    beside = [
-        name
-        for name in infos
-        if name in frames
-        and frames[name].name == frames[session].name
-        and not _told_apart(infos[name], infos[session])
-    ]
-    return building_map([(database.grid(name), frames[name].T_building_session) for name in beside])
+    names = next(names for names in floors_of(database, frames) if session in names)
+    return building_map([(database.grid(name), frames[name].T_building_session) for name in names])

@@ -3,7 +3,9 @@
 The junction graphs propose transforms (`graph_matching`); each is searched around, refined and scored by the
 walls of both. What is judged is the part of the source that lies on known ground of the target: it is a query
 that the target is asked for, and the posterior of every other answer decides (`posterior`). The other
-transforms are its rivals, with the same part.
+transforms are its rivals, with the same part. So are decoys: the source is also matched in its mirror image,
+which lies nowhere for certain. What that scores is what wrong transforms of these two maps score, and where a
+building is symmetric, or another one has its plan turned over, it scores as much as any.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pc2grid.arrays import F64, BoolGrid, freeze
+from pc2grid.arrays import F32, F64, BoolGrid, freeze
 from pc2grid.geometry import SE2
 from pc2grid.matching.refinement import refine
 from pc2grid.matching.two_way_score import Fit
@@ -54,6 +56,8 @@ class JoinParameters:
 
 
 JOIN = JoinParameters()
+_MIRROR = np.array((-1.0, 1.0), np.float32)
+"""Turns x into -x."""
 
 
 @dataclass(frozen=True, kw_only=True)  # no slots, for what is computed once
@@ -96,7 +100,7 @@ class Join:
     covariance : (3, 3) of its x, y, yaw. probability : 0..1, of the transform being right.
     agreement : 0..1, of the walls where both know the ground, the lower one of both directions.
     common_m2 : free ground that both know. nodes : of the two graphs, that agree on the transform.
-    rivals : other transforms that were compared. evidence : what the probability rests on.
+    rivals : other transforms that were compared, with decoys. evidence : what the probability rests on.
     """
 
     status: JoinStatus
@@ -141,15 +145,12 @@ class _Candidate:
 
 def join_maps(target: JoinableMap, source: JoinableMap, parameters: JoinParameters = JOIN) -> Join:
     """Whether two sessions show one building, and how the source lies in the target."""
-    candidates: list[_Candidate] = []
-    for alignment in align_graphs(target.landmarks, source.landmarks):
-        found = _refined(target, source, alignment, parameters)
-        if found is not None and not any(_same(found, other) for other in candidates):
-            candidates.append(found)
-    fits = PieceFits.of([candidate.fits for candidate in candidates], source.pieces)
-    joins = [
-        _judged(target, source, candidates, fits, number, parameters) for number in range(len(candidates))
-    ]
+    points_m = source.walls.points_m
+    candidates = _candidates(target, source.landmarks, points_m, source.pieces, parameters)
+    mirrored = tuple(piece.mirrored() for piece in source.pieces)
+    decoys = _candidates(target, source.landmarks.mirrored(), points_m * _MIRROR, mirrored, parameters)
+    fits = PieceFits.of([candidate.fits for candidate in (*candidates, *decoys)], source.pieces)
+    joins = [_judged(target, source, one, number, fits, parameters) for number, one in enumerate(candidates)]
     return max(joins, key=lambda join: (join.status == "joined", join.probability), default=UNJOINED)
 
 
@@ -157,11 +158,27 @@ def _same(a: _Candidate, b: _Candidate) -> bool:
     return same_pose(a.T_target_source @ a.at, b.T_target_source @ a.at)
 
 
+def _candidates(
+    target: JoinableMap, source: Landmarks, points_m: F32, pieces: Sequence[Piece], parameters: JoinParameters
+) -> list[_Candidate]:
+    """The transforms of a source that the graphs propose, no two alike."""
+    found: list[_Candidate] = []
+    for alignment in align_graphs(target.landmarks, source) if pieces else ():
+        refined = _refined(target, points_m, pieces, alignment, parameters)
+        if refined is not None and not any(_same(refined, other) for other in found):
+            found.append(refined)
+    return found
+
+
 def _refined(
-    target: JoinableMap, source: JoinableMap, alignment: Alignment, parameters: JoinParameters
+    target: JoinableMap,
+    points_m: F32,
+    pieces: Sequence[Piece],
+    alignment: Alignment,
+    parameters: JoinParameters,
 ) -> _Candidate | None:
     """The transform of the graphs made exact by walls: around the matched nodes, then piece by piece."""
-    points_m, at = source.walls.points_m, SE2(*alignment.at_m)
+    at = SE2(*alignment.at_m)
     there = alignment.T_target_source @ at
     found = search_windows(
         target.search,
@@ -171,13 +188,13 @@ def _refined(
         half_a_rad=parameters.around_rad,
         parameters=SearchParameters(floor=0.0, most=1),
     )
-    if not len(found) or not source.pieces:
+    if not len(found):
         return None
     around = points_m[np.hypot(*(points_m - np.asarray(alignment.at_m, np.float32)).T) < PIECES.side_m]
     start = SE2(*found[0, :3].tolist()) @ SE2(-at.x, -at.y, 0.0)
     pose, _ = refine(target.search.field, around, start, alignment.at_m)
-    fits = align_pieces(target.search, source.pieces, pose, alignment.at_m)
-    T_target_source, bend_m = rigid(source.pieces, fits)
+    fits = align_pieces(target.search, pieces, pose, alignment.at_m)
+    T_target_source, bend_m = rigid(pieces, fits)
     _, covariance = refine(target.search.field, points_m, T_target_source, alignment.at_m)
     deviations = (HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)
     covariance = covariance + np.diag(np.square(deviations)) + np.diag([bend_m**2, bend_m**2, 0.0])
@@ -189,13 +206,15 @@ def _refined(
 def _judged(
     target: JoinableMap,
     source: JoinableMap,
-    candidates: Sequence[_Candidate],
-    fits: PieceFits,
+    candidate: _Candidate,
     number: int,
+    fits: PieceFits,
     parameters: JoinParameters,
 ) -> Join:
-    """The posterior of one of the transforms, by the part of the source that lies in the target."""
-    candidate = candidates[number]
+    """The posterior of a transform, by the part of the source that lies in the target.
+
+    number : its row in `fits`; the other rows are of its rivals.
+    """
     part = known_part(source.grid, target.grid, candidate.T_target_source)
     common_m2 = free_in_both(part, target.grid, candidate.T_target_source)
     forward, backward, scores = fits.of_part(number)
@@ -210,15 +229,15 @@ def _judged(
     )
     whole = [
         Fit(
-            T_map_query=other.T_target_source,
+            T_map_query=candidate.T_target_source,
             forward=forward,
             backward=backward,
             overlap=1.0,
             looked_at=float(fits.looked_at[number].sum()),
             score=score,
-            covariance=other.covariance,
+            covariance=candidate.covariance,
         )
-        for other, score in zip(candidates, scores.tolist(), strict=True)
+        for score in scores.tolist()
     ]
     evidence = evidence_of(whole, query)[number]
     # The part was chosen: of so many parts of the smaller session, this one fits best.
@@ -233,7 +252,7 @@ def _judged(
         agreement=min(forward, backward),
         common_m2=common_m2,
         nodes=candidate.nodes,
-        rivals=len(candidates) - 1,
+        rivals=len(scores) - 1,
         evidence=evidence,
     )
 

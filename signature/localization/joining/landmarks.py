@@ -7,7 +7,7 @@ Junctions and ends are few, and lie where one robot has seen enough. So the ways
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -67,6 +67,17 @@ class Landmarks:
             seen=ends != HIDDEN,
             signatures=seen_signatures(ranges_m, ends, sight_m),
             way_m=ways_between(places, kept),
+        )
+
+    def mirrored(self) -> Landmarks:
+        """With x turned into -x. Signatures are those of the mirror image, too."""
+        rays = self.ranges_m.shape[1]
+        turned = (rays // 2 - np.arange(rays)) % rays
+        return replace(
+            self,
+            at_m=self.at_m * np.array((-1.0, 1.0)),
+            ranges_m=self.ranges_m[:, turned],
+            seen=self.seen[:, turned],
         )
 
     def __len__(self) -> int:

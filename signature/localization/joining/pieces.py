@@ -46,6 +46,19 @@ class Piece:
     walls: Walls
     center_m: tuple[float, float]
 
+    def mirrored(self) -> Piece:
+        """With x turned into -x."""
+        field, points_m = self.walls.field, self.walls.points_m * np.array((-1.0, 1.0), np.float32)
+        right_m = field.origin_m[0] + field.values.shape[1] * field.resolution_m
+        flipped = replace(
+            field,
+            values=np.ascontiguousarray(field.values[:, ::-1]),
+            known=np.ascontiguousarray(field.known[:, ::-1]),
+            origin_m=(-right_m, field.origin_m[1]),
+        )
+        walls = Walls(field=flipped, points_m=points_m, weights=self.walls.weights)
+        return Piece(walls, (-self.center_m[0], self.center_m[1]))
+
 
 def pieces_of(grid: OccupancyGrid) -> tuple[Piece, ...]:
     """The squares of a map that hold enough walls."""
@@ -106,7 +119,7 @@ class PieceFits:
         weights = np.array([piece.walls.weight for piece in pieces])
 
         def column(name: str) -> F64:
-            return np.array([[getattr(fit, name) for fit in row] for row in fits]).reshape(-1, len(pieces))
+            return np.array([[getattr(fit, name) for fit in row] for row in fits]).reshape(len(fits), len(pieces))
 
         looked_at = column("looked_at")
         return PieceFits(
