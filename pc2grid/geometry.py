@@ -84,20 +84,15 @@ class SE2:
         return matrix
 
     @staticmethod
-    def fit(source_m: ArrayLike, target_m: ArrayLike, weights: ArrayLike | None = None) -> SE2:
+    def fit(source_m: ArrayLike, target_m: ArrayLike) -> SE2:
         """T_target_source that brings points (N, 2) nearest to their partners (N, 2), least squares.
 
-        Without scale (Umeyama 1991): what remains is the absolute trajectory error. weights : (N,), by default
-        all the same.
+        Without scale (Umeyama 1991): what remains is the absolute trajectory error.
         """
         source, target = np.asarray(source_m, np.float64), np.asarray(target_m, np.float64)
-        weight = np.ones(len(source)) if weights is None else np.asarray(weights, np.float64)
-        middle, there = (np.average(points, axis=0, weights=weight) for points in (source, target))
-        a, b = source - middle, target - there
-        yaw = math.atan2(
-            float(weight @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(weight @ (a * b).sum(axis=1))
-        )
-        x, y = there - SE2(0.0, 0.0, yaw).apply(middle)
+        a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+        yaw = math.atan2(float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()), float((a * b).sum()))
+        x, y = target.mean(axis=0) - SE2(0.0, 0.0, yaw).apply(source.mean(axis=0))
         return SE2(float(x), float(y), yaw)
 
     @staticmethod

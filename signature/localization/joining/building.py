@@ -90,7 +90,7 @@ def join_sessions(
         for a, b in combinations(infos, 2)
         if (only is None or a in only or b in only) and not _told_apart(infos[a], infos[b])
     ]
-    pairs = list(_compared(database, list(infos), wanted, observer))
+    pairs = list(_compared(database, infos, wanted, observer))
     stay = {} if only is None else {name: at for name, at in known.items() if name not in only}
     frames: dict[str, BuildingFrame] = dict(stay)
     accepted: set[tuple[str, str]] = set()
@@ -114,9 +114,13 @@ def _told_apart(a: SessionInfo, b: SessionInfo) -> bool:
 
 
 def _compared(
-    database: SubmapDatabase, names: Sequence[str], pairs: Sequence[tuple[str, str]], observer: Observer
+    database: SubmapDatabase,
+    infos: Mapping[str, SessionInfo],
+    pairs: Sequence[tuple[str, str]],
+    observer: Observer,
 ) -> Iterator[SessionPair]:
     """Each pair joined, as far as it can be."""
+    names = list(infos)
 
     def prepared(number: int) -> JoinableMap:
         sight_m = database.config().partition.radius_m
@@ -127,7 +131,9 @@ def _compared(
     maps = LazySequence(prepared, len(names), _KEPT)
     with observer.step(f"compare {len(pairs)} pairs of sessions"):
         for done, (a, b) in enumerate(pairs):
-            yield SessionPair(target=a, source=b, join=join_maps(maps[names.index(a)], maps[names.index(b)]))
+            target, source = maps[names.index(a)], maps[names.index(b)]
+            labelled = infos[a].provenance.label.agrees(infos[b].provenance.label)
+            yield SessionPair(target=a, source=b, join=join_maps(target, source, labelled=labelled))
             observer.on_progress((done + 1) / len(pairs))
 
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from pc2grid.arrays import F32, F64, BoolGrid, freeze
 from pc2grid.geometry import SE2
+from pc2grid.matching.likelihood_field import LIKELIHOOD
 from pc2grid.matching.refinement import refine
 from pc2grid.matching.two_way_score import Fit
 from pc2grid.matching.walls import Walls
@@ -29,7 +30,7 @@ from signature.localization.hypotheses import HYPOTHESES, coarse_points, same_po
 from signature.localization.joining.graph_matching import Alignment, align_graphs
 from signature.localization.joining.landmarks import Landmarks
 from signature.localization.joining.pieces import PIECES, Piece, PieceFits, align_pieces, pieces_of, rigid
-from signature.localization.posterior import NO_EVIDENCE, POSTERIOR, Evidence, evidence_of, in_the_map, masses
+from signature.localization.posterior import NO_EVIDENCE, Evidence, evidence_of, masses
 from signature.localization.query import QueryMap
 from signature.localization.same_place import SAME_PLACE
 
@@ -47,12 +48,14 @@ class JoinParameters:
     around_m, around_rad : a transform of the graphs is searched so far around: two nodes of a way.
     least_m2 : free ground that both sessions know at least. Smaller rooms are alike in many buildings.
     accept : least probability. A wrong answer is one, a wrong join makes all later answers wrong.
+    strangers : prior odds that two sessions show one building if their labels do not say so.
     """
 
     around_m: float = 1.0
     around_rad: float = math.radians(10.0)
     least_m2: float = 20.0
     accept: float = 0.99
+    strangers: float = 0.1
 
 
 JOIN = JoinParameters()
@@ -143,14 +146,20 @@ class _Candidate:
     covariance: F64
 
 
-def join_maps(target: JoinableMap, source: JoinableMap, parameters: JoinParameters = JOIN) -> Join:
-    """Whether two sessions show one building, and how the source lies in the target."""
+def join_maps(
+    target: JoinableMap, source: JoinableMap, *, labelled: bool = False, parameters: JoinParameters = JOIN
+) -> Join:
+    """Whether two sessions show one building, and how the source lies in the target.
+
+    labelled : labels say that both are of one floor of one building.
+    """
     points_m = source.walls.points_m
     candidates = _candidates(target, source.landmarks, points_m, source.pieces, parameters)
     mirrored = tuple(piece.mirrored() for piece in source.pieces)
     decoys = _candidates(target, source.landmarks.mirrored(), points_m * _MIRROR, mirrored, parameters)
     fits = PieceFits.of([candidate.fits for candidate in (*candidates, *decoys)], source.pieces)
-    joins = [_judged(target, source, one, number, fits, parameters) for number, one in enumerate(candidates)]
+    prior = 1.0 if labelled else parameters.strangers
+    joins = [_judged(target, source, one, k, fits, prior, parameters) for k, one in enumerate(candidates)]
     return max(joins, key=lambda join: (join.status == "joined", join.probability), default=UNJOINED)
 
 
@@ -195,7 +204,9 @@ def _refined(
     pose, _ = refine(target.search.field, around, start, alignment.at_m)
     fits = align_pieces(target.search, pieces, pose, alignment.at_m)
     T_target_source, bend_m = rigid(pieces, fits)
-    _, covariance = refine(target.search.field, points_m, T_target_source, alignment.at_m)
+    whole, covariance = refine(target.search.field, points_m, T_target_source, alignment.at_m)
+    if bend_m < LIKELIHOOD.sigma_m:  # all walls are within reach of theirs at once, which is more exact
+        T_target_source = whole
     deviations = (HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)
     covariance = covariance + np.diag(np.square(deviations)) + np.diag([bend_m**2, bend_m**2, 0.0])
     return _Candidate(
@@ -209,11 +220,12 @@ def _judged(
     candidate: _Candidate,
     number: int,
     fits: PieceFits,
+    prior: float,
     parameters: JoinParameters,
 ) -> Join:
     """The posterior of a transform, by the part of the source that lies in the target.
 
-    number : its row in `fits`; the other rows are of its rivals.
+    number : its row in `fits`; the other rows are of its rivals. prior : odds of one building.
     """
     part = known_part(source.grid, target.grid, candidate.T_target_source)
     common_m2 = free_in_both(part, target.grid, candidate.T_target_source)
@@ -241,11 +253,12 @@ def _judged(
     ]
     evidence = evidence_of(whole, query)[number]
     # The part was chosen: of so many parts of the smaller session, this one fits best.
-    odds = common_m2 / max(min(source.grid.free_m2, target.grid.free_m2), 1e-9)
-    probability = float(masses([evidence], min(odds, 1.0))[0]) if odds else 0.0
+    share = min(common_m2 / max(min(source.grid.free_m2, target.grid.free_m2), 1e-9), 1.0)
+    odds = prior * max(share, 1e-9)
+    probability = float(masses([evidence], odds)[0])
     enough = common_m2 >= parameters.least_m2
     return Join(
-        status=_status(evidence, probability, enough, parameters),
+        status=_status(evidence, odds, probability, enough, parameters),
         T_target_source=candidate.T_target_source,
         covariance=moved_to_origin(candidate.covariance, candidate.T_target_source, candidate.at),
         probability=probability,
@@ -257,10 +270,14 @@ def _judged(
     )
 
 
-def _status(evidence: Evidence, probability: float, enough: bool, parameters: JoinParameters) -> JoinStatus:
+def _status(
+    evidence: Evidence, odds: float, probability: float, enough: bool, parameters: JoinParameters
+) -> JoinStatus:
+    """What is said of a transform. enough : whether so much is in common that it may be joined."""
     if enough and probability >= parameters.accept:
         return "joined"
-    return "ambiguous" if in_the_map([evidence]) >= POSTERIOR.in_the_map else "different"
+    # That the source lies here, or at a place that fits equally well, is more probable than not.
+    return "ambiguous" if evidence.log_odds_alike() + math.log(odds) > 0.0 else "different"
 
 
 def known_part(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE2) -> OccupancyGrid:

@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pc2grid.arrays import F64
-from pc2grid.geometry import SE2
+from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.matching.likelihood_field import LIKELIHOOD
 from pc2grid.matching.refinement import refine
 from pc2grid.matching.two_way_score import Fit, score_fit
 from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import UNKNOWN, OccupancyGrid
+from signature.localization.hypotheses import HYPOTHESES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +38,8 @@ class PieceParameters:
 
 
 PIECES = PieceParameters()
+_STEPS = 4
+"""Of Gauss and Newton; only the heading is not linear."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +122,9 @@ class PieceFits:
         weights = np.array([piece.walls.weight for piece in pieces])
 
         def column(name: str) -> F64:
-            return np.array([[getattr(fit, name) for fit in row] for row in fits]).reshape(len(fits), len(pieces))
+            return np.array([[getattr(fit, name) for fit in row] for row in fits]).reshape(
+                len(fits), len(pieces)
+            )
 
         looked_at = column("looked_at")
         return PieceFits(
@@ -144,15 +149,29 @@ class PieceFits:
 
 def rigid(pieces: Sequence[Piece], fits: Sequence[Fit]) -> tuple[SE2, float]:
     """The one transform that is nearest to those of the pieces that agree, and how far (m, rms of an axis)
-    these deviate from it."""
-    weights = np.array([fit.overlap * p.walls.weight for p, fit in zip(pieces, fits, strict=True)])
-    agrees = np.array([fit.known_agreement_both_ways >= PIECES.follows for fit in fits])
-    kept = np.flatnonzero(agrees & (weights > 0.0)).tolist() or np.flatnonzero(weights > 0.0).tolist()
-    # Two points of each piece, so that a single one says how it is turned.
-    arms = np.array([(0.25, 0.0), (-0.25, 0.0)]) * PIECES.side_m
-    source_m = np.concatenate([np.add(pieces[k].center_m, arms) for k in kept])
-    target_m = np.concatenate([fits[k].T_map_query.apply(np.add(pieces[k].center_m, arms)) for k in kept])
-    weight = np.repeat(weights[kept], 2)
-    T = SE2.fit(source_m, target_m, weight)
-    off_m = T.apply(source_m) - target_m
-    return T, math.sqrt(float(weight @ (off_m**2).sum(axis=1) / weight.sum() / 2.0))
+    these deviate from it.
+
+    Least squares over the poses of the pieces at their middles, each with the information that its walls
+    give: one that shows a corridor only says nothing along it. Pieces on ground that the target hardly knows
+    do not count.
+    """
+    seen = [fit.overlap * piece.walls.weight for piece, fit in zip(pieces, fits, strict=True)]
+    shown = [k for k, walls in enumerate(seen) if walls >= PIECES.least_walls] or [int(np.argmax(seen))]
+    kept = [k for k in shown if fits[k].known_agreement_both_ways >= PIECES.follows] or shown
+    middles_m = np.array([pieces[k].center_m for k in kept])
+    there_m = np.array([fits[k].T_map_query.apply(np.array([pieces[k].center_m]))[0] for k in kept])
+    yaws = np.array([fits[k].T_map_query.yaw for k in kept])
+    noise = np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))
+    information = np.linalg.inv(np.array([fits[k].covariance for k in kept]) + noise)
+    T = fits[kept[0]].T_map_query
+    for _ in range(_STEPS):
+        at_m = T.apply(middles_m)
+        error = np.column_stack((there_m - at_m, wrap_angle(yaws - T.yaw)))
+        J = np.tile(np.eye(3), (len(kept), 1, 1))
+        J[:, 0, 2], J[:, 1, 2] = T.y - at_m[:, 1], at_m[:, 0] - T.x
+        normal = np.einsum("kia,kij,kjb->ab", J, information, J)
+        x, y, yaw = np.linalg.solve(normal, np.einsum("kia,kij,kj->a", J, information, error)).tolist()
+        T = SE2(T.x + x, T.y + y, wrap_angle(T.yaw + yaw))
+    off_m, weight = T.apply(middles_m) - there_m, information[:, :2, :2]
+    squares = np.einsum("ki,kij,kj->", off_m, weight, off_m) / np.einsum("kii->", weight)
+    return T, math.sqrt(float(squares))
