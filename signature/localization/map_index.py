@@ -17,7 +17,7 @@ from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid
 from pc2grid.observer import Observer
 from signature.config import Config
-from signature.database.protocol import Label
+from signature.database.protocol import BuildingFrame, Label
 from signature.localization.hypotheses import (
     HYPOTHESES,
     Hypothesis,
@@ -67,6 +67,7 @@ class MapIndex:
         labels: Mapping[str, Label] | None = None,
         areas_m2: Mapping[str, float] | None = None,
         stored: Callable[[str], SeenPlaces | None] = lambda session: None,
+        frames: Mapping[str, BuildingFrame] | None = None,
     ) -> None:
         """grids : map of each session, in the order of `table.session_index`.
 
@@ -76,7 +77,9 @@ class MapIndex:
         areas_m2 : free space of each map, for maps that are not to be read before they are needed.
         stored : what is seen from the places of a session; None: it is computed from the map when it is
             needed.
+        frames : where the sessions that are joined lie in their buildings.
         """
+        self.frames = dict(frames or {})
         self.made_with = made_with
         self.config = config.relocalize
         self.sessions = tuple(grids)
@@ -136,7 +139,10 @@ class MapIndex:
 
         table, by_paper = database.signatures(), config.relocalize.select_by == "paper"
         made_with = database.config()
-        index = MapIndex(grids, table, made_with, config, labels, areas_m2, stored)
+        frames: Mapping[str, BuildingFrame] = {}
+        with contextlib.suppress(DatabaseCorrupt):  # without them a search takes longer, and finds the same
+            frames = database.frames()
+        index = MapIndex(grids, table, made_with, config, labels, areas_m2, stored, frames)
         if is_large and not by_paper:
             index.places.without_histograms()
         index.points_of = points_reader(database)
@@ -246,6 +252,13 @@ class MapIndex:
             enough = [h for h in group if h.fit.score >= _KEEP * group[0].fit.score]
             kept += enough[: self.config.hypotheses]
         return tuple(sorted(kept, key=lambda h: -h.fit.score))
+
+    def joined(self, a: int, b: int) -> SE2 | None:
+        """T_a_b of two sessions that are joined; None if they are not."""
+        frame, other = (self.frames.get(self.sessions[number]) for number in (a, b))
+        if frame is None or other is None or frame.name != other.name:
+            return None
+        return frame.T_building_session.inverse() @ other.T_building_session
 
 
 def free_squares(grid: OccupancyGrid, side_m: float = HYPOTHESES.square_m) -> F64:

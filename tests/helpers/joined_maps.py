@@ -42,9 +42,7 @@ def in_frame(grid: OccupancyGrid, T_grid_frame: SE2) -> OccupancyGrid:
     at = (T_grid_frame.apply(centres) - grid.origin_m) / grid.resolution_m
     x, y = (at.T.reshape(2, rows, columns) - 0.5).astype(np.float32)
     cells = cv2.remap(grid.cells.astype(np.int16), x, y, cv2.INTER_NEAREST, borderValue=UNKNOWN)
-    return OccupancyGrid(
-        cells=cells.astype(np.int8), resolution_m=grid.resolution_m, origin_m=empty.origin_m
-    )
+    return OccupancyGrid(cells=cells.astype(np.int8), resolution_m=grid.resolution_m, origin_m=empty.origin_m)
 
 
 def joinable(grid: OccupancyGrid) -> JoinableMap:

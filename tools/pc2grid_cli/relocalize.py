@@ -166,6 +166,7 @@ def relocalize_command(
     _check_not_swapped(log, database)
     with searched(database, building, floor) as (opened, left_out):
         where = opened.location
+        frames = opened.frames() if frame is options.FrameName.building else {}
         if known.is_check:
             checked, document = check_log(
                 log,
@@ -190,7 +191,6 @@ def relocalize_command(
             on_the_way=ON_THE_WAY if report is not None or rerun is not None else 0,
         )
         # Printed first: a file that cannot be written must not cost the answer.
-        frames = opened.frames() if frame is options.FrameName.building else {}
         stated = answer_in_building(found.answer, frames)
         _print(found, stated, where, left_out, map_sigma_m(found.answer, opened), as_json=json)
         _write(outputs, opened, found, stated, located, settings)

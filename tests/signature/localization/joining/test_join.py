@@ -78,7 +78,7 @@ def test_a_wing_that_comes_twice_is_ambiguous() -> None:
 
 
 def test_too_little_in_common_is_not_joined() -> None:
-    """Two thirds of the office each, which share the corridor between x 9 and 11 m: 2 x 14 m, less its walls."""
+    """The west of the corridor, 2 m wide, and the east of the office: they share 1.5 m of the corridor."""
     left, right = part((0.0, 6.0, 10.5, 8.0)), part((9.0, 0.0, 20.0, 14.0))
     join = join_maps(joinable(right), joinable(left))
     assert join.common_m2 < JOIN.least_m2 and join.status != "joined"

@@ -1,0 +1,183 @@
+"""Which real sessions are joined: those of one building, and none of different ones.
+
+`python -m pc2grid_lab.bench.real_joins FOLDER -o joins.json` reads all databases of a folder, whose sessions
+have the label of their building (`convert --building`), and compares every two sessions, without looking at
+the labels, and each with its own mirror image. Where two sessions are parts of one recording, or a third
+session contains both, the stamps that they share tell how they lie to each other.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from pc2grid.geometry import SE2
+from pc2grid.model import Trajectory
+from pc2grid.submaps.junction_graph import junction_graph
+from signature.database import open_database
+from signature.localization.joining.join import JoinableMap, join_maps
+
+_LEAST_STAMPS = 50
+"""Poses that two trajectories share, to say how their frames lie to each other."""
+_KEPT = 12
+"""Prepared maps in memory."""
+MIRRORED = "mirror image"
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """A session of a database file."""
+
+    path: Path
+    name: str
+    building: str
+    trajectory: Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Two sessions. same : of one building. error_m, error_deg : at the middle of the source, if known."""
+
+    target: str
+    source: str
+    same: bool
+    status: str
+    probability: float
+    agreement: float
+    common_m2: float
+    nodes: int
+    error_m: float | None
+    error_deg: float | None
+    cpu_s: float
+
+
+def sessions_of(folder: Path) -> list[Session]:
+    """The sessions of all databases of a folder, as `building/name`."""
+    found = []
+    for path in sorted(folder.glob("*.submaps")):
+        with open_database(path) as database:
+            found += [
+                Session(
+                    path,
+                    info.name,
+                    info.provenance.label.building or path.stem,
+                    database.trajectory(info.name),
+                )
+                for info in database.sessions()
+            ]
+    return found
+
+
+@lru_cache(_KEPT)
+def map_of(path: Path, name: str, mirrored: bool = False) -> JoinableMap:
+    """The map of a session, or its mirror image."""
+    with open_database(path) as database:
+        grid, graph, config = database.grid(name), database.graph(name), database.config()
+    if mirrored:
+        grid = replace(grid, cells=grid.cells[:, ::-1].copy())
+        graph = junction_graph(grid, config.partition)
+    return JoinableMap(grid=grid, graph=graph, sight_m=config.partition.radius_m)
+
+
+def truth(a: Session, b: Session, others: Sequence[Session]) -> SE2 | None:
+    """T_a_b by the stamps that both share, or that both share with a third one; None if there are none."""
+    direct = by_stamps(a, b)
+    if direct is not None:
+        return direct
+    for third in others:
+        T_third_a, T_third_b = by_stamps(third, a), by_stamps(third, b)
+        if T_third_a is not None and T_third_b is not None:
+            return T_third_a.inverse() @ T_third_b
+    return None
+
+
+def by_stamps(a: Session, b: Session) -> SE2 | None:
+    """T_a_b of two sessions of one recording; None if they share too few stamps."""
+    if a.building != b.building:
+        return None
+    _, i, j = np.intersect1d(a.trajectory.stamps_ns, b.trajectory.stamps_ns, return_indices=True)
+    if len(i) < _LEAST_STAMPS:
+        return None
+    return SE2.fit(b.trajectory.planar()[j, :2], a.trajectory.planar()[i, :2])
+
+
+def rows(compared: Sequence[Session], known: Sequence[Session]) -> Iterator[Row]:
+    """All pairs, and each session with its mirror image. known : also those that only tell the truth."""
+    for a, b in itertools.combinations(compared, 2):
+        yield _row(a, b, truth(a, b, known))
+    for one in compared:
+        yield _row(one, replace(one, name=MIRRORED), None)
+
+
+def _row(a: Session, b: Session, T_a_b: SE2 | None) -> Row:
+    mirrored = b.name == MIRRORED
+    target = map_of(a.path, a.name)
+    source = map_of(b.path, a.name if mirrored else b.name, mirrored)
+    begin = time.process_time()
+    join = join_maps(target, source)
+    cpu_s = time.process_time() - begin
+    off = None
+    if T_a_b is not None and join.status != "different":
+        x, y = source.grid.to_point(np.argwhere(source.grid.free)).mean(axis=0).tolist()
+        at = SE2(x, y)
+        off = (T_a_b @ at).inverse() @ join.T_target_source @ at
+    return Row(
+        target=a.name,
+        source=b.name,
+        same=a.building == b.building and not mirrored,
+        status=join.status,
+        probability=join.probability,
+        agreement=join.agreement,
+        common_m2=join.common_m2,
+        nodes=join.nodes,
+        error_m=None if off is None else math.hypot(off.x, off.y),
+        error_deg=None if off is None else abs(math.degrees(off.yaw)),
+        cpu_s=cpu_s,
+    )
+
+
+def summary(found: Sequence[Row]) -> Mapping[str, object]:
+    """How many true and false pairs were joined."""
+    true, false = [r for r in found if r.same], [r for r in found if not r.same]
+    joined = [r for r in true if r.status == "joined"]
+    errors = [r.error_m for r in joined if r.error_m is not None]
+    return {
+        "pairs of one building": len(true),
+        "joined": len(joined),
+        "errors, m": [round(error, 3) for error in sorted(errors)],
+        "pairs of different buildings": len(false),
+        "joined, though different": sum(r.status == "joined" for r in false),
+        "highest probability of these": round(max((r.probability for r in false), default=0.0), 4),
+        "cpu_s, median": round(float(np.median([r.cpu_s for r in found])), 2) if found else None,
+    }
+
+
+def main() -> None:
+    """Compare, print each pair, and write all to a file."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--only", nargs="*", help="names of the sessions that are compared")
+    arguments = parser.parse_args()
+    known = sessions_of(arguments.folder)
+    compared = [s for s in known if not arguments.only or s.name in arguments.only]
+    found = []
+    for row in rows(compared, known):
+        found.append(row)
+        print(json.dumps(asdict(row)), file=sys.stderr, flush=True)
+        arguments.output.write_text(json.dumps([asdict(row) for row in found], indent=1) + "\n")
+    print(json.dumps(summary(found), indent=1))
+
+
+if __name__ == "__main__":
+    main()
