@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pc2grid import load_map
+from pc2grid.errors import ConfigError, DatabaseError
 from pc2grid.io.nav2_map import save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid_cli.main import app
@@ -67,8 +68,9 @@ def test_json_holds_the_pairs_and_where_the_sessions_lie() -> None:
 
 def test_a_single_session_is_refused_and_says_what_to_do() -> None:
     run("db split b.submaps west -o one.submaps")
-    done = CliRunner().invoke(app, ["db", "join", "one.submaps"])
-    assert done.exit_code == 2 and "convert LOG --add" in done.stderr
+    with pytest.raises(ConfigError, match="holds 1 session") as refused:
+        run("db join one.submaps")
+    assert "convert LOG --add" in str(refused.value.hint)
 
 
 def test_answers_are_in_the_frame_of_the_building_unless_that_of_the_session_is_asked_for() -> None:
@@ -97,8 +99,9 @@ def test_one_map_of_the_building_is_exported() -> None:
     assert whole.is_free(19.0, 7.0) and whole.is_free(1.0, 7.0)
     run("export joined.submaps --map alone --session east --frame session")
     assert np.array_equal(load_map(Path("alone.yaml")).cells, load_map(Path("east.yaml")).cells)
-    done = CliRunner().invoke(app, ["export", "b.submaps", "--map", "no"])
-    assert done.exit_code == 1 and "db join" in done.stderr
+    with pytest.raises(DatabaseError, match="holds 2 sessions") as refused:
+        run("export b.submaps --map no")
+    assert "db join" in str(refused.value.hint)
 
 
 def test_what_is_added_to_a_joined_database_is_joined() -> None:
