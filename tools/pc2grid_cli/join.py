@@ -131,10 +131,11 @@ def _buildings(found: Joined) -> dict[str, dict[str, BuildingFrame]]:
 
 
 def draw(path: Path, database: SubmapDatabase, found: Joined) -> None:
-    """A picture of the building with most sessions. Raises ConfigError if nothing is joined."""
+    """A picture of the building with most sessions; none if nothing is joined."""
     buildings = _buildings(found)
     if not buildings:
-        raise ConfigError("--plot: no two sessions are joined, so there is nothing to draw")
+        console.warn(f"{path}: not written, no two sessions are joined")
+        return
     name = max(buildings, key=lambda name: len(buildings[name]))
     draw_building(
         path, name, {s: (database.grid(s), at.T_building_session) for s, at in buildings[name].items()}
