@@ -26,7 +26,7 @@ ChangeKind = Literal["came", "went"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChangeParameters:
-    """What counts as a change. `independent_m` was chosen on four simulated offices; see `docs/changes.md`.
+    """What counts as a change. `independent_m` was chosen on four simulated offices; see `examples/changes.md`.
 
     accept : least probability that a patch has changed.
     independent_m : cells of a patch that lie so far apart are known by different scans. Nearer ones share
@@ -213,6 +213,8 @@ def _patches(
     """The patches that have changed. T : the map `here` in the frame of the earlier map."""
     # A cell that is a moved wall of the other map rather than not would tie patches to walls.
     chosen = looked.free & (looked.explained > math.log(2.0))
+    if not chosen.any():
+        return
     cells = looked.cells[chosen]
     mask = np.zeros(here.cells.shape, np.uint8)
     mask[cells[:, 0], cells[:, 1]] = 1

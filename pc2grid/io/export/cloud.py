@@ -1,4 +1,5 @@
 """Points as PLY or PCD files, as Open3D, CloudCompare and PCL read them: binary, little-endian, float32.
+A number for each point, where there is one, is its `intensity`.
 
 PLY: https://paulbourke.net/dataformats/ply. PCD: version 0.7, see `cloud_files`.
 
@@ -22,14 +23,14 @@ element vertex {n}
 property float x
 property float y
 property float z
-end_header
+{more}end_header
 """
 _PCD = """# .PCD v0.7 - Point Cloud Data file format
 VERSION 0.7
-FIELDS x y z
-SIZE 4 4 4
-TYPE F F F
-COUNT 1 1 1
+FIELDS x y z{more}
+SIZE 4 4 4{size}
+TYPE F F F{type}
+COUNT 1 1 1{count}
 WIDTH {n}
 HEIGHT 1
 VIEWPOINT 0 0 0 1 0 0 0
@@ -37,18 +38,30 @@ POINTS {n}
 DATA binary
 """
 _HEADERS = {".ply": _PLY, ".pcd": _PCD}
+_MORE = {
+    ".ply": {"more": "property float intensity\n"},
+    ".pcd": {"more": " intensity", "size": " 4", "type": " F", "count": " 1"},
+}
+"""What the header says of an intensity."""
 
 
-def write_cloud(path: str | Path, points_m: ArrayLike) -> None:
+def write_cloud(path: str | Path, points_m: ArrayLike, intensity: ArrayLike | None = None) -> None:
     """Write points (N, 3), metres, as `.ply` or `.pcd`, by the suffix; an existing file is replaced.
+
+    intensity : (N,) a number for each point.
 
     Raises OutputError for another suffix or if the file cannot be written.
 
     >>> write_cloud("corner.ply", [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     """
-    header = _HEADERS.get(Path(path).suffix.lower())
+    suffix = Path(path).suffix.lower()
+    header = _HEADERS.get(suffix)
     if header is None:
         raise OutputError(f"{path}: not a kind of cloud file", hint="end its name in .ply or .pcd")
     points = np.asarray(points_m, "<f4").reshape(-1, 3)
+    words = dict.fromkeys(("more", "size", "type", "count"), "")
+    if intensity is not None:
+        points = np.column_stack((points, np.asarray(intensity, "<f4")))
+        words |= _MORE[suffix]
     with replace_file(path) as temporary:
-        temporary.write_bytes(header.format(n=len(points)).encode("ascii") + points.tobytes())
+        temporary.write_bytes(header.format(n=len(points), **words).encode("ascii") + points.tobytes())
