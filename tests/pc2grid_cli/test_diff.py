@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import cv2
+import jsonschema
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -15,11 +16,13 @@ from pc2grid.errors import Pc2GridError
 from pc2grid.geometry import SE2
 from pc2grid.io.building_file import building_points
 from pc2grid.model import OCCUPIED, OccupancyGrid
+from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app
 from signature.config import Config
 from signature.database import maintenance
 from signature.database.protocol import BuildingFrame
 from signature.sessions import add_sessions, provenance
+from tests.helpers.json_schema import closed
 from tests.helpers.session_maps import session, way
 from tests.helpers.simulated_drives import office
 
@@ -79,6 +82,7 @@ def middle_m() -> tuple[float, float]:
 
 def test_a_wall_that_came(joined: Path) -> None:
     document = json.loads(diff(joined, "monday", "friday", "--json"))
+    jsonschema.validate(document, closed(schema("diff")))
     (wall,) = document["changes"]
     cell_m = office().resolution_m
     assert wall["kind"] == "came" and wall["probability"] > 0.99
