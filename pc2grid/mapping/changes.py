@@ -26,7 +26,7 @@ ChangeKind = Literal["came", "went"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChangeParameters:
-    """What counts as a change. `independent_m` was chosen on four simulated offices; see `examples/changes.md`.
+    """What counts as a change. Chosen on four simulated offices, see `examples/changes.md`.
 
     accept : least probability that a patch has changed.
     independent_m : cells of a patch that lie so far apart are known by different scans. Nearer ones share

@@ -72,33 +72,39 @@ def diff_command(
         _write(path, f"{before} to {after}, in the frame of {frame}", earlier, changes)
         console.of(context).note(f"wrote {path}")
     if json:
-        document: Diff = {
-            "schema_version": 1,
-            "database": where,
-            "frame": frame,
-            "before": list(names[0]),
-            "after": list(names[1]),
-            "common_m2": changes.common_m2,
-            "came_m2": changes.area_m2("came"),
-            "went_m2": changes.area_m2("went"),
-            "stood_m2": changes.stood_m2,
-            "changes": [
-                {
-                    "kind": patch.kind,
-                    "center_m": list(patch.center_m),
-                    "length_m": patch.length_m,
-                    "width_m": patch.width_m,
-                    "yaw": patch.yaw_rad,
-                    "area_m2": patch.area_m2,
-                    "probability": patch.probability,
-                }
-                for patch in changes.patches
-            ],
-            "written": [str(path) for path in outputs],
-        }
+        document = _document(where, frame, names, changes, outputs)
         console.print_json(plain(Diff, document))
     else:
         _report(names, frame, changes)
+
+
+def _document(
+    where: str, frame: str, names: Sequence[Sequence[str]], changes: MapChanges, outputs: Sequence[Path]
+) -> Diff:
+    return {
+        "schema_version": 1,
+        "database": where,
+        "frame": frame,
+        "before": list(names[0]),
+        "after": list(names[1]),
+        "common_m2": changes.common_m2,
+        "came_m2": changes.area_m2("came"),
+        "went_m2": changes.area_m2("went"),
+        "stood_m2": changes.stood_m2,
+        "changes": [
+            {
+                "kind": patch.kind,
+                "center_m": list(patch.center_m),
+                "length_m": patch.length_m,
+                "width_m": patch.width_m,
+                "yaw": patch.yaw_rad,
+                "area_m2": patch.area_m2,
+                "probability": patch.probability,
+            }
+            for patch in changes.patches
+        ],
+        "written": [str(path) for path in outputs],
+    }
 
 
 def _report(names: Sequence[Sequence[str]], frame: str, changes: MapChanges) -> None:
