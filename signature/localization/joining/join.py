@@ -245,6 +245,7 @@ def _judged(
             forward=forward,
             backward=backward,
             overlap=1.0,
+            compared=query.walls.weight,
             looked_at=float(fits.looked_at[number].sum()),
             score=score,
             covariance=candidate.covariance,
