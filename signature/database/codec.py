@@ -160,9 +160,12 @@ def _decoder(kind: Any) -> Callable[[Any, str, dict[str, Array]], Any]:
         return mapping
     if _is_dataclass(kind):
         fields = {name: _decoder(field) for name, field in fields_of(kind).items()}
+        # A field that was added to a stored type is None in the sessions of before.
+        added = {field.name: None for field in dataclasses.fields(kind) if field.default is None}
 
         def instance(content: Any, path: str, arrays: dict[str, Array]) -> Any:
             _expect(isinstance(content, dict), path, content, "an object")
+            content = added | content
             if content.keys() != fields.keys():
                 odd = sorted(map(str, content.keys() ^ fields.keys()))
                 what = f"has no {odd[0]}" if odd[0] in fields else f"unknown {odd[0]}"

@@ -77,8 +77,22 @@ def test_a_stored_session_is_as_it_was(tmp_path: Path) -> None:
     assert zlib.decompress(stored["graph.path_m"]) == b"".join(path_m[k::4] for k in range(4))
     ((document,),) = sql(path, "SELECT document FROM session")
     content = json.loads(document)
-    assert content["grid"] == {"cells": "array", "origin_m": [-1.25, 2 / 3], "resolution_m": 0.05}
+    grid = {"cells": "array", "origin_m": [-1.25, 2 / 3], "resolution_m": 0.05}
+    assert content["grid"] == {**grid, "height_m": None}
     assert (content["loops"], content["points"]["voxel_m"]) == (3, 0.1)
+
+
+def test_a_session_of_before_grids_had_heights_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "x.submaps"
+    store(path, [make_entry("monday", 0)], keep=False)
+
+    def of_before(content: Content) -> None:
+        del content.document["grid"]["height_m"]
+
+    craft(path, of_before)
+    with open_database(path) as database:
+        assert database.grid("monday").height_m is None
+    assert check(path) == ()
 
 
 @pytest.mark.fault(44)
