@@ -18,7 +18,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
@@ -31,6 +31,7 @@ from pc2grid.io.map_pose import MapPose
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
+from signature.localization.answering import answer_query
 from signature.localization.belief import Masses
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.localizer import Localizer
@@ -159,8 +160,11 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
         places=(0,),
         masses=(1.0,),
     )
-    near = index.within(region.prior).search_whole_maps(seen, (believed,))
-    answer = localizer.answer(near, partial(before.prior, seen))
+    inside, prior_of = index.within(region.prior), partial(before.prior, seen)
+    answer = localizer.answer(inside.search_whole_maps(seen, (believed,)), prior_of)
+    if answer.status != "located":  # places that fit as well elsewhere make nothing near the pose doubtful
+        near = answer_query(inside, localizer.query, seen, answer.hypotheses, prior_of=prior_of)
+        answer = replace(near, prior=None) if near.status == "located" else answer
     bases = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
     in_frame = [
         (base, place)
