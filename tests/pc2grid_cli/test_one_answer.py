@@ -79,9 +79,14 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Expected]:
 
 
 def assert_same(document: Any, expected: Expected) -> None:
-    """Equal numbers but for the rounding of sums, whose order in Open3D and BLAS depends on the machine."""
-    for key in ("status", "pose", "in_space", "confidence"):
+    """Equal numbers but for the rounding of sums, whose order in Open3D and BLAS depends on the machine.
+
+    Looks at a running robot are whole answers, those on the way of a recording are quick, and what was known
+    before the last metres follows from them: the confidence may differ, but less than what one reads.
+    """
+    for key in ("status", "pose", "in_space"):
         assert document[key] == rounded(expected[key]), key
+    assert document["confidence"] == pytest.approx(expected["confidence"], abs=1e-3)
 
 
 def rounded(value: Any) -> Any:
