@@ -52,14 +52,19 @@ class MatchingMaps:
         """What placements of one scan are compared by."""
         return match.overlap - self._parameters.residual_weight_per_m * match.residual_m
 
-    def match(self, planar_scan: PlanarScan, guess: SE2, prior: SE2, information: F64) -> Match:
+    def match(
+        self, planar_scan: PlanarScan, guess: SE2, prior: SE2, information: F64, *, wide: bool = True
+    ) -> Match:
         """Match a planar scan from a guess T_session_base.
 
         prior, information : pose that the result is held to, and its information (3, 3) of x, y, yaw.
+        wide : the neighbourhoods of the matching; else only the narrowest of them, in as many iterations.
         """
+        radii = self._matching.radii_cells
         chosen = evenly(len(planar_scan.hits_m), self._parameters.matched_hits)
         hits, normals = planar_scan.hits_m[chosen], planar_scan.normal_rad[chosen]
-        return self._maps[0][0].match(hits, normals, guess, prior, information)
+        radii = radii if wide else (radii[-1],) * len(radii)
+        return self._maps[0][0].match(hits, normals, guess, prior, information, radii=radii)
 
     def extend(self, planar_scan: PlanarScan, pose: SE2) -> None:
         """Add a planar scan at its final pose T_session_base."""

@@ -143,6 +143,8 @@ class SensorOnWheels:
             found.append(self._candidate(planar_scan, registered if near else prior, belief))
             if belief is first and not near:
                 found.append(self._candidate(planar_scan, registered, belief))
+            if not (max(found).sure and max(found).near):
+                found.append(self._candidate(planar_scan, prior, belief, wide=False))
             if max(found).sure and max(found).near and not self._is_vague(belief):
                 return max(found)
         if self._is_vague(first) and not max(found).sure:
@@ -151,28 +153,41 @@ class SensorOnWheels:
             guesses = self._maps.search(planar_scan, SE2.from_matrix(first.pose), *window)
             searched = (self._candidate(planar_scan, guess, first) for guess in guesses)
             found.extend(replace(candidate, near=False) for candidate in searched)
-        return self._believed(found)
+        best = max(found)
+        unseen = self._weight(planar_scan) * p.sure_overlap + first.log_density(first.pose)
+        return self._believed(found, -math.inf if best.near else unseen)
 
-    def _believed(self, found: list[_Candidate]) -> _Candidate:
-        """The best of several matches; it says nothing where another place is nearly as probable."""
+    def _believed(self, found: list[_Candidate], unseen: float) -> _Candidate:
+        """The best of several matches; it says nothing where another explanation is nearly as probable:
+        another place, or, with the score `unseen`, that the scan shows ground that the map does not know."""
         p, best = self._parameters, max(found)
         rivals = [
             math.exp(other.score - best.score)
             for other in found
             if not _is_near(other.match.pose, best.match.pose, p.search_above_m, p.search_above_rad)
         ]
+        rivals.append(math.exp(min(unseen - best.score, 700.0)))
         alone = 1.0 / (1.0 + sum(rivals)) >= p.least_mass
         return best if alone else replace(best, sure=False, near=False)
 
-    def _candidate(self, planar_scan: PlanarScan, guess: SE2, belief: Belief) -> _Candidate:
-        """A match of a planar scan that begins at a guess and is held to a belief."""
+    def _candidate(
+        self, planar_scan: PlanarScan, guess: SE2, belief: Belief, *, wide: bool = True
+    ) -> _Candidate:
+        """A match of a planar scan that begins at a guess and is held to a belief.
+
+        wide : lines far from the guess count at first; this reaches further, but may leave a good guess.
+        """
         information = _in_map_axes(belief)
-        match = self._maps.match(planar_scan, guess, SE2.from_matrix(belief.pose), information)
-        p = self._parameters
-        of_scan = p.hit_weight * min(len(planar_scan.hits_m), p.matched_hits) * self._maps.quality(match)
+        match = self._maps.match(planar_scan, guess, SE2.from_matrix(belief.pose), information, wide=wide)
+        of_scan = self._weight(planar_scan) * self._maps.quality(match)
         pose = match.pose.lift()
-        near = belief.chi2(pose) < p.search_sigmas**2
+        near = belief.chi2(pose) < self._parameters.search_sigmas**2
         return _Candidate(of_scan + belief.log_density(pose), match, self._is_sure(match), near)
+
+    def _weight(self, planar_scan: PlanarScan) -> float:
+        """What a scan tells if it fits without any error."""
+        p = self._parameters
+        return p.hit_weight * min(len(planar_scan.hits_m), p.matched_hits)
 
     def _is_vague(self, belief: Belief) -> bool:
         """Whether a refinement alone does not reach all that a belief holds possible."""
