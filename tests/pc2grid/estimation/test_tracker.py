@@ -399,8 +399,8 @@ def test_a_camera_without_odometry_does_not_leap_along_a_wall(monkeypatch):
         before = SE2.from_matrix(tracker.track(scan).registered.T_session_base)
     matched = MatchingMaps.match
 
-    def leaping(self, planar_scan, guess, prior, information):
-        match = matched(self, planar_scan, guess, prior, information)
+    def leaping(self, planar_scan, guess, prior, information, **how):
+        match = matched(self, planar_scan, guess, prior, information, **how)
         # The points know everything but x, and say that it is elsewhere.
         away = SE2(prior.x + 0.41, prior.y, prior.yaw)
         known = np.diag([2000.0, 40000.0, 40000.0])
