@@ -136,7 +136,7 @@ class SensorOnWheels:
         one is taken: KISS-ICP, which slides along walls, does not count where the scan fits as well without
         it.
         """
-        p, first, found = self._parameters, expected[0], []
+        p, first, found, unseen = self._parameters, expected[0], [], -math.inf
         for belief in expected:
             prior = SE2.from_matrix(belief.pose)
             near = _is_near(registered, prior, p.disagree_m, p.disagree_rad)
@@ -153,9 +153,9 @@ class SensorOnWheels:
             guesses = self._maps.search(planar_scan, SE2.from_matrix(first.pose), *window)
             searched = (self._candidate(planar_scan, guess, first) for guess in guesses)
             found.extend(replace(candidate, near=False) for candidate in searched)
-        best = max(found)
-        unseen = self._weight(planar_scan) * p.sure_overlap + first.log_density(first.pose)
-        return self._believed(found, -math.inf if best.near else unseen)
+            if not max(found).near:
+                unseen = self._weight(planar_scan) * p.sure_overlap + first.log_density(first.pose)
+        return self._believed(found, unseen)
 
     def _believed(self, found: list[_Candidate], unseen: float) -> _Candidate:
         """The best of several matches; it says nothing where another explanation is nearly as probable:
