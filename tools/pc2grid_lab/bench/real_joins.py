@@ -2,8 +2,9 @@
 
 `python -m pc2grid_lab.bench.real_joins FOLDER -o joins.json` reads all databases of a folder, whose sessions
 have the label of their building (`convert --building`), and compares every two sessions, without looking at
-the labels, and each with its own mirror image. Where two sessions are parts of one recording, or a third
-session contains both, the stamps that they share tell how they lie to each other.
+the labels, and each with its own mirror image; `--by map_merge` does it as a rival does. Where two sessions
+are parts of one recording, or a third session contains both, the stamps that they share tell how they lie to
+each other.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import numpy as np
 from pc2grid.geometry import SE2
 from pc2grid.model import Trajectory
 from pc2grid.submaps.junction_graph import junction_graph
+from pc2grid_lab.baselines.map_merge import CONFIDENT, merge
 from signature.database import open_database
 from signature.localization.joining.join import JoinableMap, join_maps
 
@@ -52,10 +54,10 @@ class Row:
     source: str
     same: bool
     status: str
-    probability: float
-    agreement: float
-    common_m2: float
-    nodes: int
+    probability: float | None
+    agreement: float | None
+    common_m2: float | None
+    nodes: int | None
     error_m: float | None
     error_deg: float | None
     cpu_s: float
@@ -111,35 +113,70 @@ def by_stamps(a: Session, b: Session) -> SE2 | None:
     return SE2.fit(b.trajectory.planar()[j, :2], a.trajectory.planar()[i, :2])
 
 
-def rows(compared: Sequence[Session], known: Sequence[Session]) -> Iterator[Row]:
-    """All pairs, and each session with its mirror image. known : also those that only tell the truth."""
-    for a, b in itertools.combinations(compared, 2):
-        yield _row(a, b, truth(a, b, known))
-    for one in compared:
-        yield _row(one, replace(one, name=MIRRORED), None)
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What was found of two maps. T_target_source : None if they are said to be of different buildings."""
+
+    status: str
+    T_target_source: SE2 | None
+    probability: float | None = None
+    agreement: float | None = None
+    common_m2: float | None = None
+    nodes: int | None = None
 
 
-def _row(a: Session, b: Session, T_a_b: SE2 | None) -> Row:
-    mirrored = b.name == MIRRORED
-    target = map_of(a.path, a.name)
-    source = map_of(b.path, a.name if mirrored else b.name, mirrored)
-    begin = time.process_time()
+def by_pc2grid(target: JoinableMap, source: JoinableMap) -> Found:
+    """As `pc2grid db join` does it."""
     join = join_maps(target, source)
-    cpu_s = time.process_time() - begin
-    off = None
-    if T_a_b is not None and join.status != "different":
-        x, y = source.grid.to_point(np.argwhere(source.grid.free)).mean(axis=0).tolist()
-        at = SE2(x, y)
-        off = (T_a_b @ at).inverse() @ join.T_target_source @ at
-    return Row(
-        target=a.name,
-        source=b.name,
-        same=a.building == b.building and not mirrored,
+    return Found(
         status=join.status,
+        T_target_source=None if join.status == "different" else join.T_target_source,
         probability=join.probability,
         agreement=join.agreement,
         common_m2=join.common_m2,
         nodes=join.nodes,
+    )
+
+
+def by_map_merge(target: JoinableMap, source: JoinableMap) -> Found:
+    """As the ROS package map_merge does it."""
+    found = merge(target.grid, source.grid)
+    joined = found.confidence >= CONFIDENT and found.T_target_source is not None
+    return Found("joined" if joined else "different", found.T_target_source if joined else None)
+
+
+METHODS = {"pc2grid": by_pc2grid, "map_merge": by_map_merge}
+
+
+def rows(compared: Sequence[Session], known: Sequence[Session], method: str) -> Iterator[Row]:
+    """All pairs, and each session with its mirror image. known : also those that only tell the truth."""
+    for a, b in itertools.combinations(compared, 2):
+        yield _row(a, b, truth(a, b, known), method)
+    for one in compared:
+        yield _row(one, replace(one, name=MIRRORED), None, method)
+
+
+def _row(a: Session, b: Session, T_a_b: SE2 | None, method: str) -> Row:
+    mirrored = b.name == MIRRORED
+    target = map_of(a.path, a.name)
+    source = map_of(b.path, a.name if mirrored else b.name, mirrored)
+    begin = time.process_time()
+    found = METHODS[method](target, source)
+    cpu_s = time.process_time() - begin
+    off = None
+    if T_a_b is not None and found.T_target_source is not None:
+        x, y = source.grid.to_point(np.argwhere(source.grid.free)).mean(axis=0).tolist()
+        at = SE2(x, y)
+        off = (T_a_b @ at).inverse() @ found.T_target_source @ at
+    return Row(
+        target=a.name,
+        source=b.name,
+        same=a.building == b.building and not mirrored,
+        status=found.status,
+        probability=found.probability,
+        agreement=found.agreement,
+        common_m2=found.common_m2,
+        nodes=found.nodes,
         error_m=None if off is None else math.hypot(off.x, off.y),
         error_deg=None if off is None else abs(math.degrees(off.yaw)),
         cpu_s=cpu_s,
@@ -157,7 +194,7 @@ def summary(found: Sequence[Row]) -> Mapping[str, object]:
         "errors, m": [round(error, 3) for error in sorted(errors)],
         "pairs of different buildings": len(false),
         "joined, though different": sum(r.status == "joined" for r in false),
-        "highest probability of these": round(max((r.probability for r in false), default=0.0), 4),
+        "highest probability of these": round(max((r.probability or 0.0 for r in false), default=0.0), 4),
         "cpu_s, median": round(float(np.median([r.cpu_s for r in found])), 2) if found else None,
     }
 
@@ -167,12 +204,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--by", choices=METHODS, default="pc2grid")
     parser.add_argument("--only", nargs="*", help="names of the sessions that are compared")
     arguments = parser.parse_args()
     known = sessions_of(arguments.folder)
     compared = [s for s in known if not arguments.only or s.name in arguments.only]
     found = []
-    for row in rows(compared, known):
+    for row in rows(compared, known, arguments.by):
         found.append(row)
         print(json.dumps(asdict(row)), file=sys.stderr, flush=True)
         arguments.output.write_text(json.dumps([asdict(row) for row in found], indent=1) + "\n")
