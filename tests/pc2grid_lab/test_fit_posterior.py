@@ -105,7 +105,7 @@ def test_one_command_fits_and_judges(tmp_path: Path) -> None:
     assert counts["laser log in another building"] == ["3", "1", "0"]
     assert counts["laser in a map by lidar"][1] == "1500"
     areas = [float(v) for v in re.findall(r"ROC curve ([\d.]+)", done.stdout)]
-    assert len(areas) == 2 and 0.8 < areas[0] < areas[1] + 0.01  # fitted to them: no worse than in use
+    assert len(areas) == 3 and 0.8 < areas[0] < areas[1] + 0.01  # fitted to them: no worse than in use
 
 
 def test_old_evidence_and_a_single_building_are_refused(tmp_path: Path) -> None:

@@ -4,8 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
-from pc2grid_lab.experiments.calibration import Known, fit, left_out, log_loss, roc_area, share_by_session
+from pc2grid_lab.experiments.calibration import (
+    Known,
+    accept_of,
+    accepted,
+    clopper_pearson,
+    fit,
+    left_out,
+    log_loss,
+    roc_area,
+    share_by_building,
+    share_by_session,
+)
 from signature.localization.posterior import POSTERIOR, Evidence, masses
 
 TRUTH = replace(POSTERIOR, bias=-4.0, fit=2.0, lead=4.0, slip=0.05)
@@ -92,3 +104,41 @@ def test_the_interval_counts_sessions_not_answers() -> None:
     _, wide_low, wide_high = share_by_session(["a"] * 50 + ["b"] * 50, yes)
     assert share == 0.5 and 0.4 < low < 0.5 < high < 0.6
     assert (wide_low, wide_high) == (0.0, 1.0)
+
+
+def test_the_interval_is_wider_where_all_of_one_building_are_wrong() -> None:
+    """Five wrong of a hundred: one in each drive, or all in one of ten buildings."""
+    buildings = [frozenset(str(i // 10)) for i in range(100)]
+    drives = [f"{i // 5}" for i in range(100)]
+    spread, together = np.arange(100) % 20 == 0, np.arange(100) < 5
+    for yes in (spread, together):
+        assert share_by_building(buildings, drives, yes)[0] == 0.05
+    low, high = share_by_building(buildings, drives, spread)[1:]
+    lowest, highest = share_by_building(buildings, drives, together)[1:]
+    assert lowest < low < 0.05 < high < highest
+
+
+def test_clopper_pearson_is_the_interval_of_the_binomial_distribution() -> None:
+    """Of 100 trials without a hit the upper end is where that happens once in twenty: .95 ** (1 / 100)."""
+    assert clopper_pearson(0, 100) == pytest.approx((0.0, 1.0 - 0.05**0.01))
+    assert clopper_pearson(100, 100) == pytest.approx((0.05**0.01, 1.0))
+    low, high = clopper_pearson(5, 100)
+    assert binom.sf(4, 100, low) == pytest.approx(0.05) and binom.cdf(5, 100, high) == pytest.approx(0.05)
+
+
+def test_the_least_mass_leaves_out_what_is_wrong_too_often() -> None:
+    right = np.array([True, True, False, True, True, True])
+    mass = np.array([0.99, 0.98, 0.8, 0.9, 0.7, 0.6])
+    assert accept_of(right, mass, most_wrong=0.0) == 0.9
+    assert accept_of(right, mass, most_wrong=0.17) == 0.6  # one of six
+    assert accept_of(right, mass, most_wrong=0.17, least=0.65) == 0.9  # one of five is too many
+    assert accept_of(~right, mass, most_wrong=0.1) == 1.0
+    assert accept_of(np.array([True, False]), np.array([0.9, 0.9]), most_wrong=0.0) == 1.0  # equal masses
+
+
+def test_the_least_mass_is_chosen_without_the_building() -> None:
+    """In building c nothing is where it seems to be. Whoever knows c answers nothing; who does not, answers."""
+    known = [replace(a, first=None) if a.buildings == frozenset("c") else a for a in answers(900)]
+    given = accepted(known, most_wrong=0.05)
+    in_c = np.array([a.buildings == frozenset("c") for a in known])
+    assert given[in_c].mean() > given[~in_c].mean()

@@ -5,9 +5,10 @@
 Each file is one that `real_queries` or `recorded_queries` has written, one of the folder trials/ of `pc2grid
 compare sensors`, or the document of `compare real` or `compare log --json`. An answer is judged by a fit
 without all answers whose query or map is of one of its buildings. Prints the parameters for
-`signature.localization.posterior`, the log loss, and by kind of pair and distance how many answers are right,
-and how many would be located by the parameters in use and by those fitted without the building, rightly and
-wrongly.
+`signature.localization.posterior`, the log loss, by kind of pair and distance how many answers are right, and
+how many would be located by the parameters in use and by those fitted without the building, rightly and
+wrongly; the risk at several coverages; and what would be located if the least mass to answer were chosen without
+the building, too.
 
 Queries whose place was found and all others weigh the same in the fit, however many of each there are.
 """
@@ -24,8 +25,20 @@ from typing import Any
 
 import numpy as np
 
+from numpy.typing import NDArray
+
 from pc2grid.arrays import F64
-from pc2grid_lab.experiments.calibration import Known, fit, left_out, log_loss, roc_area, share_by_session
+from pc2grid_lab.experiments.calibration import (
+    MOST_WRONG,
+    Known,
+    accepted,
+    clopper_pearson,
+    fit,
+    left_out,
+    log_loss,
+    roc_area,
+    share_by_building,
+)
 from signature.config import Config
 from signature.localization.posterior import POSTERIOR, Evidence
 
@@ -37,6 +50,8 @@ NEAR_M = 1.0
 SHARE_FOUND = 0.5
 """Weight of the queries whose place was found. So the probability holds for queries half of which lie in the
 map."""
+COVERAGES = (0.5, 0.6, 0.7, 0.8, 0.9)
+"""At which the risk is printed."""
 PARTS_OF = {"floor": "fr079", "fr079_floor": "fr079"}
 """Physical building of what `compare real` and the data call otherwise: the 3D scan is one floor of fr079."""
 
@@ -135,8 +150,12 @@ def main() -> None:
     in_use = np.array([k.probability(POSTERIOR) for k in known])
     refitted = left_out(known, SHARE_FOUND)
     print_counts(answered, in_use, refitted)
-    print_sums(known, "in use", in_use)
-    print_sums(known, "fitted without the building", refitted)
+    accept = Config().relocalize.accept
+    print_sums(known, "in use", in_use, in_use >= accept)
+    print_sums(known, "fitted without the building", refitted, refitted >= accept)
+    given = accepted(known, SHARE_FOUND)
+    print_sums(known, f"and the least mass for {MOST_WRONG:.0%} wrong chosen without it", refitted, given)
+    print_risk(known, refitted)
     print(fit(known, SHARE_FOUND))
 
 
@@ -169,18 +188,35 @@ def print_counts(answered: list[Answered], *probabilities: F64) -> None:
         )
 
 
-def print_sums(known: list[Known], name: str, probabilities: F64) -> None:
-    """Print how good the probabilities (N,) are."""
+def print_sums(known: list[Known], name: str, probabilities: F64, located: NDArray[np.bool_]) -> None:
+    """Print how good the probabilities (N,) are, and what is located (N,) by them."""
     right = np.array([k.right for k in known])
-    loss, area = log_loss(known, probabilities), roc_area(known, probabilities)
-    located = probabilities >= Config().relocalize.accept
-    wrong, low, high = share_by_session([k.session for k in known], located & ~right)
+    buildings, drives = [k.buildings for k in known], [k.session for k in known]
+    _, low, high = share_by_building(buildings, drives, located & ~right)
+    # Windows of one drive depend on each other: a drive with a wrong answer counts once.
+    in_drives = {drive for drive, is_located in zip(drives, located, strict=True) if is_located}
+    wrong_drives = {drive for drive, is_wrong in zip(drives, located & ~right, strict=True) if is_wrong}
+    least, most = clopper_pearson(len(wrong_drives), len(in_drives))
     print(
-        f"{name}: log loss {loss:.4f}, area under the ROC curve {area:.4f}, located"
+        f"{name}: log loss {log_loss(known, probabilities):.4f},"
+        f" area under the ROC curve {roc_area(known, probabilities):.4f}, located"
         f" {np.count_nonzero(located & right)} of {np.count_nonzero(right)} right ones,"
         f" {np.count_nonzero(located & ~right)} of {np.count_nonzero(~right)} wrong ones"
-        f" ({wrong:.2%} of all answers; 5 to 95 %, by drive: {low:.2%} to {high:.2%})"
+        f" ({np.mean(located & ~right):.2%} of all answers; 5 to 95 %, by building and drive: {low:.2%} to"
+        f" {high:.2%}); wrong in {len(wrong_drives)} of {len(in_drives)} queries that are located"
+        f" (Clopper-Pearson 90 %: {least:.2%} to {most:.2%})"
     )
+
+
+def print_risk(known: list[Known], probabilities: F64) -> None:
+    """Print which share of the answers that are given is wrong (the risk), if the surest share of those whose
+    place comes first is given (the coverage)."""
+    right = np.array([k.right for k in known])
+    order = np.argsort(-probabilities, kind="stable")
+    found, wrong = np.cumsum(right[order]), np.cumsum(~right[order])
+    for coverage in COVERAGES:
+        k = int(np.searchsorted(found, coverage * found[-1]))
+        print(f"coverage {coverage:.2f}: mass {probabilities[order][k]:.3f}, wrong {wrong[k]} of {k + 1}")
 
 
 if __name__ == "__main__":

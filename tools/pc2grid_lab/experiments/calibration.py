@@ -8,10 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.stats import mannwhitneyu
+from scipy.stats import beta, mannwhitneyu
 
 from pc2grid.arrays import F64
 from signature.localization.posterior import POSTERIOR, Evidence, PosteriorParameters, masses
+
+
+MOST_WRONG = 0.02
+"""Of the answers that are given, at most this share is to be wrong."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,6 +125,40 @@ def left_out(
     return np.array([answer.probability(models[answer.buildings]) for answer in answers])
 
 
+def accept_of(
+    right: NDArray[np.bool_], probabilities: F64, most_wrong: float = MOST_WRONG, least: float = 0.5
+) -> float:
+    """The least mass from which an answer is given such that at most the share `most_wrong` of those that are
+    given, with this mass or more, is wrong; 1 if there is none.
+
+    right, probabilities : (N,) of the answers. least : lower values are not tried: what is less probable than
+    all else is no answer.
+    """
+    order = np.argsort(-probabilities, kind="stable")
+    wrong = np.cumsum(~right[order])
+    enough = (wrong <= most_wrong * np.arange(1, len(order) + 1)) & (probabilities[order] >= least)
+    # Answers of equal mass are given together or not at all.
+    enough &= np.append(np.diff(probabilities[order]) < 0.0, True)
+    return float(probabilities[order][enough].min(initial=1.0))
+
+
+def accepted(
+    answers: Sequence[Known], share_found: float | None = None, most_wrong: float = MOST_WRONG
+) -> NDArray[np.bool_]:
+    """(N,) whether each answer is given, by parameters and by a least mass (see `accept_of`) that are both
+    chosen without its buildings."""
+    given = np.zeros(len(answers), bool)
+    for buildings in {answer.buildings for answer in answers}:
+        others = [a for a in answers if not a.buildings & buildings]
+        p = fit(others, share_found)
+        right = np.array([a.right for a in others])
+        least = accept_of(right, np.array([a.probability(p) for a in others]), most_wrong)
+        for k, answer in enumerate(answers):
+            if answer.buildings == buildings:
+                given[k] = answer.probability(p) >= least
+    return given
+
+
 def log_losses(answers: Sequence[Known], probabilities: F64) -> F64:
     """(N,) negative logarithm of the probability of what is true."""
     right = np.array([answer.right for answer in answers])
@@ -167,6 +205,45 @@ def share_by_session(
     shares = hits[drawn].sum(axis=1) / count[drawn].sum(axis=1)
     low, high = np.percentile(shares, percentiles).tolist()
     return float(np.mean(yes)), low, high
+
+
+def share_by_building(
+    buildings: Sequence[frozenset[str]],
+    sessions: Sequence[str],
+    yes: NDArray[np.bool_],
+    *,
+    draws: int = 1000,
+    seed: int = 0,
+    percentiles: tuple[float, float] = (5.0, 95.0),
+) -> tuple[float, float, float]:
+    """A share, and its percentiles when buildings are drawn anew, and of each of these its drives (bootstrap in
+    two stages): what holds for other drives in other buildings.
+
+    buildings, sessions : of each answer. yes : (N,).
+    """
+    drives: dict[frozenset[str], dict[str, list[int]]] = {}
+    for k, (building, session) in enumerate(zip(buildings, sessions, strict=True)):
+        drives.setdefault(building, {}).setdefault(session, []).append(k)
+    # (drives, 2) of each building: answers, and those that are counted.
+    counts = [
+        np.array([(len(rows), np.count_nonzero(yes[rows])) for rows in of_building.values()])
+        for of_building in drives.values()
+    ]
+    rng = np.random.default_rng(seed)
+    shares = []
+    for _ in range(draws):
+        drawn = [counts[b] for b in rng.integers(0, len(counts), len(counts))]
+        answers, hits = sum(c[rng.integers(0, len(c), len(c))].sum(axis=0) for c in drawn)
+        shares.append(hits / answers)
+    low, high = np.percentile(shares, percentiles).tolist()
+    return float(np.mean(yes)), low, high
+
+
+def clopper_pearson(hits: int, of: int, confidence: float = 0.9) -> tuple[float, float]:
+    """The interval of a share of which `hits` of `of` independent trials were seen (Clopper and Pearson 1934)."""
+    tail = 0.5 * (1.0 - confidence)
+    low = float(beta.ppf(tail, hits, of - hits + 1)) if hits else 0.0
+    return low, float(beta.ppf(1.0 - tail, hits + 1, of - hits)) if hits < of else 1.0
 
 
 _LAPSE = 0.1
