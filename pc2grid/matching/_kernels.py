@@ -18,8 +18,8 @@ LANES = 32
 
 @numba.njit(cache=True, nogil=True)
 def box_bounds(levels: U8, level: I64, points: F64, boxes: F64) -> I64:
-    """Twin of `window_search.plain_box_bounds`. The points are turned once for boxes of one heading that follow
-    each other: a quarter of the time where many do."""
+    """Twin of `window_search.plain_box_bounds`. The points are turned once for boxes of one heading that
+    follow each other."""
     _, height, width = levels.shape
     out = np.empty(len(boxes), np.int64)
     turned_x, turned_y = np.empty(len(points)), np.empty(len(points))

@@ -173,11 +173,11 @@ def evidence_of(fits: Sequence[Fit], query: QueryMap, rivals: Sequence[Fit] = ()
 
 
 def off_map(query: QueryMap, fit: Fit, field: LikelihoodField) -> float:
-    """`Evidence.off_map` of a query at a pose on a map. Scans that it leaves out count as off the map."""
+    """`Evidence.off_map` of a query at a pose on a map."""
     if not query.keyframes:
         return 0.0
     path_m = np.array([(k.T_odom_base.x, k.T_odom_base.y) for k in query.keyframes])
-    return 1.0 - (1.0 - query.left_out) * float(field.at(fit.T_map_query.apply(path_m))[1].mean())
+    return 1.0 - float(field.at(fit.T_map_query.apply(path_m))[1].mean())
 
 
 def alike(score: float, other: float) -> bool:

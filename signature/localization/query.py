@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -43,8 +42,6 @@ class QueryParameters:
     clearance_m : views on the middle lines of the free space are at least so far from walls.
     every_m : distance of the candidates for views along the middle lines.
     path_candidates : candidates for views on the path, evenly spread.
-    last_m : a query that is not located is searched for again with only so many metres of its travel, longest
-        first.
     space_m, space_every_m : metres of travel whose scans are compared in space, and travel between two of
         them. voxel_m : edge of the voxels that such a scan is reduced to.
     """
@@ -54,7 +51,6 @@ class QueryParameters:
     clearance_m: float = 0.3
     every_m: float = 0.5
     path_candidates: int = 40
-    last_m: tuple[float, ...] = (8.0, 4.0)
     space_m: float = 5.0
     space_every_m: float = 0.2
     voxel_m: float = 0.05
@@ -83,7 +79,6 @@ class QueryMap:
     T_odom_prior : the base at the time that a prior is about; None if it is not known in this odom frame.
     since_prior_m : metres driven since that time.
     keyframes : the scans that it was drawn from, oldest first, and the last scan; none of a drawn map.
-    left_out : 0..1, of the scans of the last metres, the share that it was not drawn from.
     """
 
     stamp_ns: int
@@ -97,7 +92,6 @@ class QueryMap:
     T_odom_prior: SE2 | None = None
     since_prior_m: float = 0.0
     keyframes: tuple[Keyframe, ...] = ()
-    left_out: float = 0.0
 
     @cached_property
     def likeness(self) -> float:
@@ -235,29 +229,19 @@ class Query:
         while path_m - self._keyframes[0].path_m > self._config.window_m:
             self._keyframes.popleft()
 
-    def map(self, last_m: float = math.inf) -> QueryMap:
-        """What has been seen over the last `last_m` of travel, described as the database is.
+    def map(self) -> QueryMap:
+        """What has been seen over the last metres, described as the database is.
 
         Raises NoScans if no scan could be used.
         """
         if self._newest is None:
             raise NoScans("no scan of the query shows anything", hint="look at it with `pc2grid info`")
-        if last_m < math.inf or self._drawn is None:
-            drawn = self._draw(self._newest, last_m)
-            if last_m < math.inf:
-                return drawn
-            self._drawn = drawn
+        if self._drawn is None:
+            self._drawn = self._draw(self._newest)
         return self._drawn
 
-    def last_metres(self) -> Iterator[QueryMap]:
-        """The query map again, with the last metres only, as long as these are less than the whole."""
-        for last_m in QUERY.last_m:
-            if last_m < min(self.path_m, self._config.window_m):
-                yield self.map(last_m)
-
-    def _draw(self, newest: Keyframe, last_m: float) -> QueryMap:
-        keyframes = [k for k in self._keyframes if self._keyframes[-1].path_m - k.path_m <= last_m]
-        keyframes = keyframes or [newest]
+    def _draw(self, newest: Keyframe) -> QueryMap:
+        keyframes = list(self._keyframes) or [newest]
         builder = GridBuilder(self._made_with.projection)
         for keyframe in keyframes:
             builder.add(keyframe.planar_scan, keyframe.T_odom_base)
@@ -272,7 +256,6 @@ class Query:
             T_odom_prior=None if at_prior is None else at_prior.T_odom_base,
             since_prior_m=0.0 if at_prior is None else newest.path_m - at_prior.path_m,
             keyframes=(*keyframes, *(() if newest is keyframes[-1] else (newest,))),
-            left_out=1.0 - len(keyframes) / max(len(self._keyframes), 1),
         )
 
 

@@ -7,8 +7,8 @@ compare sensors`, or the document of `compare real` or `compare log --json`. An 
 without all answers whose query or map is of one of its buildings. Prints the parameters for
 `signature.localization.posterior`, the log loss, by kind of pair and distance how many answers are right, and
 how many would be located by the parameters in use and by those fitted without the building, rightly and
-wrongly; the risk at several coverages; and what would be located if the least mass to answer were chosen without
-the building, too.
+wrongly; the risk at several coverages; and what would be located if the least mass to answer were chosen
+without the building, too.
 
 Queries whose place was found and all others weigh the same in the fit, however many of each there are.
 """
@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F64

@@ -42,7 +42,6 @@ def count(name: str, grid: OccupancyGrid, queries: list[RegisteredSession], inde
     """Print the answer to each query, and how many are right."""
     counts: dict[float, Counter[str]] = {travel_m: Counter() for travel_m in TRAVEL_M}
     for number, driven in enumerate(queries):
-        spent_ms = 0.0
         after = set(scans_after(driven, TRAVEL_M))
         scans = ((registered, planar_scan) for registered, planar_scan, _ in driven.scans())
         for travel_m, found in zip(TRAVEL_M, localize(scans, [index], after=after), strict=False):
@@ -54,11 +53,8 @@ def count(name: str, grid: OccupancyGrid, queries: list[RegisteredSession], inde
             kind = kind_of(grid, driven, found.scans - 1, truth, share)
             verdict, error = judged(answer, truth)
             counts[travel_m].update([kind, f"{kind} {verdict}"] if verdict else [kind])
-            by_last = answer.timing_ms.get("last_metres", 0.0) > spent_ms and answer.status == "located"
-            spent_ms = answer.timing_ms.get("last_metres", 0.0)
             words = (name, number, travel_m, kind, answer.status, f"{answer.confidence:.3f}")
-            note = "by the last metres" if by_last else ""
-            print(*words, f"knows {share:.2f}", error, note, flush=True)
+            print(*words, f"knows {share:.2f}", error, flush=True)
     for travel_m, counted in counts.items():
         print(name, f"{travel_m:g} m:", dict(sorted(counted.items())), flush=True)
 

@@ -13,7 +13,6 @@ from scipy.stats import beta, mannwhitneyu
 from pc2grid.arrays import F64
 from signature.localization.posterior import POSTERIOR, Evidence, PosteriorParameters, masses
 
-
 MOST_WRONG = 0.02
 """Of the answers that are given, at most this share is to be wrong."""
 
@@ -216,8 +215,8 @@ def share_by_building(
     seed: int = 0,
     percentiles: tuple[float, float] = (5.0, 95.0),
 ) -> tuple[float, float, float]:
-    """A share, and its percentiles when buildings are drawn anew, and of each of these its drives (bootstrap in
-    two stages): what holds for other drives in other buildings.
+    """A share, and its percentiles when buildings are drawn anew, and of each of these its drives: in other
+    buildings and drives it will lie between them.
 
     buildings, sessions : of each answer. yes : (N,).
     """
@@ -240,7 +239,7 @@ def share_by_building(
 
 
 def clopper_pearson(hits: int, of: int, confidence: float = 0.9) -> tuple[float, float]:
-    """The interval of a share of which `hits` of `of` independent trials were seen (Clopper and Pearson 1934)."""
+    """The interval of a share by `hits` of `of` independent trials (Clopper and Pearson 1934)."""
     tail = 0.5 * (1.0 - confidence)
     low = float(beta.ppf(tail, hits, of - hits + 1)) if hits else 0.0
     return low, float(beta.ppf(1.0 - tail, hits + 1, of - hits)) if hits < of else 1.0
