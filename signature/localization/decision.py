@@ -24,7 +24,6 @@ from signature.localization.posterior import (
     evidence_of,
     in_the_map,
     masses,
-    off_map,
     tail_of,
 )
 from signature.localization.query import QueryMap
@@ -104,14 +103,11 @@ def _by_mass(
 ) -> list[tuple[Place, float, Evidence]]:
     """Places, their priors and what tells for them, by mass; what the last scans tell, of the first."""
     fits = [place[0].fit for place, _ in places]
-    walls = [index.maps[place[0].session_index].walls for place, _ in places]
-    found = [
-        replace(one, off_map=off_map(query, fit, there.field))
-        for one, fit, there in zip(evidence_of(fits, query, rivals), fits, walls, strict=True)
-    ]
+    found = list(evidence_of(fits, query, rivals))
     order = sorted(range(len(found)), key=lambda k: -found[k].log_odds() - math.log(places[k][1]))
     best = order[0]
-    found[best] = replace(found[best], tail=tail_of(query, fits[best], walls[best]))
+    walls = index.maps[places[best][0][0].session_index].walls
+    found[best] = replace(found[best], tail=tail_of(query, fits[best], walls))
     return [(*places[k], found[k]) for k in order]
 
 

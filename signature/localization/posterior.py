@@ -5,8 +5,8 @@
     nowhere  =  1 / N                                        it lies at no place of this map
     N        =  1 + sum_h prior(h) exp(z_h) (1 + sum_k s exp(-c r_hk))
 
-    z_h = b + c (f_h + g_h) + d t_h - e u_h
-    f = l(a_f) n_f / (n_f + few_f),    g = l(a_b) n_b / (n_b + few_b),    l(a) = ln a - ln(1.2 - a)
+    z_h = b + c (f_h + g_h) + d t_h
+    f = l(a_f) n_f / (n_f + few),    g = l(a_b) n_b / (n_b + few),    l(a) = ln a - ln(1.2 - a)
     t = min(score - rival, q score) sqrt(min(n_f, most) (1 - like^2))
 
 - f and g are the log-likelihood of the wall points of the query on ground that the map knows, and of the
@@ -17,8 +17,6 @@
   another place fits nearly so well: then such a fit is nothing special. The score (`two_way_score`) is a
   mean, which varies by chance as 1 / sqrt(n). No lead counts as longer than the share q of the score: what
   scores less is not searched for, so there may always be a rival so near.
-- u, the share of the scans that were taken where the map knows nothing: a robot that is in the map has
-  mostly driven where it knows the ground, and what lies beside a map fits at many places along its edge.
 - like, how well the query fits onto itself, slid along (`pc2grid.matching.self_likeness`): the walls of a
   bare corridor tell no place along it from another.
 - r_hk, the log-likelihood of the scans from k on, f of these alone: where tracking slips, the scans before
@@ -27,7 +25,7 @@
 `located` means that one place has at least the mass `RelocalizeConfig.accept`; `not_found`, that the query
 more likely than not is at no place of the map, `ambiguous` all else.
 
-`pc2grid_lab.experiments.calibration` fits b, c, d, e and s to queries whose truth is known, and judges them
+`pc2grid_lab.experiments.calibration` fits b, c and d to queries whose truth is known, and judges them
 on buildings that were left out.
 """
 
@@ -40,13 +38,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from pc2grid.arrays import F64
-from pc2grid.matching.likelihood_field import LikelihoodField
 from pc2grid.matching.two_way_score import Fit
 from pc2grid.matching.walls import Walls
 from signature.localization.query import QueryMap
 
 FITTED_ON = frozenset(
-    {"fr079", "intel", "csail", "aces", "wean", "kidnap", "workshop", "birmingham", "hall", "jarvis"}
+    {
+        "fr079",
+        "intel",
+        "csail",
+        "aces",
+        "killian",
+        "wean",
+        "kidnap",
+        "workshop",
+        "birmingham",
+        "hall",
+        "jarvis",
+        "room",
+        "kitchen",
+    }
 )
 """Buildings that `POSTERIOR` was fitted on."""
 
@@ -55,10 +66,11 @@ FITTED_ON = frozenset(
 class PosteriorParameters:
     """What the equation above is made of.
 
-    bias, fit, lead, off_map, slip : b, c, d, e and s.
-    few_walls, few_looked_at : few_f and few_b, wall points (0.1 m apart, by weight). Chosen by hand; from
-        half to twice of it the likelihood is as high.
-    most_walls : most; more do not make a lead surer, as what has been moved and similar rooms do not average
+    bias, fit, lead : b, c and d.
+    slip : s. Fitted to evidence of an earlier tracking, which slipped at times; now it is too rare to tell s.
+    few : wall points (0.1 m apart, by weight). Chosen among 3 to 100 by what is judged without the building;
+        from half to twice of it the likelihood is as high.
+    most : more wall points do not make a lead surer, as what has been moved and similar rooms do not average
         out. By hand.
     longest_lead : q. By hand; searches report what is nearer.
     slack, least_agreement : keep the log-odds finite at an agreement of 1 and of 0.
@@ -68,14 +80,12 @@ class PosteriorParameters:
         `ambiguous`, not `not_found`.
     """
 
-    bias: float = -5.07
-    fit: float = 2.66
-    lead: float = 4.49
-    off_map: float = 2.30
+    bias: float = -7.33
+    fit: float = 2.55
+    lead: float = 4.19
     slip: float = 0.0006
-    few_walls: float = 30.0
-    few_looked_at: float = 100.0
-    most_walls: float = 300.0
+    few: float = 10.0
+    most: float = 300.0
     longest_lead: float = 0.2
     slack: float = 0.2
     least_agreement: float = 0.01
@@ -96,7 +106,6 @@ class Evidence:
     lead : score less that of the best other place, at most `longest_lead` of it. apart : the same, but places
     that fit equally well do not count as others.
     likeness : `pc2grid.matching.self_likeness` of the query.
-    off_map : u, share of the scans that were taken where the map knows nothing, 0..1; 0 of a drawn map.
     tail : r_k, log-likelihood of the scans from the k-th one on, the last one first.
     """
 
@@ -107,7 +116,6 @@ class Evidence:
     lead: float
     apart: float
     likeness: float
-    off_map: float = 0.0
     tail: tuple[float, ...] = ()
 
     @property
@@ -118,24 +126,22 @@ class Evidence:
     @property
     def log_likelihood(self) -> float:
         """f + g: below 0 the place fits less than wrong places do."""
-        p = POSTERIOR
-        forward = tempered(self.forward, self.walls, p.few_walls)
-        return forward + tempered(self.backward, self.looked_at, p.few_looked_at)
+        return tempered(self.forward, self.walls) + tempered(self.backward, self.looked_at)
 
     @property
-    def terms(self) -> tuple[float, float, float, float]:
-        """What b, c, d and e are multiplied with."""
-        return 1.0, self.log_likelihood, self.lead * self._sharpness, -self.off_map
+    def terms(self) -> tuple[float, float, float]:
+        """What b, c and d are multiplied with."""
+        return 1.0, self.log_likelihood, self.lead * self._sharpness
 
     @property
     def _sharpness(self) -> float:
-        return math.sqrt(min(self.walls, POSTERIOR.most_walls) * (1.0 - self.likeness**2))
+        return math.sqrt(min(self.walls, POSTERIOR.most) * (1.0 - self.likeness**2))
 
     def log_odds(self, p: PosteriorParameters = POSTERIOR) -> float:
         """z: logarithm of the mass of the place over that of "nowhere"; minus infinity without walls."""
         if not self.walls:
             return -math.inf
-        return float(np.dot((p.bias, p.fit, p.lead, p.off_map), self.terms))
+        return float(np.dot((p.bias, p.fit, p.lead), self.terms))
 
     def log_odds_alike(self, p: PosteriorParameters = POSTERIOR) -> float:
         """z of the place or one that fits equally well."""
@@ -170,14 +176,6 @@ def evidence_of(fits: Sequence[Fit], query: QueryMap, rivals: Sequence[Fit] = ()
             )
         )
     return tuple(found)
-
-
-def off_map(query: QueryMap, fit: Fit, field: LikelihoodField) -> float:
-    """`Evidence.off_map` of a query at a pose on a map."""
-    if not query.keyframes:
-        return 0.0
-    path_m = np.array([(k.T_odom_base.x, k.T_odom_base.y) for k in query.keyframes])
-    return 1.0 - float(field.at(fit.T_map_query.apply(path_m))[1].mean())
 
 
 def alike(score: float, other: float) -> bool:
@@ -223,12 +221,12 @@ def tail_of(query: QueryMap, fit: Fit, walls: Walls) -> tuple[float, ...]:
         likelihood += float(values[known].sum())
         points += float(np.count_nonzero(known))
         mean = likelihood / points if points else 0.0
-        tail.append(tempered(mean, points / count, POSTERIOR.few_walls))
+        tail.append(tempered(mean, points / count))
     return tuple(tail)
 
 
-def tempered(agreement: float, points: float, few: float) -> float:
+def tempered(agreement: float, points: float) -> float:
     """Log-likelihood of wall points that agree so well, tempered by their number."""
     p = POSTERIOR
     a = min(max(agreement, p.least_agreement), 1.0)
-    return (math.log(a) - math.log(1.0 + p.slack - a)) * points / (points + few)
+    return (math.log(a) - math.log(1.0 + p.slack - a)) * points / (points + p.few)

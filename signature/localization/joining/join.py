@@ -48,14 +48,15 @@ class JoinParameters:
     around_m, around_rad : a transform of the graphs is searched so far around: two nodes of a way.
     least_m2 : free ground that both sessions know at least. Smaller rooms are alike in many buildings.
     accept : least probability. A wrong answer is one, a wrong join makes all later answers wrong.
-    strangers : prior odds that two sessions show one building if their labels do not say so.
+    labelled : prior odds that two sessions show one floor if their labels say so, relative to those of other
+        sessions, which the posterior begins with.
     """
 
     around_m: float = 1.0
     around_rad: float = math.radians(10.0)
     least_m2: float = 20.0
     accept: float = 0.99
-    strangers: float = 0.1
+    labelled: float = 10.0
 
 
 JOIN = JoinParameters()
@@ -158,7 +159,7 @@ def join_maps(
     mirrored = tuple(piece.mirrored() for piece in source.pieces)
     decoys = _candidates(target, source.landmarks.mirrored(), points_m * _MIRROR, mirrored, parameters)
     fits = PieceFits.of([candidate.fits for candidate in (*candidates, *decoys)], source.pieces)
-    prior = 1.0 if labelled else parameters.strangers
+    prior = parameters.labelled if labelled else 1.0
     joins = [_judged(target, source, one, k, fits, prior, parameters) for k, one in enumerate(candidates)]
     return max(joins, key=lambda join: (join.status == "joined", join.probability), default=UNJOINED)
 

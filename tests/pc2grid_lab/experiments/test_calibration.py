@@ -20,7 +20,7 @@ from pc2grid_lab.experiments.calibration import (
 )
 from signature.localization.posterior import POSTERIOR, Evidence, masses
 
-TRUTH = replace(POSTERIOR, bias=-4.0, fit=2.0, lead=4.0, slip=0.05)
+TRUTH = replace(POSTERIOR, bias=-4.0, fit=2.0, lead=4.0)
 
 
 def place(rng: np.random.Generator, lead: float, tail: tuple[float, ...] = ()) -> Evidence:
@@ -58,7 +58,6 @@ def test_the_fit_recovers_the_model_that_made_the_answers() -> None:
     assert found.bias == pytest.approx(TRUTH.bias, rel=0.25)
     assert found.fit == pytest.approx(TRUTH.fit, rel=0.25)
     assert found.lead == pytest.approx(TRUTH.lead, rel=0.25)
-    assert TRUTH.slip / 3.0 < found.slip < TRUTH.slip * 3.0
 
 
 def test_found_places_weigh_what_they_are_told_to() -> None:

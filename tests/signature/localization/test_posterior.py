@@ -64,15 +64,15 @@ def test_the_prior_decides_between_equal_places_and_not_what_is_certain() -> Non
 
 def test_scans_that_contradict_the_place_move_its_mass_to_slipped() -> None:
     """The last ten scans fit no better than a wrong place: where the robot is now is not known."""
-    fits, contradicts = tempered(0.9, 200.0, 30.0), tempered(0.1, 200.0, 30.0)
+    fits, contradicts = tempered(0.9, 200.0), tempered(0.1, 200.0)
     assert mass(replace(USUAL, tail=(fits,) * 50)) == pytest.approx(mass(USUAL), abs=0.01)
     assert mass(replace(USUAL, tail=(contradicts,) * 10 + (fits,) * 40)) < 0.5
     # A single one that is seen from the same place may be a person who stands in the way.
-    assert mass(replace(USUAL, tail=(tempered(0.5, 200.0, 30.0), *(fits,) * 49))) > 0.9
+    assert mass(replace(USUAL, tail=(tempered(0.5, 200.0), *(fits,) * 49))) > 0.9
 
 
 def test_what_neither_side_knows_says_nothing() -> None:
-    assert tempered(0.9, 0.0, 30.0) == 0.0
+    assert tempered(0.9, 0.0) == 0.0
     assert mass(replace(USUAL, backward=1.0, looked_at=0.0)) == pytest.approx(
         mass(replace(USUAL, backward=0.0, looked_at=0.0))
     )

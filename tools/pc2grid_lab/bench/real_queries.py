@@ -37,7 +37,7 @@ from signature.config import Config
 from signature.describe import describe
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import evidence_of, off_map, tail_of
+from signature.localization.posterior import evidence_of, tail_of
 from signature.localization.query import Query, QueryMap
 from signature.localization.same_place import unseen_by
 from signature.similarity import SignatureTable
@@ -151,13 +151,10 @@ def _looks(
 
 def evidence_list(index: MapIndex, query: QueryMap, found: tuple[Hypothesis, ...]) -> list[dict[str, Any]]:
     """What tells for each hypothesis, and for the best one, what its last scans tell."""
-    walls = [index.maps[h.session_index].walls for h in found]
-    evidence = [
-        replace(one, off_map=off_map(query, h.fit, there.field))
-        for one, h, there in zip(evidence_of([h.fit for h in found], query), found, walls, strict=True)
-    ]
+    evidence = list(evidence_of([h.fit for h in found], query))
     if found:
-        evidence[0] = replace(evidence[0], tail=tail_of(query, found[0].fit, walls[0]))
+        walls = index.maps[found[0].session_index].walls
+        evidence[0] = replace(evidence[0], tail=tail_of(query, found[0].fit, walls))
     return [asdict(one) for one in evidence]
 
 

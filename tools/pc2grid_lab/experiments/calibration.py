@@ -44,8 +44,9 @@ class Known:
 
 
 def fit(answers: Sequence[Known], share_found: float | None = None) -> PosteriorParameters:
-    """The parameters bias, fit, lead, off_map and slip under which the truth is likeliest; only the bias may
-    be negative.
+    """The parameters bias, fit and lead under which the truth is likeliest; only the bias may be negative.
+
+    The rate of slips stays as it is in use: queries in which tracking slips are too rare to tell it.
 
     share_found : the answers whose true place was found weigh so much of all together, 0..1, however many of
     each there are; None: as much as their weights say. Raises ValueError unless there are both kinds.
@@ -62,21 +63,21 @@ def fit(answers: Sequence[Known], share_found: float | None = None) -> Posterior
 
     def loss(x: F64) -> float:
         p = (1.0 - _LAPSE) * likelihood.of_truth(x) + _LAPSE
-        return float(-weights @ np.log(p) + 0.5 * _PENALTY * x[:4] @ x[:4])
+        return float(-weights @ np.log(p) + 0.5 * _PENALTY * x @ x)
 
     in_use = POSTERIOR
-    start = np.array([in_use.bias, in_use.fit, in_use.lead, in_use.off_map, np.log(in_use.slip)])
-    bounds = [(None, None), (0.0, None), (0.0, None), (0.0, None), (None, 0.0)]
-    bias, fit_, lead, off_map, slip = minimize(loss, start, bounds=bounds, method="L-BFGS-B").x.tolist()
-    return replace(in_use, bias=bias, fit=fit_, lead=lead, off_map=off_map, slip=float(np.exp(slip)))
+    start = np.array([in_use.bias, in_use.fit, in_use.lead])
+    bounds = [(None, None), (0.0, None), (0.0, None)]
+    bias, fit_, lead = minimize(loss, start, bounds=bounds, method="L-BFGS-B").x.tolist()
+    return replace(in_use, bias=bias, fit=fit_, lead=lead)
 
 
 @dataclass(frozen=True, slots=True)
 class _Likelihood:
-    """Of N answers with up to K places: terms (N, K, 4), tails (N, T) of the best place, and the number of
+    """Of N answers with up to K places: terms (N, K, 3), tails (N, T) of the best place, and the number of
     the true place (N,), K for none.
 
-    Places that are missing or without walls have terms (inf, 0, 0, 0); missing tails are inf.
+    Places that are missing or without walls have terms (inf, 0, 0); missing tails are inf.
     """
 
     terms: F64
@@ -87,7 +88,7 @@ class _Likelihood:
     def of(answers: Sequence[Known]) -> _Likelihood:
         most = max((len(a.places) for a in answers), default=0)
         longest = max((len(e.tail) for a in answers for e in a.places), default=0)
-        terms = np.tile((np.inf, 0.0, 0.0, 0.0), (len(answers), most, 1))
+        terms = np.tile((np.inf, 0.0, 0.0), (len(answers), most, 1))
         tails = np.full((len(answers), longest), np.inf)
         for n, answer in enumerate(answers):
             for k, evidence in enumerate(answer.places):
@@ -98,11 +99,15 @@ class _Likelihood:
         return _Likelihood(terms, tails, first)
 
     def of_truth(self, x: F64) -> F64:
-        """(N,) probability of what is true, by bias, fit, lead, off_map and the logarithm of slip."""
+        """(N,) probability of what is true, by bias, fit and lead."""
         given = np.isfinite(self.terms[:, :, 0])
-        z = np.where(given, np.nan_to_num(self.terms, posinf=0.0) @ x[:4], -700.0)
+        z = np.where(given, np.nan_to_num(self.terms, posinf=0.0) @ x, -700.0)
         odds = np.exp(np.clip(z, -700.0, 300.0))
-        lost = np.exp(x[4] - x[1] * np.minimum(self.tails, 700.0)).sum(axis=1) * odds[:, :1].sum(axis=1)
+        lost = (
+            POSTERIOR.slip
+            * np.exp(-x[1] * np.minimum(self.tails, 700.0)).sum(axis=1)
+            * odds[:, :1].sum(axis=1)
+        )
         every = np.column_stack((odds, np.ones(len(odds))))
         lost_or_nowhere = np.where(self.first == odds.shape[1], lost, 0.0)
         truth = every[np.arange(len(odds)), self.first] + lost_or_nowhere
