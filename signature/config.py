@@ -159,7 +159,7 @@ class RelocalizeConfig(Section):
         ge=0,
         description="without a clear answer by signatures, maps up to this free area are searched as a whole",
     )
-    accept: float = Field(0.87, gt=0, lt=1, description="least confidence to answer located")
+    accept: float = Field(0.75, gt=0, lt=1, description="least confidence to answer located")
 
 
 class Config(pc2grid.config.Config):
@@ -167,7 +167,7 @@ class Config(pc2grid.config.Config):
 
     >>> config = Config()
     >>> config.partition.radius_m, config.relocalize.accept
-    (5.0, 0.87)
+    (5.0, 0.75)
     >>> Config(relocalize=RelocalizeConfig(accept=0.99)).relocalize.accept
     0.99
     """

@@ -13,7 +13,7 @@ from scipy.stats import beta, mannwhitneyu
 from pc2grid.arrays import F64
 from signature.localization.posterior import POSTERIOR, Evidence, PosteriorParameters, masses
 
-MOST_WRONG = 0.02
+MOST_WRONG = 0.025
 """Of the answers that are given, at most this share is to be wrong."""
 
 
