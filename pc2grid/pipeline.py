@@ -19,7 +19,13 @@ from pc2grid.mapping.loop_closure import LoopCloser
 from pc2grid.mapping.loop_parameters import CAMERA_LOOPS, LOOPS
 from pc2grid.mapping.part_maps import PartMap, doubtful_scans, draw_parts, long_enough, with_points
 from pc2grid.mapping.parts import PARTS
-from pc2grid.mapping.report import check_followed, part_reports, with_ride_warnings, without_points
+from pc2grid.mapping.report import (
+    check_followed,
+    check_held,
+    part_reports,
+    with_ride_warnings,
+    without_points,
+)
 from pc2grid.mapping.track import KeyframeSelection, Track, TrackRecord
 from pc2grid.model import (
     Health,
@@ -84,8 +90,8 @@ def build_map(
     recognizer : finds loops that are farther off than the search near the tracked pose reaches.
     Of a recording that does not hang together (see `build_maps`), the part with the longest travel is
     returned, and its report says what is left out.
-    Raises NoScans if there is nothing to make a map from, TrackingLost if the scans of a laser without
-    odometry cannot be followed.
+    Raises NoScans if there is nothing to make a map from, TrackingLost if the scans of a laser, or of a
+    sensor in the hand, cannot be followed without odometry.
 
     >>> import pc2grid
     >>> with pc2grid.open_log("monday.mcap") as log:
@@ -133,8 +139,10 @@ def build_maps(
     planar = SENSOR_MODELS[sensor].planar
     if not any(len(part.trajectory) for part in parts):
         raise NoScans(f"{log.info.path}: no scans in the part asked for", hint="check --start and --duration")
-    if planar and not track.with_odometry:
+    if (planar or track.carried) and not track.with_odometry:
         check_followed(track.outside_rides(), str(log.info.path))
+        if track.carried:
+            check_held(track.trajectory, str(log.info.path))
     kept = long_enough(parts)
     reached = [part.storey for part in kept]
     floors, heights_m = floor_names(track.storeys, reached), floor_heights(track.storeys, reached)

@@ -9,10 +9,8 @@ believed, else it is lost.
 
 from __future__ import annotations
 
-import dataclasses
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -23,9 +21,9 @@ from pc2grid.config import ProjectionConfig
 from pc2grid.estimation.manifold import moved, steps
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.estimation.placed import Placed
-from pc2grid.estimation.smoother import SMOOTHER, SPATIAL, Belief
+from pc2grid.estimation.smoother import SPATIAL, Belief
 from pc2grid.estimation.space_map import SpaceMap, ThinnedScan
-from pc2grid.estimation.surface_map import Placement, PosePrior
+from pc2grid.estimation.surface_map import SURFACES, Placement, PosePrior
 from pc2grid.geometry import SE2
 from pc2grid.model import Scan
 
@@ -48,6 +46,20 @@ class CarriedParameters:
 
 
 CARRIED = CarriedParameters()
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class _Candidate:
+    """A placement, and its score: the logarithm of its posterior density but for a constant.
+
+    agreement : with what is known where its points lie, -1..1. sure : it fits so well that it need not be
+    searched for.
+    """
+
+    score: float
+    placement: Placement = field(compare=False)
+    agreement: float = field(compare=False)
+    sure: bool = field(compare=False)
 
 
 class CarriedSensor:
@@ -93,29 +105,87 @@ class CarriedSensor:
         expected : where the base may be, the most credible first. A scan that fits nowhere, or shows nothing,
         is placed there.
         """
-        first = expected[0]
-        axes = _axes(first.pose)
-        prior = PosePrior(first.pose, axes @ np.linalg.inv(first.covariance) @ axes.T)
+        del seconds
+        belief = expected[0]
         if self._map is None:
             self._map = SpaceMap(scan, points_m, self._projection)
         self._thinned = thinned = self._map.thin(scan, points_m)
         if not self._map or not len(thinned.points_m):
-            self._found = prior.pose
-            return Placed(prior.pose, first=not self._map)
-        found = self._map.match(thinned, prior.pose, prior)
-        alone_s = 0.0 if scan.T_odom_base is not None else seconds  # without any word of its motion
-        if self._is_doubtful(found, alone_s, self._map):
-            found = self._search(prior, found, self._map)
-        fits = found.overlap > 0.0
-        if fits:
-            self._found = found.pose
+            self._found = belief.pose
+            return Placed(belief.pose, first=not self._map)
+        candidates = self._candidates(belief, self._map)
+        best = max(candidates)
+        found = best.placement
+        if not self._is_believed(best, belief):
+            return Placed(belief.pose)
+        self._found = found.pose
+        # Where the motion is expected to centimetres, points that only seem to hold the scan do no harm.
+        held = not self._is_vague(belief) or self._map.is_held(thinned, found)
         return Placed(
             found.pose,
-            _alone(found, prior) if fits else None,
+            _alone(found, belief, _spread(candidates, best)),
             found.overlap,
             found.residual_m,
-            found.measured,
+            found.measured and held,
         )
+
+    def _candidates(self, belief: Belief, space: SpaceMap) -> list[_Candidate]:
+        """Where the scan placed last may lie.
+
+        The coarse map brings it near from where the base is expected. Where more is possible than a match
+        reaches, or it does not fit, it is also matched without the coarse map, which slides along surfaces
+        that it smooths; and it is searched for where it still does not fit, or does not agree.
+        """
+        p = self._parameters
+        prior, vague = _prior(belief), self._is_vague(belief)
+
+        def matched(*, wide: bool) -> _Candidate:
+            return self._candidate(space.match(self._thinned, belief.pose, prior, wide=wide), belief, space)
+
+        found = [matched(wide=True)]
+        if vague or not found[0].sure:
+            found.append(matched(wide=False))
+        best = max(found)
+        if not best.sure or (vague and best.agreement < p.sure_agreement):
+            found += self._searched(belief, space)
+        return found
+
+    def _searched(self, belief: Belief, space: SpaceMap) -> Iterator[_Candidate]:
+        """Placements in all headings around the last pose that was found, with its height and tilt.
+
+        A hand turns fast; then the predicted direction of the step says nothing.
+        """
+        p, t = self._parameters, self._tracking
+        step_m = float(np.linalg.norm(belief.pose[:3, 3] - self._found[:3, 3]))
+        window_m = min(step_m + t.search_sigmas * belief.sigmas[0], t.search_most_m)
+        information = np.diag([p.turned_rad**-2] * 3 + [window_m**-2] * 3)
+        for guess in space.search(self._thinned, self._found, window_m, p.starts):
+            placement = space.match(self._thinned, guess, PosePrior(guess, information), wide=True)
+            yield self._candidate(placement, belief, space)
+
+    def _candidate(self, placement: Placement, belief: Belief, space: SpaceMap) -> _Candidate:
+        """A placement of the scan placed last, with its score."""
+        t = self._tracking
+        of_known, of_all = space.agreement(self._thinned, placement.pose)
+        quality = of_all - t.residual_weight_per_m * placement.residual_m
+        score = SURFACES.independent(len(self._thinned.points_m)) * quality + belief.log_density(
+            placement.pose
+        )
+        sure = placement.overlap >= t.sure_overlap and placement.residual_m <= t.max_residual_m
+        return _Candidate(score, placement, of_known, sure)
+
+    def _is_vague(self, belief: Belief) -> bool:
+        """Whether a match alone does not reach all that a belief holds possible."""
+        t, (sigma_m, sigma_rad) = self._tracking, belief.sigmas
+        return t.search_sigmas * max(sigma_m / t.search_above_m, sigma_rad / t.search_above_rad) > 1.0
+
+    def _is_believed(self, best: _Candidate, belief: Belief) -> bool:
+        """Whether a scan lies where it fits best: it fits well near where it is expected, or nothing that is
+        known there speaks against it."""
+        if best.sure and not self._is_vague(belief):
+            return True
+        overlaps = best.placement.overlap >= self._tracking.min_overlap
+        return overlaps and best.agreement >= self._parameters.least_agreement
 
     def extend(self, pose: F64) -> None:
         """Scans join the map in space oftener than keyframes begin, see `cut`."""
@@ -131,34 +201,6 @@ class CarriedSensor:
             self._map.extend(scan, points_m, self._thinned, pose)
         return self._map.cut(scan, pose)
 
-    def _is_doubtful(self, found: Placement, seconds: float, space: SpaceMap) -> bool:
-        """Whether the scan placed last may lie elsewhere: it does not fit, or hardly, after a long time."""
-        t = self._tracking
-        if found.overlap < t.sure_overlap:
-            return True
-        if t.search_sigmas * SMOOTHER.unsteady_radps * seconds < t.search_above_rad:
-            return False
-        return space.agreement(self._thinned, found.pose)[0] < self._parameters.sure_agreement
-
-    def _search(self, prior: PosePrior, found: Placement, space: SpaceMap) -> Placement:
-        """The best placement in all headings around the last pose that was found, with its height and tilt.
-
-        A hand turns fast; then the predicted direction of the step says nothing.
-        """
-        p, t = self._parameters, self._tracking
-        step_m = float(np.linalg.norm(prior.pose[:3, 3] - self._found[:3, 3]))
-        window_m = min(step_m + t.search_sigmas / math.sqrt(prior.information[3, 3]), t.search_most_m)
-        loose = PosePrior(self._found, np.diag([p.turned_rad**-2] * 3 + [window_m**-2] * 3))
-        placements = [found]
-        placements += (
-            space.match(self._thinned, guess, dataclasses.replace(loose, pose=guess))
-            for guess in space.search(self._thinned, self._found, window_m, p.starts)
-        )
-        best = max(placements, key=lambda placement: space.agreement(self._thinned, placement.pose)[1])
-        if space.agreement(self._thinned, best.pose)[0] < p.least_agreement:
-            return Placement(prior.pose, np.zeros((6, 6)), 0.0, 0.0, False)
-        return best
-
 
 def _axes(pose: F64) -> F64:
     """The matrix (6, 6) from a change in the axes of the base, shift first, to one as in `Placement`."""
@@ -167,14 +209,33 @@ def _axes(pose: F64) -> F64:
     return axes
 
 
-def _alone(found: Placement, prior: PosePrior) -> tuple[F64, F64]:
-    """The pose (4, 4) by the points alone, with its information (6, 6) in the axes of the base."""
-    axes = _axes(found.pose)
+def _prior(belief: Belief) -> PosePrior:
+    """A belief in the axes of `Placement`."""
+    axes = _axes(belief.pose)
+    return PosePrior(belief.pose, axes @ np.linalg.inv(belief.covariance) @ axes.T)
+
+
+def _spread(candidates: Sequence[_Candidate], best: _Candidate) -> F64:
+    """The covariance (6, 6) of all candidates about the best one, in the axes of the base there."""
+    mass = np.exp([candidate.score - best.score for candidate in candidates])
+    poses = np.array([candidate.placement.pose for candidate in candidates])
+    away = steps(np.tile(best.placement.pose, (len(poses), 1, 1)), poses).step
+    spread: F64 = np.einsum("n,na,nb->ab", mass / mass.sum(), away, away)
+    return spread
+
+
+def _alone(found: Placement, belief: Belief, spread: F64) -> tuple[F64, F64]:
+    """The pose (4, 4) by the points alone, with its information (6, 6) in the axes of the base.
+
+    spread : covariance (6, 6) of where else the scan may lie.
+    """
+    prior, axes = _prior(belief), _axes(found.pose)
     away, _, _ = steps(prior.pose[None], found.pose[None])
     pulled = axes.T @ prior.information @ axes @ away[0]
-    information = axes.T @ found.information @ axes
-    change = np.linalg.solve(information + 1e-3 * np.eye(6), pulled)
-    return moved(found.pose[None], change[None])[0], information
+    information = axes.T @ found.information @ axes + 1e-3 * np.eye(6)
+    change = np.linalg.solve(information, pulled)
+    wider = np.linalg.inv(np.linalg.inv(information) + spread)
+    return moved(found.pose[None], change[None])[0], np.asarray(wider, np.float64)
 
 
 def first_pose(scan: Scan, points_m: F32) -> F64:

@@ -102,9 +102,13 @@ class SpaceMap:
         sigma_m = self._noise_per_m2 * np.einsum("ij,ij->i", away, away)
         return ThinnedScan(thinned, 1.0 / (1.0 + (sigma_m / self._parameters.good_m) ** 2))
 
-    def match(self, thinned: ThinnedScan, guess: F64, prior: PosePrior) -> Placement:
-        """Register a scan from a guess (4, 4); it is held to a prior."""
-        return self._surfaces.match(thinned.points_m, thinned.weights, guess, prior)
+    def match(self, thinned: ThinnedScan, guess: F64, prior: PosePrior, *, wide: bool) -> Placement:
+        """Register a scan from a guess (4, 4); it is held to a prior. wide : see `SurfaceMap.match`."""
+        return self._surfaces.match(thinned.points_m, thinned.weights, guess, prior, wide=wide)
+
+    def is_held(self, thinned: ThinnedScan, placement: Placement) -> bool:
+        """Whether surfaces hold a scan where it was placed; see `SurfaceMap.is_held`."""
+        return self._surfaces.is_held(thinned.points_m, thinned.weights, placement)
 
     def agreement(self, thinned: ThinnedScan, pose: F64) -> tuple[float, float]:
         """How a scan at a pose (4, 4) agrees with surfaces and free space, see `ColumnMap.agreement`."""

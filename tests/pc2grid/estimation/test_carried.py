@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -60,12 +60,12 @@ def hand(count: int) -> list[F64]:
     return poses
 
 
-def images(count: int = 80) -> Iterator[tuple[Scan, F64]]:
-    """What it sees at 10 Hz, 64 x 50 degrees, with noise, holes and flying pixels, and its pose."""
-    rng, scene = np.random.default_rng(1), room()
+def images(scene: Scene, poses: Sequence[F64], interval_ns: int = 100_000_000) -> Iterator[tuple[Scan, F64]]:
+    """What it sees, 64 x 50 degrees, with noise, holes and flying pixels, and its pose."""
+    rng = np.random.default_rng(1)
     v, u = np.meshgrid(np.linspace(-0.47, 0.47, HEIGHT), np.linspace(-0.63, 0.63, WIDTH), indexing="ij")
     rays = np.column_stack((u.ravel(), v.ravel(), np.ones(u.size)))
-    for k, T in enumerate(hand(count)):
+    for k, T in enumerate(poses):
         T_room_camera = T @ T_BASE_CAMERA
         ahead = rays @ T_room_camera[:3, :3].T
         start = np.tile(T_room_camera[:3, 3], (len(rays), 1))
@@ -78,7 +78,7 @@ def images(count: int = 80) -> Iterator[tuple[Scan, F64]]:
         points = (depth[seen, None] * rays[seen]) @ T_BASE_CAMERA[:3, :3].T
         yield (
             Scan(
-                stamp_ns=100_000_000 * k,
+                stamp_ns=interval_ns * k,
                 points_m=points.astype(np.float32),
                 T_base_sensor=T_BASE_CAMERA,
                 sensor="depth",
@@ -90,7 +90,7 @@ def images(count: int = 80) -> Iterator[tuple[Scan, F64]]:
 
 @pytest.fixture(scope="module")
 def recorded() -> list[tuple[Scan, F64]]:
-    return list(images())
+    return list(images(room(), hand(80)))
 
 
 def tracked(scans: list[Scan]) -> tuple[list[Tracked], Tracker]:
@@ -164,6 +164,32 @@ def test_the_same_scans_give_the_same_bytes(recorded: list[tuple[Scan, F64]]) ->
     for a, b in zip(first, second, strict=True):
         assert a.registered.T_session_base.tobytes() == b.registered.T_session_base.tobytes()
         assert a.planar_scan.hits_m.tobytes() == b.planar_scan.hits_m.tobytes()
+
+
+def test_along_a_bare_wall_nothing_is_known_without_odometry() -> None:
+    """Three times a second, a fifth of a metre a step, the camera passes a long wall without a feature.
+
+    Each image fits the last ones wherever it is put along the wall. Odometry knows how fast it goes.
+    """
+    scene = Scene(box((0.0, 0.0), (40.0, 8.0), 0.0, 6.0))
+    passing = []
+    for k in range(30):
+        T = pose_from_rotation_vector((0.0, 0.0, 0.5 * math.pi)) @ pose_from_rotation_vector((0.0, 0.4, 0.0))
+        T[:3, 3] = 15.0 + 0.2 * k, 6.0, 1.4
+        passing.append(T)
+    scans = [scan for scan, _ in images(scene, passing, 333_000_000)]
+    with_it, _ = tracked(scans)
+    assert not any(one.registered.health is Health.LOST for one in with_it)
+    assert error_m(with_it, passing) < 0.05
+    without, _ = tracked([dataclasses.replace(scan, T_odom_base=None) for scan in scans])
+    fine = sum(one.registered.health is Health.FINE for one in without)
+    assert fine < 4  # the first scan, and hardly one that noise seems to hold
+
+
+def test_in_a_furnished_room_the_pose_is_known_without_odometry(recorded: list[tuple[Scan, F64]]) -> None:
+    found, _ = tracked([dataclasses.replace(scan, T_odom_base=None) for scan, _ in recorded])
+    fine = sum(one.registered.health is Health.FINE for one in found)
+    assert fine > 0.5 * len(found)  # a third is refused
 
 
 @pytest.mark.slow

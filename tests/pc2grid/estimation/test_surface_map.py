@@ -61,6 +61,25 @@ def test_a_floor_alone_does_not_measure_the_position() -> None:
     assert found.overlap == 1.0 and not found.measured
 
 
+def test_what_only_seems_to_be_held_is_not() -> None:
+    """A floor and one wall with 2 cm of noise: the voxels are uneven, so the tangent says that a shift along
+    the wall is measured. Half a voxel aside nothing draws the points back. A corner holds all the same."""
+    rng = np.random.default_rng(3)
+
+    def after(faces: tuple[int, ...]) -> tuple[bool, bool]:
+        """Whether the position seems to be measured, and whether it is held."""
+        first, second = (
+            corner(k, faces) + 0.02 * rng.standard_normal((5000 * len(faces), 3)) for k in (0, 1)
+        )
+        middle = second[(np.abs(second[:, 1]) < 0.7) | (second[:, 1] > 1.3)]  # not the ends of wall and floor
+        surfaces, weights = seen(first), np.ones(len(middle))
+        placed = surfaces.match(middle, weights, np.eye(4), PosePrior(np.eye(4), np.eye(6)))
+        return placed.measured, surfaces.is_held(middle, weights, placed)
+
+    assert after((0, 2)) == (True, False)
+    assert after((0, 1, 2)) == (True, True)
+
+
 def test_a_scan_of_another_place_does_not_overlap() -> None:
     elsewhere = corner(1) + np.array([0.0, 0.0, 9.0])
     found = seen(corner(0)).match(
