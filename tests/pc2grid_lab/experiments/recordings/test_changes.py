@@ -10,7 +10,7 @@ import pytest
 
 from pc2grid_lab.experiments.recordings.chance import by_chance, clopper_pearson
 from pc2grid_lab.experiments.recordings.changes import RowChange, changes
-from pc2grid_lab.experiments.recordings.page import page
+from pc2grid_lab.experiments.recordings.page import page, sensor_matrix
 from pc2grid_lab.experiments.recordings.rows import MapRow, PairRow, QueryRow, Table
 from pc2grid_lab.experiments.recordings.warned import warned
 
@@ -192,3 +192,19 @@ def test_intervals_are_exact() -> None:
     assert (low, high) == pytest.approx((0.187, 0.813), abs=1e-3)
     assert clopper_pearson(10, 10) == pytest.approx((0.692, 1.0), abs=1e-3)
     assert by_chance(0, 3) == 1.0
+
+
+def test_the_matrix_of_sensors_shows_its_gaps() -> None:
+    """Sums over pairs of one building; nothing of other buildings, and a dash where there is no pair."""
+    rows = [
+        pair_row("right", "refused"),
+        pair_row("wrong", building="office"),
+        pair_row("right", sensors="depth in laser"),
+        pair_row("right", "right", sensors="lidar", kind="elsewhere"),
+        pair_row("right", sensors="laser in map"),
+    ]
+    lines = sensor_matrix(table(*rows))
+    cells = {line.split("|")[1].strip(): [c.strip() for c in line.split("|")[2:-1]] for line in lines[2:5]}
+    assert cells["lidar"] == ["-", "-", "-", "-"]
+    assert cells["depth"] == ["-", "-", "1 of 1, 0 wrong (1 building)", "-"]
+    assert cells["laser"] == ["-", "-", "1 of 3, 1 wrong (2 buildings)", "1 of 1, 0 wrong (1 building)"]

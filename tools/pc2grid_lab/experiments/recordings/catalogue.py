@@ -246,6 +246,8 @@ PAIRS: tuple[Pair, ...] = (
     _pair("fewer scans", "hall, every 2nd scan", "hall", 6.0, 6, quick=True),
     _pair("fewer scans", "hall, every 2nd scan", "hall with points", 6.0, 6),
     _pair("fewer scans", "hall, every 3rd scan", "hall", 9.0, 4),
+    _later("e1r_office_a", 10.0, 4.0, 4),
+    _later("kitchen", 4.0, 2.0, 3),
     _later("fr079", 600.0, 20.0, 10),
     _later("intel", 900.0, 25.0, 10),
     _later("csail", 250.0, 6.0, 10, quick=True),

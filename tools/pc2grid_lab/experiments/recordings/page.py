@@ -32,6 +32,10 @@ def page(table: Table, changed: Sequence[RowChange] = ()) -> str:
             "",
             *_places(table),
             "",
+            "## By sensor",
+            "",
+            *sensor_matrix(table),
+            "",
             "## By building",
             "",
             *_by_building(table),
@@ -182,6 +186,41 @@ def _in_space(row: PairRow) -> str:
     """How many answers the points of the map confirm, leave open and contradict; empty without points."""
     said = [query.in_space for query in row.queries if query.in_space is not None]
     return "/".join(str(said.count(status)) for status in ("agrees", "unsure", "contradicts")) if said else ""
+
+
+_SENSORS = ("lidar", "depth", "laser")
+
+
+def sensor_matrix(table: Table) -> list[str]:
+    """Queries by each kind of sensor in maps by each, over all pairs of one building.
+
+    A dash: no two recordings of one building have these sensors, so that nothing was measured.
+    """
+    groups: dict[tuple[str, str], list[PairRow]] = {}
+    for row in table.pairs:
+        if row.kind != "elsewhere" and not row.problem:
+            query, _, map_ = row.sensors.partition(" in ")
+            groups.setdefault((query, map_ or query), []).append(row)
+    sources = (*_SENSORS, "map")
+    heads = (("query by", *(f"in a map by {s}" for s in _SENSORS), "in a map.yaml or a 3D scan"), (), ())
+    cells = [
+        [query, *(_sensor_cell(groups.get((query, source), [])) for source in sources)] for query in _SENSORS
+    ]
+    return [
+        *_markdown(heads, cells),
+        "",
+        "Right of covered, and wrong. -: there is no such pair of real recordings.",
+    ]
+
+
+def _sensor_cell(rows: Sequence[PairRow]) -> str:
+    if not rows:
+        return "-"
+    counts, buildings = _total(rows), len({row.building for row in rows})
+    judged = f"{counts.covered_right} of {counts.covered}, {counts.wrong} wrong"
+    if all(row.truth is None for row in rows):
+        judged = f"{counts.located} of {counts.queries} located, not judged"
+    return f"{judged} ({buildings} building{'s' if buildings > 1 else ''})"
 
 
 def _by_building(table: Table) -> list[str]:
