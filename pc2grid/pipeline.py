@@ -139,10 +139,8 @@ def build_maps(
     planar = SENSOR_MODELS[sensor].planar
     if not any(len(part.trajectory) for part in parts):
         raise NoScans(f"{log.info.path}: no scans in the part asked for", hint="check --start and --duration")
-    if (planar or track.carried) and not track.with_odometry:
-        check_followed(track.outside_rides(), str(log.info.path))
-        if track.carried:
-            check_held(track.trajectory, str(log.info.path))
+    if not track.with_odometry:
+        _check_without_odometry(track, planar, str(log.info.path))
     kept = long_enough(parts)
     reached = [part.storey for part in kept]
     floors, heights_m = floor_names(track.storeys, reached), floor_heights(track.storeys, reached)
@@ -164,6 +162,14 @@ def build_maps(
     )
     observer.on_progress(1.0)
     return maps
+
+
+def _check_without_odometry(track: Track, planar: bool, name: str) -> None:
+    """Raise TrackingLost if the scans of a laser, or of a sensor in the hand, do not tell where they are."""
+    if planar or track.carried:
+        check_followed(track.outside_rides(), name)
+    if track.carried:
+        check_held(track.trajectory, name)
 
 
 def _session_map(
