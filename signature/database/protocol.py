@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from pc2grid.display import short
 from pc2grid.errors import DatabaseError, DatabaseVersion
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from signature.describe import Signature
 
 
+Key = TypeVar("Key")
 Place = str | Path
 """Path of a `*.submaps` file, or URL of a PostgreSQL database."""
 
@@ -97,6 +99,18 @@ class Provenance:
         return f"Provenance({short(self.source)}, sha256 {self.digest[:12]}, {short(self.label)})"
 
 
+class SessionRole(enum.Enum):
+    """What a joined session is to its building (`signature.living`).
+
+    SESSION : a recording or an imported map. LIVING : the living map of a floor, made of such sessions.
+    RETIRED : one of these; the living map is searched for it.
+    """
+
+    SESSION = "session"
+    LIVING = "living"
+    RETIRED = "retired"
+
+
 Covariance = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 """Of x, y and yaw, row by row; metres and radians."""
 
@@ -109,11 +123,19 @@ class BuildingFrame:
         stays when that session is renamed or removed.
     T_building_session : the map frame of the session in that of the building. covariance : of it, in the axes
         of the building.
+    role : what the session is to its building.
     """
 
     name: str
     T_building_session: SE2
     covariance: Covariance
+    role: SessionRole = SessionRole.SESSION
+
+
+def retired(frames: Mapping[Key, BuildingFrame]) -> set[Key]:
+    """Those of joined sessions that a living map stands for. frames : of sessions, by name or number."""
+    living = {frame.name for frame in frames.values() if frame.role is SessionRole.LIVING}
+    return {key for key, at in frames.items() if at.role is SessionRole.RETIRED and at.name in living}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

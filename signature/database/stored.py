@@ -105,6 +105,9 @@ RECOVERED = ("graph", "points", "submaps", "seen", "frame")
 ADDED = ("frame",)
 """The parts that a session gets after it was stored; without them, nothing in its document tells of them."""
 
+_POSE_M = 1.0
+"""Metres of its way for each pose that a session keeps when it is thinned. By hand."""
+
 
 def stored_session(entry: Entry) -> StoredSession:
     """A session as it is stored. Raises ValueError for what its settings do not make."""
@@ -160,6 +163,32 @@ def completed(parts: Mapping[str, Any]) -> StoredSession:
             found.pop("seen", None)
     found.setdefault("seen", seen_from(found["submaps"], grid, config))
     return StoredSession(**found)
+
+
+def thinned(session: StoredSession, frame: BuildingFrame) -> StoredSession:
+    """A session of which only its map is kept, and a pose for each metre of its way: what `completed` makes
+    the rest from, but for the loops, the other poses and the points. frame : its new one."""
+    import networkx as nx
+
+    config, poses = session.info.provenance.config, session.trajectory
+    kept = np.unique(np.floor(poses.path_m() / _POSE_M), return_index=True)[1]
+    trajectory = Trajectory(
+        stamps_ns=poses.stamps_ns[kept],
+        T_session_base=poses.T_session_base[kept],
+        health=tuple(poses.health[k] for k in kept) if poses.health else (),
+    )
+    nothing = SubmapArrays.of((), (), config)
+    return replace(
+        session,
+        info=replace(session.info, submaps=0, scans=len(trajectory)),
+        trajectory=trajectory,
+        loops=(),
+        graph=graph_to_arrays(nx.Graph()),
+        points=None,
+        submaps=nothing,
+        seen=seen_from(nothing, session.grid, config),
+        frame=frame,
+    )
 
 
 def seen_from(submaps: SubmapArrays, grid: OccupancyGrid, config: Config) -> SeenPlaces:

@@ -43,6 +43,10 @@ _Join = Annotated[
     bool | None,
     typer.Option("--join/--no-join", help="join what is new (db join); default: if others are joined"),
 ]
+_Update = Annotated[
+    bool,
+    typer.Option("--update", help="join what is new, and update the living map of its floor (db update)"),
+]
 _Dask = Annotated[
     str | None,
     typer.Option("--dask", metavar="[ADDRESS]", help="of a scheduler; none: processes on this machine"),
@@ -66,6 +70,7 @@ def convert_command(
     points: _Points = None,
     add: _Add = False,
     join: _Join = None,
+    update: _Update = False,
     dask: _Dask = None,
     jobs: _JobCount = None,
     rerun: options.Rerun = None,
@@ -84,6 +89,8 @@ def convert_command(
 
     Example: pc2grid convert monday.mcap -o building.submaps
     """
+    if update and join is False:
+        raise ConfigError("--update joins what is new: not with --no-join")
     _check(output, rerun, dask=dask, jobs=jobs, several=len(inputs) > 1)
     settings = options.make_config(
         config,
@@ -113,7 +120,9 @@ def convert_command(
         quiet=json,
         strict=strict,
     )
-    conversion.join_added(output, done, console.of(context), wanted=join)
+    conversion.join_added(output, done, console.of(context), wanted=True if update else join)
+    if update:
+        conversion.update_living(output, done, console.of(context))
     conversion.conclude(output, done, len(inputs), json=json)
 
 

@@ -222,7 +222,7 @@ def _write_building(
     terminal: console.Console,
 ) -> None:
     """Write the map and the cloud of the sessions of a floor, in the frame of their building."""
-    others = [info.name for info in database.sessions() if info.name not in names]
+    others = [info.name for info in database.sessions() if info.name not in frames]
     if others:
         console.warn(f"not joined, and left out: {', '.join(others)}")
     if outputs.map_stem is not None:

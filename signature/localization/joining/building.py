@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from pc2grid.arrays import F64
+from pc2grid.errors import DatabaseError
 from pc2grid.geometry import SE2
 from pc2grid.mapping.local_maps import pose_at
 from pc2grid.mapping.pose_graph import Edge, information_matrix, optimise
 from pc2grid.model import OccupancyGrid, same_recording
 from pc2grid.observer import Observer
-from signature.database.protocol import BuildingFrame, Covariance, SessionInfo
+from signature.database.protocol import BuildingFrame, Covariance, SessionInfo, SessionRole, retired
 from signature.database.rows import no_session
 from signature.localization.joining.building_map import building_map
 from signature.localization.joining.join import Join, JoinableMap, join_maps
@@ -78,32 +79,44 @@ def join_sessions(
     with each other; the others stay where they are. None: all are joined anew, which `frame` needs.
     observer : gets the progress.
 
-    Raises DatabaseError for a name that no session has.
+    Living maps stay where they are, and are compared in place of the sessions that retired for them.
+
+    Raises DatabaseError for a name that no session has, and for a `frame` where there are living maps.
     """
-    infos = {info.name: info for info in database.sessions()}
+    known = database.frames()
+    asleep = {name: known[name] for name in retired(known)}
+    living = {name for name, at in known.items() if at.role is SessionRole.LIVING}
+    infos = {info.name: info for info in database.sessions() if info.name not in asleep}
+    if living and frame is not None:
+        raise DatabaseError(
+            f"{database.location}: has living maps, which stay in the frames that they have",
+            hint=f"`pc2grid db update --undo {database.location}` first",
+        )
     for name in (*((frame,) if frame else ()), *(only or ())):
         if name not in infos:
             raise no_session(name, infos, database.location)
-    known = database.frames()
+    if only is None and living:
+        only = infos.keys() - living
     wanted = [
         (a, b)
         for a, b in combinations(infos, 2)
         if (only is None or a in only or b in only) and not _told_apart(infos[a], infos[b])
     ]
     pairs = list(_compared(database, infos, wanted, observer))
-    stay = {} if only is None else {name: at for name, at in known.items() if name not in only}
+    stay = {} if only is None else {n: at for n, at in known.items() if n in infos and n not in only}
     frames: dict[str, BuildingFrame] = dict(stay)
     accepted: set[tuple[str, str]] = set()
     for tree in _buildings(infos, pairs, stay):
         members = [name for name in infos if name in tree]
-        anchor = _anchor(members, frame, stay or known)
+        anchor = _anchor(members, frame, stay if any(name in stay for name in members) else known)
         within = [p for p in pairs if p.join.status == "joined" and p.target in tree and p.source in tree]
         placed, counted = _placed(tree, anchor, within, stay)
         frames = placed | frames
         accepted |= counted
+    frames |= asleep
     return Joined(
         pairs=tuple(replace(pair, accepted=pair.names in accepted) for pair in pairs),
-        frames={name: frames[name] for name in infos if name in frames},
+        frames={info.name: frames[info.name] for info in database.sessions() if info.name in frames},
     )
 
 
@@ -234,10 +247,14 @@ def _rows(covariance: F64) -> Covariance:
 
 
 def floors_of(database: SubmapDatabase, frames: Mapping[str, BuildingFrame]) -> tuple[tuple[str, ...], ...]:
-    """The joined sessions of each floor, oldest first. frames : of sessions, by name."""
+    """The joined sessions of each floor, oldest first, without those that a living map stands for.
+
+    frames : of sessions, by name.
+    """
     floors: dict[str, list[str]] = {}
+    asleep = retired(frames)
     for info in database.sessions():
-        if info.name in frames:
+        if info.name in frames and info.name not in asleep:
             floors.setdefault(frames[info.name].name, []).append(info.name)
     return tuple(tuple(names) for names in floors.values())
 
@@ -250,5 +267,6 @@ def map_of(database: SubmapDatabase, session: str, frames: Mapping[str, Building
     """
     if session not in frames:
         return database.grid(session)
-    names = next(names for names in floors_of(database, frames) if session in names)
+    floor = frames[session].name
+    names = next(names for names in floors_of(database, frames) if frames[names[0]].name == floor)
     return building_map([(database.grid(name), frames[name].T_building_session) for name in names])

@@ -1,4 +1,4 @@
-"""The maps of joined sessions as one: in each cell the newest session that knows it."""
+"""The maps of joined sessions as one: in each cell the newest session that is sure of it."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import hand_over
 from pc2grid.geometry import SE2
-from pc2grid.model import UNKNOWN, OccupancyGrid
+from pc2grid.model import FREE, FREE_BELOW, OCCUPIED_FROM, THING, UNKNOWN, OccupancyGrid
 
 
 def building_map(maps: Sequence[tuple[OccupancyGrid, SE2]]) -> OccupancyGrid:
     """The maps of sessions, oldest first, each with its T_building_session, as one in the building's frame.
 
-    Cells are as large as those of the first map; each is what the newest map that knows its centre says.
+    Cells are as large as those of the first map; each is what the newest map says that is sure of its centre
+    (free, occupied, or a thing); where none is sure, the oldest that knows it.
     Raises ValueError without a map.
 
     >>> import pc2grid
@@ -40,7 +41,9 @@ def building_map(maps: Sequence[tuple[OccupancyGrid, SE2]]) -> OccupancyGrid:
         told = _cells_at(grid, T_building_session.inverse().apply(whole.to_point(at.reshape(-1, 2))))
         window = cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         told = told.reshape(window.shape)
-        window[told != UNKNOWN] = told[told != UNKNOWN]
+        sure = (told >= OCCUPIED_FROM) | (told == THING) | ((told >= FREE) & (told < FREE_BELOW))
+        chosen = sure | ((told != UNKNOWN) & (window == UNKNOWN))
+        window[chosen] = told[chosen]
     return OccupancyGrid(cells=hand_over(cells), resolution_m=cell_m, origin_m=origin_m)
 
 
