@@ -36,6 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("convert", folder / "office.yaml", "-o", folder / "b.submaps"),
         ("simulate", folder / "office.yaml", folder / "drive.mcap", *laser),
         ("convert", folder / "office.yaml", folder / "part.yaml", "-o", folder / "two.submaps"),
+        ("convert", folder / "office.yaml", folder / "part.yaml", "-o", folder / "joined.submaps", "--join"),
     ):
         assert CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False).exit_code == 0
     data = bytearray((folder / "b.submaps").read_bytes())
@@ -66,6 +67,8 @@ COMMANDS = [
     ("db-check", "db check b.submaps", 0),
     ("db-check", "db check damaged.submaps", 1),
     ("db-join", "db join two.submaps", 0),
+    ("db-update", "db update joined.submaps", 0),
+    ("db-update", "db update joined.submaps --undo", 0),
     ("db-copy", "db copy b.submaps -o out.submaps", 0),
     ("db-copy", "db copy --recover damaged.submaps -o out.submaps", 3),
     ("db-merge", "db merge b.submaps -o out.submaps", 0),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -9,14 +11,20 @@ from typing import Annotated
 import typer
 
 from pc2grid.display import counted
-from pc2grid.errors import DatabaseError, one_line
+from pc2grid.errors import DatabaseCorrupt, DatabaseError, one_line
 from pc2grid_cli import console
 from pc2grid_cli.json_schemas import DbCheck, DbInfo, DbWrite, StoredInfo, plain
 from pc2grid_cli.options import DATABASE, AsJson, Database, Force, WrittenDatabase
 from pc2grid_cli.session_documents import precision_summary
-from signature.database import Problem, SessionInfo, open_database
+from signature.database import Problem, SessionInfo, SubmapDatabase, open_database
 from signature.database.maintenance import check, copy, merge, remove, rename, shown, split
+from signature.database.protocol import SessionRole
 
+_ROLES = {
+    SessionRole.SESSION: "",
+    SessionRole.LIVING: ", the living map of its floor",
+    SessionRole.RETIRED: ", retired: the living map is searched for it",
+}
 _Sessions = Annotated[list[str], typer.Argument(metavar="SESSION...", help="which of its sessions")]
 
 
@@ -26,12 +34,12 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
     Example: pc2grid db info building.submaps
     """
     with open_database(database) as opened:
-        sessions, where = opened.sessions(), opened.location
+        sessions, where, roles = opened.sessions(), opened.location, _roles(opened)
     if json:
         document: DbInfo = {
             "schema_version": 1,
             "database": where,
-            "sessions": list(map(_document, sessions)),
+            "sessions": [_document(session, roles[session.name]) for session in sessions],
         }
         console.print_json(plain(DbInfo, document))
         return
@@ -49,12 +57,21 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
             line += f", bent: contradicts itself along {s.consistency.contradicted:.0%} of the travel"
         if s.precision is not None and s.precision.loose:
             line += f", loosely tied: places up to +- {s.precision.worst_m:.1f} m"
-        print(one_line(line))
+        print(one_line(line + _ROLES[roles[s.name]]))
 
 
-def _document(s: SessionInfo) -> StoredInfo:
+def _roles(database: SubmapDatabase) -> dict[str, SessionRole]:
+    """What each session is to its building."""
+    with contextlib.suppress(DatabaseCorrupt):  # `db check` reports it
+        roles = {name: frame.role for name, frame in database.frames().items()}
+        return defaultdict(lambda: SessionRole.SESSION, roles)
+    return defaultdict(lambda: SessionRole.SESSION)
+
+
+def _document(s: SessionInfo, role: SessionRole) -> StoredInfo:
     return {
         "name": s.name,
+        "role": role.value,
         "sensor": s.sensor,
         "building": s.provenance.label.building,
         "floor": s.provenance.label.floor,

@@ -24,7 +24,9 @@ from pc2grid.observer import Observer
 from signature.database.protocol import BuildingFrame, Covariance, SessionInfo, SessionRole, retired
 from signature.database.rows import no_session
 from signature.localization.joining.building_map import building_map
+from signature.localization.joining.candidates import CANDIDATES, LookedAt, candidates
 from signature.localization.joining.join import Join, JoinableMap, join_maps
+from signature.localization.joining.journal import JoinJournal, key_of
 from signature.localization.lazy_maps import LazySequence
 
 if TYPE_CHECKING:
@@ -70,6 +72,7 @@ def join_sessions(
     *,
     frame: str | None = None,
     only: Collection[str] | None = None,
+    journal: JoinJournal | None = None,
     observer: Observer = Observer(),
 ) -> Joined:
     """Which sessions of a database show one building, and how they lie in its frame.
@@ -77,8 +80,10 @@ def join_sessions(
     frame : the session whose map frame is that of its building. None: the frame of those that were joined
     before, else of the session that was stored first. only : sessions that are joined, with the others and
     with each other; the others stay where they are. None: all are joined anew, which `frame` needs.
-    observer : gets the progress.
+    journal : keeps what is compared, and knows what need not be compared again. observer : gets the
+    progress.
 
+    Of many sessions, each is compared with those that look most like it (`candidates`), each pair once.
     Living maps stay where they are, and are compared in place of the sessions that retired for them.
 
     Raises DatabaseError for a name that no session has, and for a `frame` where there are living maps.
@@ -97,12 +102,8 @@ def join_sessions(
             raise no_session(name, infos, database.location)
     if only is None and living:
         only = infos.keys() - living
-    wanted = [
-        (a, b)
-        for a, b in combinations(infos, 2)
-        if (only is None or a in only or b in only) and not _told_apart(infos[a], infos[b])
-    ]
-    pairs = list(_compared(database, infos, wanted, observer))
+    wanted = _wanted(database, infos, infos.keys() if only is None else only)
+    pairs = list(_compared(database, infos, wanted, journal, observer))
     stay = {} if only is None else {n: at for n, at in known.items() if n in infos and n not in only}
     frames: dict[str, BuildingFrame] = dict(stay)
     accepted: set[tuple[str, str]] = set()
@@ -120,6 +121,28 @@ def join_sessions(
     )
 
 
+def _wanted(
+    database: SubmapDatabase, infos: Mapping[str, SessionInfo], only: Collection[str]
+) -> list[tuple[str, str]]:
+    """The pairs that are compared, one of them at least of `only`, in the order of the sessions."""
+
+    def comparable(a: str, b: str) -> bool:
+        return not _told_apart(infos[a], infos[b])
+
+    if len(infos) <= 1 + CANDIDATES.sessions:
+        pairs = {(a, b) for a, b in combinations(infos, 2) if a in only or b in only}
+    else:
+        places = {name: LookedAt.of(database.seen_places(name)) for name in infos}
+        found = candidates(places, only, comparable, CANDIDATES)
+        order = {name: number for number, name in enumerate(infos)}
+        pairs = {
+            (min(a, b, key=order.__getitem__), max(a, b, key=order.__getitem__))
+            for a, others in found.items()
+            for b in others
+        }
+    return [pair for pair in combinations(infos, 2) if pair in pairs and comparable(*pair)]
+
+
 def _told_apart(a: SessionInfo, b: SessionInfo) -> bool:
     """Whether labels say that two sessions are not of one floor of one building."""
     one_recording = same_recording(a.name, b.name)
@@ -130,6 +153,7 @@ def _compared(
     database: SubmapDatabase,
     infos: Mapping[str, SessionInfo],
     pairs: Sequence[tuple[str, str]],
+    journal: JoinJournal | None,
     observer: Observer,
 ) -> Iterator[SessionPair]:
     """Each pair joined, as far as it can be."""
@@ -146,7 +170,13 @@ def _compared(
         for done, (a, b) in enumerate(pairs):
             target, source = maps[names.index(a)], maps[names.index(b)]
             labelled = infos[a].provenance.label.agrees(infos[b].provenance.label)
-            yield SessionPair(target=a, source=b, join=join_maps(target, source, labelled=labelled))
+            key = "" if journal is None else key_of(target.grid, source.grid, labelled=labelled)
+            join = None if journal is None else journal.find(key)
+            if join is None:
+                join = join_maps(target, source, labelled=labelled)
+                if journal is not None:
+                    journal.add(key, join)
+            yield SessionPair(target=a, source=b, join=join)
             observer.on_progress((done + 1) / len(pairs))
 
 

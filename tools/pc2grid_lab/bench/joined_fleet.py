@@ -1,0 +1,193 @@
+"""A fleet's sessions joined: how long it takes, what is joined, and whether it goes on after it was killed.
+
+python -m pc2grid_lab.bench.joined_fleet FOLDER [--buildings N] [--sessions N] [-o OUT.json]
+
+Small offices, each driven through several times by a laser, its doors and furniture different each time, are
+mapped as a user's recordings are and stored without labels, all in one database. What is there already in the
+folder is not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import networkx as nx
+import numpy as np
+
+from pc2grid.geometry import SE2
+from pc2grid.model import Scan, SessionMap
+from pc2grid.pipeline import map_scans
+from pc2grid.simulate import office_floorplan
+from pc2grid.simulate.session import plan_session
+from pc2grid.submaps.partition import divide
+from pc2grid_lab.worlds import WorldConfig
+from pc2grid_lab.worlds.change import change_building
+from signature.config import Config
+from signature.database import maintenance, open_database
+from signature.database.protocol import BuildingFrame
+from signature.localization.joining.building import Joined, join_sessions
+from signature.localization.joining.journal import JoinJournal
+from signature.sessions import add_sessions, provenance
+
+_SIDES_M = (26.0, 22.0)
+_LENGTH_M, _RATE_HZ = 50.0, 3.0
+_THINGS, _DOORS = 20, 0.6
+
+
+def fleet(folder: Path, buildings: int, sessions: int) -> Path:
+    """The database of all sessions, `building-number`, and their truth in `truth.json`: T_plan_map."""
+    truth: dict[str, list[float]] = {}
+    parts = []
+    for building in range(buildings):
+        part, known = folder / f"{building}.submaps", folder / f"{building}.json"
+        if not known.exists():
+            made = dict(_sessions(building, sessions))
+            config = Config()
+            entries = [(m, provenance(name, f"{building}-{name}", config)) for name, (m, _) in made.items()]
+            add_sessions(part, entries, config, keep=False, force=True)
+            known.write_text(json.dumps({name: [T.x, T.y, T.yaw] for name, (_, T) in made.items()}))
+        truth |= json.loads(known.read_text())
+        parts.append(part)
+    path = folder / "fleet.submaps"
+    maintenance.merge(parts, path, force=True)
+    (folder / "truth.json").write_text(json.dumps(truth))
+    return path
+
+
+def _sessions(building: int, sessions: int) -> Iterator[tuple[str, tuple[SessionMap, SE2]]]:
+    plan = office_floorplan(1000 + building, *_SIDES_M)
+    config = Config()
+    for number in range(sessions):
+        world = WorldConfig.model_validate(
+            {
+                "length_m": _LENGTH_M,
+                "seed": 1000 * building + number,
+                "clutter": _THINGS,
+                "change": {"doors": _DOORS},
+                "laser": {"rate_hz": _RATE_HZ},
+            }
+        )
+        streams = (np.random.default_rng([world.seed, 6]), np.random.default_rng([building, 1]))
+        robot_m = world.drive.clearance_m
+        _, _, doors = change_building(plan, None, world.change, *streams, robot_m=robot_m)
+        drive, true_m = plan_session("laser", plan, None, world, doors.added), []
+
+        def scans() -> Iterator[Scan]:
+            for scan, truth in drive.scans():  # noqa: B023  # used up before the next drive
+                true_m.append((truth.x, truth.y))  # noqa: B023
+                yield scan
+
+        grid, trajectory, loops = map_scans(scans(), config)
+        graph, submaps = divide(grid, config.partition)
+        name = f"{building}-{number}"
+        yield (
+            name,
+            (
+                SessionMap(
+                    session=name,
+                    sensor="laser",
+                    grid=grid,
+                    submaps=submaps,
+                    trajectory=trajectory,
+                    loops=loops,
+                    graph=graph,
+                ),
+                SE2.fit(trajectory.planar()[:, :2], np.array(true_m)),
+            ),
+        )
+
+
+def summary(found: Joined, truth: Mapping[str, Sequence[float]]) -> dict[str, object]:
+    """What was compared and joined, and how far joined sessions lie from the truth."""
+    T_plan = {name: SE2(*pose) for name, pose in truth.items()}
+    true = [pair for pair in found.pairs if _building(pair.target) == _building(pair.source)]
+    joined = [pair for pair in found.pairs if pair.accepted]
+    errors = []
+    for pair in joined:
+        if _building(pair.target) == _building(pair.source):
+            T = T_plan[pair.target].inverse() @ T_plan[pair.source]
+            off = T.inverse() @ pair.join.T_target_source
+            errors.append(math.hypot(off.x, off.y))
+    groups = nx.Graph(pair.names for pair in joined)
+    sizes = sorted(map(len, nx.connected_components(groups)), reverse=True)
+    return {
+        "sessions": len(truth),
+        "buildings": len({_building(name) for name in truth}),
+        "pairs compared": len(found.pairs),
+        "of these of one building": len(true),
+        "joined": len(joined),
+        "joined, though different": len(joined) - len(errors),
+        "error, median and largest, m": [round(float(f(errors)), 3) for f in (np.median, np.max)]
+        if errors
+        else [],
+        "sessions in a frame": len(found.frames),
+        "sizes of what hangs together": sizes,
+    }
+
+
+def _building(name: str) -> str:
+    return name.partition("-")[0]
+
+
+def measured(
+    path: Path, truth: Mapping[str, Sequence[float]]
+) -> tuple[dict[str, object], dict[str, BuildingFrame]]:
+    """Join all sessions of a database in this process, and say what it took."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    with open_database(path) as database:
+        found = join_sessions(database)
+    took = {"wall, s": round(time.perf_counter() - wall), "cpu, s": round(time.process_time() - cpu)}
+    return summary(found, truth) | took, dict(found.frames)
+
+
+def resumed(path: Path, folder: Path) -> tuple[int, dict[str, BuildingFrame]]:
+    """Kill `db join` when it has compared some pairs, and begin again: how many it knew, and the frames."""
+    again = folder / "killed.submaps"
+    shutil.copy(path, again)
+    journal = again.with_name(again.name + ".joining")
+    journal.unlink(missing_ok=True)
+    command = [sys.executable, "-c", "from pc2grid_cli.main import main; main()", "db", "join", str(again)]
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    while running.poll() is None and (not journal.exists() or journal.read_bytes().count(b"\n") < 10):
+        time.sleep(0.05)
+    running.send_signal(signal.SIGKILL)
+    running.wait()
+    known = len(JoinJournal(journal))
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    with open_database(again) as database:
+        return known, database.frames()
+
+
+def main() -> None:
+    """Make the fleet, join it, kill and resume it, and write the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--buildings", type=int, default=20)
+    parser.add_argument("--sessions", type=int, default=15, help="of each building")
+    parser.add_argument("--kill", action="store_true", help="also kill and resume: takes as long again")
+    parser.add_argument("-o", "--output", type=Path)
+    arguments = parser.parse_args()
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    path = fleet(arguments.folder, arguments.buildings, arguments.sessions)
+    truth = json.loads((arguments.folder / "truth.json").read_text())
+    found, frames = measured(path, truth)
+    if arguments.kill:
+        known, again = resumed(path, arguments.folder)
+        found |= {"compared when killed": known, "the same after that": again == frames}
+    text = json.dumps(found, indent=1)
+    print(text)
+    if arguments.output is not None:
+        arguments.output.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
