@@ -1,10 +1,11 @@
 """The living map of a floor: one map of all its joined sessions, which is searched in their place.
 
-Sessions of one floor repeat each other, and the older ones show what has moved since. The living map takes
-each cell from the newest session that is sure of it (`building_map`); places and signatures are made from it
-anew. Its sessions retire: they keep their maps, from which the next living map is made and they themselves
-are made whole again, and lose what only a search needs. So what is searched grows with the floor, not with
-the years.
+Sessions of one floor repeat each other, and the older ones show what has moved since. The living map adds up
+what all of them say of each cell (`evidence_map`): what has stood in every session is certain, what moves is
+not; places and signatures are made from it anew. Its sessions retire: they keep their maps, from which the
+next living map is made and they themselves are made whole again, and lose what only a search needs. So what
+is searched grows with the floor, not with the years. The map that is exported shows what stands there now
+(`building_map`), and is made from the same maps.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from pc2grid.submaps.partition import divide
 from signature.database import maintenance, open_database
 from signature.database.protocol import BuildingFrame, Label, Place, Provenance, SessionRole
 from signature.database.stored import StoredSession, completed, stored_session, thinned
-from signature.localization.joining.building_map import building_map
+from signature.localization.joining.building_map import evidence_map
 from signature.sessions import describe_all, provenance
 
 if TYPE_CHECKING:
@@ -152,7 +153,7 @@ def _living(
     config = newest.provenance.config
     voxel_m = {"points_voxel_m": None if points is None else points.voxel_m}
     config = config.model_copy(update={"projection": config.projection.model_copy(update=voxel_m)})
-    grid = building_map([(database.grid(member), T) for member, T in placed])
+    grid = evidence_map([(database.grid(member), T) for member, T in placed])
     graph, submaps = divide(grid, config.partition)
     whole = SessionMap(
         session=name,

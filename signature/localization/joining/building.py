@@ -277,15 +277,12 @@ def _rows(covariance: F64) -> Covariance:
 
 
 def floors_of(database: SubmapDatabase, frames: Mapping[str, BuildingFrame]) -> tuple[tuple[str, ...], ...]:
-    """The joined sessions of each floor, oldest first, without those that a living map stands for.
-
-    frames : of sessions, by name.
-    """
+    """The joined sessions of each floor, its living map first, then the oldest. frames : of sessions, by
+    name."""
     floors: dict[str, list[str]] = {}
-    asleep = retired(frames)
-    for info in database.sessions():
-        if info.name in frames and info.name not in asleep:
-            floors.setdefault(frames[info.name].name, []).append(info.name)
+    names = [info.name for info in database.sessions() if info.name in frames]
+    for name in sorted(names, key=lambda name: frames[name].role is not SessionRole.LIVING):
+        floors.setdefault(frames[name].name, []).append(name)
     return tuple(tuple(names) for names in floors.values())
 
 

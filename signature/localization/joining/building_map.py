@@ -1,15 +1,23 @@
-"""The maps of joined sessions as one: in each cell the newest session that is sure of it."""
+"""The maps of joined sessions as one: what stands there now, or what all of them say."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import hand_over
+from pc2grid.arrays import BoolGrid, hand_over
 from pc2grid.geometry import SE2
 from pc2grid.model import FREE, FREE_BELOW, OCCUPIED_FROM, THING, UNKNOWN, OccupancyGrid
+
+Cells = NDArray[np.int8]
+SUREST = 99
+"""Percent, of a cell that is occupied for sure; 100 less it, that is free: as sure as a session's map is that
+was made from scans (`OccupancyParameters.limit`)."""
+_MOST = float(np.log(SUREST / (100 - SUREST)))
+"""The same as log-odds."""
 
 
 def building_map(maps: Sequence[tuple[OccupancyGrid, SE2]]) -> OccupancyGrid:
@@ -25,26 +33,72 @@ def building_map(maps: Sequence[tuple[OccupancyGrid, SE2]]) -> OccupancyGrid:
     >>> round(moved.free_m2 / plan.free_m2, 2), round(moved.origin_m[0] - plan.origin_m[0], 2)
     (1.0, 10.0)
     """
+    whole = _around(maps)
+    cells = whole.cells.copy()
+    for window, told in _drawn(maps, whole):
+        here = cells[window]
+        chosen = _sure(told) | ((told != UNKNOWN) & (here == UNKNOWN))
+        here[chosen] = told[chosen]
+    return replace(whole, cells=hand_over(cells))
+
+
+def evidence_map(maps: Sequence[tuple[OccupancyGrid, SE2]]) -> OccupancyGrid:
+    """The maps of sessions, oldest first, each with its T_building_session, as one by what all of them say.
+
+    The log-odds of a cell are added up from map to map, and never exceed `SUREST`, what a map may say by
+    itself (Yguel, Aycard and Laugier, "Update policy of dense maps: efficient algorithms and sparse
+    representation", FSR 2007). So what stands in every session is certain; what came or went with the newest
+    one is undecided, which tells for no place and against none; and the session after that decides. Things
+    are those of the newest map that is sure. Raises ValueError without a map.
+    """
+    whole = _around(maps)
+    log_odds = np.zeros(whole.cells.shape, np.float32)
+    known, things = np.zeros(whole.cells.shape, bool), np.zeros(whole.cells.shape, bool)
+    for window, told in _drawn(maps, whole):
+        share = np.clip(told, 100 - SUREST, SUREST).astype(np.float32) / 100.0
+        evidence = np.where(told == UNKNOWN, 0.0, np.log(share / (1.0 - share)))
+        log_odds[window] = np.clip(log_odds[window] + evidence, -_MOST, _MOST)
+        known[window] |= told != UNKNOWN
+        things[window] = np.where(_sure(told), told == THING, things[window])
+    percent = np.rint(100.0 / (1.0 + np.exp(-log_odds))).astype(np.int8)
+    percent[percent == THING] -= 1
+    percent[things], percent[~known] = THING, UNKNOWN
+    return replace(whole, cells=hand_over(percent))
+
+
+def _sure(cells: Cells) -> BoolGrid:
+    """Where a map says what is there: an obstacle, a thing, or nothing."""
+    return np.asarray((cells >= OCCUPIED_FROM) | (cells == THING) | ((cells >= FREE) & (cells < FREE_BELOW)))
+
+
+def _around(maps: Sequence[tuple[OccupancyGrid, SE2]]) -> OccupancyGrid:
+    """A grid of unknown cells that holds all maps."""
     if not maps:
         raise ValueError("a building without a map")
     cell_m = maps[0][0].resolution_m
     corners_m = np.concatenate([T.apply(_corners(grid)) for grid, T in maps])
     low = np.floor(corners_m.min(axis=0) / cell_m + 1e-6)
     width, height = (np.ceil(corners_m.max(axis=0) / cell_m - 1e-6) - low).astype(int).tolist()
-    cells = np.full((height, width), UNKNOWN, np.int8)
     x, y = (low * cell_m).tolist()
-    origin_m = (float(x), float(y))
-    whole = OccupancyGrid(cells=cells, resolution_m=cell_m, origin_m=origin_m)
+    heights_m = {grid.height_m for grid, _ in maps}
+    return OccupancyGrid(
+        cells=np.full((height, width), UNKNOWN, np.int8),
+        resolution_m=cell_m,
+        origin_m=(float(x), float(y)),
+        height_m=None if None in heights_m else float(np.mean([grid.height_m for grid, _ in maps])),
+    )
+
+
+def _drawn(
+    maps: Sequence[tuple[OccupancyGrid, SE2]], whole: OccupancyGrid
+) -> Iterator[tuple[tuple[slice, slice], Cells]]:
+    """For each map the window of the grid that it lies in, and what it says of the cells there."""
     for grid, T_building_session in maps:
         rows, columns = _covered(whole, T_building_session.apply(_corners(grid)))
         at = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
         told = _cells_at(grid, T_building_session.inverse().apply(whole.to_point(at.reshape(-1, 2))))
-        window = cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        told = told.reshape(window.shape)
-        sure = (told >= OCCUPIED_FROM) | (told == THING) | ((told >= FREE) & (told < FREE_BELOW))
-        chosen = sure | ((told != UNKNOWN) & (window == UNKNOWN))
-        window[chosen] = told[chosen]
-    return OccupancyGrid(cells=hand_over(cells), resolution_m=cell_m, origin_m=origin_m)
+        window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        yield window, told.reshape(len(rows), len(columns))
 
 
 def _corners(grid: OccupancyGrid) -> NDArray[np.float64]:

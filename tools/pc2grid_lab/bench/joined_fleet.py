@@ -26,7 +26,7 @@ import numpy as np
 from pc2grid.geometry import SE2
 from pc2grid.model import Scan, SessionMap
 from pc2grid.pipeline import map_scans
-from pc2grid.simulate import office_floorplan
+from pc2grid.simulate import Session, office_floorplan
 from pc2grid.simulate.session import plan_session
 from pc2grid.submaps.partition import divide
 from pc2grid_lab.worlds import WorldConfig
@@ -48,25 +48,33 @@ def fleet(folder: Path, buildings: int, sessions: int) -> Path:
     truth: dict[str, list[float]] = {}
     parts = []
     for building in range(buildings):
-        part, known = folder / f"{building}.submaps", folder / f"{building}.json"
-        if not known.exists():
-            made = dict(_sessions(building, sessions))
-            config = Config()
-            entries = [(m, provenance(name, f"{building}-{name}", config)) for name, (m, _) in made.items()]
-            add_sessions(part, entries, config, keep=False, force=True)
-            known.write_text(json.dumps({name: [T.x, T.y, T.yaw] for name, (_, T) in made.items()}))
-        truth |= json.loads(known.read_text())
-        parts.append(part)
+        parts.append(building_of(folder, building, sessions))
+        truth |= json.loads(parts[-1].with_suffix(".json").read_text())
     path = folder / "fleet.submaps"
     maintenance.merge(parts, path, force=True)
     (folder / "truth.json").write_text(json.dumps(truth))
     return path
 
 
-def _sessions(building: int, sessions: int) -> Iterator[tuple[str, tuple[SessionMap, SE2]]]:
+def building_of(folder: Path, building: int, sessions: int) -> Path:
+    """The database of a building, and its truth beside it, ending in `.json`."""
+    path = folder / f"{building}.submaps"
+    known = path.with_suffix(".json")
+    if not known.exists():
+        config, made, truth = Config(), [], {}
+        for number, drive in enumerate(drives(building, sessions)):
+            session, T_plan_map = mapped(drive, f"{building}-{number}", config)
+            made.append((session, provenance(session.session, f"{building}-{number}", config)))
+            truth[session.session] = [T_plan_map.x, T_plan_map.y, T_plan_map.yaw]
+        add_sessions(path, made, config, keep=False, force=True)
+        known.write_text(json.dumps(truth))
+    return path
+
+
+def drives(building: int, count: int) -> Iterator[Session]:
+    """So many drives through a building, whose doors and furniture are different each time."""
     plan = office_floorplan(1000 + building, *_SIDES_M)
-    config = Config()
-    for number in range(sessions):
+    for number in range(count):
         world = WorldConfig.model_validate(
             {
                 "length_m": _LENGTH_M,
@@ -79,31 +87,30 @@ def _sessions(building: int, sessions: int) -> Iterator[tuple[str, tuple[Session
         streams = (np.random.default_rng([world.seed, 6]), np.random.default_rng([building, 1]))
         robot_m = world.drive.clearance_m
         _, _, doors = change_building(plan, None, world.change, *streams, robot_m=robot_m)
-        drive, true_m = plan_session("laser", plan, None, world, doors.added), []
+        yield plan_session("laser", plan, None, world, doors.added)
 
-        def scans() -> Iterator[Scan]:
-            for scan, truth in drive.scans():  # noqa: B023  # used up before the next drive
-                true_m.append((truth.x, truth.y))  # noqa: B023
-                yield scan
 
-        grid, trajectory, loops = map_scans(scans(), config)
-        graph, submaps = divide(grid, config.partition)
-        name = f"{building}-{number}"
-        yield (
-            name,
-            (
-                SessionMap(
-                    session=name,
-                    sensor="laser",
-                    grid=grid,
-                    submaps=submaps,
-                    trajectory=trajectory,
-                    loops=loops,
-                    graph=graph,
-                ),
-                SE2.fit(trajectory.planar()[:, :2], np.array(true_m)),
-            ),
-        )
+def mapped(drive: Session, name: str, config: Config) -> tuple[SessionMap, SE2]:
+    """A drive mapped as a user's recording is, and T_plan_map."""
+    true_m: list[tuple[float, float]] = []
+
+    def scans() -> Iterator[Scan]:
+        for scan, truth in drive.scans():
+            true_m.append((truth.x, truth.y))
+            yield scan
+
+    grid, trajectory, loops = map_scans(scans(), config)
+    graph, submaps = divide(grid, config.partition)
+    made = SessionMap(
+        session=name,
+        sensor="laser",
+        grid=grid,
+        submaps=submaps,
+        trajectory=trajectory,
+        loops=loops,
+        graph=graph,
+    )
+    return made, SE2.fit(trajectory.planar()[:, :2], np.array(true_m))
 
 
 def summary(found: Joined, truth: Mapping[str, Sequence[float]]) -> dict[str, object]:
