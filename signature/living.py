@@ -55,38 +55,51 @@ def update(target: Place, frames: Collection[str] | None = None) -> tuple[Living
 
     frames : of the buildings that are updated; None: all.
 
-    Raises DatabaseError if no two sessions are joined, and as `maintenance.replace_sessions`.
+    Raises DatabaseError if no two sessions are joined, or if a session has the name of a living map and is
+    none, and as `maintenance.replace_sessions`.
     """
-    changed: list[StoredSession] = []
-    made: list[LivingMap] = []
     with open_database(target) as database:
         known = database.frames()
-        for name, members in _floors(database, known, frames).items():
-            session = _living(database, name, members, known)
-            changed.append(session)
-            changed += [
-                thinned(database.stored(m), replace(known[m], role=SessionRole.RETIRED))
-                for m in members
-                if known[m].role is not SessionRole.RETIRED
-            ]
-            about = session.info
-            made.append(
-                LivingMap(
-                    name=name,
-                    frame=known[members[0]].name,
-                    members=tuple(members),
-                    free_m2=about.area_m2,
-                    submaps=about.submaps,
-                )
-            )
-    if not made:
+        floors = _floors(database, known, frames)
+        _refuse_taken(database, known, floors)
+        lived = [_living(database, name, members, known) for name, members in floors.items()]
+        retiring = [
+            thinned(database.stored(name), replace(known[name], role=SessionRole.RETIRED))
+            for name in (member for members in floors.values() for member in members)
+            if known[name].role is not SessionRole.RETIRED
+        ]
+    if not floors:
         where = maintenance.shown(target)
         raise DatabaseError(
             f"{where}: no two sessions of one building are joined",
             hint=f"`pc2grid db join {where}` finds out which show one building",
         )
-    maintenance.replace_sessions(target, changed)
-    return tuple(made)
+    # Living maps that were renamed, or whose sessions are gone.
+    living = {n for n, at in known.items() if at.role is SessionRole.LIVING}
+    stale = [n for n in living - floors.keys() if frames is None or known[n].name in frames]
+    maintenance.replace_sessions(target, [*lived, *retiring], remove=stale)
+    return tuple(
+        LivingMap(
+            name=made.info.name,
+            frame=known[members[0]].name,
+            members=tuple(members),
+            free_m2=made.info.area_m2,
+            submaps=made.info.submaps,
+        )
+        for made, members in zip(lived, floors.values(), strict=True)
+    )
+
+
+def _refuse_taken(
+    database: SubmapDatabase, known: Mapping[str, BuildingFrame], names: Collection[str]
+) -> None:
+    """Raises DatabaseError if a session has one of the names of living maps and is none."""
+    for info in database.sessions(names):
+        if info.name not in known or known[info.name].role is not SessionRole.LIVING:
+            raise DatabaseError(
+                f"{database.location}: holds a session {info.name!r} that is no living map",
+                hint=f"`pc2grid db rename {database.location} {info.name} NAME` gives it another name",
+            )
 
 
 def undo(target: Place) -> tuple[str, ...]:

@@ -163,6 +163,22 @@ def test_without_its_living_map_a_session_that_retired_is_no_longer_passed_over(
         assert floors_of(database, database.frames()) == (("west", "east"),)
 
 
+def test_there_is_one_living_map_and_no_other_session_is_replaced(tmp_path: Path) -> None:
+    """The living map was renamed; then a recording got the name that the next one would have."""
+    path = tmp_path / "x.submaps"
+    store(path, MAPS, FRAMES)
+    living.update(path)
+    maintenance.rename(path, "west.living", "mine")
+    living.update(path)
+    assert [name for name, role in names(path).items() if role is SessionRole.LIVING] == ["west.living"]
+    living.undo(path)
+    maintenance.rename(path, "east", "west.living")
+    before = path.read_bytes()
+    with pytest.raises(DatabaseError, match="that is no living map") as refused:
+        living.update(path)
+    assert "db rename" in str(refused.value.hint) and path.read_bytes() == before
+
+
 def test_nothing_joined_is_an_error_and_changes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "x.submaps"
     store(path, MAPS, {})

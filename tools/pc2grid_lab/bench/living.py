@@ -45,7 +45,7 @@ from signature.sessions import add_sessions, provenance
 _FIXED, _MOVED, _PRESENT, _DOORS = 10, 50, 20, 0.6
 _DAYS = 4
 _LENGTH_M, _QUERIED_M, _RATE_HZ = 180.0, 90.0, 3.0
-_LOOKS = {1: 20, 4: 16}
+_LOOKS = {1: 40, 4: 30}
 """Scans of a query, and how many of such queries are asked."""
 _AROUND_M, _KNOWN = 1.5, 0.7
 """So much of what is so near to the robot must be known to the map of the first day."""
