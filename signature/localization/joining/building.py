@@ -124,23 +124,35 @@ def join_sessions(
 def _wanted(
     database: SubmapDatabase, infos: Mapping[str, SessionInfo], only: Collection[str]
 ) -> list[tuple[str, str]]:
-    """The pairs that are compared, one of them at least of `only`, in the order of the sessions."""
+    """The pairs that may have to be compared, one of them at least of `only`: of few sessions all, of many
+    the likeliest of each session, then the next ones."""
 
     def comparable(a: str, b: str) -> bool:
         return not _told_apart(infos[a], infos[b])
 
     if len(infos) <= 1 + CANDIDATES.sessions:
-        pairs = {(a, b) for a, b in combinations(infos, 2) if a in only or b in only}
-    else:
-        places = {name: LookedAt.of(database.seen_places(name)) for name in infos}
-        found = candidates(places, only, comparable, CANDIDATES)
-        order = {name: number for number, name in enumerate(infos)}
-        pairs = {
-            (min(a, b, key=order.__getitem__), max(a, b, key=order.__getitem__))
-            for a, others in found.items()
-            for b in others
-        }
-    return [pair for pair in combinations(infos, 2) if pair in pairs and comparable(*pair)]
+        return [(a, b) for a, b in combinations(infos, 2) if (a in only or b in only) and comparable(a, b)]
+    places = {name: LookedAt.of(database.seen_places(name)) for name in infos}
+    found = candidates(places, only, comparable, CANDIDATES)
+    number = {name: k for k, name in enumerate(infos)}
+    rounds = (
+        (name, others[rank])
+        for rank in range(CANDIDATES.sessions)
+        for name, others in found.items()
+        if rank < len(others)
+    )
+    return list(dict.fromkeys((a, b) if number[a] < number[b] else (b, a) for a, b in rounds))
+
+
+def _settled(joined: nx.Graph, a: str, b: str) -> bool:
+    """Whether two sessions lie in one building already, each by so many joins that another tells little.
+
+    joined : the sessions that were joined, with an edge for each pair.
+    """
+    import networkx as nx
+
+    enough = all(name in joined and joined.degree(name) >= CANDIDATES.enough for name in (a, b))
+    return enough and nx.has_path(joined, a, b)
 
 
 def _told_apart(a: SessionInfo, b: SessionInfo) -> bool:
@@ -156,7 +168,9 @@ def _compared(
     journal: JoinJournal | None,
     observer: Observer,
 ) -> Iterator[SessionPair]:
-    """Each pair joined, as far as it can be."""
+    """Each pair joined, as far as it can be and tells something new."""
+    import networkx as nx
+
     names = list(infos)
 
     def prepared(number: int) -> JoinableMap:
@@ -166,8 +180,11 @@ def _compared(
         )
 
     maps = LazySequence(prepared, len(names), _KEPT)
+    joined = nx.Graph()
     with observer.step(f"compare {len(pairs)} pairs of sessions"):
         for done, (a, b) in enumerate(pairs):
+            if len(names) > 1 + CANDIDATES.sessions and _settled(joined, a, b):
+                continue
             target, source = maps[names.index(a)], maps[names.index(b)]
             labelled = infos[a].provenance.label.agrees(infos[b].provenance.label)
             key = "" if journal is None else key_of(target.grid, source.grid, labelled=labelled)
@@ -176,6 +193,8 @@ def _compared(
                 join = join_maps(target, source, labelled=labelled)
                 if journal is not None:
                     journal.add(key, join)
+            if join.status == "joined":
+                joined.add_edge(a, b)
             yield SessionPair(target=a, source=b, join=join)
             observer.on_progress((done + 1) / len(pairs))
 

@@ -22,10 +22,12 @@ from signature.seen_places import SeenPlaces
 class CandidateParameters:
     """How many sessions are compared. By hand, checked on simulated fleets (`examples/fleet.md`).
 
-    sessions : that each session is compared with. neighbours : that each place looks up, for each of these.
+    sessions : that each session is compared with. enough : joins of a session; two that have so many, and are
+        of one building by these, are not compared. neighbours : that each place looks up, for each session.
     """
 
     sessions: int = 8
+    enough: int = 3
     neighbours: int = 4
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
+import networkx as nx
 import numpy as np
 import pytest
 
@@ -162,3 +163,22 @@ def test_what_was_compared_is_not_compared_again(
     whole = join_sessions(database)
     assert resumed.frames == whole.frames
     assert [pair.join.probability for pair in resumed.pairs] == [p.join.probability for p in whole.pairs]
+
+
+def test_sessions_that_hang_together_by_enough_joins_are_not_compared() -> None:
+    """Five in a ring, and a sixth at one of them."""
+    joined = nx.cycle_graph(["a", "b", "c", "d", "e"])
+    joined.add_edge("a", "f")
+    for (one, other), enough, settled in (
+        (("a", "c"), 2, True),
+        (("a", "c"), 3, False),
+        (("f", "c"), 2, False),
+        (("a", "new"), 0, False),
+    ):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(building, "CANDIDATES", CandidateParameters(enough=enough))
+            assert building._settled(joined, one, other) is settled
+    joined.add_edges_from([("x", "y"), ("y", "z"), ("z", "x")])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(building, "CANDIDATES", CandidateParameters(enough=2))
+        assert not building._settled(joined, "a", "x")
