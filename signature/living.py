@@ -126,7 +126,7 @@ def _whole(session: StoredSession) -> StoredSession:
     kept = ("info", "grid", "trajectory", "loops")
     again = completed({name: getattr(session, name) for name in kept})
     frame = session.frame
-    return replace(again, frame=None if frame is None else replace(frame, role=SessionRole.SESSION))
+    return replace(again, frame=None if frame is None else replace(frame, role=None))
 
 
 def _floors(

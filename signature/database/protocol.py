@@ -100,13 +100,11 @@ class Provenance:
 
 
 class SessionRole(enum.Enum):
-    """What a joined session is to its building (`signature.living`).
+    """What a joined session is to the living map of its floor (`signature.living`).
 
-    SESSION : a recording or an imported map. LIVING : the living map of a floor, made of such sessions.
-    RETIRED : one of these; the living map is searched for it.
+    LIVING : that map itself. RETIRED : a session that it was made from, and for which it is searched.
     """
 
-    SESSION = "session"
     LIVING = "living"
     RETIRED = "retired"
 
@@ -123,13 +121,13 @@ class BuildingFrame:
         stays when that session is renamed or removed.
     T_building_session : the map frame of the session in that of the building. covariance : of it, in the axes
         of the building.
-    role : what the session is to its building.
+    role : what the session is to the living map of its floor; None: nothing, it is searched itself.
     """
 
     name: str
     T_building_session: SE2
     covariance: Covariance
-    role: SessionRole = SessionRole.SESSION
+    role: SessionRole | None = None
 
 
 def retired(frames: Mapping[Key, BuildingFrame]) -> set[Key]:

@@ -53,7 +53,7 @@ def place(request: pytest.FixtureRequest, tmp_path: Path) -> str | Path:
     return target
 
 
-def names(place: str | Path) -> dict[str, SessionRole]:
+def names(place: str | Path) -> dict[str, SessionRole | None]:
     with open_database(place) as database:
         return {name: at.role for name, at in database.frames().items()}
 
@@ -112,7 +112,7 @@ def test_undoing_makes_the_sessions_whole_and_leaves_no_living_map(place: str | 
     before = searched()
     living.update(place)
     assert living.undo(place) == ("west", "east")
-    assert names(place) == dict.fromkeys(MAPS, SessionRole.SESSION)
+    assert names(place) == dict.fromkeys(MAPS, None)
     for name, arrays in searched().items():
         assert all(np.array_equal(a, b) for a, b in zip(arrays, before[name], strict=True))
     assert maintenance.check(place) == () and living.undo(place) == ()

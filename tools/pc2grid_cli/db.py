@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -18,10 +17,10 @@ from pc2grid_cli.options import DATABASE, AsJson, Database, Force, WrittenDataba
 from pc2grid_cli.session_documents import precision_summary
 from signature.database import Problem, SessionInfo, SubmapDatabase, open_database
 from signature.database.maintenance import check, copy, merge, remove, rename, shown, split
-from signature.database.protocol import SessionRole
+from signature.database.protocol import BuildingFrame, SessionRole
 
 _ROLES = {
-    SessionRole.SESSION: "",
+    None: "",
     SessionRole.LIVING: ", the living map of its floor",
     SessionRole.RETIRED: ", retired: the living map is searched for it",
 }
@@ -60,18 +59,20 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
         print(one_line(line + _ROLES[roles[s.name]]))
 
 
-def _roles(database: SubmapDatabase) -> dict[str, SessionRole]:
-    """What each session is to its building."""
+def _roles(database: SubmapDatabase) -> dict[str, SessionRole | None]:
+    """What each session is to the living map of its floor."""
+    frames: Mapping[str, BuildingFrame] = {}
     with contextlib.suppress(DatabaseCorrupt):  # `db check` reports it
-        roles = {name: frame.role for name, frame in database.frames().items()}
-        return defaultdict(lambda: SessionRole.SESSION, roles)
-    return defaultdict(lambda: SessionRole.SESSION)
+        frames = database.frames()
+    return {
+        info.name: frames[info.name].role if info.name in frames else None for info in database.sessions()
+    }
 
 
-def _document(s: SessionInfo, role: SessionRole) -> StoredInfo:
+def _document(s: SessionInfo, role: SessionRole | None) -> StoredInfo:
     return {
         "name": s.name,
-        "role": role.value,
+        "role": None if role is None else role.value,
         "sensor": s.sensor,
         "building": s.provenance.label.building,
         "floor": s.provenance.label.floor,

@@ -292,10 +292,11 @@ class Convert(TypedDict):
 class StoredInfo(TypedDict):
     """A session of a database, with the versions and settings that made it. consistency: null for an imported
     map, and for a session that was stored before it was measured. floor_height_m: above the lowest floor of
-    its recording, null if that is not known. role: a living map is searched for those that are retired."""
+    its recording, null if that is not known. role: a living map is searched for those that are retired; null:
+    neither."""
 
     name: str
-    role: Literal["session", "living", "retired"]
+    role: Literal["living", "retired"] | None
     sensor: str
     building: str | None
     floor: str | None
