@@ -51,12 +51,12 @@ class LivingMap:
 
 def update(target: Place, frames: Collection[str] | None = None) -> tuple[LivingMap, ...]:
     """Make the living maps of a database anew, and retire the sessions that they are made from, in one
-    transaction. Floors with one session only, of one kind (`_kinds`), get none.
+    transaction. A session that alone observes its heights (`living_name`) is searched as before.
 
     frames : of the buildings that are updated; None: all.
 
-    Raises DatabaseError if no two sessions are joined, or if a session has the name of a living map and is
-    none, and as `maintenance.replace_sessions`.
+    Raises DatabaseError if no two sessions observe the same heights of one floor, or if a session has the name
+    of a living map and is none, and as `maintenance.replace_sessions`.
     """
     with open_database(target) as database:
         known = database.frames()
@@ -71,8 +71,8 @@ def update(target: Place, frames: Collection[str] | None = None) -> tuple[Living
     if not floors:
         where = maintenance.shown(target)
         raise DatabaseError(
-            f"{where}: no two sessions of one building are joined",
-            hint=f"`pc2grid db join {where}` finds out which show one building",
+            f"{where}: no two joined sessions of one floor observe the same heights",
+            hint=f"`pc2grid db join {where}` finds out which sessions show one building",
         )
     # Living maps that were renamed, or whose sessions are gone.
     living = {n for n, at in known.items() if at.role is SessionRole.LIVING}

@@ -143,7 +143,7 @@ def test_what_is_added_with_update_goes_into_the_living_map() -> None:
     assert made["members"] == ["west", "east", "again"]
     with pytest.raises(ConfigError, match="--update joins what is new"):
         run("convert west.yaml -o x.submaps --add --update --no-join --name other")
-    with pytest.raises(DatabaseError, match="no two sessions of one building are joined"):
+    with pytest.raises(DatabaseError, match="no two joined sessions"):
         run("db update b.submaps")
 
 

@@ -183,7 +183,7 @@ def test_nothing_joined_is_an_error_and_changes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "x.submaps"
     store(path, MAPS, {})
     before = path.read_bytes()
-    with pytest.raises(DatabaseError, match="no two sessions") as refused:
+    with pytest.raises(DatabaseError, match="no two joined sessions") as refused:
         living.update(path)
     assert "db join" in str(refused.value.hint) and path.read_bytes() == before
 
