@@ -55,8 +55,8 @@ def update(target: Place, frames: Collection[str] | None = None) -> tuple[Living
 
     frames : of the buildings that are updated; None: all.
 
-    Raises DatabaseError if no two sessions observe the same heights of one floor, or if a session has the name
-    of a living map and is none, and as `maintenance.replace_sessions`.
+    Raises DatabaseError if no two sessions observe the same heights of one floor, or if a session has the
+    name of a living map and is none, and as `maintenance.replace_sessions`.
     """
     with open_database(target) as database:
         known = database.frames()
