@@ -62,6 +62,7 @@ class SensorOnWheels:
         parameters: TrackingParameters = TRACKING_PARAMETERS,
     ) -> None:
         self._registration, self._projection, self._parameters = registration, projection, parameters
+        self._narrow = False  # the sensor sees a part of its surroundings only
         self._depth_limit = DepthLimit()
         self._floor = GroundModel(None, parameters)
         self._maps = MatchingMaps(projection.max_range_m, parameters)
@@ -78,7 +79,8 @@ class SensorOnWheels:
         """Begin with a scan whose base is at a place of the session frame; returns its pose (4, 4),
         levelled."""
         self._floor = GroundModel.start(points_m, scan, self._parameters)
-        matching = CAMERA_MATCHING if SENSOR_MODELS[scan.sensor].narrow else MATCHING_PARAMETERS
+        self._narrow = SENSOR_MODELS[scan.sensor].narrow
+        matching = CAMERA_MATCHING if self._narrow else MATCHING_PARAMETERS
         self._maps = MatchingMaps(self._projection.max_range_m, self._parameters, matching)
         pose = self.levelled(at.lift())
         self.kiss.register(self._floor.remove(points_m), pose, 0.0)
@@ -104,7 +106,7 @@ class SensorOnWheels:
         registered = SE2.from_matrix(near)
         self._planar_scan = planar_scan = self._project(scan, points_m)
         motion = None
-        if scan.T_odom_base is None and self.kiss.registered and not SENSOR_MODELS[scan.sensor].narrow:
+        if scan.T_odom_base is None and self.kiss.registered and not self._narrow:
             p = self._parameters
             motion = (
                 (self._last.inverse() @ registered).lift(),
@@ -153,7 +155,8 @@ class SensorOnWheels:
             guesses = self._maps.search(planar_scan, SE2.from_matrix(first.pose), *window)
             searched = (self._candidate(planar_scan, guess, first) for guess in guesses)
             found.extend(replace(candidate, near=False) for candidate in searched)
-            if not max(found).near:
+            # A wide scan shows known ground behind it, too.
+            if self._narrow and not max(found).near:
                 unseen = self._weight(planar_scan) * p.sure_overlap + first.log_density(first.pose)
         return self._believed(found, unseen)
 
