@@ -159,27 +159,32 @@ def _decoder(kind: Any) -> Callable[[Any, str, dict[str, Array]], Any]:
 
         return mapping
     if _is_dataclass(kind):
-        fields = {name: _decoder(field) for name, field in fields_of(kind).items()}
-        # A field that was added to a stored type is None in the sessions of before.
-        added = {field.name: None for field in dataclasses.fields(kind) if field.default is None}
-
-        def instance(content: Any, path: str, arrays: dict[str, Array]) -> Any:
-            _expect(isinstance(content, dict), path, content, "an object")
-            content = added | content
-            if content.keys() != fields.keys():
-                odd = sorted(map(str, content.keys() ^ fields.keys()))
-                what = f"has no {odd[0]}" if odd[0] in fields else f"unknown {odd[0]}"
-                raise ValueError(f"{path}: {what}")
-            return kind(
-                **{name: field(content[name], _join(path, name), arrays) for name, field in fields.items()}
-            )
-
-        return instance
+        return _instance_decoder(kind)
     if _is_a(kind, BaseModel):
         return lambda content, path, arrays: _settings(kind, json.dumps(content, sort_keys=True))
     if _is_enum(kind):
         return lambda content, path, arrays: kind(content)
     return lambda content, path, arrays: _SCALARS[kind](content, path.rpartition(".")[2])
+
+
+def _instance_decoder(kind: Any) -> Callable[[Any, str, dict[str, Array]], Any]:
+    """The function that decodes instances of a dataclass."""
+    fields = {name: _decoder(field) for name, field in fields_of(kind).items()}
+    # A field that was added to a stored type is None in the sessions of before.
+    added = {field.name: None for field in dataclasses.fields(kind) if field.default is None}
+
+    def instance(content: Any, path: str, arrays: dict[str, Array]) -> Any:
+        _expect(isinstance(content, dict), path, content, "an object")
+        content = added | content
+        if content.keys() != fields.keys():
+            odd = sorted(map(str, content.keys() ^ fields.keys()))
+            what = f"has no {odd[0]}" if odd[0] in fields else f"unknown {odd[0]}"
+            raise ValueError(f"{path}: {what}")
+        return kind(
+            **{name: field(content[name], _join(path, name), arrays) for name, field in fields.items()}
+        )
+
+    return instance
 
 
 def _whole(value: Any, name: str) -> int:
