@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -42,6 +43,8 @@ class QueryParameters:
     clearance_m : views on the middle lines of the free space are at least so far from walls.
     every_m : distance of the candidates for views along the middle lines.
     path_candidates : candidates for views on the path, evenly spread.
+    last_m : a query that is not located is searched for again with only so many metres of its travel, longest
+        first.
     space_m, space_every_m : metres of travel whose scans are compared in space, and travel between two of
         them. voxel_m : edge of the voxels that such a scan is reduced to.
     """
@@ -51,6 +54,7 @@ class QueryParameters:
     clearance_m: float = 0.3
     every_m: float = 0.5
     path_candidates: int = 40
+    last_m: tuple[float, ...] = (8.0, 4.0)
     space_m: float = 5.0
     space_every_m: float = 0.2
     voxel_m: float = 0.05
@@ -229,19 +233,29 @@ class Query:
         while path_m - self._keyframes[0].path_m > self._config.window_m:
             self._keyframes.popleft()
 
-    def map(self) -> QueryMap:
-        """What has been seen over the last metres, described as the database is.
+    def map(self, last_m: float = math.inf) -> QueryMap:
+        """What has been seen over the last `last_m` of travel, described as the database is.
 
         Raises NoScans if no scan could be used.
         """
         if self._newest is None:
             raise NoScans("no scan of the query shows anything", hint="look at it with `pc2grid info`")
-        if self._drawn is None:
-            self._drawn = self._draw(self._newest)
+        if last_m < math.inf or self._drawn is None:
+            drawn = self._draw(self._newest, last_m)
+            if last_m < math.inf:
+                return drawn
+            self._drawn = drawn
         return self._drawn
 
-    def _draw(self, newest: Keyframe) -> QueryMap:
-        keyframes = list(self._keyframes) or [newest]
+    def last_metres(self) -> Iterator[QueryMap]:
+        """The query map again, with the last metres only, as long as these are less than the whole."""
+        for last_m in QUERY.last_m:
+            if last_m < min(self.path_m, self._config.window_m):
+                yield self.map(last_m)
+
+    def _draw(self, newest: Keyframe, last_m: float) -> QueryMap:
+        keyframes = [k for k in self._keyframes if self._keyframes[-1].path_m - k.path_m <= last_m]
+        keyframes = keyframes or [newest]
         builder = GridBuilder(self._made_with.projection)
         for keyframe in keyframes:
             builder.add(keyframe.planar_scan, keyframe.T_odom_base)

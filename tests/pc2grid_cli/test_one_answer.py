@@ -203,4 +203,5 @@ def test_check_of_a_wrong_pose_tells_the_answer(expected: tuple[Path, Expected])
     document = relocalize_at_once(folder, "--check", last["pose"]["x"] + 4.0, last["pose"]["y"], 0.0)
     assert document["status"] == "lost"
     assert document["better"]["pose"] == rounded(last["pose"]) == rounded(watched["pose"])
-    assert document["better"]["confidence"] == rounded(last["confidence"])
+    # The pose that is checked was believed, so a little of the mass is there.
+    assert document["better"]["confidence"] == pytest.approx(last["confidence"], abs=1e-3)
