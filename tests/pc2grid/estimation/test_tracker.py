@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 import os
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from pc2grid.clouds.deskew import deskew
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.estimation.matching_maps import MatchingMaps
+from pc2grid.estimation.on_wheels import SensorOnWheels, _Candidate
+from pc2grid.estimation.point_to_line import Match
 from pc2grid.estimation.registration import KissRegistration
 from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2, invert_pose, motion_size, transform_points, wrap_angle
@@ -410,3 +413,14 @@ def test_a_camera_without_odometry_does_not_leap_along_a_wall(monkeypatch):
     pose = SE2.from_matrix(tracker.track(depth[-1]).registered.T_session_base)
     # Of the leap of 0.41 m a quarter is believed, which the next scans correct; a step is 0.04 m.
     assert abs(pose.x - before.x) < 0.41 / 3.0
+
+
+@pytest.mark.parametrize(("new_ground", "believed"), [(-math.inf, True), (7.0, True), (9.5, False)])
+def test_a_match_that_was_searched_for_is_believed_if_new_ground_explains_the_scan_worse(
+    new_ground, believed
+):
+    """Of two explanations the better one must have 0.9 of the probability: log 9 = 2.2 more."""
+    match = Match(SE2(3.0, 0.0, 1.0), SE2(3.0, 0.0, 1.0), np.eye(3), 0.9, 0.01, True)
+    found = _Candidate(10.0, match, sure=True, near=False)
+    sensor = SensorOnWheels(RegistrationConfig(), ProjectionConfig())
+    assert sensor._believed([found], new_ground).sure is believed
