@@ -2,9 +2,9 @@
 
 `python -m pc2grid_lab.bench.real_joins FOLDER -o joins.json` reads all databases of a folder, whose sessions
 have the label of their building (`convert --building`), and compares every two sessions, without looking at
-the labels, and each with its own mirror image; `--by map_merge` does it as a rival does. Where two sessions
-are parts of one recording, or a third session contains both, the stamps that they share tell how they lie to
-each other.
+the labels, and each with its own mirror image; `--by map_merge` and `--by grid_matching` do it as rivals do.
+Where two sessions are parts of one recording, or a third session contains both, the stamps that they share
+tell how they lie to each other.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import numpy as np
 from pc2grid.geometry import SE2
 from pc2grid.model import Trajectory
 from pc2grid.submaps.junction_graph import junction_graph
+from pc2grid_lab.baselines.grid_matching import match_grids
 from pc2grid_lab.baselines.map_merge import CONFIDENT, merge
 from signature.database import open_database
 from signature.localization.joining.join import JoinableMap, join_maps
@@ -145,7 +146,13 @@ def by_map_merge(target: JoinableMap, source: JoinableMap) -> Found:
     return Found("joined" if joined else "different", found.T_target_source if joined else None)
 
 
-METHODS = {"pc2grid": by_pc2grid, "map_merge": by_map_merge}
+def by_grid_matching(target: JoinableMap, source: JoinableMap) -> Found:
+    """As MRPT's program does it."""
+    found = match_grids((target.grid, target.graph), (source.grid, source.graph))
+    return Found("joined", found[0].T_target_source) if found else Found("different", None)
+
+
+METHODS = {"pc2grid": by_pc2grid, "map_merge": by_map_merge, "grid_matching": by_grid_matching}
 
 
 def rows(compared: Sequence[Session], known: Sequence[Session], method: str) -> Iterator[Row]:
