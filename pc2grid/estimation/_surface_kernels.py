@@ -168,14 +168,14 @@ def normal_equations(
 
     pose : (4, 4). A point meets the shape whose mean is nearest, of its own voxel and the 26 around it.
     scale : of the Cauchy weight of a distance. weights : (N,) inverse variances of the points, relative.
-    The perturbation is a rotation vector and a translation of the placed points about the base's origin.
+    The unknowns are the shift and the rotation vector of the placed points about the origin of the base.
 
     Returns H (6, 6) and g (6,) of the step H d = -g, the number of points that found a shape, and the sum of
     their distances.
     """
     H, g = np.zeros((6, 6)), np.zeros(6)
     J = np.zeros((3, 6))
-    J[0, 3] = J[1, 4] = J[2, 5] = 1.0
+    J[0, 0] = J[1, 1] = J[2, 2] = 1.0
     W = np.empty((3, 3))
     d = np.empty(3)
     WJ = np.empty((3, 6))
@@ -210,9 +210,9 @@ def normal_equations(
         wz = W[2, 0] * d[0] + W[2, 1] * d[1] + W[2, 2] * d[2]
         squared = d[0] * wx + d[1] * wy + d[2] * wz
         weight = weights[n] / (1.0 + squared / (scale * scale))
-        J[0, 1], J[0, 2] = rz, -ry
-        J[1, 0], J[1, 2] = -rz, rx
-        J[2, 0], J[2, 1] = ry, -rx
+        J[0, 4], J[0, 5] = rz, -ry
+        J[1, 3], J[1, 5] = -rz, rx
+        J[2, 3], J[2, 4] = ry, -rx
         for a in range(3):
             for b in range(6):
                 WJ[a, b] = weight * (W[a, 0] * J[0, b] + W[a, 1] * J[1, b] + W[a, 2] * J[2, b])

@@ -18,12 +18,12 @@ from pc2grid.arrays import F32, F64
 from pc2grid.clouds.ground import Ground, find_ground
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
+from pc2grid.estimation.belief import SPATIAL, Belief
 from pc2grid.estimation.manifold import moved, steps
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.estimation.placed import Placed
-from pc2grid.estimation.smoother import SPATIAL, Belief
 from pc2grid.estimation.space_map import SpaceMap, ThinnedScan
-from pc2grid.estimation.surface_map import SURFACES, Placement, PosePrior
+from pc2grid.estimation.surface_map import SURFACES, Placement
 from pc2grid.geometry import SE2
 from pc2grid.model import Scan
 
@@ -79,6 +79,11 @@ class CarriedSensor:
         self._thinned = ThinnedScan(np.empty((0, 3)), np.empty(0))  # the scan placed last
 
     @property
+    def ground(self) -> None:
+        """The floor in the base frame changes with every step."""
+        return None
+
+    @property
     def map(self) -> SpaceMap | None:
         """The local map in space; None before the first scan and after `restart`."""
         return self._map
@@ -100,11 +105,7 @@ class CarriedSensor:
         return pose
 
     def place(self, scan: Scan, points_m: F32, seconds: float, expected: Sequence[Belief]) -> Placed:
-        """Place the deskewed points (N, 3) of a scan, `seconds` after the one before.
-
-        expected : where the base may be, the most credible first. A scan that fits nowhere, or shows nothing,
-        is placed there.
-        """
+        """See `PlacingSensor`."""
         del seconds
         belief = expected[0]
         if self._map is None:
@@ -137,10 +138,10 @@ class CarriedSensor:
         that it smooths; and it is searched for where it still does not fit, or does not agree.
         """
         p = self._parameters
-        prior, vague = _prior(belief), self._is_vague(belief)
+        vague = self._is_vague(belief)
 
         def matched(*, wide: bool) -> _Candidate:
-            return self._candidate(space.match(self._thinned, belief.pose, prior, wide=wide), belief, space)
+            return self._candidate(space.match(self._thinned, belief.pose, belief, wide=wide), belief, space)
 
         found = [matched(wide=True)]
         if vague or not found[0].sure:
@@ -158,9 +159,10 @@ class CarriedSensor:
         p, t = self._parameters, self._tracking
         step_m = float(np.linalg.norm(belief.pose[:3, 3] - self._found[:3, 3]))
         window_m = min(step_m + t.search_sigmas * belief.sigmas[0], t.search_most_m)
-        information = np.diag([p.turned_rad**-2] * 3 + [window_m**-2] * 3)
+        covariance = np.diag([window_m**2] * 3 + [p.turned_rad**2] * 3)
         for guess in space.search(self._thinned, self._found, window_m, p.starts):
-            placement = space.match(self._thinned, guess, PosePrior(guess, information), wide=True)
+            loose = Belief(guess, covariance, belief.free)
+            placement = space.match(self._thinned, guess, loose, wide=True)
             yield self._candidate(placement, belief, space)
 
     def _candidate(self, placement: Placement, belief: Belief, space: SpaceMap) -> _Candidate:
@@ -168,9 +170,8 @@ class CarriedSensor:
         t = self._tracking
         of_known, of_all = space.agreement(self._thinned, placement.pose)
         quality = of_all - t.residual_weight_per_m * placement.residual_m
-        score = SURFACES.independent(len(self._thinned.points_m)) * quality + belief.log_density(
-            placement.pose
-        )
+        of_scan = SURFACES.independent(len(self._thinned.points_m)) * quality
+        score = of_scan + belief.log_density(belief.chi2(placement.pose))
         sure = placement.overlap >= t.sure_overlap and placement.residual_m <= t.max_residual_m
         return _Candidate(score, placement, of_known, sure)
 
@@ -188,7 +189,7 @@ class CarriedSensor:
         return overlaps and best.agreement >= self._parameters.least_agreement
 
     def extend(self, pose: F64) -> None:
-        """Scans join the map in space oftener than keyframes begin, see `cut`."""
+        """Nothing: scans join the map in space oftener than keyframes begin, see `cut`."""
 
     def cut(self, scan: Scan, points_m: F32, pose: F64, *, lost: bool) -> PlanarScan:
         """Add the scan placed last to the map at its final pose (4, 4), and cut its planar scan out of it.
@@ -202,19 +203,6 @@ class CarriedSensor:
         return self._map.cut(scan, pose)
 
 
-def _axes(pose: F64) -> F64:
-    """The matrix (6, 6) from a change in the axes of the base, shift first, to one as in `Placement`."""
-    axes = np.zeros((6, 6))
-    axes[:3, 3:] = axes[3:, :3] = pose[:3, :3]
-    return axes
-
-
-def _prior(belief: Belief) -> PosePrior:
-    """A belief in the axes of `Placement`."""
-    axes = _axes(belief.pose)
-    return PosePrior(belief.pose, axes @ np.linalg.inv(belief.covariance) @ axes.T)
-
-
 def _spread(candidates: Sequence[_Candidate], best: _Candidate) -> F64:
     """The covariance (6, 6) of all candidates about the best one, in the axes of the base there."""
     mass = np.exp([candidate.score - best.score for candidate in candidates])
@@ -225,15 +213,13 @@ def _spread(candidates: Sequence[_Candidate], best: _Candidate) -> F64:
 
 
 def _alone(found: Placement, belief: Belief, spread: F64) -> tuple[F64, F64]:
-    """The pose (4, 4) by the points alone, with its information (6, 6) in the axes of the base.
+    """The pose (4, 4) by the points alone, with its information (6, 6).
 
     spread : covariance (6, 6) of where else the scan may lie.
     """
-    prior, axes = _prior(belief), _axes(found.pose)
-    away, _, _ = steps(prior.pose[None], found.pose[None])
-    pulled = axes.T @ prior.information @ axes @ away[0]
-    information = axes.T @ found.information @ axes + 1e-3 * np.eye(6)
-    change = np.linalg.solve(information, pulled)
+    away, _, J = (of_belief[0] for of_belief in steps(belief.pose[None], found.pose[None]))
+    information = found.information + 1e-3 * np.eye(6)
+    change = np.linalg.solve(information, J.T @ belief.information @ away)
     wider = np.linalg.inv(np.linalg.inv(information) + spread)
     return moved(found.pose[None], change[None])[0], np.asarray(wider, np.float64)
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from pc2grid.estimation.belief import Belief
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.estimation.placed import Placed
-from pc2grid.estimation.smoother import Belief
 from pc2grid.model import Health
 
 

@@ -65,6 +65,17 @@ def carried_on(motion: F64) -> F64:
     return result
 
 
+def weakest(information: F64, position: int) -> float:
+    """Information (N, N) on the position, the first 2 or 3 directions, in its weakest one.
+
+    The rotation, which follows, is eliminated (Schur complement).
+    """
+    mixed, turn = information[:position, position:], information[position:, position:]
+    turn = turn + 1e-9 * np.eye(len(turn))
+    across = information[:position, :position] - mixed @ np.linalg.solve(turn, mixed.T)
+    return float(np.linalg.eigvalsh(across)[0])
+
+
 def _skew(vectors: F64) -> F64:
     """The matrices (N, 3, 3) of the cross products with vectors (N, 3)."""
     result = np.zeros((len(vectors), 3, 3))

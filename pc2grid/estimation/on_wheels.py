@@ -17,6 +17,7 @@ from pc2grid.clouds.depth_limit import DepthLimit
 from pc2grid.clouds.ground import Ground
 from pc2grid.clouds.planar_scan import PlanarScan, project_to_plane
 from pc2grid.config import ProjectionConfig, RegistrationConfig
+from pc2grid.estimation.belief import PLANAR, Belief
 from pc2grid.estimation.ground_model import GroundModel
 from pc2grid.estimation.matching_maps import MatchingMaps
 from pc2grid.estimation.parameters import (
@@ -28,7 +29,6 @@ from pc2grid.estimation.parameters import (
 from pc2grid.estimation.placed import Placed
 from pc2grid.estimation.point_to_line import Match
 from pc2grid.estimation.registration import KissRegistration
-from pc2grid.estimation.smoother import PLANAR, Belief
 from pc2grid.geometry import SE2
 from pc2grid.model import Scan
 from pc2grid.sensor_model import SENSOR_MODELS
@@ -97,10 +97,7 @@ class SensorOnWheels:
         return pose @ self._floor.T_level_base()
 
     def place(self, scan: Scan, points_m: F32, seconds: float, expected: Sequence[Belief]) -> Placed:
-        """Place the deskewed points (N, 3) of a scan.
-
-        seconds : since the scan before. expected : where the base may be, the most credible first.
-        """
+        """See `PlacingSensor`."""
         self._floor.follow(points_m, scan)
         near = self.kiss.register(self._floor.remove(points_m), self.levelled(expected[0].pose), seconds)
         registered = SE2.from_matrix(near)
@@ -157,7 +154,7 @@ class SensorOnWheels:
             found.extend(replace(candidate, near=False) for candidate in searched)
             # A wide scan shows known ground behind it, too.
             if self._narrow and not max(found).near:
-                unseen = self._weight(planar_scan) * p.sure_overlap + first.log_density(first.pose)
+                unseen = self._weight(planar_scan) * p.sure_overlap + first.log_density(0.0)
         return self._believed(found, unseen)
 
     def _believed(self, found: list[_Candidate], unseen: float) -> _Candidate:
@@ -183,9 +180,9 @@ class SensorOnWheels:
         information = _in_map_axes(belief)
         match = self._maps.match(planar_scan, guess, SE2.from_matrix(belief.pose), information, wide=wide)
         of_scan = self._weight(planar_scan) * self._maps.quality(match)
-        pose = match.pose.lift()
-        near = belief.chi2(pose) < self._parameters.search_sigmas**2
-        return _Candidate(of_scan + belief.log_density(pose), match, self._is_sure(match), near)
+        chi2 = belief.chi2(match.pose.lift())
+        near = chi2 < self._parameters.search_sigmas**2
+        return _Candidate(of_scan + belief.log_density(chi2), match, self._is_sure(match), near)
 
     def _weight(self, planar_scan: PlanarScan) -> float:
         """What a scan tells if it fits without any error."""
@@ -255,5 +252,4 @@ def _turned(matrix: F64, yaw_rad: float) -> F64:
 
 def _in_map_axes(belief: Belief) -> F64:
     """The information (3, 3) of a belief, in the axes of the session frame."""
-    information = np.asarray(np.linalg.inv(belief.covariance), np.float64)
-    return _turned(information, -SE2.from_matrix(belief.pose).yaw)
+    return _turned(belief.information, -SE2.from_matrix(belief.pose).yaw)

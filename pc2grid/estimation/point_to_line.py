@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pc2grid.arrays import F32, F64
+from pc2grid.estimation.manifold import weakest
 from pc2grid.estimation.parameters import MATCHING_PARAMETERS, MatchingParameters
 from pc2grid.geometry import SE2, wrap_angle
 
@@ -143,15 +144,8 @@ class PointGrid:
             information,
             found / max(len(points), 1),
             distance / max(found, 1),
-            _weakest(information) > unit * p.least_points,
+            weakest(information, 2) > unit * p.least_points,
         )
-
-
-def _weakest(information: F64) -> float:
-    """Information on the position in its weakest direction, the yaw eliminated (Schur complement)."""
-    J = information
-    across = J[:2, :2] - np.outer(J[:2, 2], J[2, :2]) / max(J[2, 2], 1e-9)
-    return float(np.linalg.eigvalsh(across)[0])
 
 
 def sector_of(normal_rad: F64, sectors: int) -> NDArray[np.int64]:

@@ -28,14 +28,10 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from pc2grid.arrays import F64
+from pc2grid.estimation.belief import KERNEL, PLANAR, Belief
 from pc2grid.estimation.graph import Factors, normal_equations, without
 from pc2grid.estimation.manifold import Steps, carried_on, moved, steps
 from pc2grid.geometry import invert_pose, wrap_angle
-
-PLANAR = (0, 1, 5)
-"""The free directions of a base on wheels: x, y, and the turn about z, in the base frame."""
-SPATIAL = (0, 1, 2, 3, 4, 5)
-"""The free directions of a sensor in the hand: x, y, z, and the turns about them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +48,7 @@ class SmootherParameters:
     steady_s : the motion before is taken over this time, so that an error of one pose does not come back in
         the next with the other sign.
     scale, direction_rad, yaw_rad_per_m, turn : standard deviations, over robots, of the systematic errors.
-    kernel : standard deviations at which evidence counts half.
+    kernel : see `pc2grid.estimation.belief.KERNEL`.
     iterations : of Gauss-Newton, at most. converged : they end when no unknown changes by more.
     """
 
@@ -68,7 +64,7 @@ class SmootherParameters:
     direction_rad: float = math.radians(2.0)
     yaw_rad_per_m: float = math.radians(2.0)
     turn: float = 0.05
-    kernel: float = 3.0
+    kernel: float = KERNEL
     iterations: int = 5
     converged: float = 1e-2
 
@@ -89,36 +85,6 @@ _CERTAIN = np.array([np.inf])  # kernel of a factor whose weight is 1
 _UNKNOWN = 1e3  # standard deviation of what is not known
 _LEAST_S = 1e-3  # scans follow each other no faster
 _LEAST_DRIFT = 1e-3  # standard deviation of odometry that reports no motion
-
-
-@dataclass(frozen=True, slots=True)
-class Belief:
-    """A pose (4, 4) T_session_base with its covariance (D, D) in the free directions (D,) of the base
-    frame."""
-
-    pose: F64
-    covariance: F64
-    free: NDArray[np.intp]
-
-    def log_density(self, pose: F64, kernel: float = SMOOTHER.kernel) -> float:
-        """Logarithm of the density at a pose (4, 4), but for a constant; far off it falls as slowly as
-        evidence."""
-        _, log_volume = np.linalg.slogdet(self.covariance)
-        return -0.5 * (kernel**2 * math.log1p(self.chi2(pose) / kernel**2) + float(log_volume))
-
-    @property
-    def sigmas(self) -> tuple[float, float]:
-        """Largest standard deviation of the position (m) and of the turn (rad)."""
-        position = self.free < 3
-        largest = (np.linalg.eigvalsh(self.covariance[np.ix_(k, k)])[-1] for k in (position, ~position))
-        of_position_m, of_turn_rad = (math.sqrt(variance) for variance in largest)
-        return of_position_m, of_turn_rad
-
-    def chi2(self, pose: F64) -> float:
-        """Squared Mahalanobis distance of a pose (4, 4)."""
-        step, _, _ = steps(self.pose[None], pose[None])
-        away = step[0, self.free]
-        return float(away @ np.linalg.solve(self.covariance, away))
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,9 @@ from pc2grid.clouds.column_map import ColumnMap
 from pc2grid.clouds.level import floor_height
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
+from pc2grid.estimation.belief import Belief
 from pc2grid.estimation.point_to_line import best_placements, evenly
-from pc2grid.estimation.surface_map import Placement, PosePrior, SurfaceMap
+from pc2grid.estimation.surface_map import Placement, SurfaceMap
 from pc2grid.geometry import SE2, invert_pose, motion_size
 from pc2grid.model import Scan
 from pc2grid.sensor_model import SENSOR_MODELS
@@ -102,7 +103,7 @@ class SpaceMap:
         sigma_m = self._noise_per_m2 * np.einsum("ij,ij->i", away, away)
         return ThinnedScan(thinned, 1.0 / (1.0 + (sigma_m / self._parameters.good_m) ** 2))
 
-    def match(self, thinned: ThinnedScan, guess: F64, prior: PosePrior, *, wide: bool) -> Placement:
+    def match(self, thinned: ThinnedScan, guess: F64, prior: Belief, *, wide: bool) -> Placement:
         """Register a scan from a guess (4, 4); it is held to a prior. wide : see `SurfaceMap.match`."""
         return self._surfaces.match(thinned.points_m, thinned.weights, guess, prior, wide=wide)
 

@@ -22,7 +22,8 @@ from scipy.linalg import eigh
 from pc2grid.arrays import F32, F64, I64, BoolGrid
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.estimation import _surface_kernels as kernels
-from pc2grid.geometry import pose_from_rotation_vector, rotation_vector
+from pc2grid.estimation.belief import Belief
+from pc2grid.estimation.manifold import moved, steps, weakest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,8 +81,8 @@ SURFACES = SurfaceParameters()
 class Placement:
     """A scan placed in the map in space.
 
-    pose : (4, 4) T_map_base. information : (6, 6), from the points alone, of a small rotation vector (rad)
-    and a shift (m) of the pose, both in the axes of the map; the rotation is about the origin of the base.
+    pose : (4, 4) T_map_base. information : (6, 6), from the points alone, of a change of the pose as in
+    `pc2grid.estimation.manifold`.
     overlap : share of the points that meet a surface of the map. residual_m : their mean distance from it.
     measured : whether the points fix every direction of the position.
     """
@@ -91,14 +92,6 @@ class Placement:
     overlap: float
     residual_m: float
     measured: bool
-
-
-@dataclass(frozen=True, slots=True)
-class PosePrior:
-    """Where a scan is expected: a pose (4, 4), and its information (6, 6) as that of `Placement`."""
-
-    pose: F64
-    information: F64
 
 
 @dataclass(slots=True)
@@ -174,11 +167,13 @@ class VoxelShapes:
     def equations(
         self, points_m: F64, weights: F64, pose: F64, scale_m: float
     ) -> tuple[F64, F64, float, float]:
-        """What points (N, 3) say of a small change of their pose (4, 4); see `normal_equations`."""
+        """What points (N, 3) say of a change of their pose (4, 4) in its own axes; see `normal_equations`."""
         rows = self._rows
-        return kernels.normal_equations(
+        H, g, found, distance_m = kernels.normal_equations(
             self._slots, rows.codes, rows.shapes, points_m, weights, pose, self.edge_m, scale_m
         )
+        R = np.kron(np.eye(2), pose[:3, :3])
+        return R.T @ H @ R, R.T @ g, found, distance_m
 
 
 class SurfaceMap:
@@ -223,7 +218,7 @@ class SurfaceMap:
                 voxels.forget_beyond(here, 1.25 * self._reach_m)
 
     def match(
-        self, points_m: F64, weights: F64, guess: F64, prior: PosePrior, *, wide: bool = True
+        self, points_m: F64, weights: F64, guess: F64, prior: Belief, *, wide: bool = True
     ) -> Placement:
         """Place thinned points (N, 3), base frame, from a guess (4, 4); they are held to a prior.
 
@@ -250,11 +245,11 @@ class SurfaceMap:
 
         def at(step: F64) -> tuple[F64, F64]:
             """Hessian (6, 6) and gradient (6,) after a change (6,) of the pose."""
-            pose = _moved(placement.pose, step)
+            pose = moved(placement.pose[None], step[None])[0]
             return self.fine.equations(points, own, pose, p.aside_scale * self.fine.edge_m)[:2]
 
         H, _ = at(np.zeros(6))
-        tangents, changes = eigh(H, _displacement(points @ placement.pose[:3, :3].T))
+        tangents, changes = eigh(H, _displacement(points))
         secants = [
             change @ (at(aside_m * change)[1] - at(-aside_m * change)[1]) / (2.0 * aside_m)
             for change in changes.T
@@ -267,7 +262,7 @@ class SurfaceMap:
         points_m: F64,
         weights: F64,
         guess: F64,
-        prior: PosePrior,
+        prior: Belief,
         rounds: tuple[float, ...],
     ) -> Placement:
         """Gauss-Newton on one of the two maps."""
@@ -277,11 +272,12 @@ class SurfaceMap:
         for scale_m in rounds:
             H, g, found, distance_m = voxels.equations(points_m, weights, pose, scale_m)
             information = H / sigma_m**2
+            away, _, J = (of_prior[0] for of_prior in steps(prior.pose[None], pose[None]))
             step = -np.linalg.solve(
-                information + prior.information + 1e-3 * np.eye(6),
-                g / sigma_m**2 + prior.information @ _difference(pose, prior.pose),
+                information + J.T @ prior.information @ J + 1e-3 * np.eye(6),
+                g / sigma_m**2 + J.T @ prior.information @ away,
             )
-            pose = _moved(pose, step)
+            pose = moved(pose[None], step[None])[0]
             if scale_m == rounds[-1] and np.abs(step).sum() < p.converged:
                 break
         return Placement(
@@ -289,38 +285,16 @@ class SurfaceMap:
             information,
             found / max(len(points_m), 1),
             distance_m / max(found, 1.0),
-            _weakest(information) > p.least_points / sigma_m**2,
+            weakest(information, 3) > p.least_points / sigma_m**2,
         )
 
 
-def _weakest(information: F64) -> float:
-    """Information (6, 6) on the position in its weakest direction, the rotation eliminated (Schur)."""
-    turn, shift, mixed = information[:3, :3], information[3:, 3:], information[:3, 3:]
-    across = shift - mixed.T @ np.linalg.solve(turn + 1e-9 * np.eye(3), mixed)
-    return float(np.linalg.eigvalsh(across)[0])
-
-
 def _displacement(points_m: F64) -> F64:
-    """The mean square in m2 by which small changes (6,) displace points (N, 3), from the base: (6, 6)."""
+    """The mean square in m2 by which changes (6,) of the base displace its points (N, 3): (6, 6)."""
     x, y, z = points_m.T
-    moved = np.zeros((len(points_m), 3, 6))
-    moved[:, 0, 1], moved[:, 0, 2], moved[:, 1, 2] = z, -y, x
-    moved[:, 1, 0], moved[:, 2, 0], moved[:, 2, 1] = -z, y, -x
-    moved[:, :, 3:] = np.eye(3)
-    mean: F64 = np.einsum("nai,naj->ij", moved, moved) / len(points_m)
+    displaced = np.zeros((len(points_m), 3, 6))
+    displaced[:, :, :3] = np.eye(3)
+    displaced[:, 0, 4], displaced[:, 0, 5], displaced[:, 1, 5] = z, -y, x
+    displaced[:, 1, 3], displaced[:, 2, 3], displaced[:, 2, 4] = -z, y, -x
+    mean: F64 = np.einsum("nai,naj->ij", displaced, displaced) / len(points_m)
     return mean + 1e-9 * np.eye(6)
-
-
-def _difference(pose: F64, other: F64) -> F64:
-    """The small change (6,) from another pose (4, 4) to a pose, as in `Placement.information`."""
-    turn = np.eye(4)
-    turn[:3, :3] = pose[:3, :3] @ other[:3, :3].T
-    return np.concatenate((rotation_vector(turn), pose[:3, 3] - other[:3, 3]))
-
-
-def _moved(pose: F64, step: NDArray[np.floating]) -> F64:
-    """A pose (4, 4) after a small change (6,), as in `Placement.information`."""
-    moved = pose_from_rotation_vector(step[:3])
-    moved[:3, :3] = moved[:3, :3] @ pose[:3, :3]
-    moved[:3, 3] = pose[:3, 3] + step[3:]
-    return moved

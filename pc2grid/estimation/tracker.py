@@ -20,14 +20,16 @@ from pc2grid.clouds.deskew import deskew
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.config import ProjectionConfig, RegistrationConfig
+from pc2grid.estimation.belief import SPATIAL
 from pc2grid.estimation.carried import CarriedSensor
 from pc2grid.estimation.ground_model import DECIDING_SCANS, is_rolling
 from pc2grid.estimation.health import HealthJudge
 from pc2grid.estimation.on_wheels import SensorOnWheels
 from pc2grid.estimation.overruled import Disagreement, disagreement
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.estimation.placed import PlacingSensor
 from pc2grid.estimation.rides import Ride, RideWatch
-from pc2grid.estimation.smoother import IN_THE_HAND, PLANAR, SMOOTHER, Evidence, Smoother
+from pc2grid.estimation.smoother import IN_THE_HAND, SMOOTHER, Evidence, Smoother
 from pc2grid.geometry import SE2, invert_pose, motion_size
 from pc2grid.model import Health, RegisteredScan, Scan, Storey
 
@@ -83,9 +85,7 @@ class Tracker:
         self._keyframe: SE2 | None = None  # where the last one was
         self._restarted = False  # no keyframe has been reported since tracking started again
         # These three depend on how the sensor is carried; `start` makes them from the first scan.
-        self._sensor: SensorOnWheels | CarriedSensor = SensorOnWheels(
-            registration, self._projection, parameters
-        )
+        self._sensor: PlacingSensor = SensorOnWheels(registration, self._projection, parameters)
         self._smoother = Smoother()
         self._health = HealthJudge(parameters)
 
@@ -97,7 +97,7 @@ class Tracker:
     @property
     def carried(self) -> bool:
         """Whether the sensor is in the hand, so that tilts and heights say nothing of a slope."""
-        return isinstance(self._sensor, CarriedSensor)
+        return self._sensor.free == SPATIAL
 
     def start(self, scan: Scan) -> Tracked:
         """Begin with the first scan: find the floor, and put the base at the origin of the session frame."""
@@ -199,7 +199,7 @@ class Tracker:
 
         The travel is that of the wheels where they are known: tracking in the plane errs on stairs.
         """
-        if not isinstance(self._sensor, SensorOnWheels):
+        if self.carried:
             return Ride()
         step = self._reported(scan)
         if step is None or not continues:
@@ -218,7 +218,7 @@ class Tracker:
 
     def _flat(self, pose: F64) -> F64:
         """A pose (4, 4) in the directions that are free: on wheels those of the plane."""
-        return SE2.from_matrix(pose).lift() if self._sensor.free == PLANAR else pose
+        return pose if self.carried else SE2.from_matrix(pose).lift()
 
     def _odometry(self, scan: Scan) -> F64 | None:
         """The reading (4, 4) of odometry at a scan."""

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from pc2grid.arrays import F64
-from pc2grid.estimation.smoother import PLANAR, SMOOTHER, Belief, Evidence, Smoother
+from pc2grid.estimation.belief import PLANAR, Belief
+from pc2grid.estimation.smoother import SMOOTHER, Evidence, Smoother
 from pc2grid.geometry import SE2
 
 gtsam = pytest.importorskip("gtsam")

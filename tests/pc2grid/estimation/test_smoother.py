@@ -11,9 +11,10 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.estimation import _kernels
+from pc2grid.estimation.belief import PLANAR, SPATIAL, Belief
 from pc2grid.estimation.graph import Factors, add_factors_plain, normal_equations, without
 from pc2grid.estimation.manifold import moved, steps, steps_plain
-from pc2grid.estimation.smoother import PLANAR, SPATIAL, Belief, Evidence, Smoother
+from pc2grid.estimation.smoother import Evidence, Smoother
 from pc2grid.geometry import SE2, invert_pose, motion_size, pose_from_rotation_vector
 
 Odometry = list[F64] | list[None]
@@ -151,7 +152,7 @@ def test_a_belief_says_how_far_off_it_is() -> None:
             noise = rng.normal(size=3) / np.sqrt(np.diag(WALLS_ALL_AROUND))
             placed = pose @ SE2(*noise.tolist()).lift()
             belief = smoother.add(placed, Evidence(0.1, pose, match=(placed, WALLS_ALL_AROUND)))
-        chi2.append(-2.0 * (belief.log_density(true[19]) - belief.log_density(belief.pose)))
+        chi2.append(belief.chi2(true[19]))
     assert 1.0 < np.mean(chi2) < 4.5
 
 
@@ -218,6 +219,6 @@ def test_what_is_marginalised_leaves_the_same_solution() -> None:
 
 def test_the_density_of_a_belief_falls_with_the_distance() -> None:
     belief = Belief(np.eye(4), np.diag([0.1, 0.1, 0.05]) ** 2, np.array(PLANAR))
-    densities = [belief.log_density(SE2(x, 0.0, 0.0).lift()) for x in (0.0, 0.1, 0.3, 3.0)]
+    densities = [belief.log_density(belief.chi2(SE2(x, 0.0, 0.0).lift())) for x in (0.0, 0.1, 0.3, 3.0)]
     assert densities == sorted(densities, reverse=True)
     assert densities[1] - densities[0] == pytest.approx(-0.5, abs=0.05)  # one standard deviation
