@@ -33,6 +33,12 @@ class Factors:
     information: F64
     kernel: F64
 
+    def touching(self, rows: NDArray[np.intp]) -> Factors:
+        """Those of the factors that depend on any of some unknowns (R,)."""
+        of_these = np.isin(self.rows, rows).any(axis=1)
+        parts = (self.rows, self.error, self.jacobian, self.information, self.kernel)
+        return Factors(*(part[of_these] for part in parts))
+
 
 def normal_equations(factors: Iterable[Factors], count: int) -> tuple[F64, F64, float]:
     """The matrix (N, N) and the gradient (N,) of all factors over N = `count` unknowns, and their robust

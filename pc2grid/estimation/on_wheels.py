@@ -38,13 +38,18 @@ from pc2grid.sensor_model import SENSOR_MODELS
 class _Candidate:
     """A match, and its score: the logarithm of its posterior density but for a constant.
 
-    sure : the scan fits well. near : it lies where it is expected. If both, nothing else needs to be tried.
+    sure : the scan fits well. near : it lies where it is expected.
     """
 
     score: float
     match: Match = field(compare=False)
     sure: bool = field(compare=False)
     near: bool = field(compare=False)
+
+    @property
+    def settles(self) -> bool:
+        """Whether nothing else needs to be tried."""
+        return self.sure and self.near
 
 
 class SensorOnWheels:
@@ -135,23 +140,24 @@ class SensorOnWheels:
         one is taken: KISS-ICP, which slides along walls, does not count where the scan fits as well without
         it.
         """
-        p, first, found, unseen = self._parameters, expected[0], [], -math.inf
+        p, first, unseen = self._parameters, expected[0], -math.inf
+        found: list[_Candidate] = []
         for belief in expected:
             prior = SE2.from_matrix(belief.pose)
-            near = _is_near(registered, prior, p.disagree_m, p.disagree_rad)
-            found.append(self._candidate(planar_scan, registered if near else prior, belief))
-            if belief is first and not near:
-                found.append(self._candidate(planar_scan, registered, belief))
-            if not (max(found).sure and max(found).near):
+            starts = [prior, registered]
+            if _is_near(registered, prior, p.disagree_m, p.disagree_rad):
+                starts = [registered]
+            found += (self._candidate(planar_scan, start, belief) for start in starts)
+            if not max(found).settles:
                 found.append(self._candidate(planar_scan, prior, belief, wide=False))
-            if max(found).sure and max(found).near and not self._is_vague(belief):
+            if max(found).settles and not self._is_vague(belief):
                 return max(found)
         if self._is_vague(first) and not max(found).sure:
             window_m, window_rad = (p.search_sigmas * sigma for sigma in first.sigmas)
             window = min(window_m, p.search_most_m), min(window_rad, math.pi)
             guesses = self._maps.search(planar_scan, SE2.from_matrix(first.pose), *window)
             searched = (self._candidate(planar_scan, guess, first) for guess in guesses)
-            found.extend(replace(candidate, near=False) for candidate in searched)
+            found += (replace(candidate, near=False) for candidate in searched)
             # A wide scan shows known ground behind it, too.
             if self._narrow and not max(found).near:
                 unseen = self._weight(planar_scan) * p.sure_overlap + first.log_density(0.0)

@@ -9,10 +9,15 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
-from pc2grid.arrays import F64
+import numpy as np
+
+from pc2grid.arrays import F64, BoolGrid
 from pc2grid.geometry import invert_pose, motion_size
 from pc2grid.model import OdometryCheck, Overruled
+
+T = TypeVar("T")
 
 _INEXACT_M, _INEXACT_RAD, _INEXACT_SHARE = 0.1, 0.1, 0.1
 """Odometry that differs by less, or by less than this share of the motion, is merely inexact; by hand."""
@@ -70,29 +75,22 @@ def check_odometry(stamps_ns: Sequence[int], disagreements: Sequence[Disagreemen
 
     disagreements : of each scan; None where there was nothing to compare.
     """
-    stretches: list[Overruled] = []
-    compared = overruled = 0
-    for stamp_ns, found in zip(stamps_ns, disagreements, strict=True):
-        if found is None:
-            continue
-        compared += 1
-        if not found.overrules:
-            continue
-        overruled += 1
-        stretch = Overruled(
-            from_ns=stamp_ns, to_ns=stamp_ns, distance_m=found.distance_m, turn_rad=found.turn_rad
+    compared = _known(stamps_ns, disagreements)
+    overruled = [(stamp_ns, found) for stamp_ns, found in compared if found.overrules]
+    apart = np.diff([stamp_ns for stamp_ns, _ in overruled]) > _TOGETHER_NS
+    stretches = [
+        Overruled(
+            from_ns=group[0][0],
+            to_ns=group[-1][0],
+            distance_m=max(found.distance_m for _, found in group),
+            turn_rad=max(found.turn_rad for _, found in group),
         )
-        if stretches and stamp_ns - stretches[-1].to_ns <= _TOGETHER_NS:
-            last = stretches.pop()
-            stretch = Overruled(
-                from_ns=last.from_ns,
-                to_ns=stamp_ns,
-                distance_m=max(last.distance_m, stretch.distance_m),
-                turn_rad=max(last.turn_rad, stretch.turn_rad),
-            )
-        stretches.append(stretch)
+        for group in _split(overruled, apart)
+    ]
     stretches.sort(key=lambda s: (-(s.distance_m + s.turn_rad), s.from_ns))
-    return OdometryCheck(compared=compared, overruled=overruled, stretches=tuple(stretches[:_SHOWN]))
+    return OdometryCheck(
+        compared=len(compared), overruled=len(overruled), stretches=tuple(stretches[:_SHOWN])
+    )
 
 
 def stalls(stamps_ns: Sequence[int], disagreements: Sequence[Disagreement | None]) -> list[Stall]:
@@ -103,25 +101,34 @@ def stalls(stamps_ns: Sequence[int], disagreements: Sequence[Disagreement | None
     lengths of the ways are compared, since odometry may have the direction wrong (fr079: forwards for
     backwards).
     """
-    known = [(stamp, found) for stamp, found in zip(stamps_ns, disagreements, strict=True) if found]
-    behind = [False] * len(known)
-    first, reported_m, moved_m = 0, 0.0, 0.0
-    for last, (_, found) in enumerate(known):
-        reported_m += found.reported_m
-        moved_m += found.moved_m
-        while reported_m - known[first][1].reported_m >= _STALLED_M:
-            reported_m -= known[first][1].reported_m
-            moved_m -= known[first][1].moved_m
-            first += 1
-        if reported_m >= _STALLED_M and moved_m < _STALLED_SHARE * reported_m:
-            behind[first : last + 1] = [True] * (last + 1 - first)
+    known = _known(stamps_ns, disagreements)
+    steps_m = np.array([(found.reported_m, found.moved_m) for _, found in known]).reshape(-1, 2)
+    reported_m, moved_m = np.vstack((np.zeros((1, 2)), steps_m.cumsum(axis=0))).T
+    # Of each scan, the shortest way up to it over which the two are compared.
+    first = np.searchsorted(reported_m, reported_m - _STALLED_M, side="right") - 1
+    share = (moved_m - moved_m[first]) / np.maximum(reported_m - reported_m[first], _STALLED_M)
+    last = np.flatnonzero((first >= 0) & (share < _STALLED_SHARE))
+    ends = np.bincount(first[last], minlength=len(first)) - np.bincount(last, minlength=len(first))
+    behind = np.flatnonzero(ends.cumsum()[:-1] > 0)
     return [
         Stall(
-            from_ns=known[members[0]][0],
-            to_ns=known[members[-1]][0],
-            reported_m=sum(known[k][1].reported_m for k in members),
-            moved_m=sum(known[k][1].moved_m for k in members),
+            known[k][0],
+            known[m][0],
+            float(reported_m[m + 1] - reported_m[k]),
+            float(moved_m[m + 1] - moved_m[k]),
         )
-        for stalled, group in itertools.groupby(range(len(known)), key=behind.__getitem__)
-        if stalled and (members := list(group))
+        for k, m in ((group[0], group[-1]) for group in _split(behind.tolist(), np.diff(behind) > 1))
     ]
+
+
+def _known(
+    stamps_ns: Sequence[int], disagreements: Sequence[Disagreement | None]
+) -> list[tuple[int, Disagreement]]:
+    """The scans where there was something to compare, with their stamps."""
+    return [(stamp, found) for stamp, found in zip(stamps_ns, disagreements, strict=True) if found]
+
+
+def _split(items: Sequence[T], ends: BoolGrid) -> list[Sequence[T]]:
+    """Items (N,) in groups; `ends` (N - 1,): whether an item is the last of its group."""
+    cuts = [0, *(np.flatnonzero(ends) + 1).tolist(), len(items)]
+    return [items[first:end] for first, end in itertools.pairwise(cuts) if first < end]

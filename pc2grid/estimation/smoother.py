@@ -19,15 +19,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from pc2grid.arrays import F64
+from pc2grid.arrays import F64, BoolGrid
 from pc2grid.estimation.belief import KERNEL, PLANAR, Belief
 from pc2grid.estimation.graph import Factors, normal_equations, without
 from pc2grid.estimation.manifold import Steps, carried_on, moved, steps
@@ -77,8 +77,6 @@ IN_THE_HAND = SmootherParameters(
 """For odometry in six degrees of freedom, which is visual and inertial: it is exact to millimetres from image
 to image, drifts by a percent, and has no wheels whose errors are always the same. Chosen by hand."""
 
-T = TypeVar("T")
-
 _ERRORS = 4  # systematic errors of odometry
 _DAMPING = 1e-9  # so that unknowns without evidence can be solved for
 _CERTAIN = np.array([np.inf])  # kernel of a factor whose weight is 1
@@ -102,6 +100,42 @@ class Evidence:
     continues: bool = True
     match: tuple[F64, F64] | None = None
     motion: tuple[F64, F64] | None = None
+
+
+class _Window(NamedTuple):
+    """The evidence of the last N scans; what is not measured has infinite standard deviations, or no
+    information.
+
+    seconds : (N,) since the scan before. jumps : (N,) whether the reading does not go on from the one before.
+    read : (N, 4, 4) T_odom_base, with read_sigma (N, D). match : (N, 4, 4) T_session_base, with
+    match_information (N, D, D). motion : (N, 6) step from the scan before, with motion_sigma (N, D).
+    """
+
+    seconds: F64
+    jumps: BoolGrid
+    read: F64
+    read_sigma: F64
+    match: F64
+    match_information: F64
+    motion: F64
+    motion_sigma: F64
+
+    def part(self, begin: int, end: int) -> _Window:
+        """Of the scans from `begin` to before `end`."""
+        return _Window(*(rows[begin:end] for rows in self))
+
+    def then(self, more: _Window) -> _Window:
+        """With further scans."""
+        return _Window(*map(np.concatenate, zip(self, more, strict=True)))
+
+    @property
+    def unmeasured(self) -> BoolGrid:
+        """(N,) whether neither registration nor odometry nor, where that jumps, a match says where a scan
+        lies."""
+        read, moved_by = np.isfinite(self.read_sigma[:, 0]), np.isfinite(self.motion_sigma[:, 0])
+        matched = self.match_information.any(axis=(1, 2))
+        without: BoolGrid = ~moved_by & ~(read & (matched | ~self.jumps))
+        return without
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +189,6 @@ class Smoother:
     def __init__(self, free: tuple[int, ...] = PLANAR, parameters: SmootherParameters = SMOOTHER) -> None:
         self._parameters = parameters
         self._free = np.array(free)
-        self._evidence: list[Evidence] = []
 
     # ------------------------------------------------------------------------------------------ prediction
 
@@ -164,7 +197,8 @@ class Smoother:
         p, d = self._parameters, len(self._free)
         reading = T_session_base if T_odom_base is None else T_odom_base
         self._state = _State(T_session_base[None].copy(), reading[None].copy(), np.zeros(_ERRORS))
-        self._evidence = [Evidence(seconds=0.0)]
+        self._window = self._row(Evidence(seconds=0.0), T_session_base, reading)
+        self._begins = True  # the sensor has not been seen to move yet
         errors = np.array([p.scale, p.direction_rad, p.yaw_rad_per_m, p.turn])
         own = np.concatenate((np.full(d, 1e-4), self._noise(p.reading_m, p.reading_rad)))
         information = np.diag(np.concatenate((errors, own)) ** -2)
@@ -187,14 +221,11 @@ class Smoother:
 
     def by_steadiness(self, seconds: float) -> Belief:
         """The next pose, `seconds` later, if the motion before goes on."""
-        p, k, span_s = self._parameters, len(self._evidence) - 1, 0.0
-        while k > 0 and span_s < p.steady_s:
-            span_s += self._evidence[k].seconds
-            k -= 1
-        step, _, _ = steps(self._state.poses[k : k + 1], self._state.poses[-1:])
-        share = min(seconds / span_s, 1.0) if span_s > 0.0 else 0.0
-        sigmas = self._unsteadiness(seconds)
-        return self._after(moved(np.eye(4)[None], share * step)[0], sigmas**2)
+        spans_s = np.concatenate(((0.0,), np.cumsum(self._window.seconds[:0:-1])))  # back from the last scan
+        back = min(int(np.searchsorted(spans_s, self._parameters.steady_s)), len(spans_s) - 1)
+        step, _, _ = steps(self._state.poses[-1 - back :][:1], self._state.poses[-1:])
+        share = min(seconds / max(float(spans_s[back]), _LEAST_S), 1.0)
+        return self._after(moved(np.eye(4)[None], share * step)[0], self._unsteadiness(seconds) ** 2)
 
     def _after(self, motion: F64, variance: F64) -> Belief:
         """The last pose after a motion (4, 4) with variances (D,) of its own."""
@@ -220,9 +251,10 @@ class Smoother:
         reading = before.readings[-1] @ invert_pose(before.poses[-1]) @ guess
         if read is not None and not evidence.continues:
             reading = read
-        if len(self._evidence) == 1 and read is None and evidence.motion is None:
+        if self._begins and read is None and evidence.motion is None:
             evidence = dataclasses.replace(evidence, motion=(np.eye(4), self._unsteadiness(evidence.seconds)))
-        self._evidence = [*self._evidence, evidence]
+        self._begins = False
+        self._window = self._window.then(self._row(evidence, guess, reading))
         state = _State(
             np.concatenate((before.poses, guess[None])),
             np.concatenate((before.readings, reading[None])),
@@ -235,9 +267,20 @@ class Smoother:
                 solution = jumped
         self._state = solution.state
         self._covariance = self._last_covariance(solution.information)
-        if len(self._evidence) > self._parameters.lag:
+        if len(self._state.poses) > self._parameters.lag:
             self._marginalise()
         return self.belief
+
+    def _row(self, evidence: Evidence, pose: F64, reading: F64) -> _Window:
+        """The evidence of one scan; a pose (4, 4) and a reading stand for what is not measured."""
+        p, d = self._parameters, len(self._free)
+        nothing, noise = np.full(d, np.inf), self._noise(p.reading_m, p.reading_rad)
+        read = (reading, nothing) if evidence.T_odom_base is None else (evidence.T_odom_base, noise)
+        motion, motion_sigma = evidence.motion or (np.eye(4), nothing)
+        step, _, _ = steps(np.eye(4)[None], motion[None])
+        match = evidence.match or (pose, np.zeros((d, d)))
+        row = (evidence.seconds, not evidence.continues, *read, *match, step[0], motion_sigma)
+        return _Window(*(np.array(value)[None] for value in row))
 
     def _is_contradicted(self, read: F64, reading: F64) -> bool:
         """Whether a reading (4, 4) is so far from what it should be that it counts less than half."""
@@ -248,18 +291,17 @@ class Smoother:
 
     def _as_read(self, readings: F64) -> F64:
         """The readings (N, 4, 4) as they were read, but for the first, and where there was none."""
-        result = readings.copy()
-        for k, evidence in enumerate(self._evidence):
-            if k and evidence.T_odom_base is not None:
-                result[k] = evidence.T_odom_base
-        return result
+        window = self._window
+        read = np.isfinite(window.read_sigma[:, 0]) & (np.arange(len(readings)) > 0)
+        return np.where(read[:, None, None], window.read, readings)
 
     def _solved(self, state: _State) -> _Solution:
         """Gauss-Newton from a state."""
         p, n = self._parameters, len(state.poses)
         count = _ERRORS + 2 * len(self._free) * n
         for _ in range(p.iterations):
-            H, g, cost = normal_equations(self._factors(state), count)
+            self._drift_scale = self._shown_drift(state) if n > 2 else self._drift_scale
+            H, g, cost = normal_equations(self._factors(state, self._window), count)
             H[np.diag_indices(count)] += _DAMPING
             delta = -cho_solve(cho_factor(H, check_finite=False), g, check_finite=False)
             changes = np.zeros((n, 2, 6))
@@ -281,37 +323,29 @@ class Smoother:
     def _marginalise(self) -> None:
         """Replace the first scan by what it says of the next two."""
         d = len(self._free)
-        few = self._state.part(0, 3)
-        H, g, _ = normal_equations(self._factors(few, first=True), _ERRORS + 2 * d * len(few.poses))
-        information, gradient = without(H, g, _ERRORS + np.arange(2 * d))
+        few, first = self._state.part(0, 3), _ERRORS + np.arange(2 * d)
+        factors = (part.touching(first) for part in self._factors(few, self._window.part(0, 3)))
+        H, g, _ = normal_equations(factors, _ERRORS + 2 * d * len(few.poses))
+        information, gradient = without(H, g, first)
         shift = np.asarray(
             np.linalg.solve(information + _DAMPING * np.eye(len(gradient)), gradient), np.float64
         )
         self._prior = _Prior(few.part(1, 3), shift, information)
-        self._state = self._state.part(1, len(self._evidence))
-        self._evidence = self._evidence[1:]
+        self._state = self._state.part(1, len(self._state.poses))
+        self._window = self._window.part(1, len(self._window.seconds))
 
     # --------------------------------------------------------------------------------------------- factors
 
-    def _factors(self, state: _State, *, first: bool = False) -> Iterator[Factors]:
-        """All factors at a state; `first`: those alone that its first scan takes part in."""
-        used = 1 if first else len(state.poses)
+    def _factors(self, state: _State, window: _Window) -> Iterator[Factors]:
+        """All factors of some scans at a state, the first of which is the oldest one."""
+        of_poses = steps(state.poses[:-1], state.poses[1:])
+        of_readings = steps(state.readings[:-1], state.readings[1:])
         yield self._prior_factor(state)
-        yield from self._reading_factors(state.readings[:used])
-        yield from self._match_factors(state.poses[:used])
-        if len(state.poses) > 1:
-            of_poses = steps(state.poses[:-1], state.poses[1:])
-            of_readings = steps(state.readings[:-1], state.readings[1:])
-            yield self._drift_factors(
-                Steps(*(a[:used] for a in of_poses)), Steps(*(a[:used] for a in of_readings)), state.errors
-            )
-            yield from self._motion_factors(Steps(*(a[:used] for a in of_poses)))
-            yield from self._steadiness_factors(of_poses, used)
-
-    def _known(self, count: int, what: Callable[[Evidence], T | None]) -> list[tuple[int, T]]:
-        """Of the first scans, those that have some evidence, with it."""
-        found = ((k, what(evidence)) for k, evidence in enumerate(self._evidence[:count]))
-        return [(k, value) for k, value in found if value is not None]
+        yield self._reading_factors(state.readings, window)
+        yield self._match_factors(state.poses, window)
+        yield self._drift_factors(of_poses, of_readings, state.errors, window)
+        yield self._motion_factors(of_poses, window)
+        yield self._steadiness_factors(of_poses, window)
 
     def _prior_factor(self, state: _State) -> Factors:
         """What the marginalised scans say of errors and first states."""
@@ -322,31 +356,39 @@ class Smoother:
         identity, rows = np.eye(len(error)), np.arange(len(error))
         return Factors(rows[None], error[None], identity[None], self._prior.information[None], _CERTAIN)
 
-    def _reading_factors(self, readings: F64) -> Iterator[Factors]:
+    def _reading_factors(self, readings: F64, window: _Window) -> Factors:
         """A reading of odometry lies near what it should be."""
-        read = self._known(len(readings), lambda evidence: evidence.T_odom_base)
-        if read:
-            p, known = self._parameters, [k for k, _ in read]
-            off = steps(np.array([T for _, T in read]), readings[known])
-            sigmas = np.tile(self._noise(p.reading_m, p.reading_rad), (len(known), 1))
-            rows = self._rows(known, of_reading=True)
-            yield self._factor(rows, off.step, off.by_second[:, :, self._free], sigmas)
+        off = steps(window.read, readings)
+        rows = self._rows(np.arange(len(readings)), of_reading=True)
+        return self._factor(rows, off.step, off.by_second[:, :, self._free], window.read_sigma)
 
-    def _match_factors(self, poses: F64) -> Iterator[Factors]:
+    def _match_factors(self, poses: F64, window: _Window) -> Factors:
         """A pose lies near where the scan fits the local map."""
-        matched = self._known(len(poses), lambda evidence: evidence.match)
-        if matched:
-            known, information = [k for k, _ in matched], np.array([L for _, (_, L) in matched])
-            off = steps(np.array([T for _, (T, _) in matched]), poses[known])
-            jacobian = off.by_second[:, self._free[:, None], self._free]
-            kernel = np.full(len(known), self._parameters.kernel)
-            yield Factors(self._rows(known), off.step[:, self._free], jacobian, information, kernel)
+        off = steps(window.match, poses)
+        jacobian = off.by_second[:, self._free[:, None], self._free]
+        kernel = np.full(len(poses), self._parameters.kernel)
+        rows = self._rows(np.arange(len(poses)))
+        return Factors(rows, off.step[:, self._free], jacobian, window.match_information, kernel)
 
-    def _drift_factors(self, of_poses: Steps, of_readings: Steps, errors: F64) -> Factors:
+    def _drift(self, of_poses: Steps, of_readings: Steps, errors: F64) -> tuple[F64, F64]:
+        """By how much poses move otherwise than odometry should report, (N, 6), and its drift (N, D)."""
+        corrected, _, _ = self._corrected(of_readings.step, errors)
+        return _wrapped(of_poses.step - corrected), np.sqrt(self._drift_variance(of_readings.step))
+
+    def _shown_drift(self, state: _State) -> float:
+        """The root mean square of the drift of the last steps in its standard deviations, at least 1."""
+        of_poses = steps(state.poses[:-1], state.poses[1:])
+        error, sigmas = self._drift(of_poses, steps(state.readings[:-1], state.readings[1:]), state.errors)
+        sigmas[self._window.jumps[1:]] = _UNKNOWN
+        return math.sqrt(max(float(((error[:, self._free] / sigmas) ** 2).mean()), 1.0))
+
+    def _drift_factors(self, of_poses: Steps, of_readings: Steps, errors: F64, window: _Window) -> Factors:
         """From scan to scan the pose moves as odometry should report it, but for its errors and its drift."""
-        moved_by, reported = of_poses.step, of_readings.step
-        corrected, by_report, by_errors = self._corrected(reported, errors)
-        scans = np.arange(len(moved_by))
+        _, by_report, by_errors = self._corrected(of_readings.step, errors)
+        error, sigmas = self._drift(of_poses, of_readings, errors)
+        sigmas[window.jumps[1:]] = _UNKNOWN
+        sigmas = self._drift_scale * sigmas
+        scans = np.arange(len(error))
         rows = np.concatenate(
             (
                 np.tile(np.arange(_ERRORS), (len(scans), 1)),
@@ -355,17 +397,9 @@ class Smoother:
             ),
             axis=1,
         )  # fmt: skip
-        sigmas = np.sqrt(self._drift_variance(reported))
-        jumps = [not e.continues for e in self._evidence[1 : 1 + len(scans)]]
-        sigmas[jumps] = _UNKNOWN
-        error = _wrapped(moved_by - corrected)
-        chi2 = ((error[:, self._free] / sigmas) ** 2).sum(axis=1)
-        if len(scans) > 1:
-            self._drift_scale = math.sqrt(max(float(chi2.mean()) / len(self._free), 1.0))
-        sigmas = self._drift_scale * sigmas
         # What slips, or comes late, says nothing of errors that are the same in every step.
-        weight = 1.0 / (1.0 + chi2 / (self._drift_scale * self._parameters.kernel) ** 2)
-        by_errors = by_errors * weight[:, None, None]
+        chi2 = ((error[:, self._free] / sigmas) ** 2).sum(axis=1)
+        by_errors = by_errors / (1.0 + chi2 / self._parameters.kernel**2)[:, None, None]
         jacobians = (
             of_poses.by_first,
             of_poses.by_second,
@@ -375,46 +409,32 @@ class Smoother:
         free = [a[:, :, self._free] for a in jacobians]
         return self._factor(rows, error, np.concatenate((-by_errors, *free), axis=2), sigmas)
 
-    def _motion_factors(self, of_poses: Steps) -> Iterator[Factors]:
+    def _motion_factors(self, of_poses: Steps, window: _Window) -> Factors:
         """A pose follows the one before by the motion that registration measured."""
-        motions = [(k, value) for k, value in self._known(1 + len(of_poses.step), lambda e: e.motion) if k]
-        if motions:
-            scans = np.array([k - 1 for k, _ in motions])
-            measured = steps(np.tile(np.eye(4), (len(scans), 1, 1)), np.array([T for _, (T, _) in motions]))
-            rows = np.concatenate((self._rows(scans), self._rows(scans + 1)), axis=1)
-            jacobian = np.concatenate((of_poses.by_first[scans], of_poses.by_second[scans]), axis=2)
-            jacobian = jacobian[:, :, np.concatenate((self._free, 6 + self._free))]
-            sigmas = np.array([sigma for _, (_, sigma) in motions])
-            yield self._factor(rows, _wrapped(of_poses.step[scans] - measured.step), jacobian, sigmas)
+        scans = np.arange(len(of_poses.step))
+        rows = np.concatenate((self._rows(scans), self._rows(scans + 1)), axis=1)
+        jacobian = np.concatenate(
+            (of_poses.by_first[:, :, self._free], of_poses.by_second[:, :, self._free]), axis=2
+        )
+        return self._factor(
+            rows, _wrapped(of_poses.step - window.motion[1:]), jacobian, window.motion_sigma[1:]
+        )
 
-    def _steadiness_factors(self, of_poses: Steps, used: int) -> Iterator[Factors]:
+    def _steadiness_factors(self, of_poses: Steps, window: _Window) -> Factors:
         """Where nothing else measures it, the motion goes on as it was."""
-        p = self._parameters
-        known = [
-            k for k, e in enumerate(self._evidence[2 : len(of_poses.step) + 1])
-            if k < used and e.motion is None and self._unmeasured(e)
-        ]  # fmt: skip
-        if not known:
-            return
-        scans = np.array(known)
-        seconds = np.array([max(e.seconds, _LEAST_S) for e in self._evidence])
-        for_s = np.minimum(seconds[scans + 2], np.maximum(seconds[scans + 1], p.steady_s))
-        ratio = (for_s / seconds[scans + 1])[:, None]
+        p, scans = self._parameters, np.arange(len(of_poses.step) - 1)
+        seconds = np.maximum(window.seconds, _LEAST_S)
+        for_s = np.minimum(seconds[2:], np.maximum(seconds[1:-1], p.steady_s))
+        ratio = (for_s / seconds[1:-1])[:, None]
         rows = np.concatenate([self._rows(scans + k) for k in range(3)], axis=1)
-        of_first = -ratio[:, :, None] * of_poses.by_first[scans]
-        of_second = of_poses.by_first[scans + 1] - ratio[:, :, None] * of_poses.by_second[scans]
-        of_third = of_poses.by_second[scans + 1]
+        of_first = -ratio[:, :, None] * of_poses.by_first[:-1]
+        of_second = of_poses.by_first[1:] - ratio[:, :, None] * of_poses.by_second[:-1]
+        of_third = of_poses.by_second[1:]
         jacobian = np.concatenate([J[:, :, self._free] for J in (of_first, of_second, of_third)], axis=2)
-        sigmas = seconds[scans + 2, None] * self._noise(p.unsteady_mps, p.unsteady_radps)
-        error = _wrapped(of_poses.step[scans + 1] - ratio * of_poses.step[scans])
-        yield self._factor(rows, error, jacobian, sigmas, kernel=np.inf)
-
-    @staticmethod
-    def _unmeasured(evidence: Evidence) -> bool:
-        """Whether neither odometry nor, where that does not go on, a match says where a scan lies."""
-        if evidence.T_odom_base is None:
-            return True
-        return not evidence.continues and evidence.match is None
+        sigmas = seconds[2:, None] * self._noise(p.unsteady_mps, p.unsteady_radps)
+        sigmas[~window.unmeasured[2:]] = np.inf
+        error = _wrapped(of_poses.step[1:] - ratio * of_poses.step[:-1])
+        return self._factor(rows, error, jacobian, sigmas, kernel=np.inf)
 
     def _factor(
         self, rows: NDArray[np.intp], error: F64, jacobian: F64, sigmas: F64, kernel: float | None = None
@@ -425,10 +445,10 @@ class Smoother:
         scale = np.full(len(rows), self._parameters.kernel if kernel is None else kernel)
         return Factors(rows, error[:, self._free], jacobian[:, self._free], information, scale)
 
-    def _rows(self, scans: NDArray[np.intp] | list[int], *, of_reading: bool = False) -> NDArray[np.intp]:
+    def _rows(self, scans: NDArray[np.intp], *, of_reading: bool = False) -> NDArray[np.intp]:
         """The numbers (F, D) of the unknowns of the poses, or of the readings, of scans (F,)."""
         d = len(self._free)
-        rows: NDArray[np.intp] = _ERRORS + (2 * np.asarray(scans)[:, None] + of_reading) * d + np.arange(d)
+        rows: NDArray[np.intp] = _ERRORS + (2 * scans[:, None] + of_reading) * d + np.arange(d)
         return rows
 
     # --------------------------------------------------------------------------------------------- odometry
