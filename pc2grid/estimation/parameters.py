@@ -55,9 +55,8 @@ class TrackingParameters:
 
     Odometry:
 
-    gap_s, gap_intervals : odometry does not go on over a longer time than `gap_s`, and than so many times the
-        usual interval between scans, which is the median of `usual_intervals`.
-    fastest_mps, fastest_radps : odometry that reports a faster motion is not believed, with an allowance of
+    gap : odometry does not go on over a time of more than so many usual intervals between scans.
+    fastest : in m/s and in rad/s; odometry that reports a faster motion is not believed, with an allowance of
         `jump_m` and `jump_rad` for noise.
     steady_sigma_m, steady_sigma_rad : standard deviations of the motion that KISS-ICP finds, without
         odometry.
@@ -113,11 +112,8 @@ class TrackingParameters:
     steady_sigma_m: float = 0.03
     steady_sigma_rad: float = 0.01
 
-    gap_s: float = 1.0
-    gap_intervals: float = 5.0
-    usual_intervals: int = 9
-    fastest_mps: float = 4.0
-    fastest_radps: float = 4.0
+    gap: float = 10.0
+    fastest: float = 4.0
     jump_m: float = 0.2
     jump_rad: float = 0.3
 

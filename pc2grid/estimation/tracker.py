@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,13 +23,14 @@ from pc2grid.estimation.belief import SPATIAL
 from pc2grid.estimation.carried import CarriedSensor
 from pc2grid.estimation.ground_model import DECIDING_SCANS, is_rolling
 from pc2grid.estimation.health import HealthJudge
+from pc2grid.estimation.odometer import Odometer
 from pc2grid.estimation.on_wheels import SensorOnWheels
-from pc2grid.estimation.overruled import Disagreement, disagreement
+from pc2grid.estimation.overruled import Disagreement
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.estimation.placed import PlacingSensor
 from pc2grid.estimation.rides import Ride, RideWatch
 from pc2grid.estimation.smoother import IN_THE_HAND, SMOOTHER, Evidence, Smoother
-from pc2grid.geometry import SE2, invert_pose, motion_size
+from pc2grid.geometry import SE2, invert_pose
 from pc2grid.model import Health, RegisteredScan, Scan, Storey
 
 
@@ -43,9 +43,8 @@ class Tracked:
     keyframe : whether the robot had moved enough for the scan to become part of the local map.
     restart : the first keyframe after tracking was lost: its pose relative to those before is unknown.
     disagreement : of odometry with the pose; None for a lost scan, and where there is nothing to compare.
-    mapped : the scan may become part of the map. riding : on the way to another floor: the scan belongs to
-    none, see `Ride`. arrived : the first scan after a ride to another floor. storey : number of the floor,
-    see `Tracker.storeys`.
+    riding : on the way to another floor: the scan belongs to none, see `Ride`. arrived : the first scan after
+    a ride to another floor. storey : number of the floor, see `Tracker.storeys`.
     """
 
     registered: RegisteredScan
@@ -53,7 +52,6 @@ class Tracked:
     keyframe: bool
     restart: bool = False
     disagreement: Disagreement | None = None
-    mapped: bool = True
     riding: bool = False
     arrived: bool = False
     storey: int = 0
@@ -76,11 +74,8 @@ class Tracker:
         self._parameters = parameters
         self._first: Scan | None = None
         self._count = 0  # scans since the first one
-        self._last: tuple[Scan, F64] | None = None  # the last scan, and its final pose T_session_base
-        self._reading: tuple[F64, F64] | None = (
-            None  # the last T_odom_base that was known, and that pose then
-        )
-        self._intervals_s: deque[float] = deque(maxlen=parameters.usual_intervals)  # between the last scans
+        self._last: tuple[int, F64] | None = None  # stamp of the last scan, and its final pose T_session_base
+        self._odometer = Odometer(parameters=parameters)
         self._rides = RideWatch()
         self._keyframe: SE2 | None = None  # where the last one was
         self._restarted = False  # no keyframe has been reported since tracking started again
@@ -106,8 +101,8 @@ class Tracker:
 
     def _begin(self, scan: Scan, at: SE2, *, rolling: bool) -> Tracked:
         """Begin with a scan whose base is at a place of the session frame, on wheels or in the hand."""
-        self._last = self._reading = self._keyframe = None
-        points = self._deskewed(scan, None, 0.0)
+        self._keyframe, self._odometer = None, Odometer(scan.stamp_ns, self._parameters)
+        points = self._deskewed(scan, np.eye(4), 1.0)
         if rolling:
             self._sensor = SensorOnWheels(self._config, self._projection, self._parameters)
         else:
@@ -115,16 +110,17 @@ class Tracker:
         self._health = HealthJudge(self._parameters)
         pose = self._sensor.start(scan, points, at)
         self._smoother = Smoother(self._sensor.free, SMOOTHER if rolling else IN_THE_HAND)
-        self._smoother.start(self._flat(pose), self._odometry(scan))
-        return self._finish(scan, points, pose, Health.FINE)
+        self._smoother.start(self._flat(pose), self._reading(scan))
+        return self._finish(scan, points, pose, Health.FINE, np.eye(4))
 
     def track(self, scan: Scan) -> Tracked:
         """Track the next scan; stamps must increase."""
-        if self._first is None or self._last is None:
+        if self._last is None:
             return self.start(scan)
-        seconds = (scan.stamp_ns - self._last[0].stamp_ns) * 1e-9
-        reading = self._odometry(scan)
-        continues = self._continues(scan, seconds)
+        stamp_ns, last_pose = self._last
+        seconds = (scan.stamp_ns - stamp_ns) * 1e-9
+        reading, reported = self._reading(scan), self._odometer.reported(scan)
+        continues = self._odometer.continues(scan, seconds)
         # 1. What is expected: by odometry, or that the motion goes on. What is not plausible comes last.
         expected = [self._smoother.by_steadiness(seconds)]
         if reading is not None:
@@ -141,39 +137,39 @@ class Tracker:
         estimate = self._smoother.add(placed.pose, evidence)
         # 4. Judge the pose, and start again if nothing fits any more.
         health = self._health.judge(placed, estimate, bridged=reading is not None and continues)
-        self._intervals_s.append(seconds)
-        tracked = self._finish(
-            scan, points, self._sensor.levelled(estimate.pose), health, continues=continues
-        )
+        pose = self._sensor.levelled(estimate.pose)
+        travelled = invert_pose(last_pose) @ pose if reported is None or not continues else reported
+        tracked = self._finish(scan, points, pose, health, travelled)
         if self._health.gives_up:
             self._restart()
         return tracked
 
-    def _finish(
-        self, scan: Scan, points: F32, pose: F64, health: Health, *, continues: bool = True
-    ) -> Tracked:
+    def _finish(self, scan: Scan, points: F32, pose: F64, health: Health, travelled: F64) -> Tracked:
         """Extend the maps by a scan if it is worth it, and remember its final pose.
 
-        continues : whether odometry goes on from where it was last known.
+        travelled : (4, 4) motion since the scan before, by the wheels where they are known: tracking in the
+        plane errs on stairs.
         """
-        planar_scan = self._sensor.cut(scan, points, pose, lost=health is Health.LOST)
-        ride = self._ride(scan, points, planar_scan, pose, continues)
+        lost = health is Health.LOST
+        planar_scan = self._sensor.cut(scan, points, pose, lost=lost)
+        ride = Ride()
+        if not self.carried:  # a hand tilts as it likes
+            forward_m = float(travelled[0, 3])
+            ride = self._rides.observe(scan, points, planar_scan, pose, forward_m, self._sensor.ground)
         if ride.arrived:
             self._restart()
-        extended = health is not Health.LOST and len(planar_scan.hits_m) > 0 and self._is_due(pose)
+        extended = not lost and len(planar_scan.hits_m) > 0 and self._is_due(pose)
         if extended:
             self._keyframe = SE2.from_matrix(pose)
             self._sensor.extend(pose)
-        mapped = not (ride.riding or ride.tilting)
-        keyframe = extended and mapped
+        keyframe = extended and not ride.riding
         restart = keyframe and self._restarted
         self._restarted &= not keyframe
-        found = None if health is Health.LOST else self._disagreement(scan, pose)
+        found = None if lost else self._odometer.disagreement(scan, pose)
         if health is Health.FINE and found is not None and found.overrules:
             health = Health.OVERRULED
-        self._last = scan, pose
-        if scan.T_odom_base is not None:
-            self._reading = scan.T_odom_base, pose
+        self._last = scan.stamp_ns, pose
+        self._odometer.remember(scan, pose)
         deskewed = dataclasses.replace(scan, points_m=points, offsets_s=None)
         return Tracked(
             registered=RegisteredScan(scan=deskewed, T_session_base=pose, health=health),
@@ -181,7 +177,6 @@ class Tracker:
             keyframe=keyframe,
             restart=restart,
             disagreement=found,
-            mapped=mapped,
             riding=ride.riding,
             arrived=ride.arrived,
             storey=self._rides.storey,
@@ -194,19 +189,6 @@ class Tracker:
         p, step = self._parameters, self._keyframe.inverse() @ SE2.from_matrix(pose)
         return math.hypot(step.x, step.y) >= p.keyframe_travel_m or abs(step.yaw) >= p.keyframe_turn_rad
 
-    def _ride(self, scan: Scan, points: F32, planar_scan: PlanarScan, pose: F64, continues: bool) -> Ride:
-        """Look whether the robot leaves its floor. A sensor in the hand tilts as it likes.
-
-        The travel is that of the wheels where they are known: tracking in the plane errs on stairs.
-        """
-        if self.carried:
-            return Ride()
-        step = self._reported(scan)
-        if step is None or not continues:
-            _, last_pose = self._last or (scan, pose)
-            step = invert_pose(last_pose) @ pose
-        return self._rides.observe(scan, points, planar_scan, pose, float(step[0, 3]), self._sensor.ground)
-
     def _restart(self) -> None:
         """Forget the local maps; the poses go on from the last one."""
         self._sensor.restart()
@@ -214,64 +196,28 @@ class Tracker:
         self._keyframe = None
         self._restarted = True
 
-    # ---------------------------------------------------------------------------------------------- odometry
-
     def _flat(self, pose: F64) -> F64:
         """A pose (4, 4) in the directions that are free: on wheels those of the plane."""
         return pose if self.carried else SE2.from_matrix(pose).lift()
 
-    def _odometry(self, scan: Scan) -> F64 | None:
+    def _reading(self, scan: Scan) -> F64 | None:
         """The reading (4, 4) of odometry at a scan."""
         return None if scan.T_odom_base is None else self._flat(scan.T_odom_base)
 
-    def _reported(self, scan: Scan) -> F64 | None:
-        """The motion (4, 4) that odometry reports since it was last known."""
-        if scan.T_odom_base is None or self._reading is None:
-            return None
-        return invert_pose(self._reading[0]) @ scan.T_odom_base
-
-    def _continues(self, scan: Scan, seconds: float) -> bool:
-        """Whether odometry goes on from where it was last known, after a time.
-
-        It does not if it reports an impossible motion, nor over a gap in the log: its driver may have been
-        restarted meanwhile.
-        """
-        reported, p = self._reported(scan), self._parameters
-        if reported is None:
-            return True
-        usual_s = float(np.median(self._intervals_s)) if self._intervals_s else seconds
-        return seconds <= max(p.gap_s, p.gap_intervals * usual_s) and self._is_possible(reported, seconds)
-
-    def _is_possible(self, motion: F64, seconds: float) -> bool:
-        """Whether a robot or a person indoors can make a motion (4, 4) in a time."""
-        p = self._parameters
-        distance_m, turn_rad = motion_size(motion)
-        return (
-            distance_m <= p.jump_m + p.fastest_mps * seconds
-            and turn_rad <= p.jump_rad + p.fastest_radps * seconds
-        )
-
-    def _disagreement(self, scan: Scan, pose: F64) -> Disagreement | None:
-        """By how much odometry differs from the motion to the final pose (4, 4) of a scan."""
-        reported = self._reported(scan)
-        if reported is None or self._reading is None:
-            return None
-        return disagreement(reported, invert_pose(self._reading[1]) @ pose)
-
-    def _deskewed(self, scan: Scan, motion: F64 | None, seconds: float) -> F32:
+    def _deskewed(self, scan: Scan, motion: F64, seconds: float) -> F32:
         """The points (N, 3) of a scan that are used, without the motion while it was taken.
 
         motion : (4, 4) expected since the scan before, `seconds` ago. It counts only where odometry says
         nothing of the time of the scan itself, since a turn begins and ends within a scan.
         """
-        points, offsets = scan.points_m, scan.offsets_s
-        away = points - scan.T_base_sensor[:3, 3].astype(np.float32)
+        away = scan.points_m - scan.T_base_sensor[:3, 3].astype(np.float32)
         keep = np.flatnonzero(np.einsum("ij,ij->i", away, away) >= self._config.min_range_m**2)
         keep = keep[random_subset(len(keep), self._parameters.max_points)]
-        if len(keep) < len(points):
-            points, offsets = points[keep], None if offsets is None else offsets[keep]
-        if offsets is None or not self._config.deskew or not len(offsets):
+        points = scan.points_m[keep]
+        if scan.offsets_s is None or not self._config.deskew or not len(points):
             return points
-        if scan.T_first_last is not None and self._is_possible(scan.T_first_last, float(np.ptp(offsets))):
-            motion, seconds = scan.T_first_last, float(np.ptp(offsets))
-        return points if motion is None else deskew(points, offsets, motion, seconds)
+        offsets = scan.offsets_s[keep]
+        span_s = float(np.ptp(offsets))
+        if scan.T_first_last is not None and self._odometer.is_possible(scan.T_first_last, span_s):
+            motion, seconds = scan.T_first_last, span_s
+        return deskew(points, offsets, motion, seconds)

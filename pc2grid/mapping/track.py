@@ -131,7 +131,7 @@ class KeyframeSelection:
             scan = tracked.registered.scan
             if self._points is not None and not SENSOR_MODELS[scan.sensor].planar:
                 self._points.append(index, scan)
-        elif self._latest is not None and tracked.mapped and tracked.registered.health is not Health.LOST:
+        elif self._latest is not None and not tracked.riding and tracked.registered.health is not Health.LOST:
             self._unseen_hits.add(tracked.planar_scan, pose)
 
     def finish(self) -> None:
