@@ -7,6 +7,7 @@ walls that it shows; how far it knows each direction is measured, and the smooth
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -70,10 +71,12 @@ class SensorOnWheels:
         self._narrow = False  # the sensor sees a part of its surroundings only
         self._depth_limit = DepthLimit()
         self._floor = GroundModel(None, parameters)
+        self._matching = MATCHING_PARAMETERS
         self._maps = MatchingMaps(projection.max_range_m, parameters)
         self.kiss = KissRegistration(registration, parameters)
         self._planar_scan: PlanarScan | None = None  # of the scan placed last
         self._last = SE2()  # its final pose
+        self._latest: deque[tuple[PlanarScan, SE2]] = deque(maxlen=parameters.followed)
 
     @property
     def ground(self) -> Ground | None:
@@ -85,8 +88,8 @@ class SensorOnWheels:
         levelled."""
         self._floor = GroundModel.start(points_m, scan, self._parameters)
         self._narrow = SENSOR_MODELS[scan.sensor].narrow
-        matching = CAMERA_MATCHING if self._narrow else MATCHING_PARAMETERS
-        self._maps = MatchingMaps(self._projection.max_range_m, self._parameters, matching)
+        self._matching = CAMERA_MATCHING if self._narrow else MATCHING_PARAMETERS
+        self._maps = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
         pose = self.levelled(at.lift())
         self.kiss.register(self._floor.remove(points_m), pose, 0.0)
         self._planar_scan = self._project(scan, points_m)
@@ -103,34 +106,42 @@ class SensorOnWheels:
 
     def place(self, scan: Scan, points_m: F32, seconds: float, expected: Sequence[Belief]) -> Placed:
         """See `PlacingSensor`."""
+        p = self._parameters
         self._floor.follow(points_m, scan)
         near = self.kiss.register(self._floor.remove(points_m), self.levelled(expected[0].pose), seconds)
         registered = SE2.from_matrix(near)
         self._planar_scan = planar_scan = self._project(scan, points_m)
         motion = None
         if scan.T_odom_base is None and self.kiss.registered and not self._narrow:
-            p = self._parameters
-            motion = (
-                (self._last.inverse() @ registered).lift(),
-                np.array([p.steady_sigma_m, p.steady_sigma_m, p.steady_sigma_rad]),
-            )
+            sigmas = np.array([p.steady_sigma_m, p.steady_sigma_m, p.steady_sigma_rad])
+            motion = (self._last.inverse() @ registered).lift(), np.diag(sigmas**-2)
         if not self._maps:
             return Placed(expected[0].pose, first=True)
-        if len(planar_scan.hits_m) < self._parameters.min_hits:
-            return Placed(expected[0].pose, motion=motion)
         found = self._match(planar_scan, registered, expected)
         match = found.match
-        alone = match.by_points.lift(), _turned(match.information, match.by_points.yaw)
         # Half of what a camera sees while it turns may be new: where that fits badly, it says nothing.
-        fits = match.overlap >= self._parameters.min_overlap and (found.sure or found.near)
-        return Placed(
-            match.pose.lift() if fits else expected[0].pose,
-            alone if fits else None,
-            match.overlap,
-            match.residual_m,
-            match.measured,
-            motion=motion,
-        )
+        if match.overlap >= p.min_overlap and (found.sure or found.near):
+            alone = match.by_points.lift(), _turned(match.information, match.by_points.yaw)
+            return Placed(
+                match.pose.lift(), alone, match.overlap, match.residual_m, match.measured, motion=motion
+            )
+        followed = None if scan.T_odom_base is not None else self._followed(planar_scan, expected[0])
+        return Placed(expected[0].pose, motion=followed or motion, followed=followed is not None)
+
+    def _followed(self, planar_scan: PlanarScan, belief: Belief) -> tuple[F64, F64] | None:
+        """The motion (4, 4) from the scan before by the last scans alone, with its information (3, 3); None
+        if it does not fit them.
+
+        What a camera sees while it turns is new to the map, but not to the scans before.
+        """
+        last = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
+        for before, pose in self._latest:
+            last.extend(before, pose)
+        prior = SE2.from_matrix(belief.pose)
+        match = last.match(planar_scan, prior, prior, _in_map_axes(belief))
+        motion = self._last.inverse() @ match.by_points
+        information = _turned(match.information, self._last.yaw)
+        return (motion.lift(), information) if self._is_sure(match) else None
 
     def _match(self, planar_scan: PlanarScan, registered: SE2, expected: Sequence[Belief]) -> _Candidate:
         """The best match of a planar scan with the local map.
@@ -210,6 +221,7 @@ class SensorOnWheels:
         del scan, points_m, lost
         self._last = SE2.from_matrix(pose)
         assert self._planar_scan is not None
+        self._latest.append((self._planar_scan, self._last))
         return self._planar_scan
 
     def extend(self, pose: F64) -> None:

@@ -63,8 +63,8 @@ class TrackingParameters:
 
     Refinement in the plane:
 
-    min_hits : with fewer hits no refinement is made.
     matched_hits : hits of a scan that are matched, at most, evenly chosen.
+    followed : last scans that a scan is matched with which does not fit the local map.
     residual_weight_per_m : of two placements the one with the larger overlap - weight * residual is taken.
     hit_weight : what a hit tells as a share of one that is independent of its neighbours.
     disagree_m, disagree_rad : where KISS-ICP and the prediction differ by more, both start a refinement.
@@ -117,7 +117,7 @@ class TrackingParameters:
     jump_m: float = 0.2
     jump_rad: float = 0.3
 
-    min_hits: int = 10
+    followed: int = 5
     matched_hits: int = 700
     residual_weight_per_m: float = 5.0
     hit_weight: float = 0.3

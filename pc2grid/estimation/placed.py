@@ -25,7 +25,8 @@ class Placed:
     overlap : share of the points that meet the map. residual_m : their mean distance from it. measured :
         whether they fix every direction of the position.
     first : there is no local map yet, nor any since tracking started again.
-    motion : (4, 4) T_last_now by registration, with its standard deviations (D,), where that counts.
+    motion : (4, 4) T_last_now by registration, with its information (D, D), where that counts. followed : the
+        scan fits the one before, if not the map: what it shows is new.
     """
 
     pose: F64
@@ -35,6 +36,7 @@ class Placed:
     measured: bool = False
     first: bool = False
     motion: tuple[F64, F64] | None = None
+    followed: bool = False
 
 
 class PlacingSensor(Protocol):

@@ -92,7 +92,7 @@ class Evidence:
     seconds : since the scan before. T_odom_base : (4, 4) the reading of odometry, None if there is none.
     continues : whether that reading goes on from the one before. match : where the scan lies on the local
     map, a pose (4, 4) with its information (D, D); None if it fits nowhere. motion : (4, 4) T_last_now by
-    registration, with its standard deviations (D,); None if it is not measured.
+    registration, with its information (D, D); None if it is not measured.
     """
 
     seconds: float
@@ -108,7 +108,7 @@ class _Window(NamedTuple):
 
     seconds : (N,) since the scan before. jumps : (N,) whether the reading does not go on from the one before.
     read : (N, 4, 4) T_odom_base, with read_sigma (N, D). match : (N, 4, 4) T_session_base, with
-    match_information (N, D, D). motion : (N, 6) step from the scan before, with motion_sigma (N, D).
+    match_information (N, D, D). motion : (N, 6) step from the scan before, with motion_information (N, D, D).
     """
 
     seconds: F64
@@ -118,7 +118,7 @@ class _Window(NamedTuple):
     match: F64
     match_information: F64
     motion: F64
-    motion_sigma: F64
+    motion_information: F64
 
     def part(self, begin: int, end: int) -> _Window:
         """Of the scans from `begin` to before `end`."""
@@ -132,8 +132,9 @@ class _Window(NamedTuple):
     def unmeasured(self) -> BoolGrid:
         """(N,) whether neither registration nor odometry nor, where that jumps, a match says where a scan
         lies."""
-        read, moved_by = np.isfinite(self.read_sigma[:, 0]), np.isfinite(self.motion_sigma[:, 0])
-        matched = self.match_information.any(axis=(1, 2))
+        informed = (self.match_information, self.motion_information)
+        matched, moved_by = (information.any(axis=(1, 2)) for information in informed)
+        read = np.isfinite(self.read_sigma[:, 0])
         without: BoolGrid = ~moved_by & ~(read & (matched | ~self.jumps))
         return without
 
@@ -252,7 +253,8 @@ class Smoother:
         if read is not None and not evidence.continues:
             reading = read
         if self._begins and read is None and evidence.motion is None:
-            evidence = dataclasses.replace(evidence, motion=(np.eye(4), self._unsteadiness(evidence.seconds)))
+            stands = np.diag(self._unsteadiness(evidence.seconds) ** -2)
+            evidence = dataclasses.replace(evidence, motion=(np.eye(4), stands))
         self._begins = False
         self._window = self._window.then(self._row(evidence, guess, reading))
         state = _State(
@@ -274,12 +276,13 @@ class Smoother:
     def _row(self, evidence: Evidence, pose: F64, reading: F64) -> _Window:
         """The evidence of one scan; a pose (4, 4) and a reading stand for what is not measured."""
         p, d = self._parameters, len(self._free)
-        nothing, noise = np.full(d, np.inf), self._noise(p.reading_m, p.reading_rad)
-        read = (reading, nothing) if evidence.T_odom_base is None else (evidence.T_odom_base, noise)
-        motion, motion_sigma = evidence.motion or (np.eye(4), nothing)
+        nothing, read = np.zeros((d, d)), (reading, np.full(d, np.inf))
+        if evidence.T_odom_base is not None:
+            read = evidence.T_odom_base, self._noise(p.reading_m, p.reading_rad)
+        motion, information = evidence.motion or (np.eye(4), nothing)
         step, _, _ = steps(np.eye(4)[None], motion[None])
-        match = evidence.match or (pose, np.zeros((d, d)))
-        row = (evidence.seconds, not evidence.continues, *read, *match, step[0], motion_sigma)
+        match = evidence.match or (pose, nothing)
+        row = (evidence.seconds, not evidence.continues, *read, *match, step[0], information)
         return _Window(*(np.array(value)[None] for value in row))
 
     def _is_contradicted(self, read: F64, reading: F64) -> bool:
@@ -416,9 +419,9 @@ class Smoother:
         jacobian = np.concatenate(
             (of_poses.by_first[:, :, self._free], of_poses.by_second[:, :, self._free]), axis=2
         )
-        return self._factor(
-            rows, _wrapped(of_poses.step - window.motion[1:]), jacobian, window.motion_sigma[1:]
-        )
+        error = _wrapped(of_poses.step - window.motion[1:])[:, self._free]
+        kernel = np.full(len(scans), self._parameters.kernel)
+        return Factors(rows, error, jacobian[:, self._free], window.motion_information[1:], kernel)
 
     def _steadiness_factors(self, of_poses: Steps, window: _Window) -> Factors:
         """Where nothing else measures it, the motion goes on as it was."""

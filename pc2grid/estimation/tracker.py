@@ -134,9 +134,14 @@ class Tracker:
         # 3. Place the scan by itself, and weigh that against odometry and the scans before.
         placed = self._sensor.place(scan, points, seconds, expected)
         evidence = Evidence(seconds, reading, continues, placed.alone, placed.motion)
-        estimate = self._smoother.add(placed.pose, evidence)
+        if placed.first:  # nothing ties a new local map to what was before
+            self._smoother.start(self._flat(placed.pose), reading)
+            estimate = self._smoother.belief
+        else:
+            estimate = self._smoother.add(placed.pose, evidence)
         # 4. Judge the pose, and start again if nothing fits any more.
-        health = self._health.judge(placed, estimate, bridged=reading is not None and continues)
+        bridged = placed.followed or (reading is not None and continues)
+        health = self._health.judge(placed, estimate, bridged=bridged)
         pose = self._sensor.levelled(estimate.pose)
         travelled = invert_pose(last_pose) @ pose if reported is None or not continues else reported
         tracked = self._finish(scan, points, pose, health, travelled)
