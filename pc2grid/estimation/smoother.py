@@ -205,7 +205,6 @@ class Smoother:
         information = np.diag(np.concatenate((errors, own)) ** -2)
         self._prior = _Prior(self._state, np.zeros(len(information)), information)
         self._covariance = np.diag(own[:d] ** 2)
-        self._drift_scale = 1.0  # of the drift that the last steps show, in its standard deviations
 
     @property
     def belief(self) -> Belief:
@@ -303,7 +302,6 @@ class Smoother:
         p, n = self._parameters, len(state.poses)
         count = _ERRORS + 2 * len(self._free) * n
         for _ in range(p.iterations):
-            self._drift_scale = self._shown_drift(state) if n > 2 else self._drift_scale
             H, g, cost = normal_equations(self._factors(state, self._window), count)
             H[np.diag_indices(count)] += _DAMPING
             delta = -cho_solve(cho_factor(H, check_finite=False), g, check_finite=False)
@@ -373,24 +371,12 @@ class Smoother:
         rows = self._rows(np.arange(len(poses)))
         return Factors(rows, off.step[:, self._free], jacobian, window.match_information, kernel)
 
-    def _drift(self, of_poses: Steps, of_readings: Steps, errors: F64) -> tuple[F64, F64]:
-        """By how much poses move otherwise than odometry should report, (N, 6), and its drift (N, D)."""
-        corrected, _, _ = self._corrected(of_readings.step, errors)
-        return _wrapped(of_poses.step - corrected), np.sqrt(self._drift_variance(of_readings.step))
-
-    def _shown_drift(self, state: _State) -> float:
-        """The root mean square of the drift of the last steps in its standard deviations, at least 1."""
-        of_poses = steps(state.poses[:-1], state.poses[1:])
-        error, sigmas = self._drift(of_poses, steps(state.readings[:-1], state.readings[1:]), state.errors)
-        sigmas[self._window.jumps[1:]] = _UNKNOWN
-        return math.sqrt(max(float(((error[:, self._free] / sigmas) ** 2).mean()), 1.0))
-
     def _drift_factors(self, of_poses: Steps, of_readings: Steps, errors: F64, window: _Window) -> Factors:
         """From scan to scan the pose moves as odometry should report it, but for its errors and its drift."""
-        _, by_report, by_errors = self._corrected(of_readings.step, errors)
-        error, sigmas = self._drift(of_poses, of_readings, errors)
+        corrected, by_report, by_errors = self._corrected(of_readings.step, errors)
+        error = _wrapped(of_poses.step - corrected)
+        sigmas = np.sqrt(self._drift_variance(of_readings.step))
         sigmas[window.jumps[1:]] = _UNKNOWN
-        sigmas = self._drift_scale * sigmas
         scans = np.arange(len(error))
         rows = np.concatenate(
             (
