@@ -35,9 +35,14 @@ class Factors:
 
     def touching(self, rows: NDArray[np.intp]) -> Factors:
         """Those of the factors that depend on any of some unknowns (R,)."""
-        of_these = np.isin(self.rows, rows).any(axis=1)
-        parts = (self.rows, self.error, self.jacobian, self.information, self.kernel)
-        return Factors(*(part[of_these] for part in parts))
+        these = np.isin(self.rows, rows).any(axis=1)
+        return Factors(
+            self.rows[these],
+            self.error[these],
+            self.jacobian[these],
+            self.information[these],
+            self.kernel[these],
+        )
 
 
 def normal_equations(factors: Iterable[Factors], count: int) -> tuple[F64, F64, float]:

@@ -25,8 +25,7 @@ class HealthJudge:
         not fit is DEGENERATE, too, where odometry tells where it is from a scan that was not lost; else LOST.
         """
         p = self._parameters
-        fits = placed.alone is not None and placed.overlap >= p.min_overlap
-        if placed.first or (fits and placed.residual_m <= p.max_residual_m):
+        if placed.first or (placed.alone is not None and placed.residual_m <= p.max_residual_m):
             self.restart()
             return Health.FINE if placed.first or placed.measured else Health.DEGENERATE
         if bridged and not self._lost_scans:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -117,23 +117,20 @@ class SensorOnWheels:
             motion = (self._last.inverse() @ registered).lift(), np.diag(sigmas**-2)
         if not self._maps:
             return Placed(expected[0].pose, first=True)
-        found = self._match(planar_scan, registered, expected)
-        match = found.match
-        # Half of what a camera sees while it turns may be new: where that fits badly, it says nothing.
-        if match.overlap >= p.min_overlap and (found.sure or found.near):
-            alone = match.by_points.lift(), _turned(match.information, match.by_points.yaw)
-            return Placed(
-                match.pose.lift(), alone, match.overlap, match.residual_m, match.measured, motion=motion
-            )
-        followed = None if scan.T_odom_base is not None else self._followed(planar_scan, expected[0])
-        return Placed(expected[0].pose, motion=followed or motion, followed=followed is not None)
+        best = self._match(planar_scan, registered, expected)
+        match = best.match
+        # Half of what a camera sees while it turns may be new to the map, but not to the scans before.
+        if match.overlap < p.min_overlap or not (best.sure or best.near):
+            followed = None if scan.T_odom_base is not None else self._followed(planar_scan, expected[0])
+            return Placed(expected[0].pose, motion=followed or motion, followed=followed is not None)
+        alone = match.by_points.lift(), _turned(match.information, match.by_points.yaw)
+        return Placed(
+            match.pose.lift(), alone, match.overlap, match.residual_m, match.measured, motion=motion
+        )
 
     def _followed(self, planar_scan: PlanarScan, belief: Belief) -> tuple[F64, F64] | None:
         """The motion (4, 4) from the scan before by the last scans alone, with its information (3, 3); None
-        if it does not fit them.
-
-        What a camera sees while it turns is new to the map, but not to the scans before.
-        """
+        if it does not fit them."""
         last = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
         for before, pose in self._latest:
             last.extend(before, pose)
@@ -144,14 +141,29 @@ class SensorOnWheels:
         return (motion.lift(), information) if self._is_sure(match) else None
 
     def _match(self, planar_scan: PlanarScan, registered: SE2, expected: Sequence[Belief]) -> _Candidate:
-        """The best match of a planar scan with the local map.
+        """The most probable match of a planar scan with the local map.
 
-        It begins where the base is expected and where KISS-ICP puts it. If the scan fits nowhere there, it
-        begins where else the base may be, and at last it is searched for. Of all matches the most probable
-        one is taken: KISS-ICP, which slides along walls, does not count where the scan fits as well without
-        it.
+        A scan that fits nowhere near what is expected is searched for.
         """
         p, first, unseen = self._parameters, expected[0], -math.inf
+        found = self._candidates(planar_scan, registered, expected)
+        if self._is_vague(first) and not max(found).sure:
+            found += self._searched(planar_scan, first)
+            # A wide scan shows known ground behind it, too.
+            if self._narrow and not max(found).near:
+                unseen = self._weight(planar_scan) * p.sure_overlap + first.log_density(0.0)
+        return self._believed(found, unseen)
+
+    def _candidates(
+        self, planar_scan: PlanarScan, registered: SE2, expected: Sequence[Belief]
+    ) -> list[_Candidate]:
+        """Matches of a planar scan with the local map.
+
+        They begin where the base is expected and where KISS-ICP puts it. If the scan fits nowhere there, they
+        begin where else the base may be. KISS-ICP slides along walls, so it does not count where the scan
+        fits as well without it.
+        """
+        p = self._parameters
         found: list[_Candidate] = []
         for belief in expected:
             prior = SE2.from_matrix(belief.pose)
@@ -162,17 +174,15 @@ class SensorOnWheels:
             if not max(found).settles:
                 found.append(self._candidate(planar_scan, prior, belief, wide=False))
             if max(found).settles and not self._is_vague(belief):
-                return max(found)
-        if self._is_vague(first) and not max(found).sure:
-            window_m, window_rad = (p.search_sigmas * sigma for sigma in first.sigmas)
-            window = min(window_m, p.search_most_m), min(window_rad, math.pi)
-            guesses = self._maps.search(planar_scan, SE2.from_matrix(first.pose), *window)
-            searched = (self._candidate(planar_scan, guess, first) for guess in guesses)
-            found += (replace(candidate, near=False) for candidate in searched)
-            # A wide scan shows known ground behind it, too.
-            if self._narrow and not max(found).near:
-                unseen = self._weight(planar_scan) * p.sure_overlap + first.log_density(0.0)
-        return self._believed(found, unseen)
+                return [max(found)]
+        return found
+
+    def _searched(self, planar_scan: PlanarScan, belief: Belief) -> Iterator[_Candidate]:
+        """Matches of a planar scan anywhere within a belief."""
+        p, (sigma_m, sigma_rad) = self._parameters, belief.sigmas
+        window = min(p.search_sigmas * sigma_m, p.search_most_m), min(p.search_sigmas * sigma_rad, math.pi)
+        for guess in self._maps.search(planar_scan, SE2.from_matrix(belief.pose), *window):
+            yield replace(self._candidate(planar_scan, guess, belief), near=False)
 
     def _believed(self, found: list[_Candidate], unseen: float) -> _Candidate:
         """The best of several matches; it says nothing where another explanation is nearly as probable:

@@ -43,8 +43,8 @@ class SmootherParameters:
     drift : standard deviation of odometry over one metre (m), over one radian and, for the turn, over one
         metre (rad); it grows with the square root of the way. drift_turn_m : that of the position over a turn
         of one radian.
-    unsteady_mps, unsteady_radps : without odometry, the change of the motion from one scan to the next is
-        this times the time between them: a robot indoors starts, stops and turns.
+    unsteady : in m/s and rad/s; without odometry, the change of the motion from one scan to the next is this
+        times the time between them: a robot indoors starts, stops and turns.
     steady_s : the motion before is taken over this time, so that an error of one pose does not come back in
         the next with the other sign.
     scale, direction_rad, yaw_rad_per_m, turn : standard deviations, over robots, of the systematic errors.
@@ -57,8 +57,7 @@ class SmootherParameters:
     reading_rad: float = 0.004
     drift: float = 0.05
     drift_turn_m: float = 0.03
-    unsteady_mps: float = 0.4
-    unsteady_radps: float = 0.4
+    unsteady: float = 0.4
     steady_s: float = 0.3
     scale: float = 0.05
     direction_rad: float = math.radians(2.0)
@@ -80,7 +79,6 @@ to image, drifts by a percent, and has no wheels whose errors are always the sam
 _ERRORS = 4  # systematic errors of odometry
 _DAMPING = 1e-9  # so that unknowns without evidence can be solved for
 _CERTAIN = np.array([np.inf])  # kernel of a factor whose weight is 1
-_UNKNOWN = 1e3  # standard deviation of what is not known
 _LEAST_S = 1e-3  # scans follow each other no faster
 _LEAST_DRIFT = 1e-3  # standard deviation of odometry that reports no motion
 
@@ -376,7 +374,7 @@ class Smoother:
         corrected, by_report, by_errors = self._corrected(of_readings.step, errors)
         error = _wrapped(of_poses.step - corrected)
         sigmas = np.sqrt(self._drift_variance(of_readings.step))
-        sigmas[window.jumps[1:]] = _UNKNOWN
+        sigmas[window.jumps[1:]] = np.inf
         scans = np.arange(len(error))
         rows = np.concatenate(
             (
@@ -420,7 +418,7 @@ class Smoother:
         of_second = of_poses.by_first[1:] - ratio[:, :, None] * of_poses.by_second[:-1]
         of_third = of_poses.by_second[1:]
         jacobian = np.concatenate([J[:, :, self._free] for J in (of_first, of_second, of_third)], axis=2)
-        sigmas = seconds[2:, None] * self._noise(p.unsteady_mps, p.unsteady_radps)
+        sigmas = p.unsteady * np.tile(seconds[2:, None], len(self._free))
         sigmas[~window.unmeasured[2:]] = np.inf
         error = _wrapped(of_poses.step[1:] - ratio * of_poses.step[:-1])
         return self._factor(rows, error, jacobian, sigmas, kernel=np.inf)
@@ -448,8 +446,7 @@ class Smoother:
 
     def _unsteadiness(self, seconds: float) -> F64:
         """Standard deviations (D,) of the change of the motion from one scan to the next."""
-        p = self._parameters
-        return seconds * self._noise(p.unsteady_mps, p.unsteady_radps)
+        return np.full(len(self._free), self._parameters.unsteady * seconds)
 
     def _drift_variance(self, reported: F64) -> F64:
         """Variances (N, D) of the drift over steps (N, 6)."""

@@ -19,7 +19,7 @@ from pc2grid.clouds.deskew import deskew
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.config import ProjectionConfig, RegistrationConfig
-from pc2grid.estimation.belief import SPATIAL
+from pc2grid.estimation.belief import SPATIAL, Belief
 from pc2grid.estimation.carried import CarriedSensor
 from pc2grid.estimation.ground_model import DECIDING_SCANS, is_rolling
 from pc2grid.estimation.health import HealthJudge
@@ -27,7 +27,7 @@ from pc2grid.estimation.odometer import Odometer
 from pc2grid.estimation.on_wheels import SensorOnWheels
 from pc2grid.estimation.overruled import Disagreement
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
-from pc2grid.estimation.placed import PlacingSensor
+from pc2grid.estimation.placed import Placed, PlacingSensor
 from pc2grid.estimation.rides import Ride, RideWatch
 from pc2grid.estimation.smoother import IN_THE_HAND, SMOOTHER, Evidence, Smoother
 from pc2grid.geometry import SE2, invert_pose
@@ -134,11 +134,7 @@ class Tracker:
         # 3. Place the scan by itself, and weigh that against odometry and the scans before.
         placed = self._sensor.place(scan, points, seconds, expected)
         evidence = Evidence(seconds, reading, continues, placed.alone, placed.motion)
-        if placed.first:  # nothing ties a new local map to what was before
-            self._smoother.start(self._flat(placed.pose), reading)
-            estimate = self._smoother.belief
-        else:
-            estimate = self._smoother.add(placed.pose, evidence)
+        estimate = self._estimated(placed, evidence)
         # 4. Judge the pose, and start again if nothing fits any more.
         bridged = placed.followed or (reading is not None and continues)
         health = self._health.judge(placed, estimate, bridged=bridged)
@@ -148,6 +144,13 @@ class Tracker:
         if self._health.gives_up:
             self._restart()
         return tracked
+
+    def _estimated(self, placed: Placed, evidence: Evidence) -> Belief:
+        """The pose of a scan by all that is known of it. Nothing ties a new local map to what was before."""
+        if not placed.first:
+            return self._smoother.add(placed.pose, evidence)
+        self._smoother.start(self._flat(placed.pose), evidence.T_odom_base)
+        return self._smoother.belief
 
     def _finish(self, scan: Scan, points: F32, pose: F64, health: Health, travelled: F64) -> Tracked:
         """Extend the maps by a scan if it is worth it, and remember its final pose.
