@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pc2grid.arrays import F64
 from pc2grid.estimation.manifold import steps
 
-PLANAR = (0, 1, 5)
+PLANAR: tuple[int, ...] = (0, 1, 5)
 """The free directions of a base on wheels: x, y, and the turn about z, in the base frame."""
-SPATIAL = (0, 1, 2, 3, 4, 5)
+SPATIAL: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
 """The free directions of a sensor in the hand: x, y, z, and the turns about them."""
 KERNEL = 3.0
 """Standard deviations at which evidence counts half: scale of the Cauchy weights. Chosen by hand."""

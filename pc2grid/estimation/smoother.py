@@ -120,11 +120,11 @@ class _Window(NamedTuple):
 
     def part(self, begin: int, end: int) -> _Window:
         """Of the scans from `begin` to before `end`."""
-        return _Window(*(rows[begin:end] for rows in self))
+        return _Window._make(rows[begin:end] for rows in self)
 
     def then(self, more: _Window) -> _Window:
         """With further scans."""
-        return _Window(*map(np.concatenate, zip(self, more, strict=True)))
+        return _Window._make(map(np.concatenate, zip(self, more, strict=True)))
 
     @property
     def unmeasured(self) -> BoolGrid:
