@@ -203,6 +203,7 @@ class Smoother:
         information = np.diag(np.concatenate((errors, own)) ** -2)
         self._prior = _Prior(self._state, np.zeros(len(information)), information)
         self._covariance = np.diag(own[:d] ** 2)
+        self._drift_scale = 1.0  # of the drift that the last steps show, in its standard deviations
 
     @property
     def belief(self) -> Belief:
@@ -384,9 +385,13 @@ class Smoother:
             ),
             axis=1,
         )  # fmt: skip
-        # What slips, or comes late, says nothing of errors that are the same in every step.
         chi2 = ((error[:, self._free] / sigmas) ** 2).sum(axis=1)
-        by_errors = by_errors / (1.0 + chi2 / self._parameters.kernel**2)[:, None, None]
+        if len(scans) > 2:  # not of the few that are marginalised
+            self._drift_scale = math.sqrt(max(float(chi2.mean()) / len(self._free), 1.0))
+        sigmas = self._drift_scale * sigmas
+        # What slips, or comes late, says nothing of errors that are the same in every step.
+        weight = 1.0 / (1.0 + chi2 / (self._drift_scale * self._parameters.kernel) ** 2)
+        by_errors = by_errors * weight[:, None, None]
         jacobians = (
             of_poses.by_first,
             of_poses.by_second,
