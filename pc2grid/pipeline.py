@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from itertools import chain
@@ -20,8 +21,9 @@ from pc2grid.mapping.loop_parameters import CAMERA_LOOPS, LOOPS
 from pc2grid.mapping.part_maps import PartMap, doubtful_scans, draw_parts, long_enough, with_points
 from pc2grid.mapping.parts import PARTS
 from pc2grid.mapping.report import (
+    HELD_SCANS,
     check_followed,
-    check_held,
+    not_held,
     part_reports,
     with_ride_warnings,
     without_points,
@@ -53,11 +55,17 @@ _SHARE_BEFORE_LOOPS = 0.8
 """Share of the work of `build_map` that is done when the last scan has been tracked; chosen by hand."""
 
 
-def follow(scans: Iterable[Scan], config: Config = Config()) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
+def follow(
+    scans: Iterable[Scan], config: Config = Config(), observer: Observer = Observer()
+) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
     """Each scan with its pose, and its planar scan, as they come.
 
     The memory needed is that of one local map, however many scans there are. Scans on the way to
-    another floor, and the first one there, count as lost.
+    another floor, and the first one there, count as lost. So do those of a sensor in the hand without
+    odometry as long as few of its last scans fix their poses (`pc2grid.mapping.report.not_held`); their planar
+    scans are empty, since the map that these are cut out of is not to be trusted either.
+
+    observer : is warned of that, once. Raises TrackingLost if it is so at the last scan.
 
     >>> import pc2grid
     >>> with pc2grid.open_log("tuesday.mcap") as log:
@@ -66,13 +74,25 @@ def follow(scans: Iterable[Scan], config: Config = Config()) -> Iterator[tuple[R
     ((4, 4), 0.0)
     """
     tracker = _tracker(config)
+    unaided: deque[Health] = deque(maxlen=HELD_SCANS)  # of a sensor in the hand, without odometry
+    fault, warned = None, False
     for scan in scans:
         tracked = tracker.track(scan)
-        registered = tracked.registered
-        if tracked.riding or tracked.arrived:
+        registered, planar_scan = tracked.registered, tracked.planar_scan
+        if tracker.carried and scan.T_odom_base is None:
+            unaided.append(registered.health)
+            fault = not_held(unaided, "the last scans")
+        if tracked.riding or tracked.arrived or fault is not None:
             # A ride resets the pose: earlier scans do not constrain it.
             registered = dataclasses.replace(registered, health=Health.LOST)
-        yield registered, tracked.planar_scan
+        if fault is not None:
+            planar_scan = planar_scan.emptied()
+            if not warned and len(unaided) == HELD_SCANS:
+                warned = True
+                observer.on_warning(str(fault))
+        yield registered, planar_scan
+    if fault is not None:
+        raise fault
 
 
 def build_map(
@@ -169,7 +189,9 @@ def _check_without_odometry(track: Track, planar: bool, name: str) -> None:
     if planar or track.carried:
         check_followed(track.outside_rides(), name)
     if track.carried:
-        check_held(track.trajectory, name)
+        fault = not_held(track.trajectory.health, name)
+        if fault is not None:
+            raise fault
 
 
 def _session_map(

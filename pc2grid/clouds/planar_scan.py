@@ -6,7 +6,7 @@ where an obstacle is, and how far the floor is free before it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -59,6 +59,13 @@ class PlanarScan:
             normal_rad=planar_normals(hits_m, origin_m),
             origin_m=origin_m,
             free_m=free_m,
+        )
+
+    def emptied(self) -> PlanarScan:
+        """The scan of a sensor that has seen nothing."""
+        none = np.empty((0, 2), np.float32)
+        return replace(
+            self, hits_m=none, normal_rad=none[:, 0], free_m=np.zeros_like(self.free_m), low_m=none
         )
 
     def free_polygon(self, limit_m: float = np.inf) -> F64:

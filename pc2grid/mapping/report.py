@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -25,6 +25,8 @@ _LEAST_HELD = 1.0 / 3.0
 odometry. In recordings of two rooms, an office, a kitchen and a hall it is 0.9 to 1, of a simulated phone
 that drifts by 2 percent 0.5, and in simulated flats that are seen three times a second, whose tracks are off
 by metres, 0.1."""
+HELD_SCANS = 100
+"""While a recording is followed, so many of the last scans are judged by that share; chosen by hand."""
 _WARN_DEGENERATE = 0.1
 """Share of degenerate scans above which the report says so; chosen by hand."""
 
@@ -43,18 +45,17 @@ def check_followed(trajectory: Trajectory, name: str) -> None:
     )
 
 
-def check_held(trajectory: Trajectory, name: str) -> None:
-    """Raise TrackingLost if most scans of the log `name`, of a sensor in the hand, do not fix their poses.
+def not_held(health: Collection[Health], name: str) -> TrackingLost | None:
+    """The error of a log, if most scans of a sensor in the hand, without odometry, do not fix their poses.
 
     Such a map does not contradict itself: each scan fits what the last ones showed, wherever these lie.
     """
-    total = len(trajectory)
-    fine = sum(health is Health.FINE for health in trajectory.health)
+    total, fine = len(health), sum(h is Health.FINE for h in health)
     if fine >= _LEAST_HELD * total:
-        return
-    raise TrackingLost(
+        return None
+    return TrackingLost(
         f"{name}: only {fine} of {total} scans of a sensor in the hand fix the pose in every direction, and "
-        "the log has no odometry, so that the map would be wrong by metres",
+        "there is no odometry, so that the poses would be wrong by metres",
         hint="--odometry TOPIC names a topic with odometry, such as the visual-inertial one of the device; "
         "else record it, or more scans a second, or corners and furniture in place of bare walls",
     )

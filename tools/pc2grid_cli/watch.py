@@ -15,7 +15,7 @@ import typer
 
 from pc2grid import extras
 from pc2grid.display import probability
-from pc2grid.errors import ConfigError, one_line
+from pc2grid.errors import ConfigError, TrackingLost, one_line
 from pc2grid.geometry import SE2
 from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.io.live.targets import open_live
@@ -186,10 +186,13 @@ class _Following:
         choice = live.choose()
         self.terminal.note(f"{live.feed.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
         while not live.ended and not over:
-            for registered, planar_scan in follow(live.scans(), config):
-                follower.add(registered, planar_scan)
-                if poll():
-                    break
+            try:
+                for registered, planar_scan in follow(live.scans(), config, self.terminal.observer()):
+                    follower.add(registered, planar_scan)
+                    if poll():
+                        break
+            except TrackingLost as error:
+                console.warn(str(error))
             follower.restart()
         if not over:
             follower.finish()

@@ -14,12 +14,14 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.config import Config, RegistrationConfig
+from pc2grid.errors import TrackingLost
 from pc2grid.estimation.tracker import Tracked, Tracker
 from pc2grid.geometry import invert_pose, motion_size, pose_from_rotation_vector
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Health, OccupancyGrid, Scan
-from pc2grid.pipeline import map_scans
+from pc2grid.observer import Observer
+from pc2grid.pipeline import follow, map_scans
 from pc2grid.simulate.scene import Mesh, Scene, prism
 from pc2grid.simulate.sensors import OPTICAL
 
@@ -166,24 +168,50 @@ def test_the_same_scans_give_the_same_bytes(recorded: list[tuple[Scan, F64]]) ->
         assert a.planar_scan.hits_m.tobytes() == b.planar_scan.hits_m.tobytes()
 
 
-def test_along_a_bare_wall_nothing_is_known_without_odometry() -> None:
-    """Three times a second, a fifth of a metre a step, the camera passes a long wall without a feature.
-
-    Each image fits the last ones wherever it is put along the wall. Odometry knows how fast it goes.
-    """
-    scene = Scene(box((0.0, 0.0), (40.0, 8.0), 0.0, 6.0))
+def along_a_bare_wall(count: int) -> tuple[list[Scan], list[F64]]:
+    """Three times a second, a fifth of a metre a step, the camera passes a long wall without a feature."""
+    scene = Scene(box((0.0, 0.0), (60.0, 8.0), 0.0, 6.0))
     passing = []
-    for k in range(30):
+    for k in range(count):
         T = pose_from_rotation_vector((0.0, 0.0, 0.5 * math.pi)) @ pose_from_rotation_vector((0.0, 0.4, 0.0))
         T[:3, 3] = 15.0 + 0.2 * k, 6.0, 1.4
         passing.append(T)
-    scans = [scan for scan, _ in images(scene, passing, 333_000_000)]
+    return [scan for scan, _ in images(scene, passing, 333_000_000)], passing
+
+
+def test_along_a_bare_wall_nothing_is_known_without_odometry() -> None:
+    """Each image fits the last ones wherever it is put along the wall. Odometry knows how fast it goes."""
+    scans, passing = along_a_bare_wall(30)
     with_it, _ = tracked(scans)
     assert not any(one.registered.health is Health.LOST for one in with_it)
     assert error_m(with_it, passing) < 0.05
     without, _ = tracked([dataclasses.replace(scan, T_odom_base=None) for scan in scans])
     fine = sum(one.registered.health is Health.FINE for one in without)
     assert fine < 4  # the first scan, and hardly one that noise seems to hold
+
+
+def test_who_follows_it_along_a_bare_wall_is_told_that_nothing_is_known() -> None:
+    """Nothing that a query could rest on is handed out, and whoever listens to a live sensor is warned."""
+
+    class Heard(Observer):
+        def __init__(self) -> None:
+            self.warnings: list[str] = []
+
+        def on_warning(self, text: str) -> None:
+            self.warnings.append(text)
+
+    scans, heard = along_a_bare_wall(110)[0], Heard()
+    unaided = (dataclasses.replace(scan, T_odom_base=None) for scan in scans)
+    shown = []
+    with pytest.raises(TrackingLost, match=r"only \d+ of 100 scans .* no odometry"):
+        for registered, planar_scan in follow(unaided, observer=heard):
+            shown.append(registered.health is not Health.LOST and len(planar_scan.hits_m) > 0)
+    assert len(shown) == len(scans)
+    assert not any(shown[10:])  # the first ones are few: one that is fine is a third of three
+    assert len(heard.warnings) == 1
+    aided = list(follow(scans[:10], observer=heard))
+    assert all(len(planar_scan.hits_m) > 0 for _, planar_scan in aided)
+    assert len(heard.warnings) == 1
 
 
 def test_in_a_furnished_room_the_pose_is_known_without_odometry(recorded: list[tuple[Scan, F64]]) -> None:
