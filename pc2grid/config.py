@@ -34,6 +34,9 @@ class ReadConfig(Section):
         None, description="topic of the scans, or several, /a,/b, of one kind; null: the only one that fits"
     )
     odometry: str | None = Field(None, description='odometry topic; null: found in the log; "none": ignored')
+    imu: str | None = Field(
+        None, description='IMU topic; null: found where there is no odometry; "none": ignored'
+    )
     base_frame: str | None = Field(
         None, description="null: base_link, base_footprint, or the sensor if no tf"
     )

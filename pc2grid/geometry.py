@@ -175,6 +175,15 @@ def pose_from_rotation_vector(rotation_rad: ArrayLike, xyz_m: ArrayLike = (0.0, 
     return pose_from_xyz_quat(xyz_m, (*(axis * math.sin(angle / 2)), math.cos(angle / 2)))
 
 
+def leveling(up: F64) -> F64:
+    """Pose (4, 4): the smallest rotation that turns a unit vector (3,) upright."""
+    axis = np.cross(up, (0.0, 0.0, 1.0))
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:
+        axis, sine = np.array([1.0, 0.0, 0.0]), 0.0
+    return pose_from_rotation_vector(axis / (sine or 1.0) * math.atan2(sine, float(up[2])))
+
+
 def interpolate_pose(T_a: F64, T_b: F64, fraction: float) -> F64:
     """Pose between two poses (4, 4): straight in translation, constant rate in rotation; 0 -> a, 1 -> b."""
     relative = invert_pose(T_a) @ T_b

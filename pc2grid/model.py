@@ -53,6 +53,8 @@ class Scan:
     T_odom_base : (4, 4) odometry at `stamp_ns`, or None if the log has none there.
     T_first_last : (4, 4) how the base moved from the first to the last of the points' times, by odometry;
         None where that or the times are not recorded.
+    T_level_base : (4, 4) attitude at `stamp_ns` by an IMU: z is up, the heading drifts, no translation; None
+        if there is no IMU.
     sensor : which of the three kinds made it.
     dropped : how many returns were left out while decoding (NaN, inf, no return, out of range).
 
@@ -70,14 +72,14 @@ class Scan:
     T_odom_base: F64 | None = None
     T_first_last: F64 | None = None
     dropped: int = 0
+    T_level_base: F64 | None = None
 
     def __post_init__(self) -> None:
         freeze(self, "points_m", np.float32, (None, 3))
         freeze(self, "T_base_sensor", np.float64, (4, 4))
-        if self.T_odom_base is not None:
-            freeze(self, "T_odom_base", np.float64, (4, 4))
-        if self.T_first_last is not None:
-            freeze(self, "T_first_last", np.float64, (4, 4))
+        for name in ("T_odom_base", "T_first_last", "T_level_base"):
+            if getattr(self, name) is not None:
+                freeze(self, name, np.float64, (4, 4))
         if self.offsets_s is not None:
             freeze(self, "offsets_s", np.float32, (len(self.points_m),))
 

@@ -62,8 +62,8 @@ def follow(
 
     The memory needed is that of one local map, however many scans there are. Scans on the way to
     another floor, and the first one there, count as lost. So do those of a sensor in the hand without
-    odometry as long as few of its last scans fix their poses (`pc2grid.mapping.report.not_held`); their planar
-    scans are empty, since the map that these are cut out of is not to be trusted either.
+    odometry as long as few of its last scans fix their poses (`pc2grid.mapping.report.not_held`); their
+    planar scans are empty, since the map that these are cut out of is not to be trusted either.
 
     observer : is warned of that, once. Raises TrackingLost if it is so at the last scan.
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pc2grid.arrays import F64
 from pc2grid.clouds.parameters import CLOUD_PARAMETERS, CloudParameters
 from pc2grid.clouds.sampling import random_subset
-from pc2grid.geometry import pose_from_rotation_vector
+from pc2grid.geometry import leveling
 
 Plane = tuple[F64, float]
 """Unit normal (3,) that points up, and offset: height = normal . p + offset."""
@@ -43,11 +43,7 @@ class Ground:
 
     def leveling(self) -> F64:
         """Return T_level_base (4, 4): the smallest rotation that turns the normal upright."""
-        axis = np.cross(self.normal, (0.0, 0.0, 1.0))
-        sine = float(np.linalg.norm(axis))
-        if sine < 1e-9:
-            return np.eye(4)
-        return pose_from_rotation_vector(axis / sine * np.arctan2(sine, float(self.normal[2])))
+        return leveling(self.normal)
 
     def toward(self, other: Ground, gain: float) -> Ground:
         """Return the mean of this ground and another one, weighted 1 - `gain` and `gain` (0..1)."""

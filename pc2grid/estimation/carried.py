@@ -15,7 +15,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pc2grid.arrays import F32, F64
-from pc2grid.clouds.ground import Ground, find_ground
+from pc2grid.clouds.ground import find_ground
+from pc2grid.clouds.level import LEVEL
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
 from pc2grid.estimation.belief import SPATIAL, Belief
@@ -24,7 +25,7 @@ from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameter
 from pc2grid.estimation.placed import Placed
 from pc2grid.estimation.space_map import SpaceMap, ThinnedScan
 from pc2grid.estimation.surface_map import SURFACES, Placement
-from pc2grid.geometry import SE2
+from pc2grid.geometry import SE2, leveling
 from pc2grid.model import Scan
 
 
@@ -227,10 +228,15 @@ def _alone(found: Placement, belief: Belief, spread: F64) -> tuple[F64, F64]:
 def first_pose(scan: Scan, points_m: F32) -> F64:
     """T_session_base (4, 4) of the first scan of a carried sensor: the session frame is the base, levelled.
 
-    The vertical is that of the odometry, which has six degrees of freedom, else that of the floor in the
-    points (N, 3), else the z axis of the base.
+    The vertical is that of the odometry, which has six degrees of freedom; else that of the floor in the
+    points (N, 3), unless an IMU contradicts it, which measures it less exactly; else that of the IMU, else
+    the z axis of the base.
     """
     if scan.T_odom_base is not None:
-        return Ground(scan.T_odom_base[2, :3].copy(), 0.0).leveling()
+        return leveling(scan.T_odom_base[2, :3])
     ground = find_ground(points_m, scan.T_base_sensor[:3, 3])
+    if scan.T_level_base is not None:
+        up = scan.T_level_base[2, :3]
+        if ground is None or ground.normal @ up < LEVEL.level:
+            return leveling(up)
     return np.eye(4) if ground is None else ground.leveling()

@@ -63,6 +63,7 @@ class Choice:
 
     topic, sensor : of the scans.
     odometry_topic : None if there is none; a tf topic if the odometry is the transform odom -> base.
+    imu_topic : None if there is none, or if none is needed.
     base_frame : the robot's frame, in which points are expressed.
     sensor_frame : the frame in the header of the scans; None if it is empty.
     reason : one sentence for the user.
@@ -74,6 +75,7 @@ class Choice:
     base_frame: str
     sensor_frame: str | None
     reason: str
+    imu_topic: str | None = None
 
 
 class RawMessage(NamedTuple):

@@ -42,6 +42,7 @@ class Plan:
 
     camera : None unless the scans are depth images. odometry : None if there is none, or if it is in tf.
     odometry_frame : the parent frame of the odometry in tf; None if it is not there.
+    imu : None if there is none, or none is needed.
     tf_moves : whether tf must be read along with the scans.
     sensor_is_base : whether the log has no tf, so that the sensor's frame serves as the base.
     further : topics of more sensors of the same kind, with the calibration of each, whose scans are put
@@ -58,6 +59,7 @@ class Plan:
     sensor_is_base: bool
     stampless: bool
     further: tuple[tuple[TopicInfo, TopicInfo | None], ...] = ()
+    imu: TopicInfo | None = None
 
 
 def make_plan(source: MessageSource, config: ReadConfig, frames: FrameTree) -> Plan:
@@ -138,6 +140,8 @@ class _Planner:
         motion = _Motion(odometry, odometry, None, why)
         if in_tf:
             motion = self._motion_in_tf(found, moving, why)
+        planar = SENSOR_MODELS[topics.SENSORS[sensors.scans.type]].planar
+        imu, of_imu = self._imu(found, sensor_frame, needed=motion.name is None and not planar)
         return Plan(
             choice=Choice(
                 topic=sensors.scans.topic,
@@ -145,7 +149,8 @@ class _Planner:
                 odometry_topic=motion.name,
                 base_frame=base,
                 sensor_frame=sensor_frame or None,
-                reason=f"{sensors.reason}; {motion.reason}",
+                reason="; ".join(filter(None, (sensors.reason, motion.reason, of_imu))),
+                imu_topic=None if imu is None else imu.topic,
             ),
             scans=sensors.scans,
             camera=sensors.cameras[0],
@@ -155,7 +160,36 @@ class _Planner:
             sensor_is_base=found is None,
             stampless=bool(headers) and not any(header.stamp_ns for header in headers),
             further=tuple(zip(sensors.more, sensors.cameras[1:], strict=True)),
+            imu=imu,
         )
+
+    def _imu(self, base: str | None, sensor_frame: str, *, needed: bool) -> tuple[TopicInfo | None, str]:
+        """The IMU, and a sentence that says why; base : None if the log has no tf.
+
+        needed : whether one is looked for that the user does not name. Raises TopicError, FrameError for one
+        that he names.
+        """
+        wanted = self._config.imu
+        imu = topics.imu_topic(self._topics, wanted) if needed or wanted is not None else None
+        if imu is None:
+            return None, ""
+        frame = self._first_frame(imu)
+        frames, there = self._frames, sensor_frame if base is None else base
+        known = base is not None and frame in frames and frames.connected(there, frame)
+        if frame == there or (known and not frames.moving(there, frame)):
+            return imu, f"gravity from {imu.topic}"
+        if wanted is not None:
+            raise frames.missing(frame, there)
+        return None, f"{imu.topic} is not used: tf does not connect its frame {frame or '(empty)'} to {there}"
+
+    def _first_frame(self, topic: TopicInfo) -> str:
+        """The frame of the first message that can be decoded; empty if there is none."""
+        decode = decoder_for(topic)
+        for message in self._source.messages({topic.topic}):
+            found = tolerant(decode, message.data, None)
+            if message.channel == topic and found is not None:
+                return str(found.header.frame)
+        return ""
 
     def _base_or_sensor(self, found: str | None, sensor_frame: str) -> str:
         if found is not None:

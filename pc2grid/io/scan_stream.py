@@ -22,11 +22,12 @@ from pc2grid.errors import (
 )
 from pc2grid.geometry import invert_pose
 from pc2grid.io import topics
+from pc2grid.io.attitude import Attitude
 from pc2grid.io.frames import FrameTree, PoseTrack
 from pc2grid.io.further_scans import FurtherScans, together
 from pc2grid.io.message_source import MessageSource, RawMessage, Tally, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
-from pc2grid.io.messages.types import Odometry, ScanMessage, Transform
+from pc2grid.io.messages.types import Imu, Odometry, ScanMessage, Transform
 from pc2grid.io.read_plan import Plan, is_static, tolerant
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
 from pc2grid.io.sensors.scan_decoder import ScanDecoder
@@ -187,6 +188,8 @@ class _Poses:
         self._track = PoseTrack()
         self._T_child_base: F64 | None = None
         self._images = SENSOR_MODELS[plan.choice.sensor].image
+        self._attitude = Attitude()
+        self._imu_frame = ""
         self.frame = plan.odometry_frame
 
     def take_odometry(self, topic: TopicInfo) -> Callable[[Any, int], None]:
@@ -200,6 +203,20 @@ class _Poses:
             elif self._T_child_base is None:
                 self._T_child_base = self._child_to_base(found.child)
                 self.frame = found.header.frame or None
+
+        return take
+
+    def take_imu(self, topic: TopicInfo) -> Callable[[Any, int], None]:
+        """What takes in the messages of the topic of the IMU."""
+        decode = decoder_for(topic)
+
+        def take(data: Any, log_time_ns: int) -> None:
+            found: Imu | None = tolerant(decode, data, None)
+            if found is None:
+                self._tally.warn("some IMU messages are unreadable or not finite, and were ignored")
+                return
+            self._imu_frame = found.header.frame
+            self._attitude.add(found, found.header.stamp_ns or log_time_ns)
 
         return take
 
@@ -243,6 +260,21 @@ class _Poses:
         if found is None or self._T_child_base is None:
             return found
         return found @ self._T_child_base
+
+    def level(self, stamp_ns: int) -> F64 | None:
+        """`T_level_base` (4, 4) at a time, see `Scan`; None if there is no IMU, or it does not tell."""
+        if not self._attitude.received:
+            return None
+        T_level_imu = self._attitude.at(stamp_ns)
+        if T_level_imu is None:
+            self._tally.warn(
+                "the IMU does not say at all scans which way is up: it must measure accelerations of about "
+                "9.81 m/s2 at their stamps"
+            )
+            return None
+        T_imu_base = invert_pose(self.sensor(self._imu_frame, stamp_ns))
+        T_imu_base[:3, 3] = 0.0
+        return T_level_imu @ T_imu_base
 
     def sensor(self, frame: str, stamp_ns: int) -> F64:
         """`T_base_sensor` (4, 4) of the sensor with this frame. Raises FrameError, PointCloudError."""
@@ -293,6 +325,8 @@ class Stream:
         on: dict[TopicInfo, Callable[[Any, int], None]] = {plan.scans: self._take_scan}
         if plan.odometry is not None:
             on[plan.odometry] = self._poses.take_odometry(plan.odometry)
+        if plan.imu is not None:
+            on[plan.imu] = self._poses.take_imu(plan.imu)
         on.update((f.topic, functools.partial(self._take_further, f)) for f in self._further)
         for camera, decoder in (
             (plan.camera, self._decoder),
@@ -433,6 +467,7 @@ class Stream:
             self._stamps.check(stamp_ns, log_time_ns, self._waiting.scans)
             T_base_sensor = self._poses.sensor(message.header.frame, stamp_ns)
             scan = self._decoder.scan(message, stamp_ns, T_base_sensor, self._poses.odometry(stamp_ns))
+            scan = replace(scan, T_level_base=self._poses.level(stamp_ns))
             scan = self._with_motion(self._with_further(scan))
         except (PointCloudError, LimitExceeded) as error:
             self._skip(error)

@@ -27,6 +27,7 @@ CAMERA_INFOS = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
 ODOMETRY = ("nav_msgs/Odometry", "foxglove.Odometry", "foxglove.PoseInFrame", "cloud/pose")
 POSES = ("geometry_msgs/PoseWithCovarianceStamped", "geometry_msgs/PoseStamped")
 """Of the base in a map, as localization publishes them."""
+IMU = ("sensor_msgs/Imu",)
 TF = ("tf2_msgs/TFMessage", "tf/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
 
 
@@ -101,7 +102,7 @@ def may_be_used(topic: TopicInfo, topics: Sequence[TopicInfo], wanted: str | Non
 
     wanted : the topic that scans are to be read from; None: any.
     """
-    return topic.type in (*TF, *ODOMETRY, *CAMERA_INFOS) or topic in usable(topics, wanted)
+    return topic.type in (*TF, *ODOMETRY, *IMU, *CAMERA_INFOS) or topic in usable(topics, wanted)
 
 
 def camera_info_topic(image: TopicInfo, topics: Sequence[TopicInfo]) -> TopicInfo:
@@ -130,7 +131,7 @@ def odometry_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[Top
     if wanted is not None and wanted.lower() == "none":
         return None, "odometry is ignored as asked"
     if wanted is not None:
-        return _named_odometry(topics, wanted), f"odometry from {wanted} as asked"
+        return _named_of(topics, wanted, "odometry", ODOMETRY, TF), f"odometry from {wanted} as asked"
     candidates = [t for t in topics if t.message_count != 0 and _holds_odometry(t)]
     if not candidates:
         return None, "no odometry topic"
@@ -141,13 +142,29 @@ def odometry_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[Top
     return best, f"odometry from {best.topic}"
 
 
-def _named_odometry(topics: Sequence[TopicInfo], wanted: str) -> TopicInfo:
+def imu_topic(topics: Sequence[TopicInfo], wanted: str | None) -> TopicInfo | None:
+    """The topic of the IMU or None.
+
+    Raises TopicError if `wanted` is missing.
+    """
+    if wanted is not None and wanted.lower() == "none":
+        return None
+    if wanted is not None:
+        return _named_of(topics, wanted, "imu", IMU)
+    candidates = [t for t in topics if t.message_count != 0 and t.type in IMU]
+    return min(candidates, key=lambda t: (len(t.topic), t.topic), default=None)
+
+
+def _named_of(
+    topics: Sequence[TopicInfo], wanted: str, what: str, types: Sequence[str], also: Sequence[str] = ()
+) -> TopicInfo:
+    """The topic that is wanted, of one of the types; those of `also` are not proposed in an error."""
     for topic in topics:
-        if topic.topic == wanted and topic.type in (*ODOMETRY, *TF):
+        if topic.topic == wanted and topic.type in (*types, *also):
             return topic
-    there = _listed([t for t in topics if t.type in ODOMETRY])
+    there = _listed([t for t in topics if t.type in types])
     raise TopicError(
-        f"no odometry topic {wanted}; there is: {there or 'none'}", hint="--odometry none goes without"
+        f"no {what} topic {wanted}; there is: {there or 'none'}", hint=f"--{what} none goes without"
     )
 
 

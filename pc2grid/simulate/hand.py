@@ -15,9 +15,6 @@ import numpy as np
 from pc2grid.arrays import F64, freeze
 from pc2grid.simulate.config import DepthConfig, HandConfig, OdometryConfig, SimulationConfig
 
-_PERIODS_S = (2.0, 5.0, 11.0)
-"""Of the sway: somebody looks up and down within a few seconds."""
-
 
 @dataclass(frozen=True, slots=True)
 class Hand:
@@ -30,17 +27,17 @@ class Hand:
     phases: F64
 
     def __post_init__(self) -> None:
-        freeze(self, "phases", np.float64, (3, len(_PERIODS_S)))
+        freeze(self, "phases", np.float64, (3, len(self.config.periods_s)))
 
     @staticmethod
     def of(config: HandConfig, rng: np.random.Generator) -> Hand:
         """A hand that sways in its own way."""
-        return Hand(config, rng.uniform(0.0, 2.0 * math.pi, (3, len(_PERIODS_S))))
+        return Hand(config, rng.uniform(0.0, 2.0 * math.pi, (3, len(config.periods_s))))
 
     def at(self, time_s: float) -> F64:
         """T_walker_base (4, 4): the base over the walker's place on the floor, tilted about x and y."""
         c = self.config
-        turns = 2.0 * math.pi * time_s / np.array(_PERIODS_S)
+        turns = 2.0 * math.pi * time_s / np.array(c.periods_s)
         rise, nod, lean = np.sin(turns + self.phases).mean(axis=1)
         pitch = math.radians(c.pitch_deg + c.pitch_sway_deg * nod)
         roll = math.radians(c.roll_sway_deg * lean)

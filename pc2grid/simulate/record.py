@@ -17,6 +17,7 @@ from pc2grid.io.trajectory import write_tum
 from pc2grid.model import OccupancyGrid, SensorKind, Trajectory
 from pc2grid.simulate.building import Building
 from pc2grid.simulate.config import DepthConfig, LaserConfig, SimulationConfig
+from pc2grid.simulate.imu import SimulatedImu
 from pc2grid.simulate.odometry import SimulatedOdometry
 from pc2grid.simulate.sensors import Sensor, depth_intrinsics, laser_angle_min, laser_time_increment
 from pc2grid.simulate.session import EPOCH_NS, Reading, prepare_session
@@ -29,6 +30,7 @@ TOPICS: dict[SensorKind, str] = {
 }
 INFO_TOPIC = "/camera/depth/camera_info"
 ODOMETRY_TOPIC = "/odom"
+IMU_TOPIC = "/imu/data_raw"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,6 +82,10 @@ class Recordable(Protocol):
         """What the wheels measure."""
 
     @property
+    def imu(self) -> SimulatedImu | None:
+        """What an IMU measures."""
+
+    @property
     def config(self) -> SimulationConfig:
         """The settings."""
 
@@ -114,7 +120,8 @@ def simulate_session(
     progress : called with the share that is done, 0..1.
 
     Topics: the sensor's (TOPICS; a camera has INFO_TOPIC too), /tf_static base_link -> sensor and, unless
-    switched off, nav_msgs/Odometry with /tf odom -> base_link. The same arguments give the same bytes.
+    switched off, nav_msgs/Odometry with /tf odom -> base_link; with `imu.enabled`, IMU_TOPIC. The same
+    arguments give the same bytes.
     Raises ConfigError if there is no room for the robot, OutputError if a file cannot be written.
 
     >>> made = simulate_session("drive.mcap", sensor="laser", config=SimulationConfig(length_m=1.0))
@@ -149,6 +156,9 @@ def record_session(
         about = {"sensor": session.sensor.kind, "config": session.config.model_dump_json()}
         log.metadata("pc2grid.simulation", about)
         log.tf_static(EPOCH_NS, BASE_FRAME, session.sensor.frame, session.sensor.T_base_sensor)
+        if session.imu is not None:
+            for message in session.imu.messages(EPOCH_NS, BASE_FRAME):
+                log.imu(IMU_TOPIC, message)
         odometry_sent = 0
         for reading in session.readings():
             odometry_sent = _write_odometry(log, session, odometry_sent, reading.time_s)

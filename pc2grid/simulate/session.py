@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pc2grid.arrays import F32, F64
-from pc2grid.errors import ConfigError
-from pc2grid.geometry import SE2
+from pc2grid.geometry import SE2, invert_pose
 from pc2grid.model import OccupancyGrid, Scan, SensorKind
 from pc2grid.simulate.building import Building
 from pc2grid.simulate.clutter import Furniture, covered, place_clutter
@@ -17,6 +16,7 @@ from pc2grid.simulate.config import SimulationConfig
 from pc2grid.simulate.drive import Drive, drive_along
 from pc2grid.simulate.floorplan import office_floorplan
 from pc2grid.simulate.hand import Hand
+from pc2grid.simulate.imu import SimulatedImu, imu_of
 from pc2grid.simulate.odometry import SimulatedOdometry, odometry_of
 from pc2grid.simulate.route import plan_route
 from pc2grid.simulate.scene import Mesh, Scene, extrude
@@ -28,7 +28,7 @@ EPOCH_NS = 1_700_000_000_000_000_000
 RAYS_PER_CAST = 300_000  # bounds the memory of one call of the ray caster
 
 # Each purpose has its own stream of random numbers, so that more clutter does not change the noise.
-_CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE, _HAND = range(6)
+_CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE, _HAND, _IMU = range(7)
 
 Cast = Callable[[F32, F64, F64, int], F32]
 """Ranges (S, R) of rays (S, R, 6) that are cast at times (S, R) from base poses (S, R, 3); the last argument
@@ -50,7 +50,7 @@ class Reading:
     @property
     def stamp_ns(self) -> int:
         """Its header stamp."""
-        return EPOCH_NS + round(self.time_s * 1e9)
+        return _stamp_ns(self.time_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Session:
     odometry : None when switched off. scan_count : scans of the sensor during the drive.
     shell : geometry of a real building; None where the plan is extruded.
     added : further objects that the plan does not show.
-    hand : what carries the sensor; None: it is on wheels.
+    hand : what carries the sensor; None: it is on wheels. imu : None when switched off.
     """
 
     sensor: Sensor
@@ -74,6 +74,7 @@ class Session:
     shell: Mesh | None = None
     added: tuple[Furniture, ...] = ()
     hand: Hand | None = None
+    imu: SimulatedImu | None = None
 
     @property
     def objects(self) -> tuple[Furniture, ...]:
@@ -113,17 +114,19 @@ class Session:
             if self.hand is None:
                 rays = _rays(poses, T[:3, 3], directions)
             else:
-                rays = np.stack([self._carried_rays(float(time_s)) for time_s in times_s[:, 0]])
+                rays = np.stack([self._carried_rays(of_scan) for of_scan in times_s])
             true_m = cast(rays, times_s, poses, first)
             for index, ranges in zip(indices, true_m, strict=True):
                 rng = np.random.default_rng([self.config.seed, _NOISE, int(index)])
                 yield Reading(int(index), float(index) / sensor.rate_hz, sensor.measure(ranges, rng))
 
-    def _carried_rays(self, time_s: float) -> F32:
-        """Rays (R, 6) in the map frame of a scan that is taken at one moment."""
-        T = self.pose(time_s) @ self.sensor.T_base_sensor
-        rays = np.empty((len(self.sensor.directions), 6), np.float32)
-        rays[:, :3], rays[:, 3:] = T[:3, 3], self.sensor.directions @ T[:3, :3].T
+    def _carried_rays(self, times_s: F64) -> F32:
+        """Rays (R, 6) in the map frame, each at its time (R,)."""
+        moments, of_ray = np.unique(times_s, return_inverse=True)
+        poses = np.array([self.pose(float(time_s)) for time_s in moments])
+        T = (poses @ self.sensor.T_base_sensor)[of_ray]
+        rays = np.empty((len(T), 6), np.float32)
+        rays[:, :3], rays[:, 3:] = T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], self.sensor.directions)
         return rays
 
     def pose(self, time_s: float) -> F64:
@@ -136,35 +139,56 @@ class Session:
 
     def scan(self, reading: Reading) -> Scan:
         """A reading as the scan that `pc2grid.io` decodes from the recording."""
-        scan = scan_of(reading, self.sensor, self.odometry)
-        if self.hand is None or self.odometry is None:
-            return scan
-        return replace(scan, T_odom_base=self.in_space(self.odometry.at(reading.time_s), reading.time_s))
+        return scan_of(reading, self.sensor, self.odometry, self.in_space)
 
     def scans(self) -> Iterator[tuple[Scan, SE2]]:
         """Scans in the base frame, not deskewed, with the true T_map_base at their stamps."""
+        stamps_ns = (_stamp_ns(k / self.sensor.rate_hz) for k in range(self.scan_count))
+        levels = iter(()) if self.imu is None else self.imu.levels(stamps_ns, EPOCH_NS)
         for reading in self.readings():
-            yield self.scan(reading), self.drive.pose(reading.time_s)
+            scan = replace(self.scan(reading), T_level_base=next(levels, None))
+            yield scan, self.drive.pose(reading.time_s)
 
 
-def scan_of(reading: Reading, sensor: Sensor, odometry: SimulatedOdometry | None) -> Scan:
-    """A reading as the scan that `pc2grid.io` decodes from the recording."""
+def _stamp_ns(time_s: float) -> int:
+    """The stamp at a time since the session's start."""
+    return EPOCH_NS + round(time_s * 1e9)
+
+
+def _on_the_floor(pose: SE2, time_s: float) -> F64:
+    return pose.lift()
+
+
+def scan_of(
+    reading: Reading,
+    sensor: Sensor,
+    odometry: SimulatedOdometry | None,
+    in_space: Callable[[SE2, float], F64] = _on_the_floor,
+) -> Scan:
+    """A reading as the scan that `pc2grid.io` decodes from the recording.
+
+    in_space : a pose on the floor, at a time, as that of the base (4, 4).
+    """
+
+    def odometry_at(time_s: float) -> F64 | None:
+        return None if odometry is None else in_space(odometry.at(time_s), time_s)
+
     T = sensor.T_base_sensor
     kept = np.isfinite(reading.values_m)
     points = (reading.values_m[kept, None] * sensor.directions[kept]).astype(np.float32)
     moving = bool(sensor.offsets_s.any())
     offsets = sensor.offsets_s[kept].astype(np.float32) if moving else None
     motion = None
-    if odometry is not None and offsets is not None and len(offsets):
-        first, last = (odometry.at(reading.time_s + float(s)) for s in (offsets.min(), offsets.max()))
-        motion = (first.inverse() @ last).lift()
+    if offsets is not None and len(offsets):
+        first, last = (odometry_at(reading.time_s + float(s)) for s in (offsets.min(), offsets.max()))
+        motion = None if first is None or last is None else invert_pose(first) @ last
     return Scan(
         stamp_ns=reading.stamp_ns,
         points_m=(points @ T[:3, :3].T + T[:3, 3]).astype(np.float32),
         T_base_sensor=T,
         sensor=sensor.kind,
         offsets_s=offsets,
-        T_odom_base=None if odometry is None else odometry.at(reading.time_s).lift(),
+        T_odom_base=odometry_at(reading.time_s),
         T_first_last=motion,
         dropped=int((~kept).sum()),
     )
@@ -229,12 +253,11 @@ def plan_session(
     odometry = odometry_of(drive, config.odometry, stream(_ODOMETRY)) if config.odometry.enabled else None
     carried = make_sensor(sensor, config)
     hand = Hand.of(config.hand, stream(_HAND)) if config.hand.carried else None
-    if hand is not None and carried.offsets_s.any():
-        raise ConfigError(
-            f"hand.carried: a {sensor} sweeps while the hand moves, which is not simulated",
-            hint="carry a camera: --sensor depth",
-        )
-    return Session(carried, plan, clutter, drive, odometry, config, shell, added, hand)
+    session = Session(carried, plan, clutter, drive, odometry, config, shell, added, hand)
+    if config.imu.enabled:
+        imu = imu_of(session.pose, drive.duration_s, config.imu, stream(_IMU))
+        session = replace(session, imu=imu)
+    return session
 
 
 def iter_session(

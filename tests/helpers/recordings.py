@@ -165,6 +165,18 @@ class Ros:
         )
         return self.message(topic, stamp_ns, content)
 
+    def imu(self, topic: str, stamp_ns: int, felt_mps2: Sequence[float], frame: str = "imu") -> Message:
+        """An IMU that does not turn, and does not tell its orientation."""
+        make, vector = self.make, functools.partial(self.make, "geometry_msgs/Vector3")
+        unknown, known = np.zeros(9), np.zeros(9)
+        unknown[0] = -1.0
+        content = make(
+            "sensor_msgs/Imu", self.header(stamp_ns, frame),
+            make("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), unknown,
+            vector(0.0, 0.0, 0.0), known, vector(*felt_mps2), known,
+        )  # fmt: skip
+        return self.message(topic, stamp_ns, content)
+
 
 @functools.cache
 def ros(dialect: Dialect = "ros2") -> Ros:

@@ -150,6 +150,7 @@ def describe(path: Path, *, topic: str | None = None, recover: bool = False) -> 
                 "topic": chosen.topic,
                 "sensor": chosen.sensor,
                 "odometry_topic": chosen.odometry_topic,
+                "imu_topic": chosen.imu_topic,
                 "camera_topic": _camera_topic(found, chosen.topic)
                 if SENSOR_MODELS[chosen.sensor].image
                 else None,
@@ -199,7 +200,7 @@ def _show(document: Info) -> None:
     uses: dict[str | None, str] = {}
     if choice is not None:
         uses = {t["topic"]: "transforms" for t in document["topics"] if t["type"] in TF}
-        uses |= {choice["camera_topic"]: "calibration"}
+        uses |= {choice["camera_topic"]: "calibration", choice["imu_topic"]: "gravity"}
         uses |= {choice["odometry_topic"]: "odometry", choice["topic"]: f"scans ({choice['sensor']})"}
     for topic in document["topics"]:
         number = "?" if topic["message_count"] is None else str(topic["message_count"])

@@ -177,6 +177,7 @@ class ChosenTopics(TypedDict):
     topic: str
     sensor: str
     odometry_topic: str | None
+    imu_topic: str | None
     camera_topic: str | None
     base_frame: str
     sensor_frame: str

@@ -59,6 +59,10 @@ Topic = Annotated[
 OdometryTopic = Annotated[
     str | None, typer.Option("--odometry", help='odometry topic; "none": do not use any')
 ]
+ImuTopic = Annotated[
+    str | None,
+    typer.Option("--imu", help='IMU of a sensor in the hand without odometry; "none": do not use any'),
+]
 Start = Annotated[float, typer.Option("--start", min=0.0, metavar="S", help="seconds from the log's start")]
 Duration = Annotated[
     float | None, typer.Option("--duration", metavar="S", help="seconds to read; default: all")
@@ -97,6 +101,7 @@ def make_config(
     *,
     topic: str | None = None,
     odometry: str | None = None,
+    imu: str | None = None,
     assume_identity: bool = False,
     top_k: int | None = None,
     points_voxel_m: float | None = None,
@@ -108,7 +113,7 @@ def make_config(
 
     base = Config.paper() if preset is PresetName.paper else None
     config = load_settings(Config, file, assignments or (), preset=base)
-    read = {"topic": topic, "odometry": odometry, "assume_identity": assume_identity or None}
+    read = {"topic": topic, "odometry": odometry, "imu": imu, "assume_identity": assume_identity or None}
     kept = {"points_voxel_m": points_voxel_m}
     return _changed(config, {"read": read, "relocalize": {"top_k": top_k}, "projection": kept})
 

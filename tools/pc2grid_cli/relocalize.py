@@ -106,6 +106,7 @@ def relocalize_command(
     ] = None,
     topic: options.Topic = None,
     odometry: options.OdometryTopic = None,
+    imu: options.ImuTopic = None,
     start: options.Start = 0.0,
     duration: options.Duration = None,
     top_k: Annotated[int | None, typer.Option("--top-k", min=1, help="candidates to align with")] = None,
@@ -161,7 +162,7 @@ def relocalize_command(
     if rerun is not None:
         require_target(rerun, force)
     settings = options.make_config(
-        config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity, top_k=top_k
+        config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity, top_k=top_k
     )
     _check_not_swapped(log, database)
     with searched(database, building, floor) as (opened, left_out):

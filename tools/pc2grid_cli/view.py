@@ -59,6 +59,7 @@ def view_command(
     floor: options.Floor = None,
     topic: options.Topic = None,
     odometry: options.OdometryTopic = None,
+    imu: options.ImuTopic = None,
     config: options.ConfigFile = None,
     set_: options.Assignments = None,
     assume_identity: options.AssumeIdentity = False,
@@ -72,7 +73,7 @@ def view_command(
     """
     extras.require(extras.of_addresses(source, database))
     settings = options.make_config(
-        config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
+        config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity
     )
     terminal = console.of(context)
     with (

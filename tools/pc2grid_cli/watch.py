@@ -113,6 +113,7 @@ def watch_command(
     ] = None,
     topic: options.Topic = None,
     odometry: options.OdometryTopic = None,
+    imu: options.ImuTopic = None,
     config: options.ConfigFile = None,
     set_: options.Assignments = None,
     assume_identity: options.AssumeIdentity = False,
@@ -127,7 +128,7 @@ def watch_command(
     """
     extras.require(extras.of_addresses(source, database))
     settings = options.make_config(
-        config, set_, topic=topic, odometry=odometry, assume_identity=assume_identity
+        config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity
     )
     known = KnownPose(near=near, check_topic=check_topic, session=session)
     prior = known.region()

@@ -9,8 +9,10 @@ messages are decoded by rosbags, with the log's own definition.
 from __future__ import annotations
 
 import functools
+import math
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,12 +29,14 @@ from pc2grid.io.messages.types import (
     CompressedImage,
     Header,
     Image,
+    Imu,
     LaserScan,
     Odometry,
     PointCloud2,
     PoseStamped,
     Seven,
     Transform,
+    valid_pose,
 )
 
 # Counts that no real message reaches: a damaged one is refused before memory is allocated for it.
@@ -164,6 +168,23 @@ def _odometry(m: Any) -> Odometry:
     return Odometry(_header(m.header), m.child_frame_id.lstrip("/"), _seven(pose.position, pose.orientation))
 
 
+def _imu(m: Any) -> Imu:
+    """Raises PointCloudError for numbers that are not finite, or a quaternion without a direction."""
+    q, w, a = m.orientation, m.angular_velocity, m.linear_acceleration
+    found = Imu(
+        _header(m.header),
+        None if m.orientation_covariance[0] == -1.0 else (q.x, q.y, q.z, q.w),
+        None if m.angular_velocity_covariance[0] == -1.0 else (w.x, w.y, w.z),
+        None if m.linear_acceleration_covariance[0] == -1.0 else (a.x, a.y, a.z),
+    )
+    numbers = (found.turn_rate_rps or ()) + (found.acceleration_mps2 or ())
+    if not all(map(math.isfinite, numbers)):
+        raise PointCloudError("the message is not finite")
+    if found.orientation is not None and not valid_pose((0.0, 0.0, 0.0, *found.orientation)):
+        return replace(found, orientation=None)
+    return found
+
+
 def _pose_stamped(m: Any) -> PoseStamped:
     return PoseStamped(_header(m.header), _seven(m.pose.position, m.pose.orientation))
 
@@ -197,6 +218,7 @@ def _seven(p: Any, q: Any) -> Seven:
 _CONVERTERS: dict[str, Callable[[Any], Any]] = {
     "sensor_msgs/CameraInfo": _camera_info,
     "nav_msgs/Odometry": _odometry,
+    "sensor_msgs/Imu": _imu,
     "geometry_msgs/PoseStamped": _pose_stamped,
     "geometry_msgs/PoseWithCovarianceStamped": _pose_with_covariance,
     "tf2_msgs/TFMessage": _transforms,

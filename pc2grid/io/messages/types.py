@@ -155,6 +155,20 @@ class Odometry:
 
 
 @dataclass(frozen=True, slots=True)
+class Imu:
+    """sensor_msgs/Imu: each of the three is None where its covariance says that it is not measured (-1).
+
+    orientation : quaternion x y z w in a frame whose z axis is up. turn_rate_rps : (3,) of the gyroscope.
+    acceleration_mps2 : (3,) with what holds against gravity: at rest it points up.
+    """
+
+    header: Header
+    orientation: tuple[float, float, float, float] | None
+    turn_rate_rps: tuple[float, float, float] | None
+    acceleration_mps2: tuple[float, float, float] | None
+
+
+@dataclass(frozen=True, slots=True)
 class PoseStamped:
     """geometry_msgs/PoseStamped or PoseWithCovarianceStamped: a pose in `header.frame`.
 

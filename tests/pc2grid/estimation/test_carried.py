@@ -15,6 +15,7 @@ import pytest
 from pc2grid.arrays import F64
 from pc2grid.config import Config, RegistrationConfig
 from pc2grid.errors import TrackingLost
+from pc2grid.estimation.carried import first_pose
 from pc2grid.estimation.tracker import Tracked, Tracker
 from pc2grid.geometry import invert_pose, motion_size, pose_from_rotation_vector
 from pc2grid.io import open_log
@@ -218,6 +219,52 @@ def test_in_a_furnished_room_the_pose_is_known_without_odometry(recorded: list[t
     found, _ = tracked([dataclasses.replace(scan, T_odom_base=None) for scan, _ in recorded])
     fine = sum(one.registered.health is Health.FINE for one in found)
     assert fine > 0.5 * len(found)  # a third is refused
+
+
+def looking_up(count: int) -> list[F64]:
+    """T_room_base of a camera that first looks 25 degrees up at a corner without a floor, then down."""
+    poses = []
+    for k in range(count):
+        pitch = math.radians(-25.0 + 50.0 * min(max(k - 8, 0) / 20.0, 1.0))
+        yaw = 0.6 + 0.02 * k
+        T = pose_from_rotation_vector((0.0, 0.0, yaw)) @ pose_from_rotation_vector((0.0, pitch, 0.0))
+        T[:3, 3] = 1.0 + 0.02 * k, 1.0, 1.4
+        poses.append(T)
+    return poses
+
+
+def tilt_deg(found: F64, true: F64) -> float:
+    """How far two attitudes disagree about what is up."""
+    return math.degrees(math.acos(min(1.0, float(found[2, :3] @ true[2, :3]))))
+
+
+def test_a_start_that_shows_no_floor_is_levelled_by_the_imu() -> None:
+    """The IMU errs by 2 degrees, and its heading means nothing."""
+    poses = looking_up(3)
+    wrong = pose_from_rotation_vector((0.0, math.radians(2.0), 0.0)) @ pose_from_rotation_vector((0, 0, 2.5))
+    scans = [dataclasses.replace(s, T_odom_base=None) for s, _ in images(room(), poses)]
+    felt = [dataclasses.replace(s, T_level_base=level(wrong @ T)) for s, T in zip(scans, poses, strict=True)]
+    by_imu, _ = tracked(felt)
+    for one, true in zip(by_imu, poses, strict=True):
+        assert tilt_deg(one.registered.T_session_base, true) < 3.0  # its error, and some of tracking
+    without, _ = tracked(scans)
+    assert tilt_deg(without[0].registered.T_session_base, poses[0]) > 20.0  # taken to be held level
+
+
+def test_a_floor_in_view_is_more_exact_than_the_imu(recorded: list[tuple[Scan, F64]]) -> None:
+    scan, true = recorded[0]
+    for error_deg, least_deg, most_deg in ((3.0, 0.0, 1.5), (40.0, 39.0, 41.0)):
+        wrong = pose_from_rotation_vector((math.radians(error_deg), 0.0, 0.0))
+        felt = dataclasses.replace(scan, T_odom_base=None, T_level_base=level(wrong @ true))
+        found = first_pose(felt, felt.points_m)
+        assert least_deg <= tilt_deg(found, true) < most_deg
+
+
+def level(T: F64) -> F64:
+    """The attitude of a pose (4, 4)."""
+    turn = T.copy()
+    turn[:3, 3] = 0.0
+    return turn
 
 
 @pytest.mark.slow

@@ -370,6 +370,11 @@ class HouseSession:
                 yield Reading(index, index / sensor.rate_hz, sensor.measure(ranges, rng))
             first = end
 
+    @property
+    def imu(self) -> None:
+        """There is none."""
+        return
+
     def scan(self, reading: Reading) -> Scan:
         """A reading as the scan that `pc2grid.io` decodes from the recording."""
         return scan_of(reading, self.sensor, self.odometry)
