@@ -65,7 +65,8 @@ def follow(
     odometry as long as few of its last scans fix their poses (`pc2grid.mapping.report.not_held`); their
     planar scans are empty, since the map that these are cut out of is not to be trusted either.
 
-    observer : is warned of that, once. Raises TrackingLost if it is so at the last scan.
+    observer : is warned of that, once, and of a start without a floor in view
+        (`pc2grid.estimation.first_floor`). Raises TrackingLost if it is so at the last scan.
 
     >>> import pc2grid
     >>> with pc2grid.open_log("tuesday.mcap") as log:
@@ -76,7 +77,7 @@ def follow(
     tracker = _tracker(config)
     unaided: deque[Health] = deque(maxlen=HELD_SCANS)  # of a sensor in the hand, without odometry
     fault, warned = None, False
-    for scan in scans:
+    for scan in _with_vertical(scans, config, observer):
         tracked = tracker.track(scan)
         registered, planar_scan = tracked.registered, tracked.planar_scan
         if tracker.carried and scan.T_odom_base is None:
@@ -279,7 +280,7 @@ def _map(
     A part whose map contradicts itself is divided, and drawn again. whole : all scans are one part.
     """
     projection = config.projection
-    first, scans = _first_of(scans)
+    first, scans = _first_of(_with_vertical(scans, config, observer))
     narrow = first is not None and SENSOR_MODELS[first.sensor].narrow
     with ExitStack() as stack:
         keyframes = stack.enter_context(closing(Keyframes()))
@@ -331,6 +332,13 @@ def _track(
         observer.on_scan(tracked.registered)
     selection.finish()
     return record.track(tracker)
+
+
+def _with_vertical(scans: Iterable[Scan], config: Config, observer: Observer) -> Iterator[Scan]:
+    """The scans, see `pc2grid.estimation.first_floor`; loaded late, like the tracker."""
+    from pc2grid.estimation.first_floor import with_vertical
+
+    return with_vertical(scans, config, observer)
 
 
 def _tracker(config: Config) -> Tracker:

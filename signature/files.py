@@ -166,7 +166,7 @@ def locate_log(
             watch(registered, moment)
 
     with observer.step("locate", span.length_ns(*ends_ns) * 1e-9):
-        scans = follow(log.scans(span.start_s, span.duration_s), config)
+        scans = follow(log.scans(span.start_s, span.duration_s), config, observer)
         return locate_in(
             scans, index, until_located=until_located, watch=see, answer_at=due if on_the_way else None
         )

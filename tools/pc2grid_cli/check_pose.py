@@ -53,7 +53,7 @@ def check_log(
 
         with observer.step("check", span.length_ns(*ends_ns) * 1e-9):
             checked = check_pose(
-                follow(log.scans(span.start_s, span.duration_s), config),
+                follow(log.scans(span.start_s, span.duration_s), config, observer),
                 MapIndex.of(database, config),
                 T_map_base,
                 stamp_ns=stamp_ns,

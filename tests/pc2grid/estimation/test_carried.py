@@ -16,6 +16,7 @@ from pc2grid.arrays import F64
 from pc2grid.config import Config, RegistrationConfig
 from pc2grid.errors import TrackingLost
 from pc2grid.estimation.carried import first_pose
+from pc2grid.estimation.first_floor import MOST_WAITING, with_vertical
 from pc2grid.estimation.tracker import Tracked, Tracker
 from pc2grid.geometry import invert_pose, motion_size, pose_from_rotation_vector
 from pc2grid.io import open_log
@@ -89,6 +90,17 @@ def images(scene: Scene, poses: Sequence[F64], interval_ns: int = 100_000_000) -
             ),
             T,
         )
+
+
+class Heard(Observer):
+    """Keeps all warnings."""
+
+    def __init__(self) -> None:
+        self.warnings: list[str] = []
+
+    def on_warning(self, text: str) -> None:
+        """See `Observer.on_warning`."""
+        self.warnings.append(text)
 
 
 @pytest.fixture(scope="module")
@@ -194,13 +206,6 @@ def test_along_a_bare_wall_nothing_is_known_without_odometry() -> None:
 def test_who_follows_it_along_a_bare_wall_is_told_that_nothing_is_known() -> None:
     """Nothing that a query could rest on is handed out, and whoever listens to a live sensor is warned."""
 
-    class Heard(Observer):
-        def __init__(self) -> None:
-            self.warnings: list[str] = []
-
-        def on_warning(self, text: str) -> None:
-            self.warnings.append(text)
-
     scans, heard = along_a_bare_wall(110)[0], Heard()
     unaided = (dataclasses.replace(scan, T_odom_base=None) for scan in scans)
     shown = []
@@ -249,6 +254,29 @@ def test_a_start_that_shows_no_floor_is_levelled_by_the_imu() -> None:
         assert tilt_deg(one.registered.T_session_base, true) < 3.0  # its error, and some of tracking
     without, _ = tracked(scans)
     assert tilt_deg(without[0].registered.T_session_base, poses[0]) > 20.0  # taken to be held level
+
+
+def test_a_start_that_shows_no_floor_is_levelled_by_the_floor_that_comes_in_view() -> None:
+    """The camera looks down to the floor within two seconds; nothing else says which way is up."""
+    poses, heard = looking_up(40), Heard()
+    unaided = [dataclasses.replace(scan, T_odom_base=None) for scan, _ in images(room(), poses)]
+    followed = [registered for registered, _ in follow(iter(unaided), observer=heard)]
+    assert [r.scan.stamp_ns for r in followed] == [scan.stamp_ns for scan in unaided]
+    for registered, true in zip(followed, poses, strict=True):
+        assert tilt_deg(registered.T_session_base, true) < 3.0
+    assert len(heard.warnings) == 1
+    assert "until one is in view" in heard.warnings[0]
+
+
+def test_where_no_floor_comes_in_view_the_user_is_told() -> None:
+    poses, heard = looking_up(5), Heard()
+    unaided = [dataclasses.replace(scan, T_odom_base=None) for scan, _ in images(room(), poses)]
+    many = [dataclasses.replace(unaided[k % 5], stamp_ns=k * 10**8) for k in range(MOST_WAITING + 5)]
+    handed_on = list(with_vertical(iter(many), Config(), heard))
+    assert [a.stamp_ns for a in handed_on] == [b.stamp_ns for b in many]
+    assert handed_on[0].T_level_base is None
+    assert len(heard.warnings) == 2
+    assert "taken to be held level" in heard.warnings[1]
 
 
 def test_a_floor_in_view_is_more_exact_than_the_imu(recorded: list[tuple[Scan, F64]]) -> None:

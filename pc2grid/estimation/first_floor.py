@@ -1,0 +1,67 @@
+"""The start of a recording by a sensor in the hand that does not show yet which way is up.
+
+Without odometry in space and without an IMU, the vertical is that of the floor. A camera that begins with a
+wall or a table can be followed in space all the same, but neither its walls nor its floor can be told. So
+its first scans are kept aside and followed in the frame of the first one. The scan that shows a floor gives
+all of them their vertical, and they are handed on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+
+from pc2grid.arrays import F64
+from pc2grid.clouds.ground import find_ground
+from pc2grid.config import Config
+from pc2grid.estimation.ground_model import is_rolling
+from pc2grid.estimation.tracker import Tracker
+from pc2grid.geometry import leveling
+from pc2grid.model import Health, Scan
+from pc2grid.observer import Observer
+
+MOST_WAITING = 100
+"""Scans that wait for a floor, at most: some 50 MB. Chosen by hand."""
+
+
+def with_vertical(scans: Iterable[Scan], config: Config, observer: Observer = Observer()) -> Iterator[Scan]:
+    """All scans, the first with the vertical that a later one shows, if it does not know it (`T_level_base`).
+
+    observer : is warned when scans wait, and if no floor is seen before tracking is lost or too many wait;
+        the sensor is then taken to be held level at first.
+    """
+    scans = iter(scans)
+    waiting: list[Scan] = []
+    tracker = Tracker(config.registration, config.projection)
+    for scan in scans:
+        waiting.append(scan)
+        if len(waiting) == 1 and _knows_vertical(scan):
+            break
+        registered, up = tracker.track(scan).registered, _floor_normal(scan)
+        if up is not None and registered.health is not Health.LOST:
+            # The first pose is the identity, as no vertical was known.
+            T_level_base = leveling(registered.T_session_base[:3, :3] @ up)
+            waiting[0] = dataclasses.replace(waiting[0], T_level_base=T_level_base)
+            break
+        if len(waiting) == 1:
+            observer.on_warning("the first scans show no floor: they are kept aside until one is in view")
+        if registered.health is Health.LOST or len(waiting) == MOST_WAITING:
+            observer.on_warning(
+                f"the first {len(waiting)} scans show no floor, and without odometry and IMU nothing else says "
+                "which way is up: the sensor is taken to be held level at first; begin with the floor in view"
+            )
+            break
+    yield from waiting
+    yield from scans
+
+
+def _knows_vertical(scan: Scan) -> bool:
+    """Whether nothing need be waited for: on wheels, by odometry or IMU, or by a floor in view."""
+    known = scan.T_odom_base is not None or scan.T_level_base is not None
+    return known or is_rolling(scan) or _floor_normal(scan) is not None
+
+
+def _floor_normal(scan: Scan) -> F64 | None:
+    """The normal (3,) of the floor in a scan, base frame; None if it shows none."""
+    ground = find_ground(scan.points_m, scan.T_base_sensor[:3, 3])
+    return None if ground is None else ground.normal
