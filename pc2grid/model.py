@@ -52,7 +52,7 @@ class Scan:
     T_base_sensor : (4, 4) where the sensor sits on the base; its translation is the origin of the rays.
     T_odom_base : (4, 4) odometry at `stamp_ns`, or None if the log has none there.
     T_first_last : (4, 4) how the base moved from the first to the last of the points' times, by odometry;
-        None where that or the times are not recorded.
+        without odometry how it turned, by an IMU; None where that or the times are not recorded.
     T_level_base : (4, 4) attitude at `stamp_ns` by an IMU: z is up, the heading drifts, no translation; None
         if there is no IMU.
     sensor : which of the three kinds made it.

@@ -47,8 +47,8 @@ def with_vertical(scans: Iterable[Scan], config: Config, observer: Observer = Ob
             observer.on_warning("the first scans show no floor: they are kept aside until one is in view")
         if registered.health is Health.LOST or len(waiting) == MOST_WAITING:
             observer.on_warning(
-                f"the first {len(waiting)} scans show no floor, and without odometry or IMU nothing else says "
-                "which way is up: the sensor is taken to be held level at first; begin with the floor in view"
+                f"the first {len(waiting)} scans show no floor, and neither odometry nor an IMU says what "
+                "is up: the sensor is taken to be held level at first; begin with the floor in view"
             )
             break
     yield from waiting

@@ -45,6 +45,7 @@ class SmootherParameters:
         of one radian.
     unsteady : in m/s and rad/s; without odometry, the change of the motion from one scan to the next is this
         times the time between them: a robot indoors starts, stops and turns.
+    gyroscope_radps : of a gyroscope, with its bias.
     steady_s : the motion before is taken over this time, so that an error of one pose does not come back in
         the next with the other sign.
     scale, direction_rad, yaw_rad_per_m, turn : standard deviations, over robots, of the systematic errors.
@@ -58,6 +59,7 @@ class SmootherParameters:
     drift: float = 0.05
     drift_turn_m: float = 0.03
     unsteady: float = 0.4
+    gyroscope_radps: float = 0.02
     steady_s: float = 0.3
     scale: float = 0.05
     direction_rad: float = math.radians(2.0)
@@ -216,21 +218,33 @@ class Smoother:
         reported, _, _ = steps(self._state.readings[-1:], T_odom_base[None])
         corrected, _, _ = self._corrected(reported, self._state.errors)
         variance = self._drift_variance(reported)[0] + 2.0 * self._noise(p.reading_m, p.reading_rad) ** 2
-        return self._after(moved(np.eye(4)[None], corrected)[0], variance)
+        return self.after(moved(np.eye(4)[None], corrected)[0], np.sqrt(variance))
 
     def by_steadiness(self, seconds: float) -> Belief:
         """The next pose, `seconds` later, if the motion before goes on."""
+        return self.after(*self.steady(seconds))
+
+    def steady(self, seconds: float, turn: F64 | None = None) -> tuple[F64, F64]:
+        """The next motion (4, 4), over a time, if that before goes on; with standard deviations (D,).
+
+        turn : (4, 4) by a gyroscope; None if there is none.
+        """
+        p = self._parameters
         spans_s = np.concatenate(((0.0,), np.cumsum(self._window.seconds[:0:-1])))  # back from the last scan
-        back = min(int(np.searchsorted(spans_s, self._parameters.steady_s)), len(spans_s) - 1)
+        back = min(int(np.searchsorted(spans_s, p.steady_s)), len(spans_s) - 1)
         step, _, _ = steps(self._state.poses[-1 - back :][:1], self._state.poses[-1:])
         share = min(seconds / max(float(spans_s[back]), _LEAST_S), 1.0)
-        return self._after(moved(np.eye(4)[None], share * step)[0], self._unsteadiness(seconds) ** 2)
+        motion, sigmas = moved(np.eye(4)[None], share * step)[0], self._unsteadiness(seconds)
+        if turn is not None:
+            motion[:3, :3] = turn[:3, :3]
+            sigmas = np.where(self._free < 3, sigmas, p.gyroscope_radps * seconds)
+        return motion, sigmas
 
-    def _after(self, motion: F64, variance: F64) -> Belief:
-        """The last pose after a motion (4, 4) with variances (D,) of its own."""
+    def after(self, motion: F64, sigmas: F64) -> Belief:
+        """The last pose after a motion (4, 4) with standard deviations (D,) of its own."""
         F = carried_on(motion)[np.ix_(self._free, self._free)]
         return Belief(
-            self._state.poses[-1] @ motion, F @ self._covariance @ F.T + np.diag(variance), self._free
+            self._state.poses[-1] @ motion, F @ self._covariance @ F.T + np.diag(sigmas**2), self._free
         )
 
     # ---------------------------------------------------------------------------------------------- update

@@ -74,7 +74,7 @@ class Tracker:
         self._parameters = parameters
         self._first: Scan | None = None
         self._count = 0  # scans since the first one
-        self._last: tuple[int, F64] | None = None  # stamp of the last scan, and its final pose T_session_base
+        self._last: tuple[Scan, F64] | None = None  # with its final pose T_session_base
         self._odometer = Odometer(parameters=parameters)
         self._rides = RideWatch()
         self._keyframe: SE2 | None = None  # where the last one was
@@ -117,12 +117,13 @@ class Tracker:
         """Track the next scan; stamps must increase."""
         if self._last is None:
             return self.start(scan)
-        stamp_ns, last_pose = self._last
-        seconds = (scan.stamp_ns - stamp_ns) * 1e-9
+        last, last_pose = self._last
+        seconds = (scan.stamp_ns - last.stamp_ns) * 1e-9
         reading, reported = self._reading(scan), self._odometer.reported(scan)
         continues = self._odometer.continues(scan, seconds)
         # 1. What is expected: by odometry, or that the motion goes on. What is not plausible comes last.
-        expected = [self._smoother.by_steadiness(seconds)]
+        steady = self._smoother.steady(seconds, turn := self._turn(scan))
+        expected = [self._smoother.after(*steady)]
         if reading is not None:
             expected.insert(0 if continues else 1, self._smoother.by_odometry(reading))
         self._count += 1
@@ -133,8 +134,8 @@ class Tracker:
         points = self._deskewed(scan, motion, seconds)
         # 3. Place the scan by itself, and weigh that against odometry and the scans before.
         placed = self._sensor.place(scan, points, seconds, expected)
-        evidence = Evidence(seconds, reading, continues, placed.alone, placed.motion)
-        estimate = self._estimated(placed, evidence)
+        between = placed.motion if turn is None else (steady[0], np.diag(steady[1] ** -2))
+        estimate = self._estimated(placed, Evidence(seconds, reading, continues, placed.alone, between))
         # 4. Judge the pose, and start again if nothing fits any more.
         bridged = placed.followed or (reading is not None and continues)
         health = self._health.judge(placed, estimate, bridged=bridged)
@@ -176,7 +177,7 @@ class Tracker:
         found = None if lost else self._odometer.disagreement(scan, pose)
         if health is Health.FINE and found is not None and found.overrules:
             health = Health.OVERRULED
-        self._last = scan.stamp_ns, pose
+        self._last = scan, pose
         self._odometer.remember(scan, pose)
         deskewed = dataclasses.replace(scan, points_m=points, offsets_s=None)
         return Tracked(
@@ -212,6 +213,15 @@ class Tracker:
         """The reading (4, 4) of odometry at a scan."""
         return None if scan.T_odom_base is None else self._flat(scan.T_odom_base)
 
+    def _turn(self, scan: Scan) -> F64 | None:
+        """The turn (4, 4) of a sensor in the hand since the last scan, by its IMU; None if that is not known,
+        and beside odometry."""
+        before = None if self._last is None else self._last[0].T_level_base
+        unaided = self.carried and scan.T_odom_base is None
+        if not unaided or before is None or scan.T_level_base is None:
+            return None
+        return invert_pose(before) @ scan.T_level_base
+
     def _deskewed(self, scan: Scan, motion: F64, seconds: float) -> F32:
         """The points (N, 3) of a scan that are used, without the motion while it was taken.
 
@@ -227,5 +237,8 @@ class Tracker:
         offsets = scan.offsets_s[keep]
         span_s = float(np.ptp(offsets))
         if scan.T_first_last is not None and self._odometer.is_possible(scan.T_first_last, span_s):
-            motion, seconds = scan.T_first_last, span_s
+            within = scan.T_first_last.copy()
+            if scan.T_odom_base is None:  # an IMU tells the turn alone
+                within[:3, 3] = motion[:3, 3] * span_s / seconds
+            motion, seconds = within, span_s
         return deskew(points, offsets, motion, seconds)

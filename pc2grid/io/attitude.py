@@ -55,8 +55,14 @@ class Attitude:
         """Begin a new frame: how the IMU has turned is not known."""
         self._track = PoseTrack()  # T_turning_imu: the frame that the gyroscope carries on
         self._turned = np.eye(4)
+        self._rate_rps = np.zeros(3)  # of the message before
         self._up = np.zeros(3)  # mean acceleration in that frame, in standard gravities
         self._counted = 0  # accelerations in it
+
+    @property
+    def newest_ns(self) -> int:
+        """The stamp up to which the attitude is known; 0 if it is not."""
+        return self._track.newest_ns
 
     def add(self, imu: Imu, stamp_ns: int) -> None:
         """Take in the next message; one that is late or repeated is ignored."""
@@ -72,7 +78,9 @@ class Attitude:
             self._turned = pose_from_xyz_quat((0.0, 0.0, 0.0), imu.orientation)
             self._up, self._counted = np.array([0.0, 0.0, 1.0]), 1
         elif imu.turn_rate_rps is not None:
-            self._turned = self._turned @ pose_from_rotation_vector(seconds * np.array(imu.turn_rate_rps))
+            rate_rps = np.array(imu.turn_rate_rps)
+            between = 0.5 * seconds * (self._rate_rps + rate_rps)
+            self._turned, self._rate_rps = self._turned @ pose_from_rotation_vector(between), rate_rps
         x, y, z, w = quat_xyzw_from_pose(self._turned).tolist()
         self._track.add(stamp_ns, (0.0, 0.0, 0.0, x, y, z, w))
         if imu.acceleration_mps2 is None:

@@ -249,6 +249,11 @@ class _Poses:
             return self._frames.newest_ns(plan.odometry_frame, plan.choice.base_frame)
         return None if plan.odometry is None else self._track.newest_ns
 
+    def complete_ns(self) -> int | None:
+        """The stamp up to which odometry or, without it, the IMU is known; as `newest_ns`."""
+        newest_ns = self.newest_ns()
+        return self._attitude.newest_ns if newest_ns is None and self._plan.imu is not None else newest_ns
+
     def odometry(self, stamp_ns: int) -> F64 | None:
         """`T_odom_base` (4, 4) at a time; None if it is not known."""
         plan = self._plan
@@ -394,11 +399,11 @@ class Stream:
         )
 
     def _all_is_there(self, stamp_ns: int) -> bool:
-        """Whether what belongs to a scan has arrived: those of further sensors, and odometry if there is
-        any."""
+        """Whether what belongs to a scan has arrived: those of further sensors, and odometry or an IMU if
+        there is any."""
         if any(further.newest_ns < stamp_ns for further in self._further):
             return False
-        newest_ns = self.newest_odometry_ns()
+        newest_ns = self._poses.complete_ns()
         needed_ns = [stamp_ns + self._sweep_ns, *(f.nearest_ns(stamp_ns) for f in self._further)]
         return newest_ns is None or newest_ns >= max(needed_ns)
 
@@ -504,15 +509,17 @@ class Stream:
         return together(scan, found) if found else scan
 
     def _with_motion(self, scan: Scan) -> Scan:
-        """The scan with the motion from its first to its last point, if there is odometry at both."""
+        """The scan with the motion from its first to its last point, if there is odometry at both, or with
+        the turn by an IMU."""
         if scan.offsets_s is None or not len(scan.offsets_s):
             self._sweep_ns = 0
             return scan
         times_s = float(scan.offsets_s.min()), float(scan.offsets_s.max())
         self._sweep_ns = max(round(times_s[1] * 1e9), 0)
-        if scan.T_odom_base is None:
+        if scan.T_odom_base is None and scan.T_level_base is None:
             return scan
-        first, last = (self._poses.odometry(scan.stamp_ns + round(time_s * 1e9)) for time_s in times_s)
+        pose_at = self._poses.level if scan.T_odom_base is None else self._poses.odometry
+        first, last = (pose_at(scan.stamp_ns + round(time_s * 1e9)) for time_s in times_s)
         if first is None or last is None:
             return scan
         return replace(scan, T_first_last=invert_pose(first) @ last)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from pc2grid.arrays import F64, freeze
 from pc2grid.geometry import invert_pose, rotation_vector
-from pc2grid.io.attitude import Attitude
 from pc2grid.io.messages.types import Header, Imu
-from pc2grid.io.scan_stream import PARAMETERS as STREAM
 from pc2grid.simulate.config import ImuConfig
 
 _HOLDING_MPS2 = np.array([0.0, 0.0, 9.81])
@@ -44,15 +41,6 @@ class SimulatedImu:
             rate, acceleration = (a[k].tolist() for a in (self.turn_rates_rps, self.accelerations_mps2))
             header = Header(begin_ns + round(time_s * 1e9), frame)
             yield Imu(header, None, tuple(rate), tuple(acceleration))
-
-    def levels(self, stamps_ns: Iterable[int], begin_ns: int) -> Iterator[F64 | None]:
-        """`Scan.T_level_base` at stamps as `pc2grid.io` finds it, which waits for later messages."""
-        attitude, messages = Attitude(), deque(self.messages(begin_ns, ""))
-        for stamp_ns in stamps_ns:
-            while messages and messages[0].header.stamp_ns <= stamp_ns + STREAM.wait_ns:
-                message = messages.popleft()
-                attitude.add(message, message.header.stamp_ns)
-            yield attitude.at(stamp_ns)
 
 
 def imu_of(

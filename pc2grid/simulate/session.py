@@ -50,7 +50,7 @@ class Reading:
     @property
     def stamp_ns(self) -> int:
         """Its header stamp."""
-        return _stamp_ns(self.time_s)
+        return EPOCH_NS + round(self.time_s * 1e9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,21 +138,13 @@ class Session:
         return pose.lift() if self.hand is None else pose.lift() @ self.hand.at(time_s)
 
     def scan(self, reading: Reading) -> Scan:
-        """A reading as the scan that `pc2grid.io` decodes from the recording."""
+        """A reading as the scan that `pc2grid.io` decodes from the recording, but for what an IMU says."""
         return scan_of(reading, self.sensor, self.odometry, self.in_space)
 
     def scans(self) -> Iterator[tuple[Scan, SE2]]:
         """Scans in the base frame, not deskewed, with the true T_map_base at their stamps."""
-        stamps_ns = (_stamp_ns(k / self.sensor.rate_hz) for k in range(self.scan_count))
-        levels = iter(()) if self.imu is None else self.imu.levels(stamps_ns, EPOCH_NS)
         for reading in self.readings():
-            scan = replace(self.scan(reading), T_level_base=next(levels, None))
-            yield scan, self.drive.pose(reading.time_s)
-
-
-def _stamp_ns(time_s: float) -> int:
-    """The stamp at a time since the session's start."""
-    return EPOCH_NS + round(time_s * 1e9)
+            yield self.scan(reading), self.drive.pose(reading.time_s)
 
 
 def _on_the_floor(pose: SE2, time_s: float) -> F64:
@@ -268,6 +260,6 @@ def iter_session(
 ) -> Iterator[tuple[Scan, SE2]]:
     """A session in memory: each scan with the true T_map_base at its stamp.
 
-    The same scans as in the log that `simulate_session` writes, without the log.
+    The same scans as in the log that `simulate_session` writes, without the log and without what an IMU says.
     """
     yield from prepare_session(sensor=sensor, grid=grid, config=config).scans()
