@@ -222,3 +222,18 @@ def test_the_density_of_a_belief_falls_with_the_distance() -> None:
     densities = [belief.log_density(belief.chi2(SE2(x, 0.0, 0.0).lift())) for x in (0.0, 0.1, 0.3, 3.0)]
     assert densities == sorted(densities, reverse=True)
     assert densities[1] - densities[0] == pytest.approx(-0.5, abs=0.05)  # one standard deviation
+
+
+def test_a_gyroscope_replaces_the_turn_of_the_motion_before() -> None:
+    """Three steps of 0.1 m straight on; then the gyroscope says that the sensor turns."""
+    smoother = Smoother(SPATIAL)
+    pose, known = np.eye(4), 1e8 * np.eye(6)
+    smoother.start(pose, None)
+    for _ in range(3):
+        pose = pose @ SE2(0.1, 0.0, 0.0).lift()
+        smoother.add(pose, Evidence(0.1, match=(pose, known)))
+    turn = pose_from_rotation_vector((0.0, 0.3, 0.0))
+    belief = smoother.after(*smoother.steady(0.1, turn))
+    np.testing.assert_allclose(belief.pose[:3, :3], turn[:3, :3], atol=1e-3)
+    np.testing.assert_allclose(belief.pose[:3, 3], (0.4, 0.0, 0.0), atol=0.02)
+    assert belief.sigmas[1] < 0.1 * smoother.by_steadiness(0.1).sigmas[1]
