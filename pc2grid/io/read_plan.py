@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import FrameError, NoScans, PointCloudError
+from pc2grid.errors import FrameError, NoScans, PointCloudError, UnsupportedSchema
 from pc2grid.io import topics
 from pc2grid.io.frames import FrameTree
 from pc2grid.io.message_source import Choice, MessageSource, TopicInfo
@@ -107,7 +107,8 @@ class _Sensors(NamedTuple):
 
 
 class _Motion(NamedTuple):
-    """Where the odometry comes from: a topic, or the transform from a frame in tf; and the topic to name."""
+    """Where odometry, or an IMU, comes from: a topic, or the transform from a frame in tf; and the topic to
+    name."""
 
     topic: TopicInfo | None
     named: TopicInfo | None
@@ -140,8 +141,7 @@ class _Planner:
         motion = _Motion(odometry, odometry, None, why)
         if in_tf:
             motion = self._motion_in_tf(found, moving, why)
-        planar = SENSOR_MODELS[topics.SENSORS[sensors.scans.type]].planar
-        imu, of_imu = self._imu(found, sensor_frame, needed=motion.name is None and not planar)
+        imu = self._imu(found, sensor_frame, sensors, motion)
         return Plan(
             choice=Choice(
                 topic=sensors.scans.topic,
@@ -149,8 +149,8 @@ class _Planner:
                 odometry_topic=motion.name,
                 base_frame=base,
                 sensor_frame=sensor_frame or None,
-                reason="; ".join(filter(None, (sensors.reason, motion.reason, of_imu))),
-                imu_topic=None if imu is None else imu.topic,
+                reason="; ".join(filter(None, (sensors.reason, motion.reason, imu.reason))),
+                imu_topic=imu.name,
             ),
             scans=sensors.scans,
             camera=sensors.cameras[0],
@@ -160,27 +160,34 @@ class _Planner:
             sensor_is_base=found is None,
             stampless=bool(headers) and not any(header.stamp_ns for header in headers),
             further=tuple(zip(sensors.more, sensors.cameras[1:], strict=True)),
-            imu=imu,
+            imu=imu.topic,
         )
 
-    def _imu(self, base: str | None, sensor_frame: str, *, needed: bool) -> tuple[TopicInfo | None, str]:
-        """The IMU, and a sentence that says why; base : None if the log has no tf.
+    def _imu(self, base: str | None, sensor_frame: str, sensors: _Sensors, motion: _Motion) -> _Motion:
+        """The IMU; base : None if the log has no tf. Beside odometry, and with a laser, none is looked for.
 
-        needed : whether one is looked for that the user does not name. Raises TopicError, FrameError for one
-        that he names.
+        Raises TopicError, FrameError for one that the user names.
         """
-        wanted = self._config.imu
-        imu = topics.imu_topic(self._topics, wanted) if needed or wanted is not None else None
-        if imu is None:
-            return None, ""
-        frame = self._first_frame(imu)
+        wanted, none = self._config.imu, _Motion(None, None, None, "")
+        planar = SENSOR_MODELS[topics.SENSORS[sensors.scans.type]].planar
+        imu = topics.imu_topic(self._topics, wanted)
+        if imu is None or (wanted is None and (planar or motion.name is not None)):
+            return none
+        try:
+            self._check_imu(imu, base, sensor_frame)
+        except (FrameError, UnsupportedSchema) as error:
+            if wanted is not None:
+                raise
+            return none._replace(reason=f"{imu.topic} is not used: {error.message}")
+        return _Motion(imu, imu, None, f"gravity from {imu.topic}")
+
+    def _check_imu(self, imu: TopicInfo, base: str | None, sensor_frame: str) -> None:
+        """Raise FrameError if it is not known how the IMU sits on the base, UnsupportedSchema."""
         frames, there = self._frames, sensor_frame if base is None else base
-        known = base is not None and frame in frames and frames.connected(there, frame)
-        if frame == there or (known and not frames.moving(there, frame)):
-            return imu, f"gravity from {imu.topic}"
-        if wanted is not None:
+        frame = self._first_frame(imu)
+        known = frame == there or (base is not None and frames.connected(there, frame))
+        if not known or frames.moving(there, frame):
             raise frames.missing(frame, there)
-        return None, f"{imu.topic} is not used: tf does not connect its frame {frame or '(empty)'} to {there}"
 
     def _first_frame(self, topic: TopicInfo) -> str:
         """The frame of the first message that can be decoded; empty if there is none."""

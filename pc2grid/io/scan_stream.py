@@ -328,10 +328,8 @@ class Stream:
         """By topic, what takes in its messages. Reads the first CameraInfo of the source."""
         plan = self._plan
         on: dict[TopicInfo, Callable[[Any, int], None]] = {plan.scans: self._take_scan}
-        if plan.odometry is not None:
-            on[plan.odometry] = self._poses.take_odometry(plan.odometry)
-        if plan.imu is not None:
-            on[plan.imu] = self._poses.take_imu(plan.imu)
+        of_motion = (plan.odometry, self._poses.take_odometry), (plan.imu, self._poses.take_imu)
+        on.update((topic, take(topic)) for topic, take in of_motion if topic is not None)
         on.update((f.topic, functools.partial(self._take_further, f)) for f in self._further)
         for camera, decoder in (
             (plan.camera, self._decoder),

@@ -12,7 +12,6 @@ import functools
 import math
 import struct
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -169,20 +168,21 @@ def _odometry(m: Any) -> Odometry:
 
 
 def _imu(m: Any) -> Imu:
-    """Raises PointCloudError for numbers that are not finite, or a quaternion without a direction."""
+    """Raises PointCloudError for numbers that are not finite; a quaternion of zeros is none."""
     q, w, a = m.orientation, m.angular_velocity, m.linear_acceleration
-    found = Imu(
-        _header(m.header),
-        None if m.orientation_covariance[0] == -1.0 else (q.x, q.y, q.z, q.w),
-        None if m.angular_velocity_covariance[0] == -1.0 else (w.x, w.y, w.z),
-        None if m.linear_acceleration_covariance[0] == -1.0 else (a.x, a.y, a.z),
-    )
-    numbers = (found.turn_rate_rps or ()) + (found.acceleration_mps2 or ())
-    if not all(map(math.isfinite, numbers)):
+    orientation = (q.x, q.y, q.z, q.w) if _measured(m.orientation_covariance) else None
+    turn_rate = (w.x, w.y, w.z) if _measured(m.angular_velocity_covariance) else None
+    acceleration = (a.x, a.y, a.z) if _measured(m.linear_acceleration_covariance) else None
+    if not all(map(math.isfinite, (*(turn_rate or ()), *(acceleration or ())))):
         raise PointCloudError("the message is not finite")
-    if found.orientation is not None and not valid_pose((0.0, 0.0, 0.0, *found.orientation)):
-        return replace(found, orientation=None)
-    return found
+    if orientation is not None and not valid_pose((0.0, 0.0, 0.0, *orientation)):
+        orientation = None
+    return Imu(_header(m.header), orientation, turn_rate, acceleration)
+
+
+def _measured(covariance: Any) -> bool:
+    """Whether an IMU measures what this is the covariance of, see sensor_msgs/Imu."""
+    return bool(covariance[0] != -1.0)
 
 
 def _pose_stamped(m: Any) -> PoseStamped:

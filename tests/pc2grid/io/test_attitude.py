@@ -132,8 +132,17 @@ def test_an_imu_whose_place_is_not_known_is_not_used(tmp_path: Path) -> None:
     with open_log(path) as log:
         choice = log.choose()
     assert choice.imu_topic is None
-    assert "/imu/data is not used: tf does not connect its frame imu to base_link" in choice.reason
+    assert "/imu/data is not used: tf does not connect frame imu to base_link" in choice.reason
     with pytest.raises(FrameError, match="imu"):
         read(path, ReadConfig(imu="/imu/data"))
     with pytest.raises(TopicError, match=r"no imu topic /imu; there is: /imu/data"):
         read(path, ReadConfig(imu="/imu"))
+
+
+def test_an_imu_that_cannot_be_decoded_costs_nothing_but_gravity(tmp_path: Path) -> None:
+    to = ros()
+    messages = [to.tf(T0, "base_link", "lidar", 0.2, topic="/tf_static")]
+    messages += [to.cloud("/points", T0 + k * STEP, [[1.0, 2.0, 3.0]]) for k in range(5)]
+    messages += [Message("/imu/data", "sensor_msgs/Imu", T0 + k * STEP, b"\0\1\0\0") for k in range(5)]
+    scans, _ = read(write_mcap(tmp_path / "a.mcap", messages))
+    assert [scan.T_level_base for scan in scans] == [None] * 5
