@@ -29,8 +29,8 @@ MOST_WAITING = 100
 """Scans that wait for a floor, at most: some 50 MB. Chosen by hand."""
 
 _UNKNOWN = (
-    "the first scans show no floor, and neither odometry nor an IMU says what is up: the sensor is taken to be "
-    "held level at first; begin with the floor in view"
+    "the first scans show no floor, and neither odometry nor an IMU says what is up: the sensor is taken "
+    "to be held level at first; begin with the floor in view"
 )
 
 
