@@ -17,8 +17,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
 
-from pc2grid.arrays import F32, F64, I64
+from pc2grid.arrays import F64, I64
 from pc2grid.geometry import SE2, wrap_angle
 from signature.localization.joining.landmarks import Landmarks
 from signature.retrieval.likeness import peaks, rotate_and_compare
@@ -49,7 +51,9 @@ class GraphMatchingParameters:
 
 GRAPH_MATCHING = GraphMatchingParameters()
 _ROUNDS = 50
-"""Of the power iteration; the sets do not change after 20."""
+"""Of the power iteration; the largest sets do not change after 20."""
+_LEAST_STRENGTH = 1e-4
+"""Of a pair that belongs to a set."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,12 +95,12 @@ def align_graphs(target: Landmarks, source: Landmarks) -> tuple[Alignment, ...]:
     agreement = agreements(target, source, pairs)
     found, left = [], np.arange(len(pairs.target))
     for _ in range(GRAPH_MATCHING.sets):
-        members = consistent_set(agreement[np.ix_(left, left)])
+        members = consistent_set(agreement[left][:, left])
         if len(members) < GRAPH_MATCHING.least:
             break
         found.append(_alignment(target, source, pairs.only(left[members])))
         # What agrees with the strongest pair of a set would give the same transform again.
-        left = left[agreement[left[members[0]], left] == 0.0]
+        left = np.setdiff1d(left, agreeing(agreement, left[members[0]]))
     return tuple(sorted(found, key=lambda alignment: -alignment.evidence))
 
 
@@ -133,50 +137,64 @@ def likeness_of_nodes(target: Landmarks, source: Landmarks) -> F64:
     return spread.log_ratio(np.maximum(squared, 0.0), hidden)
 
 
-def agreements(target: Landmarks, source: Landmarks, pairs: NodePairs) -> F32:
-    """(P, P) how well two pairs agree, 0..1; 0 on the diagonal."""
+def agreements(target: Landmarks, source: Landmarks, pairs: NodePairs) -> csr_array:
+    """(P, P) how well two pairs agree, 0..1; empty on the diagonal. Few pairs do, so only these are held."""
     p = GRAPH_MATCHING
-    step_target = target.at_m[pairs.target][None] - target.at_m[pairs.target][:, None]
-    step_source = source.at_m[pairs.source][None] - source.at_m[pairs.source][:, None]
+    one, other = at_alike_headings(pairs.yaw_rad, p.turn_rad).T
+    # A node of either side has one partner.
+    alone = (pairs.target[one] != pairs.target[other]) & (pairs.source[one] != pairs.source[other])
+    one, other = one[alone], other[alone]
+    step_target = target.at_m[pairs.target[other]] - target.at_m[pairs.target[one]]
+    step_source = source.at_m[pairs.source[other]] - source.at_m[pairs.source[one]]
     way_m = np.minimum(
-        target.way_m[np.ix_(pairs.target, pairs.target)], source.way_m[np.ix_(pairs.source, pairs.source)]
+        target.way_m[pairs.target[one], pairs.target[other]],
+        source.way_m[pairs.source[one], pairs.source[other]],
     )
-    straight_m = np.hypot(step_source[..., 0], step_source[..., 1])
+    straight_m = np.hypot(*step_source.T)
     way_m = np.where(np.isfinite(way_m), way_m, straight_m)
     allowed_m = p.near_m + p.drift * np.maximum(way_m, straight_m)
-    turn = np.abs(wrap_angle(pairs.yaw_rad[:, None] - pairs.yaw_rad))
+    length = np.abs(np.hypot(*step_target.T) - straight_m)
     # The heading that both steps give, and the headings of the two pairs, which are known to one ray.
-    length = np.abs(np.hypot(step_target[..., 0], step_target[..., 1]) - straight_m)
-    heading = np.arctan2(step_target[..., 1], step_target[..., 0]) - np.arctan2(
-        step_source[..., 1], step_source[..., 0]
-    )
-    mean_yaw = pairs.yaw_rad[:, None] + 0.5 * wrap_angle(pairs.yaw_rad - pairs.yaw_rad[:, None])
-    aside = np.abs(wrap_angle(heading - mean_yaw))
+    heading = np.arctan2(*step_target.T[::-1]) - np.arctan2(*step_source.T[::-1])
+    mean_yaw = pairs.yaw_rad[one] + 0.5 * wrap_angle(pairs.yaw_rad[other] - pairs.yaw_rad[one])
     slack = p.turn_rad + np.arctan2(allowed_m, np.maximum(straight_m, 1e-6))
-    agrees = (length < allowed_m) & (turn < p.turn_rad) & (aside < slack)
-    # A node of either side has one partner.
-    agrees &= (pairs.target[:, None] != pairs.target) & (pairs.source[:, None] != pairs.source)
-    return np.where(agrees, 1.0 - length / allowed_m, 0.0).astype(np.float32)
+    agrees = (length < allowed_m) & (np.abs(wrap_angle(heading - mean_yaw)) < slack)
+    one, other, agreement = one[agrees], other[agrees], (1.0 - length / allowed_m)[agrees]
+    count = len(pairs.yaw_rad)
+    both = np.concatenate((one, other)), np.concatenate((other, one))
+    return csr_array((np.tile(agreement, 2), both), shape=(count, count))
 
 
-def consistent_set(agreement: F32) -> I64:
+def at_alike_headings(yaw_rad: F64, turn_rad: float) -> I64:
+    """(E, 2) which two of the headings (P,) differ by less than `turn_rad`."""
+    around = cKDTree(np.mod(yaw_rad, 2.0 * math.pi)[:, None], boxsize=2.0 * math.pi)
+    return np.asarray(around.query_pairs(turn_rad, output_type="ndarray"), np.int64)
+
+
+def consistent_set(agreement: csr_array) -> I64:
     """The members of the largest set of pairs that agree with each other, the strongest first."""
-    if not len(agreement):
-        return np.empty(0, np.int64)
-    strength = np.ones(len(agreement), np.float32)
+    strength = np.ones(agreement.shape[0])
     for _ in range(_ROUNDS):
         strength = agreement @ strength
-        norm = float(np.linalg.norm(strength))
+        norm = math.sqrt(strength @ strength)
         if norm == 0.0:
             return np.empty(0, np.int64)
         strength /= norm
+    left = np.argsort(-strength, kind="stable")
+    left = left[strength[left] > _LEAST_STRENGTH]
     members: list[int] = []
-    open_ = strength > 1e-4
-    while open_.any():
-        best = int(np.argmax(np.where(open_, strength, -1.0)))
-        members.append(best)
-        open_ &= agreement[best] > 0.0
+    agrees = np.zeros(len(strength), bool)
+    while len(left):
+        members.append(int(left[0]))
+        agrees[:] = False
+        agrees[agreeing(agreement, members[-1])] = True
+        left = left[agrees[left]]
     return np.array(members, np.int64)
+
+
+def agreeing(agreement: csr_array, pair: int) -> I64:
+    """The pairs that agree with one."""
+    return np.asarray(agreement.indices[agreement.indptr[pair] : agreement.indptr[pair + 1]], np.int64)
 
 
 def _alignment(target: Landmarks, source: Landmarks, pairs: NodePairs) -> Alignment:

@@ -22,6 +22,7 @@ from pc2grid.arrays import F32, F64, BoolGrid, freeze
 from pc2grid.geometry import SE2
 from pc2grid.matching.likelihood_field import LIKELIHOOD
 from pc2grid.matching.refinement import refine
+from pc2grid.matching.self_likeness import self_likeness
 from pc2grid.matching.two_way_score import Fit
 from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import SearchMap, SearchParameters, search_windows
@@ -84,6 +85,19 @@ class JoinableMap:
     def walls(self) -> Walls:
         """Its walls."""
         return Walls.of(self.grid)
+
+    @cached_property
+    def query(self) -> QueryMap:
+        """The map as a query."""
+        return QueryMap(
+            stamp_ns=0,
+            path_m=0.0,
+            T_odom_base=SE2(),
+            grid=self.grid,
+            views=(),
+            walls=self.walls,
+            center_m=(0.0, 0.0),
+        )
 
     @cached_property
     def pieces(self) -> tuple[Piece, ...]:
@@ -160,8 +174,16 @@ def join_maps(
     decoys = _candidates(target, source.landmarks.mirrored(), points_m * _MIRROR, mirrored, parameters)
     fits = PieceFits.of([candidate.fits for candidate in (*candidates, *decoys)], source.pieces)
     prior = parameters.labelled if labelled else 1.0
-    joins = [_judged(target, source, one, k, fits, prior, parameters) for k, one in enumerate(candidates)]
-    return max(joins, key=lambda join: (join.status == "joined", join.probability), default=UNJOINED)
+    best = UNJOINED
+    # Branch and bound: what is left out is neither joined nor more probable than the best.
+    found = [_evidence(source, one, k, fits) for k, one in enumerate(candidates)]
+    bounds = [_bound(evidence, prior) for evidence in found]
+    for k in sorted(range(len(candidates)), key=lambda k: -bounds[k]):
+        if bounds[k] < min(best.probability, parameters.accept):
+            break
+        join = _judged(target, source, candidates[k], k, fits, found[k], prior, parameters)
+        best = max(best, join, key=lambda join: (join.status == "joined", join.probability))
+    return best
 
 
 def _same(a: _Candidate, b: _Candidate) -> bool:
@@ -215,45 +237,54 @@ def _refined(
     )
 
 
-def _judged(
-    target: JoinableMap,
-    source: JoinableMap,
-    candidate: _Candidate,
-    number: int,
-    fits: PieceFits,
-    prior: float,
-    parameters: JoinParameters,
-) -> Join:
-    """The posterior of a transform, by the part of the source that lies in the target.
+def _evidence(source: JoinableMap, candidate: _Candidate, number: int, fits: PieceFits) -> Evidence:
+    """What tells for a transform, by the walls of the source that lie on known ground of the target.
 
-    number : its row in `fits`; the other rows are of its rivals. prior : odds of one building.
+    number : its row in `fits`; the other rows are of its rivals.
     """
-    part = known_part(source.grid, target.grid, candidate.T_target_source)
-    common_m2 = free_in_both(part, target.grid, candidate.T_target_source)
     forward, backward, scores = fits.of_part(number)
-    query = QueryMap(
-        stamp_ns=0,
-        path_m=0.0,
-        T_odom_base=SE2(),
-        grid=part,
-        views=(),
-        walls=Walls.of(part),
-        center_m=(candidate.at.x, candidate.at.y),
-    )
     whole = [
         Fit(
             T_map_query=candidate.T_target_source,
             forward=forward,
             backward=backward,
             overlap=1.0,
-            compared=query.walls.weight,
+            compared=float(fits.seen[number].sum()),
             looked_at=float(fits.looked_at[number].sum()),
             score=score,
             covariance=candidate.covariance,
         )
         for score in scores.tolist()
     ]
-    evidence = evidence_of(whole, query)[number]
+    return evidence_of(whole, source.query)[number]
+
+
+def _bound(evidence: Evidence, prior: float) -> float:
+    """The probability of a transform if its part of the source is unlike itself, and is all of it: never
+    lower than the true one."""
+    highest = replace(evidence, lead=max(evidence.lead, 0.0), likeness=0.0)
+    return float(masses([highest], prior)[0])
+
+
+def _judged(
+    target: JoinableMap,
+    source: JoinableMap,
+    candidate: _Candidate,
+    number: int,
+    fits: PieceFits,
+    evidence: Evidence,
+    prior: float,
+    parameters: JoinParameters,
+) -> Join:
+    """The posterior of a transform, by the part of the source that lies in the target.
+
+    number : its row in `fits`; the other rows are of its rivals. evidence : see `_evidence`. prior : odds of
+    one building.
+    """
+    part = known_part(source.grid, target.grid, candidate.T_target_source)
+    common_m2 = free_in_both(part, target.grid, candidate.T_target_source)
+    forward, backward, scores = fits.of_part(number)
+    evidence = replace(evidence, likeness=self_likeness(Walls.of(part)))
     # The part was chosen: of so many parts of the smaller session, this one fits best.
     share = min(common_m2 / max(min(source.grid.free_m2, target.grid.free_m2), 1e-9), 1.0)
     odds = prior * max(share, 1e-9)
