@@ -6,28 +6,20 @@ results, in the order of the jobs. So the database has the same bytes wherever t
 
 from __future__ import annotations
 
-import contextlib
-import logging
-import signal
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from pc2grid import extras
 from pc2grid._version import __version__
 from pc2grid.errors import ClusterError, DatabaseError
 from pc2grid.mapping.drawn_map import is_drawn_map
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
+from signature.cluster import connected
 from signature.config import Config
 from signature.database.protocol import Entry, Label, Provenance
 from signature.sessions import build_sessions, describe_all, digest_of, on_floors, provenance
-
-LOCAL = "local"
-"""In place of the address of a scheduler: start a cluster of processes on this machine."""
-CONNECT_TIMEOUT_S = 10.0
-"""How long a scheduler may take to answer, and to have its first worker; chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,7 +115,7 @@ def on_cluster(
 
     Raises ClusterError if the cluster cannot be reached or goes away; the jobs yielded until then are done.
     """
-    with _connected(address, processes) as client:
+    with connected(address, processes) as client:
         names: dict[str, str] = {}
         futures = []
         for number, job in enumerate(jobs):
@@ -186,68 +178,3 @@ class _LostWorkers:
                 self._report(
                     f"worker {message['worker']} was lost; {self._names[key]} starts over on another"
                 )
-
-
-@contextlib.contextmanager
-def _connected(address: str, processes: int) -> Iterator[Any]:
-    """Connects to a scheduler that has at least one worker."""
-    extras.require({"cluster": "a cluster"})
-    import distributed
-
-    class Client(distributed.Client):
-        """A client that closes itself if it cannot connect.
-
-        Otherwise the garbage collector would close the incomplete client at an arbitrary time. If another
-        client starts at that time, each waits for a lock that the other one holds.
-        """
-
-        def __init__(self, address: str) -> None:
-            try:
-                super().__init__(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)  # type: ignore[no-untyped-call]
-            except BaseException:
-                self.close()  # type: ignore[no-untyped-call]
-                raise
-
-    # The library logs many lines for each lost connection; our error is one line.
-    for name in ("distributed", "tornado", "asyncio"):
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    with contextlib.ExitStack() as stack:
-        if address == LOCAL:
-            address = stack.enter_context(_processes(processes)).scheduler_address
-        problem = "does not answer"
-        try:
-            client = stack.enter_context(Client(address))
-            problem = "has no workers"
-            client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
-        except (OSError, ValueError) as error:
-            raise ClusterError(
-                f"the scheduler {address} {problem}",
-                hint="start one with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`",
-            ) from error
-        yield client
-
-
-def _processes(count: int) -> Any:
-    """A cluster of `count` processes on this machine.
-
-    A terminal sends Ctrl-C to all processes, but only this one may react, because it ends the others. So
-    SIGINT is blocked while the workers are started: they, and the workers that replace them, inherit this.
-    """
-    from multiprocessing import resource_tracker
-
-    import distributed
-
-    # Started later, the resource tracker would unblock the signal.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        make: Any = distributed.LocalCluster  # untyped
-        return make(
-            n_workers=count,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.CRITICAL,
-        )
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -24,7 +24,7 @@ from pc2grid.io.nav2_map import save_map
 from pc2grid.model import OccupancyGrid, part_name
 from pc2grid.observer import Observer
 from pc2grid_cli.main import app
-from signature import conversion_jobs
+from signature import cluster, conversion_jobs
 from signature.config import Config
 from signature.conversion_jobs import Job, Outcome, on_cluster
 from signature.database import maintenance, open_database
@@ -63,7 +63,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def processes() -> Iterator[Any]:
     """A scheduler with two workers of one thread each."""
-    with conversion_jobs._processes(2) as made:
+    with cluster.processes_here(2) as made:
         yield made
 
 
@@ -233,7 +233,7 @@ def test_a_worker_of_another_version_is_refused(folder: Path) -> None:
 
 
 def test_no_scheduler_and_no_workers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(conversion_jobs, "CONNECT_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT_S", 0.5)
     jobs = [job(folder, "hall")]
     for address in ("tcp://127.0.0.1:1", "nonsense://x", "tcp://nowhere.invalid:8786"):
         with pytest.raises(ClusterError, match="does not answer") as caught:

@@ -17,6 +17,7 @@ from pc2grid.model import SessionMap
 from pc2grid.observer import Observer, Observers
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
+from pc2grid_cli.comparing import comparing
 from pc2grid_cli.json_schemas import Convert, Converted, JoinedSession, UpdatedMap, plain
 from pc2grid_cli.session_documents import joined_document, living_as_text, living_document, session_document
 from signature import conversion_jobs, living
@@ -220,10 +221,18 @@ def _as_text(d: Converted) -> str:
     return f"{d['session']}{floor}: {travel}{d['area_m2']:.0f} m2 free, {counted(d['submaps'], 'submap')}"
 
 
-def join_added(output: str, done: Done, terminal: console.Console, *, wanted: bool | None) -> None:
+def join_added(
+    output: str,
+    done: Done,
+    terminal: console.Console,
+    *,
+    wanted: bool | None,
+    dask: str | None,
+    jobs: int | None,
+) -> None:
     """Join the new sessions with those that the database holds.
 
-    wanted : None: only if the database holds sessions that are joined already.
+    wanted : None: only if the database holds sessions that are joined already. dask, jobs : see `comparing`.
     """
     names = [document["session"] for document in done.sessions]
     if wanted is False or not names:
@@ -231,7 +240,8 @@ def join_added(output: str, done: Done, terminal: console.Console, *, wanted: bo
     with open_database(output) as opened:
         if wanted is None and not opened.frames():
             return
-        found = join_sessions(opened, only=names, observer=terminal.observer())
+        with comparing(output, dask, jobs) as compare:
+            found = join_sessions(opened, only=names, compare=compare, observer=terminal.observer())
     maintenance.place(output, found.frames)
     done.joined = [joined_document(name, found.frames[name]) for name in names if name in found.frames]
     for document in done.joined:

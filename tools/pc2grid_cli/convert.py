@@ -17,7 +17,7 @@ from pc2grid_cli import options as options
 from pc2grid_cli.output_files import check_database
 from pc2grid_cli.rerun_target import require_target, url_of
 from pc2grid_cli.stored_sessions import stored_sessions
-from signature.conversion_jobs import LOCAL
+from signature.cluster import LOCAL
 from signature.database import Label
 
 _Inputs = Annotated[
@@ -47,13 +47,6 @@ _Update = Annotated[
     bool,
     typer.Option("--update", help="join what is new, and update the living map of its floor (db update)"),
 ]
-_Dask = Annotated[
-    str | None,
-    typer.Option("--dask", metavar="[ADDRESS]", help="of a scheduler; none: processes on this machine"),
-]
-_JobCount = Annotated[
-    int | None, typer.Option("--jobs", min=1, help="how many processes; default: as many as cores")
-]
 
 
 def convert_command(
@@ -72,8 +65,8 @@ def convert_command(
     add: _Add = False,
     join: _Join = None,
     update: _Update = False,
-    dask: _Dask = None,
-    jobs: _JobCount = None,
+    dask: options.Dask = None,
+    jobs: options.JobCount = None,
     rerun: options.Rerun = None,
     config: options.ConfigFile = None,
     set_: options.Assignments = None,
@@ -122,7 +115,9 @@ def convert_command(
         quiet=json,
         strict=strict,
     )
-    conversion.join_added(output, done, console.of(context), wanted=True if update else join)
+    conversion.join_added(
+        output, done, console.of(context), wanted=True if update else join, dask=dask, jobs=jobs
+    )
     if update:
         conversion.update_living(output, done, console.of(context))
     conversion.conclude(output, done, len(inputs), json=json)

@@ -13,8 +13,9 @@ import typer
 from pc2grid.display import counted, probability
 from pc2grid.errors import ConfigError, one_line
 from pc2grid_cli import console
+from pc2grid_cli.comparing import comparing
 from pc2grid_cli.json_schemas import ComparedSessions, DbJoin, plain
-from pc2grid_cli.options import AsJson, Database, Force
+from pc2grid_cli.options import AsJson, Dask, Database, Force, JobCount
 from pc2grid_cli.output_files import check_file
 from pc2grid_cli.picture import draw_building
 from pc2grid_cli.session_documents import joined_document
@@ -53,6 +54,8 @@ def db_join_command(
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="OUT.png", help="the maps of a building over each other")
     ] = None,
+    dask: Dask = None,
+    jobs: JobCount = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -74,7 +77,9 @@ def db_join_command(
                 hint="`pc2grid convert LOG --add` adds one, `pc2grid db merge` puts databases together",
             )
         done = _journal(database, journal)
-        found = join_sessions(opened, frame=frame, journal=done, observer=console.of(context).observer())
+        observer = console.of(context).observer()
+        with comparing(database, dask, jobs) as compare:
+            found = join_sessions(opened, frame=frame, journal=done, compare=compare, observer=observer)
         if plot is not None:
             draw(plot, opened, found)
     if not dry_run:

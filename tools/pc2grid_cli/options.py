@@ -74,6 +74,13 @@ AssumeIdentity = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="one JSON document on stdout")]
 Force = Annotated[bool, typer.Option("--force", help="replace existing files")]
+Dask = Annotated[
+    str | None,
+    typer.Option("--dask", metavar="[ADDRESS]", help="of a scheduler; none: processes on this machine"),
+]
+JobCount = Annotated[
+    int | None, typer.Option("--jobs", min=1, help="how many processes; default: as many as cores")
+]
 DATABASE = "BUILDING.submaps|postgresql://..."
 Database = Annotated[str, typer.Argument(metavar=DATABASE, help="the database")]
 SearchedDatabase = Annotated[str, typer.Option("--database", "-d", metavar=DATABASE, help="where to look")]

@@ -7,6 +7,7 @@ pose graph over the sessions, each pair a robust edge, says where they lie, and 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -25,17 +26,15 @@ from signature.database.protocol import BuildingFrame, Covariance, SessionInfo, 
 from signature.database.rows import no_session
 from signature.localization.joining.building_map import building_map
 from signature.localization.joining.candidates import CANDIDATES, LookedAt, candidates
-from signature.localization.joining.join import Join, JoinableMap, join_maps
+from signature.localization.joining.comparing import Compare, ToCompare, compare_here
+from signature.localization.joining.join import Join
 from signature.localization.joining.journal import JoinJournal, key_of
-from signature.localization.lazy_maps import LazySequence
 
 if TYPE_CHECKING:
     import networkx as nx
 
     from signature.database import SubmapDatabase
 
-_KEPT = 8
-"""Prepared maps that stay in memory."""
 _HELD = 1e10
 """Information (1/m^2, 1/rad^2) that holds sessions where they are that were joined before."""
 
@@ -73,6 +72,7 @@ def join_sessions(
     frame: str | None = None,
     only: Collection[str] | None = None,
     journal: JoinJournal | None = None,
+    compare: Compare | None = None,
     observer: Observer = Observer(),
 ) -> Joined:
     """Which sessions of a database show one building, and how they lie in its frame.
@@ -80,8 +80,8 @@ def join_sessions(
     frame : the session whose map frame is that of its building. None: the frame of those that were joined
     before, else of the session that was stored first. only : sessions that are joined, with the others and
     with each other; the others stay where they are. None: all are joined anew, which `frame` needs.
-    journal : keeps what is compared, and knows what need not be compared again. observer : gets the
-    progress.
+    journal : keeps what is compared, and knows what need not be compared again. compare : compares pairs, see
+    `signature.localization.joining.comparing`; None: this process does. observer : gets the progress.
 
     Of many sessions, each is compared with those that look most like it (`candidates`), each pair once.
     Living maps stay where they are, and are compared in place of the sessions that retired for them.
@@ -103,7 +103,8 @@ def join_sessions(
     if only is None and living:
         only = infos.keys() - living
     wanted = _wanted(database, infos, infos.keys() if only is None else only)
-    pairs = list(_compared(database, infos, wanted, journal, observer))
+    compare = compare or functools.partial(compare_here, database)
+    pairs = list(_compared(database, infos, wanted, journal, compare, observer))
     stay = {} if only is None else {n: at for n, at in known.items() if n in infos and n not in only}
     frames: dict[str, BuildingFrame] = dict(stay)
     accepted: set[tuple[str, str]] = set()
@@ -123,25 +124,34 @@ def join_sessions(
 
 def _wanted(
     database: SubmapDatabase, infos: Mapping[str, SessionInfo], only: Collection[str]
-) -> list[tuple[str, str]]:
-    """The pairs that may have to be compared, one of them at least of `only`: of few sessions all, of many
-    the likeliest of each session, then the next ones."""
+) -> list[list[tuple[str, str]]]:
+    """The pairs that may have to be compared, one of them at least of `only`, in rounds: of few sessions all
+    at once, of many the likeliest of each session, then the next ones."""
 
     def comparable(a: str, b: str) -> bool:
         return not _told_apart(infos[a], infos[b])
 
     if len(infos) <= 1 + CANDIDATES.sessions:
-        return [(a, b) for a, b in combinations(infos, 2) if (a in only or b in only) and comparable(a, b)]
+        return [[(a, b) for a, b in combinations(infos, 2) if (a in only or b in only) and comparable(a, b)]]
     places = {name: LookedAt.of(database.seen_places(name)) for name in infos}
     found = candidates(places, only, comparable, CANDIDATES)
     number = {name: k for k, name in enumerate(infos)}
-    rounds = (
-        (name, others[rank])
-        for rank in range(CANDIDATES.sessions)
-        for name, others in found.items()
-        if rank < len(others)
-    )
-    return list(dict.fromkeys((a, b) if number[a] < number[b] else (b, a) for a, b in rounds))
+    rounds, known = [], set[tuple[str, str]]()
+    for rank in range(CANDIDATES.sessions):
+        each = [(name, others[rank]) for name, others in found.items() if rank < len(others)]
+        pairs = {(a, b) if number[a] < number[b] else (b, a) for a, b in each} - known
+        rounds.append(_along(pairs))
+        known |= pairs
+    return rounds
+
+
+def _along(pairs: Collection[tuple[str, str]]) -> list[tuple[str, str]]:
+    """The pairs in an order in which neighbours share a session, whose map is prepared once."""
+    import networkx as nx
+
+    graph = nx.Graph(sorted(pairs))
+    place = {name: k for k, name in enumerate(nx.dfs_preorder_nodes(graph))}
+    return sorted(pairs, key=lambda pair: sorted((place[name] for name in pair), reverse=True))
 
 
 def _settled(joined: nx.Graph, a: str, b: str) -> bool:
@@ -164,39 +174,51 @@ def _told_apart(a: SessionInfo, b: SessionInfo) -> bool:
 def _compared(
     database: SubmapDatabase,
     infos: Mapping[str, SessionInfo],
-    pairs: Sequence[tuple[str, str]],
+    rounds: Sequence[Sequence[tuple[str, str]]],
     journal: JoinJournal | None,
+    compare: Compare,
     observer: Observer,
 ) -> Iterator[SessionPair]:
-    """Each pair joined, as far as it can be and tells something new."""
+    """Each pair joined, as far as it can be and tells something new, by the rounds before its own: so it does
+    not matter which pair of a round is compared first."""
     import networkx as nx
 
-    names = list(infos)
-
-    def prepared(number: int) -> JoinableMap:
-        sight_m = database.config().partition.radius_m
-        return JoinableMap(
-            grid=database.grid(names[number]), graph=database.graph(names[number]), sight_m=sight_m
-        )
-
-    maps = LazySequence(prepared, len(names), _KEPT)
     joined = nx.Graph()
-    with observer.step(f"compare {len(pairs)} pairs of sessions"):
-        for done, (a, b) in enumerate(pairs):
-            if len(names) > 1 + CANDIDATES.sessions and _settled(joined, a, b):
-                continue
-            target, source = maps[names.index(a)], maps[names.index(b)]
-            labelled = infos[a].provenance.label.agrees(infos[b].provenance.label)
-            key = "" if journal is None else key_of(target.grid, source.grid, labelled=labelled)
-            join = None if journal is None else journal.find(key)
-            if join is None:
-                join = join_maps(target, source, labelled=labelled)
-                if journal is not None:
-                    journal.add(key, join)
-            if join.status == "joined":
-                joined.add_edge(a, b)
-            yield SessionPair(target=a, source=b, join=join)
-            observer.on_progress((done + 1) / len(pairs))
+    done, total = 0, sum(map(len, rounds))
+    with observer.step(f"compare {total} pairs of sessions"):
+        for pairs in rounds:
+            wanted = [pair for pair in pairs if len(rounds) == 1 or not _settled(joined, *pair)]
+            done += len(pairs) - len(wanted)
+            for (a, b), join in _joins(database, infos, wanted, journal, compare):
+                if join.status == "joined":
+                    joined.add_edge(a, b)
+                yield SessionPair(target=a, source=b, join=join)
+                done += 1
+                observer.on_progress(done / total)
+
+
+def _joins(
+    database: SubmapDatabase,
+    infos: Mapping[str, SessionInfo],
+    pairs: Sequence[tuple[str, str]],
+    journal: JoinJournal | None,
+    compare: Compare,
+) -> Iterator[tuple[tuple[str, str], Join]]:
+    """The joins of pairs, in their order: of the journal if it has them, else compared and added to it."""
+    wanted = [ToCompare(a, b, infos[a].provenance.label.agrees(infos[b].provenance.label)) for a, b in pairs]
+    keys = [
+        key_of(database.grid(pair.target), database.grid(pair.source), labelled=pair.labelled)
+        for pair in wanted
+        if journal is not None
+    ]
+    known = [None] * len(wanted) if journal is None else [journal.find(key) for key in keys]
+    found = compare([pair for pair, join in zip(wanted, known, strict=True) if join is None])
+    for k, join in enumerate(known):
+        if join is None:
+            join = next(found)
+            if journal is not None:
+                journal.add(keys[k], join)
+        yield pairs[k], join
 
 
 def _buildings(

@@ -197,8 +197,8 @@ def _same(a: _Candidate, b: _Candidate) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Start:
-    """A transform of the graphs where it fits best. at : middle of its nodes in the source. score : 0..1, of the
-    walls around there, see `search_windows`."""
+    """A transform of the graphs where it fits best. at : middle of its nodes in the source. score : 0..1, of
+    the walls around there, see `search_windows`."""
 
     T_target_source: SE2
     at: SE2

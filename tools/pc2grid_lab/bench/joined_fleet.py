@@ -1,6 +1,6 @@
 """A fleet's sessions joined: how long it takes, what is joined, and whether it goes on after it was killed.
 
-python -m pc2grid_lab.bench.joined_fleet FOLDER [--buildings N] [--sessions N] [-o OUT.json]
+python -m pc2grid_lab.bench.joined_fleet FOLDER [--buildings N] [--sessions N] [--jobs N] [-o OUT.json]
 
 Small offices, each driven through several times by a laser, its doors and furniture different each time, are
 mapped as a user's recordings are and stored without labels, all in one database. What is there already in the
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import resource
 import shutil
 import signal
 import subprocess
@@ -29,6 +30,7 @@ from pc2grid.pipeline import map_scans
 from pc2grid.simulate import Session, office_floorplan
 from pc2grid.simulate.session import plan_session
 from pc2grid.submaps.partition import divide
+from pc2grid_cli.comparing import comparing
 from pc2grid_lab.worlds import WorldConfig
 from pc2grid_lab.worlds.change import change_building
 from signature.config import Config
@@ -146,23 +148,30 @@ def _building(name: str) -> str:
 
 
 def measured(
-    path: Path, truth: Mapping[str, Sequence[float]]
+    path: Path, truth: Mapping[str, Sequence[float]], jobs: int | None
 ) -> tuple[dict[str, object], dict[str, BuildingFrame]]:
-    """Join all sessions of a database in this process, and say what it took."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    with open_database(path) as database:
-        found = join_sessions(database)
-    took = {"wall, s": round(time.perf_counter() - wall), "cpu, s": round(time.process_time() - cpu)}
+    """Join all sessions of a database, and say what it took, the processes that compare included."""
+    wall, cpu = time.perf_counter(), _cpu_s()
+    with comparing(str(path), None, jobs) as compare, open_database(path) as database:
+        found = join_sessions(database, compare=compare)
+    took = {"wall, s": round(time.perf_counter() - wall), "cpu, s": round(_cpu_s() - cpu)}
     return summary(found, truth) | took, dict(found.frames)
 
 
-def resumed(path: Path, folder: Path) -> tuple[int, dict[str, BuildingFrame]]:
+def _cpu_s() -> float:
+    """Processor time of this process and of those that it has waited for."""
+    own, others = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return own.ru_utime + own.ru_stime + others.ru_utime + others.ru_stime
+
+
+def resumed(path: Path, folder: Path, jobs: int | None) -> tuple[int, dict[str, BuildingFrame]]:
     """Kill `db join` when it has compared some pairs, and begin again: how many it knew, and the frames."""
     again = folder / "killed.submaps"
     shutil.copy(path, again)
     journal = again.with_name(again.name + ".joining")
     journal.unlink(missing_ok=True)
     command = [sys.executable, "-c", "from pc2grid_cli.main import main; main()", "db", "join", str(again)]
+    command += [] if jobs is None else ["--jobs", str(jobs)]
     running = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     while running.poll() is None and (not journal.exists() or journal.read_bytes().count(b"\n") < 10):
         time.sleep(0.05)
@@ -180,15 +189,16 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--buildings", type=int, default=20)
     parser.add_argument("--sessions", type=int, default=15, help="of each building")
+    parser.add_argument("--jobs", type=int, help="processes that compare; default: this one")
     parser.add_argument("--kill", action="store_true", help="also kill and resume: takes as long again")
     parser.add_argument("-o", "--output", type=Path)
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     path = fleet(arguments.folder, arguments.buildings, arguments.sessions)
     truth = json.loads((arguments.folder / "truth.json").read_text())
-    found, frames = measured(path, truth)
+    found, frames = measured(path, truth, arguments.jobs)
     if arguments.kill:
-        known, again = resumed(path, arguments.folder)
+        known, again = resumed(path, arguments.folder, arguments.jobs)
         found |= {"compared when killed": known, "the same after that": again == frames}
     text = json.dumps(found, indent=1)
     print(text)
