@@ -151,7 +151,12 @@ def _along(pairs: Collection[tuple[str, str]]) -> list[tuple[str, str]]:
 
     graph = nx.Graph(sorted(pairs))
     place = {name: k for k, name in enumerate(nx.dfs_preorder_nodes(graph))}
-    return sorted(pairs, key=lambda pair: sorted((place[name] for name in pair), reverse=True))
+
+    def reached(pair: tuple[str, str]) -> tuple[int, int]:
+        first, last = sorted(place[name] for name in pair)
+        return last, -first
+
+    return sorted(pairs, key=reached)
 
 
 def _settled(joined: nx.Graph, a: str, b: str) -> bool:

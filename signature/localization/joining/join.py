@@ -28,10 +28,10 @@ from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import SearchMap, SearchParameters, search_windows
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from signature.localization.hypotheses import HYPOTHESES, coarse_points, same_pose
-from signature.localization.joining.graph_matching import align_graphs
+from signature.localization.joining.graph_matching import Alignment, align_graphs
 from signature.localization.joining.landmarks import Landmarks
 from signature.localization.joining.pieces import PIECES, Piece, PieceFits, align_pieces, pieces_of, rigid
-from signature.localization.posterior import NO_EVIDENCE, POSTERIOR, Evidence, evidence_of, masses
+from signature.localization.posterior import NO_EVIDENCE, Evidence, evidence_of, masses
 from signature.localization.query import QueryMap
 from signature.localization.same_place import SAME_PLACE
 
@@ -169,20 +169,32 @@ def join_maps(
     labelled : labels say that both are of one floor of one building.
     """
     points_m = source.walls.points_m
-    starts = _starts(target, source.landmarks, points_m, parameters)
-    flipped = points_m * _MIRROR
-    wrong = _starts(target, source.landmarks.mirrored(), flipped, parameters)
-    # What scores less than this is too far behind the best to be its rival.
-    least = (1.0 - POSTERIOR.longest_lead) * max((start.score for start in (*starts, *wrong)), default=0.0)
-    candidates = _candidates(target, points_m, source.pieces, starts, least)
-    mirrored = tuple(piece.mirrored() for piece in source.pieces)
-    decoys = _candidates(target, flipped, mirrored, wrong, least)
-    fits = PieceFits.of([candidate.fits for candidate in (*candidates, *decoys)], source.pieces)
     prior = parameters.labelled if labelled else 1.0
-    best = UNJOINED
-    # Branch and bound: what is left out is neither joined nor more probable than the best.
+    candidates = _candidates(target, source.landmarks, points_m, source.pieces, parameters)
+    join = _best(target, source, candidates, (), prior, parameters)
+    if join.status == "different":
+        return join  # decoys are further rivals, which tell against it at most
+    mirrored = tuple(piece.mirrored() for piece in source.pieces)
+    decoys = _candidates(target, source.landmarks.mirrored(), points_m * _MIRROR, mirrored, parameters)
+    return _best(target, source, candidates, decoys, prior, parameters)
+
+
+def _best(
+    target: JoinableMap,
+    source: JoinableMap,
+    candidates: Sequence[_Candidate],
+    decoys: Sequence[_Candidate],
+    prior: float,
+    parameters: JoinParameters,
+) -> Join:
+    """The most probable of some transforms, all others being its rivals. prior : odds of one building.
+
+    By branch and bound: what is not judged is neither joined nor more probable than the best.
+    """
+    fits = PieceFits.of([candidate.fits for candidate in (*candidates, *decoys)], source.pieces)
     found = [_evidence(source, one, k, fits) for k, one in enumerate(candidates)]
     bounds = [_bound(evidence, prior) for evidence in found]
+    best = UNJOINED
     for k in sorted(range(len(candidates)), key=lambda k: -bounds[k]):
         if bounds[k] < min(best.probability, parameters.accept):
             break
@@ -195,66 +207,50 @@ def _same(a: _Candidate, b: _Candidate) -> bool:
     return same_pose(a.T_target_source @ a.at, b.T_target_source @ a.at)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Start:
-    """A transform of the graphs where it fits best. at : middle of its nodes in the source. score : 0..1, of
-    the walls around there, see `search_windows`."""
-
-    T_target_source: SE2
-    at: SE2
-    nodes: int
-    score: float
-
-
-def _starts(
-    target: JoinableMap, source: Landmarks, points_m: F32, parameters: JoinParameters
-) -> list[_Start]:
-    """The transforms that the graphs propose, each searched around, see `JoinParameters.around_m`."""
-    starts = []
-    for alignment in align_graphs(target.landmarks, source):
-        at = SE2(*alignment.at_m)
-        there = alignment.T_target_source @ at
-        found = search_windows(
-            target.search,
-            coarse_points(points_m, alignment.at_m),
-            np.array([[there.x, there.y, there.yaw]]),
-            half_t_m=parameters.around_m,
-            half_a_rad=parameters.around_rad,
-            parameters=SearchParameters(floor=0.0, most=1),
-        )
-        for x, y, yaw, score in found.tolist():
-            T_target_source = SE2(x, y, yaw) @ SE2(-at.x, -at.y, 0.0)
-            starts.append(_Start(T_target_source=T_target_source, at=at, nodes=alignment.nodes, score=score))
-    return starts
-
-
 def _candidates(
-    target: JoinableMap, points_m: F32, pieces: Sequence[Piece], starts: Sequence[_Start], least: float
+    target: JoinableMap, source: Landmarks, points_m: F32, pieces: Sequence[Piece], parameters: JoinParameters
 ) -> list[_Candidate]:
-    """The transforms that score so much at least, made exact, no two alike."""
+    """The transforms of a source that the graphs propose, no two alike."""
     found: list[_Candidate] = []
-    for start in starts if pieces else ():
-        if start.score >= least:
-            refined = _refined(target, points_m, pieces, start)
-            if not any(_same(refined, other) for other in found):
-                found.append(refined)
+    for alignment in align_graphs(target.landmarks, source) if pieces else ():
+        refined = _refined(target, points_m, pieces, alignment, parameters)
+        if refined is not None and not any(_same(refined, other) for other in found):
+            found.append(refined)
     return found
 
 
-def _refined(target: JoinableMap, points_m: F32, pieces: Sequence[Piece], start: _Start) -> _Candidate:
-    """A transform made exact by walls: around the matched nodes, then piece by piece."""
-    at_m = (start.at.x, start.at.y)
-    around = points_m[np.hypot(*(points_m - np.asarray(at_m, np.float32)).T) < PIECES.side_m]
-    pose, _ = refine(target.search.field, around, start.T_target_source, at_m)
-    fits = align_pieces(target.search, pieces, pose, at_m)
+def _refined(
+    target: JoinableMap,
+    points_m: F32,
+    pieces: Sequence[Piece],
+    alignment: Alignment,
+    parameters: JoinParameters,
+) -> _Candidate | None:
+    """The transform of the graphs made exact by walls: around the matched nodes, then piece by piece."""
+    at = SE2(*alignment.at_m)
+    there = alignment.T_target_source @ at
+    found = search_windows(
+        target.search,
+        coarse_points(points_m, alignment.at_m),
+        np.array([[there.x, there.y, there.yaw]]),
+        half_t_m=parameters.around_m,
+        half_a_rad=parameters.around_rad,
+        parameters=SearchParameters(floor=0.0, most=1),
+    )
+    if not len(found):
+        return None
+    around = points_m[np.hypot(*(points_m - np.asarray(alignment.at_m, np.float32)).T) < PIECES.side_m]
+    start = SE2(*found[0, :3].tolist()) @ SE2(-at.x, -at.y, 0.0)
+    pose, _ = refine(target.search.field, around, start, alignment.at_m)
+    fits = align_pieces(target.search, pieces, pose, alignment.at_m)
     T_target_source, bend_m = rigid(pieces, fits)
-    whole, covariance = refine(target.search.field, points_m, T_target_source, at_m)
+    whole, covariance = refine(target.search.field, points_m, T_target_source, alignment.at_m)
     if bend_m < LIKELIHOOD.sigma_m:  # all walls are within reach of theirs at once, which is more exact
         T_target_source = whole
     deviations = (HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)
     covariance = covariance + np.diag(np.square(deviations)) + np.diag([bend_m**2, bend_m**2, 0.0])
     return _Candidate(
-        T_target_source=T_target_source, at=start.at, nodes=start.nodes, fits=fits, covariance=covariance
+        T_target_source=T_target_source, at=at, nodes=alignment.nodes, fits=fits, covariance=covariance
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import networkx as nx
@@ -13,10 +14,11 @@ import pytest
 from pc2grid.errors import DatabaseError
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
+from signature.cluster import LOCAL
 from signature.config import Config
 from signature.database import Label, SubmapDatabase, maintenance, open_database
 from signature.database.protocol import BuildingFrame
-from signature.localization.joining import building
+from signature.localization.joining import building, comparing
 from signature.localization.joining.building import join_sessions, map_of
 from signature.localization.joining.candidates import CandidateParameters
 from signature.localization.joining.join import Join, JoinableMap, join_maps
@@ -151,7 +153,7 @@ def test_what_was_compared_is_not_compared_again(
             compared.append(1)
             return join_maps(*maps, labelled=labelled)
 
-        monkeypatch.setattr(building, "join_maps", counting)
+        monkeypatch.setattr(comparing, "join_maps", counting)
 
     ends_at(2)
     with pytest.raises(KeyboardInterrupt):
@@ -163,6 +165,26 @@ def test_what_was_compared_is_not_compared_again(
     whole = join_sessions(database)
     assert resumed.frames == whole.frames
     assert [pair.join.probability for pair in resumed.pairs] == [p.join.probability for p in whole.pairs]
+
+
+def test_processes_find_what_one_process_finds(stored: Path, database: SubmapDatabase) -> None:
+    pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    alone = join_sessions(database)
+    with comparing.comparing_in_processes(str(stored), LOCAL, 2) as compare:
+        together = join_sessions(database, compare=compare)
+    assert together.frames == alone.frames
+    assert [(pair.names, pair.join.probability) for pair in together.pairs] == [
+        (pair.names, pair.join.probability) for pair in alone.pairs
+    ]
+
+
+def test_rounds_compare_each_pair_once_the_likeliest_first_and_neighbours_share_a_session() -> None:
+    ring = [("a", "b"), ("b", "c"), ("c", "d"), ("d", "e"), ("a", "e"), ("x", "y")]
+    order = building._along(set(ring))
+    assert sorted(order) == sorted(ring)
+    shared = [bool({*one} & {*other}) for one, other in pairwise(order)]
+    # Only where the other component begins, or ends, is no session shared.
+    assert shared.count(False) == 1
 
 
 def test_sessions_that_hang_together_by_enough_joins_are_not_compared() -> None:
