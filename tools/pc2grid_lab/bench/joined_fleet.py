@@ -148,7 +148,7 @@ def _building(name: str) -> str:
 
 
 def measured(
-    path: Path, truth: Mapping[str, Sequence[float]], jobs: int | None
+    path: Path, truth: Mapping[str, Sequence[float]], jobs: int
 ) -> tuple[dict[str, object], dict[str, BuildingFrame]]:
     """Join all sessions of a database, and say what it took, the processes that compare included."""
     wall, cpu = time.perf_counter(), _cpu_s()
@@ -164,14 +164,14 @@ def _cpu_s() -> float:
     return own.ru_utime + own.ru_stime + others.ru_utime + others.ru_stime
 
 
-def resumed(path: Path, folder: Path, jobs: int | None) -> tuple[int, dict[str, BuildingFrame]]:
+def resumed(path: Path, folder: Path, jobs: int) -> tuple[int, dict[str, BuildingFrame]]:
     """Kill `db join` when it has compared some pairs, and begin again: how many it knew, and the frames."""
     again = folder / "killed.submaps"
     shutil.copy(path, again)
     journal = again.with_name(again.name + ".joining")
     journal.unlink(missing_ok=True)
     command = [sys.executable, "-c", "from pc2grid_cli.main import main; main()", "db", "join", str(again)]
-    command += [] if jobs is None else ["--jobs", str(jobs)]
+    command += ["--jobs", str(jobs)]
     running = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     while running.poll() is None and (not journal.exists() or journal.read_bytes().count(b"\n") < 10):
         time.sleep(0.05)
@@ -189,7 +189,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--buildings", type=int, default=20)
     parser.add_argument("--sessions", type=int, default=15, help="of each building")
-    parser.add_argument("--jobs", type=int, help="processes that compare; default: this one")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that compare")
     parser.add_argument("--kill", action="store_true", help="also kill and resume: takes as long again")
     parser.add_argument("-o", "--output", type=Path)
     arguments = parser.parse_args()
