@@ -19,7 +19,7 @@ import numpy as np
 
 from pc2grid.arrays import BoolGrid
 from pc2grid.errors import DatabaseError
-from pc2grid.geometry import SE2, transform_points
+from pc2grid.geometry import SE2
 from pc2grid.matching.walls import WALLS
 from pc2grid.model import UNKNOWN, PointMap, SessionMap, Trajectory
 from pc2grid.submaps.partition import divide
@@ -160,13 +160,13 @@ def _living(
     database: SubmapDatabase, name: str, members: Sequence[str], known: Mapping[str, BuildingFrame]
 ) -> StoredSession:
     """The living map of some sessions, as it is stored."""
-    placed = [(member, known[member].T_building_session) for member in members]
-    points = _points(database, [*((old, SE2()) for old in known if old == name), *placed])
+    placed = [(member, known[member]) for member in members]
+    points = _points(database, [*((old, at) for old, at in known.items() if old == name), *placed])
     (newest,) = database.sessions(members[-1:])
     config = newest.provenance.config
     voxel_m = {"points_voxel_m": None if points is None else points.voxel_m}
     config = config.model_copy(update={"projection": config.projection.model_copy(update=voxel_m)})
-    grid = evidence_map([(database.grid(member), T) for member, T in placed])
+    grid = evidence_map([(database.grid(member), frame) for member, frame in placed])
     graph, submaps = divide(grid, config.partition)
     whole = SessionMap(
         session=name,
@@ -198,22 +198,22 @@ def _origin(database: SubmapDatabase, members: Sequence[str], config: Config) ->
     return provenance(f"{len(origins)} sessions", digest, config, label=label)
 
 
-def _points(database: SubmapDatabase, placed: Sequence[tuple[str, SE2]]) -> PointMap | None:
+def _points(database: SubmapDatabase, placed: Sequence[tuple[str, BuildingFrame]]) -> PointMap | None:
     """The points in space of all maps that have any, oldest first: over ground that a newer one of them
     knows, those of the newest."""
-    newer: list[tuple[str, SE2]] = []
+    newer: list[tuple[str, BuildingFrame]] = []
     clouds, voxel_m = [], 0.0
-    for member, T in reversed(placed):
+    for member, frame in reversed(placed):
         points = database.points(member)
         if points is None or not len(points):
             continue
-        cloud_m, voxel_m = transform_points(T.lift(), points.points_m()), max(voxel_m, points.voxel_m)
-        for other, T_other in newer:
+        cloud_m, voxel_m = frame.apply(points.points_m()), max(voxel_m, points.voxel_m)
+        for other, of_other in newer:
             grid = database.grid(other)
-            at = grid.to_cell(T_other.inverse().apply(cloud_m[:, :2]))
+            at = grid.to_cell(of_other.as_drawn(cloud_m[:, :2]))
             inside: BoolGrid = np.asarray(((at >= 0) & (at < grid.cells.shape)).all(axis=1))
             inside[inside] = grid.cells[tuple(at[inside].T)] != UNKNOWN
             cloud_m = cloud_m[~inside]
-        newer.append((member, T))
+        newer.append((member, frame))
         clouds.append(cloud_m)
     return PointMap.of(np.concatenate(clouds), voxel_m) if clouds else None

@@ -8,6 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
+
+from pc2grid.arrays import F64
 from pc2grid.display import short
 from pc2grid.errors import DatabaseError, DatabaseVersion
 from pc2grid.geometry import SE2
@@ -19,6 +22,7 @@ from pc2grid.model import (
     ReadReport,
     SessionMap,
 )
+from signature.bend import Bend, drawn_at, rigid_motions, straightened
 from signature.config import Config
 
 if TYPE_CHECKING:
@@ -122,12 +126,35 @@ class BuildingFrame:
     T_building_session : the map frame of the session in that of the building. covariance : of it, in the axes
         of the building.
     role : what the session is to the living map of its floor; None: nothing, it is searched itself.
+    bend : how the map is bent before it is placed by T_building_session; empty: it is rigid.
     """
 
     name: str
     T_building_session: SE2
     covariance: Covariance
     role: SessionRole | None = None
+    bend: Bend = ()
+
+    def at(self, x_m: float, y_m: float) -> SE2:
+        """T_building_session around a place of the session's map."""
+        return self.around(np.array([(x_m, y_m)]))[0]
+
+    def around(self, points_m: F64) -> list[SE2]:
+        """T_building_session around points (N, 2) of the session's map."""
+        return [self.T_building_session @ T for T in rigid_motions(self.bend, points_m)]
+
+    def placed(self, T_session_base: SE2) -> SE2:
+        """A pose in the session's map, in the building."""
+        return self.at(T_session_base.x, T_session_base.y) @ T_session_base
+
+    def apply(self, points_m: F64) -> F64:
+        """Points (N, 2) or (N, 3) of the session's map, in the building."""
+        plane_m = self.T_building_session.apply(straightened(self.bend, points_m[:, :2]))
+        return np.column_stack((plane_m, points_m[:, 2:]))
+
+    def as_drawn(self, points_m: F64) -> F64:
+        """The points (N, 2) of the session's map that lie at points (N, 2) of the building."""
+        return drawn_at(self.bend, self.T_building_session.inverse().apply(points_m))
 
 
 def retired(frames: Mapping[Key, BuildingFrame]) -> set[Key]:

@@ -29,8 +29,9 @@ def answer_in_building(answer: Answer, frames: Mapping[str, BuildingFrame]) -> A
         if frame is None:
             return hypothesis
         fit = hypothesis.fit
-        T_building_query = frame.T_building_session @ fit.T_map_query
-        covariance = covariance_in_building(fit.covariance, fit.T_map_query @ answer.T_odom_base, frame)
+        T_map_base = fit.T_map_query @ answer.T_odom_base
+        T_building_query = frame.at(T_map_base.x, T_map_base.y) @ fit.T_map_query
+        covariance = covariance_in_building(fit.covariance, T_map_base, frame)
         return replace(hypothesis, fit=replace(fit, T_map_query=T_building_query, covariance=covariance))
 
     excluded = None if answer.excluded is None else _moment(answer.excluded, frames)
@@ -44,7 +45,7 @@ def answer_in_building(answer: Answer, frames: Mapping[str, BuildingFrame]) -> A
     frame = frames.get(answer.session or "")
     if frame is None or answer.T_map_base is None or answer.T_map_odom is None or answer.covariance is None:
         return stated
-    T_building_session = frame.T_building_session
+    T_building_session = frame.at(answer.T_map_base.x, answer.T_map_base.y)
     return replace(
         stated,
         T_map_base=T_building_session @ answer.T_map_base,
@@ -59,7 +60,7 @@ def look_in_building(look: Look, frames: Mapping[str, BuildingFrame]) -> Look:
     frame = frames.get(look.session or "")
     T_map_base = look.T_map_base
     if frame is not None and T_map_base is not None:
-        T_map_base = frame.T_building_session @ T_map_base
+        T_map_base = frame.placed(T_map_base)
     return replace(look, answer=answer_in_building(look.answer, frames), T_map_base=T_map_base)
 
 
@@ -67,8 +68,8 @@ def covariance_in_building(covariance: F64, T_session_base: SE2, frame: Building
     """The covariance (3, 3) of a pose in a session's map as one in its building: turned, and with that of the
     session's own place, whose heading moves the pose the more the farther it is from the session's origin."""
     T = frame.T_building_session
-    turn = SE2(0.0, 0.0, T.yaw).matrix()
-    there = T @ T_session_base
+    there = frame.placed(T_session_base)
+    turn = SE2(0.0, 0.0, there.yaw - T_session_base.yaw).matrix()
     J = np.eye(3)
     J[:2, 2] = T.y - there.y, there.x - T.x
     return np.asarray(turn @ covariance @ turn.T + J @ np.array(frame.covariance) @ J.T)
@@ -78,14 +79,15 @@ def _moment(moment: Moment, frames: Mapping[str, BuildingFrame]) -> Moment:
     frame = frames.get(moment.session or "")
     if frame is None or moment.pose is None:
         return moment
-    return replace(moment, pose=frame.T_building_session @ moment.pose)
+    return replace(moment, pose=frame.placed(moment.pose))
 
 
 def _in_space(pose: PoseInSpace, frame: BuildingFrame) -> PoseInSpace:
-    T = frame.T_building_session.lift()
+    T_map_base = SE2.from_matrix(pose.T_map_base)
+    T = frame.at(T_map_base.x, T_map_base.y).lift()
     turn = np.kron(np.eye(2), T[:3, :3])
     covariance = turn @ pose.covariance @ turn.T
     planar = np.ix_((0, 1, 5), (0, 1, 5))
     nothing = np.zeros((3, 3))
-    covariance[planar] += covariance_in_building(nothing, SE2.from_matrix(pose.T_map_base), frame)
+    covariance[planar] += covariance_in_building(nothing, T_map_base, frame)
     return replace(pose, T_map_base=T @ pose.T_map_base, covariance=covariance)

@@ -255,12 +255,12 @@ class MapIndex:
             kept += enough[: self.config.hypotheses]
         return tuple(sorted(kept, key=lambda h: -h.fit.score))
 
-    def joined(self, a: int, b: int) -> SE2 | None:
-        """T_a_b of two sessions that are joined; None if they are not."""
+    def joined(self, a: int, b: int) -> tuple[BuildingFrame, BuildingFrame] | None:
+        """Where two sessions lie in the building in which they are joined; None if they are not."""
         frame, other = (self.frames.get(self.sessions[number]) for number in (a, b))
         if frame is None or other is None or frame.name != other.name:
             return None
-        return frame.T_building_session.inverse() @ other.T_building_session
+        return frame, other
 
 
 def free_squares(grid: OccupancyGrid, side_m: float = HYPOTHESES.square_m) -> F64:

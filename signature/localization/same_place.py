@@ -83,8 +83,10 @@ def _belongs(index: MapIndex, query: QueryMap, h: Hypothesis, place: Sequence[Hy
 def _one_place(index: MapIndex, query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
     """Whether two hypotheses in two maps are one place: by the frame of their building if the sessions are
     joined, or by what is around."""
-    T_a_b, base = index.joined(a.session_index, b.session_index), query.T_odom_base
-    if T_a_b is not None and same_pose(a.fit.T_map_query @ base, T_a_b @ b.fit.T_map_query @ base):
+    joined = index.joined(a.session_index, b.session_index)
+    if joined is not None and same_pose(
+        *(at.placed(h.fit.T_map_query @ query.T_odom_base) for at, h in zip(joined, (a, b), strict=True))
+    ):
         return True
     label, other = index.labels[a.session_index], index.labels[b.session_index]
     one_recording = same_recording(index.sessions[a.session_index], index.sessions[b.session_index])

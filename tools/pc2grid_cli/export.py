@@ -13,7 +13,6 @@ import typer
 
 from pc2grid import extras
 from pc2grid.errors import ConfigError, DatabaseError
-from pc2grid.geometry import transform_points
 from pc2grid.io.export.cloud import write_cloud
 from pc2grid.io.export.g2o import write_g2o
 from pc2grid.io.export.graphml import write_graph
@@ -245,8 +244,7 @@ def _write_session(
     if outputs.map_stem is not None:
         save_map(map_of(database, name, frames), outputs.map_stem)
     if outputs.trajectory is not None and poses is not None:
-        T = np.eye(4) if frame is None else frame.T_building_session.lift()
-        moved = replace(poses, T_session_base=T @ poses.T_session_base)
+        moved = poses if frame is None else _in_building(poses, frame)
         write_trajectory(outputs.trajectory, moved, outputs.trajectory_format)
     if outputs.cloud is not None:
         _write_cloud(outputs.cloud, database, [name], frames, terminal)
@@ -260,6 +258,11 @@ def _write_session(
         stream_session(outputs.rerun, database, name)
     if outputs.plot is not None:
         draw_session(outputs.plot, database, name)
+
+
+def _in_building(poses: Trajectory, frame: BuildingFrame) -> Trajectory:
+    T = np.array([at.lift() for at in frame.around(poses.planar()[:, :2])])
+    return replace(poses, T_session_base=T @ poses.T_session_base)
 
 
 def _poses(database: SubmapDatabase, session: str) -> Trajectory:
@@ -281,13 +284,13 @@ def _write_cloud(
     """The points in space of the sessions that have them; if none has, a point for each occupied cell."""
     clouds, walls, voxel_m = [np.empty((0, 3))], [np.empty((0, 3))], 0.0
     for name in sessions:
-        T = frames[name].T_building_session.lift() if name in frames else np.eye(4)
+        placed = frames[name].apply if name in frames else np.asarray
         points, grid = database.points(name), database.grid(name)
         if points is not None:
             voxel_m = max(voxel_m, points.voxel_m)
-            clouds.append(transform_points(T, points.points_m()))
+            clouds.append(placed(points.points_m()))
         flat = grid.to_point(np.argwhere(grid.occupied))
-        walls.append(transform_points(T, np.column_stack((flat, np.zeros(len(flat))))))
+        walls.append(placed(np.column_stack((flat, np.zeros(len(flat))))))
     cloud, wall = np.concatenate(clouds), np.concatenate(walls)
     if len(cloud):
         write_cloud(path, cloud)

@@ -20,6 +20,7 @@ from pc2grid_cli.output_files import check_file
 from pc2grid_cli.picture import draw_building
 from pc2grid_cli.session_documents import joined_document
 from pc2grid_cli.tables import show, table
+from signature.bend import largest_m
 from signature.database import SubmapDatabase, maintenance, open_database
 from signature.database.postgres.server import is_url
 from signature.localization.joining.building import Joined, SessionPair, join_sessions
@@ -119,7 +120,8 @@ def report(found: Joined, names: list[str], *, dry_run: bool = False) -> None:
         for session, at in sessions.items():
             T = at.T_building_session
             where = f"x {T.x:.2f} m, y {T.y:.2f} m, turned by {math.degrees(T.yaw):.1f} deg"
-            show(one_line(f"  {session}: {where}, sigma {_sigma_m(at.covariance):.2f} m"))
+            bent = f", bent by {largest_m(at.bend):.2f} m at most" if at.bend else ""
+            show(one_line(f"  {session}: {where}, sigma {_sigma_m(at.covariance):.2f} m{bent}"))
     alone = [name for name in names if name not in found.frames]
     if alone:
         show(one_line(f"alone: {', '.join(alone)}"))
@@ -162,9 +164,7 @@ def draw(path: Path, database: SubmapDatabase, found: Joined) -> None:
         console.warn(f"{path}: not written, no two sessions are joined")
         return
     name = max(buildings, key=lambda name: len(buildings[name]))
-    draw_building(
-        path, name, {s: (database.grid(s), at.T_building_session) for s, at in buildings[name].items()}
-    )
+    draw_building(path, name, {s: (database.grid(s), at) for s, at in buildings[name].items()})
 
 
 def _document(where: str, found: Joined, names: list[str], dry_run: bool) -> DbJoin:

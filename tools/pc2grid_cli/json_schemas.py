@@ -267,12 +267,14 @@ class Converted(TypedDict):
 
 
 class JoinedSession(TypedDict):
-    """Where a session lies in its building. frame: name of the building's frame."""
+    """Where a session lies in its building. frame: name of the building's frame. bent_m: how far the map is
+    bent there at most, where another session straightens it."""
 
     session: str
     frame: str
     T_building_session: Pose
     covariance: list[list[float]]
+    bent_m: float
 
 
 class Convert(TypedDict):

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pc2grid.mapping.changes import ChangeKind, MapChanges
     from pc2grid.model import OccupancyGrid, Trajectory
     from signature.database import SubmapDatabase
+    from signature.database.protocol import BuildingFrame
     from signature.localization.answer import Answer
     from signature.localization.hypotheses import Hypothesis
 
@@ -123,13 +124,13 @@ def draw_session(path: Path, database: SubmapDatabase, session: str) -> None:
     _finish(figure, axes, path)
 
 
-def draw_building(path: Path, name: str, maps: Mapping[str, tuple[OccupancyGrid, SE2]]) -> None:
-    """The walls of the sessions of a building over each other, each with its T_building_session.
+def draw_building(path: Path, name: str, maps: Mapping[str, tuple[OccupancyGrid, BuildingFrame]]) -> None:
+    """The walls of the sessions of a building over each other, each with where it lies.
 
     name : of the building's frame.
     """
     walls = {
-        session: T.apply(grid.to_point(np.argwhere(grid.occupied))) for session, (grid, T) in maps.items()
+        session: at.apply(grid.to_point(np.argwhere(grid.occupied))) for session, (grid, at) in maps.items()
     }
     boxes = [_Box.around(points_m, _CLOSE_MARGIN_M) for points_m in walls.values() if len(points_m)]
     whole = reduce(_Box.united, boxes or [_Box(0.0, 1.0, 0.0, 1.0)])

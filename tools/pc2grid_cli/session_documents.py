@@ -8,6 +8,7 @@ from pc2grid.display import counted
 from pc2grid.errors import one_line
 from pc2grid.model import Precision, SessionMap
 from pc2grid_cli.json_schemas import Converted, JoinedSession, PrecisionSummary, UpdatedMap
+from signature.bend import largest_m
 from signature.database import Provenance
 from signature.database.protocol import BuildingFrame
 from signature.living import LivingMap
@@ -51,6 +52,7 @@ def joined_document(session: str, frame: BuildingFrame) -> JoinedSession:
         "frame": frame.name,
         "T_building_session": {"x": T.x, "y": T.y, "yaw": T.yaw},
         "covariance": [list(row) for row in frame.covariance],
+        "bent_m": round(largest_m(frame.bend), 3),
     }
 
 

@@ -2,7 +2,8 @@
 
 Pairs are joined in the order of their probability (Kruskal's algorithm), so each building begins with what
 is surest, and never two sessions into one building whose labels name different buildings or floors. Then one
-pose graph over the sessions, each pair a robust edge, says where they lie, and how exactly.
+pose graph over the sessions, each pair a robust edge, says where they lie, and how exactly; and another one,
+over all that they have measured, how they are bent (`straightening`).
 """
 
 from __future__ import annotations
@@ -29,14 +30,12 @@ from signature.localization.joining.candidates import CANDIDATES, LookedAt, cand
 from signature.localization.joining.comparing import Compare, ToCompare, compare_here
 from signature.localization.joining.join import Join
 from signature.localization.joining.journal import JoinJournal, key_of
+from signature.localization.joining.straightening import HELD, bodies_of, straighten
 
 if TYPE_CHECKING:
     import networkx as nx
 
     from signature.database import SubmapDatabase
-
-_HELD = 1e10
-"""Information (1/m^2, 1/rad^2) that holds sessions where they are that were joined before."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +112,9 @@ def join_sessions(
         anchor = _anchor(members, frame, stay if any(name in stay for name in members) else known)
         within = [p for p in pairs if p.join.status == "joined" and p.target in tree and p.source in tree]
         placed, counted = _placed(tree, anchor, within, stay)
-        frames = placed | frames
+        links = {pair.names: pair.join.links for pair in within if pair.names in counted}
+        placed = {name: stay.get(name, frame) for name, frame in placed.items()}
+        frames |= straighten(bodies_of(database, placed, stay), placed, links, placed.keys() & stay)
         accepted |= counted
     frames |= asleep
     return Joined(
@@ -286,7 +287,7 @@ def _placed(
         for pair in pairs
     ]
     held = [
-        Edge(0, names.index(n), poses[first].inverse() @ poses[n], _HELD * np.eye(3))
+        Edge(0, names.index(n), poses[first].inverse() @ poses[n], HELD * np.eye(3))
         for n in stay
         if n in tree and n != first
     ]
@@ -342,4 +343,4 @@ def map_of(database: SubmapDatabase, session: str, frames: Mapping[str, Building
         return database.grid(session)
     floor = frames[session].name
     names = next(names for names in floors_of(database, frames) if frames[names[0]].name == floor)
-    return building_map([(database.grid(name), frames[name].T_building_session) for name in names])
+    return building_map([(database.grid(name), frames[name]) for name in names])

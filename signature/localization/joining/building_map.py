@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import BoolGrid, hand_over
-from pc2grid.geometry import SE2
+from pc2grid.arrays import F64, BoolGrid, hand_over
 from pc2grid.model import FREE, FREE_BELOW, OCCUPIED_FROM, THING, UNKNOWN, OccupancyGrid
+from signature.bend import largest_m
+from signature.database.protocol import BuildingFrame
 
 Cells = NDArray[np.int8]
 SUREST = 99
@@ -18,10 +19,12 @@ SUREST = 99
 was made from scans (`OccupancyParameters.limit`)."""
 _MOST = float(np.log(SUREST / (100 - SUREST)))
 """The same as log-odds."""
+_SQUARE_M = 1.0
+"""Side of the squares for which a bend is computed."""
 
 
-def building_map(maps: Sequence[tuple[OccupancyGrid, SE2]]) -> OccupancyGrid:
-    """The maps of sessions, oldest first, each with its T_building_session, as one in the building's frame.
+def building_map(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> OccupancyGrid:
+    """The maps of sessions, oldest first, each with where it lies, as one in the building's frame.
 
     Cells are as large as those of the first map; each is what the newest map says that is sure of its centre
     (free, occupied, or a thing); where none is sure, the oldest that knows it.
@@ -29,7 +32,9 @@ def building_map(maps: Sequence[tuple[OccupancyGrid, SE2]]) -> OccupancyGrid:
 
     >>> import pc2grid
     >>> plan = pc2grid.load_map("map.yaml")
-    >>> moved = building_map([(plan, SE2(10.0, 0.0, 0.0))])
+    >>> exact = ((0.0, 0.0, 0.0),) * 3
+    >>> frame = BuildingFrame(name="x", T_building_session=SE2(10.0, 0.0, 0.0), covariance=exact)
+    >>> moved = building_map([(plan, frame)])
     >>> round(moved.free_m2 / plan.free_m2, 2), round(moved.origin_m[0] - plan.origin_m[0], 2)
     (1.0, 10.0)
     """
@@ -42,8 +47,8 @@ def building_map(maps: Sequence[tuple[OccupancyGrid, SE2]]) -> OccupancyGrid:
     return replace(whole, cells=hand_over(cells))
 
 
-def evidence_map(maps: Sequence[tuple[OccupancyGrid, SE2]]) -> OccupancyGrid:
-    """The maps of sessions, oldest first, each with its T_building_session, as one by what all of them say.
+def evidence_map(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> OccupancyGrid:
+    """The maps of sessions, oldest first, each with where it lies, as one by what all of them say.
 
     The log-odds of a cell are added up from map to map, and never exceed `SUREST`, what a map may say by
     itself (Yguel, Aycard and Laugier, "Update policy of dense maps: efficient algorithms and sparse
@@ -71,12 +76,12 @@ def _sure(cells: Cells) -> BoolGrid:
     return np.asarray((cells >= OCCUPIED_FROM) | (cells == THING) | ((cells >= FREE) & (cells < FREE_BELOW)))
 
 
-def _around(maps: Sequence[tuple[OccupancyGrid, SE2]]) -> OccupancyGrid:
+def _around(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> OccupancyGrid:
     """A grid of unknown cells that holds all maps."""
     if not maps:
         raise ValueError("a building without a map")
     cell_m = maps[0][0].resolution_m
-    corners_m = np.concatenate([T.apply(_corners(grid)) for grid, T in maps])
+    corners_m = np.concatenate([_corners(grid, frame) for grid, frame in maps])
     low = np.floor(corners_m.min(axis=0) / cell_m + 1e-6)
     width, height = (np.ceil(corners_m.max(axis=0) / cell_m - 1e-6) - low).astype(int).tolist()
     x, y = (low * cell_m).tolist()
@@ -90,22 +95,47 @@ def _around(maps: Sequence[tuple[OccupancyGrid, SE2]]) -> OccupancyGrid:
 
 
 def _drawn(
-    maps: Sequence[tuple[OccupancyGrid, SE2]], whole: OccupancyGrid
+    maps: Sequence[tuple[OccupancyGrid, BuildingFrame]], whole: OccupancyGrid
 ) -> Iterator[tuple[tuple[slice, slice], Cells]]:
     """For each map the window of the grid that it lies in, and what it says of the cells there."""
-    for grid, T_building_session in maps:
-        rows, columns = _covered(whole, T_building_session.apply(_corners(grid)))
-        at = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
-        told = _cells_at(grid, T_building_session.inverse().apply(whole.to_point(at.reshape(-1, 2))))
+    for grid, frame in maps:
+        rows, columns = _covered(whole, _corners(grid, frame))
+        told = _cells_at(grid, _as_drawn(frame, whole, rows, columns).reshape(-1, 2))
         window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         yield window, told.reshape(len(rows), len(columns))
 
 
-def _corners(grid: OccupancyGrid) -> NDArray[np.float64]:
-    """(4, 2) of a map, in its frame."""
+def _corners(grid: OccupancyGrid, frame: BuildingFrame) -> F64:
+    """(4, 2) of a map, wherever it is bent to, in the building."""
     height, width = grid.cells.shape
-    corners = np.array([(0, 0), (width, 0), (0, height), (width, height)], np.float64)
-    return corners * grid.resolution_m + grid.origin_m
+    around_m = largest_m(frame.bend)
+    corners = np.array([(0, 0), (width, 0), (0, height), (width, height)], np.float64) * grid.resolution_m
+    outwards = np.array([(-1, -1), (1, -1), (-1, 1), (1, 1)]) * around_m
+    return frame.T_building_session.apply(corners + grid.origin_m + outwards)
+
+
+def _as_drawn(
+    frame: BuildingFrame, whole: OccupancyGrid, rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> F64:
+    """Where the centres of cells of a building (R, C, 2) lie in the map of a session.
+
+    A bend changes little from cell to cell: it is inverted for the middles of large squares, and in between
+    it is interpolated.
+    """
+    import cv2
+
+    at = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
+    T_session_building = frame.T_building_session.inverse()
+    straight_m = T_session_building.apply(whole.to_point(at.reshape(-1, 2))).reshape(at.shape)
+    if not frame.bend:
+        return straight_m
+    n = max(1, round(_SQUARE_M / whole.resolution_m))
+    middle = (n - 1) / 2
+    squares = np.stack(np.meshgrid(rows[::n] + middle, columns[::n] + middle, indexing="ij"), axis=-1)
+    points_m = whole.to_point(squares.reshape(-1, 2))
+    bent_m = (frame.as_drawn(points_m) - T_session_building.apply(points_m)).reshape(squares.shape)
+    height, width = squares.shape[:2]
+    return straight_m + cv2.resize(bent_m, (n * width, n * height))[: len(rows), : len(columns)]
 
 
 def _covered(

@@ -63,9 +63,8 @@ def building_changes(
     """
     frames = _common_frame(database, (*before, *after))
     earlier = _map_of(database, before, frames)
-    if len(after) == 1:
-        frame = frames[after[0]]
-        later, T_building_later = database.grid(after[0]), frame.T_building_session
+    if len(after) == 1 and not frames[after[0]].bend:
+        later, T_building_later = database.grid(after[0]), frames[after[0]].T_building_session
     else:
         later, T_building_later = _map_of(database, after, frames), SE2()
     covariance = sum(
@@ -78,9 +77,10 @@ def building_changes(
 def _map_of(
     database: SubmapDatabase, names: Sequence[str], frames: Mapping[str, BuildingFrame]
 ) -> OccupancyGrid:
-    if len(names) == 1 and frames[names[0]].T_building_session == SE2():
+    first = frames[names[0]]
+    if len(names) == 1 and first.T_building_session == SE2() and not first.bend:
         return database.grid(names[0])
-    return building_map([(database.grid(name), frames[name].T_building_session) for name in names])
+    return building_map([(database.grid(name), frames[name]) for name in names])
 
 
 def _common_frame(database: SubmapDatabase, names: Sequence[str]) -> dict[str, BuildingFrame]:

@@ -30,7 +30,16 @@ from pc2grid.model import UNKNOWN, OccupancyGrid
 from signature.localization.hypotheses import HYPOTHESES, coarse_points, same_pose
 from signature.localization.joining.graph_matching import Alignment, align_graphs
 from signature.localization.joining.landmarks import Landmarks
-from signature.localization.joining.pieces import PIECES, Piece, PieceFits, align_pieces, pieces_of, rigid
+from signature.localization.joining.pieces import (
+    PIECES,
+    Link,
+    Piece,
+    PieceFits,
+    align_pieces,
+    links_of,
+    pieces_of,
+    rigid,
+)
 from signature.localization.posterior import NO_EVIDENCE, Evidence, evidence_of, masses
 from signature.localization.query import QueryMap
 from signature.localization.same_place import SAME_PLACE
@@ -119,6 +128,7 @@ class Join:
     agreement : 0..1, of the walls where both know the ground, the lower one of both directions.
     common_m2 : free ground that both know. nodes : of the two graphs, that agree on the transform.
     rivals : other transforms that were compared, with decoys. evidence : what the probability rests on.
+    links : where the pieces of the source lie that agree with the target.
     """
 
     status: JoinStatus
@@ -130,6 +140,7 @@ class Join:
     nodes: int
     rivals: int
     evidence: Evidence
+    links: tuple[Link, ...] = ()
 
     def __post_init__(self) -> None:
         freeze(self, "covariance", np.float64, (3, 3))
@@ -152,12 +163,13 @@ UNJOINED = Join(
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Candidate:
     """A transform that was made exact by walls. at : middle of its nodes in the source. fits : of each piece
-    of the source. covariance : (3, 3) of the transform at `at`."""
+    of the source. links : of those that agree. covariance : (3, 3) of the transform at `at`."""
 
     T_target_source: SE2
     at: SE2
     nodes: int
     fits: tuple[Fit, ...]
+    links: tuple[Link, ...]
     covariance: F64
 
 
@@ -243,14 +255,20 @@ def _refined(
     start = SE2(*found[0, :3].tolist()) @ SE2(-at.x, -at.y, 0.0)
     pose, _ = refine(target.search.field, around, start, alignment.at_m)
     fits = align_pieces(target.search, pieces, pose, alignment.at_m)
-    T_target_source, bend_m = rigid(pieces, fits)
+    links = links_of(pieces, fits)
+    T_target_source, bend_m = rigid(links)
     whole, covariance = refine(target.search.field, points_m, T_target_source, alignment.at_m)
     if bend_m < LIKELIHOOD.sigma_m:  # all walls are within reach of theirs at once, which is more exact
         T_target_source = whole
     deviations = (HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)
     covariance = covariance + np.diag(np.square(deviations)) + np.diag([bend_m**2, bend_m**2, 0.0])
     return _Candidate(
-        T_target_source=T_target_source, at=at, nodes=alignment.nodes, fits=fits, covariance=covariance
+        T_target_source=T_target_source,
+        at=at,
+        nodes=alignment.nodes,
+        fits=fits,
+        links=links,
+        covariance=covariance,
     )
 
 
@@ -317,6 +335,7 @@ def _judged(
         nodes=candidate.nodes,
         rivals=len(scores) - 1,
         evidence=evidence,
+        links=candidate.links,
     )
 
 

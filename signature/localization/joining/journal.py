@@ -12,12 +12,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pc2grid._version import __version__
 from pc2grid.arrays import F64
 from pc2grid.errors import OutputError
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from signature.localization.joining.join import Join
+from signature.localization.joining.pieces import Link
 from signature.localization.posterior import Evidence
 
 _HEAD = "compared by pc2grid"
@@ -94,5 +97,13 @@ def _listed(array: F64) -> Any:
 def _join(content: dict[str, Any]) -> Join:
     """The join that `asdict` and JSON have made this of."""
     evidence = Evidence(**{**content["evidence"], "tail": tuple(content["evidence"]["tail"])})
+    links = tuple(
+        Link(
+            center_m=tuple(link["center_m"]),
+            T_target_source=SE2(**link["T_target_source"]),
+            covariance=np.array(link["covariance"]),
+        )
+        for link in content["links"]
+    )
     T = SE2(**content["T_target_source"])
-    return Join(**{**content, "T_target_source": T, "evidence": evidence})
+    return Join(**{**content, "T_target_source": T, "evidence": evidence, "links": links})

@@ -147,27 +147,51 @@ class PieceFits:
         return float(forward[chosen]), float(backward[chosen]), np.sqrt(forward * backward)
 
 
-def rigid(pieces: Sequence[Piece], fits: Sequence[Fit]) -> tuple[SE2, float]:
-    """The one transform that is nearest to those of the pieces that agree, and how far (m, rms of an axis)
-    these deviate from it.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Link:
+    """Where a piece of a source lies in a target.
 
-    Least squares over the poses of the pieces at their middles, each with the information that its walls
-    give: one that shows a corridor only says nothing along it. Pieces on ground that the target hardly knows
-    do not count.
+    center_m : (x, y) the middle of its walls, in the source. covariance : (3, 3) of the piece's pose there,
+    in the axes of the target, with what a map leaves open of where it shows anything.
     """
+
+    center_m: tuple[float, float]
+    T_target_source: SE2
+    covariance: F64
+
+
+def links_of(pieces: Sequence[Piece], fits: Sequence[Fit]) -> tuple[Link, ...]:
+    """The pieces that agree with the target. Those on ground that it hardly knows do not count."""
     seen = [fit.overlap * piece.walls.weight for piece, fit in zip(pieces, fits, strict=True)]
     shown = [k for k, walls in enumerate(seen) if walls >= PIECES.least_walls] or [int(np.argmax(seen))]
     kept = [k for k in shown if fits[k].known_agreement_both_ways >= PIECES.follows] or shown
-    middles_m = np.array([pieces[k].center_m for k in kept])
-    there_m = np.array([fits[k].T_map_query.apply(np.array([pieces[k].center_m]))[0] for k in kept])
-    yaws = np.array([fits[k].T_map_query.yaw for k in kept])
     noise = np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))
-    information = np.linalg.inv(np.array([fits[k].covariance for k in kept]) + noise)
-    T = fits[kept[0]].T_map_query
+    return tuple(
+        Link(
+            center_m=pieces[k].center_m,
+            T_target_source=fits[k].T_map_query,
+            covariance=fits[k].covariance + noise,
+        )
+        for k in kept
+    )
+
+
+def rigid(links: Sequence[Link]) -> tuple[SE2, float]:
+    """The one transform that is nearest to those of the pieces, and how far (m, rms of an axis) these deviate
+    from it.
+
+    Least squares over the poses of the pieces at their middles, each with the information that its walls
+    give: one that shows a corridor only says nothing along it.
+    """
+    middles_m = np.array([link.center_m for link in links])
+    there_m = np.array([link.T_target_source.apply(np.array([link.center_m]))[0] for link in links])
+    yaws = np.array([link.T_target_source.yaw for link in links])
+    information = np.linalg.inv(np.array([link.covariance for link in links]))
+    T = links[0].T_target_source
     for _ in range(_STEPS):
         at_m = T.apply(middles_m)
         error = np.column_stack((there_m - at_m, wrap_angle(yaws - T.yaw)))
-        J = np.tile(np.eye(3), (len(kept), 1, 1))
+        J = np.tile(np.eye(3), (len(links), 1, 1))
         J[:, 0, 2], J[:, 1, 2] = T.y - at_m[:, 1], at_m[:, 0] - T.x
         normal = np.einsum("kia,kij,kjb->ab", J, information, J)
         x, y, yaw = np.linalg.solve(normal, np.einsum("kia,kij,kj->a", J, information, error)).tolist()

@@ -21,6 +21,7 @@ THERE = BuildingFrame(
     name="monday",
     T_building_session=SE2(1 / 3, -2.5, 3.0),
     covariance=((4e-4, 1e-5, 2e-6), (1e-5, 9e-4, -3e-6), (2e-6, -3e-6, 1 / 7e5)),
+    bend=((1 / 3, -7.0, 0.02, -0.03, 1 / 300), (4.5, -7.0, 0.0, 0.0, 0.0)),
 )
 FRAMES = {"monday": HERE, "tuesday": THERE}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,6 +34,21 @@ def test_an_answer_is_moved_with_all_its_poses() -> None:
     document = moved.to_json()
     assert document["frame"] == document["hypotheses"][0]["frame"] == "ground floor"
     assert document["pose"] is not None and document["pose"]["x"] == moved.T_map_base.x
+
+
+def test_an_answer_in_a_bent_map_moves_as_its_place_does() -> None:
+    """East of x = 4 m the map lies 0.3 m too far north; in the west it is right."""
+    bend = tuple((x, y, 0.0, -0.3 * (x > 4.0), 0.0) for x in (0.0, 8.0) for y in (2.0, 7.0, 12.0))
+    answer = locate_map(office_part((9.0, 7.0)), building({"monday": office()}))
+    straight, bent = (
+        answer_in_building(answer, {"monday": replace(FRAME, bend=rows)}) for rows in ((), bend)
+    )
+    assert straight.T_map_base is not None and bent.T_map_base is not None
+    # South in the map is east in the building, which is turned by a quarter.
+    assert bent.T_map_base.x - straight.T_map_base.x == pytest.approx(0.3, abs=0.02)
+    assert bent.T_map_base.y == pytest.approx(straight.T_map_base.y, abs=0.02)
+    assert bent.T_map_odom == bent.T_map_base == bent.hypotheses[0].fit.T_map_query
+    assert bent.history[-1].pose == bent.T_map_base
 
 
 def test_an_answer_in_a_session_that_was_not_joined_stays() -> None:

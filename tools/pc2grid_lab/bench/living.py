@@ -132,13 +132,13 @@ def asked(folder: Path, building: int) -> Iterator[Asked]:
         with open_database(place) as database:
             index = MapIndex.of(database, Config())
             at = database.frames()
-            T_plan = [T_plan_frame @ at[session].T_building_session for session in index.sessions]
+            placed = [at[session] for session in index.sessions]
             for scans, count in _LOOKS.items():
                 for start in np.linspace(0, len(drive) - scans, count).astype(int).tolist():
                     true = drive[start + scans - 1][1]
                     if _known(first, truth["day0"].inverse() @ true):
                         answer, _ = _ask(index, [scan for scan, _ in drive[start : start + scans]])
-                        error = _error(answer, T_plan, true)
+                        error = _error(answer, placed, T_plan_frame.inverse() @ true)
                         yield Asked(
                             building=building,
                             map=name,
@@ -150,12 +150,13 @@ def asked(folder: Path, building: int) -> Iterator[Asked]:
                         )
 
 
-def _error(answer: Answer, T_plan: Sequence[SE2], T_plan_base: SE2) -> tuple[float, float]:
+def _error(answer: Answer, frames: Sequence[BuildingFrame], T_frame_base: SE2) -> tuple[float, float]:
     """Distance and turn of the best hypothesis from the truth; infinite without one."""
     if not answer.hypotheses:
         return math.inf, math.inf
     best = answer.hypotheses[0]
-    off = T_plan_base.inverse() @ T_plan[best.session_index] @ best.fit.T_map_query @ answer.T_odom_base
+    T_map_base = best.fit.T_map_query @ answer.T_odom_base
+    off = T_frame_base.inverse() @ frames[best.session_index].placed(T_map_base)
     return math.hypot(off.x, off.y), abs(math.remainder(off.yaw, 2.0 * math.pi))
 
 

@@ -9,6 +9,8 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.model import FREE, OCCUPIED, THING, UNKNOWN, OccupancyGrid
+from signature.bend import Bend
+from signature.database.protocol import BuildingFrame
 from signature.localization.joining.building_map import building_map, evidence_map
 
 _ = UNKNOWN
@@ -19,24 +21,45 @@ def grid(rows: list[list[int]]) -> OccupancyGrid:
     return OccupancyGrid(cells=np.array(rows[::-1], np.int8), resolution_m=1.0, origin_m=(0.0, 0.0))
 
 
+def at(x: float = 0.0, y: float = 0.0, yaw: float = 0.0, bend: Bend = ()) -> BuildingFrame:
+    exact = ((0.0, 0.0, 0.0),) * 3
+    return BuildingFrame(name="old", T_building_session=SE2(x, y, yaw), covariance=exact, bend=bend)
+
+
 OLD = grid([[OCCUPIED, OCCUPIED, OCCUPIED], [FREE, FREE, OCCUPIED]])
 NEW = grid([[_, FREE, _], [_, OCCUPIED, _]])
 
 
 def test_the_newest_that_knows_a_cell_decides() -> None:
-    whole = building_map([(OLD, SE2()), (NEW, SE2())])
+    whole = building_map([(OLD, at()), (NEW, at())])
     assert whole.cells[::-1].tolist() == [[OCCUPIED, FREE, OCCUPIED], [FREE, OCCUPIED, OCCUPIED]]
 
 
 def test_maps_are_moved_and_turned_into_one_frame() -> None:
     """The new one, a quarter turn counterclockwise, stands left of the old one."""
-    whole = building_map([(OLD, SE2()), (NEW, SE2(0.0, 0.0, math.pi / 2))])
+    whole = building_map([(OLD, at()), (NEW, at(0.0, 0.0, math.pi / 2))])
     assert whole.origin_m == (-2.0, 0.0)
     assert whole.cells[::-1].tolist() == [
         [_, _, _, _, _],
         [FREE, OCCUPIED, OCCUPIED, OCCUPIED, OCCUPIED],
         [_, _, FREE, FREE, OCCUPIED],
     ]
+
+
+def test_a_bent_map_is_straight_in_the_building() -> None:
+    """A wall of 30 m, drawn with a step for every 10 m: it leaves its line by 2 cells."""
+    cells = np.zeros((9, 300), np.int8)
+    for begin, row in ((0, 4), (100, 5), (200, 6)):
+        cells[row, begin : begin + 100] = OCCUPIED
+    drawn = OccupancyGrid(cells=cells, resolution_m=0.1, origin_m=(0.0, 0.0))
+    places = tuple((x, 0.45, 0.0, -0.1 * int(x / 10.0), 0.0) for x in np.arange(0.5, 30.0).tolist())
+    whole = building_map([(drawn, at(5.0, bend=places))])
+    rows, columns = np.nonzero(whole.occupied)
+    x, y = whole.to_point(np.column_stack((rows, columns))).T
+    # Where the bend changes, cells round to one beside the line.
+    assert np.abs(y - 0.45).max() < 0.1 + 1e-6 and (np.histogram(x, np.arange(5.0, 35.1))[0] >= 10).all()
+    # Nothing of the map was cut off that the bend moves beyond its edges.
+    assert whole.free_m2 == pytest.approx(drawn.free_m2, rel=0.02)
 
 
 def test_no_map_is_no_building() -> None:
@@ -46,9 +69,9 @@ def test_no_map_is_no_building() -> None:
 
 def test_what_the_newest_is_not_sure_of_stays() -> None:
     unsure = grid([[50, 50, _], [50, THING, _]])
-    whole = building_map([(OLD, SE2()), (unsure, SE2())])
+    whole = building_map([(OLD, at()), (unsure, at())])
     assert whole.cells[::-1].tolist() == [[OCCUPIED, OCCUPIED, OCCUPIED], [FREE, THING, OCCUPIED]]
-    assert building_map([(unsure, SE2())]).cells[::-1].tolist() == [[50, 50, _], [50, THING, _]]
+    assert building_map([(unsure, at())]).cells[::-1].tolist() == [[50, 50, _], [50, THING, _]]
 
 
 def test_evidence_adds_up_and_one_session_undoes_what_any_number_said() -> None:
@@ -59,22 +82,22 @@ def test_evidence_adds_up_and_one_session_undoes_what_any_number_said() -> None:
         grid([[OCCUPIED, FREE, OCCUPIED, OCCUPIED, _]]),
         grid([[OCCUPIED, OCCUPIED, OCCUPIED, FREE, _]]),
     ]
-    whole = evidence_map([(day, SE2()) for day in days])
+    whole = evidence_map([(day, at()) for day in days])
     assert whole.cells.tolist() == [[99, 50, 99, 50, 80]]
     # What is less sure counts for less: twice two thirds make four fifths.
-    assert evidence_map([(grid([[67]]), SE2()), (grid([[67]]), SE2())]).cells.tolist() == [[80]]
+    assert evidence_map([(grid([[67]]), at()), (grid([[67]]), at())]).cells.tolist() == [[80]]
 
 
 def test_things_are_those_of_the_newest_that_is_sure_and_no_sum_is_taken_for_one() -> None:
     """A table that stays, one that went, and one whose place the newest session has not seen well."""
     old, new = grid([[THING, THING, THING]]), grid([[THING, FREE, 50]])
-    assert evidence_map([(old, SE2()), (new, SE2())]).cells.tolist() == [[THING, 1, THING]]
-    assert evidence_map([(grid([[61]]), SE2()), (grid([[49]]), SE2())]).cells.tolist() == [[THING - 1]]
+    assert evidence_map([(old, at()), (new, at())]).cells.tolist() == [[THING, 1, THING]]
+    assert evidence_map([(grid([[61]]), at()), (grid([[49]]), at())]).cells.tolist() == [[THING - 1]]
 
 
 def test_the_plane_of_lasers_stays_known() -> None:
     low, high = (
         OccupancyGrid(cells=OLD.cells, resolution_m=1.0, origin_m=(0, 0), height_m=h) for h in (0.2, 0.4)
     )
-    assert evidence_map([(low, SE2()), (high, SE2())]).height_m == pytest.approx(0.3)
-    assert evidence_map([(low, SE2()), (OLD, SE2())]).height_m is None
+    assert evidence_map([(low, at()), (high, at())]).height_m == pytest.approx(0.3)
+    assert evidence_map([(low, at()), (OLD, at())]).height_m is None

@@ -15,6 +15,7 @@ from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from signature.localization.joining.join import UNJOINED, Join
 from signature.localization.joining.journal import JoinJournal, key_of
+from signature.localization.joining.pieces import Link
 from signature.localization.posterior import NO_EVIDENCE
 
 JOIN = replace(
@@ -24,6 +25,7 @@ JOIN = replace(
     covariance=np.diag([1e-3 / 3, 2e-3, 3e-6]),
     probability=0.999,
     evidence=replace(NO_EVIDENCE, forward=2 / 3, tail=(-0.5, -1 / 3)),
+    links=(Link(center_m=(1 / 3, -2.0), T_target_source=SE2(0.1, 1 / 7, -3.0), covariance=np.eye(3) / 3),),
 )
 
 
