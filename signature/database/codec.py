@@ -170,8 +170,11 @@ def _decoder(kind: Any) -> Callable[[Any, str, dict[str, Array]], Any]:
 def _instance_decoder(kind: Any) -> Callable[[Any, str, dict[str, Array]], Any]:
     """The function that decodes instances of a dataclass."""
     fields = {name: _decoder(field) for name, field in fields_of(kind).items()}
-    # A field that was added to a stored type is None in the sessions of before.
-    added = {field.name: None for field in dataclasses.fields(kind) if field.default is None}
+    # A field that was added to a stored type is None, or holds nothing, in the sessions of before.
+    without: dict[Any, Any] = {None: None, (): []}
+    added = {
+        field.name: without[field.default] for field in dataclasses.fields(kind) if field.default in without
+    }
 
     def instance(content: Any, path: str, arrays: dict[str, Array]) -> Any:
         _expect(isinstance(content, dict), path, content, "an object")

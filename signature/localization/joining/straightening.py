@@ -13,20 +13,19 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pc2grid.arrays import F64, I64
+from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.mapping.local_maps import pose_at
-from pc2grid.mapping.loop_parameters import CAMERA_LOOPS, LOOPS, LoopParameters
+from pc2grid.mapping.loop_parameters import LOOPS
 from pc2grid.mapping.pose_graph import Edge, optimise
-from pc2grid.model import Health, Loop, SensorKind, Trajectory
-from pc2grid.sensor_model import SENSOR_MODELS
+from pc2grid.mapping.precision import position_sigmas
+from pc2grid.model import Health, Loop, Precision, Trajectory
 from signature.bend import SPACING_M, Bend, largest_m
 from signature.database.protocol import BuildingFrame
-from signature.localization.hypotheses import HYPOTHESES
 from signature.localization.joining.pieces import Link
 
 if TYPE_CHECKING:
@@ -34,8 +33,10 @@ if TYPE_CHECKING:
 
 HELD = 1e10
 """Information (1/m^2, 1/rad^2) that holds sessions where they are that were joined before."""
-_LEAST_SHARE = 0.05
-"""Of the travel of a local map, that a step between two nodes counts as at least."""
+_LEAST_M = 0.05
+"""A bend that moves no place further is left out: a cell of a map, and more than most pieces are off."""
+_LEAST_SIGMA_M = 0.005
+"""No map is more exact than a tenth of a cell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,40 +56,40 @@ class SessionBody:
 RIGID = SessionBody(np.zeros((1, 3)))
 
 
-def body_of(trajectory: Trajectory, loops: Sequence[Loop], parameters: LoopParameters = LOOPS) -> SessionBody:
-    """The graph of a session: a node for each local map of its way and each end of a loop."""
-    if len(trajectory) < 2:
+def body_of(trajectory: Trajectory, loops: Sequence[Loop], precision: Precision | None) -> SessionBody:
+    """The graph of a session over the local maps that its precision is known of.
+
+    Its steps and loops say how stiff its parts are to each other. As a whole it is as stiff as its precision
+    says, which knows also what the local maps show of each step.
+    """
+    if precision is None or len(precision.stamps_ns) < 2 or len(trajectory) < 2:
         return RIGID
-    path_m = trajectory.path_m()
-    begun = np.unique(np.floor(path_m / parameters.travel_m), return_index=True)[1]
     closed = [loop for loop in loops if loop.accepted]
     ends = [end for loop in closed for end in (loop.older, loop.newer)]
-    scans = np.unique([*begun.tolist(), *ends, len(trajectory) - 1])
+    mapped = np.searchsorted(trajectory.stamps_ns, precision.stamps_ns).clip(max=len(trajectory) - 1)
+    scans = np.unique([*mapped.tolist(), *ends])
     nodes = trajectory.planar()[scans]
     number = {scan: k for k, scan in enumerate(scans.tolist())}
-
-    def at_rest(first: int, second: int, information: F64) -> Edge:
-        T_first_second = pose_at(nodes, first).inverse() @ pose_at(nodes, second)
-        return Edge(first, second, T_first_second, information)
-
-    steps = [
-        at_rest(k, k + 1, information)
-        for k, information in enumerate(_of_steps(trajectory, scans, np.diff(path_m[scans]), parameters))
+    lengths_m = np.diff(trajectory.path_m()[scans]).tolist()
+    measured = [
+        (k, k + 1, LOOPS.tracked_information(length_m, restart=_lost(trajectory, *scans[k : k + 2])))
+        for k, length_m in enumerate(lengths_m)
     ]
-    measured = [at_rest(number[loop.older], number[loop.newer], loop.information) for loop in closed]
-    return SessionBody(nodes, (*steps, *measured))
-
-
-def _of_steps(trajectory: Trajectory, scans: I64, length_m: F64, parameters: LoopParameters) -> list[F64]:
-    """The information (3, 3) of each step between two of the scans: that of tracking over a local map, for
-    its share of the travel of one."""
-    lost = np.cumsum([0, *(health is Health.LOST for health in trajectory.health)])
-    lost = lost if trajectory.health else np.zeros(len(trajectory) + 1)
-    share = np.maximum(length_m / parameters.travel_m, _LEAST_SHARE)
-    return [
-        parameters.tracked_information(parameters.travel_m, restart=bool(lost[b + 1] > lost[a])) / part
-        for a, b, part in zip(scans[:-1], scans[1:], share, strict=True)
+    measured += [(number[loop.older], number[loop.newer], loop.information) for loop in closed]
+    edges = [
+        Edge(a, b, pose_at(nodes, a).inverse() @ pose_at(nodes, b), information)
+        for a, b, information in measured
     ]
+    variance = float(np.square(position_sigmas(nodes, edges)[0]).mean())
+    known = float(np.square(np.maximum(precision.sigma_m, _LEAST_SIGMA_M)).mean())
+    return SessionBody(
+        nodes, tuple(replace(edge, information=variance / known * edge.information) for edge in edges)
+    )
+
+
+def _lost(trajectory: Trajectory, begin: int, end: int) -> bool:
+    """Whether tracking was lost from one scan to another."""
+    return Health.LOST in trajectory.health[begin : end + 1]
 
 
 def bodies_of(
@@ -97,9 +98,7 @@ def bodies_of(
     """The graphs of sessions. held : those that stay as they are."""
     found = dict.fromkeys(names, RIGID)
     for info in database.sessions([name for name in names if name not in held]):
-        if info.sensor != "map":
-            parameters = CAMERA_LOOPS if SENSOR_MODELS[cast(SensorKind, info.sensor)].narrow else LOOPS
-            found[info.name] = body_of(database.trajectory(info.name), database.loops(info.name), parameters)
+        found[info.name] = body_of(database.trajectory(info.name), database.loops(info.name), info.precision)
     return found
 
 
@@ -113,41 +112,66 @@ def straighten(
 
     bodies : of the sessions. frames : where they lie as they were drawn; the first stays there, on an average
     over its way. links : of a target and a source, by their names. held : rigid ones that stay, too.
+
+    Sessions that would hardly be bent (`_LEAST_M`) are rigid, and the others are solved for again. If none is
+    bent, the frames stay as they are.
     """
-    anchor, *others = frames
+    while not all(body.rigid for body in bodies.values()):
+        found = _lying(bodies, frames, _solved(bodies, frames, links, held), held)
+        straight = {name for name, body in bodies.items() if not body.rigid and not found[name].bend}
+        if not straight:
+            return found
+        bodies = {name: RIGID if name in straight else body for name, body in bodies.items()}
+    return dict(frames)
+
+
+def _solved(
+    bodies: Mapping[str, SessionBody],
+    frames: Mapping[str, BuildingFrame],
+    links: Mapping[tuple[str, str], Sequence[Link]],
+    held: Collection[str],
+) -> dict[str, F64]:
+    """The poses (N, 3) of the nodes of each session in the building; the first node of all stays."""
     counts = [len(bodies[name].nodes) for name in frames]
     first = dict(zip(frames, np.cumsum([0, *counts]).tolist(), strict=False))
-    within = [
-        replace(edge, first=edge.first + first[name], second=edge.second + first[name])
-        for name in frames
-        for edge in bodies[name].edges
-    ]
-    T_anchor_building = frames[anchor].T_building_session.inverse()
-    staying = [
-        Edge(0, first[name], T_anchor_building @ frames[name].T_building_session, HELD * np.eye(3))
-        for name in others
-        if name in held
-    ]
+    T_first_building = frames[next(iter(frames))].T_building_session.inverse()
+    within = [(name, name, edge) for name in frames for edge in bodies[name].edges]
     between = [
-        replace(edge, first=edge.first + first[a], second=edge.second + first[b])
+        (a, b, _edge(link, bodies[a], bodies[b], frames[a], frames[b]))
         for (a, b), found in links.items()
-        for edge in (_edge(link, bodies[a], bodies[b], frames[a], frames[b]) for link in found)
+        for link in found
+    ]
+    edges = [
+        Edge(0, first[name], T_first_building @ frames[name].T_building_session, HELD * np.eye(3))
+        for name in held
+        if first[name]
+    ]
+    edges += [
+        replace(edge, first=edge.first + first[a], second=edge.second + first[b])
+        for a, b, edge in (*within, *between)
     ]
     begin = np.concatenate([_moved(frames[name].T_building_session, bodies[name].nodes) for name in frames])
-    poses = optimise(begin, [*within, *staying, *between]).poses
-    solved = dict(zip(frames, np.split(poses, np.cumsum(counts)[:-1]), strict=True))
-    T = {name: _placement(bodies[name].nodes, solved[name]) for name in frames}
-    T_building_solved = frames[anchor].T_building_session @ T[anchor].inverse()
-    return {
-        name: frame
-        if name in held
-        else replace(
-            frame,
-            T_building_session=frame.T_building_session if name == anchor else T_building_solved @ T[name],
-            bend=_bend(bodies[name].nodes, solved[name], T[name]),
-        )
-        for name, frame in frames.items()
-    }
+    poses = optimise(begin, edges).poses
+    return dict(zip(frames, np.split(poses, np.cumsum(counts)[:-1]), strict=True))
+
+
+def _lying(
+    bodies: Mapping[str, SessionBody],
+    frames: Mapping[str, BuildingFrame],
+    solved: Mapping[str, F64],
+    held: Collection[str],
+) -> dict[str, BuildingFrame]:
+    """Where sessions lie, and how they are bent, by the poses of their nodes; the first one lies where it
+    lay, and `held` are as they were."""
+    T = {name: _placement(bodies[name].nodes, poses) for name, poses in solved.items()}
+    first = next(iter(frames))
+    T_building_solved = frames[first].T_building_session @ T[first].inverse()
+    found = dict(frames)
+    for name in frames.keys() - set(held):
+        at = frames[first].T_building_session if name == first else T_building_solved @ T[name]
+        bend = _bend(bodies[name].nodes, solved[name], T[name])
+        found[name] = replace(frames[name], T_building_session=at, bend=bend)
+    return found
 
 
 def _moved(T: SE2, poses: F64) -> F64:
@@ -205,4 +229,4 @@ def _bend(nodes: F64, solved: F64, T: SE2) -> Bend:
     bend: Bend = tuple(
         (x, y, dx, dy, yaw) for x, y, dx, dy, yaw in np.column_stack(columns).round(4).tolist()
     )
-    return bend if largest_m(bend) >= HYPOTHESES.map_m else ()
+    return bend if largest_m(bend) >= _LEAST_M else ()

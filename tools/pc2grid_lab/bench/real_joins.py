@@ -4,7 +4,8 @@
 have the label of their building (`convert --building`), and compares every two sessions, without looking at
 the labels, and each with its own mirror image; `--by map_merge` and `--by grid_matching` do it as rivals do.
 Where two sessions are parts of one recording, or a third session contains both, the stamps that they share
-tell how they lie to each other.
+tell how they lie to each other, and how far their poses lie from those of the third one, as they were drawn
+and straightened.
 """
 
 from __future__ import annotations
@@ -23,12 +24,15 @@ from pathlib import Path
 import numpy as np
 
 from pc2grid.geometry import SE2
-from pc2grid.model import Trajectory
+from pc2grid.model import Loop, Precision, Trajectory
 from pc2grid.submaps.junction_graph import junction_graph
 from pc2grid_lab.baselines.grid_matching import match_grids
 from pc2grid_lab.baselines.map_merge import CONFIDENT, merge
 from signature.database import open_database
+from signature.database.protocol import BuildingFrame
 from signature.localization.joining.join import JoinableMap, join_maps
+from signature.localization.joining.pieces import Link
+from signature.localization.joining.straightening import body_of, straighten
 
 _LEAST_STAMPS = 50
 """Poses that two trajectories share, to say how their frames lie to each other."""
@@ -45,11 +49,14 @@ class Session:
     name: str
     building: str
     trajectory: Trajectory
+    loops: tuple[Loop, ...]
+    precision: Precision | None
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Two sessions. same : of one building. error_m, error_deg : at the middle of the source, if known."""
+    """Two sessions. same : of one building. error_m, error_deg : at the middle of the source, if known.
+    drawn_m, straight_m : see `poses_off`, as the sessions were drawn and joined, and straightened."""
 
     target: str
     source: str
@@ -61,6 +68,8 @@ class Row:
     nodes: int | None
     error_m: float | None
     error_deg: float | None
+    drawn_m: tuple[float, ...] | None
+    straight_m: tuple[float, ...] | None
     cpu_s: float
 
 
@@ -75,6 +84,8 @@ def sessions_of(folder: Path) -> list[Session]:
                     info.name,
                     info.provenance.label.building or path.stem,
                     database.trajectory(info.name),
+                    database.loops(info.name),
+                    info.precision,
                 )
                 for info in database.sessions()
             ]
@@ -114,6 +125,27 @@ def by_stamps(a: Session, b: Session) -> SE2 | None:
     return SE2.fit(b.trajectory.planar()[j, :2], a.trajectory.planar()[i, :2])
 
 
+def poses_off(
+    whole: Session, parts: Sequence[Session], frames: Mapping[str, BuildingFrame]
+) -> tuple[float, ...]:
+    """RMS distance, m, of the poses of each of the parts from those of the whole, best aligned; the last one
+    is of all together, where they lie in the building."""
+    at_m, true_m = [], []
+    for part in parts:
+        _, i, j = np.intersect1d(part.trajectory.stamps_ns, whole.trajectory.stamps_ns, return_indices=True)
+        at_m.append(frames[part.name].apply(part.trajectory.planar()[i, :2]))
+        true_m.append(whole.trajectory.planar()[j, :2])
+    at_m.append(np.concatenate(at_m))
+    true_m.append(np.concatenate(true_m))
+    off_m = (SE2.fit(at, true).apply(at) - true for at, true in zip(at_m, true_m, strict=True))
+    return tuple(round(float(np.sqrt((off**2).sum(axis=1).mean())), 4) for off in off_m)
+
+
+def _frame(T: SE2) -> BuildingFrame:
+    exact = ((0.0, 0.0, 0.0),) * 3
+    return BuildingFrame(name="", T_building_session=T, covariance=exact)
+
+
 @dataclass(frozen=True, slots=True)
 class Found:
     """What was found of two maps. T_target_source : None if they are said to be of different buildings."""
@@ -124,6 +156,7 @@ class Found:
     agreement: float | None = None
     common_m2: float | None = None
     nodes: int | None = None
+    links: tuple[Link, ...] = ()
 
 
 def by_pc2grid(target: JoinableMap, source: JoinableMap) -> Found:
@@ -136,6 +169,7 @@ def by_pc2grid(target: JoinableMap, source: JoinableMap) -> Found:
         agreement=join.agreement,
         common_m2=join.common_m2,
         nodes=join.nodes,
+        links=join.links,
     )
 
 
@@ -158,13 +192,14 @@ METHODS = {"pc2grid": by_pc2grid, "map_merge": by_map_merge, "grid_matching": by
 def rows(compared: Sequence[Session], known: Sequence[Session], method: str) -> Iterator[Row]:
     """All pairs, and each session with its mirror image. known : also those that only tell the truth."""
     for a, b in itertools.combinations(compared, 2):
-        yield _row(a, b, truth(a, b, known), method)
+        yield _row(a, b, known, method)
     for one in compared:
-        yield _row(one, replace(one, name=MIRRORED), None, method)
+        yield _row(one, replace(one, name=MIRRORED), (), method)
 
 
-def _row(a: Session, b: Session, T_a_b: SE2 | None, method: str) -> Row:
+def _row(a: Session, b: Session, known: Sequence[Session], method: str) -> Row:
     mirrored = b.name == MIRRORED
+    T_a_b = truth(a, b, known) if known else None
     target = map_of(a.path, a.name)
     source = map_of(b.path, a.name if mirrored else b.name, mirrored)
     begin = time.process_time()
@@ -175,6 +210,13 @@ def _row(a: Session, b: Session, T_a_b: SE2 | None, method: str) -> Row:
         x, y = source.grid.to_point(np.argwhere(source.grid.free)).mean(axis=0).tolist()
         at = SE2(x, y)
         off = (T_a_b @ at).inverse() @ found.T_target_source @ at
+    whole = next((c for c in known if by_stamps(c, a) and by_stamps(c, b)), None)
+    drawn_m = straight_m = None
+    if whole is not None and found.links and found.T_target_source is not None:
+        frames = {a.name: _frame(SE2()), b.name: _frame(found.T_target_source)}
+        bodies = {one.name: body_of(one.trajectory, one.loops, one.precision) for one in (a, b)}
+        drawn_m = poses_off(whole, (a, b), frames)
+        straight_m = poses_off(whole, (a, b), straighten(bodies, frames, {(a.name, b.name): found.links}))
     return Row(
         target=a.name,
         source=b.name,
@@ -186,6 +228,8 @@ def _row(a: Session, b: Session, T_a_b: SE2 | None, method: str) -> Row:
         nodes=found.nodes,
         error_m=None if off is None else math.hypot(off.x, off.y),
         error_deg=None if off is None else abs(math.degrees(off.yaw)),
+        drawn_m=drawn_m,
+        straight_m=straight_m,
         cpu_s=cpu_s,
     )
 

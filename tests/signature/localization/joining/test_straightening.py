@@ -9,11 +9,12 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
-from pc2grid.model import Health, Loop, Trajectory
+from pc2grid.mapping.precision import position_sigmas
+from pc2grid.model import Health, Loop, Precision, Trajectory
 from signature.bend import Bend, largest_m
 from signature.database.protocol import BuildingFrame
 from signature.localization.joining.pieces import Link
-from signature.localization.joining.straightening import RIGID, SessionBody, body_of, straighten
+from signature.localization.joining.straightening import RIGID, body_of, straighten
 
 DRIFT = 0.002
 """Rad a metre: over a local map of 4 m as much as one standard deviation of tracking."""
@@ -37,13 +38,13 @@ def way(drift: float = DRIFT, health: tuple[Health, ...] = ()) -> Trajectory:
     return Trajectory(stamps_ns=np.arange(len(S)) * 10**8, T_session_base=poses, health=health)
 
 
-def star() -> tuple[Loop, ...]:
-    """Loops that see each place of the way from its beginning, to a centimetre."""
-    information = np.diag((1e4, 1e4, 1e6))
-    return tuple(
-        Loop(older=0, newer=k, T_older_newer=SE2(0.2 * k), information=information)
-        for k in range(20, len(S), 20)
-    )
+def exact_to(sigma_m: float) -> Precision:
+    """Of a local map each 4 m."""
+    return Precision(stamps_ns=tuple(range(0, 201 * 10**8, 20 * 10**8)), sigma_m=(sigma_m,) * 11)
+
+
+SOFT = body_of(way(), (), exact_to(0.1))
+"""About as soft as tracking is (`LoopParameters`): its drift is no surprise."""
 
 
 def frame(T: SE2, bend: Bend = ()) -> BuildingFrame:
@@ -70,7 +71,7 @@ def off_m(at: BuildingFrame, drift: float = DRIFT) -> F64:
 def test_a_session_that_drifts_is_straightened_by_a_map() -> None:
     links = {("plan", "drive"): [link(s, true(s)) for s in FOUND]}
     frames = {"plan": frame(SE2()), "drive": frame(T_PLAN_DRAWN)}
-    found = straighten({"plan": RIGID, "drive": body_of(way(), ())}, frames, links)
+    found = straighten({"plan": RIGID, "drive": SOFT}, frames, links)
     assert found["plan"] == frames["plan"]
     # Drawn, its end is 1.6 m off. A piece is exact to 2.5 cm, and 4 m beyond the last one drift goes on for
     # 4 m: 1.6 cm.
@@ -80,9 +81,8 @@ def test_a_session_that_drifts_is_straightened_by_a_map() -> None:
 
 
 def test_a_stiff_session_straightens_a_soft_one_and_never_the_other_way() -> None:
-    stiff, soft = body_of(way(drift=0.0), star()), body_of(way(), ())
+    bodies = {"stiff": body_of(way(drift=0.0), (), exact_to(0.01)), "soft": SOFT}
     for names in (("stiff", "soft"), ("soft", "stiff")):
-        bodies = {"stiff": stiff, "soft": soft}
         begin = {"stiff": frame(T_PLAN_DRAWN), "soft": frame(T_PLAN_DRAWN @ SE2(0.0, 0.5, -0.04))}
         links = {("stiff", "soft"): [link(s, SE2(s)) for s in FOUND]}
         found = straighten(bodies, {name: begin[name] for name in names}, links)
@@ -99,12 +99,12 @@ def test_a_wrong_piece_bends_nothing() -> None:
     links = [link(s, true(s)) for s in FOUND]
     links[2] = link(20.0, true(20.0) @ SE2(0.0, 1.0, 0.1))
     found = straighten(
-        {"plan": RIGID, "drive": body_of(way(), ())},
+        {"plan": RIGID, "drive": SOFT},
         {"plan": frame(SE2()), "drive": frame(T_PLAN_DRAWN)},
         {("plan", "drive"): links},
     )
-    # 16 m of tracking between the pieces beside it, which leave 6 cm across in the middle.
-    assert off_m(found["drive"]).max() < 0.1
+    # As without it: between the pieces beside it, tracking is exact enough to refuse it.
+    assert off_m(found["drive"]).max() < 0.05
 
 
 def test_sessions_that_were_joined_before_stay_bent_as_they_are() -> None:
@@ -112,7 +112,7 @@ def test_sessions_that_were_joined_before_stay_bent_as_they_are() -> None:
     links = {("plan", "drive"): [link(s, true(s)) for s in FOUND]}
     plan = frame(SE2(), ((0.0, 0.0, 0.0, 0.5, 0.0),))
     frames = {"first": frame(SE2()), "plan": plan, "drive": frame(T_PLAN_DRAWN)}
-    bodies = {"first": RIGID, "plan": RIGID, "drive": body_of(way(), ())}
+    bodies = {"first": RIGID, "plan": RIGID, "drive": SOFT}
     found = straighten(bodies, frames, links, held=("first", "plan"))
     assert found["first"] == frames["first"] and found["plan"] == plan
     there = found["drive"].placed(drawn(20.0))
@@ -121,20 +121,31 @@ def test_sessions_that_were_joined_before_stay_bent_as_they_are() -> None:
 
 
 def test_a_body_has_a_node_for_each_local_map_and_each_end_of_a_loop() -> None:
-    assert (
-        body_of(Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4))), ()) is RIGID
-    )
-    chain = body_of(way(), ())
-    assert len(chain.nodes) == 11 and len(chain.edges) == 10
+    assert len(SOFT.nodes) == 11 and len(SOFT.edges) == 10
     loop = Loop(older=30, newer=110, T_older_newer=SE2(16.0), information=np.eye(3))
     refused = Loop(older=35, newer=115, T_older_newer=SE2(), information=np.eye(3), accepted=False)
-    closed = body_of(way(), (loop, refused))
+    closed = body_of(way(), (loop, refused), exact_to(0.3))
     assert len(closed.nodes) == 13 and len(closed.edges) == 12 + 1
+
+
+def test_a_session_of_which_no_precision_is_known_is_rigid() -> None:
+    assert body_of(way(), (), None) is RIGID and body_of(way(), (), Precision()) is RIGID
+
+
+def test_a_body_is_as_stiff_as_its_session_is_exact() -> None:
+    for sigma_m in (0.01, 0.3):
+        body = body_of(way(), (), exact_to(sigma_m))
+        found_m = position_sigmas(body.nodes, body.edges)[0]
+        # The weights of the places depend a little on the sigmas.
+        assert np.sqrt(np.square(found_m).mean()) == pytest.approx(sigma_m, rel=0.1)
 
 
 def test_a_step_over_which_tracking_was_lost_is_soft() -> None:
     health = [Health.FINE] * len(S)
     health[50] = Health.LOST
-    body: SessionBody = body_of(way(health=tuple(health)), ())
+    body = body_of(way(health=tuple(health)), (), exact_to(0.3))
     sigma_m = np.array([edge.information[0, 0] ** -0.5 for edge in body.edges])
-    assert (np.flatnonzero(sigma_m > 1.0) == [2]).all() and np.delete(sigma_m, 2).max() < 0.1
+    # 1.5 m against 0.06 m, see `LoopParameters`.
+    assert int(np.argmax(sigma_m)) == 2 and np.delete(sigma_m, 2) == pytest.approx(
+        sigma_m[2] / 25.0, rel=0.01
+    )
