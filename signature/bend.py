@@ -16,8 +16,6 @@ from pc2grid.geometry import SE2
 Bend = tuple[tuple[float, float, float, float, float], ...]
 """Rows (x, y, motion in x, in y, in yaw); metres and radians."""
 
-SPACING_M = 4.0
-"""Places of a bend are about so far apart: the length of a local map of a session."""
 _BLENDED_M = 3.0
 """Standard deviation of the weights. From 2 to 4 m, sessions of csail and aces came to lie equally well."""
 _NEAREST = 8

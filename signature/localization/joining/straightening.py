@@ -24,7 +24,7 @@ from pc2grid.mapping.loop_parameters import LOOPS
 from pc2grid.mapping.pose_graph import Edge, optimise
 from pc2grid.mapping.precision import position_sigmas
 from pc2grid.model import Health, Loop, Precision, Trajectory
-from signature.bend import SPACING_M, Bend, largest_m
+from signature.bend import Bend, largest_m
 from signature.database.protocol import BuildingFrame
 from signature.localization.joining.pieces import Link
 
@@ -217,11 +217,11 @@ def _placement(nodes: F64, solved: F64) -> SE2:
 
 
 def _bend(nodes: F64, solved: F64, T: SE2) -> Bend:
-    """How a session is bent where it lies at T: a row for each square of its way; none if a map cannot show
-    as little."""
+    """How a session is bent where it lies at T: a row for each square of its way, as wide as a local map is
+    long; none if hardly."""
     moved = np.column_stack((T.inverse().apply(solved[:, :2]) - nodes[:, :2], solved[:, 2] - nodes[:, 2]))
     moved[:, 2] = wrap_angle(moved[:, 2] - T.yaw)
-    _, square = np.unique(np.floor(nodes[:, :2] / SPACING_M), axis=0, return_inverse=True)
+    _, square = np.unique(np.floor(nodes[:, :2] / LOOPS.travel_m), axis=0, return_inverse=True)
     count = np.bincount(square.ravel())
     columns = [
         np.bincount(square.ravel(), weights=values) / count for values in (nodes[:, 0], nodes[:, 1], *moved.T)

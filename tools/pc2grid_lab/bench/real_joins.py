@@ -159,6 +159,20 @@ class Found:
     links: tuple[Link, ...] = ()
 
 
+def _both_off(
+    a: Session, b: Session, found: Found, known: Sequence[Session]
+) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
+    """`poses_off` of two joined sessions, as they were drawn and straightened; None if no third session
+    contains both."""
+    whole = next((c for c in known if by_stamps(c, a) and by_stamps(c, b)), None)
+    if whole is None or found.T_target_source is None:
+        return None, None
+    frames = {a.name: _frame(SE2()), b.name: _frame(found.T_target_source)}
+    bodies = {one.name: body_of(one.trajectory, one.loops, one.precision) for one in (a, b)}
+    straight = straighten(bodies, frames, {(a.name, b.name): found.links})
+    return poses_off(whole, (a, b), frames), poses_off(whole, (a, b), straight)
+
+
 def by_pc2grid(target: JoinableMap, source: JoinableMap) -> Found:
     """As `pc2grid db join` does it."""
     join = join_maps(target, source)
@@ -210,13 +224,7 @@ def _row(a: Session, b: Session, known: Sequence[Session], method: str) -> Row:
         x, y = source.grid.to_point(np.argwhere(source.grid.free)).mean(axis=0).tolist()
         at = SE2(x, y)
         off = (T_a_b @ at).inverse() @ found.T_target_source @ at
-    whole = next((c for c in known if by_stamps(c, a) and by_stamps(c, b)), None)
-    drawn_m = straight_m = None
-    if whole is not None and found.links and found.T_target_source is not None:
-        frames = {a.name: _frame(SE2()), b.name: _frame(found.T_target_source)}
-        bodies = {one.name: body_of(one.trajectory, one.loops, one.precision) for one in (a, b)}
-        drawn_m = poses_off(whole, (a, b), frames)
-        straight_m = poses_off(whole, (a, b), straighten(bodies, frames, {(a.name, b.name): found.links}))
+    drawn_m, straight_m = _both_off(a, b, found, known)
     return Row(
         target=a.name,
         source=b.name,
