@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 
 from pc2grid.errors import DatabaseError
 from pc2grid.geometry import SE2
-from pc2grid.model import OccupancyGrid
+from pc2grid.model import UNKNOWN, OccupancyGrid, Precision, Trajectory
 from signature.cluster import LOCAL
 from signature.config import Config
 from signature.database import Label, SubmapDatabase, maintenance, open_database
@@ -26,7 +27,7 @@ from signature.localization.joining.journal import JoinJournal
 from signature.sessions import add_sessions, provenance
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, part
 from tests.helpers.session_maps import session, way
-from tests.helpers.simulated_drives import plan
+from tests.helpers.simulated_drives import office, plan
 
 OTHER = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
 NONE: tuple[tuple[float, ...], ...] = ((0.0,) * 3,) * 3
@@ -90,6 +91,43 @@ def test_the_frame_of_a_building_is_that_of_the_named_session(database: SubmapDa
     assert distance_m < 0.05 + 9.0 * 0.0072 and turn_rad < 0.0072
     with pytest.raises(DatabaseError, match="no session 'north'"):
         join_sessions(database, frame="north")
+
+
+def drawn_bent(grid: OccupancyGrid) -> OccupancyGrid:
+    """The map as a robot draws it whose heading drifts by 0.003 rad for each metre to the east."""
+    height, width = grid.cells.shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    off_m = 0.5 * 0.003 * (x * grid.resolution_m + grid.origin_m[0]) ** 2
+    rows = np.floor(y - off_m / grid.resolution_m).astype(int)
+    cells = grid.cells[rows.clip(0, height - 1), x.astype(int)]
+    return replace(grid, cells=np.where((rows >= 0) & (rows < height), cells, UNKNOWN).astype(np.int8))
+
+
+def test_a_session_that_drifts_is_straightened_by_one_that_does_not(tmp_path: Path) -> None:
+    along = np.arange(1.0, 19.0, 0.2)
+    poses = np.array([SE2(x, 7.0 + 0.0015 * x * x, 0.003 * x).lift() for x in along.tolist()])
+    drive = Trajectory(stamps_ns=np.arange(len(along)), T_session_base=poses)
+    # A local map each 4 m, as exact as tracking is.
+    exact = Precision(stamps_ns=tuple(range(0, len(along), 20)), sigma_m=(0.1,) * 5)
+    bent = replace(session("bent", drawn_bent(office()), drive), precision=exact)
+    maps = (session("plan", office(), way()), bent)
+    path = tmp_path / "x.submaps"
+    add_sessions(
+        path, [(one, provenance(Path(one.session), one.session, Config())) for one in maps], Config()
+    )
+    with open_database(path) as opened:
+        frames = join_sessions(opened).frames
+        whole = map_of(opened, "plan", frames)
+    rigid = frames["bent"].T_building_session
+    true_m = np.column_stack((along, np.full(len(along), 7.0)))
+    straight_m = frames["bent"].apply(poses[:, :2, 3])
+    drawn, straight = (np.hypot(*(at - true_m).T).mean() for at in (rigid.apply(poses[:, :2, 3]), straight_m))
+    # The plan is two pieces of 12 m wide, each of them bent by 5 cm itself: what lies beyond their middles is
+    # straightened no further.
+    assert straight < 0.5 * drawn
+    assert frames["plan"].bend == () and len(frames["bent"].bend) == 5
+    # One map of both has no wall twice.
+    assert whole.occupied.sum() < 1.1 * office().occupied.sum()
 
 
 def test_floors_stay_apart(tmp_path: Path) -> None:
