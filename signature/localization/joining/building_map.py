@@ -31,6 +31,7 @@ def building_map(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> Occupan
     Raises ValueError without a map.
 
     >>> import pc2grid
+    >>> from pc2grid import SE2
     >>> plan = pc2grid.load_map("map.yaml")
     >>> exact = ((0.0, 0.0, 0.0),) * 3
     >>> frame = BuildingFrame(name="x", T_building_session=SE2(10.0, 0.0, 0.0), covariance=exact)
