@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -57,14 +58,15 @@ def answer_query(
     if verdict.status != "located":
         seen, verdict = _by_last_metres(index, seen, verdict, query.last_metres(), prior_of)
         clock.lap("last_metres")
-    answer = _answer(index, seen, verdict, history)
-    if index.whole is not None:
-        answer = _with_prior(index, index.whole, answer, seen)
-        clock.lap("decide")
-    if query.in_space is not None and index.points_of is not None:
-        answer = settle_in_space(answer, query.in_space, index.points_of, index.config.accept)
+    verdict, prior, excluded = _with_prior(index, seen, verdict, prior_of)
+    clock.lap("decide")
+    in_space = None
+    if query.in_space is not None:
+        verdict, in_space = settle_in_space(verdict, query.in_space, index.points, index.config.accept)
         clock.lap("in_space")
-    return replace(answer, timing_ms=dict(clock.total_ms))
+    answer = _answer(index, seen, verdict, history)
+    timing_ms = dict(clock.total_ms)
+    return replace(answer, prior=prior, excluded=excluded, in_space=in_space, timing_ms=timing_ms)
 
 
 def _by_last_metres(
@@ -86,30 +88,23 @@ def _by_last_metres(
     return query, verdict
 
 
-def _with_prior(index: MapIndex, whole: MapIndex, answer: Answer, query: QueryMap) -> Answer:
-    """The answer with what became of the prior.
+def _with_prior(
+    index: MapIndex, query: QueryMap, verdict: Verdict, prior_of: PriorOf
+) -> tuple[Verdict, Literal["used", "lapsed"] | None, Moment | None]:
+    """The verdict, what became of the prior, and the best place that it excludes.
 
-    Where nothing that it allows is certain, all places are searched. What is certain without the prior is
-    not taken away by it, although a search of the whole region finds more rivals than signatures
-    propose; and a query that certainly is elsewhere is not in the region.
+    Where nothing that the prior allows is certain, all places are searched: those that fit better outside
+    tell what wrong places score.
     """
-    if not index.prior_applies(query):
-        return replace(answer, prior="lapsed")
-    answer = replace(answer, prior="used")
-    if answer.status == "located":
-        return answer
-    verdict = decide(whole, query, whole.look_up(query))
-    if not verdict.hypotheses:
-        return answer
-    if index.allows(query, verdict.hypotheses[0]):
-        if verdict.status == "located":
-            answer = replace(_answer(index, query, verdict, answer.history[:-1]), prior="used")
-        return answer
-    excluded = moment_of(whole, query, verdict)
-    if excluded.status == "located":
-        last = replace(answer.history[-1], status="not_found")
-        answer = replace(answer, status="not_found", history=(*answer.history[:-1], last))
-    return replace(answer, excluded=excluded)
+    if index.whole is None or not index.prior_applies(query):
+        return verdict, None if index.whole is None else "lapsed", None
+    if verdict.status == "located":
+        return verdict, "used", None
+    everywhere = index.whole.search_whole_maps(query, index.whole.look_up(query, verdict.hypotheses))
+    best = judge(index.whole, query, everywhere)
+    excluded = best.hypotheses and not index.allows(query, best.hypotheses[0])
+    verdict = judge(index, query, everywhere, prior_of)
+    return verdict, "used", moment_of(index.whole, query, best) if excluded else None
 
 
 def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:

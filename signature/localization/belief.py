@@ -136,12 +136,12 @@ class Belief:
             here = look.mass(self._place[1])
         if best is not None:
             place = look.places[0]
-            goes_on = not self._was_located or here >= POSTERIOR.in_the_map
+            goes_on = not self._was_located or here >= POSTERIOR.likely
             self._was_located = True
             all_of = (h for h, number in zip(look.hypotheses, look.places, strict=True) if number == place)
             self._place = look.part, (best, *(h for h in all_of if h is not best))
             return "located" if goes_on else "recovered"
-        if here >= POSTERIOR.in_the_map:
+        if here >= POSTERIOR.likely:
             return "doubtful"
         self._place = None
         return "lost" if self._was_located else "searching"

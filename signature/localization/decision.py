@@ -1,7 +1,7 @@
 """What is decided of a query: the masses of the places that are found, and the status that they give.
 
 located      one place has at least the mass `RelocalizeConfig.accept`
-ambiguous    the query more likely than not lies at one of the places that fit equally well
+ambiguous    the query more likely than not lies at one of the places
 not_found    all else
 """
 
@@ -19,10 +19,7 @@ from signature.localization.map_index import MapIndex
 from signature.localization.posterior import (
     NO_EVIDENCE,
     POSTERIOR,
-    Evidence,
-    alike,
     evidence_of,
-    in_the_map,
     masses,
     tail_of,
 )
@@ -66,19 +63,23 @@ def judge(
     """The posterior over the places of the hypotheses, see `signature.localization.posterior`.
 
     A place that the prior of the index excludes has no mass. But it shows what wrong places score for this
-    query, so it remains a rival, unless it fits as well as the best one that is allowed: between equal places
-    the prior decides. Otherwise any place in a small region, which has few rivals, would look certain.
+    query, so it remains a rival. Otherwise any place in a small region, which has few rivals, would look
+    certain.
     """
     places, rivals = _allowed(index, query, places_of(index, query, hypotheses))
     if not places:
         return NOTHING
-    known = _by_mass(index, query, [(place, prior_of(place)) for place in places], rivals)
+    evidence_for = evidence_of([place[0].fit for place in places], query, rivals)
+    known = list(zip(places, map(prior_of, places), evidence_for, strict=True))
+    known.sort(key=lambda each: -math.log(each[1]) - each[2].log_odds())
     ordered, prior, evidence = (list(each) for each in zip(*known, strict=True))
+    best = ordered[0][0]
+    evidence[0] = replace(evidence[0], tail=tail_of(query, best.fit, index.maps[best.session_index].walls))
     # The same place on a floor that looks alike and is not contradicted has the same mass.
-    floors = unseen_alike(index, query, ordered[0][0]) if evidence[0].log_odds() > 0.0 else []
+    floors = unseen_alike(index, query, best) if evidence[0].log_odds() > 0.0 else []
     mass = masses([*evidence, *evidence[:1] * len(floors)], [*prior, *prior[:1] * len(floors)]).tolist()
     ordered += [(h,) for h in floors if not any(_same(query, h, o) for place in ordered for o in place)]
-    status: Status = "ambiguous" if in_the_map(evidence, prior) >= POSTERIOR.in_the_map else "not_found"
+    status: Status = "ambiguous" if sum(mass) >= POSTERIOR.likely else "not_found"
     return Verdict(
         status="located" if mass[0] >= index.config.accept else status,
         confidence=mass[0],
@@ -92,23 +93,8 @@ def judge(
 def _allowed(index: MapIndex, query: QueryMap, places: Sequence[Place]) -> tuple[list[Place], list[Fit]]:
     """The places that the prior of the index allows, and fits of others that tell what wrong places score."""
     inside = [tuple(h for h in place if index.allows(query, h)) for place in places]
-    allowed = [place for place in inside if place]
-    highest = max((place[0].fit.score for place in allowed), default=0.0)
     excluded = [place[0].fit for place, left in zip(places, inside, strict=True) if not left]
-    return allowed, [fit for fit in excluded if not alike(fit.score, highest)]
-
-
-def _by_mass(
-    index: MapIndex, query: QueryMap, places: Sequence[tuple[Place, float]], rivals: Sequence[Fit]
-) -> list[tuple[Place, float, Evidence]]:
-    """Places, their priors and what tells for them, by mass; what the last scans tell, of the first."""
-    fits = [place[0].fit for place, _ in places]
-    found = list(evidence_of(fits, query, rivals))
-    order = sorted(range(len(found)), key=lambda k: -found[k].log_odds() - math.log(places[k][1]))
-    best = order[0]
-    walls = index.maps[places[best][0][0].session_index].walls
-    found[best] = replace(found[best], tail=tail_of(query, fits[best], walls))
-    return [(*places[k], found[k]) for k in order]
+    return [place for place in inside if place], excluded
 
 
 def _same(query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:

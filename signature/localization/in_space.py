@@ -10,17 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
-from pc2grid.matching.icp_in_space import RAYS, SpatialFit, SpatialView, register_in_space
+from pc2grid.matching.icp_in_space import RAYS, SpatialFit, register_in_space
 from pc2grid.model import PointMap
 from signature.database import SubmapDatabase
-from signature.localization.answer import Answer, Moment, PoseInSpace, SpaceStatus
-from signature.localization.hypotheses import Hypothesis
+from signature.localization.answer import PoseInSpace, SpaceStatus, Verdict
 from signature.localization.posterior import POSTERIOR
 from signature.localization.query import QueryInSpace
 
@@ -32,7 +30,6 @@ class SpaceParameters:
 
     agrees, contradicts : from the first share of rays on surfaces a place agrees, below the second it
         contradicts.
-    sure : of several places one is chosen only from this share on.
     patch_log_odds : of one place against another, for each patch of the building that only it explains
         (`Rays.patches_over`). Two maps of one simulated office, with other things in it, differ by 0 to 4 of
         them, by 7 where a map is bent; offices whose ceilings differ by 1 m, by 30 where they are seen.
@@ -41,7 +38,6 @@ class SpaceParameters:
 
     agrees: float = 0.75
     contradicts: float = 0.55
-    sure: float = 0.85
     patch_log_odds: float = 0.2
     places: int = 5
 
@@ -59,73 +55,57 @@ def points_reader(database: SubmapDatabase) -> PointsOf | None:
     return lru_cache(maxsize=SPACE.places)(database.points)
 
 
-def settle_in_space(answer: Answer, query: QueryInSpace, points_of: PointsOf, accept: float) -> Answer:
-    """The answer, refined and checked in space; as it was where the query or the map has no points.
+def settle_in_space(
+    verdict: Verdict, query: QueryInSpace, points_of: Callable[[int], PointMap | None], accept: float
+) -> tuple[Verdict, PoseInSpace | None]:
+    """The verdict, refined and checked in space, and the pose there; as it was, and None, where the query or
+    a map has no points.
 
-    points_of : the points of a session. accept : least confidence to be located.
+    points_of : the points of a session, by its index. accept : least confidence to be located.
     """
     views, T_odom_base = query.views, query.T_odom_base
-    if not views or T_odom_base is None or not answer.hypotheses or answer.status == "not_found":
-        return answer
-    rivals = _rivals(answer)
-    if answer.status == "located":
-        (best,) = _fits(answer, rivals[:1], views, points_of)
-        if best is None:
-            return answer
-        in_space = _pose(best, T_odom_base)
-        if in_space.status == "contradicts":
-            return _refused(answer, in_space)
-        return _located(answer, rivals[0], best, T_odom_base, answer.confidence)
-    if not 2 <= len(rivals) <= SPACE.places:
-        return answer
-    # Ambiguous: one place must agree, and every other place must have been compared and agree less.
-    compared = [fit for fit in _fits(answer, rivals, views, points_of) if fit is not None]
-    if len(compared) < len(rivals):
-        return answer
-    best_of = winner(compared, accept)
-    if best_of is None:
-        return answer
-    first, confidence = best_of
-    return _located(answer, rivals[first], compared[first], T_odom_base, confidence)
+    rivals = _rivals(verdict)
+    if not views or T_odom_base is None or not 1 <= len(rivals) <= SPACE.places:
+        return verdict, None
+    fits = []
+    for row in rivals:
+        h = verdict.hypotheses[row]
+        points = points_of(h.session_index)
+        fit = None if points is None else register_in_space(views, points, h.fit.T_map_query)
+        if fit is None or fit.rays < RAYS.least:
+            return verdict, None
+        fits.append(fit)
+    first, share = _likeliest(fits, [verdict.masses[verdict.places[row]] for row in rivals])
+    in_space = _pose(fits[first], T_odom_base)
+    if verdict.status == "located" and in_space.status == "contradicts":
+        return _refused(verdict, in_space.on), in_space
+    if verdict.status == "located":
+        return _located(verdict, rivals[first], in_space, T_odom_base, verdict.confidence), in_space
+    if share < accept or in_space.status != "agrees":
+        return verdict, None
+    return _located(verdict, rivals[first], in_space, T_odom_base, share), in_space
 
 
-def winner(fits: Sequence[SpatialFit], accept: float) -> tuple[int, float] | None:
-    """Number and confidence of the one of several places that alone agrees in space; None if none does.
-
-    accept : least confidence to be chosen.
-    """
-    odds = np.array([[other.compared.patches_over(fit.compared) for other in fits] for fit in fits])
-    # Each row: how much more likely the other places are than this one; 0 for the place itself.
-    probabilities = 1.0 / np.exp(SPACE.patch_log_odds * odds).sum(axis=1)
-    first = int(probabilities.argmax())
-    confidence = float(probabilities[first])
-    return (first, confidence) if fits[first].on >= SPACE.sure and confidence >= accept else None
+def _rivals(verdict: Verdict) -> list[int]:
+    """Numbers of the hypotheses that are compared: of a located verdict the best one, of an ambiguous one the
+    best of each place, without those that lie so far behind that they do not lessen its mass."""
+    if verdict.status != "ambiguous":
+        return [0] if verdict.status == "located" else []
+    scores = [h.fit.score for h in verdict.hypotheses]
+    least = (1.0 - POSTERIOR.longest_lead) * max(scores)
+    first = [verdict.places.index(place) for place in dict.fromkeys(verdict.places)]
+    return [row for row in first if scores[row] >= least]
 
 
-def _fits(
-    answer: Answer, wanted: list[Hypothesis], views: tuple[SpatialView, ...], points_of: PointsOf
-) -> list[SpatialFit | None]:
-    """A fit for each of these hypotheses of the answer; None for one that cannot be compared."""
-    compared: list[SpatialFit | None] = []
-    maps: dict[str, PointMap | None] = {}
-    for hypothesis in wanted:
-        session = answer.sessions[hypothesis.session_index]
-        if session not in maps:
-            maps[session] = points_of(session)
-        points = maps[session]
-        fit = None if points is None else register_in_space(views, points, hypothesis.fit.T_map_query)
-        compared.append(fit if fit is not None and fit.rays >= RAYS.least else None)
-    return compared
-
-
-def _rivals(answer: Answer) -> list[Hypothesis]:
-    """The best hypothesis of each place, best first, without those that lie so far behind the best one that
-    they do not lessen its confidence."""
-    first: dict[int, Hypothesis] = {}
-    for hypothesis, place in zip(answer.hypotheses, answer.places, strict=True):
-        first.setdefault(place, hypothesis)
-    least = (1.0 - POSTERIOR.longest_lead) * max(hypothesis.fit.score for hypothesis in first.values())
-    return [hypothesis for hypothesis in first.values() if hypothesis.fit.score >= least]
+def _likeliest(fits: Sequence[SpatialFit], masses: Sequence[float]) -> tuple[int, float]:
+    """Number of the place that is likeliest by its mass in the plane and its points, and its share of the
+    masses of all."""
+    patches = np.array([[other.compared.patches_over(fit.compared) for other in fits] for fit in fits])
+    # Each row: the masses of the places beside that of one of them, which only the points of both change.
+    odds = np.exp(SPACE.patch_log_odds * patches) * np.asarray(masses)
+    shares = np.asarray(masses) / odds.sum(axis=1)
+    first = int(shares.argmax())
+    return first, float(shares[first])
 
 
 def _pose(fit: SpatialFit, T_odom_base: F64) -> PoseInSpace:
@@ -146,60 +126,27 @@ def _pose(fit: SpatialFit, T_odom_base: F64) -> PoseInSpace:
     )
 
 
-def _refused(answer: Answer, in_space: PoseInSpace) -> Answer:
-    """A located answer that the points contradict: nothing was found."""
-    confidence = min(answer.confidence, in_space.on)
-    return replace(
-        answer,
-        status="not_found",
-        session=None,
-        T_map_base=None,
-        covariance=None,
-        T_map_odom=None,
-        confidence=confidence,
-        masses=tuple(0.0 for _ in answer.masses),
-        history=_ending(answer.history, status="not_found", confidence=confidence),
-        in_space=in_space,
-    )
-
-
-def _ending(history: tuple[Moment, ...], **changed: Any) -> tuple[Moment, ...]:
-    """A history whose last moment, that of the answer, is changed."""
-    return (*history[:-1], *(replace(moment, **changed) for moment in history[-1:]))
+def _refused(verdict: Verdict, on: float) -> Verdict:
+    """A located verdict that the points contradict: nothing was found."""
+    confidence, masses = min(verdict.confidence, on), (0.0,) * len(verdict.masses)
+    return replace(verdict, status="not_found", confidence=confidence, masses=masses)
 
 
 def _located(
-    answer: Answer, hypothesis: Hypothesis, fit: SpatialFit, T_odom_base: F64, confidence: float
-) -> Answer:
-    """The answer at one of its hypotheses, with the pose that its points give."""
-    in_space = _pose(fit, T_odom_base)
-    T_map_odom = SE2.from_matrix(in_space.T_map_base) @ answer.T_odom_base.inverse()
-    T_map_base = T_map_odom @ answer.T_odom_base
+    verdict: Verdict, row: int, in_space: PoseInSpace, T_odom_base: F64, confidence: float
+) -> Verdict:
+    """The verdict at one of its hypotheses, with the pose that its points give."""
     planar = np.ix_((0, 1, 5), (0, 1, 5))
-    refined = replace(
-        hypothesis,
-        fit=replace(hypothesis.fit, T_map_query=T_map_odom, covariance=in_space.covariance[planar]),
-    )
-    row = next(k for k, other in enumerate(answer.hypotheses) if other is hypothesis)
-    order = [row, *(k for k in range(len(answer.hypotheses)) if k != row)]
-    places = [answer.places[k] for k in order]
-    numbers = {known: number for number, known in enumerate(dict.fromkeys(places))}
-    session = answer.sessions[hypothesis.session_index]
-    hypotheses = tuple(refined if k == row else answer.hypotheses[k] for k in order)
+    chosen = verdict.hypotheses[row]
+    T_map_query = SE2.from_matrix(in_space.T_map_base) @ SE2.from_matrix(T_odom_base).inverse()
+    refined = replace(chosen.fit, T_map_query=T_map_query, covariance=in_space.covariance[planar])
+    order = sorted(range(len(verdict.hypotheses)), key=lambda k: k != row)
+    numbers = {k: n for n, k in enumerate(dict.fromkeys(verdict.places[k] for k in order))}
     return replace(
-        answer,
+        verdict,
         status="located",
-        session=session,
-        T_map_base=T_map_base,
-        covariance=in_space.covariance[planar],
-        T_map_odom=T_map_odom,
         confidence=confidence,
-        hypotheses=hypotheses,
-        history=_ending(
-            answer.history, status="located", session=session, pose=T_map_base, confidence=confidence
-        ),
-        places=tuple(numbers[known] for known in places),
-        masses=(confidence, *(0.0 for _ in range(1, len(numbers)))),
-        submap_ids=tuple(answer.submap_ids[k] for k in order),
-        in_space=in_space,
+        hypotheses=(replace(chosen, fit=refined), *(verdict.hypotheses[k] for k in order[1:])),
+        places=tuple(numbers[verdict.places[k]] for k in order),
+        masses=(confidence, *[0.0] * (len(numbers) - 1)),
     )

@@ -14,7 +14,7 @@ from pc2grid.arrays import F64, I64
 from pc2grid.errors import DatabaseCorrupt
 from pc2grid.geometry import SE2
 from pc2grid.matching.window_search import SearchMap
-from pc2grid.model import OccupancyGrid
+from pc2grid.model import OccupancyGrid, PointMap
 from pc2grid.observer import Observer
 from signature.config import Config
 from signature.database.protocol import BuildingFrame, Label
@@ -158,6 +158,10 @@ class MapIndex:
                 f" {len(infos)} sessions, so it was computed now; `pc2grid db copy --recover` makes it whole"
             )
         return index
+
+    def points(self, session_index: int) -> PointMap | None:
+        """The points of a session; None if it has none."""
+        return None if self.points_of is None else self.points_of(self.sessions[session_index])
 
     @property
     def prior(self) -> Prior | None:

@@ -18,7 +18,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
@@ -31,13 +31,12 @@ from pc2grid.io.map_pose import MapPose
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
-from signature.localization.answering import answer_query
 from signature.localization.belief import Masses
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import evidence_of
-from signature.localization.prior import Prior, Region
+from signature.localization.prior import Prior
 
 if TYPE_CHECKING:
     from signature.localization.localizer import Watch
@@ -54,8 +53,6 @@ class CheckParameters:
     near_m, near_rad : poses so far around the checked one are compared with it.
     most_scans : so many past scans of a running robot are remembered with their poses; a belief may be as old
         as the oldest, at 40 scans a second two minutes.
-    most_waiting : so many beliefs wait for their scans; of more, the oldest are left out.
-    nearest_s : a belief counts at the scan that is nearest to it in time, if it is as near as this.
     """
 
     tolerance_m: float = 0.3
@@ -63,8 +60,6 @@ class CheckParameters:
     near_m: float = 1.5
     near_rad: float = math.radians(45.0)
     most_scans: int = 5000
-    most_waiting: int = 50
-    nearest_s: float = 0.5
 
 
 CHECK = CheckParameters()
@@ -120,9 +115,7 @@ def check_pose(
     >>> checked.status, checked.off_m < 0.1
     ('fine', True)
     """
-    Region.of(
-        _around(T_map_base, session), index.sessions
-    )  # raises what is wrong with the session before any work
+    index.within(_around(T_map_base, session))  # raises what is wrong with the session before any work
     localizer = Localizer(index, prior_ns=stamp_ns)
     for registered, planar_scan in scans:
         localizer.take(registered, planar_scan)
@@ -147,8 +140,9 @@ def check_pose(
 def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None) -> PoseCheck:
     """Whether a pose at the query's last scan is right. Raises the errors of `check_pose`."""
     index, seen = localizer.index, localizer.query.map()
-    region = Region.of(_around(T_map_base, session), index.sessions)
-    number = region.session_index
+    near = index.within(_around(T_map_base, session))
+    assert near.region is not None
+    number = near.region.session_index
     T_map_query = T_map_base @ seen.T_odom_base.inverse()
     fit = score_fit(index.maps[number].walls, seen.walls, T_map_query, np.zeros((3, 3)))
     believed = Hypothesis(session_index=number, row=-1, fit=fit)
@@ -160,26 +154,20 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
         places=(0,),
         masses=(1.0,),
     )
-    inside, prior_of = index.within(region.prior), partial(before.prior, seen)
-    answer = localizer.answer(inside.search_whole_maps(seen, (believed,)), prior_of)
-    if answer.status != "located":  # places that fit as well elsewhere make nothing near the pose doubtful
-        near = answer_query(inside, localizer.query, seen, answer.hypotheses, prior_of=prior_of)
-        answer = replace(near, prior=None) if near.status == "located" else answer
-    bases = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
-    in_frame = [
-        (base, place)
-        for base, place, h in zip(bases, answer.places, answer.hypotheses, strict=True)
-        if h.session_index == number and region.prior.allows(base)
+    answer = localizer.answer(near.search_whole_maps(seen, (believed,)), partial(before.prior, seen))
+    apart = [
+        (place, *_apart(T_map_base, h.fit.T_map_query @ answer.T_odom_base))
+        for h, place in zip(answer.hypotheses, answer.places, strict=True)
+        if near.allows(seen, h)
     ]
-    here = {place for base, place in in_frame if _within_tolerance(T_map_base, base)}
+    here = {place for place, *off in apart if _within_tolerance(*off)}
     mass_here = sum(answer.masses[place] for place in here)
-    elsewhere = sum(answer.masses) - mass_here
     # Where the map knows too little to contradict the pose, "at no place of this map" does not exclude it.
     (evidence,) = evidence_of([fit], seen)
-    at_most = mass_here if evidence.log_likelihood < 0.0 else 1.0 - elsewhere
+    at_most = mass_here if evidence.log_likelihood < 0.0 else 1.0 - sum(answer.masses) + mass_here
     status: CheckStatus = "lost" if at_most <= 1.0 - index.config.accept else "unsure"
     status = "fine" if mass_here >= index.config.accept else status
-    off_m, off_rad = _apart(T_map_base, in_frame[0][0]) if in_frame else (None, None)
+    _, off_m, off_rad = apart[0] if apart else (None, None, None)
     return PoseCheck(
         status=status,
         probability=mass_here if status == "fine" else at_most,
@@ -208,8 +196,7 @@ def _apart(a: SE2, b: SE2) -> tuple[float, float]:
     return math.hypot(a.x - b.x, a.y - b.y), abs(wrap_angle(a.yaw - b.yaw))
 
 
-def _within_tolerance(a: SE2, b: SE2) -> bool:
-    off_m, off_rad = _apart(a, b)
+def _within_tolerance(off_m: float, off_rad: float) -> bool:
     return off_m <= CHECK.tolerance_m and off_rad <= CHECK.tolerance_rad
 
 
@@ -245,7 +232,7 @@ class PoseWatch:
         """The scans do not go on from those before."""
         self._localizer = Localizer(self._index)
         self._driven: deque[tuple[int, SE2]] = deque(maxlen=CHECK.most_scans)
-        self._waiting: deque[MapPose] = deque(maxlen=CHECK.most_waiting)
+        self._waiting: MapPose | None = None
         self._T_map_session: SE2 | None = None
         self._judged: SE2 | None = None
 
@@ -270,9 +257,9 @@ class PoseWatch:
         if T_map_session is None or not may_look:
             return None
         T_map_base = T_map_session @ T_session_base
-        if not is_time and (
-            self._judged is None or _within_tolerance(T_map_base, self._judged @ T_session_base)
-        ):
+        judged = T_map_session if self._judged is None else self._judged
+        jumped = not _within_tolerance(*_apart(T_map_base, judged @ T_session_base))
+        if not is_time and not jumped:
             return None
         try:
             checked = judge_pose(self._localizer, T_map_base, self._session)
@@ -290,20 +277,12 @@ class PoseWatch:
         ahead of the scans waits for them.
         """
         newest = self._believed()
-        if newest is not None and newest is not self._received:
-            self._received = newest
-            self._waiting.append(newest)
-        while self._waiting and self._waiting[0].stamp_ns <= self._driven[-1][0]:
-            pose = self._waiting.popleft()
-            nearest_ns, T_session_base = self._nearest(pose.stamp_ns)
-            if abs(nearest_ns - pose.stamp_ns) <= CHECK.nearest_s * 1e9:
-                self._T_map_session = pose.T_map_base @ T_session_base.inverse()
-
-    def _nearest(self, stamp_ns: int) -> tuple[int, SE2]:
-        """The scan nearest in time: stamp and pose. A belief is recent, so the newest are looked at first."""
-        later = self._driven[-1]
-        for known in reversed(self._driven):
-            if known[0] <= stamp_ns:
-                return min(known, later, key=lambda scan: abs(scan[0] - stamp_ns))
-            later = known
-        return later
+        if self._waiting is None and newest is not self._received:
+            self._waiting = self._received = newest
+        (newest_ns, _) = self._driven[-1]
+        if self._waiting is None or self._waiting.stamp_ns > newest_ns:
+            return
+        pose, self._waiting = self._waiting, None
+        if self._driven[0][0] <= pose.stamp_ns:
+            nearest = min(self._driven, key=lambda scan: abs(scan[0] - pose.stamp_ns))
+            self._T_map_session = pose.T_map_base @ nearest[1].inverse()

@@ -16,14 +16,15 @@
 - t is what wrong places tell. However well a place fits, "not in this map" explains the query as well if
   another place fits nearly so well: then such a fit is nothing special. The score (`two_way_score`) is a
   mean, which varies by chance as 1 / sqrt(n). No lead counts as longer than the share q of the score: what
-  scores less is not searched for, so there may always be a rival so near.
+  scores less is not searched for, so there may always be a rival so near. Places that fit equally well are
+  no examples of it. What tells for the best of them tells for each, so they share the mass by their priors.
 - like, how well the query fits onto itself, slid along (`pc2grid.matching.self_likeness`): the walls of a
   bare corridor tell no place along it from another.
 - r_hk, the log-likelihood of the scans from k on, f of these alone: where tracking slips, the scans before
   fit and those after do not, and nothing tells where the robot is now. s is the rate of slips, per scan.
 
-`located` means that one place has at least the mass `RelocalizeConfig.accept`; `not_found`, that the query
-more likely than not is at no place of the map, `ambiguous` all else.
+`located` means that one place has at least the mass `RelocalizeConfig.accept`; `ambiguous`, that the query
+more likely than not lies at one of the places; `not_found` all else.
 
 `pc2grid_lab.experiments.calibration` fits b, c and d to queries whose truth is known, and judges them
 on buildings that were left out.
@@ -34,6 +35,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
@@ -76,8 +78,7 @@ class PosteriorParameters:
     slack, least_agreement : keep the log-odds finite at an agreement of 1 and of 0.
     alike : places whose scores differ by less fit equally well: twice the spread of the score between two
         equal places (simulated twin rooms, which differ by the paths that they were seen from).
-    in_the_map : least mass of all places together, of those that fit equally well as of one, to answer
-        `ambiguous`, not `not_found`.
+    likely : least mass of what is more likely than not.
     """
 
     bias: float = -7.33
@@ -90,7 +91,7 @@ class PosteriorParameters:
     slack: float = 0.2
     least_agreement: float = 0.01
     alike: float = 0.02
-    in_the_map: float = 0.5
+    likely: float = 0.5
 
 
 POSTERIOR = PosteriorParameters()
@@ -103,8 +104,7 @@ class Evidence:
     forward : `pc2grid.matching.two_way_score.Fit.known_agreement`. walls : wall points of the query that lie
     on ground known to the map, weighted by `pc2grid.matching.walls.steadiness`.
     backward, looked_at : the same the other way round.
-    lead : score less that of the best other place, at most `longest_lead` of it. apart : the same, but places
-    that fit equally well do not count as others.
+    lead : score less that of the best place that does not fit equally well, at most `longest_lead` of it.
     likeness : `pc2grid.matching.self_likeness` of the query.
     tail : r_k, log-likelihood of the scans from the k-th one on, the last one first.
     """
@@ -114,7 +114,6 @@ class Evidence:
     backward: float
     looked_at: float
     lead: float
-    apart: float
     likeness: float
     tail: tuple[float, ...] = ()
 
@@ -131,11 +130,8 @@ class Evidence:
     @property
     def terms(self) -> tuple[float, float, float]:
         """What b, c and d are multiplied with."""
-        return 1.0, self.log_likelihood, self.lead * self._sharpness
-
-    @property
-    def _sharpness(self) -> float:
-        return math.sqrt(min(self.walls, POSTERIOR.most) * (1.0 - self.likeness**2))
+        sharpness = math.sqrt(min(self.walls, POSTERIOR.most) * (1.0 - self.likeness**2))
+        return 1.0, self.log_likelihood, self.lead * sharpness
 
     def log_odds(self, p: PosteriorParameters = POSTERIOR) -> float:
         """z: logarithm of the mass of the place over that of "nowhere"; minus infinity without walls."""
@@ -143,49 +139,34 @@ class Evidence:
             return -math.inf
         return float(np.dot((p.bias, p.fit, p.lead), self.terms))
 
-    def log_odds_alike(self, p: PosteriorParameters = POSTERIOR) -> float:
-        """z of the place or one that fits equally well."""
-        return self.log_odds(p) + p.lead * (self.apart - self.lead) * self._sharpness
-
     def slipped(self, p: PosteriorParameters = POSTERIOR) -> float:
         """Mass of "it lay here, but tracking slipped", as a multiple of the mass of the place."""
         return float(p.slip * np.exp(-p.fit * np.array(self.tail)).sum())
 
 
-NO_EVIDENCE = Evidence(forward=0.0, walls=0.0, backward=0.0, looked_at=0.0, lead=0.0, apart=0.0, likeness=0.0)
+NO_EVIDENCE = Evidence(forward=0.0, walls=0.0, backward=0.0, looked_at=0.0, lead=0.0, likeness=0.0)
 
 
 def evidence_of(fits: Sequence[Fit], query: QueryMap, rivals: Sequence[Fit] = ()) -> tuple[Evidence, ...]:
     """Evidence of places, one fit each. rivals : of places that are no answers, but as good an example of
     what wrong places score."""
     scores = np.array([fit.score for fit in (*fits, *rivals)])
-    found = []
-    for k, fit in enumerate(fits):
-        others = np.delete(scores, k)
-        lower = others[others < fit.score - POSTERIOR.alike]
-        higher = others[others > fit.score + POSTERIOR.alike]
-        found.append(
-            Evidence(
-                forward=fit.known_agreement,
-                walls=fit.compared,
-                backward=fit.backward,
-                looked_at=fit.looked_at,
-                lead=_lead(fit.score, others),
-                apart=_lead(fit.score, higher if len(higher) else lower),
-                likeness=query.likeness,
-            )
+    alike = np.abs(scores[: len(fits), None] - scores) <= POSTERIOR.alike
+    each = [
+        Evidence(
+            forward=fit.known_agreement,
+            walls=fit.compared,
+            backward=fit.backward,
+            looked_at=fit.looked_at,
+            lead=min(
+                POSTERIOR.longest_lead * fit.score,
+                fit.score - float(np.max(scores[~equal], initial=-math.inf)),
+            ),
+            likeness=query.likeness,
         )
-    return tuple(found)
-
-
-def alike(score: float, other: float) -> bool:
-    """Whether two places fit equally well, for all that their scores tell."""
-    return abs(score - other) <= POSTERIOR.alike
-
-
-def _lead(score: float, others: F64) -> float:
-    longest = POSTERIOR.longest_lead * score
-    return min(longest, score - float(others.max())) if len(others) else longest
+        for fit, equal in zip(fits, alike, strict=True)
+    ]
+    return tuple(max(compress(each, equal), key=Evidence.log_odds) for equal in alike)
 
 
 def masses(
@@ -200,14 +181,6 @@ def masses(
     odds = np.exp(log_odds - highest)
     lost = odds @ np.array([e.slipped(p) for e in evidence])
     return np.asarray(odds / (math.exp(-highest) + odds.sum() + lost))
-
-
-def in_the_map(
-    evidence: Sequence[Evidence], prior: float | Sequence[float] = 1.0, p: PosteriorParameters = POSTERIOR
-) -> float:
-    """Probability that the query lies at the best of the places or at one that fits equally well."""
-    best = np.max(np.array([e.log_odds_alike(p) for e in evidence]) + np.log(prior), initial=-math.inf)
-    return 1.0 / (1.0 + math.exp(min(-best, 700.0)))
 
 
 def tail_of(query: QueryMap, fit: Fit, walls: Walls) -> tuple[float, ...]:
@@ -227,6 +200,10 @@ def tail_of(query: QueryMap, fit: Fit, walls: Walls) -> tuple[float, ...]:
 
 def tempered(agreement: float, points: float) -> float:
     """Log-likelihood of wall points that agree so well, tempered by their number."""
-    p = POSTERIOR
-    a = min(max(agreement, p.least_agreement), 1.0)
-    return (math.log(a) - math.log(1.0 + p.slack - a)) * points / (points + p.few)
+    return log_likelihood_ratio(agreement) * points / (points + POSTERIOR.few)
+
+
+def log_likelihood_ratio(agreement: float) -> float:
+    """l of an agreement, 0..1: 0 at what wrong places reach."""
+    a = min(max(agreement, POSTERIOR.least_agreement), 1.0)
+    return math.log(a) - math.log(1.0 + POSTERIOR.slack - a)

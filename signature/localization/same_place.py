@@ -23,6 +23,7 @@ from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import UNKNOWN, OccupancyGrid, same_recording
 from signature.localization.hypotheses import Hypothesis, same_pose
 from signature.localization.map_index import MapIndex
+from signature.localization.posterior import log_likelihood_ratio
 from signature.localization.query import QueryMap
 
 
@@ -52,7 +53,8 @@ class SamePlace:
     def probability(self, agreement: float, walls: float) -> float:
         """Probability, 0..1, given the agreement and the wall points that it rests on."""
         k = self.sharpness * min(1.0, walls / 100.0)
-        return 1.0 / (1.0 + math.exp(-k * (_log_odds(agreement) - _log_odds(self.neutral))))
+        least = log_likelihood_ratio(self.neutral)
+        return 1.0 / (1.0 + math.exp(-k * (log_likelihood_ratio(agreement) - least)))
 
 
 SAME_PLACE = SamePlace()
@@ -145,8 +147,3 @@ def unseen_by(query: QueryMap, grid: OccupancyGrid, T_map_query: SE2) -> Occupan
     left = grid.cells.copy()
     left[cells[inside, 0], cells[inside, 1]] = UNKNOWN
     return replace(grid, cells=left)
-
-
-def _log_odds(agreement: float) -> float:
-    a = min(max(agreement, 0.01), 1.0)
-    return math.log(a) - math.log(1.2 - a)

@@ -10,9 +10,8 @@ import pytest
 from pc2grid.geometry import SE2, invert_pose
 from pc2grid.matching.icp_in_space import register_in_space
 from pc2grid.matching.two_way_score import Fit
-from pc2grid.model import Health, OccupancyGrid, PointMap
-from signature.database import Label
-from signature.localization.answer import Answer
+from pc2grid.model import Health, PointMap
+from signature.localization.answer import Verdict
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.in_space import settle_in_space
 from signature.localization.posterior import NO_EVIDENCE
@@ -25,8 +24,8 @@ def points() -> PointMap:
     return twin_map()
 
 
-def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[QueryInSpace, Answer]:
-    """A query, and the planar answer that it lies in the rooms that begin at these x."""
+def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[QueryInSpace, Verdict]:
+    """A query, and the planar verdict that it lies in the rooms that begin at these x."""
     query, scans = QueryInSpace(), drive(height_m, cupboard=cupboard)
     for registered, _ in scans:
         query.add(registered)
@@ -49,97 +48,86 @@ def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[Que
         )
         for x_m in rooms_x_m
     )
-    T_odom_base = SE2.from_matrix(last.T_session_base)
     alone = len(rooms_x_m) == 1
-    answer = Answer(
+    mass = 0.95 if alone else 0.49
+    verdict = Verdict(
         status="located" if alone else "ambiguous",
-        session="floor" if alone else None,
-        stamp_ns=5,
-        T_map_base=hypotheses[0].fit.T_map_query @ T_odom_base if alone else None,
-        covariance=np.eye(3) * 1e-4 if alone else None,
-        T_map_odom=hypotheses[0].fit.T_map_query if alone else None,
-        confidence=0.95 if alone else 0.5,
+        confidence=mass,
         hypotheses=hypotheses,
         places=tuple(range(len(hypotheses))),
-        history=(),
-        T_odom_base=T_odom_base,
-        path_m=1.0,
-        sessions=("floor",),
-        labels=(Label(),),
-        submap_ids=(-1,) * len(hypotheses),
+        masses=(mass,) * len(hypotheses),
         evidence=NO_EVIDENCE,
-        local_map=OccupancyGrid(cells=np.zeros((1, 1)), resolution_m=0.05, origin_m=(0.0, 0.0)),
     )
-    return query, answer
+    return query, verdict
+
+
+def base_of(verdict: Verdict, query: QueryInSpace) -> SE2:
+    """The base at the first hypothesis, in the plane."""
+    assert query.T_odom_base is not None
+    return verdict.hypotheses[0].fit.T_map_query @ SE2.from_matrix(query.T_odom_base)
 
 
 @pytest.mark.parametrize(("height_m", "x_m"), [(HEIGHTS_M[0], 0.0), (HEIGHTS_M[1], APART_M)])
 def test_twins_in_the_plane_are_told_apart_by_their_height(
     height_m: float, x_m: float, points: PointMap
 ) -> None:
-    query, answer = ask(height_m, 0.0, APART_M)
-    settled = settle_in_space(answer, query, lambda _: points, accept=0.9)
-    assert settled.status == "located" and settled.session == "floor" and settled.confidence > 0.9
-    assert settled.T_map_base is not None and settled.in_space is not None
-    assert abs(settled.T_map_base.x - x_m - 3.3) < 1.5
-    assert settled.in_space.status == "agrees"
+    query, verdict = ask(height_m, 0.0, APART_M)
+    settled, in_space = settle_in_space(verdict, query, lambda _: points, accept=0.9)
+    assert settled.status == "located" and settled.confidence > 0.9
+    assert in_space is not None and in_space.status == "agrees"
+    base = base_of(settled, query)
+    assert abs(base.x - x_m - 3.3) < 1.5
     assert settled.places == (0, 1)
     # The planar pose is that of space; the floor is at z = 0, and the base on it.
-    assert settled.T_map_base.x == pytest.approx(settled.in_space.T_map_base[0, 3])
-    assert settled.in_space.T_map_base[2, 3] == pytest.approx(0.0, abs=0.02)
-    document = settled.to_json()["in_space"]
-    assert document is not None and document["z"] == settled.in_space.T_map_base[2, 3]
+    assert base.x == pytest.approx(in_space.T_map_base[0, 3])
+    assert in_space.T_map_base[2, 3] == pytest.approx(0.0, abs=0.02)
 
 
 def test_equal_twins_stay_ambiguous(points: PointMap) -> None:
     """Both hypotheses in the same room, which is taken for two places."""
-    query, answer = ask(HEIGHTS_M[0], 0.0, 0.0)
-    settled = settle_in_space(answer, query, lambda _: points, accept=0.9)
-    assert settled is answer
+    query, verdict = ask(HEIGHTS_M[0], 0.0, 0.0)
+    settled, in_space = settle_in_space(verdict, query, lambda _: points, accept=0.9)
+    assert settled is verdict and in_space is None
 
 
 def test_furniture_does_not_tell_twins_apart() -> None:
     """The query is in the second room, or in the first one, into which a cupboard was brought since."""
-    query, answer = ask(HEIGHTS_M[0], 0.0, APART_M, cupboard=True)
+    query, verdict = ask(HEIGHTS_M[0], 0.0, APART_M, cupboard=True)
     points = furnished_map()
-    fits = [register_in_space(query.views, points, h.fit.T_map_query) for h in answer.hypotheses]
+    fits = [register_in_space(query.views, points, h.fit.T_map_query) for h in verdict.hypotheses]
     assert fits[0] is not None and fits[1] is not None
     assert fits[1].on - fits[0].on > 0.05
     assert fits[1].compared.patches_over(fits[0].compared) == 0
-    assert settle_in_space(answer, query, lambda _: points, accept=0.9) is answer
+    assert settle_in_space(verdict, query, lambda _: points, accept=0.9)[0] is verdict
 
 
 def test_a_located_pose_is_refined_and_keeps_its_confidence(points: PointMap) -> None:
-    query, answer = ask(HEIGHTS_M[0], 0.0)
-    off = answer.hypotheses[0].fit.T_map_query @ SE2(0.1, -0.05, 0.03)
-    moved = replace(answer.hypotheses[0], fit=replace(answer.hypotheses[0].fit, T_map_query=off))
-    settled = settle_in_space(replace(answer, hypotheses=(moved,)), query, lambda _: points, accept=0.9)
+    query, verdict = ask(HEIGHTS_M[0], 0.0)
+    first = verdict.hypotheses[0]
+    moved = replace(first, fit=replace(first.fit, T_map_query=first.fit.T_map_query @ SE2(0.1, -0.05, 0.03)))
+    settled, _ = settle_in_space(replace(verdict, hypotheses=(moved,)), query, lambda _: points, accept=0.9)
     assert settled.status == "located" and settled.confidence == 0.95
-    assert settled.T_map_base is not None and answer.T_map_base is not None
-    error = answer.T_map_base.inverse() @ settled.T_map_base
+    error = base_of(verdict, query).inverse() @ base_of(settled, query)
     assert np.hypot(error.x, error.y) < 0.02
-    assert settled.T_map_odom is not None
-    assert settled.T_map_odom == settled.hypotheses[0].fit.T_map_query
 
 
 def test_a_place_that_the_points_contradict_is_turned_down() -> None:
     """The map has the floor there, and walls that stand elsewhere."""
     from tests.helpers.building_clouds import box_surface
 
-    query, answer = ask(HEIGHTS_M[0], 0.0)
+    query, verdict = ask(HEIGHTS_M[0], 0.0)
     other = [box_surface((-5, -5, 0), (10, 10, 0)), box_surface((4.0, -5, 0), (4.0, 10, 4.0))]
     other += [box_surface((-5, 1.0, 0), (10, 1.0, 4.0)), box_surface((-5, -5, 4.0), (10, 10, 4.0))]
     wrong = PointMap.of(np.concatenate(other), 0.05)
-    settled = settle_in_space(answer, query, lambda _: wrong, accept=0.9)
-    assert settled.status == "not_found" and settled.T_map_base is None and settled.session is None
-    assert settled.in_space is not None and settled.in_space.status == "contradicts"
-    assert settled.confidence < 0.9
+    settled, in_space = settle_in_space(verdict, query, lambda _: wrong, accept=0.9)
+    assert settled.status == "not_found" and settled.confidence < 0.9
+    assert in_space is not None and in_space.status == "contradicts"
 
 
 def test_without_points_on_a_side_nothing_changes(points: PointMap) -> None:
-    query, answer = ask(HEIGHTS_M[0], 0.0)
-    assert settle_in_space(answer, query, lambda _: None, accept=0.9) is answer
-    assert settle_in_space(answer, QueryInSpace(), lambda _: points, accept=0.9) is answer
+    query, verdict = ask(HEIGHTS_M[0], 0.0)
+    assert settle_in_space(verdict, query, lambda _: None, accept=0.9) == (verdict, None)
+    assert settle_in_space(verdict, QueryInSpace(), lambda _: points, accept=0.9) == (verdict, None)
 
 
 def test_what_was_seen_before_tracking_was_lost_is_forgotten() -> None:
