@@ -14,6 +14,9 @@ from signature.localization.answer import Answer, Moment, PoseInSpace
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.localizer import Look
 
+_APART = BuildingFrame(name="", T_building_session=SE2(), covariance=((0.0,) * 3,) * 3)
+"""Of a session that is not joined: its poses stay as they are."""
+
 
 def answer_in_building(answer: Answer, frames: Mapping[str, BuildingFrame]) -> Answer:
     """An answer with all poses in the frames of the buildings, where their sessions have one.
@@ -21,46 +24,33 @@ def answer_in_building(answer: Answer, frames: Mapping[str, BuildingFrame]) -> A
     frames : of sessions that were joined, by name (`SubmapDatabase.frames`). Covariances contain how exactly
     the session is known to lie in its building.
     """
-    if not any(name in frames for name in answer.sessions):
-        return answer
-
-    def moved(hypothesis: Hypothesis) -> Hypothesis:
-        frame = frames.get(answer.sessions[hypothesis.session_index])
-        if frame is None:
-            return hypothesis
-        fit = hypothesis.fit
-        T_map_base = fit.T_map_query @ answer.T_odom_base
-        T_building_query = frame.at(T_map_base.x, T_map_base.y) @ fit.T_map_query
-        covariance = covariance_in_building(fit.covariance, T_map_base, frame)
-        return replace(hypothesis, fit=replace(fit, T_map_query=T_building_query, covariance=covariance))
-
-    excluded = None if answer.excluded is None else _moment(answer.excluded, frames)
+    frame_of = [frames.get(name, _APART) for name in answer.sessions]
+    hypotheses = tuple(
+        _hypothesis(h, frame_of[h.session_index], answer.T_odom_base) for h in answer.hypotheses
+    )
     stated = replace(
         answer,
-        hypotheses=tuple(map(moved, answer.hypotheses)),
+        hypotheses=hypotheses,
         history=tuple(_moment(moment, frames) for moment in answer.history),
-        excluded=excluded,
-        frames=tuple(frames[name].name if name in frames else None for name in answer.sessions),
+        excluded=answer.excluded and _moment(answer.excluded, frames),
+        frames=tuple(frame.name or None for frame in frame_of),
     )
-    frame = frames.get(answer.session or "")
-    if frame is None or answer.T_map_base is None or answer.T_map_odom is None or answer.covariance is None:
+    if answer.status != "located":
         return stated
-    T_building_session = frame.at(answer.T_map_base.x, answer.T_map_base.y)
+    fit = hypotheses[0].fit
     return replace(
         stated,
-        T_map_base=T_building_session @ answer.T_map_base,
-        T_map_odom=T_building_session @ answer.T_map_odom,
-        covariance=covariance_in_building(answer.covariance, answer.T_map_base, frame),
-        in_space=None if answer.in_space is None else _in_space(answer.in_space, frame),
+        T_map_base=fit.T_map_query @ answer.T_odom_base,
+        T_map_odom=fit.T_map_query,
+        covariance=fit.covariance,
+        in_space=answer.in_space and _in_space(answer.in_space, frame_of[hypotheses[0].session_index]),
     )
 
 
 def look_in_building(look: Look, frames: Mapping[str, BuildingFrame]) -> Look:
     """A look at a running robot with all poses in the frames of the buildings."""
-    frame = frames.get(look.session or "")
-    T_map_base = look.T_map_base
-    if frame is not None and T_map_base is not None:
-        T_map_base = frame.placed(T_map_base)
+    frame = frames.get(look.session or "", _APART)
+    T_map_base = look.T_map_base and frame.placed(look.T_map_base)
     return replace(look, answer=answer_in_building(look.answer, frames), T_map_base=T_map_base)
 
 
@@ -75,11 +65,17 @@ def covariance_in_building(covariance: F64, T_session_base: SE2, frame: Building
     return np.asarray(turn @ covariance @ turn.T + J @ np.array(frame.covariance) @ J.T)
 
 
+def _hypothesis(hypothesis: Hypothesis, frame: BuildingFrame, T_odom_base: SE2) -> Hypothesis:
+    fit = hypothesis.fit
+    T_map_base = fit.T_map_query @ T_odom_base
+    T_building_query = frame.at(T_map_base.x, T_map_base.y) @ fit.T_map_query
+    covariance = covariance_in_building(fit.covariance, T_map_base, frame)
+    return replace(hypothesis, fit=replace(fit, T_map_query=T_building_query, covariance=covariance))
+
+
 def _moment(moment: Moment, frames: Mapping[str, BuildingFrame]) -> Moment:
-    frame = frames.get(moment.session or "")
-    if frame is None or moment.pose is None:
-        return moment
-    return replace(moment, pose=frame.placed(moment.pose))
+    frame = frames.get(moment.session or "", _APART)
+    return replace(moment, pose=moment.pose and frame.placed(moment.pose))
 
 
 def _in_space(pose: PoseInSpace, frame: BuildingFrame) -> PoseInSpace:

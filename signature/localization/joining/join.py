@@ -40,7 +40,7 @@ from signature.localization.joining.pieces import (
     pieces_of,
     rigid,
 )
-from signature.localization.posterior import NO_EVIDENCE, Evidence, evidence_of, masses
+from signature.localization.posterior import NO_EVIDENCE, POSTERIOR, Evidence, evidence_of, masses
 from signature.localization.query import QueryMap
 from signature.localization.same_place import SAME_PLACE
 
@@ -323,7 +323,9 @@ def _judged(
     # The part was chosen: of so many parts of the smaller session, this one fits best.
     share = min(common_m2 / max(min(source.grid.free_m2, target.grid.free_m2), 1e-9), 1.0)
     odds = prior * max(share, 1e-9)
-    probability = float(masses([evidence], odds)[0])
+    # Transforms that fit equally well share the mass.
+    equal = int(np.count_nonzero(np.abs(scores - scores[number]) <= POSTERIOR.alike))
+    probability = float(masses([evidence] * equal, odds)[0])
     enough = common_m2 >= parameters.least_m2
     return Join(
         status=_status(evidence, odds, probability, enough, parameters),
@@ -346,7 +348,7 @@ def _status(
     if enough and probability >= parameters.accept:
         return "joined"
     # That the source lies here, or at a place that fits equally well, is more probable than not.
-    return "ambiguous" if evidence.log_odds_alike() + math.log(odds) > 0.0 else "different"
+    return "ambiguous" if evidence.log_odds() + math.log(odds) > 0.0 else "different"
 
 
 def known_part(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE2) -> OccupancyGrid:

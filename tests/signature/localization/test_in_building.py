@@ -53,8 +53,9 @@ def test_an_answer_in_a_bent_map_moves_as_its_place_does() -> None:
 
 def test_an_answer_in_a_session_that_was_not_joined_stays() -> None:
     answer = locate_map(office_part((9.0, 7.0)), building({"monday": office()}))
-    assert answer_in_building(answer, {"tuesday": FRAME}) is answer
-    assert answer.to_json()["frame"] is None
+    moved = answer_in_building(answer, {"tuesday": FRAME})
+    assert moved.T_map_base == answer.T_map_base and moved.covariance == pytest.approx(answer.covariance)
+    assert moved.to_json()["frame"] is moved.to_json()["hypotheses"][0]["frame"] is None
 
 
 def test_the_covariance_holds_how_exactly_the_session_lies_in_its_building() -> None:
