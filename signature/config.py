@@ -131,7 +131,7 @@ class RelocalizeConfig(Section):
     """Query -> hypotheses -> answer."""
 
     window_m: float = Field(
-        15.0, gt=0, description="length of the latest part of its path that a query is made of"
+        8.0, gt=0, description="length of the latest part of its path that a query is made of"
     )
     step_m: float = Field(1.0, gt=0, description="metres of travel between two searches of the database")
     views: int = Field(8, gt=0, description="number of views that describe a query, along its path")

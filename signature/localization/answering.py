@@ -1,13 +1,12 @@
 """From a query and the hypotheses for it to its answer.
 
-By all that it has seen; if that does not settle it, by the last metres; refined and checked in space, where
+By what it has seen over the last metres, and by what was known before; refined and checked in space, where
 both sides have points.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Literal
 
@@ -16,7 +15,6 @@ import numpy as np
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from signature.localization.answer import Answer, Moment, Verdict
-from signature.localization.belief import Masses
 from signature.localization.decision import PriorOf, anywhere, decide, judge
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.in_space import settle_in_space
@@ -55,9 +53,6 @@ def answer_query(
     clock = clock or Clock()
     verdict = decide(index, seen, found, prior_of)
     clock.lap("decide")
-    if verdict.status != "located":
-        seen, verdict = _by_last_metres(index, seen, verdict, query.last_metres(), prior_of)
-        clock.lap("last_metres")
     verdict, prior, excluded = _with_prior(index, seen, verdict, prior_of)
     clock.lap("decide")
     in_space = None
@@ -67,25 +62,6 @@ def answer_query(
     answer = _answer(index, seen, verdict, history)
     timing_ms = dict(clock.total_ms)
     return replace(answer, prior=prior, excluded=excluded, in_space=in_space, timing_ms=timing_ms)
-
-
-def _by_last_metres(
-    index: MapIndex, query: QueryMap, verdict: Verdict, last_metres: Iterable[QueryMap], prior_of: PriorOf
-) -> tuple[QueryMap, Verdict]:
-    """The first of the shorter queries that is located, with its verdict; the query itself if none is.
-
-    A stretch through rooms that the map lacks or shows otherwise, or in which tracking drifted, spoils the
-    whole query, even after it. Either the whole query lies in the map or its last metres do, so the odds of
-    both add up.
-    """
-    whole = Masses.of(query, verdict)
-    for shorter in last_metres:
-        found = index.look_up(shorter, verdict.hypotheses)
-        if judge(index, shorter, found, prior_of).status == "located":
-            by_last = whole.or_else(decide(index, shorter, found, prior_of))
-            if by_last.confidence >= index.config.accept:
-                return shorter, by_last
-    return query, verdict
 
 
 def _with_prior(

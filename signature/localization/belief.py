@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from pc2grid.geometry import SE2
@@ -77,15 +77,6 @@ class Masses:
         """Prior of a place, relative to that of "nowhere", for a query of later scans."""
         kept = (1.0 - POSTERIOR.slip) ** max(len(query.keyframes), 1)
         return 1.0 + kept * self.mass(place) / (1.0 - kept * sum(self.masses))
-
-    def or_else(self, other: Verdict) -> Verdict:
-        """The verdict on a part of the same scans, with the mass of its first place if the one or the other
-        explanation holds: their odds against "nowhere" add up."""
-        first = [h for h, number in zip(other.hypotheses, other.places, strict=True) if number == 0]
-        nowhere, elsewhere = 1.0 - sum(other.masses), 1.0 - sum(self.masses)
-        odds = sum(other.masses[:1]) / nowhere + self.mass(first) / elsewhere
-        confidence = odds / (1.0 / nowhere + 1.0 / elsewhere - 1.0)
-        return replace(other, confidence=confidence, masses=(confidence, *other.masses[1:]))
 
 
 class Belief:

@@ -100,9 +100,7 @@ class Localizer:
         self.index = index
         prior_ns = prior_ns if index.prior is None else index.prior.stamp_ns
         in_space = index.points_of is not None
-        if query is None:  # not `or`: a query without scans is false
-            query = Query(index.made_with, index.config, prior_ns=prior_ns, in_space=in_space)
-        self.query = query
+        self.query = query or Query(index.made_with, index.config, prior_ns=prior_ns, in_space=in_space)
         self._carried: tuple[Hypothesis, ...] = ()
         self._looked_at = 0, 0.0  # part of the query, and metres driven in it
         self._history.clear()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -43,8 +42,6 @@ class QueryParameters:
     clearance_m : views on the middle lines of the free space are at least so far from walls.
     every_m : distance of the candidates for views along the middle lines.
     path_candidates : candidates for views on the path, evenly spread.
-    last_m : a query that is not located is searched for again with only so many metres of its travel, longest
-        first.
     space_m, space_every_m : metres of travel whose scans are compared in space, and travel between two of
         them. voxel_m : edge of the voxels that such a scan is reduced to.
     """
@@ -54,7 +51,6 @@ class QueryParameters:
     clearance_m: float = 0.3
     every_m: float = 0.5
     path_candidates: int = 40
-    last_m: tuple[float, ...] = (8.0, 4.0)
     space_m: float = 5.0
     space_every_m: float = 0.2
     voxel_m: float = 0.05
@@ -166,8 +162,8 @@ class Query:
     query.
 
     in_space : the same scans in space; None if their points are not needed. part : number of times that
-    registration was lost. lost_scans : on how many of the last scans in a row. driven_m : metres driven in
-    all parts. first_ns : stamp of the first scan.
+    registration was lost. lost_scans : on how many of the last scans in a row. first_ns : stamp of the
+    first scan.
     """
 
     def __init__(
@@ -185,7 +181,6 @@ class Query:
         self._made_with, self._config, self._prior_ns = made_with, config, prior_ns
         self.in_space = QueryInSpace() if in_space else None
         self.part = self.lost_scans = 0
-        self.driven_m = 0.0
         self.first_ns: int | None = None
         self._keyframes: deque[Keyframe] = deque()
         self._newest: Keyframe | None = None
@@ -196,10 +191,6 @@ class Query:
     def path_m(self) -> float:
         """Metres driven since the start, or since registration was lost."""
         return self._newest.path_m if self._newest is not None else 0.0
-
-    def __len__(self) -> int:
-        """The number of keyframes."""
-        return len(self._keyframes)
 
     def add(self, registered: RegisteredScan, planar_scan: PlanarScan) -> None:
         """Take in the next scan; forget what lies more than `relocalize.window_m` of travel back."""
@@ -219,9 +210,7 @@ class Query:
         path_m = 0.0
         if self._keyframes and self._newest is not None:
             step = self._newest.T_odom_base.inverse() @ pose
-            step_m = math.hypot(step.x, step.y)
-            path_m = self._newest.path_m + step_m
-            self.driven_m += step_m
+            path_m = self._newest.path_m + math.hypot(step.x, step.y)
         self._newest = newest = Keyframe(planar_scan, pose, path_m)
         if self._prior_ns is not None and abs(planar_scan.stamp_ns - self._prior_ns) < self._at_prior[0]:
             self._at_prior = abs(planar_scan.stamp_ns - self._prior_ns), newest
@@ -233,29 +222,19 @@ class Query:
         while path_m - self._keyframes[0].path_m > self._config.window_m:
             self._keyframes.popleft()
 
-    def map(self, last_m: float = math.inf) -> QueryMap:
-        """What has been seen over the last `last_m` of travel, described as the database is.
+    def map(self) -> QueryMap:
+        """What has been seen over the last metres, described as the database is.
 
         Raises NoScans if no scan could be used.
         """
         if self._newest is None:
             raise NoScans("no scan of the query shows anything", hint="look at it with `pc2grid info`")
-        if last_m < math.inf or self._drawn is None:
-            drawn = self._draw(self._newest, last_m)
-            if last_m < math.inf:
-                return drawn
-            self._drawn = drawn
+        if self._drawn is None:
+            self._drawn = self._draw(self._newest)
         return self._drawn
 
-    def last_metres(self) -> Iterator[QueryMap]:
-        """The query map again, with the last metres only, as long as these are less than the whole."""
-        for last_m in QUERY.last_m:
-            if last_m < min(self.path_m, self._config.window_m):
-                yield self.map(last_m)
-
-    def _draw(self, newest: Keyframe, last_m: float) -> QueryMap:
-        keyframes = [k for k in self._keyframes if self._keyframes[-1].path_m - k.path_m <= last_m]
-        keyframes = keyframes or [newest]
+    def _draw(self, newest: Keyframe) -> QueryMap:
+        keyframes = tuple(self._keyframes) or (newest,)
         builder = GridBuilder(self._made_with.projection)
         for keyframe in keyframes:
             builder.add(keyframe.planar_scan, keyframe.T_odom_base)
@@ -269,7 +248,7 @@ class Query:
             part=self.part,
             T_odom_prior=None if at_prior is None else at_prior.T_odom_base,
             since_prior_m=0.0 if at_prior is None else newest.path_m - at_prior.path_m,
-            keyframes=(*keyframes, *(() if newest is keyframes[-1] else (newest,))),
+            keyframes=keyframes if newest is keyframes[-1] else (*keyframes, newest),
         )
 
 

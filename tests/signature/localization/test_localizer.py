@@ -2,33 +2,24 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
-from collections.abc import Iterator
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
 
 from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
-from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import FREE, Health, OccupancyGrid, RegisteredScan, Submap
 from signature.config import Config, SignatureConfig
 from signature.database import Label
 from signature.describe import Signature, describe
-from signature.localization import answering
 from signature.localization import query as query_module
-from signature.localization.answer import Moment, Verdict
-from signature.localization.answering import answer_query
-from signature.localization.belief import Masses
+from signature.localization.answer import Moment
 from signature.localization.decision import decide, judge
 from signature.localization.hypotheses import Hypothesis, fitted
 from signature.localization.localizer import Answer, Localizer, MapIndex, locate_in
-from signature.localization.posterior import NO_EVIDENCE
 from signature.localization.query import Query, QueryMap
 from tests.helpers.simulated_drives import building, drive, office, plan
 
@@ -243,91 +234,13 @@ def test_the_json_document_keeps_its_contract() -> None:
     assert {"query", "database", "timing_ms"} <= set(document)
 
 
-def verdict_of(confidence: float) -> Verdict:
-    """One place, where the query lies if its `path_m` is this confidence, which is its mass."""
-    fit = Fit(
-        T_map_query=SE2(),
-        forward=1.0,
-        backward=1.0,
-        overlap=1.0,
-        compared=100.0,
-        looked_at=100.0,
-        score=1.0,
-        covariance=np.eye(3),
-    )
-    return Verdict(
-        status="located" if confidence >= 0.9 else "ambiguous",
-        confidence=confidence,
-        hypotheses=(Hypothesis(session_index=0, row=0, fit=fit),),
-        places=(0,),
-        masses=(confidence,),
-        evidence=NO_EVIDENCE,
-    )
-
-
-def mixed(*confidences: float) -> float:
-    """Mass of a place if one of the explanations holds, that give it these masses: their odds add up."""
-    odds = sum(c / (1.0 - c) for c in confidences)
-    return odds / (odds + 1.0)
-
-
-@pytest.mark.parametrize(
-    ("whole", "shorter", "expected", "asked"),
-    [
-        (0.95, [0.99, 0.99], 0.95, 0),
-        (0.5, [0.98, 0.99], mixed(0.5, 0.98), 1),
-        (0.5, [0.85, 0.92], mixed(0.5, 0.92), 2),  # 0.85 alone is not enough
-        (0.5, [0.85, 0.8], 0.5, 2),
-        (0.5, [], 0.5, 0),
-    ],
-)
-def test_the_last_metres_answer_where_the_whole_query_is_not_sure(
-    whole: float, shorter: list[float], expected: float, asked: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = []
-
-    def last_metres() -> Iterator[QueryMap]:
-        for confidence in shorter:
-            made.append(confidence)
-            yield query_with(confidence)
-
-    def judged(index: MapIndex, query: QueryMap, *known: object) -> Verdict:
-        return verdict_of(query.path_m)
-
-    monkeypatch.setattr(answering, "judge", judged)
-    monkeypatch.setattr(answering, "decide", judged)
-    monkeypatch.setattr(MapIndex, "look_up", lambda index, query, carried: ())
-    query = cast("Query", SimpleNamespace(last_metres=last_metres, in_space=None))
-    answer = answer_query(OFFICE, query, query_with(whole), ())
-    assert answer.confidence == pytest.approx(expected)
-    assert (answer.status == "located") == (expected >= 0.9)
-    assert len(made) == asked
-
-
-def test_what_the_whole_query_says_of_other_places_counts_against_the_last_metres() -> None:
-    """Equal rooms: by all that it has seen it is in the one or in the other, by the last metres in one."""
-    query = query_with(1.0)
-    last, twin = verdict_of(0.95), verdict_of(0.0).hypotheses[0]
-    twin = replace(twin, fit=replace(twin.fit, T_map_query=SE2(9.0, 0.0, 0.0)))
-    both = replace(
-        last, hypotheses=(*last.hypotheses, twin), places=(0, 1), masses=(0.49, 0.49), confidence=0.49
-    )
-    # Odds against "nowhere": 19 by the last metres, 24.5 each by the whole.
-    assert Masses.of(query, both).or_else(last).confidence == pytest.approx((19 + 24.5) / (20 + 49))
-
-
-def query_with(path_m: float) -> QueryMap:
-    query = Query(Config(), Config().relocalize)
-    for registered, planar_scan, _ in itertools.islice(drive(office(), ROUTE), 1):
-        query.add(registered, planar_scan)
-    return replace(query.map(), path_m=path_m)
-
-
-def test_the_last_metres_are_drawn_from_the_newest_scans_alone() -> None:
-    query = Query(Config(), Config().relocalize)
+def test_a_query_is_drawn_from_the_newest_scans_alone() -> None:
+    config = Config().relocalize
+    queries = [Query(Config(), config.model_copy(update={"window_m": m})) for m in (15.0, 2.0)]
     for registered, planar_scan, _ in drive(office(), ROUTE, reach_m=3.0):
-        query.add(registered, planar_scan)
-    whole, last = query.map(), query.map(2.0)
+        for query in queries:
+            query.add(registered, planar_scan)
+    whole, last = (query.map() for query in queries)
     assert last.T_odom_base == whole.T_odom_base and last.path_m == whole.path_m
     assert 0 < last.walls.weight < 0.7 * whole.walls.weight
 

@@ -132,7 +132,7 @@ def queries_of(
         if not session.lost[number]:
             query.add(registered, planar_scan)
         while due and path_m[number] >= due[0]:
-            if len(query):
+            if not np.all(session.lost[: number + 1]):
                 so_far = dataclasses.replace(
                     session,
                     planar_scans=session.planar_scans[: number + 1],
