@@ -19,7 +19,6 @@ and Fox, "Probabilistic Robotics", chapter 8.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -83,7 +82,7 @@ class Belief:
     """The masses of the looks since the start of the last window, and what they say of a running robot."""
 
     def __init__(self) -> None:
-        self._looks: deque[Masses] = deque()
+        self._looks: list[Masses] = []
         self._place: tuple[int, tuple[Hypothesis, ...]] | None = None  # part and place of the last "located"
         self._was_located = False
 
@@ -104,21 +103,21 @@ class Belief:
 
     def prior(self, query: QueryMap, place: Sequence[Hypothesis]) -> float:
         """Prior of a place, relative to that of "nowhere", by the looks before the scans of a query."""
-        before = None
-        for look in self._looks:
-            if query.keyframes and look.part == query.part and look.path_m < query.keyframes[0].path_m:
-                before = look
-        return 1.0 if before is None else before.prior(query, place)
+        before = self._before(query)
+        return before[-1].prior(query, place) if before else 1.0
 
     def add(self, query: QueryMap, found: Verdict | Answer) -> Masses:
         """Keep the masses of a look; those that no later query follows from are forgotten."""
         look = Masses.of(query, found)
-        first_m = query.keyframes[0].path_m if query.keyframes else query.path_m
-        looks = self._looks
-        while len(looks) > 1 and (looks[1].path_m < first_m or looks[0].part != query.part):
-            looks.popleft()
-        self._looks.append(look)
+        forgotten = max(len(self._before(query)) - 1, 0)
+        here = [known for known in self._looks if known.part == query.part]
+        self._looks = [*here[forgotten:], look]
         return look
+
+    def _before(self, query: QueryMap) -> list[Masses]:
+        """The looks that lie before all scans of a query."""
+        first_m = query.keyframes[0].path_m if query.keyframes else 0.0
+        return [look for look in self._looks if look.part == query.part and look.path_m < first_m]
 
     def follow(self, look: Masses, best: Hypothesis | None) -> State:
         """The state of a running robot after a look. best : the hypothesis that it is located at."""

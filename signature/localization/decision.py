@@ -14,7 +14,7 @@ from dataclasses import replace
 from pc2grid.matching.two_way_score import Fit
 from signature.localization.alike_floors import unseen_alike
 from signature.localization.answer import Status, Verdict
-from signature.localization.hypotheses import Hypothesis, coarse_score, same_pose
+from signature.localization.hypotheses import Hypothesis, same_pose
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import (
     NO_EVIDENCE,
@@ -45,16 +45,8 @@ def decide(
     index: MapIndex, query: QueryMap, hypotheses: tuple[Hypothesis, ...], prior_of: PriorOf = anywhere
 ) -> Verdict:
     """The verdict after all maps were searched as a whole, so that neither the right place nor a rival is
-    left out.
-
-    Where the proposals settled it, only for what the coarse search scores as high as the best one, which
-    is faster: a wrong place among few proposals may lead by far, if the right one was not proposed.
-    """
-    verdict, least = judge(index, query, hypotheses, prior_of), 0.0
-    if verdict.status == "located":
-        best = verdict.hypotheses[0]
-        least = coarse_score(query, index.maps_for(query)[best.session_index], best.fit.T_map_query)
-    return judge(index, query, index.search_whole_maps(query, hypotheses, least), prior_of)
+    left out: a wrong place among few proposals may lead by far, if the right one was not proposed."""
+    return judge(index, query, index.search_whole_maps(query, hypotheses), prior_of)
 
 
 def judge(

@@ -24,10 +24,10 @@ from signature.retrieval.vote import Proposal
 class HypothesisParameters:
     """How places are verified. All chosen by hand, checked on fr079 and intel.
 
-    half_t_m, half_a_rad : poses are searched so far around a proposal: half a lattice of viewpoints and half
-        a ray of their isovists, with some reserve.
-    square_m : side of the squares of free ground that a whole map is searched in; headings are searched in
-        equal parts of at most 2 `half_a_rad`.
+    square_m : side of the squares of free ground that a whole map is searched in, and of those around a
+        proposal: a lattice of viewpoints, with some reserve.
+    half_a_rad : headings are searched so far around a proposal, half a ray of its isovist with some reserve;
+        of a whole map in equal parts of at most twice as much.
     few_points : near wall points in the coarse search, and as many far ones; enough to rank poses.
     few_spacing_m : they are at least about so far apart.
     near_m : near are walls up to so far from the centre of rotation. A small error of yaw moves those beyond
@@ -35,7 +35,6 @@ class HypothesisParameters:
     far_m : walls beyond are left out. What is near may be people and carts only: of a real hall, 4 s of a
         lidar were found with the walls between 8 and 20 m and not without them.
     refined : share of `RelocalizeConfig.hypotheses` that is refined; some of these will merge.
-    half_coarse_rad : of a pose whose coarse score is asked for; about half a step of heading of the search.
     same_m, same_rad : two hypotheses nearer than this are one.
     map_m, map_rad : standard deviations of where a map shows what is around a place: half a cell, and over
         the range of a laser as an angle. They are added to those of the alignment, which are of some
@@ -43,7 +42,6 @@ class HypothesisParameters:
         stated (median), with them 1.0.
     """
 
-    half_t_m: float = 0.4
     half_a_rad: float = math.radians(8.0)
     square_m: float = 0.8
     few_points: int = 128
@@ -51,7 +49,6 @@ class HypothesisParameters:
     near_m: float = 8.0
     far_m: float = 20.0
     refined: int = 2
-    half_coarse_rad: float = math.radians(0.8)
     same_m: float = 0.5
     same_rad: float = math.radians(10.0)
     map_m: float = 0.025
@@ -98,7 +95,7 @@ def verify(
             maps[session],
             coarse_points(query.walls.points_m, center),
             np.array([(*p.at_m, p.yaw_rad) for p in members]),
-            half_t_m=HYPOTHESES.half_t_m,
+            half_t_m=0.5 * HYPOTHESES.square_m,
             half_a_rad=HYPOTHESES.half_a_rad,
             parameters=SearchParameters(
                 floor=max(config.coarse_floor, config.coarse_keep * best),
@@ -124,13 +121,11 @@ def search_whole_map(
     target: SearchMap,
     free_xy_m: F64,
     config: RelocalizeConfig,
-    least: float = 0.0,
 ) -> tuple[Hypothesis, ...]:
     """Align the query on the whole map of a session: slower than at proposals, but nothing is left out.
 
     free_xy_m : (K, 2) centres of the squares of `HYPOTHESES.square_m` that hold free space; the base is in
-    one of them. least : placements with a lower coarse score are left out; the higher it is, the faster is
-    the search.
+    one of them.
     """
     center = (query.T_odom_base.x, query.T_odom_base.y)
     count = math.ceil(math.pi / HYPOTHESES.half_a_rad)
@@ -144,7 +139,7 @@ def search_whole_map(
         half_t_m=0.5 * HYPOTHESES.square_m,
         half_a_rad=half_a_rad,
         parameters=SearchParameters(
-            floor=max(config.coarse_floor, least), keep=config.coarse_keep, most=config.hypotheses
+            floor=config.coarse_floor, keep=config.coarse_keep, most=config.hypotheses
         ),
     )
     found = [
@@ -152,21 +147,6 @@ def search_whole_map(
         for x, y, yaw, _ in poses.tolist()
     ]
     return distinct(found, query.T_odom_base)
-
-
-def coarse_score(query: QueryMap, target: SearchMap, T_map_query: SE2) -> float:
-    """What `search_whole_map` scores a pose with, 0..1."""
-    center = (query.T_odom_base.x, query.T_odom_base.y)
-    at = T_map_query @ SE2(*center)
-    poses = search_windows(
-        target,
-        coarse_points(query.walls.points_m, center),
-        np.array([[at.x, at.y, at.yaw]]),
-        half_t_m=target.field.resolution_m,
-        half_a_rad=HYPOTHESES.half_coarse_rad,
-        parameters=SearchParameters(floor=0.0, most=1),
-    )
-    return float(poses[0, 3]) if len(poses) else 0.0
 
 
 def fitted(query: QueryMap, session_index: int, row: int, target: SearchMap, T_map_query: SE2) -> Hypothesis:

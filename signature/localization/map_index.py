@@ -210,20 +210,17 @@ class MapIndex:
         found = (*old, *verify(query, proposals, self.places, self.maps_for(query), self.config))
         return self._worth_keeping(query, found)
 
-    def search_whole_maps(
-        self, query: QueryMap, known: tuple[Hypothesis, ...], least: float = 0.0
-    ) -> tuple[Hypothesis, ...]:
+    def search_whole_maps(self, query: QueryMap, known: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
         """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole; in
         a large database, on those that look most like the query. With a prior: anywhere in its region.
 
-        least : what has a lower coarse score is left out, see `hypotheses.search_whole_map`; and so is what
-        has less than the share `SEARCHED` of the best.
+        What has less than the share `SEARCHED` of the best coarse score is left out.
         """
         found = list(known)
         config = self.config.model_copy(update={"coarse_keep": SEARCHED})
         maps = self.maps_for(query)
         for index, free in self._searched(query):
-            found.extend(search_whole_map(query, index, maps[index], free, config, least))
+            found.extend(search_whole_map(query, index, maps[index], free, config))
         return self._worth_keeping(query, found)
 
     def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:

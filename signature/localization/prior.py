@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from pc2grid.arrays import F64, BoolGrid
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2, wrap_angle
+from signature.localization.hypotheses import HYPOTHESES
 from signature.localization.query import QueryMap
 
 
@@ -26,19 +27,16 @@ from signature.localization.query import QueryMap
 class PriorParameters:
     """How a covariance becomes a region, and how the region grows with travel.
 
-    sigmas_squared : the region of a normal distribution holds the positions within this squared Mahalanobis
-        distance, 99 % of them (the quantile of chi-square with two degrees of freedom).
-    yaw_sigmas : and the headings within so many standard deviations, 99 % of them.
-    least_m, least_rad : a region is at least so wide on each side, the distance within which two
-        hypotheses are one. A smaller one would exclude right places that are drawn a little off.
+    A region is at least as wide on each side as the distance within which two hypotheses are one. A smaller
+    one would exclude right places that are drawn a little off.
+
+    sigmas : the region of a normal distribution holds the positions within this Mahalanobis distance, 99 % of
+        them (the root of the quantile of chi-square with two degrees of freedom), and the headings.
     drift, drift_rad_m : a region for an earlier time grows by this share of the way since, and turns by this
         much a metre. Chosen by hand: the error of wheel odometry that is not calibrated well.
     """
 
-    sigmas_squared: float = 9.21
-    yaw_sigmas: float = 2.58
-    least_m: float = 0.5
-    least_rad: float = math.radians(10.0)
+    sigmas: float = 3.035
     drift: float = 0.03
     drift_rad_m: float = math.radians(0.3)
 
@@ -84,7 +82,7 @@ class Prior:
             raise ConfigError(
                 f"near: expected x and y in metres and a radius > 0, found {x_m:g} {y_m:g} {radius_m:g}"
             )
-        radius_m = max(radius_m, PRIOR.least_m)
+        radius_m = max(radius_m, HYPOTHESES.same_m)
         return Prior(
             T_map_base=SE2(x_m, y_m, yaw_rad),
             shape_m2=radius_m**2 * np.eye(2),
@@ -112,8 +110,8 @@ class Prior:
                 hint="--near X Y RADIUS names one",
             )
         # Added, not a lower bound of the axes, so that the shape of the ellipse stays.
-        shape = PRIOR.sigmas_squared * position + PRIOR.least_m**2 * np.eye(2)
-        half_yaw = PRIOR.yaw_sigmas * math.sqrt(full[2, 2]) + PRIOR.least_rad
+        shape = PRIOR.sigmas**2 * position + HYPOTHESES.same_m**2 * np.eye(2)
+        half_yaw = PRIOR.sigmas * math.sqrt(full[2, 2]) + HYPOTHESES.same_rad
         return Prior(
             T_map_base=T_map_base,
             shape_m2=shape,
