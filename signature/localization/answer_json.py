@@ -188,17 +188,18 @@ def document(answer: answer.Answer) -> AnswerDocument:
 def _prior(answer: answer.Answer) -> PriorUse | None:
     if answer.prior is None:
         return None
-    excluded: Excluded | None = None
-    if answer.excluded is not None:
-        moment = _moment(answer.excluded)
-        excluded = {
-            "session": answer.excluded.session,
-            "status": moment["status"],
-            "x": moment["x"],
-            "y": moment["y"],
-            "yaw": moment["yaw"],
-            "confidence": moment["confidence"],
-        }
+    moment = answer.excluded
+    if moment is None:
+        return {"status": answer.prior, "excluded": None}
+    x, y, yaw = _coordinates(moment.pose)
+    excluded: Excluded = {
+        "session": moment.session,
+        "status": moment.status,
+        "x": x,
+        "y": y,
+        "yaw": yaw,
+        "confidence": moment.confidence,
+    }
     return {"status": answer.prior, "excluded": excluded}
 
 
@@ -227,16 +228,20 @@ def in_space_document(answer: answer.Answer) -> PoseInSpace | None:
 
 
 def _moment(moment: answer.Moment) -> Moment:
-    pose = moment.pose
+    x, y, yaw = _coordinates(moment.pose)
     return {
         "stamp_ns": moment.stamp_ns,
         "path_m": moment.path_m,
         "status": moment.status,
-        "x": None if pose is None else float(pose.x),
-        "y": None if pose is None else float(pose.y),
-        "yaw": None if pose is None else float(pose.yaw),
+        "x": x,
+        "y": y,
+        "yaw": yaw,
         "confidence": moment.confidence,
     }
+
+
+def _coordinates(pose: SE2 | None) -> tuple[float, float, float] | tuple[None, None, None]:
+    return (None, None, None) if pose is None else (float(pose.x), float(pose.y), float(pose.yaw))
 
 
 def _pose(pose: SE2) -> Pose:

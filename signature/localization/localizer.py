@@ -101,8 +101,8 @@ class Localizer:
         prior_ns = prior_ns if index.prior is None else index.prior.stamp_ns
         in_space = index.points_of is not None
         self.query = query or Query(index.made_with, index.config, prior_ns=prior_ns, in_space=in_space)
-        self._carried: tuple[Hypothesis, ...] = ()
-        self._looked_at = 0, 0.0  # part of the query, and metres driven in it
+        # Of the last look: part of the query, metres driven in it, and hypotheses.
+        self._last: tuple[int, float, tuple[Hypothesis, ...]] = 0, 0.0, ()
         self._history.clear()
         self._clock = Clock()
         self._stood = False
@@ -125,8 +125,14 @@ class Localizer:
     @property
     def due(self) -> bool:
         """Whether the robot has travelled `relocalize.step_m` since the last look."""
-        part, path_m = self._looked_at
-        return self.path_m - (path_m if part == self.query.part else 0.0) >= self.index.config.step_m
+        path_m, _ = self._last_look
+        return self.path_m - path_m >= self.index.config.step_m
+
+    @property
+    def _last_look(self) -> tuple[float, tuple[Hypothesis, ...]]:
+        """Metres driven at the last look since registration was lost, and the hypotheses then."""
+        part, path_m, hypotheses = self._last
+        return (path_m, hypotheses) if part == self.query.part else (0.0, ())
 
     def add(self, registered: RegisteredScan, planar_scan: PlanarScan) -> Moment | None:
         """Take in the next scan. After every `relocalize.step_m` of travel the database is searched, and the
@@ -147,10 +153,10 @@ class Localizer:
 
     def looked(self) -> None:
         """The database was searched now without `look`: the next one is due a metre later."""
-        self._keep(self.query.map(), self._carried)
+        self._keep(self.query.map(), self._last_look[1])
 
     def _keep(self, query: QueryMap, hypotheses: tuple[Hypothesis, ...]) -> None:
-        self._carried, self._looked_at = hypotheses, (query.part, query.path_m)
+        self._last = query.part, query.path_m, hypotheses
 
     def answer(self, known: tuple[Hypothesis, ...] = (), prior_of: PriorOf | None = None) -> Answer:
         """Where the query is by all that it has seen. The search goes on as if it had not been asked.
@@ -173,7 +179,7 @@ class Localizer:
         """The query, and what retrieval proposes for it beside the hypotheses of the last look."""
         query = self.query.map()
         self._clock.lap("describe")
-        carried = self._carried if self._looked_at[0] == query.part else ()
+        _, carried = self._last_look
         found = self.index.look_up(query, (*carried, *known))
         self._clock.lap("look_up")
         return query, found

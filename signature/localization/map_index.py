@@ -179,13 +179,18 @@ class MapIndex:
 
     def prior_applies(self, query: QueryMap) -> bool:
         """Whether there is a prior, and the motion of the query since its time is known."""
-        return self.region is not None and self.region.T_odom_prior(query) is not None
+        return self._region_for(query) is not None
+
+    def _region_for(self, query: QueryMap) -> Region | None:
+        lapsed = self.region is None or self.region.T_odom_prior(query) is None
+        return None if lapsed else self.region
 
     def allows(self, query: QueryMap, h: Hypothesis) -> bool:
         """Whether the prior allows the place of a hypothesis; true if there is none that applies."""
-        if self.region is None or not self.prior_applies(query):
-            return True
-        return h.session_index == self.region.session_index and self.region.allows(query, h.fit.T_map_query)
+        region = self._region_for(query)
+        return region is None or (
+            h.session_index == region.session_index and region.allows(query, h.fit.T_map_query)
+        )
 
     def look_up(
         self, query: QueryMap, carried: tuple[Hypothesis, ...] = (), *, rows: I64 | None = None
@@ -236,9 +241,10 @@ class MapIndex:
 
     def _searched(self, query: QueryMap) -> Iterator[tuple[int, F64]]:
         """The maps that are searched as a whole, and the free squares (K, 2) there that may hold the base."""
-        if self.region is not None and self.prior_applies(query):
-            index = self.region.session_index
-            free = self.region.squares(query, self._free[index], HYPOTHESES.square_m)
+        region = self._region_for(query)
+        if region is not None:
+            index = region.session_index
+            free = region.squares(query, self._free[index], HYPOTHESES.square_m)
             if len(free) * HYPOTHESES.square_m**2 <= self.config.exhaustive_m2:
                 yield index, free
             return

@@ -7,7 +7,7 @@
 
     z_h = b + c (f_h + g_h) + d t_h
     f = l(a_f) n_f / (n_f + few),    g = l(a_b) n_b / (n_b + few),    l(a) = ln a - ln(1.2 - a)
-    t = min(score - rival, q score) sqrt(min(n_f, most) (1 - like^2))
+    t = min(score - rival, q score) sqrt(n_f (1 - like^2))
 
 - f and g are the log-likelihood of the wall points of the query on ground that the map knows, and of the
   map's on ground that the query knows, as log-odds against a wrong place, where 0.6 agree. Divided by
@@ -72,8 +72,6 @@ class PosteriorParameters:
     slip : s. Fitted to evidence of an earlier tracking, which slipped at times; now it is too rare to tell s.
     few : wall points (0.1 m apart, by weight). Chosen among 3 to 100 by what is judged without the building;
         from half to twice of it the likelihood is as high.
-    most : more wall points do not make a lead surer, as what has been moved and similar rooms do not average
-        out. By hand.
     longest_lead : q. By hand; searches report what is nearer.
     slack, least_agreement : keep the log-odds finite at an agreement of 1 and of 0.
     alike : places whose scores differ by less fit equally well: twice the spread of the score between two
@@ -86,7 +84,6 @@ class PosteriorParameters:
     lead: float = 4.19
     slip: float = 0.0006
     few: float = 10.0
-    most: float = 300.0
     longest_lead: float = 0.2
     slack: float = 0.2
     least_agreement: float = 0.01
@@ -130,7 +127,7 @@ class Evidence:
     @property
     def terms(self) -> tuple[float, float, float]:
         """What b, c and d are multiplied with."""
-        sharpness = math.sqrt(min(self.walls, POSTERIOR.most) * (1.0 - self.likeness**2))
+        sharpness = math.sqrt(self.walls * (1.0 - self.likeness**2))
         return 1.0, self.log_likelihood, self.lead * sharpness
 
     def log_odds(self, p: PosteriorParameters = POSTERIOR) -> float:
