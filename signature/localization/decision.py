@@ -1,7 +1,7 @@
 """What is decided of a query: the masses of the places that are found, and the status that they give.
 
 located      one place has at least the mass `RelocalizeConfig.accept`
-ambiguous    the query more likely than not lies at one of the places
+ambiguous    the best place, or one that fits equally well, is at least as likely as none in the map
 not_found    all else
 """
 
@@ -18,7 +18,6 @@ from signature.localization.hypotheses import Hypothesis, same_pose
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import (
     NO_EVIDENCE,
-    POSTERIOR,
     evidence_of,
     masses,
     tail_of,
@@ -71,7 +70,8 @@ def judge(
     floors = unseen_alike(index, query, best) if evidence[0].log_odds() > 0.0 else []
     mass = masses([*evidence, *evidence[:1] * len(floors)], [*prior, *prior[:1] * len(floors)]).tolist()
     ordered += [(h,) for h in floors if not any(_same(query, h, o) for place in ordered for o in place)]
-    status: Status = "ambiguous" if sum(mass) >= POSTERIOR.likely else "not_found"
+    in_the_map = evidence[0].log_odds() + math.log(prior[0]) >= 0.0
+    status: Status = "ambiguous" if in_the_map else "not_found"
     return Verdict(
         status="located" if mass[0] >= index.config.accept else status,
         confidence=mass[0],

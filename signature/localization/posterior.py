@@ -23,8 +23,8 @@
 - r_hk, the log-likelihood of the scans from k on, f of these alone: where tracking slips, the scans before
   fit and those after do not, and nothing tells where the robot is now. s is the rate of slips, per scan.
 
-`located` means that one place has at least the mass `RelocalizeConfig.accept`; `ambiguous`, that the query
-more likely than not lies at one of the places; `not_found` all else.
+`located` means that one place has at least the mass `RelocalizeConfig.accept`; `ambiguous`, that the best
+place is at least as likely as "nowhere", z + ln prior >= 0; `not_found` all else.
 
 `pc2grid_lab.experiments.calibration` fits b, c and d to queries whose truth is known, and judges them
 on buildings that were left out.
