@@ -27,7 +27,6 @@ def made(count: int, seed: int) -> list[tuple[Evidence, bool]]:
             backward=float(rng.uniform(0.4, 0.99)),
             looked_at=float(rng.uniform(30, 300)),
             lead=float(rng.uniform(0.02, 0.15)),
-            apart=0.15,
             likeness=float(rng.uniform(0.0, 1.0)),
         )
         found.append((evidence, bool(rng.random() < masses([evidence], p=TRUTH)[0])))
@@ -56,9 +55,7 @@ def evidence_files(folder: Path) -> list[Path]:
     for log, seed in (("a", 0), ("b", 1)):
         for i, (evidence, right) in enumerate(made(1500, seed)):
             rows.append(row(log, i, evidence, [0.1, 0.01] if right else [7.0, 0.0]))
-    poor = Evidence(
-        forward=0.4, walls=100.0, backward=0.4, looked_at=100.0, lead=0.01, apart=0.01, likeness=0.5
-    )
+    poor = Evidence(forward=0.4, walls=100.0, backward=0.4, looked_at=100.0, lead=0.01, likeness=0.5)
     rows += [
         row("a", 0, poor, [float("inf"), 3.0], map="b", place="elsewhere"),
         row("a", 0, poor, [9.0, 0.0], place="blanked"),
@@ -112,10 +109,14 @@ def test_old_evidence_and_a_single_building_are_refused(tmp_path: Path) -> None:
     real, sensors = evidence_files(tmp_path)
     alone = run(sensors)
     assert alone.returncode != 0 and "without c not both kinds" in alone.stderr
-    old = [{k: v for k, v in one.items() if k != "place"} for one in json.loads(real.read_text())[:3]]
-    real.write_text(json.dumps(old))
-    refused = run(real)
-    assert refused.returncode != 0 and "real_queries.py" in refused.stderr
+    rows = json.loads(real.read_text())[:3]
+    for old in (
+        [{k: v for k, v in one.items() if k != "place"} for one in rows],
+        [one | {"evidence": [each | {"apart": 0.1} for each in one["evidence"]]} for one in rows],
+    ):
+        real.write_text(json.dumps(old))
+        refused = run(real)
+        assert refused.returncode != 0 and "real_queries.py" in refused.stderr
 
 
 def test_a_scan_and_a_log_of_one_building_are_left_out_together(tmp_path: Path) -> None:
