@@ -18,7 +18,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
@@ -31,6 +31,7 @@ from pc2grid.io.map_pose import MapPose
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
+from signature.localization.answering import answer_query
 from signature.localization.belief import Masses
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.localizer import Localizer
@@ -154,7 +155,11 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
         places=(0,),
         masses=(1.0,),
     )
-    answer = localizer.answer(near.search_whole_maps(seen, (believed,)), partial(before.prior, seen))
+    prior_of = partial(before.prior, seen)
+    answer = localizer.answer(near.search_whole_maps(seen, (believed,)), prior_of)
+    if answer.status != "located":  # a pose that is off in one of two equal rooms is off in this one
+        inside = answer_query(near, localizer.query, seen, answer.hypotheses, prior_of=prior_of)
+        answer = replace(inside, prior=None) if inside.status == "located" else answer
     apart = [
         (place, *_apart(T_map_base, h.fit.T_map_query @ answer.T_odom_base))
         for h, place in zip(answer.hypotheses, answer.places, strict=True)
