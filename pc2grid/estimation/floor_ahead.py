@@ -23,8 +23,9 @@ class FloorAheadParameters:
     """How the slope ahead is measured. Chosen by hand, for a camera that sees the floor from 1.3 m on.
 
     near_m, far_m, half_width_m : of the floor that is looked at, in the base frame, x and to both sides.
-    steepest_rad : what rises by more is no floor. noise_m : of heights; a slope counts if `least_points` or
-        more lie along a line this well.
+    steepest_rad, noise_m : what rises by more is no floor; heights are noisy.
+    least_points, most_rms_m : a slope counts if so many points lie along a line this well.
+    every_m : travel from one measurement to the next.
     remembered : measurements whose median is that of a floor without a bend, since the floor's tilt in the
         base frame is known to half a degree only. A ramp shows two bends, and none in between.
     turned_rad : a robot that turns by more does not reach the floor that it saw.
@@ -36,7 +37,9 @@ class FloorAheadParameters:
     steepest_rad: float = CLOUD_PARAMETERS.steepest_floor_rad
     noise_m: float = 0.03
     least_points: int = 40
-    remembered: int = 50
+    most_rms_m: float = 0.03
+    every_m: float = 0.1
+    remembered: int = 150
     turned_rad: float = math.radians(20.0)
 
 
@@ -48,6 +51,7 @@ class FloorAhead:
         self._bends_rad: deque[float] = deque(maxlen=parameters.remembered)
         self._seen: deque[tuple[float, float]] = deque()  # travel at which it is reached, and its pitch
         self._travel_m = 0.0
+        self._measured_m = -math.inf
         self._yaw_rad = 0.0
 
     def move(self, forward_m: float, yaw_rad: float) -> None:
@@ -72,6 +76,9 @@ class FloorAhead:
         points_m : (N, 3) in the base frame. ground : the floor in that frame.
         """
         p = self._parameters
+        if self._travel_m - self._measured_m < p.every_m:
+            return
+        self._measured_m = self._travel_m
         x, heights = points_m[:, 0], ground.heights(points_m)
         floor = (
             (x > p.near_m)
@@ -82,7 +89,7 @@ class FloorAhead:
         if floor.sum() < p.least_points:
             return
         (slope, _), residual, *_ = np.polyfit(x[floor], heights[floor], 1, full=True)
-        if math.sqrt(float(residual[0]) / floor.sum()) > p.noise_m:
+        if math.sqrt(float(residual[0]) / floor.sum()) > p.most_rms_m:
             return
         self._bends_rad.append(math.atan(float(slope)))
         bend_rad = self._bends_rad[-1] - float(np.median(self._bends_rad))
