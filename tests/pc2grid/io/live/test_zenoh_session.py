@@ -50,7 +50,7 @@ def test_the_same_bytes_give_the_same_scans(recording: Path) -> None:
     with open_log(recording) as log:
         expected = list(log.scans())[:-1]  # the last one waits for odometry that does not come
     found: list[Scan] = []
-    with ZenohRobot(Recorded.read(recording), speed=20.0).running(nodes=2) as robot:
+    with ZenohRobot(Recorded.read(recording), speed=4.0).running(nodes=2) as robot:
         feed = ZenohSession(robot.url, ReadConfig(), PATIENT)
         with LiveLog(feed, ReadConfig()) as live:
             live.on_poll = until(lambda: len(found) >= len(expected))
