@@ -75,7 +75,7 @@ def settle_in_space(
         if fit is None or fit.rays < RAYS.least:
             return verdict, None
         fits.append(fit)
-    first, share = _likeliest(fits, [verdict.masses[verdict.places[row]] for row in rivals])
+    first, share = likeliest(fits, [verdict.masses[verdict.places[row]] for row in rivals])
     in_space = _pose(fits[first], T_odom_base)
     if verdict.status == "located" and in_space.status == "contradicts":
         return _refused(verdict, in_space.on), in_space
@@ -97,7 +97,7 @@ def _rivals(verdict: Verdict) -> list[int]:
     return [row for row in first if scores[row] >= least]
 
 
-def _likeliest(fits: Sequence[SpatialFit], masses: Sequence[float]) -> tuple[int, float]:
+def likeliest(fits: Sequence[SpatialFit], masses: Sequence[float]) -> tuple[int, float]:
     """Number of the place that is likeliest by its mass in the plane and its points, and its share of the
     masses of all."""
     patches = np.array([[other.compared.patches_over(fit.compared) for other in fits] for fit in fits])

@@ -30,7 +30,6 @@ def place(rng: np.random.Generator, lead: float, tail: tuple[float, ...] = ()) -
         backward=float(rng.uniform(0.3, 0.98)),
         looked_at=float(rng.uniform(30, 300)),
         lead=lead,
-        apart=lead,
         likeness=float(rng.uniform(0.0, 1.0)),
         tail=tail,
     )

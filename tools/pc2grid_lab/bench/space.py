@@ -27,7 +27,7 @@ from pc2grid_lab.experiments.plan_drives import MAP_SEED
 from pc2grid_lab.experiments.sensor_matrix import query_start
 from signature.config import Config
 from signature.database import open_database
-from signature.localization.in_space import winner
+from signature.localization.in_space import SPACE, likeliest
 from signature.localization.localizer import locate
 from signature.localization.query import QueryInSpace
 from signature.sessions import add_sessions, build_session
@@ -169,10 +169,13 @@ def _outcome(height_m: float, *rooms: tuple[float, Any]) -> str:
     heights, fits = zip(*rooms, strict=True)
     if None in fits:
         return "no fit"
-    best = winner(fits, 0.9)
+    first, share = likeliest(fits, [1.0] * len(fits))
+    chosen = share >= 0.9 and fits[first].on >= SPACE.agrees
     if heights[0] == heights[1]:
-        return "alike" if best is None else "alike, chosen"
-    return "none" if best is None else "right" if heights[best[0]] == height_m else "wrong"
+        return "alike, chosen" if chosen else "alike"
+    if not chosen:
+        return "none"
+    return "right" if heights[first] == height_m else "wrong"
 
 
 def _twin(length_m: float, seed: int, height_m: float) -> SimulationConfig:
