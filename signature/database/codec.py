@@ -21,9 +21,10 @@ import struct
 import types
 import typing
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, Union
+from typing import Any, NamedTuple, Protocol, TypeVar, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,36 +78,7 @@ def clean(word: str) -> str:
 
 def encode(kind: Any, value: Any, path: str, arrays: dict[str, Array]) -> Any:
     """The document of a value that is declared as `kind`; its arrays are added to `arrays`, by their path."""
-    kind = _without_none(kind)
-    if value is None:
-        return None
-    if kind in _SCALARS:
-        return clean(value) if kind is str else kind(value)
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if (dtype := _dtype_of(kind)) is not None:
-        arrays[path] = np.ascontiguousarray(value, dtype)
-        return _ARRAY
-    if origin is tuple and arguments[-1] is ...:
-        if _is_enum(arguments[0]):
-            arrays[path] = _indices(arguments[0], value)
-            return _ARRAY
-        if _holds_arrays(arguments[0]):
-            _encode_columns(arguments[0], value, path, arrays)
-            return len(value)
-    if origin is tuple:
-        kinds = arguments[:1] * len(value) if arguments[-1] is ... else arguments
-        return [encode(kind, item, path, arrays) for kind, item in zip(kinds, value, strict=True)]
-    if _is_mapping(origin):
-        return {clean(key): encode(arguments[1], item, path, arrays) for key, item in value.items()}
-    if _is_dataclass(kind):
-        return {
-            name: encode(field, getattr(value, name), _join(path, name), arrays)
-            for name, field in fields_of(kind).items()
-        }
-    if _is_a(kind, BaseModel):
-        return value.model_dump(mode="json")
-    assert _is_enum(kind), kind
-    return value.value
+    return _coding(kind).encode(value, path, arrays)
 
 
 def decode(kind: Any, content: Any, path: str, arrays: dict[str, Array]) -> Any:
@@ -114,80 +86,197 @@ def decode(kind: Any, content: Any, path: str, arrays: dict[str, Array]) -> Any:
 
     Raises ValueError for what `encode` does not make.
     """
-    return _decoder(kind)(content, path, arrays)
+    return _coding(kind).decode(content, path, arrays)
+
+
+class _Coding(Protocol):
+    """How values of one type are stored; `decode` is the inverse of `encode`."""
+
+    def encode(self, value: Any, path: str, arrays: dict[str, Array]) -> Any: ...
+
+    def decode(self, content: Any, path: str, arrays: dict[str, Array]) -> Any: ...
 
 
 @functools.cache
-def _decoder(kind: Any) -> Callable[[Any, str, dict[str, Array]], Any]:
-    """The function that decodes values of a type: what follows from the type is found out once."""
-    origin, arguments, dtype = typing.get_origin(kind), typing.get_args(kind), _dtype_of(kind)
+def _coding(kind: Any) -> _Coding:
+    """How values of a type are stored: what follows from the type is found out once."""
     if (bare := _without_none(kind)) is not kind:
-        some = _decoder(bare)
-        return lambda content, path, arrays: None if content is None else some(content, path, arrays)
-    if dtype is not None:
-
-        def array(content: Any, path: str, arrays: dict[str, Array]) -> Any:
-            _expect(content == _ARRAY, path, content, "an array")
-            return _taken(arrays, path, dtype)
-
-        return array
-    if origin is tuple and arguments[-1] is ... and _is_enum(arguments[0]):
-        indices = _decoder(NDArray[np.uint8])
-        return lambda content, path, arrays: tuple(
-            _members(arguments[0], indices(content, path, arrays), path)
-        )
-    if origin is tuple and arguments[-1] is ... and _holds_arrays(arguments[0]):
-        return lambda content, path, arrays: tuple(
-            _decode_columns(arguments[0], validation.count(content, path), path, arrays)
-        )
+        return _OrNone(_coding(bare))
+    if kind in _SCALARS:
+        return _Scalar(kind)
+    if (dtype := _dtype_of(kind)) is not None:
+        return _Array(dtype)
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple:
-        items = [_decoder(item) for item in arguments if item is not ...]
-
-        def values(content: Any, path: str, arrays: dict[str, Array]) -> Any:
-            _expect(isinstance(content, list), path, content, "a list")
-            each = items * len(content) if arguments[-1] is ... else items
-            _expect(len(each) == len(content), path, content, f"{len(each)} values")
-            return tuple(item(value, path, arrays) for item, value in zip(each, content, strict=True))
-
-        return values
-    if _is_mapping(origin):
-        value_of = _decoder(arguments[1])
-
-        def mapping(content: Any, path: str, arrays: dict[str, Array]) -> Any:
-            _expect(isinstance(content, dict), path, content, "an object")
-            return {key: value_of(value, _join(path, key), arrays) for key, value in content.items()}
-
-        return mapping
+        return _coding_of_tuple(arguments)
+    if _is_a(origin, Mapping):
+        return _Mapping(_coding(arguments[1]))
     if _is_dataclass(kind):
-        return _instance_decoder(kind)
-    if _is_a(kind, BaseModel):
-        return lambda content, path, arrays: _settings(kind, json.dumps(content, sort_keys=True))
-    if _is_enum(kind):
-        return lambda content, path, arrays: kind(content)
-    return lambda content, path, arrays: _SCALARS[kind](content, path.rpartition(".")[2])
+        return _Instance(kind)
+    return _Settings(kind) if _is_a(kind, BaseModel) else _Member(kind)
 
 
-def _instance_decoder(kind: Any) -> Callable[[Any, str, dict[str, Array]], Any]:
-    """The function that decodes instances of a dataclass."""
-    fields = {name: _decoder(field) for name, field in fields_of(kind).items()}
-    # A field that was added to a stored type is None, or holds nothing, in the sessions of before.
-    without: dict[Any, Any] = {None: None, (): []}
-    added = {
-        field.name: without[field.default] for field in dataclasses.fields(kind) if field.default in without
-    }
+def _coding_of_tuple(arguments: tuple[Any, ...]) -> _Coding:
+    if arguments[-1] is not ...:
+        return _Items(tuple(map(_coding, arguments)))
+    if _is_enum(arguments[0]):
+        return _Members(arguments[0])
+    if _holds_arrays(arguments[0]):
+        return _Rows(arguments[0])
+    return _Items((_coding(arguments[0]),), repeated=True)
 
-    def instance(content: Any, path: str, arrays: dict[str, Array]) -> Any:
+
+@dataclass(frozen=True)
+class _OrNone:
+    some: _Coding
+
+    def encode(self, value: Any, path: str, arrays: dict[str, Array]) -> Any:
+        return None if value is None else self.some.encode(value, path, arrays)
+
+    def decode(self, content: Any, path: str, arrays: dict[str, Array]) -> Any:
+        return None if content is None else self.some.decode(content, path, arrays)
+
+
+@dataclass(frozen=True)
+class _Scalar:
+    kind: Any
+
+    def encode(self, value: Any, path: str, arrays: dict[str, Array]) -> Any:
+        return clean(value) if self.kind is str else self.kind(value)
+
+    def decode(self, content: Any, path: str, arrays: dict[str, Array]) -> Any:
+        return _SCALARS[self.kind](content, path.rpartition(".")[2])
+
+
+@dataclass(frozen=True)
+class _Array:
+    dtype: np.dtype[Any]
+
+    def encode(self, value: Any, path: str, arrays: dict[str, Array]) -> Any:
+        arrays[path] = np.ascontiguousarray(value, self.dtype)
+        return _ARRAY
+
+    def decode(self, content: Any, path: str, arrays: dict[str, Array]) -> Any:
+        _expect(content == _ARRAY, path, content, "an array")
+        return _taken(arrays, path, self.dtype)
+
+
+@dataclass(frozen=True)
+class _Members:
+    """A tuple of enum members: the array of their indices."""
+
+    kind: Any
+
+    def encode(self, value: Any, path: str, arrays: dict[str, Array]) -> Any:
+        arrays[path] = _indices(self.kind, value)
+        return _ARRAY
+
+    def decode(self, content: Any, path: str, arrays: dict[str, Array]) -> Any:
+        _expect(content == _ARRAY, path, content, "an array")
+        return tuple(_members(self.kind, _taken(arrays, path, np.dtype(np.uint8)), path))
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """A tuple of dataclasses that hold arrays: one array for each of their fields."""
+
+    kind: Any
+
+    def encode(self, value: Any, path: str, arrays: dict[str, Array]) -> Any:
+        _encode_columns(self.kind, value, path, arrays)
+        return len(value)
+
+    def decode(self, content: Any, path: str, arrays: dict[str, Array]) -> Any:
+        return tuple(_decode_columns(self.kind, validation.count(content, path), path, arrays))
+
+
+@dataclass(frozen=True)
+class _Items:
+    """Any other tuple: of one type each, or, `repeated`, any number of the first type."""
+
+    items: tuple[_Coding, ...]
+    repeated: bool = False
+
+    def encode(self, value: Any, path: str, arrays: dict[str, Array]) -> Any:
+        return [item.encode(one, path, arrays) for item, one in zip(self._of(value), value, strict=True)]
+
+    def decode(self, content: Any, path: str, arrays: dict[str, Array]) -> Any:
+        _expect(isinstance(content, list), path, content, "a list")
+        items = self._of(content)
+        _expect(len(items) == len(content), path, content, f"{len(items)} values")
+        return tuple(item.decode(one, path, arrays) for item, one in zip(items, content, strict=True))
+
+    def _of(self, values: Sequence[Any]) -> tuple[_Coding, ...]:
+        return self.items * len(values) if self.repeated else self.items
+
+
+@dataclass(frozen=True)
+class _Mapping:
+    value: _Coding
+
+    def encode(self, value: Any, path: str, arrays: dict[str, Array]) -> Any:
+        return {clean(key): self.value.encode(item, path, arrays) for key, item in value.items()}
+
+    def decode(self, content: Any, path: str, arrays: dict[str, Array]) -> Any:
         _expect(isinstance(content, dict), path, content, "an object")
-        content = added | content
-        if content.keys() != fields.keys():
-            odd = sorted(map(str, content.keys() ^ fields.keys()))
-            what = f"has no {odd[0]}" if odd[0] in fields else f"unknown {odd[0]}"
-            raise ValueError(f"{path}: {what}")
-        return kind(
-            **{name: field(content[name], _join(path, name), arrays) for name, field in fields.items()}
+        return {key: self.value.decode(item, _join(path, key), arrays) for key, item in content.items()}
+
+
+class _Instance:
+    """An instance of a dataclass: its fields by name."""
+
+    def __init__(self, kind: Any) -> None:
+        self._kind = kind
+        self._fields = {name: _coding(field) for name, field in fields_of(kind).items()}
+        # A field that was added to a stored type is None, or holds nothing, in the sessions of before.
+        without: dict[Any, Any] = {None: None, (): []}
+        self._added = {
+            field.name: without[field.default]
+            for field in dataclasses.fields(kind)
+            if field.default in without
+        }
+
+    def encode(self, value: Any, path: str, arrays: dict[str, Array]) -> Any:
+        return {
+            name: field.encode(getattr(value, name), _join(path, name), arrays)
+            for name, field in self._fields.items()
+        }
+
+    def decode(self, content: Any, path: str, arrays: dict[str, Array]) -> Any:
+        _expect(isinstance(content, dict), path, content, "an object")
+        content = self._added | content
+        if odd := sorted(map(str, content.keys() ^ self._fields.keys())):
+            raise ValueError(f"{path}: {'has no' if odd[0] in self._fields else 'unknown'} {odd[0]}")
+        return self._kind(
+            **{
+                name: field.decode(content[name], _join(path, name), arrays)
+                for name, field in self._fields.items()
+            }
         )
 
-    return instance
+
+@dataclass(frozen=True)
+class _Settings:
+    kind: Any
+
+    def encode(self, value: Any, path: str, arrays: dict[str, Array]) -> Any:
+        return value.model_dump(mode="json")
+
+    def decode(self, content: Any, path: str, arrays: dict[str, Array]) -> Any:
+        return _settings(self.kind, json.dumps(content, sort_keys=True))
+
+
+@dataclass(frozen=True)
+class _Member:
+    """One member of an enum."""
+
+    kind: Any
+
+    def encode(self, value: Any, path: str, arrays: dict[str, Array]) -> Any:
+        return value.value
+
+    def decode(self, content: Any, path: str, arrays: dict[str, Array]) -> Any:
+        return self.kind(content)
 
 
 def _whole(value: Any, name: str) -> int:
@@ -304,10 +393,6 @@ def _is_enum(kind: Any) -> bool:
     return _is_a(kind, enum.Enum)
 
 
-def _is_mapping(origin: Any) -> bool:
-    return _is_a(origin, Mapping)
-
-
 @functools.cache
 def _holds_arrays(kind: Any) -> bool:
     return _is_dataclass(kind) and any(
@@ -349,17 +434,22 @@ def unpack(packed: Packed) -> Array:
         raise ValueError(f"an array of {size} bytes, more than {MOST_BYTES}")
     if not isinstance(packed.data, bytes) or len(packed.data) > size:
         raise ValueError(f"{len(packed.data)} bytes where {packed.shape} of {packed.dtype} needs {size}")
-    if len(packed.data) == size:
-        array = np.frombuffer(packed.data, dtype).reshape(shape)
-    else:
-        planes = np.frombuffer(_inflate(packed.data, size), np.uint8).reshape(dtype.itemsize, -1)
-        turned = np.ascontiguousarray(planes.T).reshape(-1).view(dtype).reshape(*shape[1:], shape[0])
-        array = hand_over(np.ascontiguousarray(np.moveaxis(turned, -1, 0)))
-    if dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
+    whole = len(packed.data) == size
+    array = (
+        np.frombuffer(packed.data, dtype).reshape(shape) if whole else _expanded(packed.data, dtype, shape)
+    )
+    if dtype.kind == "b" and array.view(np.uint8).max(initial=0) > 1:
         raise ValueError("an entry that is neither true nor false")
     if dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError("a number that is not finite")
     return array
+
+
+def _expanded(data: bytes, dtype: np.dtype[Any], shape: list[int]) -> Array:
+    """What `pack` compressed, in the order it had before."""
+    planes = np.frombuffer(_inflate(data, math.prod(shape) * dtype.itemsize), np.uint8)
+    entries = np.ascontiguousarray(planes.reshape(dtype.itemsize, -1).T).reshape(-1).view(dtype)
+    return hand_over(np.ascontiguousarray(np.moveaxis(entries.reshape(*shape[1:], shape[0]), -1, 0)))
 
 
 def _inflate(data: bytes, size: int) -> bytes:
