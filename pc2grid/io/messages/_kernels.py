@@ -1,4 +1,4 @@
-"""Compiled twins of plain functions. Imports numba: import it only when needed."""
+"""Compiled functions. Imports numba: import it only when needed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 @numba.njit(cache=True)
 def expand_lzf(data: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
-    """Twin of `lzf.expand`: fills `out` and returns the number of bytes written, -1 for damaged data.
+    """Fill `out` with what LZF data expands to (`lzf`); the number of bytes written, -1 for damaged data.
 
     Measured: a compressed PCD of 75,000 points in 2 ms instead of 180 ms. Open3D needs 9 ms, but reads only
     the first value of a field of several.

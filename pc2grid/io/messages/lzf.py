@@ -21,32 +21,3 @@ def decompress(data: bytes | memoryview, size: int) -> bytes:
     if expand_lzf(np.frombuffer(data, np.uint8), out) != size:
         raise PointCloudError("the compressed data of a PCD is damaged")
     return out.tobytes()
-
-
-def expand(source: bytes, size: int) -> bytes | None:
-    """The definition: `size` bytes, or None if the data does not expand to exactly as many."""
-    out, at = bytearray(), 0
-    while at < len(source):
-        control = source[at]
-        at += 1
-        if control < 32:
-            literals = source[at : at + control + 1]
-            if len(literals) <= control:
-                return None
-            out += literals
-            at += control + 1
-        else:
-            length = control >> 5
-            follows = source[at : at + (2 if length == 7 else 1)]
-            if len(follows) < (2 if length == 7 else 1):
-                return None
-            at += len(follows)
-            length += follows[0] if length == 7 else 0
-            start = len(out) - ((control & 31) << 8) - follows[-1] - 1
-            if start < 0:
-                return None
-            for i in range(length + 2):  # one by one: the source may overlap with what is being written
-                out.append(out[start + i])
-        if len(out) > size:
-            return None
-    return bytes(out) if len(out) == size else None

@@ -103,32 +103,42 @@ def _compressed_depth(image: CompressedImage, max_points: int, stride: int) -> t
             hint="supported: 16UC1 or 32FC1; compressedDepth png",
         )
     data = memoryview(image.data)
-    a = b = 0.0
+    quantised = (0.0, 0.0)
     if "compressedDepth" in transport or bytes(data[:8]) != png.MAGIC:
         if len(data) < _CONFIG_HEADER.size:
             raise PointCloudError("a compressedDepth image is shorter than its header")
         _, a, b = _CONFIG_HEADER.unpack_from(data)
+        quantised = (a, b)
         data = data[_CONFIG_HEADER.size :]
+    values = _pixels(data, max_points)
+    kept = values[::stride, ::stride]
+    metres = _metres(kept) if encoding != "32FC1" else _dequantised(kept, *quantised)
+    return metres, values.shape
+
+
+def _pixels(data: memoryview, max_points: int) -> NDArray[np.uint16]:
+    """(H, W) the values of a png of 16 bits, examined before it is expanded."""
     try:
         found = png.inspect(data)
     except ValueError as error:
         raise PointCloudError(f"the png of a depth image is damaged: {error}") from error
-    height, width = found.height, found.width
-    _check_size(height, width, max_points)
+    _check_size(found.height, found.width, max_points)
     if (found.bits, found.channels) != (16, 1):
         raise PointCloudError("the png of a depth image has not one channel of 16 bits")
     try:
         values = cv2.imdecode(np.frombuffer(found.data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         values = None
-    if values is None or values.shape != (height, width) or values.dtype != np.uint16:
+    if values is None or values.shape != (found.height, found.width) or values.dtype != np.uint16:
         raise PointCloudError("the png of a depth image is damaged")
-    values = values[::stride, ::stride]
-    if encoding != "32FC1":
-        return _metres(values), (height, width)
+    return values.astype(np.uint16, copy=False)
+
+
+def _dequantised(values: NDArray[np.uint16], a: float, b: float) -> F32:
+    """Metres of values that image_transport made of float metres; 0 is no return."""
     with np.errstate(divide="ignore", invalid="ignore"):
         metres = np.float32(a) / (values.astype(np.float32) - np.float32(b))
-    return np.where(values == 0, np.float32(0), metres).astype(np.float32), (height, width)
+    return np.where(values == 0, np.float32(0), metres).astype(np.float32)
 
 
 def _check_size(height: int, width: int, max_points: int) -> None:

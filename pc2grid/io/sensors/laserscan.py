@@ -26,23 +26,11 @@ def decode(scan: LaserScan, *, max_points: int = 20_000_000) -> Points:
     Raises PointCloudError if the angles contradict the number of ranges.
     """
     count = len(scan.ranges)
-    most = min(max_points, MOST_BEAMS)
-    if count > most:
-        raise LimitExceeded(f"a scan of {count} beams; the limit is {most}")
-    numbers = (scan.angle_min, scan.angle_max, scan.angle_increment)
-    if not all(map(math.isfinite, numbers)):
-        raise PointCloudError(f"angles that are not finite: {numbers}")
-    if count > 1 and scan.angle_increment == 0:
-        raise PointCloudError("field angle_increment: 0")
-    if count > 1:
-        declared = (scan.angle_max - scan.angle_min) / scan.angle_increment + 1
-        if abs(declared - count) > max(_EXTRA_BEAMS, _EXTRA_SHARE * count):
-            raise PointCloudError(f"{count} ranges where the angles make {declared:.0f}")
+    _check_beams(scan, min(max_points, MOST_BEAMS))
     ranges = scan.ranges.astype(np.float32)
+    end = scan.range_max if math.isfinite(scan.range_max) and scan.range_max > 0 else math.inf
     with np.errstate(invalid="ignore"):
-        keep = np.isfinite(ranges) & (ranges > 0) & (ranges >= scan.range_min)
-        if math.isfinite(scan.range_max) and scan.range_max > 0:
-            keep &= ranges < np.float32(scan.range_max)
+        keep = (ranges > 0) & (ranges >= scan.range_min) & (ranges < np.float32(end))
     kept = ranges[keep]
     points = np.zeros((len(kept), 3), dtype=np.float32)
     points[:, :2] = kept[:, None] * _directions(count, scan.angle_min, scan.angle_increment)[keep]
@@ -53,6 +41,22 @@ def decode(scan: LaserScan, *, max_points: int = 20_000_000) -> Points:
         else:
             note = f"time_increment makes a scan longer than {LONGEST_SWEEP_S:g} s: no deskewing"
     return Points(points, offsets, count - len(kept), note)
+
+
+def _check_beams(scan: LaserScan, most: int) -> None:
+    """Raises LimitExceeded for too many beams, PointCloudError if the angles contradict their number."""
+    count = len(scan.ranges)
+    if count > most:
+        raise LimitExceeded(f"a scan of {count} beams; the limit is {most}")
+    numbers = (scan.angle_min, scan.angle_max, scan.angle_increment)
+    if not all(map(math.isfinite, numbers)):
+        raise PointCloudError(f"angles that are not finite: {numbers}")
+    if count > 1:
+        if scan.angle_increment == 0:
+            raise PointCloudError("field angle_increment: 0")
+        declared = (scan.angle_max - scan.angle_min) / scan.angle_increment + 1
+        if abs(declared - count) > max(_EXTRA_BEAMS, _EXTRA_SHARE * count):
+            raise PointCloudError(f"{count} ranges where the angles make {declared:.0f}")
 
 
 @functools.lru_cache(maxsize=4)

@@ -147,20 +147,8 @@ def _time_field(cloud: PointCloud2) -> str | None:
     return next((names[n] for n in _TIME_FIELDS if n in names), None)
 
 
-def _offsets(
-    values: NDArray[Any], stamp_ns: int, unit: str, name: str
-) -> tuple[NDArray[Any] | None, str | None]:
-    """Seconds relative to the stamp from finite times, or None if all times are the same; and a note.
-
-    Raises PointCloudError if no unit fits, or the times span longer than any scan.
-    """
-    whole = values.dtype.kind in "iu"
-    if not len(values):
-        return None, None
-    first, last = values.min(), values.max()
-    span = int(last) - int(first) if whole else float(last) - float(first)
-    if span == 0:
-        return None, f"the per-point times in field {name} are all the same: no deskewing"
+def _scale(span: float, unit: str, name: str) -> float:
+    """Seconds of a unit. Raises PointCloudError if none fits, or they span longer than any scan."""
     if unit == "auto":
         fitting = [u for u, s in _SECONDS.items() if _SWEEP_S[0] <= span * s <= _SWEEP_S[1]]
         if not fitting:
@@ -175,6 +163,24 @@ def _offsets(
             f"field {name}: times that span {span * scale:g} s, read as {unit}",
             hint="--set read.point_time=s|ms|us|ns says otherwise, none ignores them",
         )
+    return scale
+
+
+def _offsets(
+    values: NDArray[Any], stamp_ns: int, unit: str, name: str
+) -> tuple[NDArray[Any] | None, str | None]:
+    """Seconds relative to the stamp from finite times, or None if all times are the same; and a note.
+
+    Raises PointCloudError if no unit fits, or the times span longer than any scan.
+    """
+    whole = values.dtype.kind in "iu"
+    if not len(values):
+        return None, None
+    first, last = values.min(), values.max()
+    span = int(last) - int(first) if whole else float(last) - float(first)
+    if span == 0:
+        return None, f"the per-point times in field {name} are all the same: no deskewing"
+    scale = _scale(span, unit, name)
     stamp = stamp_ns * 1e-9
     if max(abs(float(first) * scale), abs(float(last) * scale)) <= _NEAR_STAMP_S:
         return values if scale == 1.0 else values.astype(np.float64) * scale, None

@@ -35,6 +35,20 @@ def inspect_header(path: Path) -> None:
     Raises NotADatabase (missing, empty, another kind of file, another program's SQLite file),
     DatabaseVersion, DatabaseCorrupt (shorter than it says).
     """
+    header, size = _header(path)
+    if len(header) < 100:
+        raise DatabaseCorrupt(f"{path}: truncated to {size} bytes, not even the header is whole")
+    _check_format(path, *(int.from_bytes(header[at : at + 4], "big") for at in (68, 60)))
+    page_size = int.from_bytes(header[16:18], "big")
+    promised = (65536 if page_size == 1 else page_size) * int.from_bytes(header[28:32], "big")
+    if size != promised:
+        raise DatabaseCorrupt(
+            f"{path}: {size} bytes where its header promises {promised}: truncated or damaged", hint=SALVAGE
+        )
+
+
+def _header(path: Path) -> tuple[bytes, int]:
+    """The header of an SQLite file, and the size of the file. Raises NotADatabase."""
     try:
         with path.open("rb") as file:
             header = file.read(100)
@@ -54,9 +68,11 @@ def inspect_header(path: Path) -> None:
             if path.suffix.lower() in _CONVERTED
             else CONVERT,
         )
-    if len(header) < 100:
-        raise DatabaseCorrupt(f"{path}: truncated to {size} bytes, not even the header is whole")
-    application_id, version = (int.from_bytes(header[at : at + 4], "big") for at in (68, 60))
+    return header, size
+
+
+def _check_format(path: Path, application_id: int, version: int) -> None:
+    """Raises NotADatabase, DatabaseVersion or DatabaseCorrupt unless both are those of this format."""
     if application_id == OLDER_ID:
         raise refused_version(path, 0)
     if application_id != APPLICATION_ID:
@@ -69,14 +85,6 @@ def inspect_header(path: Path) -> None:
         raise DatabaseCorrupt(f"{path}: database format {version} never existed", hint=SALVAGE)
     if version != FORMAT:
         raise refused_version(path, version)
-    page_size = int.from_bytes(header[16:18], "big")
-    page_size = 65536 if page_size == 1 else page_size
-    if size != page_size * int.from_bytes(header[28:32], "big"):
-        raise DatabaseCorrupt(
-            f"{path}: {size} bytes where its header promises"
-            f" {page_size * int.from_bytes(header[28:32], 'big')}: truncated or damaged",
-            hint=SALVAGE,
-        )
 
 
 def inspect_tables(connection: sqlite3.Connection, path: Path) -> None:
