@@ -45,18 +45,21 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
     print(
         f"{where}: {counted(len(sessions), 'session')}, {counted(sum(s.submaps for s in sessions), 'submap')}"
     )
-    for s in sessions:
-        travel = f", {counted(s.scans, 'scan')}, {s.path_m:.1f} m in {s.duration_s:.0f} s" if s.scans else ""
-        label = s.provenance.label
-        where = f", {label}" if label.building or label.floor else ""
-        line = (
-            f"  {s.name} ({s.sensor}{where}): {counted(s.submaps, 'submap')}, {s.area_m2:.0f} m2 free{travel}"
-        )
-        if s.consistency is not None and s.consistency.bent:
-            line += f", bent: contradicts itself along {s.consistency.contradicted:.0%} of the travel"
-        if s.precision is not None and s.precision.loose:
-            line += f", loosely tied: places up to +- {s.precision.worst_m:.1f} m"
-        print(one_line(line + _ROLES[roles[s.name]]))
+    for session in sessions:
+        print(one_line(_line(session) + _ROLES[roles[session.name]]))
+
+
+def _line(s: SessionInfo) -> str:
+    """What a person is told of a session."""
+    travel = f", {counted(s.scans, 'scan')}, {s.path_m:.1f} m in {s.duration_s:.0f} s" if s.scans else ""
+    label = s.provenance.label
+    where = f", {label}" if label.building or label.floor else ""
+    line = f"  {s.name} ({s.sensor}{where}): {counted(s.submaps, 'submap')}, {s.area_m2:.0f} m2 free{travel}"
+    if s.consistency is not None and s.consistency.bent:
+        line += f", bent: contradicts itself along {s.consistency.contradicted:.0%} of the travel"
+    if s.precision is not None and s.precision.loose:
+        line += f", loosely tied: places up to +- {s.precision.worst_m:.1f} m"
+    return line
 
 
 def _roles(database: SubmapDatabase) -> dict[str, SessionRole | None]:

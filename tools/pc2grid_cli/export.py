@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -239,39 +239,33 @@ def _write_session(
 ) -> None:
     """Write all files of a session. frame : of its building; None: its own map frame."""
     # A session without a trajectory is refused before anything is written.
-    poses = _poses(database, name) if outputs.trajectory or outputs.g2o else None
+    poses = database.trajectory(name)
+    if not len(poses) and (outputs.trajectory or outputs.g2o):
+        raise DatabaseError(f"{database.location}: session {name!r} is an imported map and has no trajectory")
     frames = {} if frame is None else {name: frame}
-    if outputs.map_stem is not None:
-        save_map(map_of(database, name, frames), outputs.map_stem)
-    if outputs.trajectory is not None and poses is not None:
-        moved = poses if frame is None else _in_building(poses, frame)
-        write_trajectory(outputs.trajectory, moved, outputs.trajectory_format)
-    if outputs.cloud is not None:
-        _write_cloud(outputs.cloud, database, [name], frames, terminal)
-    if outputs.graph is not None:
-        write_graph(outputs.graph, database.graph(name))
-    if outputs.g2o is not None and poses is not None:
-        write_g2o(outputs.g2o, poses, database.loops(name))
-    if outputs.mcap is not None:
-        write_session(outputs.mcap, database, name, outputs.force)
-    if outputs.rerun is not None:
-        stream_session(outputs.rerun, database, name)
-    if outputs.plot is not None:
-        draw_session(outputs.plot, database, name)
+    writers: list[tuple[Any, Callable[[Any], object]]] = [
+        (outputs.map_stem, lambda stem: save_map(map_of(database, name, frames), stem)),
+        (
+            outputs.trajectory,
+            lambda path: write_trajectory(path, _in_building(poses, frame), outputs.trajectory_format),
+        ),
+        (outputs.cloud, lambda path: _write_cloud(path, database, [name], frames, terminal)),
+        (outputs.graph, lambda path: write_graph(path, database.graph(name))),
+        (outputs.g2o, lambda path: write_g2o(path, poses, database.loops(name))),
+        (outputs.mcap, lambda path: write_session(path, database, name, outputs.force)),
+        (outputs.rerun, lambda target: stream_session(target, database, name)),
+        (outputs.plot, lambda path: draw_session(path, database, name)),
+    ]
+    for wanted, write in writers:
+        if wanted is not None:
+            write(wanted)
 
 
-def _in_building(poses: Trajectory, frame: BuildingFrame) -> Trajectory:
+def _in_building(poses: Trajectory, frame: BuildingFrame | None) -> Trajectory:
+    if frame is None:
+        return poses
     T = np.array([at.lift() for at in frame.around(poses.planar()[:, :2])])
     return replace(poses, T_session_base=T @ poses.T_session_base)
-
-
-def _poses(database: SubmapDatabase, session: str) -> Trajectory:
-    poses = database.trajectory(session)
-    if not len(poses):
-        raise DatabaseError(
-            f"{database.location}: session {session!r} is an imported map and has no trajectory"
-        )
-    return poses
 
 
 def _write_cloud(

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -229,31 +229,24 @@ def followed(poses: Trajectory, answer: Answer) -> Trajectory:
     at, moments = _located_moments(poses, travel_m, part, answer)
     T_odom_map = answer.T_map_odom.inverse()
     corrections = [T_odom_map @ pose @ SE2(*planar[k]).inverse() for k, pose in zip(at, moments, strict=True)]
+    turns = np.unwrap([T.yaw for T in corrections])
+    moved = np.array([T.apply(planar[:, :2]) for T in corrections])
     corrected = poses.T_session_base.copy()
-    for k in range(len(poses)):
-        same = [i for i in range(len(at)) if part[at[i]] == part[k]]
-        before = next((i for i in reversed(same) if at[i] <= k), None)
-        after = next((i for i in same if at[i] > k), None)
-        if before is None and after is None:
-            before = min(range(len(at)), key=lambda i: abs(at[i] - k))
-        first = corrections[before if before is not None else cast("int", after)]
-        last = corrections[after if after is not None else cast("int", before)]
-        share = 0.0
-        if before is not None and after is not None:
-            share = (travel_m[k] - travel_m[at[before]]) / (travel_m[at[after]] - travel_m[at[before]])
-        turn = first.yaw + share * wrap_angle(last.yaw - first.yaw)
-        x, y = (
-            (1.0 - share) * first.apply(planar[k : k + 1, :2]) + share * last.apply(planar[k : k + 1, :2])
-        )[0]
-        z = corrected[k, 2, 3]
-        corrected[k] = SE2(0.0, 0.0, turn).lift() @ corrected[k]
-        corrected[k, :3, 3] = x, y, z
+    for number in np.unique(part):
+        here = np.flatnonzero(part == number)
+        own = np.flatnonzero(part[at] == number)
+        if not len(own):
+            own = np.abs(at - here.mean()).argmin(keepdims=True)
+        # How much each of the moments counts at each of the scans: between two of them, both.
+        shares = [np.interp(travel_m[here], travel_m[at[own]], one) for one in np.eye(len(own))]
+        for k, share in zip(here, np.transpose(shares), strict=True):
+            height_m = corrected[k, 2, 3]
+            corrected[k] = SE2(0.0, 0.0, share @ turns[own]).lift() @ corrected[k]
+            corrected[k, :3, 3] = *(share @ moved[own, k]), height_m
     return replace(poses, T_session_base=corrected)
 
 
-def _located_moments(
-    poses: Trajectory, travel_m: F64, part: I64, answer: Answer
-) -> tuple[list[int], list[SE2]]:
+def _located_moments(poses: Trajectory, travel_m: F64, part: I64, answer: Answer) -> tuple[I64, list[SE2]]:
     """The scans at which the query was located in the session of the answer, and the base in its map."""
 
     planar = poses.planar()
@@ -277,7 +270,7 @@ def _located_moments(
         for here, before, after in zip(found, [False, *agrees], [*agrees, True], strict=True)
         if before or after  # the last one is the answer
     ]
-    return [k for k, _ in kept], [pose for _, pose in kept]
+    return np.array([k for k, _ in kept], np.int64), [pose for _, pose in kept]
 
 
 def _without_points(registered: RegisteredScan) -> RegisteredScan:

@@ -35,7 +35,7 @@ from pc2grid_cli.rerun_target import require_target
 from signature.localization.in_building import answer_in_building
 
 if TYPE_CHECKING:
-    from pc2grid.model import Trajectory
+    from pc2grid.model import ReadReport, Trajectory
     from pc2grid_cli.json_schemas import Relocalize
     from signature.config import Config
     from signature.database import SubmapDatabase
@@ -58,6 +58,10 @@ class _Outputs:
         """Raises OutputError if a file cannot be written, or exists and must not be replaced."""
         for option in ("trajectory", "initialpose", "output", "plot", "report"):
             check_file(option, getattr(self, option), self.force)
+
+    def of_answer(self) -> list[Path]:
+        """The files that only an answer can fill."""
+        return [path for path in (self.trajectory, self.initialpose, self.output) if path is not None]
 
     def refuse(self, reason: str, rerun: str | None) -> None:
         """Raises ConfigError if there is any."""
@@ -144,7 +148,6 @@ def relocalize_command(
 
     Example: pc2grid relocalize tuesday.mcap --database building.submaps
     """
-    extras.require(({} if rerun is None else {"viz": "--rerun"}) | extras.of_addresses(database))
     outputs = _Outputs(
         trajectory=trajectory,
         initialpose=initialpose,
@@ -154,17 +157,10 @@ def relocalize_command(
         force=force,
     )
     known = KnownPose(near=near, near_pose=near_pose, check=check, check_topic=check_topic, session=session)
-    outputs.check()
-    _check_options_for_maps(log, outputs, rerun)
-    known.validate(is_map=is_map_file(log))
-    if known.is_check:
-        outputs.refuse("--check judges a pose and finds none", rerun)
-    if rerun is not None:
-        require_target(rerun, force)
+    _check_options(log, database, outputs, known, rerun)
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity, top_k=top_k
     )
-    _check_not_swapped(log, database)
     with searched(database, building, floor) as (opened, left_out):
         where = opened.location
         frames = opened.frames() if frame is options.FrameName.building else {}
@@ -195,20 +191,41 @@ def relocalize_command(
         stated = answer_in_building(found.answer, frames)
         _print(found, stated, where, left_out, map_sigma_m(found.answer, opened), as_json=json)
         _write(outputs, opened, found, stated, located, settings)
-    for path in (trajectory, initialpose, output):
-        if path is not None and located is None:
+    if located is None:
+        for path in outputs.of_answer():
             console.warn(f"{path}: not written, there is no answer to put into it")
     for warning in found.about["warnings"]:
         console.warn(warning)
     _warn_of_prior(stated)
-    if found.report is not None and found.report.lossy:
-        console.warn(f"{log.name}: {data_loss.sentence(found.report)}")
     for damage in left_out:
         console.warn(f"{where}: damaged and left out: {damage}")
+    lossy = _warn_of_losses(log, found.report, strict) or bool(left_out)
     if found.answer.status != "located":
         raise typer.Exit(console.UNSURE)
-    if left_out or (found.report is not None and data_loss.ends_with_3(found.report, strict)):
+    if lossy:
         raise typer.Exit(console.LOSSY)
+
+
+def _check_options(log: Path, database: str, outputs: _Outputs, known: KnownPose, rerun: str | None) -> None:
+    """Raises what is wrong with the options before any work is done."""
+    extras.require(({} if rerun is None else {"viz": "--rerun"}) | extras.of_addresses(database))
+    outputs.check()
+    _check_options_for_maps(log, outputs, rerun)
+    known.validate(is_map=is_map_file(log))
+    if known.is_check:
+        outputs.refuse("--check judges a pose and finds none", rerun)
+    if rerun is not None:
+        require_target(rerun, outputs.force)
+    _check_not_swapped(log, database)
+
+
+def _warn_of_losses(log: Path, report: ReadReport | None, strict: bool) -> bool:
+    """Say what of the recording was lost; whether that is to end with exit code 3."""
+    if report is None:
+        return False
+    if report.lossy:
+        console.warn(f"{log.name}: {data_loss.sentence(report)}")
+    return data_loss.ends_with_3(report, strict)
 
 
 def _check_not_swapped(log: Path, database: str) -> None:

@@ -11,6 +11,7 @@ from signature.retrieval.explanation import compare_views
 if TYPE_CHECKING:
     from signature.database import SubmapDatabase
     from signature.localization.answer import Answer
+    from signature.retrieval.explanation import ComparedView
 
 
 def why_here(answer: Answer, database: SubmapDatabase) -> dict[str, Any] | None:
@@ -41,18 +42,17 @@ def why_here(answer: Answer, database: SubmapDatabase) -> dict[str, Any] | None:
         "places": [
             {
                 "hypothesis": number,
-                "views": [
-                    {"log_ratio": None if view.log_ratio is None else round(view.log_ratio, 2)}
-                    | {
-                        name: [_short(getattr(view.query, name)), _short(getattr(view.map, name))]
-                        for name in ("boundary", "freespace", "symmetry")
-                    }
-                    for view in views
-                ],
+                "views": [_document(view) for view in views],
             }
             for number, views in compared
         ],
     }
+
+
+def _document(view: ComparedView) -> dict[str, Any]:
+    names = ("boundary", "freespace", "symmetry")
+    drawn = {name: [_short(getattr(side, name)) for side in (view.query, view.map)] for name in names}
+    return {"log_ratio": None if view.log_ratio is None else round(view.log_ratio, 2)} | drawn
 
 
 def _short(values: np.ndarray) -> list[float]:

@@ -208,18 +208,23 @@ def main() -> None:
             for s, t, size, hit, ms in recalls(building, drawn, config):
                 rank = sizes.setdefault(size, len(sizes))
                 found.append((s, t, rank, hit, hit, ms, name))
+    _print_tables(found, places, options.logs.split(","), options.locate)
+
+
+def _print_tables(found: Sequence[Row], places: Sequence[int], logs: Sequence[str], locate: bool) -> None:
+    """A table for each number of places that are selected, or one of what was located."""
     for rank in sorted({row[2] for row in found}):
-        what = "located, rightly" if options.locate else ("0.64 %", "5 %, at least 50")[rank]
-        print(f"\n{what} of {min(places):,} to {max(places):,} places, {', '.join(options.logs.split(','))}")
+        what = "located, rightly" if locate else ("0.64 %", "5 %, at least 50")[rank]
+        print(f"\n{what} of {min(places):,} to {max(places):,} places, {', '.join(logs)}")
         for selector in dict.fromkeys(row[0] for row in found):
             cells = []
             for travel_m in TRAVELS_M:
                 rows = [r for r in found if r[0] == selector and r[1] == travel_m and r[2] == rank]
                 wrong = sum(r[3] and not r[4] for r in rows)
-                said = f" ({wrong} wrong)" if options.locate else ""
+                said = f" ({wrong} wrong)" if locate else ""
                 cells.append(f"{np.mean([r[4] for r in rows]):.2f}{said} of {len(rows)}")
             took = np.median([r[5] for r in found if r[0] == selector])
-            by_log = [f"{name} {_mean(found, selector, rank, name):.2f}" for name in options.logs.split(",")]
+            by_log = [f"{name} {_mean(found, selector, rank, name):.2f}" for name in logs]
             print(f"| {selector} | {' | '.join(cells)} | {took:.0f} ms | {', '.join(by_log)} |", flush=True)
 
 
