@@ -9,8 +9,8 @@ believed, else it is lost.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,10 +19,10 @@ from pc2grid.clouds.ground import find_ground
 from pc2grid.clouds.level import LEVEL
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
-from pc2grid.estimation.belief import SPATIAL, Belief
+from pc2grid.estimation.belief import KERNEL, SPATIAL, Belief
 from pc2grid.estimation.manifold import moved, steps
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
-from pc2grid.estimation.placed import Placed
+from pc2grid.estimation.placing import Estimate, Fit
 from pc2grid.estimation.space_map import SpaceMap, ThinnedScan
 from pc2grid.estimation.surface_map import SURFACES, Placement
 from pc2grid.geometry import SE2, leveling
@@ -31,36 +31,20 @@ from pc2grid.model import Scan
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CarriedParameters:
-    """Numbers of carried sensors. Chosen by hand, unless noted.
+    """Numbers of carried sensors. Chosen by hand.
 
-    sure_agreement : a scan long after the one before that agrees less with the map is searched for. In a
-        hall, right poses have 0.89 and more, wrong ones 0.66 to 0.88 (lidar/hall).
-    least_agreement : with less at the best place that is found, the scan is lost.
+    least_agreement : of a pose with what is known where the points lie, -1..1, that is credible. In a hall,
+        right poses have 0.89 and more, wrong ones 0.66 to 0.88 (lidar/hall).
     starts : placements that a search refines in space. turned_rad : by how much these may be turned, a
         standard deviation: more than a step of the search.
     """
 
-    sure_agreement: float = 0.9
     least_agreement: float = 0.85
     starts: int = 10
     turned_rad: float = 0.1
 
 
 CARRIED = CarriedParameters()
-
-
-@dataclass(frozen=True, slots=True, order=True)
-class _Candidate:
-    """A placement, and its score: the logarithm of its posterior density but for a constant.
-
-    agreement : with what is known where its points lie, -1..1. sure : it fits so well that it need not be
-    searched for.
-    """
-
-    score: float
-    placement: Placement = field(compare=False)
-    agreement: float = field(compare=False)
-    sure: bool = field(compare=False)
 
 
 class CarriedSensor:
@@ -76,8 +60,8 @@ class CarriedSensor:
     ) -> None:
         self._projection, self._parameters, self._tracking = projection, parameters, tracking
         self._map: SpaceMap | None = None
-        self._found: F64 = np.eye(4)  # pose of the last scan that was
-        self._thinned = ThinnedScan(np.empty((0, 3)), np.empty(0))  # the scan placed last
+        self._last: F64 = np.eye(4)  # pose of the last scan that was not lost
+        self._thinned = ThinnedScan(np.empty((0, 3)), np.empty(0))  # the scan taken last
 
     @property
     def ground(self) -> None:
@@ -98,131 +82,90 @@ class CarriedSensor:
         levelled."""
         self._map = SpaceMap(scan, points_m, self._projection)
         self._thinned = self._map.thin(scan, points_m)
-        self._found = at.lift() @ first_pose(scan, points_m)
-        return self._found
+        return at.lift() @ first_pose(scan, points_m)
 
     def levelled(self, pose: F64) -> F64:
         """A pose (4, 4) in space has its tilt and its height already."""
         return pose
 
-    def place(self, scan: Scan, points_m: F32, seconds: float, expected: Sequence[Belief]) -> Placed:
+    def __bool__(self) -> bool:
+        """Whether there is a local map."""
+        return bool(self._map)
+
+    def take(self, scan: Scan, points_m: F32, expected: Belief) -> None:
         """See `PlacingSensor`."""
-        del seconds
-        belief = expected[0]
+        del expected
         if self._map is None:
             self._map = SpaceMap(scan, points_m, self._projection)
-        self._thinned = thinned = self._map.thin(scan, points_m)
-        if not self._map or not len(thinned.points_m):
-            self._found = belief.pose
-            return Placed(belief.pose, first=not self._map)
-        candidates = self._candidates(belief, self._map)
-        best = max(candidates)
-        found = best.placement
-        if not self._is_believed(best, belief):
-            return Placed(belief.pose)
-        self._found = found.pose
-        # Where the motion is expected to centimetres, points that only seem to hold the scan do no harm.
-        held = not self._is_vague(belief) or self._map.is_held(thinned, found)
-        return Placed(
-            found.pose,
-            _alone(found, belief, _spread(candidates, best)),
-            found.overlap,
-            found.residual_m,
-            found.measured and held,
-        )
+        self._thinned = self._map.thin(scan, points_m)
 
-    def _candidates(self, belief: Belief, space: SpaceMap) -> list[_Candidate]:
-        """Where the scan placed last may lie.
+    def match(self, belief: Belief, *, wide: bool) -> list[Fit]:
+        """See `PlacingSensor`. The coarse map smooths surfaces, so a scan slides along them there."""
+        return [self._matched(belief.pose, belief, wide=wide)]
 
-        The coarse map brings it near from where the base is expected. Where more is possible than a match
-        reaches, or it does not fit, it is also matched without the coarse map, which slides along surfaces
-        that it smooths; and it is searched for where it still does not fit, or does not agree.
-        """
-        p = self._parameters
-        vague = self._is_vague(belief)
-
-        def matched(*, wide: bool) -> _Candidate:
-            return self._candidate(space.match(self._thinned, belief.pose, belief, wide=wide), belief, space)
-
-        found = [matched(wide=True)]
-        if vague or not found[0].sure:
-            found.append(matched(wide=False))
-        best = max(found)
-        if not best.sure or (vague and best.agreement < p.sure_agreement):
-            found += self._searched(belief, space)
-        return found
-
-    def _searched(self, belief: Belief, space: SpaceMap) -> Iterator[_Candidate]:
-        """Placements in all headings around the last pose that was found, with its height and tilt.
+    def search(self, belief: Belief) -> Iterator[Fit]:
+        """Match in all headings around the last pose, with its height and tilt.
 
         A hand turns fast; then the predicted direction of the step says nothing.
         """
         p, t = self._parameters, self._tracking
-        step_m = float(np.linalg.norm(belief.pose[:3, 3] - self._found[:3, 3]))
-        window_m = min(step_m + t.search_sigmas * belief.sigmas[0], t.search_most_m)
+        step_m = float(np.linalg.norm(belief.pose[:3, 3] - self._last[:3, 3]))
+        window_m = min(step_m + KERNEL * belief.sigmas[0], t.search_most_m)
         covariance = np.diag([window_m**2] * 3 + [p.turned_rad**2] * 3)
-        for guess in space.search(self._thinned, self._found, window_m, p.starts):
-            loose = Belief(guess, covariance, belief.free)
-            placement = space.match(self._thinned, guess, loose, wide=True)
-            yield self._candidate(placement, belief, space)
+        for guess in self._space.search(self._thinned, self._last, window_m, p.starts):
+            yield self._matched(guess, Belief(guess, covariance, belief.free), wide=True)
 
-    def _candidate(self, placement: Placement, belief: Belief, space: SpaceMap) -> _Candidate:
-        """A placement of the scan placed last, with its score."""
-        t = self._tracking
-        of_known, of_all = space.agreement(self._thinned, placement.pose)
-        quality = of_all - t.residual_weight_per_m * placement.residual_m
-        of_scan = SURFACES.independent(len(self._thinned.points_m)) * quality
-        score = of_scan + belief.log_density(belief.chi2(placement.pose))
-        sure = placement.overlap >= t.sure_overlap and placement.residual_m <= t.max_residual_m
-        return _Candidate(score, placement, of_known, sure)
+    def _matched(self, guess: F64, held: Belief, *, wide: bool) -> Fit:
+        """The scan taken last matched with the map from a guess (4, 4), held to a belief."""
+        space = self._space
+        found = space.match(self._thinned, guess, held, wide=wide)
+        of_known, of_all = space.agreement(self._thinned, found.pose)
+        quality = of_all - self._tracking.residual_weight_per_m * found.residual_m
+        return Fit(
+            pose=found.pose,
+            alone=_alone(found, held),
+            overlap=found.overlap,
+            residual_m=found.residual_m,
+            measured=found.measured,
+            evidence=SURFACES.independent(len(self._thinned.points_m)) * quality,
+            credible=of_known >= self._parameters.least_agreement,
+        )
 
-    def _is_vague(self, belief: Belief) -> bool:
-        """Whether a match alone does not reach all that a belief holds possible."""
-        t, (sigma_m, sigma_rad) = self._tracking, belief.sigmas
-        return t.search_sigmas * max(sigma_m / t.search_above_m, sigma_rad / t.search_above_rad) > 1.0
+    def holds(self, fit: Fit) -> bool:
+        """See `PlacingSensor`."""
+        placement = Placement(fit.pose, fit.alone[1], fit.overlap, fit.residual_m, fit.measured)
+        return self._space.is_held(self._thinned, placement)
 
-    def _is_believed(self, best: _Candidate, belief: Belief) -> bool:
-        """Whether a scan lies where it fits best: it fits well near where it is expected, or nothing that is
-        known there speaks against it."""
-        if best.sure and not self._is_vague(belief):
-            return True
-        overlaps = best.placement.overlap >= self._tracking.min_overlap
-        return overlaps and best.agreement >= self._parameters.least_agreement
+    def follow(self, belief: Belief) -> None:
+        """Nothing: the surfaces of the last scans are in the map."""
 
     def extend(self, pose: F64) -> None:
         """Nothing: scans join the map in space oftener than keyframes begin, see `cut`."""
 
     def cut(self, scan: Scan, points_m: F32, pose: F64, *, lost: bool) -> PlanarScan:
-        """Add the scan placed last to the map at its final pose (4, 4), and cut its planar scan out of it.
+        """Add the scan taken last to the map at its final pose (4, 4), and cut its planar scan out of it.
 
         The planar scan is in the levelled base frame.
         """
-        if self._map is None:
-            raise ValueError("no scan has been placed")
         if not lost:
-            self._map.extend(scan, points_m, self._thinned, pose)
-        return self._map.cut(scan, pose)
+            self._space.extend(scan, points_m, self._thinned, pose)
+            self._last = pose
+        return self._space.cut(scan, pose)
+
+    @property
+    def _space(self) -> SpaceMap:
+        """The map, of which there is one as soon as a scan has been taken."""
+        if self._map is None:
+            raise ValueError("no scan has been taken")
+        return self._map
 
 
-def _spread(candidates: Sequence[_Candidate], best: _Candidate) -> F64:
-    """The covariance (6, 6) of all candidates about the best one, in the axes of the base there."""
-    mass = np.exp([candidate.score - best.score for candidate in candidates])
-    poses = np.array([candidate.placement.pose for candidate in candidates])
-    away = steps(np.tile(best.placement.pose, (len(poses), 1, 1)), poses).step
-    spread: F64 = np.einsum("n,na,nb->ab", mass / mass.sum(), away, away)
-    return spread
-
-
-def _alone(found: Placement, belief: Belief, spread: F64) -> tuple[F64, F64]:
-    """The pose (4, 4) by the points alone, with its information (6, 6).
-
-    spread : covariance (6, 6) of where else the scan may lie.
-    """
-    away, _, J = (of_belief[0] for of_belief in steps(belief.pose[None], found.pose[None]))
+def _alone(found: Placement, held: Belief) -> Estimate:
+    """The pose (4, 4) by the points alone, with its information (6, 6). held : what drew it aside."""
+    away, _, J = (of_belief[0] for of_belief in steps(held.pose[None], found.pose[None]))
     information = found.information + 1e-3 * np.eye(6)
-    change = np.linalg.solve(information, J.T @ belief.information @ away)
-    wider = np.linalg.inv(np.linalg.inv(information) + spread)
-    return moved(found.pose[None], change[None])[0], np.asarray(wider, np.float64)
+    change = np.linalg.solve(information, J.T @ held.information @ away)
+    return moved(found.pose[None], change[None])[0], information
 
 
 def first_pose(scan: Scan, points_m: F32) -> F64:

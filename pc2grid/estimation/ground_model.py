@@ -75,7 +75,7 @@ class GroundModel:
         keep = heights > slack
         if self.ground.ceiling_m is not None:
             keep &= heights < self.ground.ceiling_m - slack
-        return points[keep] if keep.sum() > p.icp_min_points else points
+        return points[keep]
 
     def T_level_base(self) -> F64:
         """Tilt and height (4, 4) of the base over the floor. The heading of the base stays."""

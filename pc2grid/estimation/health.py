@@ -1,10 +1,9 @@
-"""What the pose of a scan is worth: by how the scan fits the local map, and by the smoother's covariance."""
+"""What the pose of a scan is worth: by how the scan fits the local map."""
 
 from __future__ import annotations
 
-from pc2grid.estimation.belief import Belief
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
-from pc2grid.estimation.placed import Placed
+from pc2grid.estimation.placing import Placed
 from pc2grid.model import Health
 
 
@@ -14,31 +13,28 @@ class HealthJudge:
     def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
         self._parameters = parameters
         self._lost_scans = 0
-        self._out_of_reach = False
 
-    def judge(self, placed: Placed, belief: Belief, *, bridged: bool) -> Health:
-        """Judge a scan by where it was placed, and by the pose that the smoother found.
+    def judge(self, placed: Placed, *, bridged: bool) -> Health:
+        """Judge a scan by where it was placed.
 
         bridged : odometry goes on from the scan before.
 
         A scan that fits is FINE; DEGENERATE if one direction of its position is not determined. One that does
         not fit is DEGENERATE, too, where odometry tells where it is from a scan that was not lost; else LOST.
         """
-        p = self._parameters
-        if placed.first or (placed.alone is not None and placed.residual_m <= p.max_residual_m):
+        if placed.first or placed.fits:
             self.restart()
             return Health.FINE if placed.first or placed.measured else Health.DEGENERATE
         if bridged and not self._lost_scans:
             return Health.DEGENERATE
         self._lost_scans += 1
-        self._out_of_reach = belief.sigmas[0] > p.search_most_m
         return Health.LOST
 
     @property
     def gives_up(self) -> bool:
-        """Whether tracking must start again: so many scans in a row were lost, or no search would reach."""
-        return self._out_of_reach or self._lost_scans > self._parameters.give_up_scans
+        """Whether tracking must start again: so many scans in a row were lost."""
+        return self._lost_scans > self._parameters.give_up_scans
 
     def restart(self) -> None:
         """Start to count again."""
-        self._lost_scans, self._out_of_reach = 0, False
+        self._lost_scans = 0

@@ -43,7 +43,7 @@ class MatchingMaps:
     def search(self, planar_scan: PlanarScan, guess: SE2, window_m: float, window_rad: float) -> list[SE2]:
         """Return the best placements of a planar scan around a guess T_session_base, to be refined."""
         p, grid = self._parameters, self._maps[0][0]
-        hits = planar_scan.hits_m[evenly(len(planar_scan.hits_m), p.search_hits)].astype(np.float64)
+        hits = planar_scan.hits_m[evenly(len(planar_scan.hits_m), p.matched_hits)].astype(np.float64)
         field = grid.likelihood(p.search_sigma_m)
         found = best_placements(field, grid.low_m, grid.cell_m, hits, guess, window_m, window_rad)
         return [pose for _, pose in found]

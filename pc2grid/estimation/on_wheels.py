@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from pc2grid.clouds.depth_limit import DepthLimit
 from pc2grid.clouds.ground import Ground
 from pc2grid.clouds.planar_scan import PlanarScan, project_to_plane
 from pc2grid.config import ProjectionConfig, RegistrationConfig
-from pc2grid.estimation.belief import PLANAR, Belief
+from pc2grid.estimation.belief import KERNEL, PLANAR, Belief
 from pc2grid.estimation.ground_model import GroundModel
 from pc2grid.estimation.matching_maps import MatchingMaps
 from pc2grid.estimation.parameters import (
@@ -27,30 +26,11 @@ from pc2grid.estimation.parameters import (
     TRACKING_PARAMETERS,
     TrackingParameters,
 )
-from pc2grid.estimation.placed import Placed
-from pc2grid.estimation.point_to_line import Match
+from pc2grid.estimation.placing import Estimate, Fit
 from pc2grid.estimation.registration import KissRegistration
 from pc2grid.geometry import SE2
 from pc2grid.model import Scan
 from pc2grid.sensor_model import SENSOR_MODELS
-
-
-@dataclass(frozen=True, slots=True, order=True)
-class _Candidate:
-    """A match, and its score: the logarithm of its posterior density but for a constant.
-
-    sure : the scan fits well. near : it lies where it is expected.
-    """
-
-    score: float
-    match: Match = field(compare=False)
-    sure: bool = field(compare=False)
-    near: bool = field(compare=False)
-
-    @property
-    def settles(self) -> bool:
-        """Whether nothing else needs to be tried."""
-        return self.sure and self.near
 
 
 class SensorOnWheels:
@@ -74,8 +54,9 @@ class SensorOnWheels:
         self._matching = MATCHING_PARAMETERS
         self._maps = MatchingMaps(projection.max_range_m, parameters)
         self.kiss = KissRegistration(registration, parameters)
-        self._planar_scan: PlanarScan | None = None  # of the scan placed last
-        self._last = SE2()  # its final pose
+        # Of the scan taken last: reduced to the plane, where KISS-ICP puts it, whether it has no odometry.
+        self._planar_scan: PlanarScan
+        self._registered, self._unaided = SE2(), True
         self._latest: deque[tuple[PlanarScan, SE2]] = deque(maxlen=parameters.followed)
 
     @property
@@ -91,7 +72,7 @@ class SensorOnWheels:
         self._matching = CAMERA_MATCHING if self._narrow else MATCHING_PARAMETERS
         self._maps = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
         pose = self.levelled(at.lift())
-        self.kiss.register(self._floor.remove(points_m), pose, 0.0)
+        self.kiss.register(self._floor.remove(points_m), pose)
         self._planar_scan = self._project(scan, points_m)
         return pose
 
@@ -104,139 +85,89 @@ class SensorOnWheels:
         """A pose (4, 4) in the plane with tilt and height from the floor: walls alone let them drift."""
         return pose @ self._floor.T_level_base()
 
-    def place(self, scan: Scan, points_m: F32, seconds: float, expected: Sequence[Belief]) -> Placed:
-        """See `PlacingSensor`."""
-        p = self._parameters
-        self._floor.follow(points_m, scan)
-        near = self.kiss.register(self._floor.remove(points_m), self.levelled(expected[0].pose), seconds)
-        registered = SE2.from_matrix(near)
-        self._planar_scan = planar_scan = self._project(scan, points_m)
-        motion = None
-        if scan.T_odom_base is None and self.kiss.registered and not self._narrow:
-            sigmas = np.array([p.steady_sigma_m, p.steady_sigma_m, p.steady_sigma_rad])
-            motion = (self._last.inverse() @ registered).lift(), np.diag(sigmas**-2)
-        if not self._maps:
-            return Placed(expected[0].pose, first=True)
-        best = self._match(planar_scan, registered, expected)
-        match = best.match
-        # Half of what a camera sees while it turns may be new to the map, but not to the scans before.
-        if match.overlap < p.min_overlap or not (best.sure or best.near):
-            followed = None if scan.T_odom_base is not None else self._followed(planar_scan, expected[0])
-            return Placed(expected[0].pose, motion=followed or motion, followed=followed is not None)
-        alone = match.by_points.lift(), _turned(match.information, match.by_points.yaw)
-        return Placed(
-            match.pose.lift(), alone, match.overlap, match.residual_m, match.measured, motion=motion
-        )
+    def __bool__(self) -> bool:
+        """Whether there is a local map."""
+        return bool(self._maps)
 
-    def _followed(self, planar_scan: PlanarScan, belief: Belief) -> tuple[F64, F64] | None:
-        """The motion (4, 4) from the scan before by the last scans alone, with its information (3, 3); None
-        if it does not fit them."""
+    def take(self, scan: Scan, points_m: F32, expected: Belief) -> None:
+        """See `PlacingSensor`."""
+        self._floor.follow(points_m, scan)
+        near = self.kiss.register(self._floor.remove(points_m), self.levelled(expected.pose))
+        self._registered = SE2.from_matrix(near)
+        self._planar_scan, self._unaided = self._project(scan, points_m), scan.T_odom_base is None
+
+    def match(self, belief: Belief, *, wide: bool) -> list[Fit]:
+        """See `PlacingSensor`. KISS-ICP slides along walls, so it is not the only beginning."""
+        prior = SE2.from_matrix(belief.pose)
+        starts = (prior, self._registered) if wide else (prior,)
+        return [self._matched(self._maps, start, belief, wide=wide) for start in starts]
+
+    def search(self, belief: Belief) -> Iterator[Fit]:
+        """See `PlacingSensor`.
+
+        Half of what a camera sees while it turns may be new to the map; a wide scan shows known ground behind
+        it, too.
+        """
+        p, (sigma_m, sigma_rad), prior = self._parameters, belief.sigmas, SE2.from_matrix(belief.pose)
+        window = min(KERNEL * sigma_m, p.search_most_m), min(KERNEL * sigma_rad, math.pi)
+        for guess in self._maps.search(self._planar_scan, prior, *window):
+            yield self._matched(self._maps, guess, belief)
+        if self._narrow:
+            nothing = belief.pose, np.zeros((3, 3))
+            yield Fit(
+                pose=belief.pose, alone=nothing, overlap=0.0, residual_m=math.inf, measured=False,
+                evidence=self._weight * p.sure_overlap, credible=False,
+            )  # fmt: skip
+
+    def holds(self, fit: Fit) -> bool:
+        """Lines hold what lies on them."""
+        return True
+
+    def follow(self, belief: Belief) -> Estimate | None:
+        """See `PlacingSensor`. Half of what a camera sees while it turns may be new to the map, but not to
+        the scans before."""
         last = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
         for before, pose in self._latest:
             last.extend(before, pose)
-        prior = SE2.from_matrix(belief.pose)
-        match = last.match(planar_scan, prior, prior, _in_map_axes(belief))
-        motion = self._last.inverse() @ match.by_points
-        information = _turned(match.information, self._last.yaw)
-        return (motion.lift(), information) if self._is_sure(match) else None
+        fit = self._matched(last, SE2.from_matrix(belief.pose), belief)
+        at, information = fit.alone
+        motion = self._last.inverse() @ SE2.from_matrix(at)
+        return (motion.lift(), _turned(information, -motion.yaw)) if fit.credible and self._unaided else None
 
-    def _match(self, planar_scan: PlanarScan, registered: SE2, expected: Sequence[Belief]) -> _Candidate:
-        """The most probable match of a planar scan with the local map.
+    def _matched(self, maps: MatchingMaps, guess: SE2, belief: Belief, *, wide: bool = True) -> Fit:
+        """The planar scan matched with local maps from a guess, held to a belief."""
+        p, prior = self._parameters, SE2.from_matrix(belief.pose)
+        information = _turned(belief.information, -prior.yaw)  # in the axes of the session frame
+        match = maps.match(self._planar_scan, guess, prior, information, wide=wide)
+        return Fit(
+            pose=match.pose.lift(),
+            alone=(match.by_points.lift(), _turned(match.information, match.by_points.yaw)),
+            overlap=match.overlap,
+            residual_m=match.residual_m,
+            measured=match.measured,
+            evidence=self._weight * maps.quality(match),
+            credible=match.overlap >= p.sure_overlap and match.residual_m <= p.max_residual_m,
+        )
 
-        A scan that fits nowhere near what is expected is searched for.
-        """
-        p, first, unseen = self._parameters, expected[0], -math.inf
-        found = self._candidates(planar_scan, registered, expected)
-        if self._is_vague(first) and not max(found).sure:
-            found += self._searched(planar_scan, first)
-            # A wide scan shows known ground behind it, too.
-            if self._narrow and not max(found).near:
-                unseen = self._weight(planar_scan) * p.sure_overlap + first.log_density(0.0)
-        return self._believed(found, unseen)
+    @property
+    def _last(self) -> SE2:
+        """The final pose of the scan before."""
+        return self._latest[-1][1]
 
-    def _candidates(
-        self, planar_scan: PlanarScan, registered: SE2, expected: Sequence[Belief]
-    ) -> list[_Candidate]:
-        """Matches of a planar scan with the local map.
-
-        They begin where the base is expected and where KISS-ICP puts it. If the scan fits nowhere there, they
-        begin where else the base may be. KISS-ICP slides along walls, so it does not count where the scan
-        fits as well without it.
-        """
+    @property
+    def _weight(self) -> float:
+        """What the scan taken last tells if it fits without any error."""
         p = self._parameters
-        found: list[_Candidate] = []
-        for belief in expected:
-            prior = SE2.from_matrix(belief.pose)
-            starts = [prior, registered]
-            if _is_near(registered, prior, p.disagree_m, p.disagree_rad):
-                starts = [registered]
-            found += (self._candidate(planar_scan, start, belief) for start in starts)
-            if not max(found).settles:
-                found.append(self._candidate(planar_scan, prior, belief, wide=False))
-            if max(found).settles and not self._is_vague(belief):
-                return [max(found)]
-        return found
-
-    def _searched(self, planar_scan: PlanarScan, belief: Belief) -> Iterator[_Candidate]:
-        """Matches of a planar scan anywhere within a belief."""
-        p, (sigma_m, sigma_rad) = self._parameters, belief.sigmas
-        window = min(p.search_sigmas * sigma_m, p.search_most_m), min(p.search_sigmas * sigma_rad, math.pi)
-        for guess in self._maps.search(planar_scan, SE2.from_matrix(belief.pose), *window):
-            yield replace(self._candidate(planar_scan, guess, belief), near=False)
-
-    def _believed(self, found: list[_Candidate], unseen: float) -> _Candidate:
-        """The best of several matches; it says nothing where another explanation is nearly as probable:
-        another place, or, with the score `unseen`, that the scan shows ground that the map does not know."""
-        p, best = self._parameters, max(found)
-        rivals = [
-            math.exp(other.score - best.score)
-            for other in found
-            if not _is_near(other.match.pose, best.match.pose, p.search_above_m, p.search_above_rad)
-        ]
-        rivals.append(math.exp(min(unseen - best.score, 700.0)))
-        alone = 1.0 / (1.0 + sum(rivals)) >= p.least_mass
-        return best if alone else replace(best, sure=False, near=False)
-
-    def _candidate(
-        self, planar_scan: PlanarScan, guess: SE2, belief: Belief, *, wide: bool = True
-    ) -> _Candidate:
-        """A match of a planar scan that begins at a guess and is held to a belief.
-
-        wide : lines far from the guess count at first; this reaches further, but may leave a good guess.
-        """
-        information = _in_map_axes(belief)
-        match = self._maps.match(planar_scan, guess, SE2.from_matrix(belief.pose), information, wide=wide)
-        of_scan = self._weight(planar_scan) * self._maps.quality(match)
-        chi2 = belief.chi2(match.pose.lift())
-        near = chi2 < self._parameters.search_sigmas**2
-        return _Candidate(of_scan + belief.log_density(chi2), match, self._is_sure(match), near)
-
-    def _weight(self, planar_scan: PlanarScan) -> float:
-        """What a scan tells if it fits without any error."""
-        p = self._parameters
-        return p.hit_weight * min(len(planar_scan.hits_m), p.matched_hits)
-
-    def _is_vague(self, belief: Belief) -> bool:
-        """Whether a refinement alone does not reach all that a belief holds possible."""
-        p, (sigma_m, sigma_rad) = self._parameters, belief.sigmas
-        return p.search_sigmas * max(sigma_m / p.search_above_m, sigma_rad / p.search_above_rad) > 1.0
-
-    def _is_sure(self, match: Match) -> bool:
-        """Whether a scan fits so well that nothing else needs to be tried."""
-        p = self._parameters
-        return match.overlap >= p.sure_overlap and match.residual_m <= p.max_residual_m
+        return p.hit_weight * min(len(self._planar_scan.hits_m), p.matched_hits)
 
     def cut(self, scan: Scan, points_m: F32, pose: F64, *, lost: bool) -> PlanarScan:
-        """The planar scan of the scan placed last."""
+        """The planar scan of the scan taken last."""
         del scan, points_m, lost
-        self._last = SE2.from_matrix(pose)
-        assert self._planar_scan is not None
-        self._latest.append((self._planar_scan, self._last))
+        self._latest.append((self._planar_scan, SE2.from_matrix(pose)))
         return self._planar_scan
 
     def extend(self, pose: F64) -> None:
-        """Add the scan placed last to the local maps at its final pose (4, 4)."""
-        assert self._planar_scan is not None
+        """Add the scan taken last to the local maps at its final pose (4, 4)."""
         self._maps.extend(self._planar_scan, SE2.from_matrix(pose))
         self.kiss.update_map(pose)
 
@@ -265,19 +196,9 @@ class SensorOnWheels:
         return self._depth_limit.before(planar_scan, T_level_base @ scan.T_base_sensor)
 
 
-def _is_near(a: SE2, b: SE2, limit_m: float, limit_rad: float) -> bool:
-    apart = a.inverse() @ b
-    return math.hypot(apart.x, apart.y) <= limit_m and abs(apart.yaw) <= limit_rad
-
-
 def _turned(matrix: F64, yaw_rad: float) -> F64:
     """A covariance or information (3, 3) of x, y, yaw in axes that are turned."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     turned: F64 = R @ matrix @ R.T
     return turned
-
-
-def _in_map_axes(belief: Belief) -> F64:
-    """The information (3, 3) of a belief, in the axes of the session frame."""
-    return _turned(belief.information, -SE2.from_matrix(belief.pose).yaw)

@@ -42,7 +42,6 @@ class TrackingParameters:
 
     max_points : of a scan, chosen at random; a depth image has 300 000.
     icp_points : of these, those given to KISS-ICP, floor and ceiling included.
-    icp_min_points : fewer than this above the floor: the floor is left in.
     floor_slack_m, floor_slack_per_m : height up to which points count as floor, and its growth with the
         horizontal range (0.01 is an error of the tilt of 0.6 degrees).
 
@@ -58,8 +57,6 @@ class TrackingParameters:
     gap : odometry does not go on over a time of more than so many usual intervals between scans.
     fastest : in m/s and in rad/s; odometry that reports a faster motion is not believed, with an allowance of
         `jump_m` and `jump_rad` for noise.
-    steady_sigma_m, steady_sigma_rad : standard deviations of the motion that KISS-ICP finds, without
-        odometry.
 
     Refinement in the plane:
 
@@ -67,16 +64,12 @@ class TrackingParameters:
     followed : last scans that a scan is matched with which does not fit the local map.
     residual_weight_per_m : of two placements the one with the larger overlap - weight * residual is taken.
     hit_weight : what a hit tells as a share of one that is independent of its neighbours.
-    disagree_m, disagree_rad : where KISS-ICP and the prediction differ by more, both start a refinement.
     sure_overlap : least overlap of a placement that alone decides between odometry and the motion before;
         with less, placements are searched for if the prediction leaves enough open.
-    search_sigmas : half width of that search in standard deviations of the predicted motion.
-    search_above_m, search_above_rad : it is made only if the half width exceeds one of these; a refinement
-        alone converges over less.
-    search_most_m : largest half width. Tracking starts again if the position is known to less.
-    least_mass : share of the probability of all matches that the best one must have.
+    search_above_m, search_above_rad : it is made only if its half width, `KERNEL` standard deviations,
+        exceeds one of these; a refinement alone converges over less.
+    search_most_m : largest half width.
     search_sigma_m : of the likelihood field that is searched; its steps are 0.2 m and 2 degrees.
-    search_hits : hits that are searched with, at most, evenly chosen.
 
     Local maps and keyframes:
 
@@ -91,26 +84,17 @@ class TrackingParameters:
 
     KISS-ICP (Vizzo et al. 2023; its defaults are for cars):
 
-    icp_range_factor, icp_range_percentile : its range is this times that percentile of the first ranges,
-        within `icp_range_m`.
     icp_voxels_per_range : its voxel is the 75th percentile of the first ranges over this, within
         `icp_voxel_m`.
-    brisk_mps, icp_max_reach_m : partners of points are looked for no farther than a voxel away, so a voxel
-        spans at least the motion of a person between two scans, up to a limit.
-    icp_* otherwise : a rolling base is refined afterwards, so a coarse and quick solution is enough.
     """
 
     max_points: int = 40_000
     icp_points: int = 6_000
-    icp_min_points: int = 100
     floor_slack_m: float = 0.1
     floor_slack_per_m: float = 0.01
 
     rolling_gain: float = 0.02
     rolling_every: int = 8
-
-    steady_sigma_m: float = 0.03
-    steady_sigma_rad: float = 0.01
 
     gap: float = 10.0
     fastest: float = 4.0
@@ -121,16 +105,11 @@ class TrackingParameters:
     matched_hits: int = 700
     residual_weight_per_m: float = 5.0
     hit_weight: float = 0.3
-    disagree_m: float = 0.03
-    disagree_rad: float = 0.02
     sure_overlap: float = 0.6
-    search_sigmas: float = 3.0
     search_above_m: float = 0.3
     search_above_rad: float = 0.2
     search_most_m: float = 3.0
-    least_mass: float = 0.9
     search_sigma_m: float = 0.15
-    search_hits: int = 200
 
     keyframe_travel_m: float = 0.2
     keyframe_turn_rad: float = math.radians(10.0)
@@ -140,18 +119,8 @@ class TrackingParameters:
     max_residual_m: float = 0.1
     give_up_scans: int = 10
 
-    icp_min_frame: int = 10
-    icp_range_factor: float = 1.5
-    icp_range_percentile: float = 98.0
-    icp_range_m: tuple[float, float] = (10.0, 100.0)
     icp_voxels_per_range: float = 40.0
     icp_voxel_m: tuple[float, float] = (0.3, 1.0)
-    brisk_mps: float = 1.0
-    icp_max_reach_m: float = 0.5
-    icp_points_per_voxel: int = 10
-    icp_iterations: int = 10
-    icp_converged: float = 1e-2
-    icp_initial_threshold_m: float = 1.0
 
 
 MATCHING_PARAMETERS = MatchingParameters()

@@ -2,8 +2,8 @@
 
 `KissRegistration` is composed of the public parts of kiss_icp, in the order of `KissICP.register_frame`.
 Three things differ. The initial guess comes from outside (odometry where the log has it). The local map is
-updated by a call of its own, once the pose of the scan is final. Voxel and range are chosen from the first
-scans, since the defaults are for cars. Floor and ceiling are removed before: the rings of a lidar on the
+updated by a call of its own, once the pose of the scan is final. The voxel is chosen from the first scan,
+since the default is for cars. Floor and ceiling are removed before: the rings of a lidar on the
 floor move with the sensor and pull point-to-point ICP towards standing still.
 """
 
@@ -27,10 +27,8 @@ _EXACT = 1e-12
 class KissRegistration:
     """KISS-ICP with a given initial guess, in one thread and hence repeatable.
 
-    registered : whether the last scan was registered, and not only predicted.
-
-    Voxel and range come from the first scan with returns and the time to the next one, unless `config`
-    fixes them. A refinement in the plane follows, so coarse voxels and few iterations are enough.
+    The voxel comes from the first scan with returns, unless `config` fixes it. A refinement in the plane
+    follows, so coarse voxels are enough.
     """
 
     def __init__(
@@ -38,40 +36,36 @@ class KissRegistration:
     ) -> None:
         self._config = config
         self._parameters = parameters
-        self._first: tuple[F64, F64] | None = None  # points and pose of the first scan
-        self.registered = False
         self._pending: F64 | None = None  # the last scan, downsampled, until its pose is final
         self._kiss_config: Any = None
         self._registration: Any = None
         self._threshold: Any = None
         self._map: Any = None
 
-    def register(self, points_m: NDArray[np.floating], guess: F64, period_s: float) -> F64:
+    def register(self, points_m: NDArray[np.floating], guess: F64) -> F64:
         """Align one scan to the local map.
 
         points_m : (N, 3) deskewed, without floor and ceiling, in the base frame. guess : (4, 4) initial
-        T_session_base. period_s : time since the last scan.
+        T_session_base.
 
         Returns T_session_base (4, 4); the guess for the first scan, and for scans without enough points.
         The scan becomes part of the local map only by `update_map`.
         """
-        self._pending, self.registered = None, False
+        self._pending = None
         guess = _proper(guess)
-        if len(points_m) < self._parameters.icp_min_frame:
+        if not len(points_m):
             return guess
         points = np.ascontiguousarray(points_m, dtype=np.float64)
-        if self._first is None:
-            self._first = points, guess
-            return guess
         if self._map is None:
-            self._start(*self._first, period_s)
+            self._start(points, guess)
+            return guess
         near = np.einsum("ij,ij->i", points, points) < self._kiss_config.data.max_range**2
         frame = self._downsample(points[near])
         pose = self._align(self._downsample(frame, 1.5), guess)
         if not np.isfinite(pose).all():
             return guess
         self._threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
-        self._pending, self.registered = frame, True
+        self._pending = frame
         return pose
 
     def _align(self, source: F64, guess: F64) -> F64:
@@ -99,7 +93,7 @@ class KissRegistration:
         sampled: F64 = voxel_down_sample(points, voxels * self._kiss_config.mapping.voxel_size)
         return sampled
 
-    def _start(self, points: F64, pose: F64, period_s: float) -> None:
+    def _start(self, points: F64, pose: F64) -> None:
         """Choose the configuration from the first scan and begin the local map with it."""
         from kiss_icp.config import KISSConfig
         from kiss_icp.mapping import get_voxel_hash_map
@@ -109,19 +103,12 @@ class KissRegistration:
         p = self._parameters
         ranges = np.linalg.norm(points, axis=1)
         config = KISSConfig()
-        config.data.max_range = self._config.max_range_m or float(
-            np.clip(p.icp_range_factor * np.percentile(ranges, p.icp_range_percentile), *p.icp_range_m)
+        config.data.max_range = self._config.max_range_m or config.data.max_range
+        middle_m = float(np.percentile(ranges, 75))
+        config.mapping.voxel_size = self._config.voxel_m or float(
+            np.clip(middle_m / p.icp_voxels_per_range, *p.icp_voxel_m)
         )
-        finest_m = max(
-            float(np.percentile(ranges, 75)) / p.icp_voxels_per_range,
-            min(p.brisk_mps * period_s, p.icp_max_reach_m),
-        )
-        config.mapping.voxel_size = self._config.voxel_m or float(np.clip(finest_m, *p.icp_voxel_m))
         config.registration.max_num_threads = 1
-        config.mapping.max_points_per_voxel = p.icp_points_per_voxel
-        config.registration.max_num_iterations = p.icp_iterations
-        config.registration.convergence_criterion = p.icp_converged
-        config.adaptive_threshold.initial_threshold = p.icp_initial_threshold_m
         self._kiss_config = config
         self._registration = get_registration(config)
         self._threshold = get_threshold_estimator(config)
@@ -130,7 +117,7 @@ class KissRegistration:
 
     @property
     def voxel_and_range_m(self) -> tuple[float, float] | None:
-        """The voxel and the range that were chosen, or None before the second scan."""
+        """The voxel and the range that were chosen, or None before the first scan."""
         if self._kiss_config is None:
             return None
         return self._kiss_config.mapping.voxel_size, self._kiss_config.data.max_range

@@ -27,7 +27,7 @@ from pc2grid.estimation.odometer import Odometer
 from pc2grid.estimation.on_wheels import SensorOnWheels
 from pc2grid.estimation.overruled import Disagreement
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
-from pc2grid.estimation.placed import Placed, PlacingSensor
+from pc2grid.estimation.placing import Placed, Placer, PlacingSensor
 from pc2grid.estimation.rides import Ride, RideWatch
 from pc2grid.estimation.smoother import IN_THE_HAND, SMOOTHER, Evidence, Smoother
 from pc2grid.geometry import SE2, invert_pose
@@ -133,12 +133,12 @@ class Tracker:
         motion = invert_pose(self._smoother.belief.pose) @ expected[0].pose
         points = self._deskewed(scan, motion, seconds)
         # 3. Place the scan by itself, and weigh that against odometry and the scans before.
-        placed = self._sensor.place(scan, points, seconds, expected)
+        placed = Placer(self._sensor, self._parameters).place(scan, points, expected)
         between = placed.motion if turn is None else (steady[0], np.diag(steady[1] ** -2))
         estimate = self._estimated(placed, Evidence(seconds, reading, continues, placed.alone, between))
         # 4. Judge the pose, and start again if nothing fits any more.
-        bridged = placed.followed or (reading is not None and continues)
-        health = self._health.judge(placed, estimate, bridged=bridged)
+        bridged = placed.motion is not None or (reading is not None and continues)
+        health = self._health.judge(placed, bridged=bridged)
         pose = self._sensor.levelled(estimate.pose)
         travelled = invert_pose(last_pose) @ pose if reported is None or not continues else reported
         tracked = self._finish(scan, points, pose, health, travelled)

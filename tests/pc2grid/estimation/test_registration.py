@@ -16,9 +16,9 @@ def test_a_matrix_that_is_nearly_a_rotation_does_not_end_the_process() -> None:
     points[np.arange(4000), np.abs(points / (6, 4, 2)).argmax(axis=1)] *= 1.2
     rounded = np.round(pose_from_rotation_vector((0.3, 0.2, 0.1), (0.01, 0.0, 0.0)), 9)
     registration = KissRegistration(RegistrationConfig())
-    registration.register(points, rounded, 0.0)
+    registration.register(points, rounded)
     registration.update_map(rounded)
     for _ in range(2):
-        pose = registration.register(points, rounded, 0.1)
+        pose = registration.register(points, rounded)
         registration.update_map(rounded)
     assert np.abs(pose - rounded).max() < 0.05

@@ -98,16 +98,16 @@ import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 from pc2grid.io import open_log
-from pc2grid.estimation.tracker import Tracker
+from pc2grid.estimation.registration import KissRegistration
 from signature.config import Config
 
 path, duration = sys.argv[1], float(sys.argv[2]) or None
 with open_log(path) as log:
     scans = list(log.scans(0.0, duration))
-tracker = Tracker(Config().registration)
+chosen = KissRegistration(Config().registration)
 for scan in scans[:3]:
-    tracker.track(scan)
-voxel_m, range_m = tracker.kiss.voxel_and_range_m  # what pc2grid chooses for this log
+    chosen.register(scan.points_m, np.eye(4))
+voxel_m, range_m = chosen.voxel_and_range_m  # what pc2grid chooses for this log
 found = {"scans": len(scans), "voxel": voxel_m}
 points = [np.asarray(scan.points_m, np.float64) for scan in scans]
 for name, voxel, reach in (

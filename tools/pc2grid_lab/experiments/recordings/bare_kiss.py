@@ -29,10 +29,9 @@ def main() -> None:
     """
     log, truth = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None
     with open_log(log) as opened:
-        chosen, last_ns = KissRegistration(Config().registration), 0
+        chosen = KissRegistration(Config().registration)
         for scan in islice(opened.scans(), 2):
-            chosen.register(scan.points_m, np.eye(4), (scan.stamp_ns - last_ns) * 1e-9)
-            last_ns = scan.stamp_ns
+            chosen.register(scan.points_m, np.eye(4))
         config: Any = KISSConfig()
         voxel_and_range_m: Any = chosen.voxel_and_range_m
         config.mapping.voxel_size, config.data.max_range = voxel_and_range_m
