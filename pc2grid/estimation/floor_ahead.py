@@ -93,4 +93,8 @@ class FloorAhead:
             return
         self._bends_rad.append(math.atan(float(slope)))
         bend_rad = self._bends_rad[-1] - float(np.median(self._bends_rad))
-        self._seen.append((self._travel_m + 0.5 * (p.near_m + p.far_m), pitch_rad + bend_rad))
+        slope_rad = pitch_rad + bend_rad
+        if self.pitch_rad is None and self._seen:
+            # Between here and what was seen first the floor may bend: the pitch here is not known.
+            slope_rad = self._seen[-1][1]
+        self._seen.append((self._travel_m + 0.5 * (p.near_m + p.far_m), slope_rad))

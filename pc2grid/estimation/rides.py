@@ -31,19 +31,16 @@ class RideParameters:
 
     Slopes:
 
-    level_every_m, every_m : travel from one measurement of the vertical to the next, on level ground, and on
-        a slope and up to `settled_m` behind it. A measurement takes as long as tracking a scan.
-    measurements : whose median is used.
-    begin_rad, end_rad : tilt from which on a robot is on a slope, and below which it is not any more; 1 in 12
-        is 4.8 degrees. camera_factor : these times, by a depth camera: in the real 3D scan of a level floor,
-        the median of its measurements reaches 2.9 degrees.
+    every_m : travel from one measurement of the vertical to the next, each of which takes as long as tracking
+        a scan. measurements : whose median is used.
+    begin_rad : tilt from which on a robot is on a slope; 1 in 12 is 4.8 degrees. In the real 3D scan of a
+        level floor, the median of a camera's measurements reaches 2.9 degrees.
     settled_m : level travel after which a slope has ended. More than the way over the landing between two
         flights of stairs.
-    known_m : travel after a measurement for which it holds: farther on the ground is not known to be level.
     storey_m : a rise of at least this leads to another floor.
     same_m : floors whose heights differ by less are one.
     steep_rad : a steeper slope, such as stairs, is not mapped. Tracking in the plane measures wrong distances
-        there, so the pose after it is not known, unless it rose or fell by less than `brief_m`. A flatter one
+        there, so the pose after it is not known, unless it rose or fell by less than `same_m`. A flatter one
         is mapped like level ground.
 
     Lifts:
@@ -58,18 +55,13 @@ class RideParameters:
     door : neighbouring sectors that are open when the door is.
     """
 
-    level_every_m: float = 0.3
-    every_m: float = 0.1
+    every_m: float = 0.3
     measurements: int = 3
-    begin_rad: float = math.radians(2.5)
-    end_rad: float = math.radians(1.5)
-    camera_factor: float = 1.4
+    begin_rad: float = math.radians(3.0)
     settled_m: float = 4.0
-    known_m: float = 1.0
     storey_m: float = 1.5
     same_m: float = 1.0
     steep_rad: float = CLOUD_PARAMETERS.steepest_floor_rad
-    brief_m: float = 0.3
 
     sectors: int = 72
     stands_m: float = 0.5
@@ -136,15 +128,15 @@ class RideWatch:
         if ground is None:
             return Ride()
         if self._slope is None:
-            self._slope = _Slope(scan.sensor, self._parameters)
+            self._slope = _Slope(scan.sensor, ground, self._parameters)
         ended = self._slope.observe(points_m, forward_m, place.yaw, ground)
-        return Ride(self._slope.riding, ended is not None and self._arrives(ended))
+        return Ride(self._slope.riding, ended and self._arrives(self._slope))
 
-    def _arrives(self, slope: _Ended) -> bool:
+    def _arrives(self, slope: _Slope) -> bool:
         """Whether a slope led to another floor, which becomes the present one, or to an unknown place."""
         p = self._parameters
         if abs(slope.rise_m) < p.storey_m:
-            return slope.steepest_rad > p.steep_rad and abs(slope.rise_m) > p.brief_m
+            return slope.steep and abs(slope.rise_m) > p.same_m
         here = self.storeys[self.storey]
         height_m = here.height_m + slope.rise_m
         joined = [k for k, other in enumerate(self.storeys) if other.group == here.group]
@@ -155,120 +147,81 @@ class RideWatch:
         return True
 
 
-@dataclass(frozen=True, slots=True)
-class _Ended:
-    """A slope that the robot has left behind, with its largest tilt."""
-
-    rise_m: float
-    steepest_rad: float
-
-
 class _Slope:
-    """Measures the tilt of the base against the walls, and the rise on a slope."""
+    """Measures the tilt of the base against the walls, and the rise on a slope.
 
-    def __init__(self, sensor: SensorKind, parameters: RideParameters) -> None:
-        self._parameters = parameters
-        model = SENSOR_MODELS[sensor]
-        self._factor = parameters.camera_factor if model.narrow else 1.0
-        self._upright = CAMERA_UPRIGHT if model.narrow else UPRIGHT
-        self._latest: deque[tuple[float, float]] = deque(maxlen=parameters.measurements)
-        self._ahead = FloorAhead() if model.narrow else None
-        self._vertical: F64 | None = None
+    rise_m : since the slope that is underway began.
+    """
+
+    def __init__(self, sensor: SensorKind, ground: Ground, parameters: RideParameters) -> None:
+        p = self._parameters = parameters
+        self._narrow = SENSOR_MODELS[sensor].narrow
+        self._upright = CAMERA_UPRIGHT if self._narrow else UPRIGHT
+        self._ahead = FloorAhead()
+        self._vertical = ground.normal
+        # The latest measurements: pitch and tilt.
+        self._tilts: deque[tuple[float, float]] = deque([(0.0, 0.0)] * p.measurements, p.measurements)
         self._unmeasured_m = math.inf
-        self._tilted = False
-        self._level_m = 0.0
-        self._forward_m = 0.0  # travel since the last measurement, forward
-        self._unknown_m = 0.0  # the same, to and fro
-        self._travels_m: deque[float] = deque(maxlen=(parameters.measurements + 1) // 2)
-        self._pitch_rad = 0.0  # the last median
-        self._rise_m = 0.0
+        self._level_m = math.inf  # measured travel since the last tilt
         self._steepest_rad = 0.0
-        self.underway = False  # on a slope, or not far behind it
+        self.rise_m = 0.0
+
+    @property
+    def underway(self) -> bool:
+        """Whether the robot is on a slope, or not far behind it."""
+        return self._level_m < self._parameters.settled_m
+
+    @property
+    def steep(self) -> bool:
+        """Whether the slope is too steep to be mapped."""
+        return self._steepest_rad > self._parameters.steep_rad
 
     @property
     def riding(self) -> bool:
         """Whether the slope is underway and too steep to be mapped, or leads to another floor."""
-        p = self._parameters
-        return self.underway and (self._steepest_rad > p.steep_rad or abs(self._rise_m) >= p.storey_m)
+        return self.underway and (self.steep or abs(self.rise_m) >= self._parameters.storey_m)
 
-    def observe(self, points_m: F32, forward_m: float, yaw_rad: float, ground: Ground) -> _Ended | None:
-        """Take in a scan; returns the slope that it shows to be over.
+    def observe(self, points_m: F32, forward_m: float, yaw_rad: float, ground: Ground) -> bool:
+        """Take in a scan; returns whether it shows that a slope is over.
 
         points_m, ground : as in `RideWatch.observe`. forward_m : travel along the base's own x axis since the
         last scan. yaw_rad : heading of the base in the session frame.
         """
         p = self._parameters
         self._unmeasured_m += abs(forward_m)
-        self._forward_m += forward_m
-        self._unknown_m += abs(forward_m)
-        measured = False
-        due = self._unmeasured_m >= (p.level_every_m if self._is_level and not self.underway else p.every_m)
-        if due:
+        self._ahead.move(forward_m, yaw_rad)
+        before, level_m = self.underway, 0.0
+        if self._unmeasured_m >= p.every_m:
+            # What was not measured may be level or not.
+            level_m = self._unmeasured_m if self._measure(points_m, ground) else 0.0
             self._unmeasured_m = 0.0
-            measured = self._measure(points_m, ground)
-        if self._ahead is not None:
-            self._ahead.move(forward_m, yaw_rad)
-            if due and not measured:
-                measured = self._foresee(self._ahead)
-            self._ahead.look(points_m, ground, self._latest[-1][0] if self._latest else 0.0)
-        if len(self._latest) < p.measurements:
-            return None
-        pitch_rad, tilt_rad = np.median(np.array(self._latest), axis=0).tolist()
-        self._tilted = tilt_rad > self._factor * (p.end_rad if self._tilted else p.begin_rad)
-        if self._tilted and not self.underway:
-            self.underway, self._steepest_rad = True, 0.0
-        if measured:
-            self._unknown_m = 0.0
-            rise_m = self._rise_between(pitch_rad)
-            self._rise_m = self._rise_m + rise_m if self.underway else rise_m
-        if self._tilted:
-            self._level_m = 0.0
-            self._steepest_rad = max(self._steepest_rad, tilt_rad)
-            return None
-        if self._unknown_m < p.known_m:
-            self._level_m += abs(forward_m)
-        if not self.underway or self._level_m < p.settled_m:
-            return None
-        self.underway = False
-        return _Ended(self._rise_m, self._steepest_rad)
-
-    def _foresee(self, ahead: FloorAhead) -> bool:
-        """Where no scan shows the vertical, take the pitch from the floor that was seen ahead, if it was."""
-        pitch_rad = ahead.pitch_rad
-        if pitch_rad is None:
-            return False
-        self._latest.append((pitch_rad, abs(pitch_rad)))
-        return True
-
-    def _rise_between(self, pitch_rad: float) -> float:
-        """The rise from the place of one median of the pitch to that of this one.
-
-        A median belongs to the place of the measurement in the middle, so the travel is that between the
-        measurements before.
-        """
-        self._travels_m.append(self._forward_m)
-        self._forward_m = 0.0
-        mean_sine = 0.5 * (math.sin(self._pitch_rad) + math.sin(pitch_rad))
-        self._pitch_rad = pitch_rad
-        return self._travels_m[0] * mean_sine
-
-    @property
-    def _is_level(self) -> bool:
-        """Whether the latest measurement is that of level ground."""
-        return bool(self._latest) and self._latest[-1][1] < self._factor * self._parameters.end_rad
+        if self._narrow:
+            self._ahead.look(points_m, ground, self._tilts[-1][0])
+        pitch_rad, tilt_rad = np.median(np.array(self._tilts), axis=0).tolist()  # of pitches and of tilts
+        self._level_m = 0.0 if tilt_rad > p.begin_rad else self._level_m + level_m
+        if self.underway and not before:
+            self.rise_m = self._steepest_rad = 0.0
+        self.rise_m += forward_m * math.sin(pitch_rad)
+        self._steepest_rad = max(self._steepest_rad, tilt_rad)
+        return before and not self.underway
 
     def _measure(self, points_m: F32, ground: Ground) -> bool:
-        """Measure the tilt, if the scan shows the vertical, and return whether it does."""
+        """Measure pitch and tilt by the walls, and return whether that was possible.
+
+        Where these do not show the vertical, the pitch is that of the floor that a camera saw ahead, if it
+        did.
+        """
         up = ground.normal
-        last = up if self._vertical is None else self._vertical
-        vertical = vertical_of(points_m, (up,) if last is up else (last, up), self._upright)
-        if vertical is None:
-            return False
-        self._vertical = vertical
-        level = ground.leveling()[:3, :3] @ vertical
-        tilt_rad = math.acos(min(float(vertical @ up), 1.0))
-        self._latest.append((math.asin(float(np.clip(level[0], -1.0, 1.0))), tilt_rad))
-        return True
+        vertical = vertical_of(points_m, (self._vertical, up), self._upright)
+        foreseen_rad = self._ahead.pitch_rad
+        if vertical is not None:
+            self._vertical = vertical
+            level = ground.leveling()[:3, :3] @ vertical
+            tilt_rad = math.acos(min(float(vertical @ up), 1.0))
+            self._tilts.append((math.asin(float(np.clip(level[0], -1.0, 1.0))), tilt_rad))
+        elif foreseen_rad is not None:
+            self._tilts.append((foreseen_rad, abs(foreseen_rad)))
+        return vertical is not None or foreseen_rad is not None
 
 
 class _Lift:

@@ -96,16 +96,23 @@ SHAFT_M = np.array([(0.0, 0.0), (6.0, 0.0), (16.0, 10.0 * math.tan(math.radians(
 """Of the floor of a shaft 1.35 m wide, x and z, in which a camera sees nothing but two smooth walls."""
 
 
-def camera_drive() -> Iterator[tuple[float, Scan]]:
+SLOPE_END_M = 6.0 + 3.0 / math.tan(math.radians(7.6))
+TO_ANOTHER_FLOOR_M = np.array([(0.0, 0.0), (6.0, 0.0), (SLOPE_END_M, 3.0), (SLOPE_END_M + 9.0, 3.0)])
+"""The same shaft, as long as a ramp to the next floor, and 9 m behind it."""
+
+
+def camera_drive(
+    profile_m: F64 = SHAFT_M, end_m: float = 15.0, step_m: float = 0.06
+) -> Iterator[tuple[float, Scan]]:
     """Scans of a camera 0.6 m above the wheels, each with the distance that these have travelled."""
-    scene, rng = Scene(tunnel(SHAFT_M, 0.675, 2.6)), np.random.default_rng(0)
+    scene, rng = Scene(tunnel(profile_m, 0.675, 2.6)), np.random.default_rng(0)
     across, up = np.meshgrid(np.tan(np.radians(np.linspace(-44, 44, 60))), np.linspace(-0.57, 0.57, 120))
     rays = np.stack((np.ones_like(across), across, up), axis=-1).reshape(-1, 3)
     mount = np.eye(4)
     mount[:3, 3] = 0.2, 0.0, 0.6
-    travel_m, before = 0.0, standing_at(1.0, SHAFT_M)
-    for k, x in enumerate(np.arange(1.0, 15.0, 0.06)):
-        here = standing_at(float(x), SHAFT_M)
+    travel_m, before = 0.0, standing_at(1.0, profile_m)
+    for k, x in enumerate(np.arange(1.0, end_m, step_m)):
+        here = standing_at(float(x), profile_m)
         travel_m += float(np.linalg.norm((here - before)[:3, 3]))
         before = here
         depth = seen(scene, here @ mount, rays)
@@ -128,6 +135,22 @@ def test_a_camera_does_not_stand_still_on_a_ramp_between_smooth_walls() -> None:
     for travel_m, scan in camera_drive():
         at_m = tracker.track(scan).registered.T_session_base[0, 3]
         assert abs(at_m - travel_m) < 0.01 * travel_m + 0.05
+
+
+def test_a_ramp_between_smooth_walls_leads_a_camera_to_another_floor() -> None:
+    """Its walls do not show the vertical: the pitch is that of the floor that was seen ahead before.
+
+    Where a slope begins and ends is known to 1 m of travel, which is 0.13 m of height at both ends: the
+    storey is 0.25 m too low.
+    """
+    tracker, arrived_m = Tracker(RegistrationConfig()), []
+    for travel_m, scan in camera_drive(TO_ANOTHER_FLOOR_M, SLOPE_END_M + 7.0, step_m=0.12):
+        tracked = tracker.track(scan)
+        arrived_m += [travel_m] if tracked.arrived else []
+    assert len(arrived_m) == 1
+    first, second = tracker.storeys
+    assert first.group == second.group
+    assert second.height_m - first.height_m == pytest.approx(3.0, abs=0.4)
 
 
 def test_the_pitch_follows_the_floor_that_was_seen_ahead() -> None:
