@@ -120,20 +120,18 @@ class CarriedSensor:
         space = self._space
         found = space.match(self._thinned, guess, held, wide=wide)
         of_known, of_all = space.agreement(self._thinned, found.pose)
-        quality = of_all - self._tracking.residual_weight_per_m * found.residual_m
         return Fit(
             pose=found.pose,
             alone=_alone(found, held),
             overlap=found.overlap,
-            residual_m=found.residual_m,
             measured=found.measured,
-            evidence=SURFACES.independent(len(self._thinned.points_m)) * quality,
+            evidence=SURFACES.independent(len(self._thinned.points_m)) * of_all,
             credible=of_known >= self._parameters.least_agreement,
         )
 
     def holds(self, fit: Fit) -> bool:
         """See `PlacingSensor`."""
-        placement = Placement(fit.pose, fit.alone[1], fit.overlap, fit.residual_m, fit.measured)
+        placement = Placement(fit.pose, fit.alone[1], fit.overlap, 0.0, fit.measured)
         return self._space.is_held(self._thinned, placement)
 
     def follow(self, belief: Belief) -> None:

@@ -22,7 +22,7 @@ class HealthJudge:
         A scan that fits is FINE; DEGENERATE if one direction of its position is not determined. One that does
         not fit is DEGENERATE, too, where odometry tells where it is from a scan that was not lost; else LOST.
         """
-        if placed.first or placed.fits:
+        if placed.first or placed.alone is not None:
             self.restart()
             return Health.FINE if placed.first or placed.measured else Health.DEGENERATE
         if bridged and not self._lost_scans:

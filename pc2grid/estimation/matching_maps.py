@@ -48,10 +48,6 @@ class MatchingMaps:
         found = best_placements(field, grid.low_m, grid.cell_m, hits, guess, window_m, window_rad)
         return [pose for _, pose in found]
 
-    def quality(self, match: Match) -> float:
-        """What placements of one scan are compared by."""
-        return match.overlap - self._parameters.residual_weight_per_m * match.residual_m
-
     def match(
         self, planar_scan: PlanarScan, guess: SE2, prior: SE2, information: F64, *, wide: bool = True
     ) -> Match:

@@ -115,7 +115,7 @@ class SensorOnWheels:
         if self._narrow:
             nothing = belief.pose, np.zeros((3, 3))
             yield Fit(
-                pose=belief.pose, alone=nothing, overlap=0.0, residual_m=math.inf, measured=False,
+                pose=belief.pose, alone=nothing, overlap=0.0, measured=False,
                 evidence=self._weight * p.sure_overlap, credible=False,
             )  # fmt: skip
 
@@ -143,10 +143,9 @@ class SensorOnWheels:
             pose=match.pose.lift(),
             alone=(match.by_points.lift(), _turned(match.information, match.by_points.yaw)),
             overlap=match.overlap,
-            residual_m=match.residual_m,
             measured=match.measured,
-            evidence=self._weight * maps.quality(match),
-            credible=match.overlap >= p.sure_overlap and match.residual_m <= p.max_residual_m,
+            evidence=self._weight * match.overlap,
+            credible=match.overlap >= p.sure_overlap,
         )
 
     @property

@@ -62,7 +62,6 @@ class TrackingParameters:
 
     matched_hits : hits of a scan that are matched, at most, evenly chosen.
     followed : last scans that a scan is matched with which does not fit the local map.
-    residual_weight_per_m : of two placements the one with the larger overlap - weight * residual is taken.
     hit_weight : what a hit tells as a share of one that is independent of its neighbours.
     sure_overlap : least overlap of a placement that alone decides between odometry and the motion before;
         with less, placements are searched for if the prediction leaves enough open.
@@ -79,7 +78,6 @@ class TrackingParameters:
     Health:
 
     min_overlap : least share of the hits that meet a line of the local map, or of the points a surface.
-    max_residual_m : largest mean distance of the hits from their lines.
     give_up_scans : lost scans in a row after which tracking starts again.
 
     KISS-ICP (Vizzo et al. 2023; its defaults are for cars):
@@ -103,7 +101,6 @@ class TrackingParameters:
 
     followed: int = 5
     matched_hits: int = 700
-    residual_weight_per_m: float = 5.0
     hit_weight: float = 0.3
     sure_overlap: float = 0.6
     search_above_m: float = 0.3
@@ -116,7 +113,6 @@ class TrackingParameters:
     map_travel_m: float = 5.0
 
     min_overlap: float = 0.3
-    max_residual_m: float = 0.1
     give_up_scans: int = 10
 
     icp_voxels_per_range: float = 40.0

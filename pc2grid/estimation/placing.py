@@ -34,8 +34,8 @@ class Fit:
 
     pose : (4, 4) T_session_base, held to what was expected. alone : the pose by the points alone, with its
     information (D, D) in the axes of the base.
-    overlap : share of the points that meet the map. residual_m : their mean distance from it. measured :
-    whether they fix every direction of the position.
+    overlap : share of the points that meet the map. measured : whether they fix every direction of the
+    position.
     evidence : logarithm of the likelihood of the scan at that pose, but for a constant.
     credible : what is known there, free space included, speaks for the pose even if nothing else does.
     """
@@ -43,7 +43,6 @@ class Fit:
     pose: F64
     alone: Estimate
     overlap: float
-    residual_m: float
     measured: bool
     evidence: float
     credible: bool
@@ -107,14 +106,13 @@ class Placed:
 
     pose : (4, 4) T_session_base, from which the smoother begins. alone : as of `Fit`; None if the scan fits
     nowhere. motion : T_last_now, if the scan fits those before, but not the map: what it shows is new.
-    fits : it fits well everywhere. measured : its points fix every direction of the position. first : there
+    measured : its points fix every direction of the position. first : there
     is no local map yet, nor any since tracking started again.
     """
 
     pose: F64
     alone: Estimate | None = None
     motion: Estimate | None = None
-    fits: bool = False
     measured: bool = False
     first: bool = False
 
@@ -157,7 +155,6 @@ class Placer:
         return Placed(
             best.fit.pose,
             (alone, np.asarray(np.linalg.inv(np.linalg.inv(information) + spread), np.float64)),
-            fits=best.fit.residual_m <= p.max_residual_m,
             measured=best.fit.measured and (not self._is_vague(belief) or self._sensor.holds(best.fit)),
         )
 
@@ -180,7 +177,7 @@ class Placer:
 
     def _hypothesis(self, fit: Fit, belief: Belief) -> _Hypothesis:
         p, chi2 = self._parameters, belief.chi2(fit.pose)
-        sure = fit.credible and fit.overlap >= p.sure_overlap and fit.residual_m <= p.max_residual_m
+        sure = fit.credible and fit.overlap >= p.sure_overlap
         near = chi2 < KERNEL**2
         return _Hypothesis(fit.evidence + belief.log_density(chi2), fit, sure, near)
 
