@@ -64,10 +64,10 @@ class RegistrationConfig(Section):
     """Scans -> poses."""
 
     voxel_m: float | None = Field(
-        default=None, gt=0, description="KISS-ICP voxel; null: chosen from the data"
+        default=None, gt=0, description="KISS-ICP voxel; null: a hundredth of its range"
     )
     min_range_m: float = Field(default=0.3, ge=0, description="nearer returns are from the robot itself")
-    max_range_m: float | None = Field(default=None, gt=0, description="null: chosen from the data")
+    max_range_m: float | None = Field(default=None, gt=0, description="of KISS-ICP; null: its own, 100 m")
     deskew: bool = Field(
         default=True, description="undo the motion within a scan where per-point times exist"
     )

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import Config
 from pc2grid.errors import NoScans
+from pc2grid.estimation.ground_model import is_rolling
 from pc2grid.mapping.floors import floor_heights, floor_names
 from pc2grid.mapping.keyframe_points import KeyframePoints
 from pc2grid.mapping.keyframes import Keyframes
 from pc2grid.mapping.local_maps import CAMERA_LOCAL_MAPS, LOCAL_MAPS
 from pc2grid.mapping.loop_closure import LoopCloser
-from pc2grid.mapping.loop_parameters import CAMERA_LOOPS, LOOPS
+from pc2grid.mapping.loop_parameters import EXACT_TRACKING, LOOPS
 from pc2grid.mapping.part_maps import PartMap, doubtful_scans, draw_parts, long_enough, with_points
 from pc2grid.mapping.parts import PARTS
 from pc2grid.mapping.report import (
@@ -282,6 +283,7 @@ def _map(
     projection = config.projection
     first, scans = _first_of(_with_vertical(scans, config, observer))
     narrow = first is not None and SENSOR_MODELS[first.sensor].narrow
+    in_hand = first is not None and not is_rolling(first)
     with ExitStack() as stack:
         keyframes = stack.enter_context(closing(Keyframes()))
         points = None
@@ -292,7 +294,7 @@ def _map(
             keyframes,
             recognizer=recognizer,
             projection=projection,
-            parameters=CAMERA_LOOPS if narrow else LOOPS,
+            parameters=EXACT_TRACKING if narrow or in_hand else LOOPS,
             local_map_parameters=CAMERA_LOCAL_MAPS if narrow else LOCAL_MAPS,
         )
         selection = KeyframeSelection(keyframes, projection, closer, points)

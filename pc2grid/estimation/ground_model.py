@@ -62,7 +62,7 @@ class GroundModel:
             found = find_ground(points_m, scan.T_base_sensor[:3, 3], self.ground)
             if found is not None:
                 self._looks += 1
-                self.ground = self.ground.toward(found, max(1.0 / self._looks, self._parameters.rolling_gain))
+                self.ground = self.ground.toward(found, 1.0 / self._looks)
 
     def remove(self, points_m: F32) -> F32:
         """The points (N, 3) that KISS-ICP is given: a sample, without floor and ceiling."""
@@ -71,10 +71,9 @@ class GroundModel:
         p = self._parameters
         points = points_m[random_subset(len(points_m), p.icp_points)]
         heights = self.ground.heights(points)
-        slack = p.floor_slack_m + p.floor_slack_per_m * np.hypot(points[:, 0], points[:, 1])
-        keep = heights > slack
+        keep = heights > p.floor_slack_m
         if self.ground.ceiling_m is not None:
-            keep &= heights < self.ground.ceiling_m - slack
+            keep &= heights < self.ground.ceiling_m - p.floor_slack_m
         return points[keep]
 
     def T_level_base(self) -> F64:

@@ -43,7 +43,7 @@ class Odometer:
     def is_possible(self, motion: F64, seconds: float) -> bool:
         """Whether a robot or a person indoors can make a motion (4, 4) in a time."""
         p, (distance_m, turn_rad) = self._parameters, motion_size(motion)
-        return distance_m <= p.jump_m + p.fastest * seconds and turn_rad <= p.jump_rad + p.fastest * seconds
+        return max(distance_m, turn_rad) <= p.jump + p.fastest * seconds
 
     def disagreement(self, scan: Scan, pose: F64) -> Disagreement | None:
         """By how much the reported motion differs from that to the final pose (4, 4) of a scan."""

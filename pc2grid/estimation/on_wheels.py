@@ -53,7 +53,7 @@ class SensorOnWheels:
         self._floor = GroundModel(None, parameters)
         self._matching = MATCHING_PARAMETERS
         self._maps = MatchingMaps(projection.max_range_m, parameters)
-        self.kiss = KissRegistration(registration, parameters)
+        self.kiss = KissRegistration(registration)
         # Of the scan taken last: reduced to the plane, where KISS-ICP puts it, whether it has no odometry.
         self._planar_scan: PlanarScan
         self._registered, self._unaided = SE2(), True
@@ -79,7 +79,7 @@ class SensorOnWheels:
     def restart(self) -> None:
         """Forget the local maps: the next keyframe begins new ones."""
         self._maps.restart()
-        self.kiss = KissRegistration(self._registration, self._parameters)
+        self.kiss = KissRegistration(self._registration)
 
     def levelled(self, pose: F64) -> F64:
         """A pose (4, 4) in the plane with tilt and height from the floor: walls alone let them drift."""

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 class MatchingParameters:
     """Point-to-line scan matching.
 
-    cell_m : edge of a cell of moments.
+    cell_m : edge of a cell of moments. It is also the standard deviation that one point counts with, far
+        above the noise of a range: the errors of neighbours on one wall are not independent.
     sectors : number of directions by which surfaces are distinguished; a point uses its own and the two
         beside it.
-    point_sigma_m : standard deviation that one point counts with. It is far above the noise of a range,
-        since the errors of neighbours on one wall are not independent.
     least_points : with fewer points (sum of their weights) across it, a direction of the position counts as
         not measured.
     residual_scale_m : scale of the Cauchy weight of a point, times the radius of its neighbourhood in cells.
@@ -26,7 +25,6 @@ class MatchingParameters:
 
     cell_m: float = 0.1
     sectors: int = 8
-    point_sigma_m: float = 0.1
     least_points: float = 0.44
     residual_scale_m: float = 0.05
     prior_scale: float = 2.0
@@ -42,21 +40,17 @@ class TrackingParameters:
 
     max_points : of a scan, chosen at random; a depth image has 300 000.
     icp_points : of these, those given to KISS-ICP, floor and ceiling included.
-    floor_slack_m, floor_slack_per_m : height up to which points count as floor, and its growth with the
-        horizontal range (0.01 is an error of the tilt of 0.6 degrees).
+    floor_slack_m : height up to which points count as floor.
 
     Ground:
 
-    rolling_gain : share by which the floor under wheels moves towards what a scan shows of it; more at first,
-        so that it is the mean of what was seen. With a larger one, the floor under a camera followed a ramp
-        that it saw ahead.
-    rolling_every : scans from one look at the floor to the next.
+    rolling_every : scans from one look at the floor to the next. The floor under wheels is the mean of all.
 
     Odometry:
 
     gap : odometry does not go on over a time of more than so many usual intervals between scans.
     fastest : in m/s and in rad/s; odometry that reports a faster motion is not believed, with an allowance of
-        `jump_m` and `jump_rad` for noise.
+        `jump`, m and rad, for noise.
 
     Refinement in the plane:
 
@@ -80,24 +74,17 @@ class TrackingParameters:
     min_overlap : least share of the hits that meet a line of the local map, or of the points a surface.
     give_up_scans : lost scans in a row after which tracking starts again.
 
-    KISS-ICP (Vizzo et al. 2023; its defaults are for cars):
-
-    icp_voxels_per_range : its voxel is the 75th percentile of the first ranges over this, within
-        `icp_voxel_m`.
     """
 
     max_points: int = 40_000
     icp_points: int = 6_000
     floor_slack_m: float = 0.1
-    floor_slack_per_m: float = 0.01
 
-    rolling_gain: float = 0.02
     rolling_every: int = 8
 
     gap: float = 10.0
     fastest: float = 4.0
-    jump_m: float = 0.2
-    jump_rad: float = 0.3
+    jump: float = 0.3
 
     followed: int = 5
     matched_hits: int = 700
@@ -115,14 +102,9 @@ class TrackingParameters:
     min_overlap: float = 0.3
     give_up_scans: int = 10
 
-    icp_voxels_per_range: float = 40.0
-    icp_voxel_m: tuple[float, float] = (0.3, 1.0)
-
 
 MATCHING_PARAMETERS = MatchingParameters()
-CAMERA_MATCHING = MatchingParameters(
-    cell_m=0.05, point_sigma_m=0.03, radii_cells=(6, 4, 4, 2, 2, 1, 1, 1, 1, 1)
-)
+CAMERA_MATCHING = MatchingParameters(cell_m=0.05, radii_cells=(6, 4, 4, 2, 2, 1, 1, 1, 1, 1))
 """For a depth camera on wheels.
 
 A hit is the mean of some dozen pixels: 2 to 10 mm from the wall at ranges up to 6 m (simulated), so it

@@ -119,7 +119,7 @@ class PointGrid:
         p, steps = self._parameters, radii or self._parameters.radii_cells
         points, normals = np.asarray(points_m, np.float64), np.asarray(normal_rad, np.float64)
         origin = np.array([*self.low_m, 0.0])
-        unit, damping = p.point_sigma_m**-2, 1e-6 * np.eye(3)
+        unit, damping = p.cell_m**-2, 1e-6 * np.eye(3)
         pose = np.array([guess.x, guess.y, guess.yaw])
         held = np.array([prior.x, prior.y, prior.yaw])
         information, found, distance = np.zeros((3, 3)), 0, 0.0

@@ -2,9 +2,8 @@
 
 `KissRegistration` is composed of the public parts of kiss_icp, in the order of `KissICP.register_frame`.
 Three things differ. The initial guess comes from outside (odometry where the log has it). The local map is
-updated by a call of its own, once the pose of the scan is final. The voxel is chosen from the first scan,
-since the default is for cars. Floor and ceiling are removed before: the rings of a lidar on the
-floor move with the sensor and pull point-to-point ICP towards standing still.
+updated by a call of its own, once the pose of the scan is final. Floor and ceiling are removed before: the
+rings of a lidar on the floor move with the sensor and pull point-to-point ICP towards standing still.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F64
 from pc2grid.config import RegistrationConfig
-from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.geometry import pose_from_rotation_vector, rotation_vector
 from pc2grid.model import Scan
 
@@ -27,15 +25,12 @@ _EXACT = 1e-12
 class KissRegistration:
     """KISS-ICP with a given initial guess, in one thread and hence repeatable.
 
-    The voxel comes from the first scan with returns, unless `config` fixes it. A refinement in the plane
-    follows, so coarse voxels are enough.
+    Voxel and range are its defaults, unless `config` fixes them: a refinement in the plane follows, so
+    coarse voxels are enough.
     """
 
-    def __init__(
-        self, config: RegistrationConfig, parameters: TrackingParameters = TRACKING_PARAMETERS
-    ) -> None:
+    def __init__(self, config: RegistrationConfig) -> None:
         self._config = config
-        self._parameters = parameters
         self._pending: F64 | None = None  # the last scan, downsampled, until its pose is final
         self._kiss_config: Any = None
         self._registration: Any = None
@@ -94,33 +89,21 @@ class KissRegistration:
         return sampled
 
     def _start(self, points: F64, pose: F64) -> None:
-        """Choose the configuration from the first scan and begin the local map with it."""
+        """Begin the local map with the first scan."""
         from kiss_icp.config import KISSConfig
         from kiss_icp.mapping import get_voxel_hash_map
         from kiss_icp.registration import get_registration
         from kiss_icp.threshold import get_threshold_estimator
 
-        p = self._parameters
-        ranges = np.linalg.norm(points, axis=1)
         config = KISSConfig()
         config.data.max_range = self._config.max_range_m or config.data.max_range
-        middle_m = float(np.percentile(ranges, 75))
-        config.mapping.voxel_size = self._config.voxel_m or float(
-            np.clip(middle_m / p.icp_voxels_per_range, *p.icp_voxel_m)
-        )
+        config.mapping.voxel_size = self._config.voxel_m or 0.01 * config.data.max_range  # its default
         config.registration.max_num_threads = 1
         self._kiss_config = config
         self._registration = get_registration(config)
         self._threshold = get_threshold_estimator(config)
         self._map = get_voxel_hash_map(config)
         self._map.update(self._downsample(points), pose)
-
-    @property
-    def voxel_and_range_m(self) -> tuple[float, float] | None:
-        """The voxel and the range that were chosen, or None before the first scan."""
-        if self._kiss_config is None:
-            return None
-        return self._kiss_config.mapping.voxel_size, self._kiss_config.data.max_range
 
 
 class BareKissIcp:

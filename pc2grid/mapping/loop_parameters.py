@@ -115,11 +115,15 @@ class LoopParameters:
 
 
 LOOPS = LoopParameters()
-CAMERA_LOOPS = LoopParameters(
+EXACT_TRACKING = LoopParameters(
     tracking_sigma_m=0.01,
     tracking_sigma_per_m=0.003,
     tracking_sigma_rad=math.radians(0.15),
     tracking_sigma_rad_per_m=math.radians(0.04),
 )
-"""For a depth camera. Two of its local maps often show a place from two sides, so that its loops are less
-exact than its tracking. About twice the errors of tracking in simulated csail (`examples/map-quality.md`)."""
+"""For a depth camera, and for a sensor in the hand, which is tracked in space.
+
+Two local maps of a camera often show a place from two sides, so that its loops are less exact than its
+tracking. So are those of a sensor in the hand, whose local maps are drawn in cells of 5 cm. About twice the
+errors of tracking by a camera in simulated csail (`examples/map-quality.md`); checked on lidar/hall.
+"""

@@ -98,16 +98,12 @@ import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 from pc2grid.io import open_log
-from pc2grid.estimation.registration import KissRegistration
-from signature.config import Config
+from pc2grid_lab.experiments.recordings.bare_kiss import indoors
 
 path, duration = sys.argv[1], float(sys.argv[2]) or None
 with open_log(path) as log:
     scans = list(log.scans(0.0, duration))
-chosen = KissRegistration(Config().registration)
-for scan in scans[:3]:
-    chosen.register(scan.points_m, np.eye(4))
-voxel_m, range_m = chosen.voxel_and_range_m  # what pc2grid chooses for this log
+voxel_m, range_m = indoors(scans[0].points_m)
 found = {"scans": len(scans), "voxel": voxel_m}
 points = [np.asarray(scan.points_m, np.float64) for scan in scans]
 for name, voxel, reach in (
@@ -131,7 +127,7 @@ print(json.dumps(found))
 class BareKiss:
     """Time of bare `KissICP.register_frame` over the decoded scans of a log, with one thread.
 
-    same : with the voxel size and range that pc2grid chooses. default : with KISS-ICP's default of 1 m.
+    same : with a voxel and a range for indoors. default : with KISS-ICP's default of 1 m.
     """
 
     scans: int
