@@ -35,11 +35,13 @@ class CarriedParameters:
 
     least_agreement : of a pose with what is known where the points lie, -1..1, that is credible. In a hall,
         right poses have 0.89 and more, wrong ones 0.66 to 0.88 (lidar/hall).
+    residual_weight_per_m : of two placements the one with the larger agreement - weight * residual is taken.
     starts : placements that a search refines in space. turned_rad : by how much these may be turned, a
         standard deviation: more than a step of the search.
     """
 
     least_agreement: float = 0.85
+    residual_weight_per_m: float = 5.0
     starts: int = 10
     turned_rad: float = 0.1
 
@@ -120,12 +122,13 @@ class CarriedSensor:
         space = self._space
         found = space.match(self._thinned, guess, held, wide=wide)
         of_known, of_all = space.agreement(self._thinned, found.pose)
+        quality = of_all - self._parameters.residual_weight_per_m * found.residual_m
         return Fit(
             pose=found.pose,
             alone=_alone(found, held),
             overlap=found.overlap,
             measured=found.measured,
-            evidence=SURFACES.independent(len(self._thinned.points_m)) * of_all,
+            evidence=SURFACES.independent(len(self._thinned.points_m)) * quality,
             credible=of_known >= self._parameters.least_agreement,
         )
 
