@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PlainSerializer
 
-from pc2grid.arrays import F32, F64, I64, BoolGrid, freeze, hand_over
+from pc2grid.arrays import F32, F64, I64, U8, BoolGrid, freeze, hand_over
 from pc2grid.display import html_picture, html_table, map_png, short
 from pc2grid.geometry import SE2
 
@@ -40,6 +40,13 @@ FREE_BELOW = 20
 # A thing on the floor that is no wall, such as a table: undecided for nav2, and told apart from all else that
 # is. Sums of `OccupancyParameters.hit` and `miss` make 56 or 62 percent, not this.
 THING = 60
+
+SLICE_BORDERS_M = (0.6, 1.1)
+"""Heights above the floor between the slices that maps are compared in: seats and legs are below, tables and
+worktops between, and only what is tall is above. Chosen by hand."""
+SLICES = len(SLICE_BORDERS_M) + 1
+"""Number of slices. A byte of heights has bit k set if slice k was observed to be occupied somewhere, and bit
+k + SLICES if it was observed to be free and nowhere occupied."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -210,6 +217,8 @@ class OccupancyGrid:
     resolution_m : edge of a cell.
     origin_m : (x, y) in the map frame of the lower-left corner of cell (0, 0).
     height_m : of the one plane that was observed, above the base; None: of all heights, or not known.
+    heights : (H, W) uint8, in which slices an occupied cell or a thing was observed to be occupied and to be
+        free (`SLICES`); 0 where that is not known. None if it is known of no cell.
 
     >>> import numpy as np
     >>> grid = OccupancyGrid(cells=np.array([[0, 100], [-1, 0]]), resolution_m=0.5, origin_m=(-1.0, 2.0))
@@ -223,9 +232,12 @@ class OccupancyGrid:
     resolution_m: float
     origin_m: tuple[float, float]
     height_m: float | None = None
+    heights: U8 | None = None
 
     def __post_init__(self) -> None:
         freeze(self, "cells", np.int8, (None, None))
+        if self.heights is not None:
+            freeze(self, "heights", np.uint8, self.cells.shape)
         if not (np.isfinite(self.resolution_m) and self.resolution_m > 0):
             raise ValueError(f"OccupancyGrid.resolution_m: expected > 0, got {self.resolution_m}")
 
@@ -278,7 +290,8 @@ class OccupancyGrid:
         return (np.asarray(cells)[:, ::-1] + 0.5) * self.resolution_m + self.origin_m
 
     def crop(self, center_m: tuple[float, float], half_width_m: float) -> OccupancyGrid:
-        """The square of (2 n + 1)^2 cells around the cell that holds `center_m`; unknown past the edge."""
+        """The square of (2 n + 1)^2 cells around the cell that holds `center_m`; unknown past the edge.
+        Heights are left out."""
         n = round(half_width_m / self.resolution_m)
         row, column = (int(v) for v in self.to_cell(np.array([center_m]))[0])
         cells = np.full((2 * n + 1, 2 * n + 1), UNKNOWN, dtype=np.int8)
@@ -291,7 +304,7 @@ class OccupancyGrid:
             self.origin_m[0] + (column - n) * self.resolution_m,
             self.origin_m[1] + (row - n) * self.resolution_m,
         )
-        return replace(self, cells=hand_over(cells), origin_m=origin)
+        return replace(self, cells=hand_over(cells), origin_m=origin, heights=None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

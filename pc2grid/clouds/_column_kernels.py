@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64, I64
+from pc2grid.model import SLICES
 
 UNKNOWN, FREE, LOW, WALL = 0, 1, 2, 3
 """What a column is."""
@@ -103,21 +104,25 @@ def observe(
 def classify(
     evidence: NDArray[np.int8],
     state: NDArray[np.uint8],
+    heights: NDArray[np.uint8],
     touched: NDArray[np.uint8],
     sums: F32,
     low: I64,
     stamp: int,
     floor: int,
     band: tuple[int, int],
+    borders: tuple[int, int],
     share: float,
     least: int,
     over: int,
 ) -> None:
-    """Write the state (W, W) of the columns that carry a stamp; 0: of all.
+    """Write the state (W, W) of the columns that carry a stamp; 0: of all. And of those with an obstacle the
+    heights (W, W), see `pc2grid.model.SLICES`.
 
-    floor : index of the layer of the floor. band : of the first and behind the last layer of an obstacle. A
-    wall is occupied in at least `least` layers, and in so large a `share` of those that were observed, and
-    less than `over` layers above it were observed to be free.
+    floor : index of the layer of the floor. band : of the first and behind the last layer of an obstacle.
+    borders : of the first layer of each slice but the lowest. A wall is occupied in at least `least` layers,
+    and in so large a `share` of those that were observed, and less than `over` layers above it were observed
+    to be free.
     """
     size, layers = evidence.shape[0], evidence.shape[2]
     first, last = max(band[0], low[2]), min(band[1], low[2] + layers)
@@ -126,8 +131,12 @@ def classify(
             if stamp != 0 and touched[a, b] != stamp:
                 continue
             occupied, free, passed_over = 0, 0, 0
+            filled, empty = 0, 0
             for k in range(first, last):
                 value = evidence[a, b, k % layers]
+                slice_bit = 1 << ((k >= borders[0]) + (k >= borders[1]))
+                filled |= slice_bit * (value > 0)
+                empty |= slice_bit * (value < 0)
                 occupied += value > 0
                 free += value < 0
                 passed_over = 0 if value > 0 else passed_over + (value < 0)
@@ -144,6 +153,7 @@ def classify(
                     if evidence[a, b, k % layers] > 0:
                         found = FREE
             state[a, b] = found
+            heights[a, b] = filled | (empty & ~filled) << SLICES if occupied else 0
 
 
 @njit(cache=True)

@@ -16,13 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.arrays import F32, F64, I64
+from pc2grid.arrays import F32, F64, I64, U8
 from pc2grid.clouds import _column_kernels as kernels
 from pc2grid.clouds.normals import planar_normals
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan, mean_per_cell
 from pc2grid.config import ProjectionConfig
 from pc2grid.geometry import SE2
-from pc2grid.model import SensorKind
+from pc2grid.model import SLICE_BORDERS_M, SensorKind
 from pc2grid.sensor_model import SENSOR_MODELS
 
 
@@ -83,6 +83,7 @@ class ColumnMap:
         self._seen = np.zeros((size, size, parameters.layers), np.uint8)
         self._touched = np.zeros((size, size), np.uint8)
         self._state = np.zeros((size, size), np.uint8)
+        self._heights = np.zeros((size, size), np.uint8)
         self._sums = np.zeros((size, size, 3), np.float32)
         self._low: I64 = np.zeros(3, np.int64)  # lowest cell of the window
         self._stamp = 0
@@ -111,10 +112,12 @@ class ColumnMap:
         if not same_floor:
             self._floor_m = floor_m
         low, high = (round(z / p.layer_m) for z in self._band_m(self._floor_m))
+        first, second = (round((self._floor_m + border_m) / p.layer_m) for border_m in SLICE_BORDERS_M)
         changed = self._stamp if same_floor else 0
         kernels.classify(
-            self._evidence, self._state, self._touched, self._sums, self._low, changed,
-            math.floor(self._floor_m / p.layer_m), (low, high), p.wall_share, p.wall_layers, p.over,
+            self._evidence, self._state, self._heights, self._touched, self._sums, self._low, changed,
+            math.floor(self._floor_m / p.layer_m), (low, high), (first, second), p.wall_share, p.wall_layers,
+            p.over,
         )  # fmt: skip
 
     def cut(self, T_session_base: SE2, sensor_m: F64, stamp_ns: int) -> PlanarScan:
@@ -135,16 +138,16 @@ class ColumnMap:
             self._state, self._sums, self._low, sensor_m[:2], pose.yaw, self._reach_m, edge_m, p.gap_m,
             (p.depth_m, 4.0 * self._noise_per_m2), BEARINGS,
         )  # fmt: skip
-        hits: F32 = np.empty((0, 2), np.float32)
-        if len(sums):
-            hits = to_base.apply(mean_per_cell(sums, edge_m)).astype(np.float32)
+        walls_m = mean_per_cell(sums, edge_m) if len(sums) else low_m[:0]
+        hits: F32 = to_base.apply(walls_m).astype(np.float32)
         return PlanarScan(
             stamp_ns=stamp_ns,
             hits_m=hits,
             normal_rad=planar_normals(hits, origin),
             origin_m=origin,
             free_m=free_m.astype(np.float32),
-            low_m=to_base.apply(low_m).astype(np.float32) if len(low_m) else np.empty((0, 2), np.float32),
+            low_m=to_base.apply(low_m).astype(np.float32),
+            heights=self._heights_at(np.concatenate((walls_m, low_m))),
         )
 
     def agreement(self, points_m: F64) -> tuple[float, float]:
@@ -168,6 +171,11 @@ class ColumnMap:
         away_m = edge_m * cv2.distanceTransform((~walls).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
         field: F32 = np.exp(np.float32(-0.5 / sigma_m**2) * away_m**2)
         return field, edge_m * self._low[:2].astype(np.float64)
+
+    def _heights_at(self, points_m: F64) -> U8:
+        """The heights (N,) of the columns of points (N, 2), session frame; see `pc2grid.model.SLICES`."""
+        column, row = np.floor(points_m.T / self._config.resolution_m).astype(np.int64) % len(self._state)
+        return np.asarray(self._heights[column, row], np.uint8)
 
     def _band_m(self, floor_m: float) -> tuple[float, float]:
         return floor_m + self._config.band_min_m, floor_m + self._config.band_max_m

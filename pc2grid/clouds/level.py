@@ -17,7 +17,7 @@ from pc2grid.arrays import F64
 class LevelParameters:
     """Numbers of the search. Chosen by hand.
 
-    flat : least information of a voxel of a flat surface.
+    flat : least information along the vertical of a voxel of a level surface.
     level : cosine of its normal with the vertical above which it lies.
     least_m2 : smallest floor.
     share : of the largest level that the floor must have: less below it are reflections.
@@ -48,9 +48,9 @@ def floor_height(
     near = (np.abs(means[:, :2] - sensor_m[:2]) < p.radius_m).all(axis=1) & (
         means[:, 2] < sensor_m[2] - p.below_m
     )
-    information = _information(shapes[near])
-    trace = np.trace(information, axis1=1, axis2=2)
-    lying = (trace > p.flat) & (information[:, 2, 2] > p.level**2 * trace)
+    # Of a plane, each column of the information points along the normal.
+    _, _, xz, _, yz, zz = shapes[near, 3:].T
+    lying = (zz > p.flat) & (zz > p.level * np.sqrt(xz**2 + yz**2 + zz**2))
     heights = means[near, 2][lying]
     if not len(heights):
         return None
@@ -65,9 +65,3 @@ def floor_height(
     if lowest + 1 < len(pairs) and pairs[lowest + 1] > pairs[lowest]:
         lowest += 1
     return float(np.median(heights[(slab == lowest) | (slab == lowest + 1)]))
-
-
-def _information(shapes: F64) -> F64:
-    """The information (V, 3, 3) of voxels from its upper triangles."""
-    xx, xy, xz, yy, yz, zz = shapes[:, 3:].T
-    return np.stack((xx, xy, xz, xy, yy, yz, xz, yz, zz), axis=1).reshape(-1, 3, 3)

@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64
+from pc2grid.arrays import F32, F64, U8
 from pc2grid.clouds.ground import Ground
 from pc2grid.clouds.normals import planar_normals
 from pc2grid.clouds.parameters import CLOUD_PARAMETERS, CloudParameters
@@ -40,6 +40,8 @@ class PlanarScan:
     low_m : (L, 2) float32, things on the floor that are no walls (tables, chairs), about one point per grid
         cell: the sensor looks over them, so they do not end what is free. Empty where heights are not known.
     height_m : of the plane that a planar laser sees, above the base; None of sensors that see all heights.
+    heights : (M + L,) uint8, of the hits and then of the things, in which slices they were observed to be
+        occupied and to be free (`pc2grid.model.SLICES`), 0 where that is not known; or empty.
     """
 
     stamp_ns: int
@@ -49,6 +51,7 @@ class PlanarScan:
     free_m: F32
     low_m: F32 = field(default_factory=lambda: np.empty((0, 2), np.float32))
     height_m: float | None = None
+    heights: U8 = field(default_factory=lambda: np.empty(0, np.uint8))
 
     @staticmethod
     def of_hits(*, stamp_ns: int, hits_m: F32, origin_m: F64, free_m: F32) -> PlanarScan:
@@ -65,7 +68,12 @@ class PlanarScan:
         """The scan of a sensor that has seen nothing."""
         none = np.empty((0, 2), np.float32)
         return replace(
-            self, hits_m=none, normal_rad=none[:, 0], free_m=np.zeros_like(self.free_m), low_m=none
+            self,
+            hits_m=none,
+            normal_rad=none[:, 0],
+            free_m=np.zeros_like(self.free_m),
+            low_m=none,
+            heights=self.heights[:0],
         )
 
     def free_polygon(self, limit_m: float = np.inf) -> F64:

@@ -8,7 +8,7 @@ Memory is that of the surroundings, whatever the length.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -154,7 +154,9 @@ class SpaceMap:
 
     def cut(self, scan: Scan, pose: F64) -> PlanarScan:
         """The planar scan of a scan at its pose (4, 4), in the levelled base frame."""
-        return self._columns.cut(SE2.from_matrix(pose), (pose @ scan.T_base_sensor)[:3, 3], scan.stamp_ns)
+        planar = self._columns.cut(SE2.from_matrix(pose), (pose @ scan.T_base_sensor)[:3, 3], scan.stamp_ns)
+        # Without a floor, heights above it are not known.
+        return planar if self.floor_m is not None else replace(planar, heights=planar.heights[:0])
 
     def _floor(self, sensor_m: F64) -> float:
         return float(sensor_m[2]) - self._parameters.assumed_m if self.floor_m is None else self.floor_m

@@ -21,8 +21,8 @@ from pc2grid.model import OccupancyGrid
 
 IN_MEMORY_BYTES = 32 << 20  # chosen by hand: about an hour of a 2D laser
 # index, stamp, restart; T_session_base; origin of the sensor and height of its plane (NaN: none); hits,
-# bearings, low things and unseen_hits
-_HEADER = struct.Struct("<qqq 3d 3d 4q")
+# bearings, low things, heights and unseen_hits
+_HEADER = struct.Struct("<qqq 3d 3d 5q")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +63,12 @@ class Keyframes:
         start, end = self._starts[number], self._starts[number + 1]
         self._file.seek(start)
         data = self._file.read(end - start)
-        index, stamp_ns, restart, x, y, yaw, *origin, hits, bearings, low, unseen_hits = _HEADER.unpack_from(
-            data
+        index, stamp_ns, restart, x, y, yaw, *origin, hits, bearings, low, heights, unseen_hits = (
+            _HEADER.unpack_from(data)
         )
         values = np.frombuffer(data, np.float32, offset=_HEADER.size)
-        ends = np.cumsum((2 * hits, hits, bearings, 2 * low))
-        hits_m, normal_rad, free_m, low_m, unseen_hits_m = np.split(values, ends)
+        ends = np.cumsum((2 * hits, hits, bearings, 2 * low, heights))
+        hits_m, normal_rad, free_m, low_m, seen_at, unseen_hits_m = np.split(values, ends)
         return Keyframe(
             index,
             PlanarScan(
@@ -79,6 +79,7 @@ class Keyframes:
                 free_m=free_m,
                 low_m=low_m.reshape(-1, 2),
                 height_m=None if math.isnan(origin[2]) else origin[2],
+                heights=seen_at.astype(np.uint8),
             ),
             SE2(x, y, yaw),
             bool(restart),
@@ -95,11 +96,15 @@ class Keyframes:
             *(pose.x, pose.y, pose.yaw),
             *planar_scan.origin_m,
             math.nan if planar_scan.height_m is None else planar_scan.height_m,
-            *(len(a) for a in (planar_scan.hits_m, planar_scan.free_m, planar_scan.low_m)),
+            *(
+                len(a)
+                for a in (planar_scan.hits_m, planar_scan.free_m, planar_scan.low_m, planar_scan.heights)
+            ),
             len(keyframe.unseen_hits_m),
         )
         arrays = (
             *(planar_scan.hits_m, planar_scan.normal_rad, planar_scan.free_m, planar_scan.low_m),
+            planar_scan.heights,
             keyframe.unseen_hits_m,
         )
         data = header + b"".join(np.ascontiguousarray(a, np.float32).tobytes() for a in arrays)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F64, I64
+from pc2grid.arrays import F64, I64, U8
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
 from pc2grid.errors import LimitExceeded
@@ -33,7 +33,7 @@ class OccupancyParameters:
         wall's noise; where a wall has a gap or ends there are fewer.
     lone_window, lone_cells : a cell that was hit once is noise if at least `lone_cells` cells in the square
         of `lone_window` around it were hit more often.
-    merged_hits : unseen hits that are collected before each cell is reduced to one entry.
+    merged : marks of cells that are collected before each cell is reduced to one entry.
     """
 
     hit: int = 150
@@ -44,7 +44,7 @@ class OccupancyParameters:
     wall_cells: int = 5
     lone_window: int = 3
     lone_cells: int = 3
-    merged_hits: int = 200_000
+    merged: int = 200_000
 
 
 OCCUPANCY = OccupancyParameters()
@@ -86,6 +86,41 @@ class _Tiles:
                 self.observed[row, column][where] |= touched
 
 
+class _Marks:
+    """A byte for each of some cells, of which bits are set; memory grows with these cells, not with the
+    number of times that they are marked.
+
+    at_once : marks that are collected before each cell is reduced to one entry.
+    """
+
+    def __init__(self, at_once: int) -> None:
+        self._at_once = at_once
+        self._kept: list[tuple[I64, U8]] = [(np.empty(0, np.int64), np.empty(0, np.uint8))]
+
+    def add(self, cells: I64, bits: U8) -> None:
+        """Set bits (N,) of cells (N, 2), column and row."""
+        self._kept.append(((cells[:, 1] << 32) + (cells[:, 0] + _COLUMN_OFFSET), bits))
+        if sum(len(codes) for codes, _ in self._kept[1:]) > self._at_once:
+            self._merge()
+
+    def within(self, first: tuple[int, int], shape: tuple[int, ...]) -> tuple[I64, I64, U8]:
+        """Rows, columns and bits (N,) of the marked cells of a window; `first` is the cell (0, 0) there."""
+        codes, bits = self._merge()
+        rows, columns = (
+            (codes >> 32) - first[0],
+            (codes & (2 * _COLUMN_OFFSET - 1)) - _COLUMN_OFFSET - first[1],
+        )
+        inside = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
+        return rows[inside], columns[inside], bits[inside]
+
+    def _merge(self) -> tuple[I64, U8]:
+        codes, bits = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
+        order = np.argsort(codes, kind="stable")
+        unique, starts = np.unique(codes[order], return_index=True)
+        self._kept = [(unique, np.bitwise_or.reduceat(bits[order], starts) if len(starts) else bits)]
+        return self._kept[0]
+
+
 class GridBuilder:
     """Draws planar scans into a growing grid.
 
@@ -99,8 +134,7 @@ class GridBuilder:
         self._parameters = parameters
         self._walls, self._things = _Tiles(parameters.limit), _Tiles(parameters.limit)
         self._heights_m: tuple[float, float] | None = None  # lowest and highest plane; NaN: not of planes
-        self._unseen_hits = np.empty(0, np.int64)  # cells, row and column in one number
-        self._new_unseen_hits: list[I64] = []
+        self._unseen_hits, self._heights = _Marks(parameters.merged), _Marks(parameters.merged)
 
     def add(self, planar_scan: PlanarScan, T_grid_base: SE2) -> None:
         """Draw one planar scan taken at `T_grid_base`.
@@ -129,6 +163,8 @@ class GridBuilder:
         # these cells are not drawn as free.
         cv2.polylines(update, _rims(corners, planar_scan.free_m), False, 0, shift=_SUBPIXEL_BITS)
         things = np.floor(T_grid_base.apply(planar_scan.low_m) / resolution).astype(np.int64)
+        if len(planar_scan.heights):
+            self._heights.add(np.concatenate((hits, things)), planar_scan.heights)
         things = things[((things >= low) & (things < high)).all(axis=1)] - low
         update[things[:, 1], things[:, 0]] = p.miss
         update[hits[:, 1] - low[1], hits[:, 0] - low[0]] = p.hit
@@ -143,15 +179,8 @@ class GridBuilder:
 
     def add_unseen_hits(self, hits_m: F64) -> None:
         """Add obstacles (N, 2), metres, that are drawn only in cells that no planar scan observes."""
-        columns, rows = np.floor(hits_m / self._config.resolution_m).astype(np.int64).T
-        self._new_unseen_hits.append((rows << 32) + (columns + _COLUMN_OFFSET))
-        if sum(map(len, self._new_unseen_hits)) > self._parameters.merged_hits:
-            self._merge_unseen_hits()
-
-    def _merge_unseen_hits(self) -> None:
-        """Keep each cell once: memory grows with the mapped area, not with the number of visits."""
-        self._unseen_hits = np.unique(np.concatenate((self._unseen_hits, *self._new_unseen_hits)))
-        self._new_unseen_hits = []
+        cells = np.floor(hits_m / self._config.resolution_m).astype(np.int64)
+        self._unseen_hits.add(cells, np.zeros(len(cells), np.uint8))
 
     def grid(self) -> OccupancyGrid:
         """The map so far: 0..100 where observed, unknown elsewhere, cropped to the observed part."""
@@ -182,8 +211,16 @@ class GridBuilder:
         r0, r1 = int(known_rows[0]), int(known_rows[-1]) + 1
         c0, c1 = int(known_columns[0]), int(known_columns[-1]) + 1
         resolution = self._config.resolution_m
+        shape = r1 - r0, c1 - c0
+        at_row, at_column, bits = self._heights.within(
+            (min(rows) * _TILE + r0, min(columns) * _TILE + c0), shape
+        )
+        heights = np.zeros(shape, np.uint8) if len(bits) else None
+        if heights is not None:
+            heights[at_row, at_column] = bits
         return OccupancyGrid(
             cells=cells[r0:r1, c0:c1].copy(),
+            heights=heights,
             resolution_m=resolution,
             origin_m=((min(columns) * _TILE + c0) * resolution, (min(rows) * _TILE + r0) * resolution),
             height_m=self._height_m,
@@ -197,11 +234,7 @@ class GridBuilder:
 
     def _draw_unseen_hits(self, cells: NDArray[np.int8], first: tuple[int, int]) -> None:
         """Draw the unseen hits in unknown cells (H, W); `first` is the cell that is (0, 0) there."""
-        self._merge_unseen_hits()
-        rows = self._unseen_hits >> 32
-        columns = (self._unseen_hits & (2 * _COLUMN_OFFSET - 1)) - _COLUMN_OFFSET
-        at = np.column_stack((rows, columns)) - first
-        row, column = at[((at >= 0) & (at < cells.shape)).all(axis=1)].T
+        row, column, _ = self._unseen_hits.within(first, cells.shape)
         walls = _count_around(cells >= OCCUPIED_FROM, self._parameters.wall_window)
         kept = (cells[row, column] == UNKNOWN) & (walls[row, column] < self._parameters.wall_cells)
         cells[row[kept], column[kept]] = round(float(_percent(np.float64(self._parameters.hit))))

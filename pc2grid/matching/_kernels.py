@@ -102,7 +102,8 @@ def best_of_boxes(
     """
     height, width = shape
     n, side, full = len(points), half + 1, 255.0 * len(points)
-    stride, across = len(blocks) // BLOCK_LEVELS, width >> 1
+    across = width >> 1
+    stride = (height >> 1) * across + LANES
     sums = np.empty((len(turns), side, -(-side // LANES) * LANES), np.uint16)
     cells, corners = np.empty((len(turns), n), np.int64), np.empty(n, np.int64)
     best = np.empty((len(boxes), 4))

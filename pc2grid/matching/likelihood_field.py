@@ -111,5 +111,6 @@ def padded_grid(grid: OccupancyGrid, margin_m: float) -> OccupancyGrid:
     return replace(
         grid,
         cells=np.pad(grid.cells, n, constant_values=UNKNOWN),
+        heights=None if grid.heights is None else np.pad(grid.heights, n),
         origin_m=(grid.origin_m[0] - n * grid.resolution_m, grid.origin_m[1] - n * grid.resolution_m),
     )

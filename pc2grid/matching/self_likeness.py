@@ -7,12 +7,13 @@ corridor", not which one or where in it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pc2grid.arrays import F64
-from pc2grid.matching.walls import Walls
+from pc2grid.matching.walls import Slice, Walls
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,19 +44,22 @@ def self_likeness(walls: Walls, parameters: LikenessParameters = LIKENESS) -> fl
     """
     from scipy import fft
 
-    total = walls.weight
+    parts: Sequence[Walls | Slice] = walls.slices or (walls,)
+    total = sum(part.weight for part in parts)
     if total <= 0.0:
         return 0.0
     n = max(round(parameters.cell_m / walls.field.resolution_m), 1)
     cell_m = n * walls.field.resolution_m
-    weights, likelihood, known = _drawn(walls, n)
+    drawn = [_drawn(part, n) for part in parts]
     reach = round(parameters.farthest_m / cell_m)
-    shape = [fft.next_fast_len(n + reach, real=True) for n in weights.shape]
-    spectrum = np.conj(fft.rfft2(weights, shape))
+    shape = [fft.next_fast_len(n + reach, real=True) for n in drawn[0][0].shape]
+    spectra = [[fft.rfft2(image, shape) for image in images] for images in drawn]
     slides = np.arange(-reach, reach + 1)
     fits, overlap = (
-        fft.irfft2(spectrum * fft.rfft2(drawn, shape), shape)[np.ix_(slides, slides)]
-        for drawn in (likelihood, known)
+        fft.irfft2(sum(np.conj(spectrum[0]) * spectrum[k] for spectrum in spectra), shape)[
+            np.ix_(slides, slides)
+        ]
+        for k in (1, 2)
     )
     there = np.where(overlap > 1e-6, fits / np.maximum(overlap, 1e-6), 0.0)
     length_m = cell_m * np.hypot(slides[:, None], slides)
@@ -66,7 +70,7 @@ def self_likeness(walls: Walls, parameters: LikenessParameters = LIKENESS) -> fl
     return math.sqrt(float(both_ways.max())) if len(both_ways) else 0.0
 
 
-def _drawn(walls: Walls, n: int) -> tuple[F64, F64, F64]:
+def _drawn(walls: Walls | Slice, n: int) -> tuple[F64, F64, F64]:
     """(H, W) each, in squares of n by n cells: weight of the wall points, mean likelihood of the known
     ground, and whether at least half of it is known."""
     field = walls.field

@@ -3,9 +3,8 @@
 One way alone is not enough. The walls of a small query fit into many places; but at the wrong ones the map
 has walls where the query has seen free space.
 
-Where both sides show things on the floor, such as tables, the edges of those of the query are compared with
-those of the map. Not the other way round: a query that looks over the floor for some seconds has passed over
-many things of the map without showing them.
+Where both sides tell at which heights they have seen what stands there, they are compared in the slices of
+heights that both have seen (`pc2grid.matching.walls.Slice`).
 
 Two lasers at different heights are compared on what both can see. The walls of the higher one stand on the
 floor; what the lower one has seen need not reach up, so it counts as on unknown ground where the higher one
@@ -15,12 +14,13 @@ sees free space.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
 from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField
-from pc2grid.matching.walls import Things, Walls
+from pc2grid.matching.walls import Slice, Walls, comparable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,13 +70,10 @@ class Fit:
 def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) -> Fit:
     """Score the query at a pose on the map `target`."""
     above, below = target.is_above(query.height_m), query.is_above(target.height_m)
-    seen, likelihood = _agreement(query, target.field, T_map_query, above)
-    looked_at, returned = _agreement(target, query.field, T_map_query.inverse(), below)
-    weight = query.weight
-    if target.things is not None and query.things is not None:
-        there = _agreement(query.things, target.things.field, T_map_query)
-        seen, likelihood = seen + there[0], likelihood + there[1]
-        weight += query.things.weight
+    pairs, T_query_map = comparable(target, query), T_map_query.inverse()
+    seen, likelihood = _sum(_agreement(mine, on.field, T_map_query, above) for on, mine in pairs)
+    looked_at, returned = _sum(_agreement(on, mine.field, T_query_map, below) for on, mine in pairs)
+    weight = sum(mine.weight for _, mine in pairs)
     forward = (likelihood + LIKELIHOOD.neutral * (weight - seen)) / weight if weight else 0.0
     backward = scored = returned / looked_at if looked_at else 0.0
     if below:
@@ -94,8 +91,13 @@ def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) ->
     )
 
 
+def _sum(agreements: Iterable[tuple[float, float]]) -> tuple[float, float]:
+    weights, likelihoods = zip(*agreements, strict=True)
+    return sum(weights), sum(likelihoods)
+
+
 def _agreement(
-    walls: Walls | Things, field: LikelihoodField, T_field_walls: SE2, above: bool = False
+    walls: Walls | Slice, field: LikelihoodField, T_field_walls: SE2, above: bool = False
 ) -> tuple[float, float]:
     """The weight of the wall points on known ground, and the weighted sum of their likelihoods, 0..1,
     there. above : see `LikelihoodField.at`."""

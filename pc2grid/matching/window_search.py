@@ -79,9 +79,10 @@ class SearchMap:
     """A map prepared to be searched.
 
     walls : its wall points and likelihood field, with a margin of `MARGIN_M`.
-    levels : (L, H, W) uint8, sliding maxima of the field within each of `REACHES_M`.
+    levels : (L, H, W) uint8, sliding maxima of the field within each of `REACHES_M`; of a map
+        searched by heights, those of each slice, one after the other.
     blocks : (`BLOCK_LEVELS`, H // 2 * W // 2 + LANES) uint8, row by row a value for each block of 2 x 2
-        cells that no cell of the block exceeds, for the first of the radii.
+        cells that no cell of the block exceeds, for the first of the radii; for each slice.
     """
 
     walls: Walls
@@ -89,34 +90,50 @@ class SearchMap:
     blocks: U8
 
     @staticmethod
-    def of(grid: OccupancyGrid, *, from_below: bool = False) -> SearchMap:
+    def of(grid: OccupancyGrid, *, from_below: bool = False, by_heights: bool = False) -> SearchMap:
         """Prepare a map. Everything outside it counts as unknown.
 
         from_below : for queries in a lower plane, to which its free space is as unknown ground.
+        by_heights : for queries that tell heights; the map must, too.
         """
-        import cv2
-
         from pc2grid.matching._kernels import BLOCK_LEVELS, LANES
 
         walls = Walls.of(grid, margin_m=MARGIN_M)
-        field = walls.field.values
+        fields = [part.field.values for part in walls.slices] if by_heights else [walls.field.values]
         if from_below:
-            lifted = LIKELIHOOD.neutral * 255.0 + (1.0 - LIKELIHOOD.neutral) * field
-            field = np.where(walls.field.known, lifted, field).astype(np.uint8)
-        levels = np.empty((len(REACHES_M), *field.shape), np.uint8)
-        levels[0] = field
-        for level, reach_m in enumerate(REACHES_M[1:], start=1):
-            n = math.ceil(reach_m / grid.resolution_m - 1e-6)
-            square = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * n + 1, 2 * n + 1))
-            levels[level] = cv2.dilate(field, square, borderType=cv2.BORDER_REPLICATE)
+            lifted = LIKELIHOOD.neutral * 255.0 + (1.0 - LIKELIHOOD.neutral) * fields[0]
+            fields = [np.where(walls.field.known, lifted, fields[0]).astype(np.uint8)]
+        levels = np.stack([_sliding_maxima(field, grid.resolution_m) for field in fields])
         # The maximum within at least a cell of a block's last cell covers the whole block.
-        halves = levels[:BLOCK_LEVELS, 1::2, 1::2].reshape(BLOCK_LEVELS, -1)
-        return SearchMap(walls=walls, levels=levels, blocks=np.pad(halves, ((0, 0), (0, LANES))))
+        halves = levels[:, :BLOCK_LEVELS, 1::2, 1::2].reshape(len(fields) * BLOCK_LEVELS, -1)
+        return SearchMap(
+            walls=walls,
+            levels=levels.reshape(-1, *fields[0].shape),
+            blocks=np.pad(halves, ((0, 0), (0, LANES))),
+        )
+
+    @property
+    def by_heights(self) -> bool:
+        """Whether it is searched slice by slice."""
+        return len(self.levels) > len(REACHES_M)
 
     @property
     def field(self) -> LikelihoodField:
         """The likelihood field of the map."""
         return self.walls.field
+
+
+def _sliding_maxima(field: U8, resolution_m: float) -> U8:
+    """(L, H, W) the maxima of a field (H, W) within each of `REACHES_M`."""
+    import cv2
+
+    levels = np.empty((len(REACHES_M), *field.shape), np.uint8)
+    levels[0] = field
+    for level, reach_m in enumerate(REACHES_M[1:], start=1):
+        n = math.ceil(reach_m / resolution_m - 1e-6)
+        square = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * n + 1, 2 * n + 1))
+        levels[level] = cv2.dilate(field, square, borderType=cv2.BORDER_REPLICATE)
+    return levels
 
 
 def search_windows(
@@ -130,7 +147,8 @@ def search_windows(
 ) -> F64:
     """The best distinct poses of a point set in boxes of poses, best first.
 
-    points_m : (M, 2) at most `MOST_POINTS` points, relative to the point that they rotate about.
+    points_m : (M, 2) at most `MOST_POINTS` points, relative to the point that they rotate about; for a map
+    searched by heights (M, 3), with the number of the slice that each is in.
     boxes : (B, 3) x, y, yaw of the centres of the boxes, with half widths `half_t_m` and `half_a_rad`; many
     are searched faster if those of one heading follow each other.
 
@@ -143,7 +161,7 @@ def search_windows(
         return np.empty((0, 4))
     res = target.field.resolution_m
     origin = np.array([*target.field.origin_m, 0.0])
-    points = np.asarray(points_m, np.float64) / res
+    points = np.asarray(points_m, np.float64) / ((res, res, 1.0)[: points_m.shape[1]])
     cells = (np.asarray(boxes, np.float64) - origin) / (res, res, 1.0)
     cells, half_t, half_a_rad = _split(
         cells, half_t_m / res, half_a_rad, MOST_HALF_T_M / res, MOST_HALF_A_RAD
@@ -187,7 +205,8 @@ def _bounds(target: SearchMap, points: F64, boxes: F64, half_t: float, half_a_ra
     res = target.field.resolution_m
     reach = 2 * math.ceil(half_t / 2) + np.hypot(points[:, 0], points[:, 1]) * half_a_rad
     covered = reach <= REACHES_M[-1] / res
-    bounds = box_bounds(target.levels, levels_for(reach[covered], res), points[covered], boxes)
+    level = levels_for(reach, res) + len(REACHES_M) * _slices_of(points)
+    bounds = box_bounds(target.levels, level[covered], points[covered], boxes)
     return np.asarray(bounds + 255 * np.count_nonzero(~covered), np.int64)
 
 
@@ -203,16 +222,18 @@ def _best(
     keep: float,
 ) -> F64:
     """The best pose (B, 4) of each box, see `plain_best_of_boxes`; score -1 if it is left out."""
-    from pc2grid.matching._kernels import best_of_boxes
+    from pc2grid.matching._kernels import BLOCK_LEVELS, best_of_boxes
 
     res = target.field.resolution_m
     turns = headings(half_a_rad, parameters.step_rad)
     reach = 0.5 + np.hypot(points[:, 0], points[:, 1]) * half_a_rad / len(turns)
+    images = with_blocks(levels_for(reach, res), res)
+    images += (images >= 0) * _slices_of(points)[:, None] * (len(REACHES_M), BLOCK_LEVELS)
     return best_of_boxes(
         target.levels.reshape(-1),
         target.blocks.reshape(-1),
         target.field.values.shape,
-        with_blocks(levels_for(reach, res), res),
+        images,
         points,
         boxes,
         bounds,
@@ -221,6 +242,11 @@ def _best(
         least,
         keep,
     )
+
+
+def _slices_of(points: F64) -> I64:
+    """The number (N,) of the slice of points (N, 2) or (N, 3)."""
+    return points[:, 2].astype(np.int64) if points.shape[1] > 2 else np.zeros(len(points), np.int64)
 
 
 def _highest(bounds: I64, count: int) -> I64:

@@ -10,10 +10,10 @@ import numpy as np
 
 from pc2grid.arrays import F32, F64
 from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.matching.refinement import refine
+from pc2grid.matching.refinement import refine, refine_all
 from pc2grid.matching.two_way_score import Fit, score_fit
-from pc2grid.matching.walls import thin_evenly
-from pc2grid.matching.window_search import SearchMap, SearchParameters, search_windows
+from pc2grid.matching.walls import comparable, thin_evenly
+from pc2grid.matching.window_search import MOST_POINTS, SearchMap, SearchParameters, search_windows
 from signature.config import RelocalizeConfig
 from signature.localization.query import QueryMap
 from signature.retrieval.viewpoints import Places
@@ -93,7 +93,7 @@ def verify(
         rows = np.array([p.row for p in members])
         poses = search_windows(
             maps[session],
-            coarse_points(query.walls.points_m, center),
+            _searched(query, maps[session], center),
             np.array([(*p.at_m, p.yaw_rad) for p in members]),
             half_t_m=0.5 * HYPOTHESES.square_m,
             half_a_rad=HYPOTHESES.half_a_rad,
@@ -134,7 +134,7 @@ def search_whole_map(
     boxes = np.column_stack((np.tile(free_xy_m, (count, 1)), np.repeat(yaws, len(free_xy_m))))
     poses = search_windows(
         target,
-        coarse_points(query.walls.points_m, center),
+        _searched(query, target, center),
         boxes,
         half_t_m=0.5 * HYPOTHESES.square_m,
         half_a_rad=half_a_rad,
@@ -164,7 +164,9 @@ def _refined(query: QueryMap, target: SearchMap, T_map_query: SE2) -> tuple[SE2,
     walls of the higher one, since things near a wall in the lower one would be drawn onto it.
     """
     if not target.walls.is_above(query.walls.height_m):
-        return refine(target.field, query.walls.points_m, T_map_query, query.center_m)
+        pairs = comparable(target.walls, query.walls)
+        parts = [(on.field, mine.points_m) for on, mine in pairs]
+        return refine_all(parts, T_map_query, query.center_m)
     center_m = T_map_query.apply(np.array([query.center_m]))[0]
     back, covariance = refine(
         query.walls.field, target.walls.points_m, T_map_query.inverse(), (center_m[0], center_m[1])
@@ -214,6 +216,16 @@ def coarse_points(points_m: F32, center_m: tuple[float, float]) -> F32:
     away_m = np.hypot(local[:, 0], local[:, 1])
     near, far = local[away_m < p.near_m], local[(away_m >= p.near_m) & (away_m < p.far_m)]
     return np.concatenate((_few(near), _few(far)))
+
+
+def _searched(query: QueryMap, target: SearchMap, center_m: tuple[float, float]) -> F32:
+    """The points of a query that are searched for on a map, relative to `center_m`: (M, 2), or if the map is
+    searched by heights (M, 3), with the number of the slice of each."""
+    if not target.by_heights:
+        return coarse_points(query.walls.points_m, center_m)
+    parts = [coarse_points(part.points_m, center_m) for part in query.walls.slices]
+    points = np.concatenate([np.insert(part, 2, k, axis=1) for k, part in enumerate(parts)])
+    return points[:: max(-(-len(points) // MOST_POINTS), 1)]
 
 
 def _few(points_m: F32) -> F32:

@@ -101,6 +101,9 @@ class MapIndex:
         self._from_below: LazySequence[SearchMap] = LazySequence(
             lambda i: SearchMap.of(self.grids[i], from_below=True), count, most_prepared
         )
+        self._by_heights: LazySequence[SearchMap] = LazySequence(
+            lambda i: SearchMap.of(self.grids[i], by_heights=True), count, most_prepared
+        )
         self.alike_floors: dict[tuple[int, int], SE2 | None] = {}  # see `signature.localization.alike_floors`
         self._free: LazySequence[F64] = LazySequence(lambda i: free_squares(self.grids[i]), count)
         self.places = Places(
@@ -229,12 +232,15 @@ class MapIndex:
         return self._worth_keeping(query, found)
 
     def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
-        """The maps as they are searched for a query: to one in a lower plane, their free space is unknown."""
-        height_m = query.walls.height_m
-        if height_m is None:
+        """The maps as they are searched for a query: by heights if both tell them; to one in a lower plane,
+        their free space is unknown."""
+        height_m, by_heights = query.walls.height_m, bool(query.walls.slices)
+        if height_m is None and not by_heights:
             return self.maps
 
         def facing(i: int) -> SearchMap:
+            if by_heights:
+                return self._by_heights[i] if self.maps[i].walls.slices else self.maps[i]
             return self._from_below[i] if self.maps[i].walls.is_above(height_m) else self.maps[i]
 
         return LazySequence(facing, len(self.maps), 0)

@@ -149,3 +149,13 @@ def test_what_rays_pass_over_is_a_thing_however_much_of_it_is_occupied() -> None
     assert (planar_scan.hits_m[:, 0] > 4.9).sum() > 20  # the wall behind it, 1 m of 4 at least
     near = planar_scan.hits_m[np.abs(planar_scan.hits_m[:, 0] - 3.0) < 0.1]
     assert not (np.abs(near[:, 1] - 2.0) < 0.9).any()
+
+
+def test_each_hit_and_thing_tells_the_heights_that_it_was_seen_at(planar_scan: PlanarScan) -> None:
+    """Slices below 0.6 m, up to 1.1 m, and above: the wall fills all, the table top only the middle one."""
+    walls, things = np.split(planar_scan.heights, [len(planar_scan.hits_m)])
+    assert len(things) == len(planar_scan.low_m)
+    assert np.mean(walls == 0b000_111) > 0.95
+    inside = np.abs(planar_scan.low_m - (3.5, 2.0)).max(axis=1) < 0.4
+    assert np.mean((things[inside] & 0b111) == 0b010) > 0.95  # occupied in the middle only
+    assert np.mean((things[inside] & 0b100_000) > 0) > 0.95  # rays have passed over it

@@ -52,3 +52,13 @@ REFLECTION = slab((1.0, 0.0), (1.3, 0.3), -0.8)
 def test_the_floor_is_the_lowest_large_level(surfaces: tuple[F64, ...], height_m: float | None) -> None:
     found = floor_height(shapes_of(*surfaces), EDGE_M, SENSOR)
     assert found == (None if height_m is None else pytest.approx(height_m, abs=0.02))
+
+
+def test_a_floor_that_is_seen_in_rows_is_a_floor() -> None:
+    """The rows of an image lie far apart on the floor: the points of a voxel fix their height, and also where
+    the row is. So do those of a post, which is no floor."""
+    rows = FLOOR[np.abs(FLOOR[:, 0] % EDGE_M - 0.5 * EDGE_M) < 0.01]
+    upright = wall(2.0)
+    posts = upright[np.abs(upright[:, 1] % EDGE_M - 0.5 * EDGE_M) < 0.01]
+    assert floor_height(shapes_of(rows, wall(2.0)), EDGE_M, SENSOR) == pytest.approx(0.0, abs=0.02)
+    assert floor_height(shapes_of(posts), EDGE_M, SENSOR) is None

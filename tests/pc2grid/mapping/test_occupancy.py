@@ -79,6 +79,23 @@ def test_what_was_taken_for_a_wall_until_rays_passed_over_it_is_a_thing_until_it
     assert 0 <= state(builder.grid(), 1.02, 0.02) < 20
 
 
+def test_a_grid_tells_the_heights_of_what_stands_there() -> None:
+    """A wall and a chair ahead; the chair is seen twice, from below and from above."""
+    builder = GridBuilder(ProjectionConfig())
+    wall, chair = np.array([[1.52, 0.02]], np.float32), np.array([[1.02, 0.02]], np.float32)
+    for of_chair in (0b000_001, 0b100_010):
+        heights = np.array([0b000_111, of_chair], np.uint8)
+        seen = dataclasses.replace(disc(2.0), hits_m=wall, normal_rad=np.zeros(1, np.float32), low_m=chair)
+        builder.add(dataclasses.replace(seen, heights=heights), SE2())
+    grid = builder.grid()
+    assert grid.heights is not None
+    assert [int(grid.heights[tuple(grid.to_cell(at)[0])]) for at in (wall, chair)] == [0b000_111, 0b100_011]
+    assert np.count_nonzero(grid.heights) == 2
+    unknown = GridBuilder(ProjectionConfig())
+    unknown.add(disc(2.0), SE2())
+    assert unknown.grid().heights is None
+
+
 def test_a_grid_knows_the_plane_of_its_laser() -> None:
     def drawn(*heights_m: float | None) -> float | None:
         builder = GridBuilder(ProjectionConfig())

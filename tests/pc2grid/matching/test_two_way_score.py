@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -52,6 +54,30 @@ def test_what_was_moved_costs_less_than_a_missing_wall() -> None:
         fits.append(score_fit(TARGET.walls, walls, SE2(10.5, 7.0, 0.0), np.eye(3)).forward)
     apart, joined = fits
     assert joined < apart < 1.0
+
+
+def kitchen(seen: str) -> Walls:
+    """A counter 2.4 m long in front of a wall, 0.6 m away: its front is seen, or it is looked over."""
+    cells = np.full((60, 80), UNKNOWN, np.int8)
+    heights = np.zeros((60, 80), np.uint8)
+    cells[4:30, 10:60] = 0
+    cells[30, 10:58], heights[30, 10:58] = (100, 0b000_011) if seen == "front" else (THING, 0b100_011)
+    if seen != "front":
+        cells[31:42, 10:58], heights[31:42, 10:58] = THING, 0b100_010
+        cells[42, 10:58], heights[42, 10:58] = 100, 0b000_100
+    return Walls.of(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0), heights=heights))
+
+
+def test_walls_are_compared_at_the_heights_that_both_have_seen() -> None:
+    """The front is a wall in one map and a thing in the other. With heights it is the same, and the wall
+    behind the counter does not fit onto the front, which is as long, but lower."""
+    front, over = kitchen("front"), kitchen("over")
+    onto_front = SE2(0.0, -0.6, 0.0)
+    right, wrong = (score_fit(front, over, pose, np.eye(3)) for pose in (SE2(), onto_front))
+    assert right.known_agreement_both_ways > 0.9 > right.score > wrong.score + 0.2
+    flat = [replace(walls, slices=()) for walls in (front, over)]
+    right, wrong = (score_fit(*flat, pose, np.eye(3)) for pose in (SE2(), onto_front))
+    assert wrong.score > right.score
 
 
 @pytest.mark.parametrize("value", [UNKNOWN, 0, 100])
