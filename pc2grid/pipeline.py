@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from itertools import chain
 from typing import TYPE_CHECKING
@@ -26,7 +26,7 @@ from pc2grid.mapping.report import (
     check_followed,
     not_held,
     part_reports,
-    with_ride_warnings,
+    with_track_warnings,
     without_points,
 )
 from pc2grid.mapping.track import KeyframeSelection, Track, TrackRecord
@@ -166,7 +166,7 @@ def build_maps(
     kept = long_enough(parts)
     reached = [part.storey for part in kept]
     floors, heights_m = floor_names(track.storeys, reached), floor_heights(track.storeys, reached)
-    read = with_ride_warnings(log.report(), track)
+    read = with_track_warnings(log.report(), track)
     if planar and config.projection.points_voxel_m is not None:
         read = without_points(read)
     reports = part_reports(read, session, parts, kept, floors, slopes_unseen=planar)
@@ -281,7 +281,8 @@ def _map(
     A part whose map contradicts itself is divided, and drawn again. whole : all scans are one part.
     """
     projection = config.projection
-    first, scans = _first_of(_with_vertical(scans, config, observer))
+    assumptions: list[str] = []
+    first, scans = _first_of(_with_vertical(scans, config, observer, assumptions.append))
     narrow = first is not None and SENSOR_MODELS[first.sensor].narrow
     in_hand = first is not None and not is_rolling(first)
     with ExitStack() as stack:
@@ -299,6 +300,7 @@ def _map(
         )
         selection = KeyframeSelection(keyframes, projection, closer, points)
         track = _track(scans, _tracker(config), selection, observer)
+        track = dataclasses.replace(track, assumptions=tuple(assumptions))
         closed = closer.finish()
         if whole:
             closed = closed.undivided()
@@ -336,11 +338,16 @@ def _track(
     return record.track(tracker)
 
 
-def _with_vertical(scans: Iterable[Scan], config: Config, observer: Observer) -> Iterator[Scan]:
+def _with_vertical(
+    scans: Iterable[Scan],
+    config: Config,
+    observer: Observer,
+    assumed: Callable[[str], object] | None = None,
+) -> Iterator[Scan]:
     """The scans, see `pc2grid.estimation.first_floor`; loaded late, like the tracker."""
     from pc2grid.estimation.first_floor import with_vertical
 
-    return with_vertical(scans, config, observer)
+    return with_vertical(scans, config, observer, assumed)
 
 
 def _tracker(config: Config) -> Tracker:

@@ -9,7 +9,7 @@ all of them their vertical, and they are handed on.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -34,12 +34,18 @@ _UNKNOWN = (
 )
 
 
-def with_vertical(scans: Iterable[Scan], config: Config, observer: Observer = Observer()) -> Iterator[Scan]:
+def with_vertical(
+    scans: Iterable[Scan],
+    config: Config,
+    observer: Observer = Observer(),
+    assumed: Callable[[str], object] | None = None,
+) -> Iterator[Scan]:
     """All scans, the first with the vertical that a later one shows, if it does not know it (`T_level_base`).
 
-    observer : is warned when scans wait, and if no floor is seen before tracking is lost or too many wait;
-        the sensor is then taken to be held level at first.
+    observer : is warned when scans wait. assumed : is told if no floor is seen before tracking is lost or too
+        many wait, so that the sensor is taken to be held level at first; by default the observer is.
     """
+    assumed = assumed or observer.on_warning
     scans = iter(scans)
     waiting: list[Scan] = []
     ups: list[F64] = []  # normals of the floor in the last scans, in the frame of the first
@@ -57,11 +63,11 @@ def with_vertical(scans: Iterable[Scan], config: Config, observer: Observer = Ob
         if len(waiting) == 1:
             observer.on_warning("the first scans show no floor: they are kept aside until one is in view")
         if registered.health is Health.LOST or len(waiting) == MOST_WAITING:
-            observer.on_warning(_UNKNOWN)
+            assumed(_UNKNOWN)
             break
     else:
         if waiting:
-            observer.on_warning(_UNKNOWN)
+            assumed(_UNKNOWN)
     yield from waiting
     yield from scans
 

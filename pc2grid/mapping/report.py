@@ -123,9 +123,9 @@ def division_warning(
     )
 
 
-def with_ride_warnings(report: ReadReport, track: Track) -> ReadReport:
-    """The report of a recording, with what `ride_warnings` says."""
-    return dataclasses.replace(report, warnings=(*report.warnings, *ride_warnings(track)))
+def with_track_warnings(report: ReadReport, track: Track) -> ReadReport:
+    """The report of a recording, with what was assumed and what `ride_warnings` says."""
+    return dataclasses.replace(report, warnings=(*report.warnings, *track.assumptions, *ride_warnings(track)))
 
 
 def without_points(report: ReadReport) -> ReadReport:

@@ -31,7 +31,8 @@ class Track:
 
     trajectory : before loops are closed. disagreements : of odometry, at each scan. riding : (N,) scans on a
     ride from floor to floor. storey : (N,) number of the floor of each in `storeys`. carried : see
-    `Tracker`. with_odometry : whether any scan has an odometry pose.
+    `Tracker`. with_odometry : whether any scan has an odometry pose. assumptions : what was
+    assumed since nothing in the recording shows it, as sentences for the user.
     """
 
     trajectory: Trajectory
@@ -41,6 +42,7 @@ class Track:
     storeys: tuple[Storey, ...]
     carried: bool = False
     with_odometry: bool = False
+    assumptions: tuple[str, ...] = ()
 
     def outside_rides(self) -> Trajectory:
         """The scans that are on no ride."""

@@ -279,6 +279,9 @@ def test_where_no_floor_comes_in_view_the_user_is_told() -> None:
     assert handed_on[0].T_level_base is None
     assert len(heard.warnings) == 2
     assert "taken to be held level" in heard.warnings[1]
+    told: list[str] = []
+    list(with_vertical(iter(many[:5]), Config(), Heard(), told.append))  # for the report of a map
+    assert told == heard.warnings[1:]
 
 
 def test_a_floor_in_view_is_more_exact_than_the_imu(recorded: list[tuple[Scan, F64]]) -> None:

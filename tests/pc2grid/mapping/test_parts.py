@@ -17,7 +17,7 @@ from pc2grid.mapping.loop_parameters import LoopParameters
 from pc2grid.mapping.part_maps import PartMap, doubtful_scans, draw_parts, long_enough
 from pc2grid.mapping.parts import Conflict, connected, cuts_for
 from pc2grid.mapping.pose_graph import Edge
-from pc2grid.mapping.report import part_reports, ride_warnings
+from pc2grid.mapping.report import part_reports, ride_warnings, with_track_warnings
 from pc2grid.mapping.settled import SettledKeyframes
 from pc2grid.mapping.track import Track
 from pc2grid.model import (
@@ -222,6 +222,7 @@ def test_rides_that_did_not_divide_a_recording_are_named() -> None:
     stamps_ns = np.arange(20) * 10**9
     track = on_one_floor(Trajectory(stamps_ns=stamps_ns, T_session_base=poses, health=(Health.FINE,) * 20))
     assert not ride_warnings(track)
+    assert with_track_warnings(ReadReport(), replace(track, assumptions=("so",))).warnings == ("so",)
     (by_hand,) = ride_warnings(replace(track, carried=True))
     assert "3.0 m above" in by_hand and "from 10 s" in by_hand
     (unfinished,) = ride_warnings(replace(track, riding=np.arange(20) >= 15))
