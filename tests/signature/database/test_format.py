@@ -78,7 +78,7 @@ def test_a_stored_session_is_as_it_was(tmp_path: Path) -> None:
     ((document,),) = sql(path, "SELECT document FROM session")
     content = json.loads(document)
     grid = {"cells": "array", "origin_m": [-1.25, 2 / 3], "resolution_m": 0.05}
-    assert content["grid"] == {**grid, "height_m": None}
+    assert content["grid"] == {**grid, "height_m": None, "heights": None}
     assert (content["loops"], content["points"]["voxel_m"]) == (3, 0.1)
 
 

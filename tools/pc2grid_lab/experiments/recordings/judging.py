@@ -1,4 +1,4 @@
-"""The rows of the page about places: each answer judged by true poses, or by the others."""
+"""The rows of the page about places: each answer judged by true poses, by clouds, or by the others."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from pc2grid.geometry import SE2
 from pc2grid.io import open_log
 from pc2grid.model import OccupancyGrid, Trajectory
 from pc2grid.pipeline import follow
+from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_frame, is_right
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.children import Finished, kept
+from pc2grid_lab.experiments.recordings.clouds import cloud_along, registered_clouds
 from pc2grid_lab.experiments.recordings.drive import RecordedDrive, config_of, sessions
 from pc2grid_lab.experiments.recordings.mapped import MISSING, map_row, said
 from pc2grid_lab.experiments.recordings.rows import NOT_RUN, PairRow, QueryRow, Table, Truth
@@ -197,7 +199,7 @@ class Judge:
         self, pair: Pair, query: Recording, map_: Recording
     ) -> tuple[Truth | None, list[LocatedWindow], Frames]:
         """The windows, and how the parts of the drive lie in the sessions of the map: by true poses, else by
-        the answers.
+        the clouds of both, else by the answers.
         """
         windows = self._located_windows(pair)
         if query.poses is not None and query.poses == map_.poses:
@@ -210,9 +212,26 @@ class Judge:
                     if (frame := self._true_frame(map_, trajectory)) is not None
                 },
             )
+        if (by_clouds := self._by_clouds(query, map_)) is not None:
+            return "clouds", windows, {(0, _SESSION): by_clouds}
         shared = self._shared(pair) if map_.sensor == "map" else None
         windows, frames = shared or (windows, _agreed(windows))
         return ("agreement" if frames else None), windows, frames
+
+    def _by_clouds(self, query: Recording, map_: Recording) -> Frame | None:
+        """The frame of a recording in the map of another one, by the clouds of both; None if they have none,
+        or do not tell."""
+        if any(r.sensor == "map" or SENSOR_MODELS[r.sensor].planar for r in (query, map_)):
+            return None
+        drives, clouds = [self._drive(recording).parts[0] for recording in (query, map_)], []
+        for recording, drive in zip((query, map_), drives, strict=True):
+            with open_log(self._folder.source(recording), config_of(recording).read) as log:
+                clouds.append(cloud_along(log, drive))
+        T_map_query = registered_clouds(clouds[0], clouds[1])
+        if T_map_query is None:
+            return None
+        ways = [SE2.from_matrix(drives[0].T_session_base[k]) for k in _steps(drives[0])]
+        return Frame(tuple(Clue(pose, T_map_query @ pose) for pose in ways))
 
     def _shared(self, pair: Pair) -> tuple[list[LocatedWindow], Frames] | None:
         """The same of several drives in one map, whose answers judge each other: those that are known to lie
@@ -254,10 +273,9 @@ class Judge:
     def _true_frame(self, map_: Recording, trajectory: Trajectory) -> Frame | None:
         """The frame of a session of the map in the world, by its own scans, one on each `_STEP_M`."""
         drive = self._drive(map_)
-        steps = np.unique((trajectory.path_m() / _STEP_M).astype(int), return_index=True)[1]
         clues = [
             Clue(true, SE2.from_matrix(trajectory.T_session_base[k]))
-            for k in steps.tolist()
+            for k in _steps(trajectory)
             if (true := drive.true_pose(int(trajectory.stamps_ns[k]))) is not None
         ]
         return Frame(tuple(clues)) if len(clues) >= 2 else None
@@ -267,6 +285,12 @@ class Judge:
             with open_database(self._folder.map(name)) as database:
                 self._grids[name] = {info.name: database.grid(info.name) for info in database.sessions()}
         return self._grids[name]
+
+
+def _steps(trajectory: Trajectory) -> list[int]:
+    """Numbers of its scans, one on each `_STEP_M`."""
+    first: list[int] = np.unique((trajectory.path_m() / _STEP_M).astype(int), return_index=True)[1].tolist()
+    return first
 
 
 def _agreed(windows: Iterable[LocatedWindow]) -> Frames:

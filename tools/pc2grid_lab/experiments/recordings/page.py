@@ -144,9 +144,9 @@ def _places(table: Table) -> list[str]:
         "degrees. rank: places before the right one, of covered queries that are not located (-: it is not",
         "among the hypotheses). error: median of the right ones. in space: answers with which the points of",
         "the map agree / do not tell / disagree, if it has points. judged by: true poses of both; or the",
-        "answers themselves, which must lie on one rigid transform of the drive's own trajectory (how many",
-        "do); elsewhere: another building, where every answer is wrong. In brackets the 95 % interval of",
-        "Clopper and Pearson.",
+        "clouds of both, registered in space; or the answers themselves, which must lie on one rigid",
+        "transform of the drive's own trajectory (how many do); elsewhere: another building, where every",
+        "answer is wrong. In brackets the 95 % interval of Clopper and Pearson.",
     ]
 
 
@@ -157,6 +157,7 @@ def _pair_cells(row: PairRow) -> list[str]:
     judged = {
         "poses": "poses",
         "elsewhere": "elsewhere",
+        "clouds": "clouds",
         "agreement": f"{row.agreeing} answers",
         None: "not judged",
     }[row.truth]

@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 NOT_RUN = "was not run"
 """The problem of a row whose commands were not run, because the run ended early."""
 Verdict = Literal["right", "false", "unknown"]
-Truth = Literal["poses", "agreement", "elsewhere"]
+Truth = Literal["poses", "clouds", "agreement", "elsewhere"]
 """How answers are judged: by true poses of query and map, by each other, or as nothing can be right."""
 
 
