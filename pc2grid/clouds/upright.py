@@ -13,7 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F64
+from pc2grid.clouds.ground import Ground, find_ground
+from pc2grid.clouds.level import LEVEL
 from pc2grid.clouds.sampling import random_subset
+from pc2grid.model import Scan
+from pc2grid.sensor_model import SENSOR_MODELS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +61,19 @@ UPRIGHT = UprightParameters()
 CAMERA_UPRIGHT = UprightParameters(voxel_m=0.1, squeeze=0.7, side_share=0.1)
 """Of a depth camera. It sees small patches densely: with the voxels of a lidar, the neighbours of a point
 span less than `breadth_m`. Chosen on simulated level ground (`examples/floors.md`)."""
+
+
+def level_floor(scan: Scan, points_m: NDArray[np.floating]) -> Ground | None:
+    """The floor in the points (N, 3) of a scan, base frame; None if it shows none.
+
+    What the walls of the scan do not stand on is no floor, but a slanting plane such as the back of a chair.
+    """
+    ground = find_ground(points_m, scan.T_base_sensor[:3, 3])
+    if ground is None:
+        return None
+    parameters = CAMERA_UPRIGHT if SENSOR_MODELS[scan.sensor].narrow else UPRIGHT
+    vertical = vertical_of(points_m, (ground.normal,), parameters)
+    return ground if vertical is None or float(vertical @ ground.normal) > LEVEL.level else None
 
 
 def vertical_of(

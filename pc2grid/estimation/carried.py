@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pc2grid.arrays import F32, F64
-from pc2grid.clouds.ground import find_ground
 from pc2grid.clouds.level import LEVEL
 from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.clouds.upright import level_floor
 from pc2grid.config import ProjectionConfig
 from pc2grid.estimation.belief import KERNEL, SPATIAL, Belief
 from pc2grid.estimation.manifold import moved, steps
@@ -178,7 +178,7 @@ def first_pose(scan: Scan, points_m: F32) -> F64:
     """
     if scan.T_odom_base is not None:
         return leveling(scan.T_odom_base[2, :3])
-    ground = find_ground(points_m, scan.T_base_sensor[:3, 3])
+    ground = level_floor(scan, points_m)
     if scan.T_level_base is not None:
         up = scan.T_level_base[2, :3]
         if ground is None or ground.normal @ up < LEVEL.level:

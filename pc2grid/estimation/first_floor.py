@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import numpy as np
 
 from pc2grid.arrays import F64
-from pc2grid.clouds.ground import find_ground
 from pc2grid.clouds.level import LEVEL
+from pc2grid.clouds.upright import level_floor
 from pc2grid.config import Config
 from pc2grid.estimation.ground_model import is_rolling
 from pc2grid.estimation.tracker import Tracker
@@ -87,5 +87,5 @@ def _common(ups: Sequence[F64]) -> F64 | None:
 
 def _floor_normal(scan: Scan) -> F64 | None:
     """The normal (3,) of the floor in a scan, base frame; None if it shows none."""
-    ground = find_ground(scan.points_m, scan.T_base_sensor[:3, 3])
+    ground = level_floor(scan, scan.points_m)
     return None if ground is None else ground.normal

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from pc2grid.arrays import F64
+from pc2grid.clouds.upright import level_floor
 from pc2grid.config import Config, ReadConfig, RegistrationConfig
 from pc2grid.errors import TrackingLost
 from pc2grid.estimation.carried import first_pose
@@ -282,6 +283,20 @@ def test_where_no_floor_comes_in_view_the_user_is_told() -> None:
     told: list[str] = []
     list(with_vertical(iter(many[:5]), Config(), Heard(), told.append))  # for the report of a map
     assert told == heard.warnings[1:]
+
+
+def test_a_slanting_plane_is_no_floor_where_walls_show_the_vertical(recorded: list[tuple[Scan, F64]]) -> None:
+    """Points of a plane that is tilted by 25 degrees, larger than the floor in view, before the walls."""
+    scan, true = recorded[0]
+    heights = scan.points_m @ true[2, :3] + true[2, 3]
+    walls = scan.points_m[heights > heights.min() + 0.1]
+    tilted = pose_from_rotation_vector((0.0, math.radians(25.0), 0.0)) @ level(np.linalg.inv(true))
+    x, y = np.meshgrid(np.linspace(-1.0, 1.0, 60), np.linspace(-1.0, 1.0, 60))
+    plane = np.column_stack((x.ravel(), y.ravel(), np.zeros(x.size))) @ tilted[:3, :3].T
+    plane += (1.5, 0.0, -1.2)
+    for points, found in ((plane, True), (np.vstack((plane, walls)), False)):
+        seen = points.astype(np.float32)
+        assert (level_floor(dataclasses.replace(scan, points_m=seen), seen) is not None) is found
 
 
 def test_a_floor_in_view_is_more_exact_than_the_imu(recorded: list[tuple[Scan, F64]]) -> None:
