@@ -82,8 +82,7 @@ class ColumnMap:
         self._evidence = np.zeros((size, size, parameters.layers), np.int8)
         self._seen = np.zeros((size, size, parameters.layers), np.uint8)
         self._touched = np.zeros((size, size), np.uint8)
-        self._state = np.zeros((size, size), np.uint8)
-        self._heights = np.zeros((size, size), np.uint8)
+        self._columns = np.zeros((2, size, size), np.uint8)  # what each is, and its heights (`SLICES`)
         self._sums = np.zeros((size, size, 3), np.float32)
         self._low: I64 = np.zeros(3, np.int64)  # lowest cell of the window
         self._stamp = 0
@@ -115,7 +114,7 @@ class ColumnMap:
         first, second = (round((self._floor_m + border_m) / p.layer_m) for border_m in SLICE_BORDERS_M)
         changed = self._stamp if same_floor else 0
         kernels.classify(
-            self._evidence, self._state, self._heights, self._touched, self._sums, self._low, changed,
+            self._evidence, self._columns[0], self._columns[1], self._touched, self._sums, self._low, changed,
             math.floor(self._floor_m / p.layer_m), (low, high), (first, second), p.wall_share, p.wall_layers,
             p.over,
         )  # fmt: skip
@@ -135,7 +134,7 @@ class ColumnMap:
             )
         edge_m = self._config.resolution_m
         free_m, sums, low_m = kernels.view(
-            self._state, self._sums, self._low, sensor_m[:2], pose.yaw, self._reach_m, edge_m, p.gap_m,
+            self._columns[0], self._sums, self._low, sensor_m[:2], pose.yaw, self._reach_m, edge_m, p.gap_m,
             (p.depth_m, 4.0 * self._noise_per_m2), BEARINGS,
         )  # fmt: skip
         walls_m = mean_per_cell(sums, edge_m) if len(sums) else low_m[:0]
@@ -167,15 +166,19 @@ class ColumnMap:
         import cv2
 
         edge_m = self._config.resolution_m
-        walls = np.roll(self._state >= kernels.LOW, (-self._low[:2] % len(self._state)).tolist(), (0, 1)).T
+        walls = np.roll(
+            self._columns[0] >= kernels.LOW, (-self._low[:2] % self._columns.shape[1]).tolist(), (0, 1)
+        ).T
         away_m = edge_m * cv2.distanceTransform((~walls).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
         field: F32 = np.exp(np.float32(-0.5 / sigma_m**2) * away_m**2)
         return field, edge_m * self._low[:2].astype(np.float64)
 
     def _heights_at(self, points_m: F64) -> U8:
         """The heights (N,) of the columns of points (N, 2), session frame; see `pc2grid.model.SLICES`."""
-        column, row = np.floor(points_m.T / self._config.resolution_m).astype(np.int64) % len(self._state)
-        return np.asarray(self._heights[column, row], np.uint8)
+        column, row = (
+            np.floor(points_m.T / self._config.resolution_m).astype(np.int64) % self._columns.shape[1]
+        )
+        return np.asarray(self._columns[1, column, row], np.uint8)
 
     def _band_m(self, floor_m: float) -> tuple[float, float]:
         return floor_m + self._config.band_min_m, floor_m + self._config.band_max_m
@@ -183,7 +186,7 @@ class ColumnMap:
     def _center(self, sensor_m: F64) -> None:
         """Move the window if the sensor is no longer near its middle."""
         p, edge_m = self._parameters, self._config.resolution_m
-        size = self._state.shape[0]
+        size = self._columns.shape[1]
         cell = np.array([edge_m, edge_m, p.layer_m])
         half = np.array([size // 2, size // 2, round(p.below * p.layers)])
         low = np.floor(sensor_m / cell).astype(np.int64) - half

@@ -38,8 +38,8 @@ class WallParameters:
 
 
 WALLS = WallParameters()
-_WALL, _THING = 0b000_111, 0b100_011
-"""Heights of a wall and of a thing where they are not known: rays pass over a thing."""
+_ANY_HEIGHT = (1 << SLICES) - 1
+"""What stands at heights that are not known is compared at all of them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,16 +59,14 @@ class Slice:
 
     @staticmethod
     def all_of(grid: OccupancyGrid, parameters: WallParameters = WALLS) -> tuple[Slice, ...]:
-        """The slices of a grid, lowest first; none if it tells neither heights nor things."""
+        """The slices of a grid, lowest first; none if it does not tell heights."""
         import cv2
 
+        if grid.heights is None:
+            return ()
         # The middle value around each cell: what is left are things, and no grains of noise.
         things = cv2.medianBlur(grid.things.astype(np.uint8), parameters.grain_cells) > 0
-        if grid.heights is None and not things.any():
-            return ()
-        assumed = np.where(things, _THING, _WALL)
-        heights = assumed if grid.heights is None else np.where(grid.heights, grid.heights, assumed)
-        standing = heights * (grid.occupied | things)
+        standing = np.where(grid.heights, grid.heights, _ANY_HEIGHT) * (grid.occupied | things)
         occupied = [(standing >> k & 1).astype(np.uint8) for k in range(SLICES)]
         weight = np.where(things, parameters.movable, 1.0) / np.maximum(sum(occupied), 1)
         return tuple(
@@ -107,7 +105,7 @@ class Walls:
     points_m : (K, 2) float32 centres of occupied cells, one per square of `WallParameters.spacing_m`, in the
         grid's frame.
     weights : (K,) float32, 0..1, how surely each of them stays where it is, see `steadiness`.
-    slices : what stands at each height; empty if the grid tells neither heights nor things.
+    slices : what stands at each height; empty if the grid does not tell.
     height_m : see `OccupancyGrid.height_m`.
     """
 

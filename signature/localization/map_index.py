@@ -98,12 +98,14 @@ class MapIndex:
         self.maps: LazySequence[SearchMap] = LazySequence(
             lambda i: SearchMap.of(self.grids[i]), count, most_prepared
         )
-        self._from_below: LazySequence[SearchMap] = LazySequence(
-            lambda i: SearchMap.of(self.grids[i], from_below=True), count, most_prepared
-        )
-        self._by_heights: LazySequence[SearchMap] = LazySequence(
-            lambda i: SearchMap.of(self.grids[i], by_heights=True), count, most_prepared
-        )
+        self._facing: dict[str, LazySequence[SearchMap]] = {
+            "lower plane": LazySequence(
+                lambda i: SearchMap.of(self.grids[i], from_below=True), count, most_prepared
+            ),
+            "heights": LazySequence(
+                lambda i: SearchMap.of(self.grids[i], by_heights=True), count, most_prepared
+            ),
+        }
         self.alike_floors: dict[tuple[int, int], SE2 | None] = {}  # see `signature.localization.alike_floors`
         self._free: LazySequence[F64] = LazySequence(lambda i: free_squares(self.grids[i]), count)
         self.places = Places(
@@ -240,8 +242,9 @@ class MapIndex:
 
         def facing(i: int) -> SearchMap:
             if by_heights:
-                return self._by_heights[i] if self.maps[i].walls.slices else self.maps[i]
-            return self._from_below[i] if self.maps[i].walls.is_above(height_m) else self.maps[i]
+                return self._facing["heights"][i] if self.maps[i].walls.slices else self.maps[i]
+            above = self.maps[i].walls.is_above(height_m)
+            return self._facing["lower plane"][i] if above else self.maps[i]
 
         return LazySequence(facing, len(self.maps), 0)
 

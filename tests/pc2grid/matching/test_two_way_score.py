@@ -139,7 +139,10 @@ def with_table(x_m: float) -> Walls:
     cells[[0, -1], :] = cells[:, [0, -1]] = 100
     column = round((x_m + 3.05) / 0.05)
     cells[31:51, column - 20 : column + 20] = THING
-    return Walls.of(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-3.05, -2.05)))
+    heights = np.select(
+        [cells == 100, cells == THING], [np.uint8(0b000_111), np.uint8(0b100_010)], np.uint8(0)
+    )
+    return Walls.of(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-3.05, -2.05), heights=heights))
 
 
 def test_a_table_tells_where_the_walls_do_not() -> None:
