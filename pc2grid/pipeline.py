@@ -78,7 +78,7 @@ def follow(
     tracker = _tracker(config)
     unaided: deque[Health] = deque(maxlen=HELD_SCANS)  # of a sensor in the hand, without odometry
     fault, warned = None, False
-    for scan in _with_vertical(scans, config, observer):
+    for scan in _with_vertical(scans, config, observer, observer.on_warning):
         tracked = tracker.track(scan)
         registered, planar_scan = tracked.registered, tracked.planar_scan
         if tracker.carried and scan.T_odom_base is None:
@@ -342,7 +342,7 @@ def _with_vertical(
     scans: Iterable[Scan],
     config: Config,
     observer: Observer,
-    assumed: Callable[[str], object] | None = None,
+    assumed: Callable[[str], object],
 ) -> Iterator[Scan]:
     """The scans, see `pc2grid.estimation.first_floor`; loaded late, like the tracker."""
     from pc2grid.estimation.first_floor import with_vertical

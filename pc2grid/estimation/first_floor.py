@@ -37,15 +37,14 @@ _UNKNOWN = (
 def with_vertical(
     scans: Iterable[Scan],
     config: Config,
-    observer: Observer = Observer(),
-    assumed: Callable[[str], object] | None = None,
+    observer: Observer,
+    assumed: Callable[[str], object],
 ) -> Iterator[Scan]:
     """All scans, the first with the vertical that a later one shows, if it does not know it (`T_level_base`).
 
     observer : is warned when scans wait. assumed : is told if no floor is seen before tracking is lost or too
-        many wait, so that the sensor is taken to be held level at first; by default the observer is.
+        many wait, so that the sensor is taken to be held level at first.
     """
-    assumed = assumed or observer.on_warning
     scans = iter(scans)
     waiting: list[Scan] = []
     ups: list[F64] = []  # normals of the floor in the last scans, in the frame of the first

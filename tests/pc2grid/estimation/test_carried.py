@@ -275,7 +275,7 @@ def test_where_no_floor_comes_in_view_the_user_is_told() -> None:
     poses, heard = looking_up(5), Heard()
     unaided = [dataclasses.replace(scan, T_odom_base=None) for scan, _ in images(room(), poses)]
     many = [dataclasses.replace(unaided[k % 5], stamp_ns=k * 10**8) for k in range(MOST_WAITING + 5)]
-    handed_on = list(with_vertical(iter(many), Config(), heard))
+    handed_on = list(with_vertical(iter(many), Config(), heard, heard.on_warning))
     assert [a.stamp_ns for a in handed_on] == [b.stamp_ns for b in many]
     assert handed_on[0].T_level_base is None
     assert len(heard.warnings) == 2
