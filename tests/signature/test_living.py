@@ -15,7 +15,8 @@ from signature import living
 from signature.config import Config
 from signature.database import maintenance, open_database
 from signature.database.protocol import BuildingFrame, SessionRole
-from signature.localization.joining.building import floors_of, join_sessions, map_of
+from signature.localization.joining.building import join_sessions
+from signature.localization.joining.building_map import floors_of, map_of
 from signature.localization.map_index import MapIndex
 from signature.sessions import add_sessions, provenance
 from tests.helpers import postgresql

@@ -27,7 +27,7 @@ from pc2grid_cli.report import write_report
 from pc2grid_cli.rerun_stream import write_session as stream_session
 from pc2grid_cli.rerun_target import require_target, url_of
 from signature.database import open_database
-from signature.localization.joining.building import floors_of, map_of
+from signature.localization.joining.building_map import floors_of, map_of
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory

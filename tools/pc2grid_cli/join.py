@@ -23,8 +23,9 @@ from pc2grid_cli.tables import show, table
 from signature.bend import largest_m
 from signature.database import SubmapDatabase, maintenance, open_database
 from signature.database.postgres.server import is_url
-from signature.localization.joining.building import Joined, SessionPair, join_sessions
+from signature.localization.joining.building import Joined, join_sessions
 from signature.localization.joining.journal import JoinJournal
+from signature.localization.joining.pairing import SessionPair
 
 if TYPE_CHECKING:
     from pc2grid.geometry import SE2

@@ -29,7 +29,7 @@ from pc2grid_cli.locate import searched
 from signature.localization.answer_json import in_space_document
 from signature.localization.follower import Follower
 from signature.localization.in_building import look_in_building
-from signature.localization.joining.building import map_of
+from signature.localization.joining.building_map import map_of
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseLook, PoseWatch

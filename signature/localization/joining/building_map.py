@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,10 @@ from numpy.typing import NDArray
 from pc2grid.arrays import F64, BoolGrid, hand_over
 from pc2grid.model import FREE, FREE_BELOW, OCCUPIED_FROM, THING, UNKNOWN, OccupancyGrid
 from signature.bend import largest_m
-from signature.database.protocol import BuildingFrame
+from signature.database.protocol import BuildingFrame, SessionRole
+
+if TYPE_CHECKING:
+    from signature.database import SubmapDatabase
 
 Cells = NDArray[np.int8]
 SUREST = 99
@@ -155,3 +159,26 @@ def _cells_at(grid: OccupancyGrid, points_m: NDArray[np.float64]) -> NDArray[np.
     found = np.full(len(at), UNKNOWN, np.int8)
     found[inside] = grid.cells[tuple(at[inside].T)]
     return found
+
+
+def floors_of(database: SubmapDatabase, frames: Mapping[str, BuildingFrame]) -> tuple[tuple[str, ...], ...]:
+    """The joined sessions of each floor, its living map first, then the oldest. frames : of sessions, by
+    name."""
+    floors: dict[str, list[str]] = {}
+    names = [info.name for info in database.sessions() if info.name in frames]
+    for name in sorted(names, key=lambda name: frames[name].role is not SessionRole.LIVING):
+        floors.setdefault(frames[name].name, []).append(name)
+    return tuple(tuple(names) for names in floors.values())
+
+
+def map_of(database: SubmapDatabase, session: str, frames: Mapping[str, BuildingFrame]) -> OccupancyGrid:
+    """The map in whose frame answers in a session are: of its floor, or of the session alone.
+
+    frames : of the sessions whose answers are in the frames of their buildings. A floor is drawn from all its
+    sessions, see `building_map`.
+    """
+    if session not in frames:
+        return database.grid(session)
+    floor = frames[session].name
+    names = next(names for names in floors_of(database, frames) if frames[names[0]].name == floor)
+    return building_map([(database.grid(name), frames[name]) for name in names])

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,9 +20,13 @@ from pc2grid.arrays import F64
 from pc2grid.errors import OutputError
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
+from signature.localization.joining.comparing import Compare, ToCompare
 from signature.localization.joining.join import Join
 from signature.localization.joining.pieces import Link
 from signature.localization.posterior import Evidence
+
+if TYPE_CHECKING:
+    from signature.database import SubmapDatabase
 
 _HEAD = "compared by pc2grid"
 
@@ -78,6 +83,25 @@ class JoinJournal:
     def remove(self) -> None:
         """Remove the file: what was compared is stored."""
         self.path.unlink(missing_ok=True)
+
+
+def remembered(database: SubmapDatabase, journal: JoinJournal, compare: Compare) -> Compare:
+    """What looks for a pair in a journal first, and adds to it what it compares."""
+
+    def known_or_compared(pairs: Sequence[ToCompare]) -> Iterator[Join]:
+        keys = [
+            key_of(database.grid(pair.target), database.grid(pair.source), labelled=pair.labelled)
+            for pair in pairs
+        ]
+        known = [journal.find(key) for key in keys]
+        found = compare([pair for pair, join in zip(pairs, known, strict=True) if join is None])
+        for key, join in zip(keys, known, strict=True):
+            if join is None:
+                join = next(found)
+                journal.add(key, join)
+            yield join
+
+    return known_or_compared
 
 
 def key_of(target: OccupancyGrid, source: OccupancyGrid, *, labelled: bool) -> str:

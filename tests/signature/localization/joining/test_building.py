@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
-import networkx as nx
 import numpy as np
 import pytest
 
@@ -19,8 +17,9 @@ from signature.cluster import LOCAL
 from signature.config import Config
 from signature.database import Label, SubmapDatabase, maintenance, open_database
 from signature.database.protocol import BuildingFrame
-from signature.localization.joining import building, comparing
-from signature.localization.joining.building import join_sessions, map_of
+from signature.localization.joining import comparing, pairing
+from signature.localization.joining.building import join_sessions
+from signature.localization.joining.building_map import map_of
 from signature.localization.joining.candidates import CandidateParameters
 from signature.localization.joining.join import Join, JoinableMap, join_maps
 from signature.localization.joining.journal import JoinJournal
@@ -172,7 +171,7 @@ def test_of_many_sessions_each_is_compared_with_few_and_the_same_are_joined(
     database: SubmapDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With one candidate each, the two halves of the office propose each other."""
-    monkeypatch.setattr(building, "CANDIDATES", CandidateParameters(sessions=1))
+    monkeypatch.setattr(pairing, "CANDIDATES", CandidateParameters(sessions=1))
     found = join_sessions(database)
     assert ("west", "east") in [pair.names for pair in found.pairs] and len(found.pairs) < 3
     assert found.frames == join_sessions(database, only=["east"]).frames
@@ -214,31 +213,3 @@ def test_processes_find_what_one_process_finds(stored: Path, database: SubmapDat
     assert [(pair.names, pair.join.probability) for pair in together.pairs] == [
         (pair.names, pair.join.probability) for pair in alone.pairs
     ]
-
-
-def test_rounds_compare_each_pair_once_the_likeliest_first_and_neighbours_share_a_session() -> None:
-    ring = [("a", "b"), ("b", "c"), ("c", "d"), ("d", "e"), ("a", "e"), ("x", "y")]
-    order = building._along(set(ring))
-    assert sorted(order) == sorted(ring)
-    shared = [bool({*one} & {*other}) for one, other in pairwise(order)]
-    # Only where the other component begins, or ends, is no session shared.
-    assert shared.count(False) == 1
-
-
-def test_sessions_that_hang_together_by_enough_joins_are_not_compared() -> None:
-    """Five in a ring, and a sixth at one of them."""
-    joined = nx.cycle_graph(["a", "b", "c", "d", "e"])
-    joined.add_edge("a", "f")
-    for (one, other), enough, settled in (
-        (("a", "c"), 2, True),
-        (("a", "c"), 3, False),
-        (("f", "c"), 2, False),
-        (("a", "new"), 0, False),
-    ):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(building, "CANDIDATES", CandidateParameters(enough=enough))
-            assert building._settled(joined, one, other) is settled
-    joined.add_edges_from([("x", "y"), ("y", "z"), ("z", "x")])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(building, "CANDIDATES", CandidateParameters(enough=2))
-        assert not building._settled(joined, "a", "x")

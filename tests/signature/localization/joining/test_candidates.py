@@ -9,7 +9,7 @@ from signature.localization.joining.candidates import CandidateParameters, Looke
 from signature.seen_places import SIGNATURE_COLUMNS, SeenPlaces
 
 BUILDINGS, SESSIONS, PLACES = 6, 4, 30
-FEW = CandidateParameters(sessions=3, neighbours=4)
+FEW = CandidateParameters(sessions=3, neighbours=16)
 
 
 def sessions() -> dict[str, LookedAt]:
@@ -32,6 +32,17 @@ def test_sessions_of_the_same_building_come_first() -> None:
     assert found.keys() == all_of_them.keys()
     for name, others in found.items():
         assert sorted(others) == [f"{name[0]}-{s}" for s in range(SESSIONS) if f"{name[0]}-{s}" != name]
+
+
+def test_a_large_session_is_not_likelier_because_it_has_more_places() -> None:
+    """Beside its building's, each place has eight places of a large session that look a little like it."""
+    all_of_them = sessions()
+    rng = np.random.default_rng(1)
+    here = np.concatenate([all_of_them[f"{b}-0"].vectors for b in range(BUILDINGS)])
+    alike = np.repeat(here, 8, axis=0) + rng.normal(0.0, 0.8, (8 * len(here), 24))
+    large = LookedAt(alike.astype(np.float32), np.ones(len(alike), np.float32))
+    found = candidates({**all_of_them, "large": large}, ["0-0"], parameters=FEW)
+    assert sorted(found["0-0"]) == ["0-1", "0-2", "0-3"]
 
 
 def test_what_may_not_be_compared_takes_no_place_of_the_others() -> None:
