@@ -19,7 +19,7 @@ from pc2grid.model import Loop, OccupancyGrid, PointMap, Trajectory
 from pc2grid.submaps.junction_graph import GraphArrays, graph_from_arrays, graph_to_arrays, junction_graph
 from pc2grid.submaps.partition import divide
 from signature.database import codec, validation
-from signature.database.protocol import BuildingFrame, Entry, SessionInfo
+from signature.database.protocol import BuildingFrame, Entry, SessionInfo, SessionRole
 from signature.describe import describe
 from signature.seen_places import SeenPlaces
 from signature.similarity import I32, SignatureTable
@@ -204,7 +204,8 @@ def stored_name(name: str) -> str:
 
 
 def encode(session: StoredSession) -> tuple[str, dict[str, codec.Packed]]:
-    """The document and the arrays of a session."""
+    """The document and the arrays of a session. One that retired is read seldom, so it is stored smaller."""
+    seldom_read = session.frame is not None and session.frame.role is SessionRole.RETIRED
     content: dict[str, Any] = {}
     packed: dict[str, codec.Packed] = {}
     for part in fields(StoredSession):
@@ -214,7 +215,10 @@ def encode(session: StoredSession) -> tuple[str, dict[str, codec.Packed]]:
             continue
         content[part.name] = codec.encode(codec.fields_of(StoredSession)[part.name], value, part.name, arrays)
         compress = part.metadata.get("compress", True)
-        packed |= {name: codec.pack(array, compress=compress) for name, array in arrays.items()}
+        packed |= {
+            name: codec.pack(array, compress=compress, seldom_read=seldom_read)
+            for name, array in arrays.items()
+        }
     return codec.to_json(content), packed
 
 
