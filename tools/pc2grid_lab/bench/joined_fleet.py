@@ -58,13 +58,13 @@ def fleet(folder: Path, buildings: int, sessions: int) -> Path:
     return path
 
 
-def building_of(folder: Path, building: int, sessions: int) -> Path:
-    """The database of a building, and its truth beside it, ending in `.json`."""
+def building_of(folder: Path, building: int, sessions: int, length_m: float = _LENGTH_M) -> Path:
+    """The database of a building, a session for each drive, and its truth beside it, ending in `.json`."""
     path = folder / f"{building}.submaps"
     known = path.with_suffix(".json")
     if not known.exists():
         config, made, truth = Config(), [], {}
-        for number, drive in enumerate(drives(building, sessions)):
+        for number, drive in enumerate(drives(building, sessions, length_m)):
             session, T_plan_map = mapped(drive, f"{building}-{number}", config)
             made.append((session, provenance(session.session, f"{building}-{number}", config)))
             truth[session.session] = [T_plan_map.x, T_plan_map.y, T_plan_map.yaw]
@@ -73,13 +73,13 @@ def building_of(folder: Path, building: int, sessions: int) -> Path:
     return path
 
 
-def drives(building: int, count: int) -> Iterator[Session]:
+def drives(building: int, count: int, length_m: float = _LENGTH_M) -> Iterator[Session]:
     """So many drives through a building, whose doors and furniture are different each time."""
     plan = office_floorplan(1000 + building, *_SIDES_M)
     for number in range(count):
         world = WorldConfig.model_validate(
             {
-                "length_m": _LENGTH_M,
+                "length_m": length_m,
                 "seed": 1000 * building + number,
                 "clutter": _THINGS,
                 "change": {"doors": _DOORS},
@@ -118,14 +118,14 @@ def mapped(drive: Session, name: str, config: Config) -> tuple[SessionMap, SE2]:
 def summary(found: Joined, truth: Mapping[str, Sequence[float]]) -> dict[str, object]:
     """What was compared and joined, and how far joined sessions lie from the truth."""
     T_plan = {name: SE2(*pose) for name, pose in truth.items()}
+    frames_off = [_off_m(T_plan, at.name, name, at.T_building_session) for name, at in found.frames.items()]
     true = [pair for pair in found.pairs if _building(pair.target) == _building(pair.source)]
     joined = [pair for pair in found.pairs if pair.accepted]
-    errors = []
-    for pair in joined:
-        if _building(pair.target) == _building(pair.source):
-            T = T_plan[pair.target].inverse() @ T_plan[pair.source]
-            off = T.inverse() @ pair.join.T_target_source
-            errors.append(math.hypot(off.x, off.y))
+    errors = [
+        _off_m(T_plan, *pair.names, pair.join.T_target_source)
+        for pair in joined
+        if _building(pair.target) == _building(pair.source)
+    ]
     groups = nx.Graph(pair.names for pair in joined)
     sizes = sorted(map(len, nx.connected_components(groups)), reverse=True)
     return {
@@ -135,12 +135,24 @@ def summary(found: Joined, truth: Mapping[str, Sequence[float]]) -> dict[str, ob
         "of these of one building": len(true),
         "joined": len(joined),
         "joined, though different": len(joined) - len(errors),
-        "error, median and largest, m": [round(float(f(errors)), 3) for f in (np.median, np.max)]
-        if errors
-        else [],
+        "error, median and largest, m": _median_and_largest(errors),
         "sessions in a frame": len(found.frames),
+        "frames": len({at.name for at in found.frames.values()}),
+        "error of where they lie, median and largest, m": _median_and_largest(frames_off),
         "sizes of what hangs together": sizes,
     }
+
+
+def _off_m(T_plan: Mapping[str, SE2], target: str, source: str, T_target_source: SE2) -> float:
+    """Distance of a transform of two sessions from the truth; infinite for those of different buildings."""
+    if _building(target) != _building(source):
+        return math.inf
+    off = (T_plan[target].inverse() @ T_plan[source]).inverse() @ T_target_source
+    return math.hypot(off.x, off.y)
+
+
+def _median_and_largest(errors_m: Sequence[float]) -> list[float]:
+    return [round(float(f(errors_m)), 3) for f in (np.median, np.max)] if errors_m else []
 
 
 def _building(name: str) -> str:
