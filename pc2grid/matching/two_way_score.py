@@ -6,6 +6,12 @@ has walls where the query has seen free space.
 Where both sides tell at which heights they have seen what stands there, they are compared in the slices of
 heights that both have seen (`pc2grid.matching.walls.Slice`).
 
+A wall that the map has seen from its other side only, as it does not know the ground in front of it, may be
+the right one: walls are thin. But a query along the outer wall of a building fits the rooms behind it, too.
+So such a wall counts in the score, by which places are ranked, and not as evidence of a place (`compared`).
+Not the other way round: what a single scan knows of the ground are thin rays. Within a session, and between
+two of one building, both sides are of one wall: there `Walls.before_m` are the walls.
+
 Two lasers at different heights are compared on what both can see. The walls of the higher one stand on the
 floor; what the lower one has seen need not reach up, so it counts as on unknown ground where the higher one
 sees free space.
@@ -16,6 +22,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+
+import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
@@ -31,7 +39,8 @@ class Fit:
     forward : 0..1, mean likelihood of the query's walls; neutral where the map is unknown.
     backward : 0..1, mean likelihood of the map's walls on ground that the query knows.
     overlap : 0..1, share of the query's walls on ground that the map knows.
-    compared : number of the query's wall points on ground that the map knows, by weight.
+    compared : number of the query's wall points on ground that the map knows, as it does the ground in front
+        of them, by weight.
     looked_at : number of the map's wall points on ground that the query knows, by weight.
     score : 0..1, geometric mean of forward and backward; hypotheses are ranked by it.
     covariance : (3, 3) of x, y, yaw from the refinement: wide along a corridor, narrow across it.
@@ -73,18 +82,19 @@ def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) ->
     pairs, T_query_map = comparable(target, query), T_map_query.inverse()
     seen, likelihood = _sum(_agreement(mine, on.field, T_map_query, above) for on, mine in pairs)
     looked_at, returned = _sum(_agreement(on, mine.field, T_query_map, below) for on, mine in pairs)
+    behind = sum(_other_side(mine, on.field, T_map_query) for on, mine in pairs)
     weight = sum(mine.weight for _, mine in pairs)
     forward = (likelihood + LIKELIHOOD.neutral * (weight - seen)) / weight if weight else 0.0
     backward = scored = returned / looked_at if looked_at else 0.0
     if below:
-        observed, _ = _agreement(target, query.field, T_map_query.inverse())
+        observed, _ = _agreement(target, query.field, T_query_map)
         scored = (returned + LIKELIHOOD.neutral * (observed - looked_at)) / observed if observed else 0.0
     return Fit(
         T_map_query=T_map_query,
         forward=forward,
         backward=backward,
         overlap=seen / weight if weight else 0.0,
-        compared=seen,
+        compared=seen - behind,
         looked_at=looked_at,
         score=math.sqrt(forward * scored),
         covariance=covariance,
@@ -104,3 +114,10 @@ def _agreement(
     likelihood, known = field.at(T_field_walls.apply(walls.points_m), above=above)
     weights = walls.weights[known].astype("f8")
     return float(weights.sum()), float(weights @ likelihood[known])
+
+
+def _other_side(walls: Walls | Slice, field: LikelihoodField, T_field_walls: SE2) -> float:
+    """The weight of the wall points on known ground that were seen from unknown ground."""
+    _, known = field.at(T_field_walls.apply(walls.points_m))
+    _, before = field.at(T_field_walls.apply(walls.before_m))
+    return float(walls.weights[known & ~before].sum(dtype=np.float64))

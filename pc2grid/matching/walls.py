@@ -2,17 +2,21 @@
 
 Small things that stand alone may have been moved between two visits, walls stay. So a wall point counts by
 the size of the connected object that it belongs to.
+
+A wall has two sides. The outer wall of a building, mapped from its rooms and seen from the street, is one
+line in both grids, but nothing that both have seen. So the walls of a query keep the ground in front of them,
+on the side that they were seen from (`seen_from`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
-from pc2grid.matching.likelihood_field import LikelihoodField, padded_grid
+from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField, padded_grid
 from pc2grid.model import SLICES, OccupancyGrid
 
 
@@ -92,6 +96,11 @@ class Slice:
         )
 
     @property
+    def before_m(self) -> F32:
+        """As `Walls.before_m`: which side of them was seen does not matter, as their heights are known."""
+        return self.points_m
+
+    @property
     def weight(self) -> float:
         """The number of points, by weight."""
         return float(self.weights.sum(dtype=np.float64))
@@ -104,6 +113,8 @@ class Walls:
     field : its likelihood field.
     points_m : (K, 2) float32 centres of occupied cells, one per square of `WallParameters.spacing_m`, in the
         grid's frame.
+    before_m : (K, 2) float32, points on the ground in front of them, on which the other side is asked for
+        what it knows; `points_m` themselves if it does not matter which side of a wall was seen.
     weights : (K,) float32, 0..1, how surely each of them stays where it is, see `steadiness`.
     slices : what stands at each height; empty if the grid does not tell.
     height_m : see `OccupancyGrid.height_m`.
@@ -111,6 +122,7 @@ class Walls:
 
     field: LikelihoodField
     points_m: F32
+    before_m: F32
     weights: F32
     slices: tuple[Slice, ...] = ()
     height_m: float | None = None
@@ -121,13 +133,34 @@ class Walls:
         padded = padded_grid(grid, margin_m)
         cells = cells_of(padded.occupied)
         cells = cells[thin_evenly(padded.to_point(cells), parameters.spacing_m)]
+        points_m = padded.to_point(cells).astype(np.float32)
         return Walls(
             field=LikelihoodField.of(padded),
-            points_m=padded.to_point(cells).astype(np.float32),
+            points_m=points_m,
+            before_m=points_m,
             weights=steadiness(padded.occupied, cells, padded.resolution_m, parameters),
             slices=Slice.all_of(padded, parameters),
             height_m=grid.height_m,
         )
+
+    def seen_from(self, free: F32) -> Walls:
+        """The walls with the ground in front of them, on the side that they were seen from.
+
+        free : (H, W) where the ground is free, 0..1, on the cells of the field. Blurred, because that of a
+        single scan consists of thin rays, its gradient points to that side. The points lie two standard
+        deviations of the field from the wall, so that one drawn a little off does not hide them.
+        """
+        import cv2
+
+        cells = np.floor((self.points_m - np.asarray(self.field.origin_m)) / self.field.resolution_m)
+        column, row = cells.astype(np.int64).T
+        blurred = cv2.GaussianBlur(free, (0, 0), LIKELIHOOD.sigma_m / self.field.resolution_m)
+        gradient = np.stack(
+            [cv2.Sobel(blurred, cv2.CV_32F, dx, 1 - dx)[row, column] for dx in (1, 0)], axis=1
+        )
+        length = np.maximum(np.hypot(*gradient.T), np.finfo(np.float32).tiny)
+        away_m = 2.0 * LIKELIHOOD.sigma_m * gradient / length[:, None]
+        return replace(self, before_m=(self.points_m + away_m).astype(np.float32))
 
     def is_above(self, height_m: float | None) -> bool:
         """Whether these are walls of one plane that is clearly higher than another plane."""

@@ -239,10 +239,12 @@ class Query:
         for keyframe in keyframes:
             builder.add(keyframe.planar_scan, keyframe.T_odom_base)
         path = np.array([(k.T_odom_base.x, k.T_odom_base.y) for k in keyframes])
-        query = query_of(builder.grid(), path, self._made_with, self._config, newest.T_odom_base)
+        grid = builder.grid()
+        query = query_of(grid, path, self._made_with, self._config, newest.T_odom_base)
         at_prior = self._at_prior[1]
         return replace(
             query,
+            walls=query.walls.seen_from(grid.free.astype(np.float32)),
             stamp_ns=newest.planar_scan.stamp_ns,
             path_m=newest.path_m,
             part=self.part,

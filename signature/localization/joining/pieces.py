@@ -51,7 +51,7 @@ class Piece:
 
     def mirrored(self) -> Piece:
         """With x turned into -x."""
-        field, points_m = self.walls.field, self.walls.points_m * np.array((-1.0, 1.0), np.float32)
+        field, flip = self.walls.field, np.array((-1.0, 1.0), np.float32)
         right_m = field.origin_m[0] + field.values.shape[1] * field.resolution_m
         flipped = replace(
             field,
@@ -59,7 +59,13 @@ class Piece:
             known=np.ascontiguousarray(field.known[:, ::-1]),
             origin_m=(-right_m, field.origin_m[1]),
         )
-        walls = Walls(field=flipped, points_m=points_m, weights=self.walls.weights)
+        walls = replace(
+            self.walls,
+            field=flipped,
+            points_m=self.walls.points_m * flip,
+            before_m=self.walls.before_m * flip,
+            slices=(),
+        )
         return Piece(walls, (-self.center_m[0], self.center_m[1]))
 
 

@@ -41,6 +41,33 @@ def test_unknown_ground_is_neutral() -> None:
     assert fit.forward == pytest.approx(fit.overlap + LIKELIHOOD.neutral * (1 - fit.overlap), abs=0.03)
 
 
+def seen_beside_a_wall(inside: bool) -> Walls:
+    """A wall of 5 m along x, and the ground on one side of it, 2 m deep."""
+    cells = np.full((81, 100), UNKNOWN, np.int8)
+    cells[40] = 100
+    cells[slice(41, None) if inside else slice(40)] = 0
+    grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, -2.0))
+    return Walls.of(grid).seen_from(grid.free.astype(np.float32))
+
+
+def test_a_wall_that_the_map_has_seen_from_its_other_side_is_no_evidence() -> None:
+    room, street = seen_beside_a_wall(True), seen_beside_a_wall(False)
+    same, other = (score_fit(room, query, SE2(), np.eye(3)) for query in (room, street))
+    assert same.compared == room.weight
+    assert other.compared < 0.05 * room.weight  # at the ends of the wall, the side that is seen is not exact
+    assert other.score == pytest.approx(same.score)  # a thin wall may well be the same
+
+
+def test_a_wall_that_the_map_knows_from_both_sides_is_compared_from_each() -> None:
+    """Drawn 0.1 m too far out, as much as the field is wide."""
+    cells = np.zeros((81, 100), np.int8)
+    cells[40] = 100
+    known = Walls.of(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, -2.0)))
+    for inside, out_m in ((True, -0.1), (False, 0.1)):
+        query = seen_beside_a_wall(inside)
+        assert score_fit(known, query, SE2(0.0, out_m, 0.0), np.eye(3)).compared == query.weight
+
+
 def test_what_was_moved_costs_less_than_a_missing_wall() -> None:
     """The same number of cells: two boxes that are gone from the map, or a stretch of its wall."""
     here = office_part((10.5, 7.0))
