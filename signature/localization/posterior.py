@@ -99,8 +99,8 @@ class Evidence:
     """What tells for one place.
 
     forward : `pc2grid.matching.two_way_score.Fit.known_agreement`. walls : wall points of the query that lie
-    on ground known to the map, weighted by `pc2grid.matching.walls.steadiness`.
-    backward, looked_at : the same the other way round.
+    on ground known to the map and were seen from a side that it knows, weighted by
+    `pc2grid.matching.walls.steadiness`. backward, looked_at : the other way round, from whichever side.
     lead : score less that of the best place that does not fit equally well, at most `longest_lead` of it.
     likeness : `pc2grid.matching.self_likeness` of the query.
     tail : r_k, log-likelihood of the scans from the k-th one on, the last one first.
