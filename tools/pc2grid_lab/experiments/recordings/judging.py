@@ -175,7 +175,12 @@ class Judge:
         if pair.kind == "elsewhere":
             return LocatedWindow(pair.query, number, span, done)
         drive = self._drive(query)
-        where = _where(drive, stamp_ns)
+        where: tuple[int, SE2] | None
+        if drive.truth is None:
+            where = drive.own_pose(stamp_ns)
+        else:
+            true = drive.true_pose(stamp_ns)
+            where = None if true is None else (-1, true)
         return LocatedWindow(pair.query, number, span, done, where, self._last_hits(query, span, stamp_ns))
 
     def _last_hits(self, query: Recording, span: TimeSpan, stamp_ns: int) -> F64:
@@ -208,14 +213,21 @@ class Judge:
                 },
             )
         if (by_clouds := self._by_clouds(query, map_)) is not None:
-            return "clouds", windows, by_clouds
+            own = [replace(one, where=self._own(query, one)) for one in windows]
+            return "clouds", own, {(0, _SESSION): by_clouds}
         shared = self._shared(pair) if map_.sensor == "map" else None
         windows, frames = shared or (windows, _agreed(windows))
         return ("agreement" if frames else None), windows, frames
 
-    def _by_clouds(self, query: Recording, map_: Recording) -> Frames | None:
-        """How a recording lies in the map of another one, by the clouds of both; None if they have none, or
-        do not tell."""
+    def _own(self, query: Recording, one: LocatedWindow) -> tuple[int, SE2] | None:
+        """Where the base is at the end of a window, by the trajectory that its cloud lies along."""
+        if one.answer is None:
+            return None
+        return self._drive(query).own_pose(int(one.answer["query"]["stamp_ns"]))
+
+    def _by_clouds(self, query: Recording, map_: Recording) -> Frame | None:
+        """The frame of a recording in the map of another one, by the clouds of both; None if they have none,
+        or do not tell."""
         if any(r.sensor == "map" or SENSOR_MODELS[r.sensor].planar for r in (query, map_)):
             return None
         drives, clouds = [self._drive(recording).parts[0] for recording in (query, map_)], []
@@ -225,13 +237,8 @@ class Judge:
         T_map_query = registered_clouds(clouds[0], clouds[1])
         if T_map_query is None:
             return None
-        clues: dict[tuple[int, str], list[Clue]] = {}
-        for k in _steps(drives[0]):
-            where = _where(self._drive(query), int(drives[0].stamps_ns[k]))
-            if where is not None:
-                T_map_base = T_map_query @ SE2.from_matrix(drives[0].T_session_base[k])
-                clues.setdefault((where[0], _SESSION), []).append(Clue(where[1], T_map_base))
-        return {key: Frame(tuple(of_part)) for key, of_part in clues.items()}
+        ways = [SE2.from_matrix(drives[0].T_session_base[k]) for k in _steps(drives[0])]
+        return Frame(tuple(Clue(pose, T_map_query @ pose) for pose in ways))
 
     def _shared(self, pair: Pair) -> tuple[list[LocatedWindow], Frames] | None:
         """The same of several drives in one map, whose answers judge each other: those that are known to lie
@@ -285,14 +292,6 @@ class Judge:
             with open_database(self._folder.map(name)) as database:
                 self._grids[name] = {info.name: database.grid(info.name) for info in database.sessions()}
         return self._grids[name]
-
-
-def _where(drive: RecordedDrive, stamp_ns: int) -> tuple[int, SE2] | None:
-    """See `LocatedWindow.where`."""
-    if drive.truth is None:
-        return drive.own_pose(stamp_ns)
-    true = drive.true_pose(stamp_ns)
-    return None if true is None else (-1, true)
 
 
 def _steps(trajectory: Trajectory) -> list[int]:
