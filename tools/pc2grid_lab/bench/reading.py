@@ -103,7 +103,7 @@ from pc2grid_lab.experiments.recordings.bare_kiss import indoors
 path, duration = sys.argv[1], float(sys.argv[2]) or None
 with open_log(path) as log:
     scans = list(log.scans(0.0, duration))
-voxel_m, range_m = indoors(scans[0].points_m)
+voxel_m, range_m = indoors(*scans[:2])
 found = {"scans": len(scans), "voxel": voxel_m}
 points = [np.asarray(scan.points_m, np.float64) for scan in scans]
 for name, voxel, reach in (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.recordings import judging
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.children import Finished
-from pc2grid_lab.experiments.recordings.drive import RecordedDrive
+from pc2grid_lab.experiments.recordings.drive import RecordedDrive, levelled
 from pc2grid_lab.experiments.recordings.judging import Judge, LocatedWindow, known_share
 from pc2grid_lab.experiments.recordings.run import Folder
 
@@ -119,16 +120,26 @@ def trajectory(*stamps_s: float) -> Trajectory:
 
 def test_true_poses_are_interpolated_or_carried() -> None:
     own = trajectory(*np.arange(0.0, 30.0, 0.25))
-    dense = RecordedDrive((), trajectory(0.0, 0.2, 0.4), SE2())
+    dense = RecordedDrive((), trajectory(0.0, 0.2, 0.4))
     between = dense.true_pose(100_000_000)
     assert between is not None and (between.x, between.y) == pytest.approx((0.1, 0.01))
-    sparse = RecordedDrive((own,), trajectory(0.0, 1.0, 8.0), SE2())
+    sparse = RecordedDrive((own,), trajectory(0.0, 1.0, 8.0))
     carried = sparse.true_pose(6_000_000_000)
     assert carried is not None and (carried.x, carried.yaw) == pytest.approx((6.0, 0.3))
     assert sparse.true_pose(25_000_000_000) is None  # 17 s from the last true pose
-    assert RecordedDrive((), trajectory(0.0, 8.0), SE2()).true_pose(6_000_000_000) is None
-    shifted = RecordedDrive((), trajectory(0.0, 0.2), SE2(-0.1, 0.0, 0.0)).true_pose(0)
-    assert shifted is not None and shifted.x == pytest.approx(-0.1)
+    assert RecordedDrive((), trajectory(0.0, 8.0)).true_pose(6_000_000_000) is None
+
+
+def test_a_world_that_lies_as_the_first_image_is_put_upright() -> None:
+    own = trajectory(*np.arange(0.0, 30.0, 0.25))
+    lying = np.eye(4)
+    lying[:3, :3] = [[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]  # x right, y down, z forward
+    upright = levelled(replace(own, T_session_base=lying @ own.T_session_base), [own])
+    first, last = (SE2.from_matrix(upright.T_session_base[k]) for k in (0, -1))
+    way, expected = first.inverse() @ last, SE2.from_matrix(own.T_session_base[-1])
+    # The heading of the world stays its own: only motions can be compared.
+    assert (way.x, way.y, way.yaw) == pytest.approx((expected.x, expected.y, expected.yaw))
+    assert np.allclose(levelled(own, []).T_session_base, own.T_session_base)
 
 
 def test_known_ground_is_known_a_little_behind_walls() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,24 +13,26 @@ import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 
-from pc2grid.arrays import F32
 from pc2grid.estimation.registration import BareKissIcp
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
-from pc2grid.model import Trajectory
+from pc2grid.model import Scan, Trajectory
 from pc2grid_lab.experiments.trajectory_error import trajectory_error
 
 VOXELS_PER_RANGE = 40.0
 """The 75th percentile of the ranges over the voxel: 0.3 m in rooms and halls. Chosen by hand."""
+_WALK_MPS, _WALK_MOST_M = 1.0, 0.5
+"""A voxel is the way between two scans at least, as partners of points are found no farther; by hand."""
 
 
-def indoors(points_m: F32) -> tuple[float, float]:
-    """The voxel and the range, metres, with which KISS-ICP maps the surroundings of a first scan (N, 3).
+def indoors(first: Scan, second: Scan) -> tuple[float, float]:
+    """The voxel and the range, metres, with which KISS-ICP maps the surroundings of the first two scans.
 
     Its own, 1 m and 100 m, are for streets: with these it is ten times faster, and makes no map of a room.
     """
-    ranges_m = np.linalg.norm(points_m, axis=1)
-    voxel_m = np.clip(np.percentile(ranges_m, 75) / VOXELS_PER_RANGE, 0.3, 1.0)
+    ranges_m = np.linalg.norm(first.points_m, axis=1)
+    walked_m = min(_WALK_MPS * (second.stamp_ns - first.stamp_ns) * 1e-9, _WALK_MOST_M)
+    voxel_m = np.clip(max(np.percentile(ranges_m, 75) / VOXELS_PER_RANGE, walked_m), 0.3, 1.0)
     return float(voxel_m), float(np.clip(1.5 * np.percentile(ranges_m, 98), 10.0, 100.0))
 
 
@@ -42,7 +45,7 @@ def main() -> None:
     log, truth = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None
     with open_log(log) as opened:
         config: Any = KISSConfig()
-        config.mapping.voxel_size, config.data.max_range = indoors(next(iter(opened.scans())).points_m)
+        config.mapping.voxel_size, config.data.max_range = indoors(*islice(opened.scans(), 2))
         config.data.deskew = False
         config.registration.max_num_threads = 1
         kiss, own = KissICP(config), BareKissIcp()

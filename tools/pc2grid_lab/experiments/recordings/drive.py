@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from pc2grid.geometry import SE2, interpolate_pose
+from pc2grid.arrays import F64
+from pc2grid.geometry import SE2, interpolate_pose, invert_pose
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Trajectory
@@ -37,10 +40,10 @@ def sessions(folder: Folder, name: str) -> dict[str, Trajectory]:
         return {info.name: database.trajectory(info.name) for info in database.sessions()}
 
 
-def mount(folder: Folder, recording: Recording) -> SE2:
-    """T_base_sensor of a recording's first scan."""
+def mount(folder: Folder, recording: Recording) -> F64:
+    """T_base_sensor (4, 4) of a recording's first scan."""
     with open_log(folder.source(recording), config_of(recording).read) as log:
-        return SE2.from_matrix(next(iter(log.scans())).T_base_sensor)
+        return next(iter(log.scans())).T_base_sensor
 
 
 @dataclass(frozen=True)
@@ -48,22 +51,25 @@ class RecordedDrive:
     """A recording as it was driven: its own trajectories, and true poses if there are any.
 
     parts : the sessions of the map of the whole recording; none for a map that is no recording.
-    truth : poses of the sensor in the world, None without. T_sensor_base : of the base in its frame.
-    late_ns : see `Recording.late_s`.
+    truth : poses of the base in the world, whose z is up; None without. late_ns : see `Recording.late_s`.
     """
 
     parts: tuple[Trajectory, ...]
     truth: Trajectory | None
-    T_sensor_base: SE2
     late_ns: int = 0
 
     @staticmethod
     def of(recording: Recording, folder: Folder) -> RecordedDrive:
         """Of a recording whose whole map is in the folder."""
         parts = tuple(sessions(folder, recording.name).values())
-        truth = None if recording.poses is None else read_tum(folder.data / recording.poses)
-        T_base_sensor = SE2() if recording.of_base or truth is None else mount(folder, recording)
-        return RecordedDrive(parts, truth, T_base_sensor.inverse(), round(recording.late_s * 1e9))
+        late_ns = round(recording.late_s * 1e9)
+        if recording.poses is None:
+            return RecordedDrive(parts, None, late_ns)
+        truth = read_tum(folder.data / recording.poses)
+        if not recording.of_base:
+            T_sensor_base = invert_pose(mount(folder, recording))
+            truth = replace(truth, T_session_base=truth.T_session_base @ T_sensor_base)
+        return RecordedDrive(parts, levelled(truth, parts, late_ns), late_ns)
 
     def own_pose(self, stamp_ns: int) -> tuple[int, SE2] | None:
         """The part and T_part_base of the scan with that stamp; None if no part has it."""
@@ -80,14 +86,14 @@ class RecordedDrive:
         stamps_ns = self.truth.stamps_ns
         nearest = _nearest(stamps_ns, stamp_ns)
         if nearest is not None and abs(int(stamps_ns[nearest]) - stamp_ns) <= _SAME_NS:
-            return SE2.from_matrix(self.truth.T_session_base[nearest]) @ self.T_sensor_base
+            return SE2.from_matrix(self.truth.T_session_base[nearest])
         after = int(np.searchsorted(stamps_ns, stamp_ns))
         if 0 < after < len(stamps_ns):
             before_ns, after_ns = int(stamps_ns[after - 1]), int(stamps_ns[after])
             if after_ns - before_ns <= _GAP_NS:
                 part = (stamp_ns - before_ns) / (after_ns - before_ns)
                 before, behind = self.truth.T_session_base[after - 1 : after + 1]
-                return SE2.from_matrix(interpolate_pose(before, behind, part)) @ self.T_sensor_base
+                return SE2.from_matrix(interpolate_pose(before, behind, part))
         return self._carried(stamp_ns)
 
     def _carried(self, stamp_ns: int) -> SE2 | None:
@@ -98,7 +104,7 @@ class RecordedDrive:
         if own is None or not len(near):
             return None
         pairs = [
-            (there[1], SE2.from_matrix(self.truth.T_session_base[k]) @ self.T_sensor_base)
+            (there[1], SE2.from_matrix(self.truth.T_session_base[k]))
             for k in near.tolist()
             if (there := self.own_pose(int(self.truth.stamps_ns[k]) + self.late_ns)) is not None
             and there[0] == own[0]
@@ -106,6 +112,26 @@ class RecordedDrive:
         if not pairs:
             return None
         return fit_frame(pairs, _AHEAD_M) @ own[1]
+
+
+def levelled(truth: Trajectory, parts: Sequence[Trajectory], late_ns: int = 0) -> Trajectory:
+    """True poses of the base, turned so that z of the world is up.
+
+    The world of a camera's poses may lie as its first image does. Which way is up in it is told by the own
+    trajectories, which are levelled; without scans that have a true pose it stays as it is.
+    """
+    up = np.zeros(3)
+    for part in parts:
+        at = np.searchsorted(part.stamps_ns, truth.stamps_ns + late_ns).clip(max=len(part) - 1)
+        same = np.abs(part.stamps_ns[at] - truth.stamps_ns - late_ns) <= _SAME_NS
+        # The third row of a rotation is the vertical of its frame, as the base sees it.
+        vertical = part.T_session_base[at[same], 2, :3, None]
+        up += (truth.T_session_base[same, :3, :3] @ vertical).sum(axis=(0, 2))
+    if not up.any():
+        return truth
+    T = np.eye(4)
+    T[:3, :3] = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
+    return replace(truth, T_session_base=T @ truth.T_session_base)
 
 
 def _nearest(stamps_ns: NDArray[np.int64], stamp_ns: int) -> int | None:

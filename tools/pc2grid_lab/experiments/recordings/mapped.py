@@ -79,7 +79,10 @@ def _error(recording: Recording, folder: Folder) -> dict[str, Any]:
     parts = list(sessions(folder, recording.name).values())
     truth = folder.data / recording.truth
     if truth.suffix == ".relations":
-        return {"truth": "relations", **_relation_error(parts, truth, mount(folder, recording))}
+        return {
+            "truth": "relations",
+            **_relation_error(parts, truth, SE2.from_matrix(mount(folder, recording))),
+        }
     return {"truth": "poses", **_pose_error(parts, truth)}
 
 
