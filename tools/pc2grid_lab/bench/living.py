@@ -138,9 +138,9 @@ def asked(folder: Path, building: int) -> Iterator[Asked]:
             for scans, count in _LOOKS.items():
                 for start in np.linspace(0, len(drive) - scans, count).astype(int).tolist():
                     true = drive[start + scans - 1][1]
-                    if _known(first, truth["day0"].inverse() @ true):
-                        answer, _ = _ask(index, [scan for scan, _ in drive[start : start + scans]])
-                        error = _error(answer, placed, T_plan_frame.inverse() @ true)
+                    if knows_around(first, truth["day0"].inverse() @ true):
+                        answer, _ = answer_to(index, [scan for scan, _ in drive[start : start + scans]])
+                        error = error_of(answer, placed, T_plan_frame.inverse() @ true)
                         yield Asked(
                             building=building,
                             map=name,
@@ -152,7 +152,7 @@ def asked(folder: Path, building: int) -> Iterator[Asked]:
                         )
 
 
-def _error(answer: Answer, frames: Sequence[BuildingFrame], T_frame_base: SE2) -> tuple[float, float]:
+def error_of(answer: Answer, frames: Sequence[BuildingFrame], T_frame_base: SE2) -> tuple[float, float]:
     """Distance and turn of the best hypothesis from the truth; infinite without one."""
     if not answer.hypotheses:
         return math.inf, math.inf
@@ -162,7 +162,7 @@ def _error(answer: Answer, frames: Sequence[BuildingFrame], T_frame_base: SE2) -
     return math.hypot(off.x, off.y), abs(math.remainder(off.yaw, 2.0 * math.pi))
 
 
-def _known(grid: OccupancyGrid, T_map_base: SE2) -> bool:
+def knows_around(grid: OccupancyGrid, T_map_base: SE2) -> bool:
     """Whether a map knows the ground around a place."""
     steps = np.arange(-_AROUND_M, _AROUND_M + 1e-9, 0.1)
     around_m: F64 = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
@@ -173,7 +173,7 @@ def _known(grid: OccupancyGrid, T_map_base: SE2) -> bool:
     return bool(known.mean() >= _KNOWN)
 
 
-def _ask(index: MapIndex, scans: Sequence[Scan]) -> tuple[Answer, float]:
+def answer_to(index: MapIndex, scans: Sequence[Scan]) -> tuple[Answer, float]:
     """The answer to some scans, and the processor time that it took."""
     localizer, begin = Localizer(index), time.process_time()
     for registered, planar_scan in follow(scans, Config()):
@@ -231,7 +231,9 @@ def cost(folder: Path, length_m: float) -> dict[str, dict[str, float]]:
             free_m2 = database.sessions(index.sessions[:1])[0].area_m2
             starts = np.linspace(0, len(scans) - _COSTED, _ASKED + 1).astype(int).tolist()
             # The first prepares the maps.
-            times = [_ask(index, scans[start : start + _COSTED])[1] for start in (starts[0], *starts)][1:]
+            times = [answer_to(index, scans[start : start + _COSTED])[1] for start in (starts[0], *starts)][
+                1:
+            ]
         found[name] = {
             "kB": place.stat().st_size / 1e3,
             "free, m2": free_m2,
