@@ -109,11 +109,9 @@ def test_one_real_floor() -> None:
 @pytest.mark.parametrize(
     ("said", "page", "measured"),
     [
-        ("Of {0} answers `located` one was wrong ({1} m off, at a confidence of {2})", "sensors.md",
-         r"\*\*1 of (\d+)\*\* .*? ([\d.]+) m off at ([\d.]+):"),
-        ("Of {1} queries from another building {0} were answered `not_found` and {2} `ambiguous`",
-         "sensors.md",
-         r"(\d+) of (\d+) `not_found` \(.*?\), (\d+) `ambiguous`"),
+        ("None of {1} answers `located` was wrong", "sensors.md", r"Wrong among located: \*\*(0) of (\d+)\*\*"),
+        ("all {0} queries from another building were answered `not_found`", "sensors.md",
+         r"\*\*(\d+) of (\1)\*\* `not_found`"),
     ],
 )  # fmt: skip
 def test_figures_in_sentences(said: str, page: str, measured: str) -> None:

@@ -152,9 +152,11 @@ class Placer:
             return Placed(belief.pose, motion=self._sensor.follow(belief))
         spread = _spread(found, best)[np.ix_(belief.free, belief.free)]
         alone, information = best.fit.alone
+        # The inverse of the sum of both covariances, also where a match tells nothing of a direction.
+        spread_too = np.linalg.solve(np.eye(len(spread)) + information @ spread, information)
         return Placed(
             best.fit.pose,
-            (alone, np.asarray(np.linalg.inv(np.linalg.inv(information) + spread), np.float64)),
+            (alone, 0.5 * (spread_too + spread_too.T)),
             measured=best.fit.measured and (not self._is_vague(belief) or self._sensor.holds(best.fit)),
         )
 
