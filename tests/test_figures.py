@@ -109,7 +109,8 @@ def test_one_real_floor() -> None:
 @pytest.mark.parametrize(
     ("said", "page", "measured"),
     [
-        ("None of {1} answers `located` was wrong", "sensors.md", r"Wrong among located: \*\*(0) of (\d+)\*\*"),
+        ("None of {1} answers `located` was wrong", "sensors.md",
+         r"Wrong among located: \*\*(0) of (\d+)\*\*"),
         ("all {0} queries from another building were answered `not_found`", "sensors.md",
          r"\*\*(\d+) of (\1)\*\* `not_found`"),
     ],
