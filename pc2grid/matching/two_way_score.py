@@ -20,7 +20,6 @@ sees free space.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,14 +79,14 @@ def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) ->
     """Score the query at a pose on the map `target`."""
     above, below = target.is_above(query.height_m), query.is_above(target.height_m)
     pairs, T_query_map = comparable(target, query), T_map_query.inverse()
-    seen, likelihood = _sum(_agreement(mine, on.field, T_map_query, above) for on, mine in pairs)
-    looked_at, returned = _sum(_agreement(on, mine.field, T_query_map, below) for on, mine in pairs)
-    behind = sum(_other_side(mine, on.field, T_map_query) for on, mine in pairs)
+    forth = [_sums(mine, on.field, T_map_query, above) for on, mine in pairs]
+    back = [_sums(on, mine.field, T_query_map, below) for on, mine in pairs]
+    (seen, likelihood, behind), (looked_at, returned, _) = np.sum((forth, back), axis=1).tolist()
     weight = sum(mine.weight for _, mine in pairs)
     forward = (likelihood + LIKELIHOOD.neutral * (weight - seen)) / weight if weight else 0.0
     backward = scored = returned / looked_at if looked_at else 0.0
     if below:
-        observed, _ = _agreement(target, query.field, T_query_map)
+        observed = float(_sums(target, query.field, T_query_map)[0])
         scored = (returned + LIKELIHOOD.neutral * (observed - looked_at)) / observed if observed else 0.0
     return Fit(
         T_map_query=T_map_query,
@@ -101,23 +100,12 @@ def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) ->
     )
 
 
-def _sum(agreements: Iterable[tuple[float, float]]) -> tuple[float, float]:
-    weights, likelihoods = zip(*agreements, strict=True)
-    return sum(weights), sum(likelihoods)
-
-
-def _agreement(
-    walls: Walls | Slice, field: LikelihoodField, T_field_walls: SE2, above: bool = False
-) -> tuple[float, float]:
-    """The weight of the wall points on known ground, and the weighted sum of their likelihoods, 0..1,
-    there. above : see `LikelihoodField.at`."""
+def _sums(walls: Walls | Slice, field: LikelihoodField, T_field_walls: SE2, above: bool = False) -> F64:
+    """(3,) of the wall points on known ground: their weight, the weighted sum of their likelihoods, 0..1, and
+    the weight of those that were seen from unknown ground. above : see `LikelihoodField.at`."""
     likelihood, known = field.at(T_field_walls.apply(walls.points_m), above=above)
+    before = known
+    if walls.before_m is not walls.points_m:
+        _, before = field.at(T_field_walls.apply(walls.before_m))
     weights = walls.weights[known].astype("f8")
-    return float(weights.sum()), float(weights @ likelihood[known])
-
-
-def _other_side(walls: Walls | Slice, field: LikelihoodField, T_field_walls: SE2) -> float:
-    """The weight of the wall points on known ground that were seen from unknown ground."""
-    _, known = field.at(T_field_walls.apply(walls.points_m))
-    _, before = field.at(T_field_walls.apply(walls.before_m))
-    return float(walls.weights[known & ~before].sum(dtype=np.float64))
+    return np.array([weights.sum(), weights @ likelihood[known], weights[~before[known]].sum()])
