@@ -125,14 +125,16 @@ class SensorOnWheels:
 
     def follow(self, belief: Belief) -> Estimate | None:
         """See `PlacingSensor`. Half of what a camera sees while it turns may be new to the map, but not to
-        the scans before."""
+        the scans before. Odometry is trusted more."""
+        if not self._unaided:
+            return None
         last = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
         for before, pose in self._latest:
             last.extend(before, pose)
         fit = self._matched(last, SE2.from_matrix(belief.pose), belief)
         at, information = fit.alone
         motion = self._last.inverse() @ SE2.from_matrix(at)
-        return (motion.lift(), _turned(information, -motion.yaw)) if fit.credible and self._unaided else None
+        return (motion.lift(), _turned(information, -motion.yaw)) if fit.credible else None
 
     def _matched(self, maps: MatchingMaps, guess: SE2, belief: Belief, *, wide: bool = True) -> Fit:
         """The planar scan matched with local maps from a guess, held to a belief."""

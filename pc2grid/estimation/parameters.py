@@ -73,7 +73,6 @@ class TrackingParameters:
 
     min_overlap : least share of the hits that meet a line of the local map, or of the points a surface.
     give_up_scans : lost scans in a row after which tracking starts again.
-
     """
 
     max_points: int = 40_000

@@ -106,8 +106,8 @@ class Placed:
 
     pose : (4, 4) T_session_base, from which the smoother begins. alone : as of `Fit`; None if the scan fits
     nowhere. motion : T_last_now, if the scan fits those before, but not the map: what it shows is new.
-    measured : its points fix every direction of the position. first : there
-    is no local map yet, nor any since tracking started again.
+    measured : its points fix every direction of the position. first : there is no local map yet, nor any
+    since tracking started again.
     """
 
     pose: F64
@@ -153,10 +153,10 @@ class Placer:
         spread = _spread(found, best)[np.ix_(belief.free, belief.free)]
         alone, information = best.fit.alone
         # The inverse of the sum of both covariances, also where a match tells nothing of a direction.
-        spread_too = np.linalg.solve(np.eye(len(spread)) + information @ spread, information)
+        believed = np.linalg.solve(np.eye(len(spread)) + information @ spread, information)
         return Placed(
             best.fit.pose,
-            (alone, 0.5 * (spread_too + spread_too.T)),
+            (alone, 0.5 * (believed + believed.T)),
             measured=best.fit.measured and (not self._is_vague(belief) or self._sensor.holds(best.fit)),
         )
 

@@ -220,10 +220,6 @@ class Smoother:
         variance = self._drift_variance(reported)[0] + 2.0 * self._noise(p.reading_m, p.reading_rad) ** 2
         return self.after(moved(np.eye(4)[None], corrected)[0], np.sqrt(variance))
 
-    def by_steadiness(self, seconds: float) -> Belief:
-        """The next pose, `seconds` later, if the motion before goes on."""
-        return self.after(*self.steady(seconds))
-
     def steady(self, seconds: float, turn: F64 | None = None) -> tuple[F64, F64]:
         """The next motion (4, 4), over a time, if that before goes on; with standard deviations (D,).
 

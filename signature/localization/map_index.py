@@ -242,7 +242,7 @@ class MapIndex:
 
         def facing(i: int) -> SearchMap:
             if by_heights:
-                return self._facing["heights"][i] if self.maps[i].walls.slices else self.maps[i]
+                return self.maps[i] if self.grids[i].heights is None else self._facing["heights"][i]
             above = self.maps[i].walls.is_above(height_m)
             return self._facing["lower plane"][i] if above else self.maps[i]
 

@@ -56,7 +56,7 @@ def follow(true: list[F64], odometry: Odometry, information: F64, seed: int = 1)
         noise = rng.normal(size=3) * 0.3 / np.sqrt(np.diag(information))
         noise[0] *= not blind
         placed = pose @ SE2(*noise.tolist()).lift()
-        expected = smoother.by_steadiness(0.1) if reading is None else smoother.by_odometry(reading)
+        expected = smoother.after(*smoother.steady(0.1)) if reading is None else smoother.by_odometry(reading)
         guess = expected.pose if blind else placed
         belief = smoother.add(guess, Evidence(0.1, reading, match=(placed, information)))
         found.append(belief.pose)
@@ -165,7 +165,7 @@ def test_in_the_hand_six_directions_are_estimated() -> None:
         pose = pose @ pose_from_rotation_vector((0.01, -0.02, 0.05), (0.03, 0.0, 0.01))
         noise = rng.normal(size=(1, 6)) / np.sqrt(np.diag(information))
         match = (moved(pose[None], noise)[0], information) if k % 2 else None
-        belief = smoother.add(smoother.by_steadiness(0.1).pose, Evidence(0.1, match=match))
+        belief = smoother.add(smoother.after(*smoother.steady(0.1)).pose, Evidence(0.1, match=match))
     assert motion_size(invert_pose(pose) @ belief.pose)[0] < 0.02  # half of a step, too
 
 
@@ -236,4 +236,4 @@ def test_a_gyroscope_replaces_the_turn_of_the_motion_before() -> None:
     belief = smoother.after(*smoother.steady(0.1, turn))
     np.testing.assert_allclose(belief.pose[:3, :3], turn[:3, :3], atol=1e-3)
     np.testing.assert_allclose(belief.pose[:3, 3], (0.4, 0.0, 0.0), atol=0.02)
-    assert belief.sigmas[1] < 0.1 * smoother.by_steadiness(0.1).sigmas[1]
+    assert belief.sigmas[1] < 0.1 * smoother.after(*smoother.steady(0.1)).sigmas[1]

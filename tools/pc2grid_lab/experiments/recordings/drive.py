@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from pc2grid.arrays import F64
-from pc2grid.geometry import SE2, interpolate_pose, invert_pose
+from pc2grid.geometry import SE2, interpolate_pose, invert_pose, leveling
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Trajectory
@@ -129,9 +128,7 @@ def levelled(truth: Trajectory, parts: Sequence[Trajectory], late_ns: int = 0) -
         up += (truth.T_session_base[same, :3, :3] @ vertical).sum(axis=(0, 2))
     if not up.any():
         return truth
-    T = np.eye(4)
-    T[:3, :3] = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
-    return replace(truth, T_session_base=T @ truth.T_session_base)
+    return replace(truth, T_session_base=leveling(up / np.linalg.norm(up)) @ truth.T_session_base)
 
 
 def _nearest(stamps_ns: NDArray[np.int64], stamp_ns: int) -> int | None:
