@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from pc2grid.errors import LogCorrupt, LogError, Pc2GridError, one_line
 
@@ -42,23 +42,17 @@ def guarded(path: Path, action: Callable[[], T], hint: str | None = None) -> T:
         raise
     except Exception as error:
         ours = translated(path, error, hint)
-        if ours is error:
-            raise
-        raise ours from error
+        try:
+            if ours is error:
+                raise
+            raise ours from error
+        finally:
+            # Its traceback holds this frame, and what was read. A name of it here would keep both alive.
+            del ours
 
 
 def guarded_stream(path: Path, stream: Iterator[T], hint: str | None = None) -> Iterator[T]:
     """The same for an iterator; exceptions of its consumer do not pass through here."""
-    while True:
-        try:
-            item = next(stream)
-        except StopIteration:
-            return
-        except MemoryError:
-            raise
-        except Exception as error:
-            ours = translated(path, error, hint)
-            if ours is error:
-                raise
-            raise ours from error
-        yield item
+    end = object()
+    while (item := guarded(path, lambda: next(stream, end), hint)) is not end:
+        yield cast("T", item)
