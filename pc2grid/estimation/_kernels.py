@@ -60,7 +60,7 @@ def normal_equations(
     cell_m: float,
     radius: int,
     scale_m: float,
-) -> tuple[F64, F64, int, float]:
+) -> tuple[F64, F64, int]:
     """Twin of `point_to_line.normal_equations_plain`.
 
     Measured: 0.09 ms instead of 23 ms for 700 points of a lidar, 0.025 instead of 7 ms for a planar laser; a
@@ -71,7 +71,6 @@ def normal_equations(
     H, g, line = np.zeros((3, 3)), np.zeros(3), np.empty(5)
     c, s = math.cos(pose[2]), math.sin(pose[2])
     found = 0
-    distance = 0.0
     for k in range(points.shape[0]):
         rx = c * points[k, 0] - s * points[k, 1]
         ry = s * points[k, 0] + c * points[k, 1]
@@ -85,7 +84,6 @@ def normal_equations(
         nx, ny = line[2], line[3]
         r = nx * (x - line[0]) + ny * (y - line[1])
         found += 1
-        distance += abs(r)
         w = line[4] * line[4] / (1.0 + (r / scale_m) ** 2)
         j2 = ny * rx - nx * ry
         H[0, 0] += w * nx * nx
@@ -98,7 +96,7 @@ def normal_equations(
         g[1] += w * ny * r
         g[2] += w * j2 * r
     H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
-    return H, g, found, distance
+    return H, g, found
 
 
 @njit(cache=True)
@@ -130,9 +128,8 @@ def placement_scores(
 @njit(cache=True)
 def add_factors(
     rows: NDArray[np.intp], error: F64, jacobian: F64, information: F64, kernel: F64, H: F64, g: F64
-) -> float:
+) -> None:
     """See `graph.add_factors_plain`."""
-    cost = 0.0
     dimension, unknowns = jacobian.shape[1], jacobian.shape[2]
     Le, LJ = np.empty(dimension), np.empty((dimension, unknowns))
     for f in range(rows.shape[0]):
@@ -143,7 +140,6 @@ def add_factors(
                 Le[a] += information[f, a, b] * error[f, b]
             chi2 += error[f, a] * Le[a]
         weight = 1.0 / (1.0 + chi2 / kernel[f] ** 2)
-        cost += chi2 if math.isinf(kernel[f]) else kernel[f] ** 2 * math.log1p(chi2 / kernel[f] ** 2)
         for a in range(dimension):
             for k in range(unknowns):
                 LJ[a, k] = 0.0
@@ -158,7 +154,6 @@ def add_factors(
                 g[row] += left * Le[a]
                 for k in range(unknowns):
                     H[row, rows[f, k]] += left * LJ[a, k]
-    return cost
 
 
 @njit(cache=True)

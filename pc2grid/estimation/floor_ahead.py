@@ -23,8 +23,8 @@ class FloorAheadParameters:
     """How the slope ahead is measured. Chosen by hand, for a camera that sees the floor from 1.3 m on.
 
     near_m, far_m, half_width_m : of the floor that is looked at, in the base frame, x and to both sides.
-    steepest_rad, noise_m : what rises by more is no floor; heights are noisy.
-    least_points, most_rms_m : a slope counts if so many points lie along a line this well.
+    steepest_rad, noise_m : what rises by more is no floor; heights are noisy by this. A slope counts if its
+        points lie along a line that well.
     every_m : travel from one measurement to the next.
     remembered : measurements whose median is that of a floor without a bend, since the floor's tilt in the
         base frame is known to half a degree only. A ramp shows two bends, and none in between.
@@ -36,8 +36,6 @@ class FloorAheadParameters:
     half_width_m: float = 0.4
     steepest_rad: float = CLOUD_PARAMETERS.steepest_floor_rad
     noise_m: float = 0.03
-    least_points: int = 40
-    most_rms_m: float = 0.03
     every_m: float = 0.1
     remembered: int = 150
     turned_rad: float = math.radians(20.0)
@@ -86,10 +84,10 @@ class FloorAhead:
             & (np.abs(points_m[:, 1]) < p.half_width_m)
             & (np.abs(heights) < math.tan(p.steepest_rad) * x + p.noise_m)
         )
-        if floor.sum() < p.least_points:
+        if floor.sum() < 3:
             return
         (slope, _), residual, *_ = np.polyfit(x[floor], heights[floor], 1, full=True)
-        if math.sqrt(float(residual[0]) / floor.sum()) > p.most_rms_m:
+        if math.sqrt(float(residual[0]) / floor.sum()) > p.noise_m:
             return
         self._bends_rad.append(math.atan(float(slope)))
         bend_rad = self._bends_rad[-1] - float(np.median(self._bends_rad))

@@ -45,21 +45,18 @@ class Factors:
         )
 
 
-def normal_equations(factors: Iterable[Factors], count: int) -> tuple[F64, F64, float]:
-    """The matrix (N, N) and the gradient (N,) of all factors over N = `count` unknowns, and their robust
-    cost."""
-    H, g, cost = np.zeros((count, count)), np.zeros(count), 0.0
+def normal_equations(factors: Iterable[Factors], count: int) -> tuple[F64, F64]:
+    """The matrix (N, N) and the gradient (N,) of all factors over N = `count` unknowns."""
+    H, g = np.zeros((count, count)), np.zeros(count)
     for kind in factors:
-        cost += _kernels.add_factors(
-            kind.rows, kind.error, kind.jacobian, kind.information, kind.kernel, H, g
-        )
-    return H, g, cost
+        _kernels.add_factors(kind.rows, kind.error, kind.jacobian, kind.information, kind.kernel, H, g)
+    return H, g
 
 
 def add_factors_plain(
     rows: NDArray[np.intp], error: F64, jacobian: F64, information: F64, kernel: F64, H: F64, g: F64
-) -> float:
-    """Add factors, see `Factors`, to the normal equations; returns their robust cost.
+) -> None:
+    """Add factors, see `Factors`, to the normal equations.
 
     The definition of the compiled form, in numpy.
     """
@@ -68,9 +65,6 @@ def add_factors_plain(
     JtL = jacobian.transpose(0, 2, 1) @ (information * weight[:, None, None])
     np.add.at(H, (rows[:, :, None], rows[:, None, :]), JtL @ jacobian)
     np.add.at(g, rows, np.einsum("fka,fa->fk", JtL, error))
-    robust = np.isfinite(kernel)
-    bounded = kernel[robust] ** 2 * np.log1p(chi2[robust] / kernel[robust] ** 2)
-    return float(chi2[~robust].sum() + bounded.sum())
 
 
 def without(H: F64, g: F64, old: NDArray[np.intp]) -> tuple[F64, F64]:

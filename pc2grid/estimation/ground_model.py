@@ -8,7 +8,6 @@ import numpy as np
 
 from pc2grid.arrays import F32, F64
 from pc2grid.clouds.ground import Ground, assumed_ground, find_ground
-from pc2grid.clouds.sampling import random_subset
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.geometry import SE2
 from pc2grid.model import Scan
@@ -65,16 +64,15 @@ class GroundModel:
                 self.ground = self.ground.toward(found, 1.0 / self._looks)
 
     def remove(self, points_m: F32) -> F32:
-        """The points (N, 3) that KISS-ICP is given: a sample, without floor and ceiling."""
+        """The points (N, 3) that KISS-ICP is given, without floor and ceiling."""
         if self.ground is None or not len(points_m):
             return points_m
-        p = self._parameters
-        points = points_m[random_subset(len(points_m), p.icp_points)]
-        heights = self.ground.heights(points)
-        keep = heights > p.floor_slack_m
+        slack_m = self._parameters.floor_slack_m
+        heights = self.ground.heights(points_m)
+        keep = heights > slack_m
         if self.ground.ceiling_m is not None:
-            keep &= heights < self.ground.ceiling_m - p.floor_slack_m
-        return points[keep]
+            keep &= heights < self.ground.ceiling_m - slack_m
+        return points_m[keep]
 
     def T_level_base(self) -> F64:
         """Tilt and height (4, 4) of the base over the floor. The heading of the base stays."""

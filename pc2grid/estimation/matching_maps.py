@@ -76,6 +76,7 @@ class MatchingMaps:
             del self._maps[0]
         for grid, _ in self._maps:
             grid.add(pose.apply(planar_scan.hits_m), planar_scan.normal_rad + pose.yaw)
+            grid.clear(pose.apply(planar_scan.free_polygon()))
 
     def restart(self) -> None:
         """Forget the maps: the next scan begins new ones."""

@@ -48,7 +48,6 @@ class SensorOnWheels:
         parameters: TrackingParameters = TRACKING_PARAMETERS,
     ) -> None:
         self._registration, self._projection, self._parameters = registration, projection, parameters
-        self._narrow = False  # the sensor sees a part of its surroundings only
         self._depth_limit = DepthLimit()
         self._floor = GroundModel(None, parameters)
         self._matching = MATCHING_PARAMETERS
@@ -68,8 +67,8 @@ class SensorOnWheels:
         """Begin with a scan whose base is at a place of the session frame; returns its pose (4, 4),
         levelled."""
         self._floor = GroundModel.start(points_m, scan, self._parameters)
-        self._narrow = SENSOR_MODELS[scan.sensor].narrow
-        self._matching = CAMERA_MATCHING if self._narrow else MATCHING_PARAMETERS
+        narrow = SENSOR_MODELS[scan.sensor].narrow  # the sensor sees a part of its surroundings only
+        self._matching = CAMERA_MATCHING if narrow else MATCHING_PARAMETERS
         self._maps = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
         pose = self.levelled(at.lift())
         self.kiss.register(self._floor.remove(points_m), pose)
@@ -103,21 +102,11 @@ class SensorOnWheels:
         return [self._matched(self._maps, start, belief, wide=wide) for start in starts]
 
     def search(self, belief: Belief) -> Iterator[Fit]:
-        """See `PlacingSensor`.
-
-        Half of what a camera sees while it turns may be new to the map; a wide scan shows known ground behind
-        it, too.
-        """
+        """See `PlacingSensor`."""
         p, (sigma_m, sigma_rad), prior = self._parameters, belief.sigmas, SE2.from_matrix(belief.pose)
         window = min(KERNEL * sigma_m, p.search_most_m), min(KERNEL * sigma_rad, math.pi)
         for guess in self._maps.search(self._planar_scan, prior, *window):
             yield self._matched(self._maps, guess, belief)
-        if self._narrow:
-            nothing = belief.pose, np.zeros((3, 3))
-            yield Fit(
-                pose=belief.pose, alone=nothing, overlap=0.0, measured=False,
-                evidence=self._weight * p.sure_overlap, credible=False,
-            )  # fmt: skip
 
     def holds(self, fit: Fit) -> bool:
         """Lines hold what lies on them."""
@@ -137,16 +126,22 @@ class SensorOnWheels:
         return (motion.lift(), _turned(information, -motion.yaw)) if fit.credible else None
 
     def _matched(self, maps: MatchingMaps, guess: SE2, belief: Belief, *, wide: bool = True) -> Fit:
-        """The planar scan matched with local maps from a guess, held to a belief."""
+        """The planar scan matched with local maps from a guess, held to a belief.
+
+        Ground that the map does not know speaks neither for nor against a placement: what lies there counts
+        as if it fitted no better than a scan must. Else a scan that shows much new ground, at a short range
+        or after a long step, would fit best where the scan before was taken.
+        """
         p, prior = self._parameters, SE2.from_matrix(belief.pose)
         information = _turned(belief.information, -prior.yaw)  # in the axes of the session frame
         match = maps.match(self._planar_scan, guess, prior, information, wide=wide)
+        unknown = 1.0 - match.overlap - match.contradicted
         return Fit(
             pose=match.pose.lift(),
             alone=(match.by_points.lift(), _turned(match.information, match.by_points.yaw)),
             overlap=match.overlap,
             measured=match.measured,
-            evidence=self._weight * match.overlap,
+            evidence=self._weight * (match.overlap + p.sure_overlap * unknown),
             credible=match.overlap >= p.sure_overlap,
         )
 

@@ -39,7 +39,6 @@ class TrackingParameters:
     Points:
 
     max_points : of a scan, chosen at random; a depth image has 300 000.
-    icp_points : of these, those given to KISS-ICP, floor and ceiling included.
     floor_slack_m : height up to which points count as floor.
 
     Ground:
@@ -76,7 +75,6 @@ class TrackingParameters:
     """
 
     max_points: int = 40_000
-    icp_points: int = 6_000
     floor_slack_m: float = 0.1
 
     rolling_every: int = 8
@@ -85,8 +83,8 @@ class TrackingParameters:
     fastest: float = 4.0
     jump: float = 0.3
 
-    followed: int = 5
     matched_hits: int = 700
+    followed: int = 5
     hit_weight: float = 0.3
     sure_overlap: float = 0.6
     search_above_m: float = 0.3

@@ -167,21 +167,24 @@ class Placer:
         it fits nowhere else that the base may be, it is searched for.
         """
         found: list[_Hypothesis] = []
+        first = expected[0]
         for belief in expected:
             for wide in (True, False):
-                found += [self._hypothesis(fit, belief) for fit in self._sensor.match(belief, wide=wide)]
+                found += [self._hypothesis(fit, expected) for fit in self._sensor.match(belief, wide=wide)]
                 if max(found).sure and max(found).near and not self._is_vague(belief):
                     return found
-        first = expected[0]
         if not max(found).sure and (self._is_vague(first) or not max(found).near):
-            found += [replace(self._hypothesis(fit, first), near=False) for fit in self._sensor.search(first)]
+            found += [
+                replace(self._hypothesis(fit, expected), near=False) for fit in self._sensor.search(first)
+            ]
         return found
 
-    def _hypothesis(self, fit: Fit, belief: Belief) -> _Hypothesis:
-        p, chi2 = self._parameters, belief.chi2(fit.pose)
-        sure = fit.credible and fit.overlap >= p.sure_overlap
-        near = chi2 < KERNEL**2
-        return _Hypothesis(fit.evidence + belief.log_density(chi2), fit, sure, near)
+    def _hypothesis(self, fit: Fit, expected: Sequence[Belief]) -> _Hypothesis:
+        """A match, weighed by the expectation that explains it best."""
+        chi2 = [belief.chi2(fit.pose) for belief in expected]
+        density = max(belief.log_density(c) for belief, c in zip(expected, chi2, strict=True))
+        sure = fit.credible and fit.overlap >= self._parameters.sure_overlap
+        return _Hypothesis(fit.evidence + density, fit, sure, near=min(chi2) < KERNEL**2)
 
     def _is_vague(self, belief: Belief) -> bool:
         """Whether a match alone does not reach all that a belief holds possible."""

@@ -17,10 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pc2grid.arrays import F32, F64
+from pc2grid.arrays import F32, F64, SUBPIXEL_BITS, BoolGrid, polygon_corners
 from pc2grid.estimation.manifold import weakest
 from pc2grid.estimation.parameters import MATCHING_PARAMETERS, MatchingParameters
 from pc2grid.geometry import SE2, wrap_angle
+
+_BORDER_CELLS = 5
+"""Width of the border of free ground that may be a wall: a neighbourhood of the matching on either side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +31,9 @@ class Match:
     """Placement of a point set on a map.
 
     pose : T_map_points. by_points : the same by the points alone, without the prior; where they measure
-        nothing
-    that is anywhere. information : (3, 3) of x, y, yaw in the map frame, from the points alone.
-    overlap : share of the points that found a line. residual_m : mean distance of those from their lines.
+    nothing that is anywhere. information : (3, 3) of x, y, yaw in the map frame, from the points alone.
+    overlap : share of the points that found a line. contradicted : share that found none where the map is
+    free; the others lie where it knows nothing.
     measured : whether the points fix every direction of the position.
     """
 
@@ -38,7 +41,7 @@ class Match:
     by_points: SE2
     information: F64
     overlap: float
-    residual_m: float
+    contradicted: float
     measured: bool
 
 
@@ -63,6 +66,7 @@ class PointGrid:
         self._index = np.full((height, width), -1, dtype=np.int32)
         self._moments = np.zeros((256, parameters.sectors, 6), dtype=np.float64)
         self._used = 0
+        self._free = np.zeros((height, width), dtype=np.uint8)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -71,10 +75,9 @@ class PointGrid:
 
     def add(self, points_m: NDArray[np.floating], normal_rad: NDArray[np.floating]) -> None:
         """Add points (N, 2) with the directions (N,) of their surface normals, in the map frame."""
-        local = np.asarray(points_m, dtype=np.float64) - self.low_m
-        column, row = np.floor(local / self.cell_m).astype(np.int64).T
-        inside = (row >= 0) & (row < self.shape[0]) & (column >= 0) & (column < self.shape[1])
-        x, y = local[inside].T
+        points = np.asarray(points_m, dtype=np.float64)
+        row, column, inside = self._cells(points)
+        x, y = (points[inside] - self.low_m).T
         cell = row[inside] * self.shape[1] + column[inside]
         cells = self._index.reshape(-1)
         fresh = np.unique(cell[cells[cell] < 0])
@@ -89,6 +92,27 @@ class PointGrid:
         flat = self._moments.reshape(-1, 6)
         for moment, weights in enumerate((np.ones_like(x), x, y, x * x, x * y, y * y)):
             flat[changed, moment] += np.bincount(group, weights, len(changed))
+
+    def clear(self, outline_m: F64) -> None:
+        """Mark the ground within an outline (B, 2) as free, but for its border, which may be a wall."""
+        import cv2
+
+        corners = [polygon_corners((outline_m - self.low_m) / self.cell_m)]
+        inside = np.zeros_like(self._free)
+        cv2.fillPoly(inside, corners, 1, shift=SUBPIXEL_BITS)
+        cv2.polylines(inside, corners, True, 0, thickness=_BORDER_CELLS, shift=SUBPIXEL_BITS)
+        self._free |= inside
+
+    def free(self, points_m: F64) -> float:
+        """The share of points (N, 2), in the map frame, that lie on free ground."""
+        row, column, inside = self._cells(points_m)
+        return float(self._free[row[inside], column[inside]].sum()) / max(len(points_m), 1)
+
+    def _cells(self, points_m: F64) -> tuple[NDArray[np.int64], NDArray[np.int64], BoolGrid]:
+        """Rows (N,) and columns (N,) of points (N, 2), and whether they lie on the map."""
+        column, row = np.floor((points_m - self.low_m) / self.cell_m).astype(np.int64).T
+        inside = (row >= 0) & (row < self.shape[0]) & (column >= 0) & (column < self.shape[1])
+        return row, column, inside
 
     def likelihood(self, sigma_m: float) -> F32:
         """Return the likelihood field (H, W), 0..1, of the cells that hold points."""
@@ -122,9 +146,9 @@ class PointGrid:
         unit, damping = p.cell_m**-2, 1e-6 * np.eye(3)
         pose = np.array([guess.x, guess.y, guess.yaw])
         held = np.array([prior.x, prior.y, prior.yaw])
-        information, found, distance = np.zeros((3, 3)), 0, 0.0
+        information, found = np.zeros((3, 3)), 0
         for radius in steps:
-            H, g, found, distance = normal_equations(
+            H, g, found = normal_equations(
                 self._index, self._moments, points, normals, pose - origin, self.cell_m,
                 radius, p.residual_scale_m * radius,
             )  # fmt: skip
@@ -138,12 +162,14 @@ class PointGrid:
             pose = pose + step
             if radius == steps[-1] and np.abs(step).sum() < p.converged:
                 break
+        overlap = found / max(len(points), 1)
+        placed = SE2(float(pose[0]), float(pose[1]), wrap_angle(float(pose[2])))
         return Match(
-            SE2(float(pose[0]), float(pose[1]), wrap_angle(float(pose[2]))),
+            placed,
             SE2(float(alone[0]), float(alone[1]), wrap_angle(float(alone[2]))),
             information,
-            found / max(len(points), 1),
-            distance / max(found, 1),
+            overlap,
+            min(self.free(placed.apply(points)), 1.0 - overlap),
             weakest(information, 2) > unit * p.least_points,
         )
 
@@ -163,22 +189,22 @@ def normal_equations_plain(
     cell_m: float,
     radius: int,
     scale_m: float,
-) -> tuple[F64, F64, int, float]:
+) -> tuple[F64, F64, int]:
     """Linearise the point-to-line distances at a pose: the definition of the compiled form, in numpy.
 
     index : (H, W) row of `moments` (K, sectors, 6) for each cell, or -1. points : (N, 2) and normal_rad :
     (N,) in their frame. pose : (3,) x, y, yaw of that frame from the corner of cell (0, 0).
     radius : half width in cells of the neighbourhood. scale_m : scale of the Cauchy weight.
 
-    Returns H (3, 3) and g (3,) of the Gauss-Newton step H d = -g for points of unit variance, the number
-    of points that found a line, and the sum of their distances from it.
+    Returns H (3, 3) and g (3,) of the Gauss-Newton step H d = -g for points of unit variance, and the
+    number of points that found a line.
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     rotated = points @ np.array([[c, s], [-s, c]])
     at = rotated + pose[:2]
     sectors = moments.shape[1]
     sector = sector_of(normal_rad + pose[2], sectors)
-    H, g, found, distance = np.zeros((3, 3)), np.zeros(3), 0, 0.0
+    H, g, found = np.zeros((3, 3)), np.zeros(3), 0
     for k, (column, row) in enumerate(np.floor(at / cell_m).astype(int)):
         if not (radius <= row < index.shape[0] - radius and radius <= column < index.shape[1] - radius):
             continue
@@ -198,8 +224,7 @@ def normal_equations_plain(
         H += weight * np.outer(J, J)
         g += weight * r * J
         found += 1
-        distance += abs(r)
-    return H, g, found, distance
+    return H, g, found
 
 
 def best_placements(

@@ -172,15 +172,6 @@ class _Prior:
     information: F64
 
 
-@dataclass(frozen=True, slots=True)
-class _Solution:
-    """A state with the information matrix on its unknowns, and the robust cost of all evidence."""
-
-    state: _State
-    information: F64
-    cost: float
-
-
 class Smoother:
     """Adds scans one by one, and keeps the states of the last ones.
 
@@ -251,10 +242,6 @@ class Smoother:
         guess : (4, 4) T_session_base where the estimate begins, such as where the scan fits.
 
         Without odometry, the sensor is taken to stand at the beginning.
-
-        Where the last reading contradicts those before, there are two explanations: readings are wrong, or
-        the odometry frame has jumped. Both are tried. A jump is rarer than a wrong reading, so it is believed
-        if several readings speak for it.
         """
         before, read = self._state, evidence.T_odom_base
         reading = before.readings[-1] @ invert_pose(before.poses[-1]) @ guess
@@ -270,13 +257,8 @@ class Smoother:
             np.concatenate((before.readings, reading[None])),
             before.errors,
         )
-        solution = self._solved(state)
-        if read is not None and self._is_contradicted(read, solution.state.readings[-1]):
-            jumped = self._solved(_State(state.poses, self._as_read(state.readings), state.errors))
-            if jumped.cost + self._parameters.kernel**2 < solution.cost:
-                solution = jumped
-        self._state = solution.state
-        self._covariance = self._last_covariance(solution.information)
+        self._state, information = self._solved(state)
+        self._covariance = self._last_covariance(information)
         if len(self._state.poses) > self._parameters.lag:
             self._marginalise()
         return self.belief
@@ -293,25 +275,12 @@ class Smoother:
         row = (evidence.seconds, not evidence.continues, *read, *match, step[0], information)
         return _Window(*(np.array(value)[None] for value in row))
 
-    def _is_contradicted(self, read: F64, reading: F64) -> bool:
-        """Whether a reading (4, 4) is so far from what it should be that it counts less than half."""
-        p = self._parameters
-        step, _, _ = steps(read[None], reading[None])
-        off = step[0, self._free] / self._noise(p.reading_m, p.reading_rad)
-        return bool(off @ off > p.kernel**2)
-
-    def _as_read(self, readings: F64) -> F64:
-        """The readings (N, 4, 4) as they were read, but for the first, and where there was none."""
-        window = self._window
-        read = np.isfinite(window.read_sigma[:, 0]) & (np.arange(len(readings)) > 0)
-        return np.where(read[:, None, None], window.read, readings)
-
-    def _solved(self, state: _State) -> _Solution:
-        """Gauss-Newton from a state."""
+    def _solved(self, state: _State) -> tuple[_State, F64]:
+        """Gauss-Newton from a state; returns the last one, and the information matrix on its unknowns."""
         p, n = self._parameters, len(state.poses)
         count = _ERRORS + 2 * len(self._free) * n
         for _ in range(p.iterations):
-            H, g, cost = normal_equations(self._factors(state, self._window), count)
+            H, g = normal_equations(self._factors(state, self._window), count)
             H[np.diag_indices(count)] += _DAMPING
             delta = -cho_solve(cho_factor(H, check_finite=False), g, check_finite=False)
             changes = np.zeros((n, 2, 6))
@@ -319,7 +288,7 @@ class Smoother:
             state = state.changed(delta[:_ERRORS], changes)
             if np.abs(delta).max() < p.converged:
                 break
-        return _Solution(state, H, cost)
+        return state, H
 
     def _last_covariance(self, information: F64) -> F64:
         """The covariance (D, D) of the last pose."""
@@ -335,7 +304,7 @@ class Smoother:
         d = len(self._free)
         few, first = self._state.part(0, 3), _ERRORS + np.arange(2 * d)
         factors = (part.touching(first) for part in self._factors(few, self._window.part(0, 3)))
-        H, g, _ = normal_equations(factors, _ERRORS + 2 * d * len(few.poses))
+        H, g = normal_equations(factors, _ERRORS + 2 * d * len(few.poses))
         information, gradient = without(H, g, first)
         shift = np.asarray(
             np.linalg.solve(information + _DAMPING * np.eye(len(gradient)), gradient), np.float64

@@ -47,6 +47,24 @@ def test_one_wall_leaves_a_direction_unmeasured_however_much_a_point_counts() ->
         assert both.measured
 
 
+def test_free_ground_contradicts_what_is_placed_there_and_unknown_ground_does_not() -> None:
+    """A room of 4 x 4 m whose middle the map has seen to be free; a wall of 3 m is placed in three ways."""
+    line = np.linspace(1.0, 4.0, 200)
+    wall, north = np.column_stack((line, np.full(200, 4.5))), np.full(200, -math.pi / 2)
+    grid = PointGrid((0.0, 0.0), (8.0, 8.0))
+    grid.add(wall, north)
+    grid.clear(np.array([(0.5, 0.5), (4.5, 0.5), (4.5, 4.5), (0.5, 4.5)]))
+
+    def placed(y_m: float) -> tuple[float, float]:
+        held = SE2(0.0, y_m, 0.0)
+        match = grid.match(wall, north, held, held, 1e9 * np.eye(3), radii=(1,))
+        return match.overlap, match.contradicted
+
+    assert placed(0.0) == (1.0, 0.0)  # the wall itself bounds the free ground, and is no part of it
+    assert placed(-2.0) == (0.0, 1.0)  # in the middle of the room
+    assert placed(2.0) == (0.0, 0.0)  # behind the wall
+
+
 def test_moments_of_points_added_in_parts_are_those_of_all_at_once() -> None:
     rng = np.random.default_rng(1)
     points, normals = rng.uniform(-1, 11, (4000, 2)), rng.uniform(-9, 9, 4000)

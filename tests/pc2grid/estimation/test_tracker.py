@@ -187,6 +187,37 @@ def test_a_camera_without_odometry_does_not_follow_kiss_icp_along_a_wall(monkeyp
     assert np.abs([r.T_session_base[:2, 3] for r in registered]).max() < 0.05
 
 
+def along_a_corridor(step_m, reach_m):
+    """What a laser of a short range sees in a corridor of 2 m with niches of unlike lengths in both walls.
+
+    Its odometry is exact; each scan has its true pose.
+    """
+    bearing, ranges_m = np.linspace(-2.3, 2.3, 180), np.arange(0.1, reach_m, 0.01)
+    rays = np.stack((np.cos(bearing), np.sin(bearing)))[:, :, None] * ranges_m
+    for k in range(12):
+        x_m = step_m * k
+        x = rays[0] + x_m
+        niche = np.sin(2.0 * x) + np.sin(3.4 * x) > 0.5
+        outside = np.abs(rays[1]) > np.where(niche, 1.3, 1.0)
+        returned = outside.any(axis=1)
+        hits = rays[:, np.flatnonzero(returned), outside[returned].argmax(axis=1)]
+        points = np.column_stack((*hits, np.zeros(returned.sum()))).astype(np.float32)
+        pose = SE2(x_m, 0.0, 0.0)
+        scan = Scan(
+            stamp_ns=k * 5_000_000_000, points_m=points, T_base_sensor=np.eye(4), sensor="laser",
+            T_odom_base=pose.lift(),
+        )  # fmt: skip
+        yield scan, pose
+
+
+def test_a_scan_that_shows_much_new_ground_does_not_overrule_odometry():
+    """Of 4 m that it sees ahead, two are known: it would fit whole near where the scan before was taken."""
+    pairs = list(along_a_corridor(step_m=2.0, reach_m=4.0))
+    registered = follow(scan for scan, _ in pairs)
+    assert not any(r.health in (Health.OVERRULED, Health.LOST) for r in registered)
+    assert errors(pairs, [r.T_session_base for r in registered]).max() < 0.1  # a fifth of a niche
+
+
 def test_odometry_with_the_wrong_sign_is_overruled(laser):
     wrong = []
     for k, (scan, pose) in enumerate(laser):
