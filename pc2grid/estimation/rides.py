@@ -46,13 +46,12 @@ class RideParameters:
     Lifts:
 
     sectors : of equal angle around a robot that stands.
-    stands_m : a robot that moves no farther stands.
     near_m : in the cabin of a lift every wall is nearer than this.
     far_m : through an open door one sees farther than this.
-    seen, open : least sectors that must have been seen, and most of these that may be open, in a shut cabin.
-    shut_s, still_m : least time for which it is shut, and how far the robot moves meanwhile, and until the
-        door is open, at most.
-    door : neighbouring sectors that are open when the door is.
+    seen : least sectors that must have been seen in a shut cabin.
+    shut_s, still_m : least time for which it is shut, and how far a robot that stands moves, at most,
+        meanwhile and until the door is open.
+    door : neighbouring sectors that are open when the door is; as many are not in a shut cabin.
     """
 
     every_m: float = 0.3
@@ -64,11 +63,9 @@ class RideParameters:
     steep_rad: float = CLOUD_PARAMETERS.steepest_floor_rad
 
     sectors: int = 72
-    stands_m: float = 0.5
     near_m: float = 2.2
     far_m: float = 3.0
     seen: int = 50
-    open: int = 2
     shut_s: float = 3.0
     still_m: float = 0.1
     door: int = 4
@@ -120,7 +117,7 @@ class RideWatch:
         """
         on_slope = self._slope is not None and self._slope.underway  # where landings are as small as cabins
         place = SE2.from_matrix(pose)
-        if not on_slope and self._lift.observe(planar_scan, place, forward_m):
+        if not on_slope and self._lift.observe(planar_scan, place.yaw, forward_m):
             self._slope = None
             self.storeys.append(Storey(group=self.storeys[-1].group + 1, height_m=0.0))
             self.storey = len(self.storeys) - 1
@@ -225,47 +222,43 @@ class _Slope:
 
 
 class _Lift:
-    """Watches the walls around a robot that stands: near on all sides, then a door opens."""
+    """Watches the walls around a robot that stands: near on all sides, then a door opens.
+
+    Whether it stands is said by the wheels: a shut door looks like the wall of a room that the map shows, and
+    the pose jumps.
+    """
 
     def __init__(self, parameters: RideParameters) -> None:
         self._parameters = parameters
-        self._start(SE2())
+        self._start()
 
-    def _start(self, at: SE2) -> None:
-        self._at = at
+    def _start(self) -> None:
         self._far: I64 = np.full(self._parameters.sectors, -1)  # 1: far, 0: near, -1: not seen yet
         self._travel_m = 0.0
-        self._shut = False
-        # Stamp and travel when the door was first seen shut while the robot stood, and last.
-        self._since = self._until = (0, 0.0)
+        self._shut_ns: list[int] = []  # first and last stamp at which the door was seen shut
 
-    def observe(self, planar_scan: PlanarScan, pose: SE2, forward_m: float) -> bool:
-        """Take in a scan at its pose; returns whether the door of a lift has opened before it.
+    def observe(self, planar_scan: PlanarScan, yaw_rad: float, forward_m: float) -> bool:
+        """Take in a scan; returns whether the door of a lift has opened before it.
 
-        Whether the robot stands is said by its travel since the last scan, which the wheels measure: a shut
-        door looks like the wall of a room that the map shows, and the pose jumps.
+        yaw_rad : heading of the base. forward_m : its travel since the last scan.
         """
         p = self._parameters
         self._travel_m += forward_m
-        if math.hypot(pose.x - self._at.x, pose.y - self._at.y) > p.stands_m:
-            self._start(pose)
-        near_m, far_m = _ranges(planar_scan, p.sectors, pose.yaw)
+        if abs(self._travel_m) > p.still_m:
+            self._start()
+        near_m, far_m = _ranges(planar_scan, p.sectors, yaw_rad)
         self._far[(near_m < p.near_m) & (far_m < p.far_m)] = 0
         self._far[far_m >= p.far_m] = 1
-        shut = (self._far >= 0).sum() >= p.seen and (self._far == 1).sum() <= p.open
-        if shut:
-            self._until = (planar_scan.stamp_ns, self._travel_m)
-            if not self._shut or abs(self._travel_m - self._since[1]) > p.still_m:
-                self._since = self._until
-        self._shut = bool(shut)
-        # A robot that drives out of a dead end sees far, too, but only once it has moved.
-        stands = abs(self._travel_m - self._until[1]) <= p.still_m
-        waited = self._until[0] - self._since[0] >= p.shut_s * 1e9
+        if (self._far >= 0).sum() >= p.seen and (self._far == 1).sum() < p.door:
+            self._shut_ns = [*self._shut_ns[:1], planar_scan.stamp_ns]
+            return False
+        if not self._shut_ns or self._shut_ns[-1] - self._shut_ns[0] < p.shut_s * 1e9:
+            self._shut_ns = []
+            return False
         around = np.concatenate((self._far, self._far[: p.door - 1])) == 1
-        door = sliding_window_view(around, p.door).all(axis=1).any()
-        opened = bool(stands and waited and door and not shut)
-        if opened or not (shut or (stands and waited)):
-            self._since = self._until  # to begin again
+        opened = bool(sliding_window_view(around, p.door).all(axis=1).any())
+        if opened:
+            self._shut_ns = []
         return opened
 
 
