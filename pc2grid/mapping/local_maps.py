@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F64, I64
+from pc2grid.arrays import F64, I64, SUBPIXEL_BITS, polygon_corners
 from pc2grid.estimation.point_to_line import Match, PointGrid, best_placements
 from pc2grid.geometry import SE2
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
-from pc2grid.matching.likelihood_field import LikelihoodField, LikelihoodParameters
+from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,8 +23,6 @@ class LocalMapParameters:
     range_m : hits farther from the sensor are left out: they are too sparse to match.
     cell_m : edge of a cell.
     margin_m : free border around the points, at least the widest neighbourhood of `radii_cells`.
-    sigma_m : of the likelihood field: wider than that of relocalization (0.10 m), because the coarse search
-        moves in steps of 0.2 m and 2 degrees.
     wall_m : a point this near an obstacle meets it.
     radii_cells : neighbourhoods of the refinement, see `PointGrid.match`.
     every_keyframe : every n-th keyframe is drawn; they are 0.2 m apart, so more of them add no new walls.
@@ -34,7 +32,6 @@ class LocalMapParameters:
     range_m: float = 12.0
     cell_m: float = 0.1
     margin_m: float = 0.6
-    sigma_m: float = 0.15
     wall_m: float = 0.25
     radii_cells: tuple[int, ...] = (3, 2, 2, 1, 1, 1, 1, 1)
     every_keyframe: int = 2
@@ -47,7 +44,6 @@ CAMERA_LOCAL_MAPS = LocalMapParameters(cell_m=0.05, radii_cells=(6, 4, 4, 2, 2, 
 Chosen on simulated drives (`examples/map-quality.md`)."""
 
 _FREE, _HIT = 1, 2  # what a local map observed in a cell; 0: nothing
-_SUBPIXEL_BITS = 4  # of cv2's polygon corners
 
 
 def pose_at(poses: F64, index: int) -> SE2:
@@ -86,7 +82,7 @@ class LocalMap:
         cells = self._cells(points)
         field = self._likelihood(cells)
         self._field = field.values.astype(np.float32) * np.float32(1.0 / 255.0)
-        near_wall = np.exp(-0.5 * (parameters.wall_m / parameters.sigma_m) ** 2)
+        near_wall = np.exp(-0.5 * (parameters.wall_m / LIKELIHOOD.sigma_m) ** 2)
         self._seen = np.where(self._field > near_wall, _HIT, self._free(outlines))
         _, first = np.unique(cells @ (self._grid.shape[1], 1), return_index=True)
         self.points_m: F64 = points[first]
@@ -102,7 +98,6 @@ class LocalMap:
             np.ones_like(occupied),
             self._parameters.cell_m,
             (low_x, low_y),
-            LikelihoodParameters(sigma_m=self._parameters.sigma_m),
         )
 
     def _free(self, outlines: Sequence[F64]) -> NDArray[np.uint8]:
@@ -111,8 +106,8 @@ class LocalMap:
 
         free = np.zeros(self._grid.shape, dtype=np.uint8)
         for outline in outlines:
-            corners = ((outline - self._low_m) / self._parameters.cell_m - 0.5) * (1 << _SUBPIXEL_BITS)
-            cv2.fillPoly(free, [np.rint(corners).astype(np.int32)], _FREE, shift=_SUBPIXEL_BITS)
+            corners = polygon_corners((outline - self._low_m) / self._parameters.cell_m)
+            cv2.fillPoly(free, [corners], _FREE, shift=SUBPIXEL_BITS)
         return free
 
     def match(self, points_m: F64, normal_rad: NDArray[np.floating], guess: SE2) -> Match:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F64, I64
 from pc2grid.geometry import SE2
-from pc2grid.mapping.pose_graph import Edge, between, compose
+from pc2grid.mapping.pose_graph import between, compose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,13 +35,12 @@ class CandidateParameters:
     The drift over the short travel between two recognitions that support each other:
 
     short_m, short_per_m, short_rad : as above; per metre of travel the yaw drifts by `drift_rad_per_m`.
-    within_m : recognitions farther apart in travel do not support each other: almost all would agree.
     consistent : largest Mahalanobis distance at which two of them agree; 3 degrees of freedom, 1 %.
 
     What is required:
 
     alone : largest Mahalanobis distance from the tracked pose at which a recognition without support is
-        accepted. probability_alone : and its least probability.
+        accepted.
     supported : the same with one other recognition that agrees.
     possible : the same with two; beyond it a recognition is never accepted. 3 degrees of freedom, 0.3 %.
     known_way_m : a recognition over a shorter way adds nothing: tracking is more exact. A stretch and a half.
@@ -56,10 +55,8 @@ class CandidateParameters:
     short_m: float = 0.15
     short_per_m: float = 0.015
     short_rad: float = math.radians(1.0)
-    within_m: float = 60.0
     consistent: float = 3.37
     alone: float = 1.0
-    probability_alone: float = 0.95
     supported: float = 2.5
     possible: float = 3.8
     known_way_m: float = 18.0
@@ -68,8 +65,6 @@ class CandidateParameters:
 
 
 CANDIDATES = CandidateParameters()
-LOOP_M = 0.1
-"""Travel that the error of a loop is worth: some centimetres."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,11 +98,10 @@ class LoopCandidates:
         """Forget a candidate that was accepted or found to be wrong."""
         self._pending.remove(candidate)
 
-    def acceptable(self, nodes: F64, travel_m: F64, edges: Sequence[Edge]) -> list[Candidate]:
+    def acceptable(self, nodes: F64, travel_m: F64) -> list[Candidate]:
         """The candidates that are loops by drift and by each other.
 
         nodes : (N, 3) settled poses of the local maps. travel_m : (N,) metres of travel at each.
-        edges : the pose graph: tracked steps, and the loops that were accepted.
         """
         pending, p = self._pending, self._parameters
         if not pending:
@@ -116,19 +110,19 @@ class LoopCandidates:
         measured = np.array([(c.T_older_newer.x, c.T_older_newer.y, c.T_older_newer.yaw) for c in pending])
         probability = np.clip([c.probability for c in pending], 1e-6, 1.0 - 1e-6)
 
-        way_m = ways(len(nodes), travel_m, edges, older)[:, newer].diagonal()
+        way_m = travel_m[newer] - travel_m[older]
         error = between(measured, between(nodes[older], nodes[newer]))
         off = _mahalanobis(error, p.drift_m + p.drift_per_m * way_m, p.drift_rad + p.drift_rad_per_m * way_m)
         in_reach, known = off <= p.possible, way_m <= p.known_way_m
 
-        agrees, near = self._agreement(older, newer, measured, nodes, travel_m)
+        agrees = self._agreement(older, newer, measured, nodes, travel_m)
         recognition = np.array([c.recognition for c in pending])
         same = recognition[:, None] == recognition
-        support = np.array([len(set(recognition[row])) for row in agrees & near & ~same & in_reach])
+        support = np.array([len(set(recognition[row])) for row in agrees & ~same & in_reach])
         likely = np.log(probability / (1.0 - probability)) - 0.5 * off**2
 
         reach = np.choose(np.minimum(support, 2), (p.alone, p.supported, p.possible))
-        fits = (off <= reach) & ~known & ((support > 0) | (probability >= p.probability_alone))
+        fits = (off <= reach) & ~known
         # Rival k of candidate i contradicts it; one of the two must be clearly better.
         weaker = support < support[:, None]
         less_likely = (support == support[:, None]) & (likely <= likely[:, None] - p.rival)
@@ -139,8 +133,8 @@ class LoopCandidates:
 
     def _agreement(
         self, older: I64, newer: I64, measured: F64, nodes: F64, travel_m: F64
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which candidates (C, C) fit together with the travel between them, and which are near in travel.
+    ) -> NDArray[np.bool_]:
+        """Which candidates (C, C) fit together with the travel between them.
 
         older, newer : (C,) local maps. measured : (C, 3) x, y, yaw of the newer in the older.
         """
@@ -154,28 +148,8 @@ class LoopCandidates:
             between(there, again),
             p.short_m + p.short_per_m * travelled_m.ravel(),
             p.short_rad + p.drift_rad_per_m * travelled_m.ravel(),
-        ).reshape(travelled_m.shape)
-        return apart <= p.consistent, travelled_m <= p.within_m
-
-
-def ways(count: int, travel_m: F64, edges: Sequence[Edge], starts: I64) -> F64:
-    """(C, N) the shortest way from each of the local maps `starts` (C,) to all, metres of travel.
-
-    Drift grows along it: a loop shortens the ways between all that lies before and after it.
-    """
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import dijkstra
-
-    ends = np.array([(edge.first, edge.second) for edge in edges])
-    loop = np.array([edge.loop for edge in edges])
-    length_m = np.where(loop, LOOP_M, np.abs(np.diff(travel_m[ends], axis=1)[:, 0]) + LOOP_M)
-    # Of several edges between two local maps the shortest counts; the matrix would add them up.
-    order = np.lexsort((length_m, ends[:, 1], ends[:, 0]))
-    first = np.append(True, np.any(np.diff(ends[order], axis=0) != 0, axis=1))
-    shortest = order[first]
-    graph = csr_array((length_m[shortest], ends[shortest].T), shape=(count, count))
-    different, at = np.unique(starts, return_inverse=True)
-    return np.asarray(dijkstra(graph, directed=False, indices=different)[at])
+        )
+        return (apart <= p.consistent).reshape(travelled_m.shape)
 
 
 def _mahalanobis(error: F64, sigma_m: F64, sigma_rad: F64) -> F64:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
@@ -153,12 +153,12 @@ class LoopCloser:
         shown = None if restart else self._verification.information(newest - 1, newest, step)
         self._graph.extend(step, walls, shown)
 
-    def _close(self, loops: list[Edge]) -> bool:
-        """Add loops to the pose graph; returns whether it was solved again."""
-        if not loops:
-            return False
-        self._drift_m = 0.0
-        return self._graph.close(loops)
+    def _close(self, loops: list[Edge]) -> None:
+        """Add loops to the pose graph, and solve it again."""
+        if loops:
+            self._drift_m = 0.0
+            self._graph.edges += loops
+            self._graph.solve()
 
     def _overlaps(self, newest: int) -> Iterator[Edge]:
         """Verified overlaps of the newest local map with older ones, near its tracked pose."""
@@ -183,14 +183,13 @@ class LoopCloser:
 
     def _close_candidates(self) -> None:
         """Close the loops among the recognised places that drift allows and that agree with each other."""
-        accepted = self._candidates.acceptable(
-            self._graph.nodes, np.array(self._travelled_m), self._graph.known()
-        )
+        accepted = self._candidates.acceptable(self._graph.nodes, np.array(self._travelled_m))
         loops: list[Edge] = []
         for candidate in accepted:
             self._candidates.remove(candidate)
             loops += self._confirmed(candidate)
-        if self._close(loops):
+        self._close(loops)
+        if loops:
             # The newest stretch lies where it belongs now: what the search near the tracked pose missed is
             # near.
             self._close([edge for number in self._stretches.latest() for edge in self._overlaps(number)])
@@ -203,7 +202,7 @@ class LoopCloser:
             self._verification.edge(older, newer, guess, parameters.recognized_m, parameters.certain_rad)
             for older, newer, guess in guesses
         ]
-        return [replace(edge, recognized=True) for edge in edges if edge is not None]
+        return [edge for edge in edges if edge is not None]
 
     # --- at the end of the session ------------------------------------------------------------------------
 
@@ -237,25 +236,16 @@ class LoopCloser:
     def _settle(self) -> Solution:
         """Solve the pose graph.
 
-        Where the solution bends local maps, their overlaps were measured on a wrong shape: these local maps
-        are drawn with the new poses and compared again.
+        The overlaps were measured on local maps that are as bent as tracking drifts. So these are drawn again
+        with the poses that are found, and compared again.
         """
-        parameters = self._parameters
-        drawn = self._keyframes.poses()
-        for _ in range(parameters.redraws):
-            self._graph.solve()
-            settled = self._settled()
-            bent = [_is_bent(drawn[run], settled[run], parameters) for run in self._local_maps.runs]
-            if not any(bent):
-                break
-            drawn = settled
-            self._local_maps.redraw(settled)
-            for k, edge in enumerate(self._graph.edges):
-                if edge.loop and (bent[edge.first] or bent[edge.second]):
-                    again = self._compare(
-                        edge.first, edge.second, parameters.certain_m, parameters.certain_rad
-                    )
-                    self._graph.edges[k] = again or edge
+        self._graph.solve()
+        self._local_maps.redraw(self._settled())
+        p, edges = self._parameters, self._graph.edges
+        again = (
+            self._compare(e.first, e.second, p.certain_m, p.certain_rad) if e.loop else None for e in edges
+        )
+        self._graph.edges = [new or old for new, old in zip(again, edges, strict=True)]
         return self._graph.solve()
 
     def _settled(self) -> F64:
@@ -287,9 +277,8 @@ class LoopCloser:
 
     def _parts(self, solution: Solution) -> I64:
         """(N,) number of the part of each local map."""
-        edges = zip(self._graph.edges, solution.accepted, strict=True)
-        accepted = [edge for edge, kept in edges if edge.loop and kept]
-        return connected(self._segments(), accepted, self._part_parameters)
+        loops = [edge for edge in compress(self._graph.edges, solution.accepted) if edge.loop]
+        return connected(self._segments(), loops, self._part_parameters)
 
     def _conflicts(self, doubtful: Sequence[range]) -> list[Conflict]:
         """The local maps that contradict each other, one of them in a doubtful stretch of scans."""
@@ -326,10 +315,3 @@ class LoopCloser:
             stop = min(cut + self._parameters.stretch_maps, len(self._graph))
             found = [edge for number in range(cut, stop) for edge in self._overlaps(number)]
             self._close([edge for edge in found if (edge.first, edge.second) not in known])
-
-
-def _is_bent(drawn: F64, settled: F64, parameters: LoopParameters) -> bool:
-    """Whether the shape of a local map, given by its keyframe poses (N, 3), has changed."""
-    before = pose_at(drawn, 0).inverse() @ pose_at(drawn, -1)
-    apart = before.inverse() @ pose_at(settled, 0).inverse() @ pose_at(settled, -1)
-    return math.hypot(apart.x, apart.y) > parameters.bent_m or abs(apart.yaw) > parameters.bent_rad

@@ -34,11 +34,9 @@ class LoopParameters:
     Which poses are accepted:
 
     search_points : points of each local map that are compared.
-    min_observed, min_observed_back : at least this share of the points of one local map must lie in cells
-        that the other one observed; the larger and the smaller of the two directions.
+    min_observed : at least this share of the points of one of the two local maps must lie in cells that the
+        other one observed.
     min_agreement : share of those that must meet an obstacle instead of free space, in both directions.
-    rival_m, rival_agreement : another pose, farther away than this, that agrees less by no more than this
-        makes the overlap ambiguous; it is then left out.
 
     What they count in the pose graph:
 
@@ -49,17 +47,10 @@ class LoopParameters:
         killian (`examples/map-quality.md`).
     lost_sigma_m, lost_sigma_rad : the same where tracking was lost in between.
 
-    When work is saved or repeated:
-
-    unmoved_m, unmoved_rad : a loop that confirms the present poses this well does not start an optimisation.
-    bent_m, bent_rad : a local map whose ends moved this much against each other is drawn and compared again.
-    redraws : at most this often.
-
     Place recognition:
 
     stretch_maps : consecutive local maps that make a stretch: 12 m of travel, chosen on aces, csail and
         killian.
-    min_probability : recognitions that are less probable are left out.
     recognized_m : window of the comparison that confirms a recognition; its yaw is within `certain_rad`.
     compared_pairs : pairs of local maps of the two stretches that are compared at most.
     """
@@ -77,10 +68,7 @@ class LoopParameters:
     lost_m: float = 150.0
     search_points: int = 400
     min_observed: float = 0.35
-    min_observed_back: float = 0.15
     min_agreement: float = 0.8
-    rival_m: float = 0.5
-    rival_agreement: float = 0.05
     information_share: float = 0.1
     tracking_sigma_m: float = 0.02
     tracking_sigma_per_m: float = 0.01
@@ -88,13 +76,7 @@ class LoopParameters:
     tracking_sigma_rad_per_m: float = math.radians(0.05)
     lost_sigma_m: float = 1.5
     lost_sigma_rad: float = math.radians(60.0)
-    unmoved_m: float = 0.1
-    unmoved_rad: float = math.radians(1.0)
-    bent_m: float = 0.01
-    bent_rad: float = math.radians(0.2)
-    redraws: int = 2
     stretch_maps: int = 3
-    min_probability: float = 0.5
     recognized_m: float = 0.4
     compared_pairs: int = 4
 

@@ -6,8 +6,6 @@ obstacles of both local maps agree.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from pc2grid.arrays import F64
@@ -50,20 +48,13 @@ def fit(
     window_rad: float,
     parameters: LoopParameters,
 ) -> Match | None:
-    """The pose of the newer local map in the older one; None if they do not overlap or fit ambiguously."""
+    """The pose of the newer local map in the older one; None if they do not overlap or do not agree.
+
+    Of two poses that agree the better one counts: a wrong one contradicts the other loops in the pose graph.
+    """
     fits = _agreeing_poses(older, newer, guess, window_m, window_rad, parameters)
-    if not fits:
-        return None
-    fits.sort(key=lambda fit: -fit[0])
-    agreement, best = fits[0]
-    if agreement < parameters.min_agreement:
-        return None
-    for other_agreement, other in fits[1:]:
-        apart = best.pose.inverse() @ other.pose
-        rival = other_agreement > agreement - parameters.rival_agreement
-        if rival and math.hypot(apart.x, apart.y) > parameters.rival_m:
-            return None
-    return best
+    agreement, best = max(fits, key=lambda fit: fit[0], default=(0.0, None))
+    return best if agreement >= parameters.min_agreement else None
 
 
 def _agreeing_poses(
@@ -86,10 +77,7 @@ def _agreeing_poses(
         match = older.match(points, normals, start)
         observed, agreement = older.agreement(points, match.pose)
         observed_back, agreement_back = newer.agreement(points_back, match.pose.inverse())
-        if (
-            max(observed, observed_back) > parameters.min_observed
-            and min(observed, observed_back) > parameters.min_observed_back
-        ):
+        if max(observed, observed_back) > parameters.min_observed:
             fits.append((min(agreement, agreement_back), match))
     return fits
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F64, I64, U8
+from pc2grid.arrays import F64, I64, SUBPIXEL_BITS, U8, polygon_corners
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
 from pc2grid.errors import LimitExceeded
@@ -50,7 +50,6 @@ class OccupancyParameters:
 OCCUPANCY = OccupancyParameters()
 
 _TILE = 256  # cells along the edge of a tile
-_SUBPIXEL_BITS = 4  # of cv2's polygon corners
 _COLUMN_OFFSET = 1 << 31  # makes column numbers positive, so that row and column fit into one int64
 
 
@@ -157,11 +156,11 @@ class GridBuilder:
         if len(hits):
             low, high = np.minimum(low, hits.min(axis=0)), np.maximum(high, hits.max(axis=0) + 1)
         update = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.int16)
-        corners = np.rint((outline - low - 0.5) * (1 << _SUBPIXEL_BITS)).astype(np.int32)
-        cv2.fillPoly(update, [corners], p.miss, shift=_SUBPIXEL_BITS)
+        corners = polygon_corners(outline - low)
+        cv2.fillPoly(update, [corners], p.miss, shift=SUBPIXEL_BITS)
         # The outline runs through cells of obstacles, most of all along a wall that is seen at a small angle:
         # these cells are not drawn as free.
-        cv2.polylines(update, _rims(corners, planar_scan.free_m), False, 0, shift=_SUBPIXEL_BITS)
+        cv2.polylines(update, _rims(corners, planar_scan.free_m), False, 0, shift=SUBPIXEL_BITS)
         things = np.floor(T_grid_base.apply(planar_scan.low_m) / resolution).astype(np.int64)
         if len(planar_scan.heights):
             self._heights.add(np.concatenate((hits, things)), planar_scan.heights)

@@ -30,20 +30,13 @@ class PoseGraphParameters:
     iterations : at most. converged : largest change of a coordinate, metres and radians, that ends them.
     damping : added to the diagonal of the normal equations, so that they can always be solved.
     robust_sigmas : standard deviations at which a loop edge has half of its weight.
-    near_m : loops whose ends lie this near each other may confirm each other.
-    same_m, same_rad : two corrections that differ by less are the same.
-    confirmations : other loops that must ask for the same correction.
-    annealing : factor by which the extra scale of confirmed loops shrinks in each iteration.
+    annealing : factor by which the robust scale of loops shrinks in each iteration.
     """
 
     iterations: int = 25
     converged: float = 1e-5
     damping: float = 1e-6
     robust_sigmas: float = 3.0
-    near_m: float = 6.0
-    same_m: float = 0.3
-    same_rad: float = 0.05
-    confirmations: int = 2
     annealing: float = 3.0
 
 
@@ -55,8 +48,6 @@ class Edge:
     """A measured relative pose T_first_second with its information (3, 3) in the first pose's axes.
 
     loop : whether the measurement may be wrong altogether; its weight is then robust.
-    recognized : a loop that was found without the present poses, so that their disagreement is no evidence
-        against it.
     """
 
     first: int
@@ -64,7 +55,6 @@ class Edge:
     T_first_second: SE2
     information: F64
     loop: bool = False
-    recognized: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,12 +79,9 @@ def optimise(
     walls : of each pose, where the building's axes constrain the headings; see
         `pc2grid.mapping.building_axes`.
 
-    A loop edge starts with its robust weight, because a false one at full weight would bend the graph before
-    the other loops can outvote it. There are two exceptions: loops that place recognition found, and loops
-    of which two more, at other places near by, ask for the same correction (large drift is then more
-    probable than three equal mistakes). The robust scale of these starts so large that they have at least
-    half of their weight, and shrinks to its final value during the iterations (graduated non-convexity, Yang
-    et al. 2020).
+    The robust scale of a loop that contradicts the poses starts so large that it has half of its weight, and
+    shrinks to its final value during the iterations (graduated non-convexity, Yang et al. 2020): large drift
+    is taken out by loops that agree, and a false loop is outvoted.
     """
     from scipy.sparse import identity
     from scipy.sparse.linalg import spsolve
@@ -109,9 +96,7 @@ def optimise(
     limit = parameters.robust_sigmas**2
     error, jacobian = _linearise(poses, i, j, measured)
     chi2 = np.einsum("ea,eab,eb->e", error, information, error)
-    lenient = _confirmed(poses, i, j, measured, loop & (chi2 > limit), parameters)
-    lenient |= np.array([e.recognized for e in edges])
-    scale = np.where(lenient, np.maximum(chi2 / limit, 1.0), 1.0)
+    scale = np.maximum(chi2 / limit, 1.0)
     for _ in range(parameters.iterations):
         weight = np.where(loop, 1.0 / (1.0 + chi2 / (scale * limit)), 1.0)
         JtO = jacobian.transpose(0, 2, 1) @ (information * weight[:, None, None])
@@ -192,41 +177,6 @@ def _arrays(edges: Sequence[Edge]) -> tuple[NDArray[np.intp], NDArray[np.intp], 
 def _unknowns(i: NDArray[np.intp], j: NDArray[np.intp]) -> NDArray[np.intp]:
     """The numbers (E, 6) of the coordinates of both poses of each edge among those of all poses."""
     return np.stack((3 * i, 3 * i + 1, 3 * i + 2, 3 * j, 3 * j + 1, 3 * j + 2), axis=1)
-
-
-def _confirmed(
-    poses: F64,
-    i: NDArray[np.intp],
-    j: NDArray[np.intp],
-    measured: F64,
-    doubtful: NDArray[np.bool_],
-    parameters: PoseGraphParameters,
-) -> NDArray[np.bool_]:
-    """Which doubtful edges (E,) agree with enough others, near by but between other poses.
-
-    Two edges agree if they move the poses at their second ends in the same way.
-    """
-    confirmed = np.zeros(len(i), np.bool_)
-    index = np.flatnonzero(doubtful)
-    a, b, relative = poses[i[index]], poses[j[index]], measured[index]
-    wanted = compose(a, relative)
-    turn = wanted[:, 2] - b[:, 2]
-    for k in range(len(index)):
-        near = np.hypot(*(b[:, :2] - b[k, :2]).T) < parameters.near_m
-        near &= np.hypot(*(a[:, :2] - a[k, :2]).T) < parameters.near_m
-        near &= (i[index] != i[index[k]]) & (j[index] != j[index[k]])
-        other = np.flatnonzero(near)
-        if len(other) < parameters.confirmations:
-            continue
-        # Where this edge's correction moves the second ends of the others.
-        cos, sin = np.cos(turn[k]), np.sin(turn[k])
-        d = b[other, :2] - b[k, :2]
-        x = wanted[k, 0] + cos * d[:, 0] - sin * d[:, 1] - wanted[other, 0]
-        y = wanted[k, 1] + sin * d[:, 0] + cos * d[:, 1] - wanted[other, 1]
-        yaw = np.abs(wrap_angle(turn[k] - turn[other]))
-        same = (np.hypot(x, y) < parameters.same_m) & (yaw < parameters.same_rad)
-        confirmed[index[k]] = same.sum() >= parameters.confirmations
-    return confirmed
 
 
 def _linearise(poses: F64, i: NDArray[np.intp], j: NDArray[np.intp], measured: F64) -> tuple[F64, F64]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
@@ -58,20 +59,6 @@ class SessionGraph:
         """T_first_second by the present poses."""
         return pose_at(self.nodes, first).inverse() @ pose_at(self.nodes, second)
 
-    def confirms(self, edge: Edge) -> bool:
-        """Whether a loop agrees with the present poses: then the optimisation can wait."""
-        apart = edge.T_first_second.inverse() @ self.relative(edge.first, edge.second)
-        near = math.hypot(apart.x, apart.y) < self._parameters.unmoved_m
-        return near and abs(apart.yaw) < self._parameters.unmoved_rad
-
-    def close(self, loops: list[Edge]) -> bool:
-        """Add loops; the poses are solved again if these do not confirm them, and True is returned."""
-        self.edges += loops
-        if all(self.confirms(edge) for edge in loops):
-            return False
-        self.solve()
-        return True
-
     def solve(self) -> Solution:
         """Solve for the poses that agree best with all edges."""
         solution = self.solution()
@@ -81,10 +68,6 @@ class SessionGraph:
     def solution(self) -> Solution:
         """What `solve` would find."""
         return optimise(self.nodes, self.edges, self._walls)
-
-    def known(self) -> list[Edge]:
-        """The tracked steps, and the loops that the present poses confirm."""
-        return [edge for edge in self.edges if not edge.loop or self.confirms(edge)]
 
     def remove_loops(self, between: Collection[tuple[int, int]], segment: I64) -> bool:
         """Remove the loops between pairs of segments, older and newer; whether there were any.
@@ -114,7 +97,7 @@ class SessionGraph:
         step is by what its local maps show of each other is added here.
         """
         sigma_m = np.zeros(len(part))
-        accepted = [edge for edge, kept in zip(self.edges, solution.accepted, strict=True) if kept]
+        kept = list(compress(self.edges, solution.accepted))
         for number in range(int(part.max(initial=-1)) + 1):
             own = np.flatnonzero(part == number)
             position = {int(local_map): k for k, local_map in enumerate(own)}
@@ -125,7 +108,7 @@ class SessionGraph:
                     second=position[edge.second],
                     information=edge.information + self._step_information.get((edge.first, edge.second), 0.0),
                 )
-                for edge in accepted
+                for edge in kept
                 if edge.first in position and edge.second in position
             ]
             walls = [self._walls[local_map] for local_map in own]

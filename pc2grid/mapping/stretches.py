@@ -120,8 +120,7 @@ class Stretches:
                     probability=found.probability,
                 )
                 for found in self._recognizer.recognize(self._draw(index, numbers))
-                if found.probability >= self._parameters.min_probability
-                and self.storey(self._asked[found.older].start) == self.storey(numbers.start)
+                if self.storey(self._asked[found.older].start) == self.storey(numbers.start)
             ]
         )
         return True

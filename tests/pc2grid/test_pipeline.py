@@ -145,8 +145,9 @@ def test_a_robot_that_was_carried_elsewhere_makes_two_maps(
         longest = build_map(first, session="robot")
     assert [made.session for made in maps] == ["robot", "robot#2"]
     assert sum(len(made.trajectory) for made in maps) == len(scans)
-    # Tracking starts again after ten lost scans, ten a second: they belong to what was before.
-    assert 0 < maps[1].trajectory.stamps_ns[0] - begin_ns < 12 * 10**8
+    # The first scan there contradicts what is known to be free. At the latest, tracking starts again after
+    # ten lost scans, ten a second, which belong to what was before.
+    assert 0 <= maps[1].trajectory.stamps_ns[0] - begin_ns < 12 * 10**8
     assert np.allclose(maps[1].trajectory.planar()[0], 0.0)
     # Found without odometry at the first scan in both cases, so the maps are equal but for some cells.
     apart = alone.trajectory.planar()[-1] - maps[1].trajectory.planar()[-1]

@@ -200,7 +200,7 @@ def _edge(
     turned = SE2(0.0, 0.0, -T_target_a.yaw).matrix() @ J
     information = np.linalg.inv(turned @ link.covariance @ turned.T)
     T_a_b = T_target_a.inverse() @ T_target_b
-    return Edge(a, b, T_a_b, np.asarray(information), loop=True, recognized=True)
+    return Edge(a, b, T_a_b, np.asarray(information), loop=True)
 
 
 def _nearest(body: SessionBody, x_m: float, y_m: float) -> int:

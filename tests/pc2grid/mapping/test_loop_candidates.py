@@ -9,20 +9,17 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
-from pc2grid.mapping.loop_candidates import Candidate, LoopCandidates, ways
-from pc2grid.mapping.pose_graph import Edge, between, compose
+from pc2grid.mapping.loop_candidates import Candidate, LoopCandidates
+from pc2grid.mapping.pose_graph import between, compose
 
 STEP_M = 4.0
 
 
-def corridor(count: int) -> tuple[F64, F64, list[Edge]]:
-    """Local maps along a straight corridor that was driven back and forth: poses, travel, tracked steps."""
+def corridor(count: int) -> tuple[F64, F64]:
+    """Local maps along a straight corridor that was driven back and forth: poses and travel."""
     x = STEP_M * np.minimum(np.arange(count), 2 * (count // 2) - np.arange(count))
     nodes = np.column_stack((x, np.zeros(count), np.where(np.arange(count) < count // 2, 0.0, math.pi)))
-    edges = [
-        Edge(k, k + 1, SE2(*nodes[k]).inverse() @ SE2(*nodes[k + 1]), np.eye(3)) for k in range(count - 1)
-    ]
-    return nodes, STEP_M * np.arange(count), edges
+    return nodes, STEP_M * np.arange(count)
 
 
 def seen(
@@ -51,9 +48,8 @@ def accepted(*batches: list[Candidate]) -> list[Candidate]:
 NODES = corridor(41)[0]
 
 
-def test_near_the_tracked_pose_one_recognition_is_enough_if_it_is_certain() -> None:
+def test_near_the_tracked_pose_one_recognition_is_enough() -> None:
     assert len(accepted([seen(NODES, 9, 10, 31)])) == 1
-    assert accepted([seen(NODES, 9, 10, 31, probability=0.7)]) == []
 
 
 def test_far_from_the_tracked_pose_others_must_agree() -> None:
@@ -90,15 +86,6 @@ def test_what_is_not_accepted_waits_and_what_cannot_be_is_forgotten() -> None:
     second = seen(NODES, 10, 7, 34, off=off)
     candidates.add([second])
     assert candidates.acceptable(*corridor(41)) == [first, second]
-
-
-def test_a_loop_shortens_the_ways_around_it() -> None:
-    nodes, travel_m, edges = corridor(41)
-    before = ways(41, travel_m, edges, np.array([10]))[0]
-    loop = Edge(8, 33, SE2(*nodes[8]).inverse() @ SE2(*nodes[33]), np.eye(3), loop=True)
-    after = ways(41, travel_m, [*edges, loop], np.array([10]))[0]
-    assert before[31] == pytest.approx(84.0, rel=0.05) and after[31] == pytest.approx(16.0, rel=0.05)
-    assert after[12] == before[12]
 
 
 def test_poses_are_composed_and_inverted() -> None:
