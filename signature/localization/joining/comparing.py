@@ -45,7 +45,7 @@ def compare_here(database: SubmapDatabase, pairs: Sequence[ToCompare]) -> Iterat
 
     @functools.lru_cache(_KEPT)
     def prepared(name: str) -> JoinableMap:
-        return JoinableMap(grid=database.grid(name), graph=database.graph(name), sight_m=sight_m)
+        return JoinableMap.of(database.grid(name), database.graph(name), sight_m)
 
     for pair in pairs:
         yield join_maps(prepared(pair.target), prepared(pair.source), labelled=pair.labelled)

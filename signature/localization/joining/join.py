@@ -78,12 +78,21 @@ _MIRROR = np.array((-1.0, 1.0), np.float32)
 class JoinableMap:
     """The map of a session, prepared to be joined when it first matters.
 
-    graph : its junction graph. sight_m : what is visible is described up to this distance.
+    grid : all heights in one, see `of`. graph : its junction graph. sight_m : what is visible is described up
+    to this distance.
     """
 
     grid: OccupancyGrid
     graph: nx.Graph
     sight_m: float
+
+    @staticmethod
+    def of(grid: OccupancyGrid, graph: nx.Graph, sight_m: float) -> JoinableMap:
+        """The map with all heights in one: the other session may be that of a laser, which sees a single one.
+
+        graph : the junction graph of the map. sight_m : what is visible is described up to this distance.
+        """
+        return JoinableMap(grid=replace(grid, heights=None), graph=graph, sight_m=sight_m)
 
     @cached_property
     def landmarks(self) -> Landmarks:

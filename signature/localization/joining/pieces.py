@@ -70,7 +70,7 @@ class Piece:
 
 
 def pieces_of(grid: OccupancyGrid) -> tuple[Piece, ...]:
-    """The squares of a map that hold enough walls."""
+    """The squares of a map without heights that hold enough walls."""
     side = round(PIECES.side_m / grid.resolution_m)
     height, width = grid.cells.shape
     found = []

@@ -87,8 +87,7 @@ def count_changes(building_seed: int, config: Config) -> ChangeCount:
     before, after = (_mapped(session, config) for session in _sessions(building_seed))
     sight_m = config.partition.radius_m
     maps = [
-        JoinableMap(grid=m.grid, graph=junction_graph(m.grid, config.partition), sight_m=sight_m)
-        for m in (before, after)
+        JoinableMap.of(m.grid, junction_graph(m.grid, config.partition), sight_m) for m in (before, after)
     ]
     join = join_maps(*maps)
     if join.status != "joined":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -37,6 +38,14 @@ def test_two_halves_of_an_office_are_joined_by_their_common_strip() -> None:
     assert 0.85 * 98.0 < join.common_m2 < 98.0
     sigmas = np.sqrt(np.diag(join.covariance))
     assert distance_m < 3.0 * sigmas[:2].max() < 0.3
+
+
+def test_a_map_that_tells_heights_is_cut_in_the_same_pieces() -> None:
+    heights = np.where(west.grid.occupied, 1, 0).astype(np.uint8)
+    tells = joinable(replace(west.grid, heights=heights))
+    assert len(tells.pieces) == len(west.pieces) > 1  # the map is larger than a piece
+    for piece, same in zip(tells.pieces, west.pieces, strict=True):
+        assert np.array_equal(piece.walls.points_m, same.walls.points_m)
 
 
 def test_it_does_not_matter_which_of_the_two_is_asked() -> None:
