@@ -8,7 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64
+from pc2grid.arrays import F32, F64, U8
+from pc2grid.model import SLICES
 
 
 @njit(cache=True)
@@ -155,3 +156,83 @@ def _surfaces(
             surfaces[found - 1, 1] += points[k, 1]
             surfaces[found - 1, 2] += 1.0
     return surfaces[:found].copy()
+
+
+@njit(cache=True)
+def heights_seen(
+    at: F32,
+    points: F32,
+    sensor: F64,
+    plane: F64,
+    band: tuple[float, float],
+    depths: tuple[float, float],
+    borders: F64,
+    bearings: int,
+) -> U8:
+    """Twin of `heights.heights_seen_plain`, which looks at the points of the `bearings` that matter alone."""
+    per_rad = bearings / (2.0 * math.pi)
+    bearing_of, ranges = np.empty(len(points), dtype=np.int32), np.empty(len(points))
+    for n in range(len(points)):
+        dx, dy = points[n, 0] - sensor[0], points[n, 1] - sensor[1]
+        bearing_of[n] = math.floor(math.atan2(dy, dx) * per_rad) % bearings
+        ranges[n] = math.hypot(dx, dy)
+    order, starts = _sorted(bearing_of, bearings)
+    heights = np.zeros(len(at), dtype=np.uint8)
+    for k in range(len(at)):
+        x, y = at[k, 0] - sensor[0], at[k, 1] - sensor[1]
+        r = math.hypot(x, y)
+        reach = 0.5 * math.pi if r <= 0.5 * depths[0] else math.asin(0.5 * depths[0] / r)
+        first = math.floor((math.atan2(y, x) - reach) * per_rad)
+        filled, empty = 0, 0
+        for bearing in range(first, first + min(math.ceil(2.0 * reach * per_rad) + 1, bearings)):
+            here = order[starts[bearing % bearings] : starts[bearing % bearings + 1]]
+            more = _heights_along(here, points, ranges, (x, y, r), sensor, plane, band, depths, borders)
+            filled, empty = filled | more[0], empty | more[1]
+        heights[k] = filled | (empty & ~filled) << SLICES
+    return heights
+
+
+@njit(cache=True)
+def _sorted(bearing_of: NDArray[np.int32], bearings: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The points by bearing, and where those of each bearing start."""
+    starts = np.zeros(bearings + 1, dtype=np.int64)
+    for bearing in bearing_of:
+        starts[bearing + 1] += 1
+    starts = np.cumsum(starts)
+    order, filled = np.empty(len(bearing_of), dtype=np.int64), starts.copy()
+    for n in range(len(bearing_of)):
+        order[filled[bearing_of[n]]] = n
+        filled[bearing_of[n]] += 1
+    return order, starts
+
+
+@njit(cache=True)
+def _heights_along(
+    order: NDArray[np.int64],
+    points: F32,
+    ranges: F64,
+    at: tuple[float, float, float],
+    sensor: F64,
+    plane: F64,
+    band: tuple[float, float],
+    depths: tuple[float, float],
+    borders: F64,
+) -> tuple[int, int]:
+    """The slices that the points in `order` fill and leave empty at x, y and the range `at`."""
+    x, y, r = at
+    deep = depths[0] + depths[1] * r * r
+    sensor_height = plane[0] * sensor[0] + plane[1] * sensor[1] + plane[2] * sensor[2] + plane[3]
+    filled, empty = 0, 0
+    for n in order:
+        dx, dy, away = points[n, 0] - sensor[0], points[n, 1] - sensor[1], max(ranges[n], 1e-9)
+        aside = abs(x * dy - y * dx) / away
+        behind = away > r + deep
+        if away < r - deep or aside > (0.25 if behind else 0.5) * depths[0] or dx * x + dy * y <= 0.0:
+            continue
+        height = plane[0] * points[n, 0] + plane[1] * points[n, 1] + plane[2] * points[n, 2] + plane[3]
+        if behind:
+            height = sensor_height + (height - sensor_height) * r / away
+        if band[0] <= height <= band[1]:
+            bit = 1 << np.searchsorted(borders, height, side="right")
+            filled, empty = filled | bit * (not behind), empty | bit * behind
+    return filled, empty

@@ -8,8 +8,6 @@ has moved less than it has (`examples/map-quality.md`).
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,7 +48,4 @@ class DepthLimit:
         depth of a hit is that at the height of the camera.
         """
         depth_m = (planar_scan.hits_m - planar_scan.origin_m) @ T_level_sensor[:2, 2]
-        kept = depth_m <= self.unbiased_m
-        if kept.all():
-            return planar_scan
-        return replace(planar_scan, hits_m=planar_scan.hits_m[kept], normal_rad=planar_scan.normal_rad[kept])
+        return planar_scan.only(depth_m <= self.unbiased_m)

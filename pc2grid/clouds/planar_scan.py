@@ -12,8 +12,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, U8
+from pc2grid.arrays import F32, F64, U8, BoolGrid
 from pc2grid.clouds.ground import Ground
+from pc2grid.clouds.heights import heights_seen
 from pc2grid.clouds.normals import planar_normals
 from pc2grid.clouds.parameters import CLOUD_PARAMETERS, CloudParameters
 from pc2grid.clouds.slope import flatten_slopes
@@ -62,6 +63,16 @@ class PlanarScan:
             normal_rad=planar_normals(hits_m, origin_m),
             origin_m=origin_m,
             free_m=free_m,
+        )
+
+    def only(self, kept: BoolGrid) -> PlanarScan:
+        """The scan with the hits (M,) that are `kept`."""
+        things = np.ones(len(self.low_m), np.bool_)
+        return replace(
+            self,
+            hits_m=self.hits_m[kept],
+            normal_rad=self.normal_rad[kept],
+            heights=self.heights[np.concatenate((kept, things))] if len(self.heights) else self.heights,
         )
 
     def emptied(self) -> PlanarScan:
@@ -133,6 +144,9 @@ def project_to_plane(
     )
     free = fill_gaps(np.where(np.isfinite(nearest), nearest, reach), parameters.max_gap_bins)
     hits = mean_per_cell(surfaces, cell_m)
+    seen_at = np.empty(0, np.uint8)
+    if ground is not None:
+        seen_at = heights_seen(hits, points, origin, plane, band, depths)
     return PlanarScan(
         stamp_ns=stamp_ns,
         hits_m=hits,
@@ -140,6 +154,7 @@ def project_to_plane(
         origin_m=origin[:2].copy(),
         free_m=np.minimum(free, config.max_range_m).astype(np.float32),
         height_m=float(origin[2]) if ground is None else None,
+        heights=seen_at,
     )
 
 

@@ -4,7 +4,8 @@ One way alone is not enough. The walls of a small query fit into many places; bu
 has walls where the query has seen free space.
 
 Where both sides tell at which heights they have seen what stands there, they are compared in the slices of
-heights that both have seen (`pc2grid.matching.walls.Slice`).
+heights that both have seen (`pc2grid.matching.walls.Slice`). Where only one side tells, it is reduced to what
+stands at all heights before (`pc2grid.matching.walls.at_all_heights`).
 
 A wall that the map has seen from its other side only, as it does not know the ground in front of it, may be
 the right one: walls are thin. But a query along the outer wall of a building fits the rooms behind it, too.
@@ -101,11 +102,21 @@ def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) ->
 
 
 def _sums(walls: Walls | Slice, field: LikelihoodField, T_field_walls: SE2, above: bool = False) -> F64:
+    """(3,) what `plain_known_sums` says of walls on a field. above : see `LikelihoodField.at`."""
+    from pc2grid.matching._kernels import known_sums
+
+    least = LIKELIHOOD.neutral_value + 1 if above else 0
+    pose = T_field_walls.x, T_field_walls.y, T_field_walls.yaw
+    on = field.values, field.known, field.resolution_m, field.origin_m
+    return np.array(known_sums(*on, walls.points_m, walls.before_m, walls.weights, pose, least))
+
+
+def plain_known_sums(
+    walls: Walls | Slice, field: LikelihoodField, T_field_walls: SE2, above: bool = False
+) -> F64:
     """(3,) of the wall points on known ground: their weight, the weighted sum of their likelihoods, 0..1, and
-    the weight of those that were seen from unknown ground. above : see `LikelihoodField.at`."""
+    the weight of those that were seen from unknown ground."""
     likelihood, known = field.at(T_field_walls.apply(walls.points_m), above=above)
-    before = known
-    if walls.before_m is not walls.points_m:
-        _, before = field.at(T_field_walls.apply(walls.before_m))
+    _, before = field.at(T_field_walls.apply(walls.before_m))
     weights = walls.weights[known].astype("f8")
     return np.array([weights.sum(), weights @ likelihood[known], weights[~before[known]].sum()])

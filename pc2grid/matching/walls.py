@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
+from pc2grid.arrays import F32, F64, I64, U8, BoolGrid, cells_of
 from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField, padded_grid
-from pc2grid.model import SLICES, OccupancyGrid
+from pc2grid.model import FREE, OCCUPIED, SLICES, UNKNOWN, OccupancyGrid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,28 +64,22 @@ class Slice:
     @staticmethod
     def all_of(grid: OccupancyGrid, parameters: WallParameters = WALLS) -> tuple[Slice, ...]:
         """The slices of a grid, lowest first; none if it does not tell heights."""
-        import cv2
-
         if grid.heights is None:
             return ()
-        # The middle value around each cell: what is left are things, and no grains of noise.
-        things = cv2.medianBlur(grid.things.astype(np.uint8), parameters.grain_cells) > 0
-        standing = np.where(grid.heights, grid.heights, _ANY_HEIGHT) * (grid.occupied | things)
-        occupied = [(standing >> k & 1).astype(np.uint8) for k in range(SLICES)]
-        weight = np.where(things, parameters.movable, 1.0) / np.maximum(sum(occupied), 1)
+        things = _things(grid, parameters)
+        standing, passed = _standing(grid, things)
+        count = sum((standing >> k & 1).astype(np.uint8) for k in range(SLICES))
+        weight = np.where(things, parameters.movable, 1.0) / np.maximum(count, 1)
         return tuple(
-            Slice._of(grid, stands > 0, (standing >> (k + SLICES) & 1) > 0, weight, parameters)
-            for k, stands in enumerate(occupied)
+            Slice._of(grid, (standing >> k & 1) > 0, (passed >> k & 1) > 0, weight, parameters)
+            for k in range(SLICES)
         )
 
     @staticmethod
     def _of(grid: OccupancyGrid, stands: BoolGrid, passed: BoolGrid, weight: F64, p: WallParameters) -> Slice:
         """One slice. stands : (H, W) cells that are occupied there. passed : those of cells with something at
         another height that are free there. weight : of each cell."""
-        import cv2
-
-        inside = cv2.erode(stands.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        cells = cells_of(stands & ~inside)
+        cells = cells_of(stands & ~_inside(stands))
         cells = cells[thin_evenly(grid.to_point(cells), p.spacing_m)]
         steady = steadiness(stands, cells, grid.resolution_m, p) * weight[cells[:, 0], cells[:, 1]]
         known = stands | passed | grid.free
@@ -177,6 +171,44 @@ class Walls:
 def comparable(target: Walls, query: Walls) -> tuple[tuple[Walls | Slice, Walls | Slice], ...]:
     """The parts of two maps that are compared: their slices if both have some, else all heights in one."""
     return tuple(zip(target.slices, query.slices, strict=False)) or ((target, query),)
+
+
+def at_all_heights(grid: OccupancyGrid, parameters: WallParameters = WALLS) -> OccupancyGrid:
+    """What any planar laser sees of a grid that tells heights, whatever its own height: what stands somewhere
+    and no ray was seen to pass. What stands at some heights only is unknown: things, which are moved about.
+    """
+    standing, passed = _standing(grid, _things(grid, parameters))
+    stands = (standing > 0) & (passed == 0)
+    cells = np.full(grid.cells.shape, UNKNOWN, np.int8)
+    cells[grid.free] = FREE
+    cells[stands & ~_inside(stands)] = OCCUPIED
+    return replace(grid, cells=cells, heights=None)
+
+
+def _standing(grid: OccupancyGrid, things: BoolGrid) -> tuple[U8, U8]:
+    """(H, W) each: the slices in which something was seen to stand in a cell, and those in which rays have
+    passed it. Where the heights of what stands are not known, it stands in all of them. things : (H, W), see
+    `_things`."""
+    assert grid.heights is not None
+    heights = np.where(grid.heights, grid.heights, np.uint8(_ANY_HEIGHT))
+    heights[~(grid.occupied | things)] = 0
+    return heights & np.uint8(_ANY_HEIGHT), heights >> np.uint8(SLICES)
+
+
+def _things(grid: OccupancyGrid, parameters: WallParameters) -> BoolGrid:
+    """(H, W) the things of a grid without grains of noise: the middle value around each cell."""
+    import cv2
+
+    things: BoolGrid = cv2.medianBlur(grid.things.astype(np.uint8), parameters.grain_cells) > 0
+    return things
+
+
+def _inside(stands: BoolGrid) -> BoolGrid:
+    """The cells (H, W) of things that have all their neighbours in them: nothing sees these."""
+    import cv2
+
+    inside: BoolGrid = cv2.erode(stands.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return inside
 
 
 def steadiness(

@@ -153,7 +153,7 @@ def fitted(query: QueryMap, session_index: int, row: int, target: SearchMap, T_m
     """The hypothesis that the query lies at a pose, which is refined first."""
     pose, covariance = _refined(query, target, T_map_query)
     covariance = covariance + np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))
-    fit = score_fit(target.walls, query.walls, pose, covariance)
+    fit = score_fit(target.walls, query.walls_for(target.walls), pose, covariance)
     return Hypothesis(session_index=session_index, row=row, fit=fit)
 
 
@@ -163,13 +163,14 @@ def _refined(query: QueryMap, target: SearchMap, T_map_query: SE2) -> tuple[SE2,
     The walls of the query are brought onto those of the map. Of two planes at different heights it is the
     walls of the higher one, since things near a wall in the lower one would be drawn onto it.
     """
-    if not target.walls.is_above(query.walls.height_m):
-        pairs = comparable(target.walls, query.walls)
+    walls = query.walls_for(target.walls)
+    if not target.walls.is_above(walls.height_m):
+        pairs = comparable(target.walls, walls)
         parts = [(on.field, mine.points_m) for on, mine in pairs]
         return refine_all(parts, T_map_query, query.center_m)
     center_m = T_map_query.apply(np.array([query.center_m]))[0]
     back, covariance = refine(
-        query.walls.field, target.walls.points_m, T_map_query.inverse(), (center_m[0], center_m[1])
+        walls.field, target.walls.points_m, T_map_query.inverse(), (center_m[0], center_m[1])
     )
     pose = back.inverse()
     turn = np.eye(3)
@@ -222,7 +223,7 @@ def _searched(query: QueryMap, target: SearchMap, center_m: tuple[float, float])
     """The points of a query that are searched for on a map, relative to `center_m`: (M, 2), or if the map is
     searched by heights (M, 3), with the number of the slice of each."""
     if not target.by_heights:
-        return coarse_points(query.walls.points_m, center_m)
+        return coarse_points(query.walls_for(target.walls).points_m, center_m)
     parts = [coarse_points(part.points_m, center_m) for part in query.walls.slices]
     points = np.concatenate([np.insert(part, 2, k, axis=1) for k, part in enumerate(parts)])
     return points[:: max(-(-len(points) // MOST_POINTS), 1)]

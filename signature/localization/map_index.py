@@ -13,6 +13,7 @@ import numpy as np
 from pc2grid.arrays import F64, I64
 from pc2grid.errors import DatabaseCorrupt
 from pc2grid.geometry import SE2
+from pc2grid.matching.walls import at_all_heights
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid, PointMap
 from pc2grid.observer import Observer
@@ -104,6 +105,9 @@ class MapIndex:
             ),
             "heights": LazySequence(
                 lambda i: SearchMap.of(self.grids[i], by_heights=True), count, most_prepared
+            ),
+            "a laser": LazySequence(
+                lambda i: SearchMap.of(at_all_heights(self.grids[i])), count, most_prepared
             ),
         }
         self.alike_floors: dict[tuple[int, int], SE2 | None] = {}  # see `signature.localization.alike_floors`
@@ -205,7 +209,7 @@ class MapIndex:
         rows : places that retrieval compares, instead of those it selects.
         """
         old = [
-            fitted(query, h.session_index, h.row, self.maps[h.session_index], h.fit.T_map_query)
+            fitted(query, h.session_index, h.row, self.maps_for(query)[h.session_index], h.fit.T_map_query)
             for h in carried
         ]
         base_m = (query.T_odom_base.x, query.T_odom_base.y)
@@ -234,17 +238,15 @@ class MapIndex:
         return self._worth_keeping(query, found)
 
     def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
-        """The maps as they are searched for a query: by heights if both tell them; to one in a lower plane,
-        their free space is unknown."""
+        """The maps as they are searched for a query: by heights if both tell them; if only the map does, what
+        any laser sees of it; to a query in a lower plane, their free space is unknown."""
         height_m, by_heights = query.walls.height_m, bool(query.walls.slices)
-        if height_m is None and not by_heights:
-            return self.maps
 
         def facing(i: int) -> SearchMap:
-            if by_heights:
-                return self.maps[i] if self.grids[i].heights is None else self._facing["heights"][i]
-            above = self.maps[i].walls.is_above(height_m)
-            return self._facing["lower plane"][i] if above else self.maps[i]
+            if self.grids[i].heights is not None:
+                return self._facing["heights" if by_heights else "a laser"][i]
+            lower = not by_heights and self.maps[i].walls.is_above(height_m)
+            return self._facing["lower plane"][i] if lower else self.maps[i]
 
         return LazySequence(facing, len(self.maps), 0)
 

@@ -10,7 +10,7 @@ import pytest
 from pc2grid.geometry import SE2
 from pc2grid.matching.likelihood_field import LIKELIHOOD
 from pc2grid.matching.refinement import refine
-from pc2grid.matching.two_way_score import score_fit
+from pc2grid.matching.two_way_score import _sums, plain_known_sums, score_fit
 from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import SearchMap, search_windows
 from pc2grid.model import THING, UNKNOWN, OccupancyGrid
@@ -39,6 +39,16 @@ def test_unknown_ground_is_neutral() -> None:
     fit = score_fit(walls, Walls.of(office_part((10.0, 7.0))), SE2(10.0, 7.0, 0.0), np.eye(3))
     assert 0.3 < fit.overlap < 0.7
     assert fit.forward == pytest.approx(fit.overlap + LIKELIHOOD.neutral * (1 - fit.overlap), abs=0.03)
+
+
+@pytest.mark.parametrize("pose", [SE2(), SE2(9.3, 6.1, 0.7), SE2(1.0, 13.0, -2.0), SE2(60.0, 0.0, 0.1)])
+@pytest.mark.parametrize("above", [False, True])
+def test_the_compiled_sums_are_the_plain_ones(pose: SE2, above: bool) -> None:
+    """Within the map, over its edge, and beside it."""
+    grid = office_part((10.0, 7.0))
+    walls = Walls.of(grid).seen_from(grid.free.astype(np.float32))
+    fast, plain = (sums(walls, TARGET.field, pose, above) for sums in (_sums, plain_known_sums))
+    assert fast == pytest.approx(plain, rel=1e-5, abs=1e-9)  # one adds in single precision
 
 
 def seen_beside_a_wall(inside: bool) -> Walls:

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from pc2grid.matching.walls import WALLS, Walls, steadiness, thin_evenly
-from pc2grid.model import OccupancyGrid
+from pc2grid.matching.walls import WALLS, Walls, at_all_heights, steadiness, thin_evenly
+from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid
 
 
 def test_a_wall_point_counts_by_the_size_of_its_object() -> None:
@@ -52,3 +52,26 @@ def test_thinning_keeps_the_first_point_of_each_square(seed: int, count: int, fa
     squares = np.floor(points / 0.4).astype(np.int64)
     first = np.unique(squares, axis=0, return_index=True)[1]
     assert np.array_equal(thin_evenly(points, 0.4), np.sort(first))
+
+
+def test_a_laser_sees_what_stands_at_all_heights() -> None:
+    """A table top, under and over which rays have passed, and a cupboard, of which the upper half was seen:
+    nothing has passed below. A laser may see the table or not, and sees the cupboard at any height."""
+    cells, heights = np.zeros((2, 40, 40), np.int8)
+    cells[10, 5:35], heights[10, 5:35] = OCCUPIED, 0b101_010
+    cells[30, 5:35], heights[30, 5:35] = OCCUPIED, 0b000_110
+    grid = OccupancyGrid(cells=cells, heights=heights, resolution_m=0.05, origin_m=(0.0, 0.0))
+    seen = at_all_heights(grid)
+    assert set(seen.cells[10, 5:35].tolist()) == {UNKNOWN}
+    assert set(seen.cells[30, 5:35].tolist()) == {OCCUPIED}
+    assert seen.free[20].all()
+    assert seen.heights is None
+
+
+def test_a_laser_sees_the_rim_of_a_thing_and_not_its_inside() -> None:
+    cells = np.zeros((40, 40), np.int8)
+    cells[10:30, 10:30] = OCCUPIED
+    grid = OccupancyGrid(cells=cells, heights=np.zeros_like(cells), resolution_m=0.05, origin_m=(0.0, 0.0))
+    seen = at_all_heights(grid)
+    assert (seen.cells[11:29, 11:29] == UNKNOWN).all()
+    assert np.count_nonzero(seen.occupied) == 4 * 19  # whose heights are not known stands at all of them

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from pc2grid.arrays import F32
 from pc2grid.geometry import SE2
 from pc2grid.matching.window_search import SearchMap
+from pc2grid.model import OCCUPIED, OccupancyGrid
 from signature.config import Config
 from signature.localization.hypotheses import HYPOTHESES, coarse_points, fitted
 from signature.localization.query import query_of
-from tests.helpers.simulated_drives import office
+from tests.helpers.simulated_drives import building, office
 
 CENTER_M = (3.0, -2.0)
 
@@ -44,3 +47,23 @@ def test_a_pose_is_not_stated_more_exactly_than_the_map_is_drawn() -> None:
     stated = np.sqrt(np.diag(fit.covariance))
     assert np.all(stated >= (HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad))
     assert np.all(stated < (0.1, 0.1, 0.01))  # a tenth of a robot's width: what is aligned is known
+
+
+def test_a_laser_and_a_lidar_are_compared_on_the_walls_that_any_laser_sees() -> None:
+    """Tables that the lidar has seen over and under hide no place from a laser, which has not seen them."""
+    of_laser = office()
+    cells, heights = of_laser.cells.copy(), np.zeros(of_laser.cells.shape, np.uint8)
+    tables = np.flatnonzero(of_laser.free)[::7]
+    cells.flat[tables], heights.flat[tables] = OCCUPIED, 0b101_010
+    of_lidar = replace(of_laser, cells=cells, heights=heights)
+    at_map = SE2(0.04, -0.03, 0.01)
+
+    def agreement(query: OccupancyGrid, target: OccupancyGrid) -> float:
+        config = Config()
+        asked = query_of(query, np.empty((0, 2)), config, config.relocalize)
+        searched = building({"map": target}, config).maps_for(asked)[0]
+        return fitted(asked, 0, -1, searched, at_map).fit.known_agreement_both_ways
+
+    plain = replace(of_lidar, heights=None)
+    assert agreement(of_laser, of_lidar) > 0.9 > agreement(of_laser, plain)
+    assert agreement(of_lidar, of_laser) > 0.9 > agreement(plain, of_laser)

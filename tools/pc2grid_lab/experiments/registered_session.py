@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +110,9 @@ class RegisteredSession:
                 hits_m=np.concatenate([empty, *(s.hits_m for s in self.planar_scans)]),
                 origin_m=np.array([s.origin_m for s in self.planar_scans]).reshape(-1, 2),
                 free_m=np.array([s.free_m for s in self.planar_scans], np.float32),
+                height_m=np.array([s.height_m for s in self.planar_scans], np.float64),
+                heights=np.concatenate([empty[:, 0], *(s.heights for s in self.planar_scans)]),
+                heights_count=np.array([len(s.heights) for s in self.planar_scans], np.int64),
             )
 
     @staticmethod
@@ -118,12 +121,23 @@ class RegisteredSession:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
         hits = np.split(arrays["hits_m"], np.cumsum(arrays["hit_count"])[:-1])
+        heights = np.split(arrays["heights"].astype(np.uint8), np.cumsum(arrays["heights_count"])[:-1])
         return RegisteredSession(
             sensor=str(arrays["sensor"]),  # type: ignore[arg-type]
             planar_scans=tuple(
-                PlanarScan.of_hits(stamp_ns=int(stamp), hits_m=points, origin_m=origin, free_m=free)
-                for stamp, points, origin, free in zip(
-                    arrays["stamps_ns"], hits, arrays["origin_m"], arrays["free_m"], strict=True
+                replace(
+                    PlanarScan.of_hits(stamp_ns=int(stamp), hits_m=points, origin_m=origin, free_m=free),
+                    height_m=None if np.isnan(height_m) else float(height_m),
+                    heights=seen_at,
+                )
+                for stamp, points, origin, free, height_m, seen_at in zip(
+                    arrays["stamps_ns"],
+                    hits,
+                    arrays["origin_m"],
+                    arrays["free_m"],
+                    arrays["height_m"],
+                    heights,
+                    strict=True,
                 )
             ),
             T_odom_base=arrays["T_odom_base"],
