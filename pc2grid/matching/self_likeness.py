@@ -10,9 +10,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+from numpy import fft
 
-from pc2grid.arrays import F64
+from pc2grid.arrays import F64, U8
 from pc2grid.matching.walls import Slice, Walls
 
 
@@ -42,8 +44,6 @@ def self_likeness(walls: Walls, parameters: LikenessParameters = LIKENESS) -> fl
     As of two maps (`two_way_score`): the geometric mean, forward and backward, of the mean likelihood of the
     wall points on known ground. All slides at once, as correlations by the fast Fourier transform.
     """
-    from scipy import fft
-
     parts: Sequence[Walls | Slice] = walls.slices or (walls,)
     total = sum(part.weight for part in parts)
     if total <= 0.0:
@@ -52,7 +52,7 @@ def self_likeness(walls: Walls, parameters: LikenessParameters = LIKENESS) -> fl
     cell_m = n * walls.field.resolution_m
     drawn = [_drawn(part, n) for part in parts]
     reach = round(parameters.farthest_m / cell_m)
-    shape = [fft.next_fast_len(n + reach, real=True) for n in drawn[0][0].shape]
+    shape = [cv2.getOptimalDFTSize(n + reach) for n in drawn[0][0].shape]
     spectra = [[fft.rfft2(image, shape) for image in images] for images in drawn]
     slides = np.arange(-reach, reach + 1)
     fits, overlap = (
@@ -76,13 +76,16 @@ def _drawn(walls: Walls | Slice, n: int) -> tuple[F64, F64, F64]:
     field = walls.field
     height, width = (-(-side // n) for side in field.values.shape)
 
-    def mean(values: F64) -> F64:
+    def mean(values: U8) -> F64:
         short = ((0, height * n - values.shape[0]), (0, width * n - values.shape[1]))
-        return np.asarray(np.pad(values, short).reshape(height, n, width, n).mean(axis=(1, 3)))
+        padded = np.pad(values, short)
+        cells = (padded[row::n, column::n].astype(np.float64) for row in range(n) for column in range(n))
+        return np.asarray(sum(cells) / n**2)
 
-    share = mean(field.known.astype(np.float64))
+    share = mean(field.known.view(np.uint8))
     known = share >= 0.5
-    likelihood = np.where(known, mean(field.values / 255.0 * field.known) / np.maximum(share, 0.5), 0.0)
+    on_known = mean(field.values * field.known) / 255.0
+    likelihood = np.where(known, on_known / np.maximum(share, 0.5), 0.0)
     cells = np.floor((walls.points_m - np.asarray(field.origin_m)) / (n * field.resolution_m)).astype(np.intp)
     weights = np.zeros((height, width))
     np.add.at(weights, (cells[:, 1], cells[:, 0]), walls.weights)

@@ -22,7 +22,9 @@ so a wall of one cell cannot be missed between two poses.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -103,7 +105,7 @@ class SearchMap:
         if from_below:
             lifted = LIKELIHOOD.neutral * 255.0 + (1.0 - LIKELIHOOD.neutral) * fields[0]
             fields = [np.where(walls.field.known, lifted, fields[0]).astype(np.uint8)]
-        levels = np.stack([_sliding_maxima(field, grid.resolution_m) for field in fields])
+        levels = _sliding_maxima(fields, grid.resolution_m)
         # The maximum within at least a cell of a block's last cell covers the whole block.
         halves = levels[:, :BLOCK_LEVELS, 1::2, 1::2].reshape(len(fields) * BLOCK_LEVELS, -1)
         return SearchMap(
@@ -123,16 +125,20 @@ class SearchMap:
         return self.walls.field
 
 
-def _sliding_maxima(field: U8, resolution_m: float) -> U8:
-    """(L, H, W) the maxima of a field (H, W) within each of `REACHES_M`."""
+def _sliding_maxima(fields: Sequence[U8], resolution_m: float) -> U8:
+    """(F, L, H, W) the maxima of F fields (H, W) within each of `REACHES_M`."""
     import cv2
 
-    levels = np.empty((len(REACHES_M), *field.shape), np.uint8)
-    levels[0] = field
-    for level, reach_m in enumerate(REACHES_M[1:], start=1):
-        n = math.ceil(reach_m / resolution_m - 1e-6)
-        square = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * n + 1, 2 * n + 1))
-        levels[level] = cv2.dilate(field, square, borderType=cv2.BORDER_REPLICATE)
+    reaches = [math.ceil(reach_m / resolution_m - 1e-6) for reach_m in REACHES_M]
+    # Tens of megabytes: they are written where they stay, as new memory costs more than the maxima.
+    levels = np.empty((len(fields), len(reaches), *fields[0].shape), np.uint8)
+    for field, maxima in zip(fields, levels, strict=True):
+        maxima[0] = field
+        for level, (before, reach) in enumerate(pairwise(reaches)):
+            # The maximum over a square of maxima over squares is that over the sum of both squares.
+            side = 2 * (reach - before) + 1
+            square = cv2.getStructuringElement(cv2.MORPH_RECT, (side, side))
+            cv2.dilate(maxima[level], square, dst=maxima[level + 1], borderType=cv2.BORDER_REPLICATE)
     return levels
 
 

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError
+from pc2grid.io.containers.detect import first_bytes, is_submap_database
 from pc2grid.model import is_part_of, part_name
 from signature.database import engine_of, open_database, refuse_existing
 from signature.database.codec import DatabaseDamage, clean
@@ -94,6 +95,16 @@ def replace_sessions(target: Place, sessions: Sequence[StoredSession], *, remove
 def exists(target: Place) -> bool:
     """Whether there is anything that storing without `keep` would replace."""
     return engine_of(target).exists(target)
+
+
+def is_database(name: str) -> bool:
+    """Whether this is the URL or the file of a submap database."""
+    if is_url(name):
+        return True
+    try:
+        return is_submap_database(first_bytes(Path(name)))
+    except OSError:
+        return False
 
 
 def shown(place: Place) -> str:

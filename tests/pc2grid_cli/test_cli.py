@@ -291,6 +291,52 @@ def test_help_loads_nothing_heavy(tmp_path: Path) -> None:
     assert done.stdout == "[]\n", done.stdout + done.stderr
 
 
+def after(code: str, *arguments: object, cwd: Path) -> list[str]:
+    """What `code` is at the end of a command, which is run in a process of its own, and at the end of that."""
+    script = (
+        "import gc, sys\nfrom pc2grid_cli import console\nfrom pc2grid_cli.main import main\n"
+        "usual, run = gc.get_threshold(), console.Console.run\n"
+        "def run_and_tell(terminal, action):\n"
+        " try: return run(terminal, action)\n"
+        f" finally: print({code}, file=sys.stderr)\n"
+        "console.Console.run = run_and_tell\n"
+        f"try: main()\nfinally: print({code}, file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, "-q", *map(str, arguments)], capture_output=True, text=True, cwd=cwd,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"},
+    )  # fmt: skip
+    return done.stderr.splitlines()[-2:]
+
+
+# A test of a whole command each: importing a library takes up to a tenth of its time.
+_FOR_PICTURES = ("matplotlib", "PIL", "rich", "rerun", "plotly", "dash")
+_OF_OTHER_SENSORS = ("open3d",)
+_NOT_IN_USE = ("scipy.fft", "scipy.optimize", "scipy.signal", "skimage", "sklearn", "pandas")
+_OF_OTHER_COMMANDS = ("pc2grid.simulate", "pc2grid_lab", "signature.localization.joining", "dask", "psycopg")
+
+
+def test_a_laser_is_located_without_libraries_for_other_things(house: Path, tmp_path: Path) -> None:
+    assert pc2grid("convert", house / "house.yaml", "-o", "h.submaps", cwd=tmp_path).returncode == 0
+    others = (*_FOR_PICTURES, *_OF_OTHER_SENSORS, *_NOT_IN_USE, *_OF_OTHER_COMMANDS)
+    loaded = f"[name for name in {others} if name in sys.modules]"
+    question = ("relocalize", house / "drive.mcap", "-d", "h.submaps", "--duration", "3")
+    assert after(loaded, *question, cwd=tmp_path) == ["[]", "[]"]
+
+
+def test_info_of_a_recording_loads_nothing_that_computes(house: Path) -> None:
+    others = ("scipy.spatial", "scipy.linalg", "networkx", "kiss_icp", "open3d", "matplotlib")
+    loaded = f"[name for name in {others} if name in sys.modules]"
+    assert after(loaded, "info", house / "drive.mcap", cwd=house) == ["[]", "[]"]
+
+
+def test_the_collector_works_leaves_out_what_is_imported_and_is_given_back(house: Path) -> None:
+    # `info` imports some 100,000 objects, and makes a few thousand.
+    state = "gc.isenabled(), gc.get_threshold() == usual, gc.get_freeze_count() > 4 * len(gc.get_objects())"
+    told = after(state, "info", house / "drive.mcap", cwd=house)
+    assert told == ["True False True", "True True True"]
+
+
 def test_help_takes_little_longer_than_typer_itself(tmp_path: Path) -> None:
     """A ratio, because machines differ: against Python that starts and loads typer, interleaved."""
 

@@ -17,14 +17,13 @@ from pc2grid.config import ReadConfig
 from pc2grid.errors import Pc2GridError, one_line
 from pc2grid.geometry import invert_pose, transform_points
 from pc2grid.io import open_log
-from pc2grid.io.containers.detect import is_submap_database
 from pc2grid.io.topics import TF, camera_info_topic
 from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid_cli.console import print_json, warn
 from pc2grid_cli.db import db_info_command
 from pc2grid_cli.options import AsJson, Assignments, Recover, Topic, make_config
-from signature.database.postgres.server import is_url
+from signature.database.maintenance import is_database
 
 if TYPE_CHECKING:
     from pc2grid.io.message_source import LogInfo
@@ -68,17 +67,6 @@ def info_command(
         print_json(document)
     else:
         _show(document)
-
-
-def is_database(name: str) -> bool:
-    """Whether this is the URL or the file of a submap database."""
-    if is_url(name):
-        return True
-    try:
-        with Path(name).open("rb") as file:
-            return is_submap_database(file.read(100))
-    except OSError:
-        return False
 
 
 def describe_map(path: Path, assignments: list[str] | None = None) -> InfoMap:

@@ -23,7 +23,6 @@ from pc2grid_cli import console, data_loss
 from pc2grid_cli import options as options
 from pc2grid_cli.check_pose import check_log, report_check
 from pc2grid_cli.foxglove import write_answer, write_located_map
-from pc2grid_cli.info import is_database
 from pc2grid_cli.known_pose import KnownPose
 from pc2grid_cli.locate import ON_THE_WAY, Found, find_log, find_map, in_map, searched
 from pc2grid_cli.nav2_pose import write_initialpose
@@ -32,6 +31,7 @@ from pc2grid_cli.picture import draw_answer
 from pc2grid_cli.report import write_report
 from pc2grid_cli.rerun_stream import Search, stream_to
 from pc2grid_cli.rerun_target import require_target
+from signature.database.maintenance import is_database
 from signature.localization.in_building import answer_in_building
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 
 from pc2grid.geometry import SE2
 from pc2grid.matching._kernels import best_of_boxes, box_bounds
@@ -55,6 +56,18 @@ def seen_from(truth: np.ndarray, walls: np.ndarray) -> np.ndarray:
     """Wall points of the map in the frame of a pose."""
     c, s = math.cos(truth[2]), math.sin(truth[2])
     return ((walls - truth[:2]) @ np.array([[c, -s], [s, c]])).astype(np.float32)
+
+
+@pytest.mark.parametrize("resolution_m", [0.03, 0.05, 0.1])
+def test_a_level_is_the_maximum_within_its_reach(resolution_m: float) -> None:
+    """Each is made from the one before; here from the field itself, whose edge goes on outside."""
+    cells = np.full((90, 120), FREE, np.int8)
+    cells[np.random.default_rng(3).random(cells.shape) < 0.01] = OCCUPIED
+    found = SearchMap.of(OccupancyGrid(cells=cells, resolution_m=resolution_m, origin_m=(0.0, 0.0)))
+    for level, reach_m in zip(found.levels, REACHES_M, strict=True):
+        side = 2 * math.ceil(reach_m / resolution_m - 1e-6) + 1
+        expected = ndimage.maximum_filter(found.field.values, side, mode="nearest")
+        assert np.array_equal(level, expected)
 
 
 @settings(max_examples=8, deadline=None)
