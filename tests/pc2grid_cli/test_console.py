@@ -256,3 +256,28 @@ sys.exit(Console().run(command))
     )
     assert done.returncode == code, done.stderr
     assert "internal error" not in done.stderr
+
+
+@pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_signal_during_a_callback_of_an_extension_ends_the_program(number: str, code: int) -> None:
+    """Python drops what is raised there: without a second signal the program would sleep to its end."""
+    program = f"""
+import ctypes, os, signal, sys, time
+from pc2grid_cli.console import Console
+
+def command():
+    ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.{number}))()
+    time.sleep(20.0)
+
+sys.exit(Console().run(command))
+"""
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"}
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        env=environment,
+        preexec_fn=interruptible,
+    )
+    assert done.returncode == code, done.stderr
+    assert "Exception ignored" not in done.stderr

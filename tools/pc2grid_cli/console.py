@@ -9,6 +9,7 @@ import math
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from types import FrameType
@@ -25,6 +26,8 @@ _LEAST_S, _LEAST_SHARE = 2.0, 0.03
 """Time and share of the work that must pass before the time left is estimated; chosen by hand."""
 _LINE_EVERY_S = 10.0
 """How often progress is printed where there is no terminal; chosen by hand."""
+_SENT_AGAIN_S = 0.05
+"""How long after a signal whose exception was dropped it is sent again; chosen by hand."""
 _COMPILING = "compiling, once after each installation: about 15 s"
 
 
@@ -305,13 +308,16 @@ class _StopSignal:
     """Ends the program when SIGINT or SIGTERM arrives, and remembers which one did.
 
     The exception that the handler raises may arrive as another one: an extension that was running returns a
-    result all the same, and Python then raises SystemError in its place.
+    result all the same, and Python then raises SystemError in its place. Python drops it where the handler
+    runs within a callback of an extension (numba loads compiled functions in one): the signal is sent again.
 
     number : the signal that arrived, None before.
     """
 
     def __init__(self) -> None:
         self.number: int | None = None
+        self._report = sys.unraisablehook
+        sys.unraisablehook = self._dropped
         signal.signal(signal.SIGTERM, self._stop)
         if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # a shell's background job ignores Ctrl-C
             signal.signal(signal.SIGINT, self._stop)
@@ -321,3 +327,11 @@ class _StopSignal:
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         raise SystemExit(128 + number)
+
+    def _dropped(self, unraisable: Any) -> None:
+        """What Python calls (`sys.unraisablehook`) for an exception that it cannot raise further."""
+        if self.number is None or not isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):
+            self._report(unraisable)
+            return
+        main_thread = threading.main_thread().ident
+        threading.Timer(_SENT_AGAIN_S, signal.pthread_kill, (main_thread, self.number)).start()
