@@ -1,58 +1,51 @@
 """Floors of one building that look alike share the mass of a place, because unknown ground says nothing.
 
 A score tells two such floors apart by what is unknown in one of their maps. So where the maps of two floors
-agree in all that both know, and the map of the other floor does not contradict the query, the same place
-there has the mass of the place that was found.
+agree in what both know, the same place there has mass, too: that of the place that was found, unless what is
+known there fits worse, by the equation of `signature.localization.posterior`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
 from pc2grid.geometry import SE2
+from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import same_recording
 from signature.localization.hypotheses import Hypothesis, fitted
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import POSTERIOR
+from signature.localization.posterior import evidence_of
 from signature.localization.query import QueryMap, query_of
-from signature.localization.same_place import share_known
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AlikeFloors:
-    """When the maps of two floors look alike, and when the query may have been made on either. By hand.
-
-    agreement, overlap : the maps of two floors look alike if so much of what both know agrees, and so much of
-        the walls of one is known to the other. Simulated floors with one plan and other furniture reach 0.82
-        and 0.45; a mirrored plan reaches 0.88, but 0.24.
-    seen_there : where two floors look alike, and the map of the other one shows less than this share of what
-        the query has seen, the query may have been made there as well; and so it may if what is known there
-        agrees with it as well as here.
-    """
-
-    agreement: float = 0.8
-    overlap: float = 0.35
-    seen_there: float = 0.6
-
-
-ALIKE_FLOORS = AlikeFloors()
-
-
-def unseen_alike(index: MapIndex, query: QueryMap, best: Hypothesis) -> list[Hypothesis]:
-    """The place of a hypothesis on the other floors that look alike and do not contradict the query: their
-    maps show too little of it, or agree with it as well. None with a prior, which names the floor."""
-    least = best.fit.known_agreement_both_ways - POSTERIOR.alike
-    found = []
+def alike_elsewhere(
+    index: MapIndex, query: QueryMap, best: Hypothesis
+) -> tuple[list[Hypothesis], list[float]]:
+    """The place of a hypothesis on the other floors that look alike, and its mass there beside that of the
+    hypothesis, 0..1. None with a prior, which names the floor."""
+    found, shares = [], []
     for there, T_there_here in _alike(index, query, best.session_index):
         pose = T_there_here @ best.fit.T_map_query
-        unseen = share_known(index.grids[there], query.grid, pose) < ALIKE_FLOORS.seen_there
-        h = fitted(query, there, -1, index.maps_for(query)[there], pose)
-        if unseen or h.fit.known_agreement_both_ways >= least:
-            found.append(h)
-    return found
+        found.append(fitted(query, there, -1, index.maps_for(query)[there], pose))
+        shares.append(_share(found[-1].fit, best.fit, query))
+    return found, shares
+
+
+def _share(there: Fit, here: Fit, query: QueryMap) -> float:
+    """Mass of a place there over that of the same place here, at most 1, by what is known there."""
+    if not there.compared:
+        return 1.0
+
+    def known(fit: Fit) -> Fit:
+        score = math.sqrt(fit.known_agreement * fit.backward)
+        return replace(fit, score=score, compared=there.compared, looked_at=there.looked_at)
+
+    evidence_there, evidence_here = evidence_of((known(there), known(here)), query)
+    return math.exp(min(evidence_there.log_odds() - evidence_here.log_odds(), 0.0))
 
 
 def _alike(index: MapIndex, query: QueryMap, here: int) -> Iterator[tuple[int, SE2]]:
@@ -77,11 +70,12 @@ def _other_floor(index: MapIndex, here: int, there: int) -> bool:
 
 
 def _aligned(index: MapIndex, here: int, there: int) -> SE2 | None:
-    """T_there_here of two maps that agree where both know something; None if they do not."""
+    """T_there_here of two maps of which one, asked as a query, is rather in the other than nowhere; None if
+    it is not."""
     whole = query_of(index.grids[here], np.empty((0, 2)), index.made_with, index.config)
     rows = np.flatnonzero(index.places.table.session_index == there)
-    for h in index.look_up(whole, rows=rows):
-        agree = h.fit.known_agreement_both_ways >= ALIKE_FLOORS.agreement
-        if h.session_index == there and agree and h.fit.overlap >= ALIKE_FLOORS.overlap:
-            return h.fit.T_map_query
-    return None
+    fits = [h.fit for h in index.look_up(whole, rows=rows) if h.session_index == there]
+    likely = (
+        fit for fit, known in zip(fits, evidence_of(fits, whole), strict=True) if known.log_odds() >= 0.0
+    )
+    return next((fit.T_map_query for fit in likely), None)

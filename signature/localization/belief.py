@@ -74,8 +74,13 @@ class Masses:
 
     def prior(self, query: QueryMap, place: Sequence[Hypothesis]) -> float:
         """Prior of a place, relative to that of "nowhere", for a query of later scans."""
-        kept = (1.0 - POSTERIOR.slip) ** max(len(query.keyframes), 1)
-        return 1.0 + kept * self.mass(place) / (1.0 - kept * sum(self.masses))
+        share = kept(query)
+        return 1.0 + share * self.mass(place) / (1.0 - share * sum(self.masses))
+
+
+def kept(query: QueryMap) -> float:
+    """1 - k, the share of the masses before a query that stays where it was."""
+    return float((1.0 - POSTERIOR.slip) ** max(len(query.keyframes), 1))
 
 
 class Belief:

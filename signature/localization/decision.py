@@ -11,8 +11,10 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from pc2grid.matching.two_way_score import Fit
-from signature.localization.alike_floors import unseen_alike
+from signature.localization.alike_floors import alike_elsewhere
 from signature.localization.answer import Status, Verdict
 from signature.localization.hypotheses import Hypothesis, same_pose
 from signature.localization.map_index import MapIndex
@@ -65,10 +67,12 @@ def judge(
     known.sort(key=lambda each: -math.log(each[1]) - each[2].log_odds())
     ordered, prior, evidence = (list(each) for each in zip(*known, strict=True))
     best = ordered[0][0]
-    evidence[0] = replace(evidence[0], tail=tail_of(query, best.fit, index.maps[best.session_index].walls))
-    # The same place on a floor that looks alike and is not contradicted has the same mass.
-    floors = unseen_alike(index, query, best) if evidence[0].log_odds() > 0.0 else []
-    mass = masses([*evidence, *evidence[:1] * len(floors)], [*prior, *prior[:1] * len(floors)]).tolist()
+    walls = index.maps_for(query)[best.session_index].walls
+    evidence[0] = replace(evidence[0], tail=tail_of(query, best.fit, walls))
+    # On a floor that looks alike, too, the same place has mass.
+    floors, shares = alike_elsewhere(index, query, best) if evidence[0].log_odds() > 0.0 else ([], [])
+    beside = (prior[0] * np.array(shares)).tolist()
+    mass = masses([*evidence, *evidence[:1] * len(floors)], [*prior, *beside]).tolist()
     ordered += [(h,) for h in floors if not any(_same(query, h, o) for place in ordered for o in place)]
     in_the_map = evidence[0].log_odds() + math.log(prior[0]) >= 0.0
     status: Status = "ambiguous" if in_the_map else "not_found"

@@ -1,7 +1,7 @@
 """Is a pose that the robot believes in still right?
 
 The same posterior as that of any query, with the robot's belief as the prior: before what it has seen lately,
-the mass was where the robot believes to be (`signature.localization.belief`). The pose is
+the mass was near where the robot believes to be (`signature.localization.belief`). The pose is
 
 - fine, if the place within its tolerance has the mass that is needed to be located;
 - lost, if another place has it, or if the map at the pose contradicts what the robot has seen: its likelihood
@@ -18,8 +18,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -31,12 +30,11 @@ from pc2grid.io.map_pose import MapPose
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
-from signature.localization.answering import answer_query
-from signature.localization.belief import Masses
+from signature.localization.belief import kept
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import evidence_of
+from signature.localization.posterior import log_likelihood
 from signature.localization.prior import Prior
 
 if TYPE_CHECKING:
@@ -145,21 +143,14 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
     assert near.region is not None
     number = near.region.session_index
     T_map_query = T_map_base @ seen.T_odom_base.inverse()
-    fit = score_fit(index.maps[number].walls, seen.walls, T_map_query, np.zeros((3, 3)))
+    walls = index.maps_for(seen)[number].walls
+    fit = score_fit(walls, seen.walls_for(walls), T_map_query, np.zeros((3, 3)))
     believed = Hypothesis(session_index=number, row=-1, fit=fit)
-    before = Masses(
-        part=seen.part,
-        path_m=seen.path_m,
-        T_odom_base=seen.T_odom_base,
-        hypotheses=(believed,),
-        places=(0,),
-        masses=(1.0,),
+    # All mass was near the pose before what was seen lately. So of two equal rooms it is in the nearer one.
+    answer = localizer.answer(
+        near.search_whole_maps(seen, (believed,)),
+        lambda place: 1.0 / (1.0 - kept(seen)) if any(near.allows(seen, h) for h in place) else 1.0,
     )
-    prior_of = partial(before.prior, seen)
-    answer = localizer.answer(near.search_whole_maps(seen, (believed,)), prior_of)
-    if answer.status != "located":  # a pose that is off in one of two equal rooms is off in this one
-        inside = answer_query(near, localizer.query, seen, answer.hypotheses, prior_of=prior_of)
-        answer = replace(inside, prior=None) if inside.status == "located" else answer
     apart = [
         (place, *_apart(T_map_base, h.fit.T_map_query @ answer.T_odom_base))
         for h, place in zip(answer.hypotheses, answer.places, strict=True)
@@ -168,8 +159,7 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
     here = {place for place, *off in apart if _within_tolerance(*off)}
     mass_here = sum(answer.masses[place] for place in here)
     # Where the map knows too little to contradict the pose, "at no place of this map" does not exclude it.
-    (evidence,) = evidence_of([fit], seen)
-    at_most = mass_here if evidence.log_likelihood < 0.0 else 1.0 - sum(answer.masses) + mass_here
+    at_most = mass_here if log_likelihood(fit) < 0.0 else 1.0 - sum(answer.masses) + mass_here
     status: CheckStatus = "lost" if at_most <= 1.0 - index.config.accept else "unsure"
     status = "fine" if mass_here >= index.config.accept else status
     _, off_m, off_rad = apart[0] if apart else (None, None, None)

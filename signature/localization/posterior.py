@@ -195,6 +195,11 @@ def tail_of(query: QueryMap, fit: Fit, walls: Walls) -> tuple[float, ...]:
     return tuple(tail)
 
 
+def log_likelihood(fit: Fit) -> float:
+    """f + g of a fit: below 0 the two sides contradict each other, and where they share nothing, it is 0."""
+    return tempered(fit.known_agreement, fit.compared) + tempered(fit.backward, fit.looked_at)
+
+
 def tempered(agreement: float, points: float) -> float:
     """Log-likelihood of wall points that agree so well, tempered by their number."""
     return log_likelihood_ratio(agreement) * points / (points + POSTERIOR.few)

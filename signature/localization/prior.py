@@ -33,7 +33,8 @@ class PriorParameters:
     sigmas : the region of a normal distribution holds the positions within this Mahalanobis distance, 99 % of
         them (the root of the quantile of chi-square with two degrees of freedom), and the headings.
     drift, drift_rad_m : a region for an earlier time grows by this share of the way since, and turns by this
-        much a metre. Chosen by hand: the error of wheel odometry that is not calibrated well.
+        much a metre. Tracking without loops is off, in four real logs with true poses, by at most 2.9 % of
+        50 m and 2.0 % of 200 m, and by 0.07 and 0.03 degrees a metre.
     """
 
     sigmas: float = 3.035
