@@ -39,6 +39,11 @@ def test_two_clouds_of_a_room_are_laid_onto_each_other() -> None:
     assert found is not None
     assert math.hypot(found.x - T.x, found.y - T.y) < 0.02  # twice the noise
     assert found.yaw == pytest.approx(T.yaw, abs=0.01)
+    back = registered_clouds(target, room(closet=True, seed=1))
+    assert back is not None
+    again = back @ found
+    # The same candidates both ways; of two that differ by where ICP stopped, either may be the best.
+    assert (again.x, again.y, again.yaw) == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
 
 
 def test_a_room_that_fits_turned_round_tells_nothing() -> None:

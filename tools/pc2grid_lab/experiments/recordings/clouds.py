@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from pc2grid.arrays import F64
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.clouds.voxel_cloud import VoxelCloud
-from pc2grid.geometry import SE2, transform_points
+from pc2grid.geometry import SE2, invert_pose, transform_points
 from pc2grid.io import Log
 from pc2grid.model import Trajectory
 from pc2grid.sensor_model import SENSOR_MODELS
@@ -69,22 +69,41 @@ def cloud_along(log: Log, trajectory: Trajectory, p: RegisteredCloudsParameters 
 def registered_clouds(
     source: F64, target: F64, p: RegisteredCloudsParameters = REGISTERED_CLOUDS
 ) -> SE2 | None:
-    """T_target_source of two clouds (N, 3) and (M, 3) of one room, z up; None if it is not clear."""
+    """T_target_source of two clouds (N, 3) and (M, 3) of one room, z up; None if it is not clear.
+
+    Neither cloud is preferred: each is registered to the other one, as one of the two ways may end beside the
+    place, and a place counts by the points on surfaces of both (geometric mean).
+    """
+    from pc2grid.open3d_core import o3d
+
+    placed = [*_refined(source, target, p), *map(invert_pose, _refined(target, source, p))]
+    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in (source, target)]
+    found: list[tuple[float, SE2]] = []
+    for T in placed:
+        there, back = (
+            o3d.pipelines.registration.evaluate_registration(*pair, p.rounds_m[-1], pose).fitness
+            for pair, pose in ((clouds, T), (clouds[::-1], invert_pose(T)))
+        )
+        found.append((math.sqrt(there * back), SE2.from_matrix(T)))
+    share, best = max(found, key=lambda one: one[0])
+    rivals = [other for other, pose in found if not _same(pose, best, p)]
+    return best if max(rivals, default=0.0) < p.rival * share else None
+
+
+def _refined(source: F64, target: F64, p: RegisteredCloudsParameters) -> list[F64]:
+    """The poses (4, 4) at which a search ends, refined."""
     from pc2grid.open3d_core import o3d
 
     steps = o3d.pipelines.registration
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in (source, target)]
     clouds[1].estimate_normals()
-    found: list[tuple[float, SE2]] = []
+    poses = []
     for T in _starts(source, target, p):
         for reach_m in p.rounds_m:
             loss = steps.TransformationEstimationPointToPlane(steps.TukeyLoss(k=0.5 * reach_m))
-            fit = steps.registration_icp(*clouds, reach_m, T, loss)
-            T = fit.transformation
-        found.append((fit.fitness, SE2.from_matrix(T)))
-    share, best = max(found, key=lambda one: one[0])
-    rivals = [other for other, pose in found if not _same(pose, best, p)]
-    return best if max(rivals, default=0.0) < p.rival * share else None
+            T = steps.registration_icp(*clouds, reach_m, T, loss).transformation
+        poses.append(np.asarray(T, np.float64))
+    return poses
 
 
 def _starts(source: F64, target: F64, p: RegisteredCloudsParameters) -> list[F64]:
