@@ -22,8 +22,12 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def pc2grid(*arguments: object, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    return python("from pc2grid_cli.main import main; main()", *arguments, cwd=cwd, **environment)
+
+
+def python(code: str, *arguments: object, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *map(str, arguments)],
+        [sys.executable, "-c", code, *map(str, arguments)],
         cwd=cwd,
         capture_output=True,
         text=True,
@@ -292,7 +296,7 @@ def test_help_loads_nothing_heavy(tmp_path: Path) -> None:
 
 
 def after(code: str, *arguments: object, cwd: Path) -> list[str]:
-    """What `code` is at the end of a command, which is run in a process of its own, and at the end of that."""
+    """What `code` is at the end of a command, and then at the end of `main`, in a process of its own."""
     script = (
         "import gc, sys\nfrom pc2grid_cli import console\nfrom pc2grid_cli.main import main\n"
         "usual, run = gc.get_threshold(), console.Console.run\n"
@@ -302,11 +306,7 @@ def after(code: str, *arguments: object, cwd: Path) -> list[str]:
         "console.Console.run = run_and_tell\n"
         f"try: main()\nfinally: print({code}, file=sys.stderr)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script, "-q", *map(str, arguments)], capture_output=True, text=True, cwd=cwd,
-        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"},
-    )  # fmt: skip
-    return done.stderr.splitlines()[-2:]
+    return python(script, "-q", *arguments, cwd=cwd).stderr.splitlines()[-2:]
 
 
 # A test of a whole command each: importing a library takes up to a tenth of its time.

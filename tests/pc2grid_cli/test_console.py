@@ -232,52 +232,49 @@ def test_completion(shell: str) -> None:
     assert "relocalize" in done.stdout
 
 
-@pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
-def test_signal_during_an_extension_is_no_bug(number: str, code: int) -> None:
-    program = f"""
-import os, signal, sys
-from pc2grid_cli.console import Console
-
-def command():
-    try:
-        os.kill(os.getpid(), signal.{number})
-    except BaseException as stop:
-        raise SystemError("returned a result with an exception set") from stop
-
-sys.exit(Console().run(command))
-"""
+def run_until_stopped(command: str) -> subprocess.CompletedProcess[str]:
+    """A program of this one command, in a process that signals may stop."""
+    program = (
+        "import ctypes, os, signal, sys, time\nfrom pc2grid_cli.console import Console\n"
+        f"{command}\nsys.exit(Console().run(command))"
+    )
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"}
-    done = subprocess.run(
+    return subprocess.run(
         [sys.executable, "-c", program],
         capture_output=True,
         text=True,
         env=environment,
         preexec_fn=interruptible,
     )
+
+
+STOPPED = pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+
+
+@STOPPED
+def test_signal_during_an_extension_is_no_bug(number: str, code: int) -> None:
+    done = run_until_stopped(
+        f"""
+def command():
+    try:
+        os.kill(os.getpid(), signal.{number})
+    except BaseException as stop:
+        raise SystemError("returned a result with an exception set") from stop
+"""
+    )
     assert done.returncode == code, done.stderr
     assert "internal error" not in done.stderr
 
 
-@pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+@STOPPED
 def test_signal_during_a_callback_of_an_extension_ends_the_program(number: str, code: int) -> None:
     """Python drops what is raised there: without a second signal the program would sleep to its end."""
-    program = f"""
-import ctypes, os, signal, sys, time
-from pc2grid_cli.console import Console
-
+    done = run_until_stopped(
+        f"""
 def command():
     ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.{number}))()
     time.sleep(20.0)
-
-sys.exit(Console().run(command))
 """
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"}
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        env=environment,
-        preexec_fn=interruptible,
     )
     assert done.returncode == code, done.stderr
     assert "Exception ignored" not in done.stderr
