@@ -78,14 +78,27 @@ def test_every_method_finds_a_submap_itself(name: str, matchers: dict[str, Match
         assert scores[i] == pytest.approx(scores.max())
 
 
-@pytest.mark.parametrize("name", ["shape_context", "shape_rings", "point_contexts", "sdf", "proposed"])
-def test_methods_on_geometry_find_a_turned_submap(name: str, matchers: dict[str, Matcher]) -> None:
-    # Bags of words are not asked: the stairs of turned walls are the only features of rooms as bare as these.
-    found = []
-    for i, submap in enumerate(rooms()):
-        turned = rotated_submap(submap.grid, submap.center_m, 8.0, 0.7)
-        found.append(int(np.argmax(matchers[name].similarities(turned))) == i)
-    assert sum(found) >= 6
+# Bags of words are not asked: the stairs of turned walls are the only features of rooms as bare as these.
+ON_GEOMETRY = ["shape_context", "shape_rings", "point_contexts", "proposed", "sdf"]
+
+
+@pytest.mark.parametrize("name", ON_GEOMETRY)
+def test_methods_on_geometry_find_a_turned_submap(name: str) -> None:
+    submaps = [submap_of(random_rooms(seed)) for seed in range(8)]
+    assert found_turned(make_methods([name])[name].fit(submaps), submaps) == 8
+
+
+@pytest.mark.parametrize("name", ON_GEOMETRY[:-1])
+def test_methods_on_geometry_find_a_turned_bare_shape(name: str, matchers: dict[str, Matcher]) -> None:
+    """Without sdf: of a disc or a cross the curvature of the distance is the same along whole ridges, so that
+    the rounding of a processor decides where its keypoints are."""
+    assert found_turned(matchers[name], rooms()) >= 6
+
+
+def found_turned(matcher: Matcher, submaps: list[Submap]) -> int:
+    """How many submaps are the most similar to themselves after a turn."""
+    similarities = (matcher.similarities(rotated_submap(s.grid, s.center_m, 8.0, 0.7)) for s in submaps)
+    return sum(int(np.argmax(scores)) == i for i, scores in enumerate(similarities))
 
 
 @pytest.mark.parametrize("name", ALL)
