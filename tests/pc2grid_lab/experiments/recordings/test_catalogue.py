@@ -61,6 +61,12 @@ def test_only_names_recordings_buildings_sensors_and_kinds() -> None:
     assert not Catalogue.of(only="nothing").mapped
 
 
+def test_windows_begin_where_commands_are_told_to() -> None:
+    catalogue = Catalogue.of()
+    starts = [w.start_s for pair in catalogue.pairs for _, w in catalogue.windows(pair, 1000.0 / 3.0)]
+    assert all(start == float(f"{start:.3f}") for start in starts)
+
+
 def test_windows_of_a_later_part_come_after_the_map() -> None:
     catalogue = Catalogue.of(only="later part")
     for pair in catalogue.pairs:

@@ -6,7 +6,7 @@ recording: another recording is another row, and no other file changes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from typing import Literal
 
@@ -333,9 +333,13 @@ class Catalogue:
         )
 
     def windows(self, pair: Pair, length_s: float) -> list[tuple[int, TimeSpan]]:
-        """The windows of a pair with their numbers, in a recording of `length_s`."""
+        """The windows of a pair with their numbers, in a recording of `length_s`.
+
+        They begin at whole milliseconds, as commands are told: else the last scan might be another one.
+        """
         first_s, last_s = self.recordings[pair.query].span_s(length_s)
         if pair.map == pair.query and pair.until_s is not None:
             first_s = pair.until_s
-        numbered = list(enumerate(evenly_spaced(first_s, last_s, pair.windows, pair.window_s)))
+        spans = evenly_spaced(first_s, last_s, pair.windows, pair.window_s)
+        numbered = [(k, replace(span, start_s=round(span.start_s, 3))) for k, span in enumerate(spans)]
         return numbered[:: _QUICK_EVERY if self.quick else 1]
