@@ -23,10 +23,9 @@ def failing(content: Content) -> Iterator[int]:
 
 
 def test_items_before_an_error_arrive_and_the_error_names_the_recording() -> None:
-    found = []
+    found: list[int] = []
     with pytest.raises(LogCorrupt, match=r"a\.bag: damaged \(ValueError: a decoder") as raised:
-        for item in guarded_stream(Path("a.bag"), failing(Content())):
-            found.append(item)
+        found.extend(guarded_stream(Path("a.bag"), failing(Content())))
     assert found == [1]
     assert isinstance(raised.value.__cause__, ValueError)
 
