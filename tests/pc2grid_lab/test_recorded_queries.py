@@ -23,7 +23,7 @@ def test_each_question_says_what_tells_for_its_places() -> None:
     pair = next(pair for pair in catalogue.pairs if (pair.query, pair.map) == ("wean 1", "wean 2"))
     window = Window(pair, TimeSpan(0.0, 20.0), whole.map(), last.map(), {"office": end}, True)
     asked = list(
-        rows(window, building({"office": office()}), ("fr079", building({"other": OTHER})), catalogue)
+        rows(window, building({"office": office()}), {"fr079": building({"other": OTHER})}, catalogue)
     )
     assert [(row["place"], row["map"]) for row in asked] == [
         ("in the map", "wean"),

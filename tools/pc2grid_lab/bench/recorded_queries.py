@@ -1,11 +1,11 @@
 """The windows of `pc2grid compare recordings`, asked once more: what tells for each place that is found.
 
-    python -m pc2grid_lab.bench.recorded_queries DATA WORK OUT.json
+    python -m pc2grid_lab.bench.recorded_queries DATA WORK OUT.json [--everywhere]
 
 DATA is the folder of recordings, WORK the one in which `compare recordings` has kept its maps and answers.
-Each window is asked in its map and in that of another building; where the map knows its place, also with all
-that it sees there made unknown ("blanked"), and standing, by its last scan alone. `fit_posterior` fits the
-posterior to them; the rows are those of `real_queries`.
+Each window is asked in its map and in that of another building, with --everywhere in those of seven or eight;
+where the map knows its place, also with all that it sees there made unknown ("blanked"), and standing, by its
+last scan alone. `fit_posterior` fits the posterior to them; the rows are those of `real_queries`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ from signature.localization.query import Query, QueryMap
 from signature.localization.same_place import unseen_by
 
 OTHERS = ("fr079", "wean 2", "kidnap dec13 before", "workshop_1", "birmingham", "csail", "jarvis nav", "hall")
-"""Maps that the queries of other buildings are asked in, in turn."""
+"""Maps that the queries of other buildings are asked in, in turn or all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +73,9 @@ def windows(catalogue: Catalogue, folder: Folder) -> Iterator[Window]:
 
 
 def rows(
-    window: Window, index: MapIndex, other: tuple[str, MapIndex], catalogue: Catalogue
+    window: Window, index: MapIndex, others: Mapping[str, MapIndex], catalogue: Catalogue
 ) -> Iterator[dict[str, Any]]:
-    """What tells for the places of a window, asked in its map and in another one."""
+    """What tells for the places of a window, asked in its map and in those of other buildings, by name."""
     building = {name: r.building for name, r in catalogue.recordings.items()}
     row = {
         "log": building[window.pair.query],
@@ -88,8 +88,8 @@ def rows(
         "place": "in the map" if window.truth else "elsewhere",
     }
     yield row | _asked(index, window.whole, window.truth)
-    name, elsewhere = other
-    yield row | {"map": building[name], "place": "elsewhere"} | _asked(elsewhere, window.whole, {})
+    for name, elsewhere in others.items():
+        yield row | {"map": building[name], "place": "elsewhere"} | _asked(elsewhere, window.whole, {})
     if window.covered:
         yield row | {"travel_m": 0.0} | _asked(index, window.standing, window.truth)
         yield row | {"place": "blanked"} | _asked(_blanked(index, window), window.whole, window.truth)
@@ -126,6 +126,7 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--only", help="of these recordings, buildings or kinds of pairs only, a pattern")
+    parser.add_argument("--everywhere", action="store_true", help="ask in all other buildings, not in one")
     options = parser.parse_args()
     folder = Folder(options.data.resolve(), options.work.resolve())
     catalogue = Catalogue.of(only=options.only)
@@ -143,9 +144,9 @@ def main() -> None:
         others = [n for n in OTHERS if catalogue.recordings[n].building not in of and folder.map(n).exists()]
         if not others:
             raise SystemExit(f"{folder.work}: holds no map of another building")
-        name = others[number % len(others)]
-        asked = rows(window, index_of(window.pair.map_name), (name, index_of(name)), catalogue)
-        collected.extend(asked)
+        chosen = others if options.everywhere else [others[number % len(others)]]
+        indices = {name: index_of(name) for name in chosen}
+        collected.extend(rows(window, index_of(window.pair.map_name), indices, catalogue))
         options.out.write_text(json.dumps(collected))
         print(window.pair.query, "in", window.pair.map_name, f"{window.span.start_s:.1f} s", flush=True)
     for database, _ in opened.values():
