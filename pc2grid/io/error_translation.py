@@ -7,6 +7,7 @@ a user gets one.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TypeVar, cast
 
@@ -54,5 +55,6 @@ def guarded(path: Path, action: Callable[[], T], hint: str | None = None) -> T:
 def guarded_stream(path: Path, stream: Iterator[T], hint: str | None = None) -> Iterator[T]:
     """The same for an iterator; exceptions of its consumer do not pass through here."""
     end = object()
-    while (item := guarded(path, lambda: next(stream, end), hint)) is not end:
+    following = partial(next, stream, end)
+    while (item := guarded(path, following, hint)) is not end:
         yield cast("T", item)
