@@ -11,6 +11,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
 BoolGrid = NDArray[np.bool_]
 
 A = TypeVar("A", bound=NDArray[np.generic])

@@ -6,150 +6,215 @@ import math
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64, U8, BoolGrid
+from pc2grid.arrays import F32, F64, I64, U8, U16, BoolGrid
+from pc2grid.matching.likelihood_field import LIKELIHOOD
+from pc2grid.matching.window_search import BLOCK, SQUARE, TILE
 
-BLOCK_LEVELS = 7
-"""So many of the sliding maxima have block maxima; a step of heading moves points by less than the last."""
-LANES = 32
-"""Width of a row of sums: a multiple of a vector register, so that rows are added without a remainder."""
-
-
-@numba.njit(cache=True, nogil=True)
-def box_bounds(levels: U8, level: I64, points: F64, boxes: F64) -> I64:
-    """Twin of `window_search.plain_box_bounds`. The points are turned once for boxes of one heading that
-    follow each other."""
-    _, height, width = levels.shape
-    out = np.empty(len(boxes), np.int64)
-    turned_x, turned_y = np.empty(len(points)), np.empty(len(points))
-    for b in range(len(boxes)):
-        x, y, yaw = boxes[b, 0], boxes[b, 1], boxes[b, 2]
-        if b == 0 or yaw != boxes[b - 1, 2]:
-            c, s = math.cos(yaw), math.sin(yaw)
-            for p in range(len(points)):
-                turned_x[p] = c * points[p, 0] - s * points[p, 1]
-                turned_y[p] = s * points[p, 0] + c * points[p, 1]
-        total = 0
-        for p in range(len(points)):
-            j, i = np.int32(math.floor(turned_x[p] + x)), np.int32(math.floor(turned_y[p] + y))
-            total += levels[level[p], min(max(i, 0), height - 1), min(max(j, 0), width - 1)]
-        out[b] = total
-    return out
+_ROWS, _COLUMNS = TILE
+_NEUTRAL = LIKELIHOOD.neutral_value
 
 
 @numba.njit(cache=True, nogil=True)
-def _sum_windows(flat: U8, corners: I64, width: int, base: int, sums: NDArray[np.uint16]) -> int:
-    """Set sums (side, LANES n) to `base` and the windows of images `width` cells wide whose first cells are
-    `corners` in `flat`. Returns the flat index of the highest among the first `side` sums of each row."""
-    side, wide = sums.shape
-    top, at = -1, 0
-    for r in range(side):
-        row = sums[r]
-        for k in range(wide):
-            row[k] = base
-        for p in range(len(corners)):
-            first = corners[p] + r * width
-            window = flat[first : first + wide]
-            for k in range(wide):
-                row[k] += window[k]
-        for k in range(side):
-            if row[k] > top:
-                top, at = row[k], r * side + k
-    return at
+def _turn(points: F64, yaw: float, turned: F64) -> None:
+    """Set `turned` (2, N), rows y and x, to the points turned by `yaw`."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    for p in range(len(points)):
+        turned[0, p] = s * points[p, 0] + c * points[p, 1]
+        turned[1, p] = c * points[p, 0] - s * points[p, 1]
 
 
 @numba.njit(cache=True, nogil=True)
-def _best_in_block(flat: U8, at: I64, width: int, down: int, right: int, last: int) -> tuple[int, int, int]:
-    """The highest sum over the cells `at` (N,) in `flat`, moved by `down` and `right` or one cell further,
-    but by no more than `last`; and how far they are moved there."""
-    s00, s01, s10, s11 = 0, 0, 0, 0
-    move = down * width + right
+def _place(
+    turned: F64, level: I64, down: float, right: float, shape: tuple[int, int], corner: I64, at: I64
+) -> tuple[int, int]:
+    """Where the points are looked up if the pose lies `down` and `right` of the corner of its square.
+
+    Sets the first of `at` to the places for the first square of the tile at `corner`, in all images flat.
+    Returns their number, and the sum of the others: they lie beyond the map for all squares of the tile, or
+    have no level.
+    """
+    height, width = shape
+    count, rest = 0, 0
+    for p in range(turned.shape[1]):
+        if level[p] < 0:
+            rest += 255
+            continue
+        i, j = math.floor(turned[0, p] + down), math.floor(turned[1, p] + right)
+        row, column = corner[0] + i // SQUARE + _ROWS, corner[1] + j // SQUARE + _COLUMNS
+        if row < 0 or column < 0 or row > height - _ROWS or column > width - _COLUMNS:
+            rest += _NEUTRAL
+            continue
+        image = (level[p] * SQUARE + i % SQUARE) * SQUARE + j % SQUARE
+        at[count] = (image * height + row) * width + column
+        count += 1
+    return count, rest
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_tile(flat: U8, at: I64, rest: int, width: int, inside: U16, sums: U16) -> int:
+    """Set `sums` (TILE) to those of a tile, 0 where nothing is `inside`; returns the highest."""
+    top = 0
+    sums[:] = rest
     for p in range(len(at)):
-        k = at[p] + move
-        s00 += flat[k]
-        s01 += flat[k + 1]
-        s10 += flat[k + width]
-        s11 += flat[k + width + 1]
-    best, i, j = s00, down, right
-    if right < last and s01 > best:
-        best, j = s01, right + 1
-    if down < last and s10 > best:
-        best, i, j = s10, down + 1, right
-    if right < last and down < last and s11 > best:
-        best, i, j = s11, down + 1, right + 1
-    return best, i, j
+        for r in range(_ROWS):
+            first = at[p] + r * width
+            window, row = flat[first : first + _COLUMNS], sums[r]
+            for k in range(_COLUMNS):
+                row[k] += window[k]
+    for r in range(_ROWS):
+        for k in range(_COLUMNS):
+            sums[r, k] &= inside[r, k]
+            top = max(top, sums[r, k])
+    return top
 
 
 @numba.njit(cache=True, nogil=True)
-def best_of_boxes(
-    levels: U8,
-    blocks: U8,
+def _sum(flat: U8, at: I64, rest: int, move: int) -> int:
+    """The sum for one square of a tile, `move` behind the first in all images flat."""
+    total = rest
+    for p in range(len(at)):
+        total += flat[at[p] + move]
+    return total
+
+
+_HALF = SQUARE // 2
+_PARTS = 1 + 4 + SQUARE * SQUARE
+"""Parts of a square: all of it, its quarters, and the cells, those of one quarter after the other."""
+
+
+@numba.njit(cache=True, nogil=True)
+def _place_parts(
+    turned: F64, levels: I64, shape: tuple[int, int], corner: I64, at: I64, counted: I64
+) -> None:
+    """Set `at` (_PARTS, N) and `counted` (_PARTS, 2) to what `_place` says of each part of a square."""
+    counted[0] = _place(turned, levels[1], _HALF, _HALF, shape, corner, at[0])
+    for q in range(4):
+        down, right = q // 2 * _HALF, q % 2 * _HALF
+        middle = 0.5 * _HALF
+        counted[1 + q] = _place(turned, levels[2], down + middle, right + middle, shape, corner, at[1 + q])
+        for c in range(_HALF**2):
+            part = 5 + q * _HALF**2 + c
+            i, j = down + c // _HALF, right + c % _HALF
+            counted[part] = _place(turned, levels[3], i + 0.5, j + 0.5, shape, corner, at[part])
+
+
+@numba.njit(cache=True, nogil=True)
+def _best_cell(flat: U8, at: I64, counted: I64, move: int, least: float) -> tuple[int, int]:
+    """The highest sum of a cell of a square, and its part; -1 where it is below `least`."""
+    best, part = -1, 0
+    if _sum(flat, at[0, : counted[0, 0]], counted[0, 1], move) < least:
+        return best, part
+    for q in range(4):
+        if _sum(flat, at[1 + q, : counted[1 + q, 0]], counted[1 + q, 1], move) < least:
+            continue
+        for c in range(5 + q * _HALF**2, 5 + (q + 1) * _HALF**2):
+            total = _sum(flat, at[c, : counted[c, 0]], counted[c, 1], move)
+            if total >= least and total > best:
+                best, part = total, c
+    return best, part
+
+
+@numba.njit(cache=True, nogil=True)
+def _best_in_block(
+    flat: U8, width: int, at: I64, counted: I64, sums: U16, down: int, right: int, least: float
+) -> tuple[int, int, int, int]:
+    """The highest sum in the block of squares at `down`, `right` of a tile, -1 where it is below `least`; and
+    where it is: square, half of the heading, part. at, counted : of both halves of the heading."""
+    best, best_square, best_side, best_part = -1, 0, 0, 0
+    # The most promising square first: what it reaches excludes most of the others.
+    first = int(sums[down : down + BLOCK, right : right + BLOCK].argmax())
+    for visit in range(BLOCK**2):
+        square = (first + visit) % BLOCK**2
+        r, c = down + square // BLOCK, right + square % BLOCK
+        for side in range(2):
+            needed = max(least, best + 1.0)
+            if sums[r, c] >= needed:
+                total, part = _best_cell(flat, at[side], counted[side], r * width + c, needed)
+                if total > best:
+                    best, best_square, best_side, best_part = total, r * _COLUMNS + c, side, part
+    return best, best_square, best_side, best_part
+
+
+@numba.njit(cache=True, nogil=True)
+def tile_bounds(
+    flat: U8,
     shape: tuple[int, int],
-    point_levels: I64,
+    level: I64,
     points: F64,
-    boxes: F64,
-    bounds: I64,
-    half: int,
+    corner: I64,
+    yaw_rad: F64,
+    inside: U16,
     turns: F64,
+) -> I64:
+    """Twin of `window_search.plain_tile_bounds`. flat, shape : images, and the size of one; then the parts of
+    `Tiles`."""
+    bounds = np.empty((len(corner), len(turns)), np.int64)
+    turned, at = np.empty((2, len(points))), np.empty(len(points), np.int64)
+    sums = np.empty((_ROWS, _COLUMNS), np.uint16)
+    middle = 0.5 * SQUARE
+    for t in range(len(corner)):
+        for k in range(len(turns)):
+            _turn(points, yaw_rad[t] + turns[k], turned)
+            count, rest = _place(turned, level, middle, middle, shape, corner[t], at)
+            bounds[t, k] = _sum_tile(flat, at[:count], rest, shape[1], inside[t], sums)
+    return bounds
+
+
+@numba.njit(cache=True, nogil=True)
+def best_in_tiles(
+    flat: U8,
+    shape: tuple[int, int],
+    levels: I64,
+    points: F64,
+    corners: I64,
+    yaws: F64,
+    inside: U16,
+    tile: I64,
+    bounds: I64,
+    half_a_rad: float,
     floor: float,
     keep: float,
 ) -> F64:
-    """Twin of `window_search.plain_best_of_boxes`.
+    """Twin of `window_search.plain_best_in_tiles`, without blocks that do not reach `floor` or the share
+    `keep` of the best so far.
 
-    levels, blocks : those of a `SearchMap` of `shape` (H, W), flat. point_levels : (N, 2) for each point the
-    sliding maximum that it is scored by, and the one in `blocks` that bounds it, or -1. half : even.
+    corners, yaws, tile, bounds : (B,) each tile at each heading, the highest bound first. tile : its number
+    in `inside`.
     """
-    height, width = shape
-    n, side, full = len(points), half + 1, 255.0 * len(points)
-    across = width >> 1
-    stride = (height >> 1) * across + LANES
-    sums = np.empty((len(turns), side, -(-side // LANES) * LANES), np.uint16)
-    cells, corners = np.empty((len(turns), n), np.int64), np.empty(n, np.int64)
-    best = np.empty((len(boxes), 4))
-    least = floor
-    for b in range(len(boxes)):
-        x, y, yaw = boxes[b, 0], boxes[b, 1], boxes[b, 2]
-        best[b, 3] = -1.0
+    n, full, width = len(points), 255.0 * len(points), shape[1]
+    turned, sums = np.empty((2, n)), np.empty((_ROWS, _COLUMNS), np.uint16)
+    at, counted = np.empty((2, _PARTS, n), np.int64), np.empty((2, _PARTS, 2), np.int64)
+    found, number = np.empty((64, 4)), 0
+    least = max(floor, 1.0 / full)
+    for b in range(len(bounds)):
         if bounds[b] < full * least:
-            continue
-        top, top_t, top_at = -1, 0, 0
-        for t in range(len(turns)):
-            c, s = math.cos(yaw + turns[t]), math.sin(yaw + turns[t])
-            count, base = 0, 0
-            for p in range(n):
-                j = math.floor(c * points[p, 0] - s * points[p, 1] + x)
-                i = math.floor(s * points[p, 0] + c * points[p, 1] + y)
-                i = min(max(i, half), height - half - 2)
-                j = min(max(j, half), width - half - 2)
-                cells[t, p] = (point_levels[p, 0] * height + i) * width + j
-                image = point_levels[p, 1]
-                if image >= 0:
-                    corners[count] = image * stride + ((i - half) >> 1) * across + ((j - half) >> 1)
-                    count += 1
-                else:
-                    base += 255
-            at = _sum_windows(blocks, corners[:count], across, base, sums[t])
-            if sums[t, at // side, at % side] > top:
-                top, top_t, top_at = sums[t, at // side, at % side], t, at
-        # The most promising block first: what it reaches excludes most of the others.
-        down, right = 2 * (top_at // side) - half, 2 * (top_at % side) - half
-        reached, down, right = _best_in_block(levels, cells[top_t], width, down, right, half)
-        best_t, best_i, best_j = top_t, down, right
-        for t in range(len(turns)):
-            for i in range(side):
-                for j in range(side):
-                    if sums[t, i, j] <= reached or sums[t, i, j] < full * least:
-                        continue
-                    total, down, right = _best_in_block(
-                        levels, cells[t], width, 2 * i - half, 2 * j - half, half
-                    )
-                    if total > reached:
-                        reached, best_t, best_i, best_j = total, t, down, right
-        best[b, 0], best[b, 1], best[b, 2] = x + best_j, y + best_i, yaw + turns[best_t]
-        best[b, 3] = reached / full
-        least = max(least, keep * best[b, 3])
-    return best
+            break
+        here, yaw = corners[b], yaws[b]
+        _turn(points, yaw, turned)
+        count, rest = _place(turned, levels[0], _HALF, _HALF, shape, here, at[0, 0])
+        _sum_tile(flat, at[0, 0, :count], rest, width, inside[tile[b]], sums)
+        for side in range(2):
+            _turn(points, yaw + (side - 0.5) * half_a_rad, turned)
+            _place_parts(turned, levels, shape, here, at[side], counted[side])
+        for block in range(_ROWS * _COLUMNS // BLOCK**2):
+            down, right = block // (_COLUMNS // BLOCK) * BLOCK, block % (_COLUMNS // BLOCK) * BLOCK
+            best, square, side, part = _best_in_block(
+                flat, width, at, counted, sums, down, right, full * least
+            )
+            if best < 0:
+                continue
+            if number == len(found):
+                found = np.concatenate((found, np.empty_like(found)))
+            quarter, cell = (part - 5) // _HALF**2, (part - 5) % _HALF**2
+            i, j = quarter // 2 * _HALF + cell // _HALF, quarter % 2 * _HALF + cell % _HALF
+            found[number, 0] = (here[1] + square % _COLUMNS) * SQUARE + j + 0.5
+            found[number, 1] = (here[0] + square // _COLUMNS) * SQUARE + i + 0.5
+            found[number, 2] = yaw + (side - 0.5) * half_a_rad
+            found[number, 3] = best / full
+            number += 1
+            least = max(least, keep * best / full)
+    return found[:number]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -128,16 +128,12 @@ def search_whole_map(
     one of them.
     """
     center = (query.T_odom_base.x, query.T_odom_base.y)
-    count = math.ceil(math.pi / HYPOTHESES.half_a_rad)
-    half_a_rad = math.pi / count
-    yaws = np.arange(count) * 2.0 * half_a_rad
-    boxes = np.column_stack((np.tile(free_xy_m, (count, 1)), np.repeat(yaws, len(free_xy_m))))
     poses = search_windows(
         target,
         _searched(query, target, center),
-        boxes,
+        np.insert(free_xy_m, 2, 0.0, axis=1),
         half_t_m=0.5 * HYPOTHESES.square_m,
-        half_a_rad=half_a_rad,
+        half_a_rad=math.pi,
         parameters=SearchParameters(
             floor=config.coarse_floor, keep=config.coarse_keep, most=config.hypotheses
         ),

@@ -12,23 +12,27 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from pc2grid.geometry import SE2
-from pc2grid.matching._kernels import best_of_boxes, box_bounds
+from pc2grid.matching._kernels import best_in_tiles, tile_bounds
 from pc2grid.matching.likelihood_field import LIKELIHOOD
 from pc2grid.matching.refinement import refine
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import (
+    BLOCK,
     MARGIN_M,
     MOST_POINTS,
     REACHES_M,
+    SQUARE,
+    TILE,
     SearchMap,
     SearchParameters,
+    Tiles,
     headings,
-    levels_for,
-    plain_best_of_boxes,
-    plain_box_bounds,
+    levels_of,
+    plain_best_in_tiles,
+    plain_sums,
+    plain_tile_bounds,
     search_windows,
-    with_blocks,
 )
 from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
 from tests.helpers.simulated_drives import office, office_part
@@ -39,17 +43,24 @@ STEP = math.radians(2.0)
 ALL = {"floor": 0.0, "keep": 0.0}
 
 
+def image(target: SearchMap, level: int) -> np.ndarray:
+    """A sliding maximum as cells (H, W), put together from its images."""
+    rows, columns = (slice(n, -n) for n in TILE)
+    inner = target.images[level][..., rows, columns]
+    _, _, height, width = inner.shape
+    return inner.transpose(2, 0, 3, 1).reshape(height * SQUARE, width * SQUARE)
+
+
 def score(points: np.ndarray, pose: np.ndarray, level: np.ndarray) -> float:
     """Mean of sliding maxima `level` (N,) at points (N, 2) m moved by x, y, yaw."""
     cells = np.array([*(pose[:2] - FIELD.origin_m) / FIELD.resolution_m, pose[2]])
-    total = plain_box_bounds(MAP.levels, level, points.astype(float) / FIELD.resolution_m, cells[None])[0]
+    total = plain_sums(MAP.images, level, points.astype(float) / FIELD.resolution_m, cells[None])[0]
     return float(total / (255.0 * len(points)))
 
 
-def levels_of(points: np.ndarray, step_rad: float) -> np.ndarray:
+def of_cells(points: np.ndarray, step_rad: float) -> np.ndarray:
     """The sliding maxima for half a cell and half a step of heading."""
-    distance = np.hypot(*points.T) / FIELD.resolution_m
-    return levels_for(0.5 + distance * 0.5 * step_rad, FIELD.resolution_m)
+    return levels_of(points / FIELD.resolution_m, step_rad, MAP)[3]
 
 
 def seen_from(truth: np.ndarray, walls: np.ndarray) -> np.ndarray:
@@ -64,10 +75,11 @@ def test_a_level_is_the_maximum_within_its_reach(resolution_m: float) -> None:
     cells = np.full((90, 120), FREE, np.int8)
     cells[np.random.default_rng(3).random(cells.shape) < 0.01] = OCCUPIED
     found = SearchMap.of(OccupancyGrid(cells=cells, resolution_m=resolution_m, origin_m=(0.0, 0.0)))
-    for level, reach_m in zip(found.levels, REACHES_M, strict=True):
+    height, width = found.field.values.shape
+    for level, reach_m in enumerate(REACHES_M):
         side = 2 * math.ceil(reach_m / resolution_m - 1e-6) + 1
         expected = ndimage.maximum_filter(found.field.values, side, mode="nearest")
-        assert np.array_equal(level, expected)
+        assert np.array_equal(image(found, level)[:height, :width], expected)
 
 
 @settings(max_examples=8, deadline=None)
@@ -82,17 +94,20 @@ def test_the_best_pose_is_the_best_of_all_in_the_box(seed: int, corner: bool) ->
         points,
         start,
         half_t_m=0.2,
-        half_a_rad=3 * STEP / 2,
+        half_a_rad=2 * STEP,
         parameters=SearchParameters(step_rad=STEP, **ALL),
     )
-    steps, turns = FIELD.resolution_m * np.arange(-4, 5), STEP * np.arange(-1, 2)
+    # The box has two headings, each of two halves.
+    steps, turns = FIELD.resolution_m * np.arange(-4, 5), STEP * np.arange(-1.5, 2)
     poses = start[0] + np.array([(dx, dy, da) for dx in steps for dy in steps for da in turns])
-    level = levels_of(points, STEP)
+    level = of_cells(points, STEP)
     everywhere = [score(points, pose, level) for pose in poses]
-    # A coordinate on the border of two cells may be rounded either way.
-    assert found[0, 3] == pytest.approx(max(everywhere), abs=0.02)
+    # A coordinate on the border of two cells may be rounded either way; and the squares of the lattice that
+    # the box touches reach over its edge.
+    assert max(everywhere) - 0.02 <= found[0, 3]
     assert score(points, found[0, :3], level) == pytest.approx(found[0, 3], abs=0.02)
-    within = start[0] + rng.uniform(-1, 1, (200, 3)) * (0.2, 0.2, 3 * STEP / 2)
+    assert np.abs(found[0, :2] - start[0, :2]).max() <= 0.2 + SQUARE * FIELD.resolution_m
+    within = start[0] + rng.uniform(-1, 1, (200, 3)) * (0.2, 0.2, 2 * STEP)
     exact = np.zeros(len(points), int)
     assert max(score(points, pose, exact) for pose in within) <= found[0, 3] + 0.02
 
@@ -212,61 +227,102 @@ def test_leaving_out_what_would_not_be_reported_changes_nothing(seed: int, half_
 
 
 def test_points_so_far_away_that_no_maximum_covers_them() -> None:
-    """Half a heading moves them further than any sliding maximum looks, and they may be on a wall."""
+    """Half a heading moves them farther than any sliding maximum looks, and they may be on a wall."""
     rng, half_a_rad = np.random.default_rng(5), math.radians(10.0)
     angles, far = rng.uniform(-math.pi, math.pi, 24), rng.uniform(1, 20, 24)
     points = np.column_stack((far * np.cos(angles), far * np.sin(angles))).astype(np.float32)
     starts = np.array([(10.02, 7.03, 0.2 + turn * 2 * half_a_rad) for turn in (-1, 0, 1)])
-    coarse = SearchParameters(step_rad=2 * half_a_rad, **ALL)
+    coarse = SearchParameters(step_rad=half_a_rad, **ALL)
     found = search_windows(MAP, points, starts, half_t_m=0.2, half_a_rad=half_a_rad, parameters=coarse)
-    level = levels_of(points, 2 * half_a_rad)
-    assert level.max() == len(REACHES_M) - 1
-    steps = FIELD.resolution_m * np.arange(-4, 5)
-    poses = [start + np.array((dx, dy, 0.0)) for start in starts for dx in steps for dy in steps]
+    level = levels_of(points / FIELD.resolution_m, half_a_rad, MAP)[3]
+    uncovered = far * 0.5 * half_a_rad > REACHES_M[-1]
+    assert np.array_equal(level < 0, uncovered) and 0 < np.count_nonzero(uncovered) < 24
+    steps, sides = FIELD.resolution_m * np.arange(-4, 5), half_a_rad * np.array((-0.5, 0.5))
+    poses = [
+        start + np.array((dx, dy, da)) for start in starts for dx in steps for dy in steps for da in sides
+    ]
     scores = [score(points, pose, level) for pose in poses]
-    # A coordinate on the border of two cells may be rounded either way.
-    assert found[0, 3] == pytest.approx(max(scores), abs=0.02)
+    assert max(scores) - 0.02 <= found[0, 3]
+    assert score(points, found[0, :3], level) == pytest.approx(found[0, 3], abs=0.02)
     assert max(scores) - np.median(scores) > 0.05
+
+
+def boxes_around(rng: np.random.Generator, inside: bool) -> np.ndarray:
+    """Boxes (6, 3) in cells: within the map, or over its edge and beyond; two of them have one heading."""
+    height, width = FIELD.values.shape
+    low, high = ((60, 60), (width - 60, height - 60)) if inside else ((-40, -40), (width + 40, 60))
+    yaws = rng.uniform(-3, 3, 5)
+    return np.column_stack((rng.uniform(low, high, (6, 2)), [*yaws, yaws[0]]))
 
 
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 10_000), inside=st.booleans())
 def test_the_compiled_functions_are_the_plain_ones(seed: int, inside: bool) -> None:
     rng = np.random.default_rng(seed)
-    _, height, width = MAP.levels.shape
     points = rng.uniform(-60, 60, (25, 2))
-    low, high = ((100, 100), (width - 100, height - 100)) if inside else ((-40, -40), (width + 40, 60))
-    boxes = np.column_stack((rng.uniform(low, high, (6, 2)), rng.uniform(-3, 3, 6)))
-    level, half = rng.integers(0, 5, 25), 4
-    bounds = box_bounds(MAP.levels, level, points, boxes)
-    assert np.array_equal(bounds, plain_box_bounds(MAP.levels, level, points, boxes))
-    turns = headings(0.05, 0.03)
-    unbounded = np.full(6, 255 * 25)
-    prepared = MAP.levels.reshape(-1), MAP.blocks.reshape(-1), FIELD.values.shape
-    levels = with_blocks(level, FIELD.resolution_m)
-    fast = best_of_boxes(*prepared, levels, points, boxes, unbounded, half, turns, 0.0, 0.0)
-    slow = plain_best_of_boxes(MAP.levels, level, points, boxes, half, turns)
-    assert fast[:, 3] == pytest.approx(slow[:, 3], abs=1e-12)
-    again = [box_bounds(MAP.levels, level, points, pose[None, :3])[0] for pose in fast]
-    assert np.array(again) / (255.0 * 25) == pytest.approx(slow[:, 3], abs=1e-12)
+    tiles, turns, half_a_rad = Tiles.of(boxes_around(rng, inside), 5.0), headings(0.05, 0.06), 0.025
+    levels = np.vstack([rng.integers(3 - k, 6 - k, 25) for k in range(4)])
+    levels[:, 0] = -1
+    flat = MAP.images.reshape(-1), MAP.images.shape[-2:]
+    bounds = tile_bounds(*flat, levels[0], points, tiles.corner, tiles.yaw_rad, tiles.inside, turns)
+    assert np.array_equal(bounds, plain_tile_bounds(MAP.images, levels[0], points, tiles, turns))
+    # What has no bound is scored everywhere, as in the plain form.
+    tile, turn = (index.ravel() for index in np.indices(bounds.shape))
+    unbounded = np.vstack([np.full((3, 25), -1), levels[3:]])
+    every = np.full(bounds.size, 255 * 25)
+    at = tiles.corner[tile], tiles.yaw_rad[tile] + turns[turn], tiles.inside, tile, every
+    fast = best_in_tiles(*flat, unbounded, points, *at, half_a_rad, 0.0, 0.0)
+    slow = plain_best_in_tiles(MAP.images, levels[3], points, tiles, turns, half_a_rad)
+    assert np.sort(fast[:, 3]) == pytest.approx(np.sort(slow[:, 3]), abs=1e-12)
+    again = plain_sums(MAP.images, levels[3], points, fast[:, :3])
+    assert again / (255.0 * 25) == pytest.approx(fast[:, 3], abs=1e-12)
 
 
-def test_no_pose_of_a_box_exceeds_its_bound() -> None:
-    rng = np.random.default_rng(3)
-    points = rng.uniform(-120, 120, (50, 2))
-    box = np.array([[250.0, 200.0, 0.4]])
-    half_t, half_a = 8.0, math.radians(8.0)
-    level = levels_for(half_t + np.hypot(*points.T) * half_a, FIELD.resolution_m)
-    bound = box_bounds(MAP.levels, level, points, box)[0]
-    poses = box + rng.uniform(-1, 1, (300, 3)) * (half_t, half_t, half_a)
-    scores = box_bounds(MAP.levels, np.zeros(50, np.int64), points, poses)
-    assert scores.max() <= bound < 255 * 50
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_no_pose_of_a_square_exceeds_its_bound(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, half_a = rng.uniform(-120, 120, (50, 2)), math.radians(1.7)
+    level = levels_of(points, half_a, MAP)
+    square = np.array([[250.0, 200.0, 0.4]])
+    found = [plain_sums(MAP.images, level[0], points, square)[0]]
+    # Its half, a quarter of that and a cell in it: each is bounded by the one before.
+    for part, (at, turn) in enumerate((((0.0, 0.0), 0.5), ((-1.0, 1.0), 0.5), ((-0.5, 1.5), 0.5)), start=1):
+        pose = square + np.array((*at, turn * half_a))
+        found.append(plain_sums(MAP.images, level[part], points, pose)[0])
+        assert found[part] - 0.01 * 255 * 50 <= found[part - 1] < 255 * 50  # half a cell is neglected
+    poses = square + rng.uniform(-1, 1, (300, 3)) * (0.5 * SQUARE, 0.5 * SQUARE, half_a)
+    assert plain_sums(MAP.images, np.zeros(50, np.int64), points, poses).max() <= found[0]
+
+
+def test_tiles_hold_each_square_that_a_box_touches_once() -> None:
+    boxes = np.array([(10.0, 10.0, 0.5), (14.0, 10.0, 0.5), (600.0, -3.0, 0.5), (10.0, 10.0, 2.0)])
+    tiles = Tiles.of(boxes, 8.0)
+    assert set(tiles.inside.ravel().tolist()) == {0, 65535}
+    expected = {
+        (yaw, row, column)
+        for x, y, yaw in boxes.tolist()
+        for row in range(math.floor((y - 8) / SQUARE), math.ceil((y + 8) / SQUARE))
+        for column in range(math.floor((x - 8) / SQUARE), math.ceil((x + 8) / SQUARE))
+    }
+    found = [
+        (yaw, *(corner + square).tolist())
+        for corner, yaw, inside in zip(tiles.corner, tiles.yaw_rad.tolist(), tiles.inside, strict=True)
+        for square in np.argwhere(inside)
+    ]
+    assert len(found) == len(set(found)) and set(found) == expected
+
+
+def test_a_tile_is_made_of_whole_blocks() -> None:
+    assert all(side % BLOCK == 0 for side in TILE)
 
 
 def test_the_edge_of_the_margin_is_neutral_on_all_levels() -> None:
-    """So that points farther outside may be taken to lie on it, with a window of a box around them."""
-    wide = round((MARGIN_M - REACHES_M[-1] - 0.4) / FIELD.resolution_m)
+    """So that points farther outside may be taken to lie on it."""
+    blurred_m = 2.0 * LIKELIHOOD.sigma_m
+    wide = round((MARGIN_M - REACHES_M[-1] - blurred_m) / FIELD.resolution_m)
     assert wide * FIELD.resolution_m >= 0.9
-    edge = np.ones(MAP.levels.shape[1:], bool)
-    edge[wide:-wide, wide:-wide] = False
-    assert (MAP.levels[:, edge] == LIKELIHOOD.neutral_value).all()
+    for level in range(len(REACHES_M)):
+        edge = image(MAP, level)
+        edge[wide:-wide, wide:-wide] = LIKELIHOOD.neutral_value
+        assert (edge == LIKELIHOOD.neutral_value).all()

@@ -22,7 +22,7 @@ from pc2grid_lab.baselines.method import Matcher
 from pc2grid_lab.baselines.proposed import Proposed
 from signature.config import SignatureConfig
 
-_HALF_T_M, _HALF_A_RAD = 0.5, math.radians(7.5)
+_HALF_T_M = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class _Verifier:
                 coarse,
                 self._boxes(self.centers_m[index]),
                 half_t_m=_HALF_T_M,
-                half_a_rad=_HALF_A_RAD,
+                half_a_rad=math.pi,
                 parameters=SearchParameters(floor=max(0.4, 0.9 * best), keep=0.95, most=2),
             )
             for x, y, yaw, score in poses:
@@ -90,6 +90,5 @@ class _Verifier:
 
     def _boxes(self, center_m: F64) -> F64:
         steps = np.arange(-self.reach_m + _HALF_T_M, self.reach_m, 2 * _HALF_T_M)
-        yaws = np.arange(-math.pi, math.pi, 2 * _HALF_A_RAD) + _HALF_A_RAD
-        x, y, yaw = np.meshgrid(center_m[0] + steps, center_m[1] + steps, yaws, indexing="ij")
+        x, y, yaw = np.meshgrid(center_m[0] + steps, center_m[1] + steps, 0.0, indexing="ij")
         return np.column_stack((x.ravel(), y.ravel(), yaw.ravel()))

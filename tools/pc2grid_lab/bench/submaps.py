@@ -125,11 +125,9 @@ def _queries(
 
 
 def _exact(field: SearchMap, query: QueryMap, points: F32, at: tuple[float, float]) -> Fit | None:
-    steps, turns = 0.75 * np.arange(4) - 1.125, np.radians(15.0) * np.arange(24)
-    starts = np.array([(at[0] + dx, at[1] + dy, yaw) for dx in steps for dy in steps for yaw in turns])
-    found = search_windows(
-        field, points, starts, half_t_m=0.375, half_a_rad=math.radians(7.5), parameters=_ONE
-    )
+    steps = 0.75 * np.arange(4) - 1.125
+    starts = np.array([(at[0] + dx, at[1] + dy, 0.0) for dx in steps for dy in steps])
+    found = search_windows(field, points, starts, half_t_m=0.375, half_a_rad=math.pi, parameters=_ONE)
     return _fit(field, query, found)
 
 
