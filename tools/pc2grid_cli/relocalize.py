@@ -191,6 +191,7 @@ def relocalize_command(
         stated = answer_in_building(found.answer, frames)
         _print(found, stated, where, left_out, map_sigma_m(found.answer, opened), as_json=json)
         _write(outputs, opened, found, stated, located, settings)
+        _warn_of_missing_points(found, opened)
     if located is None:
         for path in outputs.of_answer():
             console.warn(f"{path}: not written, there is no answer to put into it")
@@ -379,6 +380,19 @@ def _warn_of_prior(answer: Answer) -> None:
     console.warn(
         f"a place that --near excludes {how}: {where}, confidence {probability(excluded.confidence)}"
     )
+
+
+def _warn_of_missing_points(found: Found, database: SubmapDatabase) -> None:
+    """Say what would tell more, where an answer is not certain and points in space were not kept."""
+    in_space = {"lidar", "depth"}
+    if found.answer.status == "located" or found.about["sensor"] not in in_space:
+        return
+    infos = [info for info in database.sessions() if info.sensor in in_space]
+    if infos and not any(info.provenance.config.projection.points_voxel_m for info in infos):
+        console.warn(
+            "the map keeps no points in space; `pc2grid convert --points 0.05` keeps them: what the sensor"
+            " sees above and below the plane of the map then tells places apart, too"
+        )
 
 
 def as_text(answer: Answer, *, is_map: bool = False) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,12 @@ from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import Health, PointMap
 from signature.localization.answer import Verdict
 from signature.localization.hypotheses import Hypothesis
-from signature.localization.in_space import settle_in_space
+from signature.localization.in_space import (
+    SPACE,
+    agreement_in_space,
+    masses_in_space,
+    settle_in_space,
+)
 from signature.localization.posterior import NO_EVIDENCE
 from signature.localization.query import QueryInSpace
 from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, furnished_map, twin_map
@@ -87,7 +93,8 @@ def test_equal_twins_stay_ambiguous(points: PointMap) -> None:
     """Both hypotheses in the same room, which is taken for two places."""
     query, verdict = ask(HEIGHTS_M[0], 0.0, 0.0)
     settled, in_space = settle_in_space(verdict, query, lambda _: points, accept=0.9)
-    assert settled is verdict and in_space is None
+    assert settled.status == "ambiguous" and in_space is None
+    assert settled.masses == pytest.approx((0.5, 0.5), abs=0.01)
 
 
 def test_furniture_does_not_tell_twins_apart() -> None:
@@ -98,15 +105,16 @@ def test_furniture_does_not_tell_twins_apart() -> None:
     assert fits[0] is not None and fits[1] is not None
     assert fits[1].on - fits[0].on > 0.05
     assert fits[1].compared.patches_over(fits[0].compared) == 0
-    assert settle_in_space(verdict, query, lambda _: points, accept=0.9)[0] is verdict
+    settled, _ = settle_in_space(verdict, query, lambda _: points, accept=0.9)
+    assert settled.status == "ambiguous" and settled.masses == pytest.approx((0.5, 0.5), abs=0.01)
 
 
-def test_a_located_pose_is_refined_and_keeps_its_confidence(points: PointMap) -> None:
+def test_a_located_pose_is_refined_and_becomes_surer(points: PointMap) -> None:
     query, verdict = ask(HEIGHTS_M[0], 0.0)
     first = verdict.hypotheses[0]
     moved = replace(first, fit=replace(first.fit, T_map_query=first.fit.T_map_query @ SE2(0.1, -0.05, 0.03)))
     settled, _ = settle_in_space(replace(verdict, hypotheses=(moved,)), query, lambda _: points, accept=0.9)
-    assert settled.status == "located" and settled.confidence == 0.95
+    assert settled.status == "located" and settled.confidence > 0.99
     error = base_of(verdict, query).inverse() @ base_of(settled, query)
     assert np.hypot(error.x, error.y) < 0.02
 
@@ -122,6 +130,26 @@ def test_a_place_that_the_points_contradict_is_turned_down() -> None:
     settled, in_space = settle_in_space(verdict, query, lambda _: wrong, accept=0.9)
     assert settled.status == "not_found" and settled.confidence < 0.9
     assert in_space is not None and in_space.status == "contradicts"
+
+
+def test_a_place_that_the_plane_leaves_open_is_located_by_its_points(points: PointMap) -> None:
+    """Its mass in the plane is small, as if its things had been moved; a wrong place has more."""
+    query, verdict = ask(HEIGHTS_M[0], 0.0, APART_M + 3.0)
+    unsure = replace(verdict, status="not_found", confidence=0.2, places=(1, 0), masses=(0.2, 0.02))
+    settled, in_space = settle_in_space(unsure, query, lambda _: points, accept=0.9)
+    assert settled.status == "located" and settled.places == (0, 1)
+    assert in_space is not None and in_space.status == "agrees"
+    assert base_of(settled, query).x < 4.9
+
+
+def test_a_place_that_is_not_compared_keeps_its_odds(points: PointMap) -> None:
+    query, verdict = ask(HEIGHTS_M[0], 0.0)
+    fit = register_in_space(query.views, points, verdict.hypotheses[0].fit.T_map_query)
+    assert fit is not None
+    masses, best = masses_in_space((0.3, 0.3), {1: fit})
+    factor = math.exp(SPACE.weight * agreement_in_space(fit))
+    assert best == 1 and masses[1] / masses[0] == pytest.approx(factor)
+    assert masses[0] / (1.0 - masses.sum()) == pytest.approx(0.3 / 0.4)
 
 
 def test_without_points_on_a_side_nothing_changes(points: PointMap) -> None:

@@ -27,7 +27,7 @@ from pc2grid_lab.experiments.plan_drives import MAP_SEED
 from pc2grid_lab.experiments.sensor_matrix import query_start
 from signature.config import Config
 from signature.database import open_database
-from signature.localization.in_space import SPACE, likeliest
+from signature.localization.in_space import masses_in_space
 from signature.localization.localizer import locate
 from signature.localization.query import QueryInSpace
 from signature.sessions import add_sessions, build_session
@@ -169,8 +169,8 @@ def _outcome(height_m: float, *rooms: tuple[float, Any]) -> str:
     heights, fits = zip(*rooms, strict=True)
     if None in fits:
         return "no fit"
-    first, share = likeliest(fits, [1.0] * len(fits))
-    chosen = share >= 0.9 and fits[first].on >= SPACE.agrees
+    masses, first = masses_in_space([0.49] * len(fits), dict(enumerate(fits)))
+    chosen = masses[first] >= 0.9
     if heights[0] == heights[1]:
         return "alike, chosen" if chosen else "alike"
     if not chosen:

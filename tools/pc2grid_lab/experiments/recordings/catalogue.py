@@ -123,14 +123,18 @@ def _jarvis(lasers: str, *, late_s: float = 0.0, quick: bool = False) -> Recordi
     )
 
 
-def _phone(name: str, *, odometry: bool = True, quick: bool = False) -> Recording:
+_POINTS = ("--points", "0.05")
+
+
+def _phone(name: str, *, odometry: bool = True, points: bool = False, quick: bool = False) -> Recording:
     poses = f"depth/room/{name}.tum"
     return Recording(
-        name=name if odometry else f"{name} without odometry",
+        name=name + (" with points" if points else "" if odometry else " without odometry"),
         file=f"depth/room/{name}.mcap",
         building="room",
         sensor="depth",
         options=() if odometry else ("--odometry", "none"),
+        map_options=_POINTS if points else (),
         truth=poses,
         poses=poses,
         of_base=True,
@@ -140,6 +144,18 @@ def _phone(name: str, *, odometry: bool = True, quick: bool = False) -> Recordin
 
 def _kidnap(name: str, file: str, scans_s: tuple[float, float], *, quick: bool = False) -> Recording:
     return _laser(name, "kidnap", file=f"laser/kidnap/{file}", scans_s=scans_s, quick=quick)
+
+
+def _kitchen(name: str, *, map_options: tuple[str, ...] = ()) -> Recording:
+    return Recording(
+        name=name,
+        file="depth/kitchen.mcap",
+        building="kitchen",
+        sensor="depth",
+        map_options=map_options,
+        truth="depth/kitchen.tum",
+        poses="depth/kitchen.tum",
+    )
 
 
 def _hall(every: int, name: str, *, map_options: tuple[str, ...] = (), quick: bool = False) -> Recording:
@@ -158,7 +174,7 @@ def _hall(every: int, name: str, *, map_options: tuple[str, ...] = (), quick: bo
 
 RECORDINGS: tuple[Recording, ...] = (
     _hall(1, "hall", quick=True),
-    _hall(1, "hall with points", map_options=("--points", "0.05")),
+    _hall(1, "hall with points", map_options=_POINTS),
     _hall(2, "hall, every 2nd scan", quick=True),
     _hall(3, "hall, every 3rd scan", quick=True),
     Recording(
@@ -173,14 +189,10 @@ RECORDINGS: tuple[Recording, ...] = (
     _phone("room_a", odometry=False),
     _phone("room_b", quick=True),
     _phone("room_b", odometry=False, quick=True),
-    Recording(
-        name="kitchen",
-        file="depth/kitchen.mcap",
-        building="kitchen",
-        sensor="depth",
-        truth="depth/kitchen.tum",
-        poses="depth/kitchen.tum",
-    ),
+    _phone("room_a", points=True),
+    _phone("room_b", points=True),
+    _kitchen("kitchen"),
+    _kitchen("kitchen with points", map_options=_POINTS),
     _corrected("fr079", "fr079"),
     _corrected("intel", "intel"),
     _corrected("csail", "csail", quick=True),
@@ -248,6 +260,7 @@ PAIRS: tuple[Pair, ...] = (
     _pair("fewer scans", "hall, every 3rd scan", "hall", 9.0, 4),
     _later("e1r_office_a", 10.0, 4.0, 4),
     _later("kitchen", 4.0, 2.0, 3),
+    _later("kitchen with points", 4.0, 2.0, 3),
     _later("fr079", 600.0, 20.0, 10),
     _later("intel", 900.0, 25.0, 10),
     _later("csail", 250.0, 6.0, 10, quick=True),
@@ -264,6 +277,8 @@ PAIRS: tuple[Pair, ...] = (
     _pair("other day", "workshop_1_changed", "workshop_1", 4.0, 8),
     _pair("other day", "room_b", "room_a", 5.0, 4, quick=True),
     _pair("other day", "room_a", "room_b", 5.0, 8),
+    _pair("other day", "room_b", "room_a with points", 5.0, 4),
+    _pair("other day", "room_a", "room_b with points", 5.0, 8),
     _pair("other sensor", "jarvis safety", "jarvis nav", 6.0, 6, quick=True),
     _pair("other sensor", "jarvis nav", "jarvis safety", 6.0, 6, quick=True),
     _pair("other sensor", "fr079", "fr079_floor.ply", 25.0, 10),
@@ -285,6 +300,9 @@ PAIRS: tuple[Pair, ...] = (
     _pair("elsewhere", "birmingham", "wean 2", 15.0, 4),
     _pair("elsewhere", "hall", "fr079", 6.0, 2),
     _pair("elsewhere", "room_b", "kitchen", 5.0, 2),
+    _pair("elsewhere", "room_a", "hall", 5.0, 8),
+    _pair("elsewhere", "room_a", "hall with points", 5.0, 8),
+    _pair("elsewhere", "e1r_office_a", "room_b with points", 4.0, 4),
     _pair("elsewhere", "jarvis nav", "room_a", 6.0, 2),
 )
 """All pairs, in the order of the page."""
