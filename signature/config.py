@@ -151,7 +151,7 @@ class RelocalizeConfig(Section):
         0.4, ge=0, le=1, description="placements with a lower coarse score are dropped"
     )
     coarse_keep: float = Field(
-        0.8, gt=0, le=1, description="and so are those below this share of the best one"
+        0.9, gt=0, le=1, description="and so are those below this share of the best one; 0.8 takes longer"
     )
     hypotheses: int = Field(20, gt=0, description="largest number of hypotheses that are kept")
     exhaustive_m2: float = Field(

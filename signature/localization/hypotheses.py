@@ -13,7 +13,13 @@ from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.matching.refinement import refine, refine_all
 from pc2grid.matching.two_way_score import Fit, score_fit
 from pc2grid.matching.walls import comparable, thin_evenly
-from pc2grid.matching.window_search import MOST_POINTS, SearchMap, SearchParameters, search_windows
+from pc2grid.matching.window_search import (
+    MOST_POINTS,
+    SEARCH,
+    SearchMap,
+    SearchParameters,
+    search_windows,
+)
 from signature.config import RelocalizeConfig
 from signature.localization.query import QueryMap
 from signature.retrieval.viewpoints import Places
@@ -175,7 +181,8 @@ def _refined(query: QueryMap, target: SearchMap, T_map_query: SE2) -> tuple[SE2,
 
 
 def distinct(hypotheses: Sequence[Hypothesis], at: SE2) -> tuple[Hypothesis, ...]:
-    """Best first; of those that put the pose `at` (query's frame) at the same place only the best.
+    """Best first, without those that put the pose `at` (query's frame) on the shoulder of a better one in the
+    same session: nearer than the poses of a coarse search are to each other.
 
     The best one takes over the `row` of the others if it has none.
     """
@@ -183,26 +190,28 @@ def distinct(hypotheses: Sequence[Hypothesis], at: SE2) -> tuple[Hypothesis, ...
     bases: list[SE2] = []
     for candidate in sorted(hypotheses, key=lambda h: -h.fit.score):
         base = candidate.fit.T_map_query @ at
-        same = next(
-            (
-                i
-                for i, other in enumerate(bases)
-                if candidate.session_index == kept[i].session_index and same_pose(base, other)
-            ),
-            None,
+        near = (
+            i
+            for i, other in enumerate(bases)
+            if candidate.session_index == kept[i].session_index
+            and _nearer(base, other, SEARCH.apart_m, SEARCH.apart_rad)
         )
-        if same is None:
+        better = next(near, None)
+        if better is None:
             kept.append(candidate)
             bases.append(base)
-        elif kept[same].row < 0:
-            kept[same] = replace(kept[same], row=candidate.row)
+        elif kept[better].row < 0:
+            kept[better] = replace(kept[better], row=candidate.row)
     return tuple(kept)
 
 
 def same_pose(a: SE2, b: SE2) -> bool:
     """Whether two poses are so near that hypotheses there are one."""
-    near = math.hypot(a.x - b.x, a.y - b.y) < HYPOTHESES.same_m
-    return near and abs(wrap_angle(a.yaw - b.yaw)) < HYPOTHESES.same_rad
+    return _nearer(a, b, HYPOTHESES.same_m, HYPOTHESES.same_rad)
+
+
+def _nearer(a: SE2, b: SE2, apart_m: float, apart_rad: float) -> bool:
+    return math.hypot(a.x - b.x, a.y - b.y) < apart_m and abs(wrap_angle(a.yaw - b.yaw)) < apart_rad
 
 
 def coarse_points(points_m: F32, center_m: tuple[float, float]) -> F32:

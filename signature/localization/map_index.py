@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 
 _KEEP = 0.6
 """Hypotheses scoring below this share of the best are dropped: a place so far behind has no mass."""
-SEARCHED = 0.9
-"""Whole maps are searched for what reaches this share of the best coarse score: takes half as long as 0.8."""
 
 
 class MapIndex:
@@ -228,13 +226,12 @@ class MapIndex:
         """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole; in
         a large database, on those that look most like the query. With a prior: anywhere in its region.
 
-        What has less than the share `SEARCHED` of the best coarse score is left out.
+        What has less than the share `RelocalizeConfig.coarse_keep` of the best coarse score is left out.
         """
         found = list(known)
-        config = self.config.model_copy(update={"coarse_keep": SEARCHED})
         maps = self.maps_for(query)
         for index, free in self._searched(query):
-            found.extend(search_whole_map(query, index, maps[index], free, config))
+            found.extend(search_whole_map(query, index, maps[index], free, self.config))
         return self._worth_keeping(query, found)
 
     def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
