@@ -297,7 +297,8 @@ def _on_floor(target: F64, query: F64, lifted: F64, sensor_m: F64) -> F64 | None
         near = points[np.linalg.norm(points[:, :2] - at_m[:2], axis=1) < REGISTRATION.floor_m]
         if not len(near):
             return None
-        middle = np.array([at_m[0], at_m[1], float(np.median(near[:, 2]))])
+        # Half of all points and more may be of the floor, which is looked for below the middle height.
+        middle = np.array([at_m[0], at_m[1], 0.5 * float(near[:, 2].min() + near[:, 2].max())])
         ground = find_ground(near - middle, np.zeros(3))
         if ground is None:
             return None

@@ -60,6 +60,22 @@ def test_a_query_that_is_not_level_is_tilted_with_its_floor() -> None:
     assert np.linalg.norm(error[:3, 3]) < 0.02
 
 
+def test_a_hall_that_is_mostly_floor_is_registered() -> None:
+    """More than half of what is seen of a wide hall is its floor; so the floor is the median height."""
+    sides = [
+        ((-8, -8, 0), (8, -8, 2)),
+        ((-8, 8, 0), (5, 8, 2)),
+        ((-8, -8, 0), (-8, 8, 2)),
+        ((8, -8, 0), (8, 3, 2)),
+    ]
+    points_m = np.concatenate([box_surface((-8, -8, 0), (8, 8, 0)), *(box_surface(*side) for side in sides)])
+    assert np.median(points_m[:, 2]) < 0.05
+    view = SpatialView(sensor_m=np.array([1.0, 0.5, 1.0]), points_m=points_m)
+    fit = register_in_space([view], PointMap.of(points_m, 0.05), OFF)
+    assert fit is not None and fit.on > 0.97
+    assert np.linalg.norm(fit.T_map_query[:3, 3]) < 0.02
+
+
 def test_twin_rooms_of_other_height_are_told_apart() -> None:
     """A query in the lower room ends before the ceiling of the higher one; the other way round it passes."""
     for height_m, own_m, other_m, share in (
