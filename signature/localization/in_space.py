@@ -74,27 +74,33 @@ def points_reader(database: SubmapDatabase) -> PointsOf | None:
 def settle_in_space(
     verdict: Verdict, query: QueryInSpace, points_of: Callable[[int], PointMap | None], accept: float
 ) -> tuple[Verdict, PoseInSpace | None]:
-    """The verdict with the points as a factor, and the pose in space of its first place, if it is located or
-    was; as it was, and None, where that place has no points.
+    """The verdict with the points as a factor, and the pose in space of the place that is located, or was and
+    is turned down; else None. As it was, where no place can be compared.
 
     points_of : the points of a session, by its index. accept : least confidence to be located.
     """
     if not query.views or query.T_odom_base is None:
         return verdict, None
-    first = dict(zip(verdict.places[::-1], reversed(range(len(verdict.places))), strict=True))
     fits: dict[int, SpatialFit] = {}
-    for place in range(min(len(verdict.masses), SPACE.places)):
-        h = verdict.hypotheses[first[place]]
+    best, masses = 0, np.array(verdict.masses)
+    for place in range(min(len(masses), SPACE.places)):
+        h = verdict.hypotheses[verdict.places.index(place)]
         points = points_of(h.session_index)
         fit = None if points is None else register_in_space(query.views, points, h.fit.T_map_query)
         if fit is not None and fit.rays:
             fits[place] = fit
-    masses, best = masses_in_space(verdict.masses, fits) if fits else (np.array(verdict.masses), -1)
-    if best not in fits:
+            masses, best = masses_in_space(verdict.masses, fits)
+        # The places that are left can agree as well as the best one: is that certain all the same?
+        left = sum(verdict.masses[place + 1 :]) / max(verdict.masses[best], np.finfo(float).tiny)
+        if best in fits and masses[best] >= accept * (1.0 + masses[best] * left):
+            break
+    if not fits:
         return verdict, None
-    in_space = _pose(fits[best], query.T_odom_base)
+    in_space = _pose(fits[best], query.T_odom_base) if best in fits else None
     settled = _settled(verdict, best, masses, in_space, query.T_odom_base, accept)
-    return settled, in_space if "located" in (settled.status, verdict.status) else None
+    if verdict.status == "located" and settled.status != "located" and 0 in fits:
+        return settled, _pose(fits[0], query.T_odom_base)
+    return settled, in_space if settled.status == "located" else None
 
 
 def masses_in_space(masses: Sequence[float], fits: Mapping[int, SpatialFit]) -> tuple[F64, int]:
@@ -142,7 +148,7 @@ def _pose(fit: SpatialFit, T_odom_base: F64) -> PoseInSpace:
 
 
 def _settled(
-    verdict: Verdict, best: int, masses: F64, in_space: PoseInSpace, T_odom_base: F64, accept: float
+    verdict: Verdict, best: int, masses: F64, in_space: PoseInSpace | None, T_odom_base: F64, accept: float
 ) -> Verdict:
     """The verdict with new masses (P,) of its places, `best` first, at the pose that its points give."""
     located = masses[best] >= accept
@@ -150,7 +156,7 @@ def _settled(
         range(len(verdict.places)), key=lambda k: (verdict.places[k] != best, -masses[verdict.places[k]])
     )
     hypotheses = [verdict.hypotheses[k] for k in order]
-    if located:
+    if located and in_space is not None:
         planar = np.ix_((0, 1, 5), (0, 1, 5))
         T_map_query = SE2.from_matrix(in_space.T_map_base) @ SE2.from_matrix(T_odom_base).inverse()
         refined = replace(hypotheses[0].fit, T_map_query=T_map_query, covariance=in_space.covariance[planar])

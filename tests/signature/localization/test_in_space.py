@@ -152,6 +152,36 @@ def test_a_place_that_is_not_compared_keeps_its_odds(points: PointMap) -> None:
     assert masses[0] / (1.0 - masses.sum()) == pytest.approx(0.3 / 0.4)
 
 
+def test_a_place_that_is_turned_down_is_not_kept_for_one_that_is_not_compared() -> None:
+    """The map ends before the second place, so that is not compared and stays as unlikely as it was."""
+    from tests.helpers.building_clouds import box_surface
+
+    query, verdict = ask(HEIGHTS_M[0], 0.0, 60.0)
+    believed = replace(verdict, status="located", confidence=0.95, masses=(0.95, 0.01))
+    other = [box_surface((-5, -5, 0), (10, 10, 0)), box_surface((4.0, -5, 0), (4.0, 10, 4.0))]
+    other += [box_surface((-5, 1.0, 0), (10, 1.0, 4.0)), box_surface((-5, -5, 4.0), (10, 10, 4.0))]
+    wrong = PointMap.of(np.concatenate(other), 0.05)
+    settled, in_space = settle_in_space(believed, query, lambda _: wrong, accept=0.9)
+    assert settled.status == "not_found" and settled.confidence < 0.5
+    assert in_space is not None and in_space.status == "contradicts"
+
+
+def test_only_what_can_matter_is_compared(points: PointMap) -> None:
+    """A place that is certain whatever the others are; not one of two twins."""
+    asked: list[int] = []
+
+    def points_of(session_index: int) -> PointMap:
+        asked.append(session_index)
+        return points
+
+    query, alone = ask(HEIGHTS_M[0], 0.0, APART_M)
+    likely = replace(alone, status="located", confidence=0.95, masses=(0.95, 0.01))
+    assert settle_in_space(likely, query, points_of, accept=0.9)[0].status == "located"
+    assert len(asked) == 1
+    settle_in_space(alone, query, points_of, accept=0.9)
+    assert len(asked) == 3
+
+
 def test_without_points_on_a_side_nothing_changes(points: PointMap) -> None:
     query, verdict = ask(HEIGHTS_M[0], 0.0)
     assert settle_in_space(verdict, query, lambda _: None, accept=0.9) == (verdict, None)
