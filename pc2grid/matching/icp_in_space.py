@@ -73,7 +73,6 @@ class RayParameters:
     near_m : a point so near to the map lies on it.
     gap_m : a surface is passed, or not reached, if it is at least so far off along the ray.
     floor_m : points this near to the floor say nothing: it is the same everywhere.
-    least : fewer rays than this say nothing.
     patch_m : rays that end within a cell of this size see one thing.
     patch_rays : so many more rays of a patch must end on a surface of one place than of another for the patch
         to speak for it.
@@ -86,7 +85,6 @@ class RayParameters:
     near_m: float = 0.15
     gap_m: float = 0.4
     floor_m: float = 0.15
-    least: int = 100
     patch_m: float = 0.5
     patch_rays: int = 3
     above_m: float = 2.0

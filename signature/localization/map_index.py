@@ -29,6 +29,7 @@ from signature.localization.hypotheses import (
 )
 from signature.localization.in_space import PointsOf, points_reader
 from signature.localization.lazy_maps import DatabaseGrids, LazySequence
+from signature.localization.posterior import POSTERIOR
 from signature.localization.prior import Prior, Region
 from signature.localization.query import QueryMap
 from signature.retrieval.viewpoints import AT_ONCE_M2, Places
@@ -38,10 +39,6 @@ from signature.similarity import SignatureTable
 
 if TYPE_CHECKING:
     from signature.database import SubmapDatabase
-
-
-_KEEP = 0.6
-"""Hypotheses scoring below this share of the best are dropped: a place so far behind has no mass."""
 
 
 class MapIndex:
@@ -261,12 +258,13 @@ class MapIndex:
                 yield index, self._free[index]
 
     def _worth_keeping(self, query: QueryMap, found: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
-        """Best first, what scores enough beside the best one; what a prior excludes is kept beside it."""
+        """Best first, what scores enough beside the best one to tell of it
+        (`PosteriorParameters.longest_lead`); what a prior excludes is kept beside it."""
         ordered = distinct(found, query.T_odom_base)
         kept: list[Hypothesis] = []
         for inside in (True, False):
             group = [h for h in ordered if self.allows(query, h) is inside]
-            enough = [h for h in group if h.fit.score >= _KEEP * group[0].fit.score]
+            enough = [h for h in group if h.fit.score >= (1.0 - POSTERIOR.longest_lead) * group[0].fit.score]
             kept += enough[: self.config.hypotheses]
         return tuple(sorted(kept, key=lambda h: -h.fit.score))
 

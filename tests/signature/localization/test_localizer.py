@@ -18,8 +18,9 @@ from signature.describe import Signature, describe
 from signature.localization import query as query_module
 from signature.localization.answer import Moment
 from signature.localization.decision import decide, judge
-from signature.localization.hypotheses import Hypothesis, fitted
+from signature.localization.hypotheses import Hypothesis
 from signature.localization.localizer import Answer, Localizer, MapIndex, locate_in
+from signature.localization.prior import Prior
 from signature.localization.query import Query, QueryMap
 from tests.helpers.simulated_drives import building, drive, office, plan
 
@@ -60,9 +61,8 @@ def test_a_better_place_that_was_not_proposed_takes_a_certain_answer_away() -> N
         truth = end
     seen = query.map()
     proposed = index.look_up(seen)
-    wrong = tuple(h for h in proposed if math.dist(position(h, seen), (truth.x, truth.y)) > 1.0) or (
-        fitted(seen, 0, -1, index.maps[0], SE2(4.0, 3.0, 1.0)),
-    )
+    wrong = index.within(Prior.around(4.0, 3.0, radius_m=3.0)).search_whole_maps(seen, ())
+    assert math.dist(position(wrong[0], seen), (truth.x, truth.y)) > 1.0
     alone = judge(index, seen, wrong[:1])
     assert alone.status == "located"
     verdict = decide(index, seen, wrong[:1])
