@@ -212,7 +212,7 @@ def _best(
     floor: float,
     keep: float,
 ) -> F64:
-    """(N, 4) the best pose of each square that reaches `floor` and the share `keep` of the best; in cells.
+    """(N, 4) the best pose of each block that reaches `floor` and the share `keep` of the best; in cells.
 
     turns : (K,) headings relative to those of the tiles. half_a_rad : each stands for those so far beside it.
     """
