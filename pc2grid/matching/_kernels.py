@@ -26,13 +26,20 @@ def _turn(points: F64, yaw: float, turned: F64) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _place(
-    turned: F64, level: I64, down: float, right: float, shape: tuple[int, int], corner: I64, at: I64
-) -> tuple[int, int]:
+    turned: F64,
+    level: I64,
+    down: float,
+    right: float,
+    shape: tuple[int, int],
+    corner: I64,
+    at: I64,
+    counted: I64,
+) -> None:
     """Where the points are looked up if the pose lies `down` and `right` of the corner of its square.
 
-    Sets the first of `at` to the places for the first square of the tile at `corner`, in all images flat.
-    Returns their number, and the sum of the others: they lie beyond the map for all squares of the tile, or
-    have no level.
+    Sets the first of `at` to the places for the first square of the tile at `corner`, in all images flat, and
+    `counted` (2,) to their number, and to the sum of the others: they lie beyond the map for all squares of
+    the tile, or have no level.
     """
     height, width = shape
     count, rest = 0, 0
@@ -48,14 +55,16 @@ def _place(
         image = (level[p] * SQUARE + i % SQUARE) * SQUARE + j % SQUARE
         at[count] = (image * height + row) * width + column
         count += 1
-    return count, rest
+    counted[0], counted[1] = count, rest
 
 
 @numba.njit(cache=True, nogil=True)
 def _sum_tile(flat: U8, at: I64, rest: int, width: int, inside: U16, sums: U16) -> int:
     """Set `sums` (TILE) to those of a tile, 0 where nothing is `inside`; returns the highest."""
     top = 0
-    sums[:] = rest
+    for r in range(_ROWS):
+        for k in range(_COLUMNS):
+            sums[r, k] = rest
     for p in range(len(at)):
         for r in range(_ROWS):
             first = at[p] + r * width
@@ -88,15 +97,15 @@ def _place_parts(
     turned: F64, levels: I64, shape: tuple[int, int], corner: I64, at: I64, counted: I64
 ) -> None:
     """Set `at` (_PARTS, N) and `counted` (_PARTS, 2) to what `_place` says of each part of a square."""
-    counted[0] = _place(turned, levels[1], _HALF, _HALF, shape, corner, at[0])
+    _place(turned, levels[1], _HALF, _HALF, shape, corner, at[0], counted[0])
     for q in range(4):
         down, right = q // 2 * _HALF, q % 2 * _HALF
         middle = 0.5 * _HALF
-        counted[1 + q] = _place(turned, levels[2], down + middle, right + middle, shape, corner, at[1 + q])
+        _place(turned, levels[2], down + middle, right + middle, shape, corner, at[1 + q], counted[1 + q])
         for c in range(_HALF**2):
             part = 5 + q * _HALF**2 + c
             i, j = down + c // _HALF, right + c % _HALF
-            counted[part] = _place(turned, levels[3], i + 0.5, j + 0.5, shape, corner, at[part])
+            _place(turned, levels[3], i + 0.5, j + 0.5, shape, corner, at[part], counted[part])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -151,13 +160,13 @@ def tile_bounds(
     `Tiles`."""
     bounds = np.empty((len(corner), len(turns)), np.int64)
     turned, at = np.empty((2, len(points))), np.empty(len(points), np.int64)
-    sums = np.empty((_ROWS, _COLUMNS), np.uint16)
+    counted, sums = np.empty(2, np.int64), np.empty((_ROWS, _COLUMNS), np.uint16)
     middle = 0.5 * SQUARE
     for t in range(len(corner)):
         for k in range(len(turns)):
             _turn(points, yaw_rad[t] + turns[k], turned)
-            count, rest = _place(turned, level, middle, middle, shape, corner[t], at)
-            bounds[t, k] = _sum_tile(flat, at[:count], rest, shape[1], inside[t], sums)
+            _place(turned, level, middle, middle, shape, corner[t], at, counted)
+            bounds[t, k] = _sum_tile(flat, at[: counted[0]], counted[1], shape[1], inside[t], sums)
     return bounds
 
 
@@ -192,8 +201,8 @@ def best_in_tiles(
             break
         here, yaw = corners[b], yaws[b]
         _turn(points, yaw, turned)
-        count, rest = _place(turned, levels[0], _HALF, _HALF, shape, here, at[0, 0])
-        _sum_tile(flat, at[0, 0, :count], rest, width, inside[tile[b]], sums)
+        _place(turned, levels[0], _HALF, _HALF, shape, here, at[0, 0], counted[0, 0])
+        _sum_tile(flat, at[0, 0, : counted[0, 0, 0]], counted[0, 0, 1], width, inside[tile[b]], sums)
         for side in range(2):
             _turn(points, yaw + (side - 0.5) * half_a_rad, turned)
             _place_parts(turned, levels, shape, here, at[side], counted[side])
