@@ -19,6 +19,7 @@ from pc2grid.matching.two_way_score import score_fit
 from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import (
     BLOCK,
+    BOUND_SLACK,
     MARGIN_M,
     MOST_POINTS,
     REACHES_M,
@@ -290,7 +291,8 @@ def test_no_pose_of_a_square_exceeds_its_bound(seed: int) -> None:
     for part, (at, turn) in enumerate((((0.0, 0.0), 0.5), ((-1.0, 1.0), 0.5), ((-0.5, 1.5), 0.5)), start=1):
         pose = square + np.array((*at, turn * half_a))
         found.append(plain_sums(MAP.images, level[part], points, pose)[0])
-        assert found[part] - 0.01 * 255 * 50 <= found[part - 1] < 255 * 50  # half a cell is neglected
+        # Half a cell is neglected: of 3,000 seeds by 0.012 of all points at most.
+        assert found[part] - (1.0 - BOUND_SLACK) * 255 * 50 <= found[part - 1] < 255 * 50
     poses = square + rng.uniform(-1, 1, (300, 3)) * (0.5 * SQUARE, 0.5 * SQUARE, half_a)
     assert plain_sums(MAP.images, np.zeros(50, np.int64), points, poses).max() <= found[0]
 
