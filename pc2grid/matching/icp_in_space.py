@@ -36,7 +36,7 @@ from pc2grid.model import PointMap
 class RegistrationParameters:
     """How points are registered and compared. All chosen by hand, tried in simulation.
 
-    voxel_m : edge of the voxels that the query is reduced to.
+    voxel_m : edge of the voxels that the query is reduced to. points : so many of these are registered.
     margin_m : of the part of the map that is used, around the query.
     floor_m : the floors are compared so far around the sensor.
     normal_radius_m, normal_neighbours : neighbourhood in which the normals of the map are estimated.
@@ -50,6 +50,7 @@ class RegistrationParameters:
     """
 
     voxel_m: float = 0.1
+    points: int = 5000
     margin_m: float = 1.0
     floor_m: float = 8.0
     normal_radius_m: float = 0.25
@@ -321,6 +322,8 @@ def _icp(
     def cloud_of(points: F64) -> Any:
         return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
 
+    share = min(1.0, p.points / len(query))
+    query = query[random_subset(len(query), p.points)]
     source, surface = cloud_of(query), cloud_of(target)
     surface.estimate_normals(
         o3d.geometry.KDTreeSearchParamHybrid(radius=p.normal_radius_m, max_nn=p.normal_neighbours)
@@ -344,7 +347,7 @@ def _icp(
     J = np.column_stack((normals, np.cross(placed - center_m, normals)))
     rmse_m = float(np.sqrt(np.mean(away_m**2)))
     # Neighbouring points share the error of their voxels and of the map: as many count as there are patches.
-    independent = min(1.0, (p.voxel_m / p.patch_m) ** 2)
+    independent = min(1.0, (p.voxel_m / p.patch_m) ** 2) / share
     information = J.T @ J * (independent / max(rmse_m, p.noise_m) ** 2)
     return T, information, center_m, rmse_m
 
