@@ -22,6 +22,7 @@ from signature.localization.in_space import (
 )
 from signature.localization.posterior import NO_EVIDENCE
 from signature.localization.query import QueryInSpace
+from tests.helpers.building_clouds import box_surface
 from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, furnished_map, twin_map
 
 
@@ -65,6 +66,13 @@ def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[Que
         evidence=NO_EVIDENCE,
     )
     return query, verdict
+
+
+def other_walls() -> PointMap:
+    """A map with the same floor, and walls that stand elsewhere."""
+    floor = box_surface((-5, -5, 0), (10, 10, 0)), box_surface((-5, -5, 4.0), (10, 10, 4.0))
+    walls = box_surface((4.0, -5, 0), (4.0, 10, 4.0)), box_surface((-5, 1.0, 0), (10, 1.0, 4.0))
+    return PointMap.of(np.concatenate((*floor, *walls)), 0.05)
 
 
 def base_of(verdict: Verdict, query: QueryInSpace) -> SE2:
@@ -121,12 +129,8 @@ def test_a_located_pose_is_refined_and_becomes_surer(points: PointMap) -> None:
 
 def test_a_place_that_the_points_contradict_is_turned_down() -> None:
     """The map has the floor there, and walls that stand elsewhere."""
-    from tests.helpers.building_clouds import box_surface
-
     query, verdict = ask(HEIGHTS_M[0], 0.0)
-    other = [box_surface((-5, -5, 0), (10, 10, 0)), box_surface((4.0, -5, 0), (4.0, 10, 4.0))]
-    other += [box_surface((-5, 1.0, 0), (10, 1.0, 4.0)), box_surface((-5, -5, 4.0), (10, 10, 4.0))]
-    wrong = PointMap.of(np.concatenate(other), 0.05)
+    wrong = other_walls()
     settled, in_space = settle_in_space(verdict, query, lambda _: wrong, accept=0.9)
     assert settled.status == "not_found" and settled.confidence < 0.9
     assert in_space is not None and in_space.status == "contradicts"
@@ -154,13 +158,9 @@ def test_a_place_that_is_not_compared_keeps_its_odds(points: PointMap) -> None:
 
 def test_a_place_that_is_turned_down_is_not_kept_for_one_that_is_not_compared() -> None:
     """The map ends before the second place, so that is not compared and stays as unlikely as it was."""
-    from tests.helpers.building_clouds import box_surface
-
     query, verdict = ask(HEIGHTS_M[0], 0.0, 60.0)
     believed = replace(verdict, status="located", confidence=0.95, masses=(0.95, 0.01))
-    other = [box_surface((-5, -5, 0), (10, 10, 0)), box_surface((4.0, -5, 0), (4.0, 10, 4.0))]
-    other += [box_surface((-5, 1.0, 0), (10, 1.0, 4.0)), box_surface((-5, -5, 4.0), (10, 10, 4.0))]
-    wrong = PointMap.of(np.concatenate(other), 0.05)
+    wrong = other_walls()
     settled, in_space = settle_in_space(believed, query, lambda _: wrong, accept=0.9)
     assert settled.status == "not_found" and settled.confidence < 0.5
     assert in_space is not None and in_space.status == "contradicts"
