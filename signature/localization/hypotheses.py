@@ -32,8 +32,7 @@ class HypothesisParameters:
 
     square_m : side of the squares of free ground that a whole map is searched in, and of those around a
         proposal: a lattice of viewpoints, with some reserve.
-    half_a_rad : headings are searched so far around a proposal, half a ray of its isovist with some reserve;
-        of a whole map in equal parts of at most twice as much.
+    half_a_rad : headings are searched so far around a proposal, half a ray of its isovist with some reserve.
     few_points : near wall points in the coarse search, and as many far ones; enough to rank poses.
     few_spacing_m : they are at least about so far apart.
     near_m : near are walls up to so far from the centre of rotation. A small error of yaw moves those beyond

@@ -96,11 +96,11 @@ def settle_in_space(
             break
     if not fits:
         return verdict, None
-    in_space = _pose(fits[best], query.T_odom_base) if best in fits else None
-    settled = _settled(verdict, best, masses, in_space, query.T_odom_base, accept)
-    if verdict.status == "located" and settled.status != "located" and 0 in fits:
-        return settled, _pose(fits[0], query.T_odom_base)
-    return settled, in_space if settled.status == "located" else None
+    poses = {place: _pose(fit, query.T_odom_base) for place, fit in fits.items()}
+    settled = _settled(verdict, best, masses, poses.get(best), query.T_odom_base, accept)
+    if settled.status == "located":
+        return settled, poses.get(best)
+    return settled, poses.get(0) if verdict.status == "located" else None
 
 
 def masses_in_space(masses: Sequence[float], fits: Mapping[int, SpatialFit]) -> tuple[F64, int]:

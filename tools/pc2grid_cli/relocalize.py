@@ -18,6 +18,7 @@ from pc2grid.io.nav2_map import is_map_file
 from pc2grid.io.trajectory import write_trajectory
 from pc2grid.mapping.drawn_map import is_drawn_map
 from pc2grid.mapping.precision import PRECISION
+from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
 from pc2grid_cli import options as options
@@ -384,7 +385,7 @@ def _warn_of_prior(answer: Answer) -> None:
 
 def _warn_of_missing_points(found: Found, database: SubmapDatabase) -> None:
     """Say what would tell more, where an answer is not certain and points in space were not kept."""
-    in_space = {"lidar", "depth"}
+    in_space = {kind for kind, model in SENSOR_MODELS.items() if not model.planar}
     if found.answer.status == "located" or found.about["sensor"] not in in_space:
         return
     infos = [info for info in database.sessions() if info.sensor in in_space]
