@@ -125,15 +125,15 @@ def test_importing_a_package_loads_no_library(package: str) -> None:
 # --- README and what stands beside it ---------------------------------------------------------------------
 
 EXAMPLES = sorted(f"examples/{path.name}" for path in ROOT.glob("examples/*.md"))
-DOCUMENTS = ("README.md", "CONTRIBUTING.md", "docs/method.md", *EXAMPLES)
-ON_OWN_FILES = ("examples/nav2.md", "examples/fleet.md")
+GUIDES = ("docs/method.md", "docs/outputs.md", "docs/words.md")
+DOCUMENTS = ("README.md", "CONTRIBUTING.md", *GUIDES, *EXAMPLES)
+ON_OWN_FILES = ("examples/nav2.md", "examples/recordings.md", "examples/buildings.md", "docs/outputs.md")
 """Their commands are run in a folder with the files that they name; those of README make their own."""
 NOT_RUN = {
     "make": "test_repository.py looks at the Makefile; `make demo` is `pc2grid demo` after an installation",
     "pip": "the network is not asked in tests",
     "ros2": "needs ROS; test_example_nav2 has one that listens",
     "createdb": "needs a PostgreSQL server; test_postgres.py brings one",
-    "pc2grid relocalize depth.mcap --rerun": "needs a display and the extra viz; see test_rerun.py",
     "pc2grid view": "serves until Ctrl-C; see test_view.py",
     "pc2grid watch ws://": "needs a robot; test_watch.py has one",
     "pc2grid watch zenoh://": "needs a robot; test_watch.py has one",
@@ -195,14 +195,14 @@ def test_the_readme_can_be_pasted_from_top_to_bottom(
     for language, block in blocks("README.md", "sh", "python"):
         if language == "python":
             exec(compile(block, "README.md", "exec"), {})
-            assert capsys.readouterr().out.startswith("located SE2(")
+            assert capsys.readouterr().out.splitlines()[-1].startswith("located SE2(")
             continue
         for command in commands_of(block):
             if command.startswith("cd "):
                 monkeypatch.chdir(command.removeprefix("cd "))
             elif command not in ran and run_or_parse(command) is None:
                 ran.append(command)
-    assert len(ran) > 15
+    assert len(ran) >= 7
     for file in re.findall(r"`(\w+\.(?:mcap|tum|submaps|png))`", (ROOT / "README.md").read_text()):
         assert Path(file).exists(), f"README names {file}, which its commands do not make"
 
@@ -282,14 +282,17 @@ def test_links_lead_somewhere(name: str) -> None:
 
 
 def test_the_first_screen_says_what_this_is() -> None:
-    """Before anything is installed: the paper, its three signatures, and how an answer comes about."""
-    first = " ".join((ROOT / "README.md").read_text().partition("\n## ")[0].split())
+    """A command in the first lines, a picture, the paper and its three signatures; all of README is short."""
+    text = (ROOT / "README.md").read_text()
+    lines = text.splitlines()
+    assert any(line.startswith("pc2grid ") for line in lines[:15])
+    assert len(lines) <= 120 and len(text.split()) <= 1300
+    first = " ".join(text.partition("\n## ")[0].split())
     abstract = " ".join(yaml.safe_load((ROOT / "CITATION.cff").read_text())["abstract"].split())
     (title,) = re.findall(r'"(.+)"', abstract)
-    assert f'the paper "{title}"' in first and "examples/how_it_works.png" in first
+    assert f'the paper "{title}"' in first and "![" in first
     for name in ("Boundary distances", "Free-space path lengths", "Reflection symmetry"):
         assert f"- **{name}**: " in first
-    assert len(first) < 2500
 
 
 # --- examples/ --------------------------------------------------------------------------------------------

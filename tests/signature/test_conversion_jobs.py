@@ -357,10 +357,11 @@ def test_an_address_may_follow_dask_or_not(
     assert asked == [["kitchen", "hall"], address, min(2, processes)]
 
 
-@pytest.mark.parametrize(
-    "command", re.findall(r"^pc2grid ([^#\n]*)", (ROOT / "examples" / "fleet.md").read_text(), re.MULTILINE)
-)
-def test_commands_of_the_fleets_page_are_real(command: str) -> None:
+PAGE = (ROOT / "examples" / "buildings.md").read_text()
+
+
+@pytest.mark.parametrize("command", re.findall(r"^pc2grid ([^#\n]*)", PAGE, re.MULTILINE))
+def test_commands_of_the_page_of_buildings_are_real(command: str) -> None:
     from typer.main import get_command
 
     group, arguments = get_command(app), command.split()

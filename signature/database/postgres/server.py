@@ -34,7 +34,7 @@ TABLES = definitions(
     array_key=", FOREIGN KEY (building, session_id) REFERENCES session (building, id)",
 )
 """The statement that creates each table: table -> SQL. The keys begin with the building, so that a cluster
-can keep a whole building on one node (examples/fleet.md)."""
+can keep a whole building on one node (examples/buildings.md)."""
 CONVERT = "make one with `pc2grid convert LOG -o URL`"
 EXAMPLE = "postgresql://user@host:5432/database, the password in PGPASSWORD or ~/.pgpass"
 _CONNECT_TIMEOUT_S = 10

@@ -20,7 +20,7 @@ from signature.seen_places import SeenPlaces
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CandidateParameters:
-    """How many sessions are compared. By hand, checked on simulated fleets (`examples/fleet.md`).
+    """How many sessions are compared. By hand, checked on simulated fleets (`examples/buildings.md`).
 
     sessions : that each session is compared with. enough : comparisons that settle a question: joins of a
         session within its building, and pairs of sessions of two buildings that are not joined. A pair of

@@ -143,7 +143,7 @@ def test_without_the_extra_it_says_what_to_install() -> None:
 
 
 def test_rights_that_a_robot_needs(filled: str) -> None:
-    """Those that examples/fleet.md names, and no others."""
+    """Those that examples/buildings.md names, and no others."""
     with postgresql.connect(filled) as connection:
         for role, tables in (("writer", "SELECT, INSERT, DELETE"), ("viewer", "SELECT")):
             connection.execute(f"CREATE ROLE {role} LOGIN")
