@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -96,7 +99,7 @@ def relocalize(
     """Find where a recording was made, or where a map lies.
 
     query : a recording, or a map as in `convert`.
-    database : file or postgresql:// URL.
+    database : file or postgresql:// URL; or a map, which is converted for this one query.
     config : its sections `read`, `registration` and `relocalize` are used; see `query_config`.
     span : the part of the recording to use. recover : use what is whole of a damaged recording.
     prior : what is known of the robot's pose beforehand; other places are no answers.
@@ -115,7 +118,7 @@ def relocalize(
     >>> pc2grid.relocalize("tuesday.mcap", "building.submaps", prior=elsewhere).status
     'not_found'
     """
-    with open_database(database) as opened:
+    with open_places(database, config) as opened:
         settings = query_config(opened, config)
         index = MapIndex.of(opened, settings, observer)
         if is_drawn_map(Path(query)):
@@ -126,6 +129,28 @@ def relocalize(
             index = index.within(prior)
         with open_log(query, settings.read, recover=recover) as log:
             return locate_log(log, index, settings, span=span, until_located=until_located, observer=observer)
+
+
+@contextlib.contextmanager
+def open_places(place: str | Path, config: Config = Config()) -> Iterator[SubmapDatabase]:
+    """Where to look: a database, or a map, which becomes a database for as long as it is used.
+
+    place : file or postgresql:// URL of a database; or the map.yaml of a nav2 map, a point cloud or a mesh.
+    config : how a map is read and divided.
+
+    Raises the errors of `signature.open_database`, and MapFileError for a map.
+
+    >>> with open_places("map.yaml") as places:
+    ...     [session.name for session in places.sessions()]
+    ['map']
+    """
+    with contextlib.ExitStack() as stack:
+        if not is_url(place) and is_drawn_map(Path(place)):
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            file = folder / f"{Path(place).stem}.submaps"
+            convert(place, file, config)
+            place = file
+        yield stack.enter_context(open_database(place))
 
 
 def locate_log(

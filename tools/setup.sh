@@ -68,13 +68,31 @@ if [ -z "$python" ]; then
     fail "no Python 3.10 to 3.13 with venv found" "make PYTHON=/path/to/python3.11 ... uses the one you name"
 fi
 
+# Run a command while a line says how long it has taken and how much is installed.
+watched() { # command and arguments
+    "$@" &
+    job=$!
+    trap 'kill "$job" 2>/dev/null; exit 130' INT TERM  # a job in the background does not see Ctrl-C
+    if [ -t 2 ]; then every=1 start='\r' end=''; else every=20 start='' end='\n'; fi
+    seconds=0
+    while kill -0 "$job" 2>/dev/null; do
+        # shellcheck disable=SC2059  # the format is ours
+        [ $((seconds % every)) -ne 0 ] || printf "${start}setup: %d s, %d MB of about 1800 MB${end}" \
+            "$seconds" "$(du -sm .venv 2>/dev/null | cut -f 1)" >&2
+        sleep 1
+        seconds=$((seconds + 1))
+    done
+    [ ! -t 2 ] || printf '\n' >&2
+    wait "$job"
+}
+
 packages=$(missing_libraries "$python")
 # shellcheck disable=SC2086  # one word per package
 [ -z "$packages" ] || apt_install "open3d needs libraries that are missing here" $packages
 
 .venv/bin/python -c 'import pip' >/dev/null 2>&1 || "$python" -m venv --clear .venv
 echo "setup: installing into .venv with $(.venv/bin/python --version) (the first time takes some minutes)"
-.venv/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]' ||
+watched .venv/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]' ||
     fail "pip could not install pc2grid; its message is above"
 .venv/bin/python -c 'import open3d' || fail "open3d does not load; its message is above"
 echo "setup: ready"

@@ -114,6 +114,16 @@ def test_damage_is_one_line_and_exit_1(log: Path) -> None:
     assert runner.invoke(app, ["info", str(log.parent / "none.mcap")]).exit_code != 0
 
 
+def test_what_is_lost_of_a_damaged_log_shows_in_the_exit_code(log: Path) -> None:
+    assert runner.invoke(app, ["info", str(log), "--recover"]).exit_code == 0
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 50] = bytes(50)
+    log.write_bytes(data)
+    result = runner.invoke(app, ["info", str(log), "--json", "--recover"])
+    assert json.loads(result.stdout)["bytes_lost"] > 0
+    assert result.exit_code == 3
+
+
 def test_markup_in_a_topic_is_shown_and_not_obeyed(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", [ros().cloud("/[bold]x[/bold]", T0 + STEP, [[1, 2, 3]])])
     assert "/[bold]x[/bold]" in runner.invoke(app, ["info", str(path)]).stdout

@@ -17,10 +17,12 @@ from typer.testing import CliRunner
 
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
+from pc2grid_cli.check_pose import as_text
 from pc2grid_cli.console import Console
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app
 from pc2grid_cli.nav2_pose import initialpose, read_pose
+from signature.localization.pose_check import CheckStatus, PoseCheck
 from tests.helpers.json_schema import closed
 from tests.helpers.recordings import ros
 from tests.helpers.rooms import RESOLUTION_M
@@ -235,3 +237,34 @@ def test_a_missing_pose_of_a_robot_is_named(rooms: tuple[Path, SE2]) -> None:
         *("--check-topic", "/amcl_pose", "--publish", "tf"),
     )
     assert "do not go together" in str(done.exception)
+
+
+def test_a_map_is_a_database_for_one_query(rooms: tuple[Path, SE2], tmp_path: Path) -> None:
+    folder, truth = rooms
+    page = tmp_path / "page.html"
+    words = (folder / "drive.mcap", "-d", folder / "left.yaml", "--json", "--report", page)
+    done = pc2grid("relocalize", *words)
+    assert done.exit_code == 0, done.stderr
+    pose = json.loads(done.stdout)["pose"]
+    assert math.hypot(pose["x"] - truth.x, pose["y"] - truth.y) < 0.1
+    assert f"wrote {page}" in done.stderr and page.exists()
+
+
+@pytest.mark.parametrize(
+    ("status", "probability", "said"),
+    [
+        ("fine", 0.97, "probability 0.97"),
+        ("lost", 0.2, "at most 0.20"),
+        ("lost", 0.001, "probability < 0.01"),
+    ],
+)
+def test_a_probability_is_said_once(status: CheckStatus, probability: float, said: str) -> None:
+    checked = PoseCheck(
+        status=status,
+        probability=probability,
+        T_map_base=SE2(0.0, 0.0, 0.0),
+        session="monday",
+        stamp_ns=0,
+        path_m=1.0,
+    )
+    assert said in as_text(checked)

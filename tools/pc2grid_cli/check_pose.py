@@ -133,8 +133,7 @@ def as_text(checked: PoseCheck) -> str:
     told = f"{checked.status}: {where} in {one_line(checked.session)}"
     if checked.lapsed:
         return f"{told}: registration was lost after that pose, so it cannot be compared"
-    at_most = "" if checked.status == "fine" else "at most "
-    told += f", right with probability {at_most}{probability(checked.probability)}"
+    told += f", right with probability {_bound(checked)}"
     if checked.off_m is not None and checked.off_rad is not None and checked.status == "fine":
         told += f", {checked.off_m:.2f} m and {math.degrees(checked.off_rad):.1f} deg from the best fit"
     told += f", after {checked.path_m:.1f} m of travel"
@@ -146,6 +145,12 @@ def as_text(checked: PoseCheck) -> str:
             f" yaw {math.degrees(pose.yaw):.1f} deg, confidence {probability(better.confidence)}"
         )
     return told
+
+
+def _bound(checked: PoseCheck) -> str:
+    """The probability in words: an upper bound unless the pose is fine."""
+    told = probability(checked.probability)
+    return told if checked.status == "fine" or told.startswith("<") else f"at most {told}"
 
 
 def report_check(checked: PoseCheck, document: RelocalizeCheck, *, as_json: bool) -> int:

@@ -28,7 +28,7 @@ _LINE_EVERY_S = 10.0
 """How often progress is printed where there is no terminal; chosen by hand."""
 _SENT_AGAIN_S = 0.05
 """How long after a signal whose exception was dropped it is sent again; chosen by hand."""
-_COMPILING = "compiling, once after each installation: about 15 s"
+_COMPILING = "compiling what runs for the first time here; later runs do not wait for it"
 
 
 class Console:

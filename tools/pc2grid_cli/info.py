@@ -20,7 +20,7 @@ from pc2grid.io import open_log
 from pc2grid.io.topics import TF, camera_info_topic
 from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 from pc2grid.sensor_model import SENSOR_MODELS
-from pc2grid_cli.console import print_json, warn
+from pc2grid_cli.console import LOSSY, print_json, warn
 from pc2grid_cli.db import db_info_command
 from pc2grid_cli.options import AsJson, Assignments, Recover, Topic, make_config
 from signature.database.maintenance import is_database
@@ -67,6 +67,8 @@ def info_command(
         print_json(document)
     else:
         _show(document)
+    if document["bytes_lost"]:
+        raise typer.Exit(LOSSY)
 
 
 def describe_map(path: Path, assignments: list[str] | None = None) -> InfoMap:

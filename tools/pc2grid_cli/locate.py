@@ -19,8 +19,7 @@ from pc2grid.model import Health, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli.known_pose import KnownPose
-from signature.database import open_database
-from signature.files import locate_log, query_config
+from signature.files import locate_log, open_places, query_config
 from signature.localization.hypotheses import HYPOTHESES
 from signature.localization.localizer import locate_map
 from signature.localization.map_index import MapIndex
@@ -65,11 +64,11 @@ class Found:
 def searched(
     database: str, building: str | None, floor: str | None
 ) -> Iterator[tuple[SubmapDatabase, list[str]]]:
-    """A database to look in, only in the sessions of a building and floor if they are given.
+    """A database, or a map as one, to look in; only the sessions of a building and floor if they are given.
 
     Yields it, and what is damaged in it and left out.
     """
-    with open_database(database) as opened:
+    with open_places(database) as opened:
         if building is not None or floor is not None:
             opened.keep_only(building=building, floor=floor)
         yield opened, [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]

@@ -83,7 +83,9 @@ JobCount = Annotated[
 ]
 DATABASE = "BUILDING.submaps|postgresql://..."
 Database = Annotated[str, typer.Argument(metavar=DATABASE, help="the database")]
-SearchedDatabase = Annotated[str, typer.Option("--database", "-d", metavar=DATABASE, help="where to look")]
+SearchedDatabase = Annotated[
+    str, typer.Option("--database", "-d", metavar=f"{DATABASE}|MAP", help="where to look; a map is converted")
+]
 Building = Annotated[
     str | None, typer.Option("--building", metavar="NAME", help="look only in sessions labelled so")
 ]

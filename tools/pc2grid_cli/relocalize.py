@@ -64,6 +64,11 @@ class _Outputs:
         """The files that only an answer can fill."""
         return [path for path in (self.trajectory, self.initialpose, self.output) if path is not None]
 
+    def written(self, *, located: bool) -> list[Path]:
+        """The files that are there after the answer."""
+        always = [path for path in (self.plot, self.report) if path is not None]
+        return [*self.of_answer(), *always] if located else always
+
     def refuse(self, reason: str, rerun: str | None) -> None:
         """Raises ConfigError if there is any."""
         files = ("trajectory", "initialpose", "output", "plot", "report")
@@ -192,6 +197,8 @@ def relocalize_command(
         stated = answer_in_building(found.answer, frames)
         _print(found, stated, where, left_out, map_sigma_m(found.answer, opened), as_json=json)
         _write(outputs, opened, found, stated, located, settings)
+        for path in outputs.written(located=located is not None):
+            console.of(context).note(f"wrote {path}")
         _warn_of_missing_points(found, opened)
     if located is None:
         for path in outputs.of_answer():
