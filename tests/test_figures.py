@@ -9,6 +9,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text("utf-8")
 FLAT = " ".join(README.split())
@@ -51,3 +53,12 @@ def test_elsewhere_is_what_the_page_counts() -> None:
     wrong, _, asked, *_ = total["elsewhere: wrong of asked"].split()
     verb = "was" if wrong == "1" else "were"
     assert f"In the map of another building, {wrong} of {asked} queries {verb} located." in FLAT
+
+
+MEASURED = ("consistency", "map-quality", "paper", "peers", "performance", "real", "sensors", "space")
+
+
+@pytest.mark.parametrize("page", MEASURED)
+def test_a_page_of_figures_names_the_program_that_made_them(page: str) -> None:
+    head = "\n".join((ROOT / "examples" / f"{page}.md").read_text("utf-8").splitlines()[:8])
+    assert re.search(r"of commit [0-9a-f]{7}|\([0-9a-f]{7}\)", head)
