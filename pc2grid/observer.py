@@ -6,7 +6,7 @@ anybody is interested. A subclass overrides the methods that it needs.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
@@ -53,6 +53,42 @@ class Observer:
 
     def on_warning(self, text: str) -> None:
         """A sentence about something that went wrong and was dealt with."""
+
+
+class ProgressBars(Observer):
+    """Shows each step as a moving bar, on a terminal (standard error) or in a notebook; else nothing."""
+
+    def __init__(self) -> None:
+        self._update: Callable[[float], None] | None = None
+
+    @contextmanager
+    def _bar(self, what: str) -> Iterator[None]:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TimeElapsedColumn
+
+        console = Console(stderr=True)
+        columns = (
+            "{task.description}",
+            SpinnerColumn(),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+        )
+        shown = console.is_terminal or console.is_jupyter
+        with Progress(*columns, console=console, transient=True, disable=not shown) as bars:
+            task = bars.add_task(what, total=1.0)
+            self._update = lambda share: bars.update(task, completed=share)
+            yield
+        self._update = None
+
+    def step(self, what: str, recorded_s: float | None = None) -> AbstractContextManager[None]:
+        """Surrounds a step of the work with its bar."""
+        return self._bar(what)
+
+    def on_progress(self, share: float) -> None:
+        """Moves the bar."""
+        if self._update is not None:
+            self._update(share)
 
 
 class Observers(Observer):

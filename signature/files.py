@@ -14,7 +14,7 @@ from pc2grid.io.atomic import require_writable
 from pc2grid.io.recording import open_log
 from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 from pc2grid.model import SessionMap
-from pc2grid.observer import Observer
+from pc2grid.observer import Observer, ProgressBars
 from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from signature.config import Config
@@ -45,7 +45,7 @@ def convert(
     label: Label | None = None,
     add: bool = False,
     force: bool = False,
-    observer: Observer = Observer(),
+    observer: Observer | None = None,
 ) -> SessionMap:
     """Make a session of a recording or a map, and store it in a database.
 
@@ -55,9 +55,10 @@ def convert(
     source : a recording, the map.yaml of a nav2 map, or a point cloud or mesh of a building.
     database : the file to make, such as `building.submaps`, or a postgresql:// URL.
     name : of the session; by default that of the file.
-    span, recover, label, observer : as in `signature.build_session`.
+    span, recover, label : as in `signature.build_session`.
     add : add the session to an existing database. force : replace an existing database or, with `add`, a
         session of the same name.
+    observer : gets the news; None: a progress bar on a terminal or in a notebook.
 
     Raises OutputError, before any work, for an existing database without `add` and `force` and for one that
     cannot be written; else as `signature.build_session` and `signature.add_session`.
@@ -78,7 +79,7 @@ def convert(
         span=span,
         recover=recover,
         label=label,
-        observer=observer,
+        observer=observer or ProgressBars(),
     )
     maps, origins = on_floors(maps, origin)
     add_sessions(database, list(zip(maps, origins, strict=True)), config, keep=add, force=force)
@@ -94,7 +95,7 @@ def relocalize(
     prior: Prior | None = None,
     until_located: bool = False,
     recover: bool = False,
-    observer: Observer = Observer(),
+    observer: Observer | None = None,
 ) -> Answer:
     """Find where a recording was made, or where a map lies.
 
@@ -105,7 +106,8 @@ def relocalize(
     prior : what is known of the robot's pose beforehand; other places are no answers.
     until_located : ask after every metre of travel, and stop at the first answer that is `located`; otherwise
         the recording is read to its end, and the answer is about its last metres.
-    observer : gets the progress, and each scan with its tracked pose.
+    observer : gets the progress, and each scan with its tracked pose; None: a progress bar on a terminal
+        or in a notebook.
 
     Raises the errors of `pc2grid.open_log` and `signature.open_database`, MapFileError for a map, and NoScans
     if no scan can be used.
@@ -118,6 +120,7 @@ def relocalize(
     >>> pc2grid.relocalize("tuesday.mcap", "building.submaps", prior=elsewhere).status
     'not_found'
     """
+    observer = observer or ProgressBars()
     with open_places(database, config) as opened:
         settings = query_config(opened, config)
         index = MapIndex.of(opened, settings, observer)
@@ -148,7 +151,7 @@ def open_places(place: str | Path, config: Config = Config()) -> Iterator[Submap
         if not is_url(place) and is_drawn_map(Path(place)):
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             file = folder / f"{Path(place).stem}.submaps"
-            convert(place, file, config)
+            convert(place, file, config, observer=Observer())
             place = file
         yield stack.enter_context(open_database(place))
 

@@ -10,6 +10,7 @@ import pc2grid
 from pc2grid.config import ReadConfig
 from pc2grid.errors import ConfigError, DatabaseError, OutputError
 from pc2grid.io.nav2_map import save_map
+from pc2grid.simulate import SimulationConfig, simulate_session
 from signature.config import Config
 from signature.database import Label, open_database
 from signature.files import convert, query_config, relocalize
@@ -71,3 +72,23 @@ def test_a_query_is_drawn_as_the_database_and_read_as_one_says(building: Path) -
         settings = query_config(database, asked)
         assert settings.partition == database.config().partition != asked.partition
     assert settings.read.topic == "/scan"
+
+
+@pytest.mark.parametrize(("terminal", "shown"), [("1", True), ("0", False)])
+def test_python_shows_progress_where_somebody_looks(
+    building: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    terminal: str,
+    shown: bool,
+) -> None:
+    recording = tmp_path / "drive.mcap"
+    config = SimulationConfig(length_m=1.0, seed=1, clutter=0, start_m=(10.0, 7.0))
+    simulate_session(recording, sensor="laser", grid=office(), config=config)
+    monkeypatch.setenv("TTY_COMPATIBLE", terminal)  # what rich takes for a terminal
+    pc2grid.convert(recording, tmp_path / "drive.submaps")
+    pc2grid.relocalize(recording, building / "plan.submaps")
+    told = capfd.readouterr()
+    assert told.out == ""
+    assert ("%" in told.err and "locate" in told.err) == shown
