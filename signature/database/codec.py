@@ -1,6 +1,6 @@
 """Frozen types as a JSON document and named arrays, and back.
 
-`encode` follows the fields of a dataclass, by their declared types. Numbers, text, enum members, tuples,
+`encode` follows the fields of a dataclass, by their declared types. Numbers, text, tuples,
 mappings, settings and further dataclasses are written into the document. Arrays leave it and are named by
 their path, such as `grid.cells`. Two kinds of tuples become arrays as well: one of enum members is stored as
 their indices, and one of dataclasses that hold arrays column by column, `loops.information` for all loops.
@@ -16,7 +16,6 @@ import dataclasses
 import enum
 import functools
 import json
-import lzma
 import math
 import struct
 import types
@@ -29,7 +28,6 @@ from typing import Any, NamedTuple, Protocol, TypeVar, Union
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel
 
 from pc2grid.arrays import hand_over
 from pc2grid.errors import DatabaseCorrupt
@@ -49,13 +47,6 @@ _ARRAY = "array"
 """What the document has in place of an array."""
 _ZLIB_LEVEL = 6
 """zlib's own default; a part of the format only in that equal sessions give equal bytes."""
-_XZ_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 20, "lc": 0, "lp": 0, "pb": 0}]
-"""xz's own default, but that a byte is predicted without the one before it, which makes maps shorter by a
-fortieth, and that it looks back over a megabyte, about one map."""
-_XZ_MEMORY = 1 << 22
-"""Bytes that expanding these takes at most."""
-_XZ_BEGIN = b"\xfd7zXZ\x00"
-"""First bytes of what xz makes; those of zlib are others."""
 _DTYPES = {
     name: np.dtype(name).newbyteorder("<")
     for name in ("bool", "int8", "uint8", "int32", "int64", "float32", "float64")
@@ -121,7 +112,7 @@ def _coding(kind: Any) -> _Coding:
         return _Mapping(_coding(arguments[1]))
     if _is_dataclass(kind):
         return _Instance(kind)
-    return _Settings(kind) if _is_a(kind, BaseModel) else _Member(kind)
+    return _Settings(kind)
 
 
 def _coding_of_tuple(arguments: tuple[Any, ...]) -> _Coding:
@@ -274,19 +265,6 @@ class _Settings:
         return _settings(self.kind, json.dumps(content, sort_keys=True))
 
 
-@dataclass(frozen=True)
-class _Member:
-    """One member of an enum."""
-
-    kind: Any
-
-    def encode(self, value: Any, path: str, arrays: dict[str, Array]) -> Any:
-        return value.value
-
-    def decode(self, content: Any, path: str, arrays: dict[str, Array]) -> Any:
-        return self.kind(content)
-
-
 def _whole(value: Any, name: str) -> int:
     return validation.stamp(value, name) if name.endswith("_ns") else validation.count(value, name)
 
@@ -411,28 +389,21 @@ def _holds_arrays(kind: Any) -> bool:
 # --- arrays to bytes ----------------------------------------------------------------------------------
 
 
-def pack(array: Array, *, compress: bool = True, seldom_read: bool = False) -> Packed:
+def pack(array: Array, *, compress: bool = True) -> Packed:
     """Little-endian bytes of an array of one or more axes, or what zlib makes of them if that is shorter.
 
     For zlib the first axis becomes the last, and the bytes of the entries are sorted by their significance:
     of poses, points and paths, most components then change slowly or not at all.
-
-    seldom_read : xz in place of zlib, which makes a map shorter by a third, and takes ten times as long.
     """
     name = array.dtype.name
     data = np.ascontiguousarray(array, _DTYPES[name]).tobytes()
     if compress:
         turned = np.ascontiguousarray(np.moveaxis(array, 0, -1), _DTYPES[name]).reshape(-1)
         planes = turned.view(np.uint8).reshape(-1, array.itemsize).T.tobytes()
-        smaller = _by_xz(planes) if seldom_read else zlib.compress(planes, _ZLIB_LEVEL)
+        smaller = zlib.compress(planes, _ZLIB_LEVEL)
         if len(smaller) < len(data):
             return Packed(name, to_json(array.shape), smaller)
     return Packed(name, to_json(array.shape), data)
-
-
-def _by_xz(data: bytes) -> bytes:
-    """Without a checksum: the row has one."""
-    return lzma.compress(data, lzma.FORMAT_XZ, lzma.CHECK_NONE, filters=_XZ_FILTERS)
 
 
 def unpack(packed: Packed) -> Array:
@@ -469,12 +440,11 @@ def _expanded(data: bytes, dtype: np.dtype[Any], shape: list[int]) -> Array:
 
 def _inflate(data: bytes, size: int) -> bytes:
     """Decompress exactly `size` bytes; never allocates more than that."""
-    by_xz = data.startswith(_XZ_BEGIN)
-    inflate = lzma.LZMADecompressor(memlimit=_XZ_MEMORY) if by_xz else zlib.decompressobj()
+    inflate = zlib.decompressobj()
     try:
         # max_length 0 would mean "no limit" to zlib.
         raw = inflate.decompress(data, size + 1)
-    except (zlib.error, lzma.LZMAError) as error:
+    except zlib.error as error:
         raise ValueError(f"compressed data: {error}") from None
     if len(raw) != size or not inflate.eof or inflate.unused_data:
         raise ValueError(f"compressed data does not hold the {size} bytes it should")

@@ -23,7 +23,6 @@ from signature.database.protocol import (
     Provenance,
     SessionInfo,
     none_there,
-    retired,
 )
 from signature.database.rows import Rows, SessionRow, no_session
 from signature.database.stored import PARTS, StoredSession, SubmapArrays, stored_session
@@ -265,13 +264,6 @@ class SubmapDatabase(ABC):
         if len(others) == len(labels):
             raise none_there(self.location, building, floor, labels)
         self._left_out |= others
-
-    def keep_searched(self) -> None:
-        """From now on, know only the sessions that are searched: not those that a living map stands for."""
-        frames = {
-            row.id: self._rows.part(row, "frame", {"info": self._rows.info(row)}) for row in self._known()
-        }
-        self._left_out |= retired({number: frame for number, frame in frames.items() if frame is not None})
 
     def leave_out_damaged(self) -> tuple[Problem, ...]:
         """From now on, leave out the sessions that cannot be searched because they are damaged.

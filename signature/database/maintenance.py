@@ -78,20 +78,6 @@ def place(target: Place, frames: Mapping[str, BuildingFrame | None]) -> None:
     engine_of(target).change(target, lambda rows: rows.place(frames))
 
 
-def replace_sessions(target: Place, sessions: Sequence[StoredSession], *, remove: Sequence[str] = ()) -> None:
-    """Store sessions as they are, each in place of that of its name, and remove others, all or none.
-
-    Raises DatabaseError for a name to remove that no session has, OutputError, DatabaseBusy, and as
-    `open_database`.
-    """
-
-    def write(rows: Rows) -> None:
-        rows.remove(remove)
-        rows.store(sessions, force=True)
-
-    engine_of(target).change(target, write)
-
-
 def exists(target: Place) -> bool:
     """Whether there is anything that storing without `keep` would replace."""
     return engine_of(target).exists(target)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
     from signature.describe import Signature
 
 
-Key = TypeVar("Key")
 Place = str | Path
 """Path of a `*.submaps` file, or URL of a PostgreSQL database."""
 
@@ -103,16 +101,6 @@ class Provenance:
         return f"Provenance({short(self.source)}, sha256 {self.digest[:12]}, {short(self.label)})"
 
 
-class SessionRole(enum.Enum):
-    """What a joined session is to the living map of its floor (`signature.living`).
-
-    LIVING : that map itself. RETIRED : a session that it was made from, and for which it is searched.
-    """
-
-    LIVING = "living"
-    RETIRED = "retired"
-
-
 Covariance = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 """Of x, y and yaw, row by row; metres and radians."""
 
@@ -125,14 +113,12 @@ class BuildingFrame:
         stays when that session is renamed or removed.
     T_building_session : the map frame of the session in that of the building. covariance : of it, in the axes
         of the building.
-    role : what the session is to the living map of its floor; None: nothing, it is searched itself.
     bend : how the map is bent before it is placed by T_building_session; empty: it is rigid.
     """
 
     name: str
     T_building_session: SE2
     covariance: Covariance
-    role: SessionRole | None = None
     bend: Bend = ()
 
     def at(self, x_m: float, y_m: float) -> SE2:
@@ -155,12 +141,6 @@ class BuildingFrame:
     def as_drawn(self, points_m: F64) -> F64:
         """The points (N, 2) of the session's map that lie at points (N, 2) of the building."""
         return drawn_at(self.bend, self.T_building_session.inverse().apply(points_m))
-
-
-def retired(frames: Mapping[Key, BuildingFrame]) -> set[Key]:
-    """Those of joined sessions that a living map stands for. frames : of sessions, by name or number."""
-    living = {frame.name for frame in frames.values() if frame.role is SessionRole.LIVING}
-    return {key for key, at in frames.items() if at.role is SessionRole.RETIRED and at.name in living}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

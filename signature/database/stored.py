@@ -19,7 +19,7 @@ from pc2grid.model import Loop, OccupancyGrid, PointMap, Trajectory
 from pc2grid.submaps.junction_graph import GraphArrays, graph_from_arrays, graph_to_arrays, junction_graph
 from pc2grid.submaps.partition import divide
 from signature.database import codec, validation
-from signature.database.protocol import BuildingFrame, Entry, SessionInfo, SessionRole
+from signature.database.protocol import BuildingFrame, Entry, SessionInfo
 from signature.describe import describe
 from signature.seen_places import SeenPlaces
 from signature.similarity import I32, SignatureTable
@@ -105,9 +105,6 @@ RECOVERED = ("graph", "points", "submaps", "seen", "frame")
 ADDED = ("frame",)
 """The parts that a session gets after it was stored; without them, nothing in its document tells of them."""
 
-_POSE_M = 1.0
-"""Metres of its way for each pose that a session keeps when it is thinned. By hand."""
-
 
 def stored_session(entry: Entry) -> StoredSession:
     """A session as it is stored. Raises ValueError for what its settings do not make."""
@@ -165,32 +162,6 @@ def completed(parts: Mapping[str, Any]) -> StoredSession:
     return StoredSession(**found)
 
 
-def thinned(session: StoredSession, frame: BuildingFrame) -> StoredSession:
-    """A session of which only its map is kept, and a pose for each metre of its way: what `completed` makes
-    the rest from, but for the loops, the other poses and the points. frame : its new one."""
-    import networkx as nx
-
-    config, poses = session.info.provenance.config, session.trajectory
-    kept = np.unique(np.floor(poses.path_m() / _POSE_M), return_index=True)[1]
-    trajectory = Trajectory(
-        stamps_ns=poses.stamps_ns[kept],
-        T_session_base=poses.T_session_base[kept],
-        health=tuple(poses.health[k] for k in kept) if poses.health else (),
-    )
-    nothing = SubmapArrays.of((), (), config)
-    return replace(
-        session,
-        info=replace(session.info, submaps=0, scans=len(trajectory)),
-        trajectory=trajectory,
-        loops=(),
-        graph=graph_to_arrays(nx.Graph()),
-        points=None,
-        submaps=nothing,
-        seen=seen_from(nothing, session.grid, config),
-        frame=frame,
-    )
-
-
 def seen_from(submaps: SubmapArrays, grid: OccupancyGrid, config: Config) -> SeenPlaces:
     """What is seen from the centres of submaps."""
     return SeenPlaces.of(grid, submaps.center_m, config.partition.radius_m)
@@ -204,8 +175,7 @@ def stored_name(name: str) -> str:
 
 
 def encode(session: StoredSession) -> tuple[str, dict[str, codec.Packed]]:
-    """The document and the arrays of a session. One that retired is read seldom, so it is stored smaller."""
-    seldom_read = session.frame is not None and session.frame.role is SessionRole.RETIRED
+    """The document and the arrays of a session."""
     content: dict[str, Any] = {}
     packed: dict[str, codec.Packed] = {}
     for part in fields(StoredSession):
@@ -215,10 +185,7 @@ def encode(session: StoredSession) -> tuple[str, dict[str, codec.Packed]]:
             continue
         content[part.name] = codec.encode(codec.fields_of(StoredSession)[part.name], value, part.name, arrays)
         compress = part.metadata.get("compress", True)
-        packed |= {
-            name: codec.pack(array, compress=compress, seldom_read=seldom_read)
-            for name, array in arrays.items()
-        }
+        packed |= {name: codec.pack(array, compress=compress) for name, array in arrays.items()}
     return codec.to_json(content), packed
 
 

@@ -117,8 +117,7 @@ class MapIndex:
 
     @staticmethod
     def of(database: SubmapDatabase, config: Config, observer: Observer = Observer()) -> MapIndex:
-        """Everything that is in a database, but for sessions that a living map stands for; from now on, the
-        database knows no others (`SubmapDatabase.keep_searched`).
+        """Everything that is in a database.
 
         If that is more than `signature.retrieval.viewpoints.AT_ONCE_M2` of free floor, maps are read when
         they first matter, and points always are, so the database must stay open as long as the index is used.
@@ -126,7 +125,6 @@ class MapIndex:
         observer : gets the progress where places have to be selected, and a warning if what is seen from them
             is damaged and has to be computed.
         """
-        database.keep_searched()
         infos = {info.name: info for info in database.sessions()}
         areas_m2 = {name: info.area_m2 for name, info in infos.items()}
         grids: Mapping[str, OccupancyGrid] = DatabaseGrids(database, tuple(infos))

@@ -6,7 +6,6 @@ import json
 import shutil
 from pathlib import Path
 from typing import Any
-from unittest.mock import ANY
 
 import cv2
 import numpy as np
@@ -113,38 +112,6 @@ def test_what_is_added_to_a_joined_database_is_joined() -> None:
     run("db split b.submaps west -o y.submaps")
     assert document("convert east.yaml -o y.submaps --add")["joined"] == []
     assert document("convert east.yaml -o y.submaps --add --name too --join")["joined"] != []
-
-
-def test_a_living_map_is_searched_for_its_sessions_until_it_is_undone() -> None:
-    before = document("relocalize drive.mcap -d joined.submaps")
-    assert "west.living" in run("db update joined.submaps")
-    info = run("db info joined.submaps")
-    assert info.count("retired: the living map is searched for it") == 2
-    assert info.count("the living map of its floor") == 1
-    answer = document("relocalize drive.mcap -d joined.submaps")
-    assert answer["session"] == "west.living" and answer["frame"] == "west"
-    off_m = [answer["pose"][axis] - before["pose"][axis] for axis in "xy"]
-    # The map of the east, drawn anew in the frame of the west: a cell, and one of the pose before.
-    assert np.hypot(*off_m) < 0.1
-    run("export joined.submaps --map whole")
-    assert load_map(Path("whole.yaml")).is_free(19.0, 7.0)
-    assert "searched again: west, east" in run("db update joined.submaps --undo")
-    assert document("relocalize drive.mcap -d joined.submaps") == {**before, "timing_ms": ANY}
-
-
-def test_what_is_added_with_update_goes_into_the_living_map() -> None:
-    run("db split b.submaps west -o x.submaps")
-    added = document("convert east.yaml -o x.submaps --add --update")
-    assert [(s["session"], s["frame"]) for s in added["joined"]] == [("east", "west")]
-    (made,) = added["living"]
-    assert (made["session"], made["members"]) == ("west.living", ["west", "east"])
-    # The third is compared with the living map, and the next is made of all three.
-    (made,) = document("convert west.yaml -o x.submaps --add --update --name again")["living"]
-    assert made["members"] == ["west", "east", "again"]
-    with pytest.raises(ConfigError, match="--update joins what is new"):
-        run("convert west.yaml -o x.submaps --add --update --no-join --name other")
-    with pytest.raises(DatabaseError, match="no two joined sessions"):
-        run("db update b.submaps")
 
 
 def test_an_interrupted_join_goes_on_and_leaves_no_file() -> None:

@@ -67,8 +67,6 @@ COMMANDS = [
     ("db-check", "db check b.submaps", 0),
     ("db-check", "db check damaged.submaps", 1),
     ("db-join", "db join two.submaps", 0),
-    ("db-update", "db update joined.submaps", 0),
-    ("db-update", "db update joined.submaps --undo", 0),
     ("db-copy", "db copy b.submaps -o out.submaps", 0),
     ("db-copy", "db copy --recover damaged.submaps -o out.submaps", 3),
     ("db-merge", "db merge b.submaps -o out.submaps", 0),

@@ -18,9 +18,9 @@ from pc2grid.observer import Observer, Observers
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
 from pc2grid_cli.comparing import comparing
-from pc2grid_cli.json_schemas import Convert, Converted, JoinedSession, UpdatedMap, plain
-from pc2grid_cli.session_documents import joined_document, living_as_text, living_document, session_document
-from signature import conversion_jobs, living
+from pc2grid_cli.json_schemas import Convert, Converted, JoinedSession, plain
+from pc2grid_cli.session_documents import joined_document, session_document
+from signature import conversion_jobs
 from signature.config import Config
 from signature.conversion_jobs import Job
 from signature.database import Label, maintenance, open_database
@@ -60,8 +60,7 @@ class Done:
     """The results of all inputs so far.
 
     lossy : data was lost, or an input failed. severe : so much that the exit code is 3. joined : where those
-    of the new sessions lie in a building that were joined with others. living : the living maps that were
-    updated.
+    of the new sessions lie in a building that were joined with others.
     """
 
     sessions: list[Converted] = field(default_factory=list)
@@ -69,7 +68,6 @@ class Done:
     failed: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     joined: list[JoinedSession] = field(default_factory=list)
-    living: list[UpdatedMap] = field(default_factory=list)
     lossy: bool = False
     severe: bool = False
 
@@ -83,7 +81,6 @@ class Done:
             "unchanged": self.unchanged,
             "failed": self.failed,
             "joined": self.joined,
-            "living": self.living,
         }
         return plain(Convert, document)
 
@@ -249,14 +246,6 @@ def join_added(
     alone = [name for name in names if name not in found.frames]
     if alone:
         done.warnings.append(f"{', '.join(alone)}: not joined with another session; see `pc2grid db join`")
-
-
-def update_living(output: str, done: Done, terminal: console.Console) -> None:
-    """Update the living maps of the floors that the new sessions were joined to."""
-    frames = {document["frame"] for document in done.joined}
-    for made in living.update(output, frames) if frames else ():
-        done.living.append(living_document(made))
-        terminal.note(living_as_text(made))
 
 
 def conclude(output: str, done: Done, count: int, *, json: bool) -> None:

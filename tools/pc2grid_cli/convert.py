@@ -43,10 +43,6 @@ _Join = Annotated[
     bool | None,
     typer.Option("--join/--no-join", help="join what is new (db join); default: if others are joined"),
 ]
-_Update = Annotated[
-    bool,
-    typer.Option("--update", help="join what is new, and update the living map of its floor (db update)"),
-]
 
 
 def convert_command(
@@ -64,7 +60,6 @@ def convert_command(
     points: _Points = None,
     add: _Add = False,
     join: _Join = None,
-    update: _Update = False,
     dask: options.Dask = None,
     jobs: options.JobCount = None,
     rerun: options.Rerun = None,
@@ -83,8 +78,6 @@ def convert_command(
 
     Example: pc2grid convert monday.mcap -o building.submaps
     """
-    if update and join is False:
-        raise ConfigError("--update joins what is new: not with --no-join")
     _check(output, rerun, dask=dask, jobs=jobs, several=len(inputs) > 1)
     settings = options.make_config(
         config,
@@ -115,11 +108,7 @@ def convert_command(
         quiet=json,
         strict=strict,
     )
-    conversion.join_added(
-        output, done, console.of(context), wanted=True if update else join, dask=dask, jobs=jobs
-    )
-    if update:
-        conversion.update_living(output, done, console.of(context))
+    conversion.join_added(output, done, console.of(context), wanted=join, dask=dask, jobs=jobs)
     conversion.conclude(output, done, len(inputs), json=json)
 
 

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pc2grid.display import counted
-from pc2grid.errors import DatabaseCorrupt, DatabaseError, one_line
+from pc2grid.errors import DatabaseError, one_line
 from pc2grid_cli import console
 from pc2grid_cli.json_schemas import DbCheck, DbInfo, DbWrite, StoredInfo, plain
 from pc2grid_cli.options import DATABASE, AsJson, Database, Force, WrittenDatabase
 from pc2grid_cli.session_documents import precision_summary
-from signature.database import Problem, SessionInfo, SubmapDatabase, open_database
+from signature.database import Problem, SessionInfo, open_database
 from signature.database.maintenance import check, copy, merge, remove, rename, shown, split
-from signature.database.protocol import BuildingFrame, SessionRole
 
-_ROLES = {
-    None: "",
-    SessionRole.LIVING: ", the living map of its floor",
-    SessionRole.RETIRED: ", retired: the living map is searched for it",
-}
 _Sessions = Annotated[list[str], typer.Argument(metavar="SESSION...", help="which of its sessions")]
 
 
@@ -33,12 +26,12 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
     Example: pc2grid db info building.submaps
     """
     with open_database(database) as opened:
-        sessions, where, roles = opened.sessions(), opened.location, _roles(opened)
+        sessions, where = opened.sessions(), opened.location
     if json:
         document: DbInfo = {
             "schema_version": 1,
             "database": where,
-            "sessions": [_document(session, roles[session.name]) for session in sessions],
+            "sessions": [_document(session) for session in sessions],
         }
         console.print_json(plain(DbInfo, document))
         return
@@ -46,7 +39,7 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
         f"{where}: {counted(len(sessions), 'session')}, {counted(sum(s.submaps for s in sessions), 'submap')}"
     )
     for session in sessions:
-        print(one_line(_line(session) + _ROLES[roles[session.name]]))
+        print(one_line(_line(session)))
 
 
 def _line(s: SessionInfo) -> str:
@@ -62,20 +55,9 @@ def _line(s: SessionInfo) -> str:
     return line
 
 
-def _roles(database: SubmapDatabase) -> dict[str, SessionRole | None]:
-    """What each session is to the living map of its floor."""
-    frames: Mapping[str, BuildingFrame] = {}
-    with contextlib.suppress(DatabaseCorrupt):  # `db check` reports it
-        frames = database.frames()
-    return {
-        info.name: frames[info.name].role if info.name in frames else None for info in database.sessions()
-    }
-
-
-def _document(s: SessionInfo, role: SessionRole | None) -> StoredInfo:
+def _document(s: SessionInfo) -> StoredInfo:
     return {
         "name": s.name,
-        "role": None if role is None else role.value,
         "sensor": s.sensor,
         "building": s.provenance.label.building,
         "floor": s.provenance.label.floor,

@@ -279,8 +279,7 @@ class JoinedSession(TypedDict):
 
 class Convert(TypedDict):
     """`pc2grid convert --json`. unchanged: sessions that were stored already; failed: inputs left out.
-    joined: where those of the new sessions lie in a building that were joined with others. living: the living
-    maps that were made with --update."""
+    joined: where those of the new sessions lie in a building that were joined with others."""
 
     schema_version: Version
     database: str
@@ -289,17 +288,14 @@ class Convert(TypedDict):
     unchanged: list[str]
     failed: list[str]
     joined: list[JoinedSession]
-    living: list[UpdatedMap]
 
 
 class StoredInfo(TypedDict):
     """A session of a database, with the versions and settings that made it. consistency: null for an imported
     map, and for a session that was stored before it was measured. floor_height_m: above the lowest floor of
-    its recording, null if that is not known. role: a living map is searched for those that are retired; null:
-    neither."""
+    its recording, null if that is not known."""
 
     name: str
-    role: Literal["living", "retired"] | None
     sensor: str
     building: str | None
     floor: str | None
@@ -378,27 +374,6 @@ class DbJoin(TypedDict):
     alone: list[str]
 
 
-class UpdatedMap(TypedDict):
-    """A living map. session: its name. frame: of its building. members: the sessions that it was made from,
-    oldest first. area_m2: free ground."""
-
-    session: str
-    frame: str
-    members: list[str]
-    area_m2: ThreeDigits
-    submaps: int
-
-
-class DbUpdate(TypedDict):
-    """`pc2grid db update --json`. living: the living maps that were made, none with --undo. back: the
-    sessions that are searched again, with --undo."""
-
-    schema_version: Version
-    database: str
-    living: list[UpdatedMap]
-    back: list[str]
-
-
 class Changed(TypedDict):
     """A patch that changed. kind: came or went. center_m, length_m, width_m, yaw: the smallest rectangle
     around it, in the frame of the building; yaw is the direction of its longer side. probability: of the
@@ -445,7 +420,6 @@ DOCUMENTS: dict[str, type] = {
     "db-copy": DbWrite,
     "db-info": DbInfo,
     "db-join": DbJoin,
-    "db-update": DbUpdate,
     "db-merge": DbWrite,
     "db-remove": DbWrite,
     "db-rename": DbWrite,

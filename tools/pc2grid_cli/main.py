@@ -34,10 +34,6 @@ DB = {
         "pc2grid_cli.join:db_join_command",
         "Find out how sessions of a building lie to each other.",
     ),
-    "update": (
-        "pc2grid_cli.update:db_update_command",
-        "Keep one living map of each floor, and search it only.",
-    ),
     "copy": ("pc2grid_cli.db:db_copy_command", "Write a compact copy of a database."),
     "split": ("pc2grid_cli.db:db_split_command", "Copy sessions into a database of their own."),
     "rename": ("pc2grid_cli.db:db_rename_command", "Give a session another name."),
@@ -117,7 +113,7 @@ app.add_typer(
 app.add_typer(
     typer.Typer(
         cls=group(DB),
-        help="Look into databases, check, join, update, change, merge, split and copy them.",
+        help="Look into databases, check, join, change, merge, split and copy them.",
         no_args_is_help=True,
     ),
     name="db",

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import statistics
 
-from pc2grid.display import counted
-from pc2grid.errors import one_line
 from pc2grid.model import Precision, SessionMap
-from pc2grid_cli.json_schemas import Converted, JoinedSession, PrecisionSummary, UpdatedMap
+from pc2grid_cli.json_schemas import Converted, JoinedSession, PrecisionSummary
 from signature.bend import largest_m
 from signature.database import Provenance
 from signature.database.protocol import BuildingFrame
-from signature.living import LivingMap
 
 
 def session_document(session: SessionMap, origin: Provenance) -> Converted:
@@ -54,25 +51,6 @@ def joined_document(session: str, frame: BuildingFrame) -> JoinedSession:
         "covariance": [list(row) for row in frame.covariance],
         "bent_m": round(largest_m(frame.bend), 3),
     }
-
-
-def living_document(made: LivingMap) -> UpdatedMap:
-    """A living map, as `convert` and `db update` describe it."""
-    return {
-        "session": made.name,
-        "frame": made.frame,
-        "members": list(made.members),
-        "area_m2": made.free_m2,
-        "submaps": made.submaps,
-    }
-
-
-def living_as_text(made: LivingMap) -> str:
-    """One line on a living map."""
-    return one_line(
-        f"{made.name}: {made.free_m2:.0f} m2 free, {counted(made.submaps, 'submap')}, searched for"
-        f" {', '.join(made.members)}"
-    )
 
 
 def precision_summary(precision: Precision | None) -> PrecisionSummary | None:

@@ -12,9 +12,8 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from pc2grid.errors import DatabaseError
 from pc2grid.observer import Observer
-from signature.database.protocol import BuildingFrame, SessionInfo, SessionRole, retired
+from signature.database.protocol import BuildingFrame, SessionInfo
 from signature.database.rows import no_session
 from signature.localization.joining.comparing import Compare, ToCompare, compare_here
 from signature.localization.joining.journal import JoinJournal, remembered
@@ -55,16 +54,14 @@ def join_sessions(
     `signature.localization.joining.comparing`; None: this process does. observer : gets the progress.
 
     Of many sessions, each is compared with those that look most like it (`candidates`), each pair once.
-    Living maps stay where they are, and are compared in place of the sessions that retired for them.
 
-    Raises DatabaseError for a name that no session has, and for a `frame` where there are living maps.
+    Raises DatabaseError for a name that no session has.
     """
     known = database.frames()
-    asleep = {name: known[name] for name in retired(known)}
-    infos = {info.name: info for info in database.sessions() if info.name not in asleep}
-    living = {name for name, at in known.items() if at.role is SessionRole.LIVING}
-    _check_names(database, infos, living, frame, only)
-    moving = infos.keys() - living if only is None else only
+    infos = {info.name: info for info in database.sessions()}
+    for name in {*(only or ()), *(() if frame is None else (frame,))} - infos.keys():
+        raise no_session(name, infos, database.location)
+    moving = infos.keys() if only is None else only
     stay = {name: at for name, at in known.items() if name in infos and name not in moving}
     rounds = rounds_of(database, infos, moving)
     compare = compare or functools.partial(compare_here, database)
@@ -72,7 +69,7 @@ def join_sessions(
         compare = remembered(database, journal, compare)
     pairs = list(_compared(infos, rounds, Buildings(stay), compare, observer))
     joined = [pair for pair in pairs if pair.join.status == "joined"]
-    frames = asleep | stay
+    frames = dict(stay)
     accepted: set[Names] = set()
     for tree in buildings_of(infos, joined, stay):
         within = [pair for pair in joined if pair.target in tree and pair.source in tree]
@@ -83,26 +80,8 @@ def join_sessions(
         accepted |= counted
     return Joined(
         pairs=tuple(replace(pair, accepted=pair.names in accepted) for pair in pairs),
-        frames={info.name: frames[info.name] for info in database.sessions() if info.name in frames},
+        frames={name: frames[name] for name in infos if name in frames},
     )
-
-
-def _check_names(
-    database: SubmapDatabase,
-    infos: Mapping[str, SessionInfo],
-    living: Collection[str],
-    frame: str | None,
-    only: Collection[str] | None,
-) -> None:
-    """Raises DatabaseError as `join_sessions`."""
-    if living and frame is not None:
-        raise DatabaseError(
-            f"{database.location}: has living maps, which stay in the frames that they have",
-            hint=f"`pc2grid db update --undo {database.location}` first",
-        )
-    named = [*(only or ()), *([] if frame is None else [frame])]
-    for name in set(named) - infos.keys():
-        raise no_session(name, infos, database.location)
 
 
 def _compared(

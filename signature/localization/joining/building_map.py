@@ -1,4 +1,4 @@
-"""The maps of joined sessions as one: what stands there now, or what all of them say."""
+"""The maps of joined sessions as one: what stands there now."""
 
 from __future__ import annotations
 
@@ -12,17 +12,12 @@ from numpy.typing import NDArray
 from pc2grid.arrays import F64, BoolGrid, hand_over
 from pc2grid.model import FREE, FREE_BELOW, OCCUPIED_FROM, THING, UNKNOWN, OccupancyGrid
 from signature.bend import largest_m
-from signature.database.protocol import BuildingFrame, SessionRole
+from signature.database.protocol import BuildingFrame
 
 if TYPE_CHECKING:
     from signature.database import SubmapDatabase
 
 Cells = NDArray[np.int8]
-SUREST = 99
-"""Percent, of a cell that is occupied for sure; 100 less it, that is free: as sure as a session's map is that
-was made from scans (`OccupancyParameters.limit`)."""
-_MOST = float(np.log(SUREST / (100 - SUREST)))
-"""The same as log-odds."""
 _SQUARE_M = 1.0
 """Side of the squares for which a bend is computed."""
 
@@ -50,30 +45,6 @@ def building_map(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> Occupan
         chosen = _sure(told) | ((told != UNKNOWN) & (here == UNKNOWN))
         here[chosen] = told[chosen]
     return replace(whole, cells=hand_over(cells))
-
-
-def evidence_map(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> OccupancyGrid:
-    """The maps of sessions, oldest first, each with where it lies, as one by what all of them say.
-
-    The log-odds of a cell are added up from map to map, and never exceed `SUREST`, what a map may say by
-    itself (Yguel, Aycard and Laugier, "Update policy of dense maps: efficient algorithms and sparse
-    representation", FSR 2007). So what stands in every session is certain; what came or went with the newest
-    one is undecided, which tells for no place and against none; and the session after that decides. Things
-    are those of the newest map that is sure. Raises ValueError without a map.
-    """
-    whole = _around(maps)
-    log_odds = np.zeros(whole.cells.shape, np.float32)
-    known, things = np.zeros(whole.cells.shape, bool), np.zeros(whole.cells.shape, bool)
-    for window, told in _drawn(maps, whole):
-        share = np.clip(told, 100 - SUREST, SUREST).astype(np.float32) / 100.0
-        evidence = np.where(told == UNKNOWN, 0.0, np.log(share / (1.0 - share)))
-        log_odds[window] = np.clip(log_odds[window] + evidence, -_MOST, _MOST)
-        known[window] |= told != UNKNOWN
-        things[window] = np.where(_sure(told), told == THING, things[window])
-    percent = np.rint(100.0 / (1.0 + np.exp(-log_odds))).astype(np.int8)
-    percent[percent == THING] -= 1
-    percent[things], percent[~known] = THING, UNKNOWN
-    return replace(whole, cells=hand_over(percent))
 
 
 def _sure(cells: Cells) -> BoolGrid:
@@ -162,11 +133,9 @@ def _cells_at(grid: OccupancyGrid, points_m: NDArray[np.float64]) -> NDArray[np.
 
 
 def floors_of(database: SubmapDatabase, frames: Mapping[str, BuildingFrame]) -> tuple[tuple[str, ...], ...]:
-    """The joined sessions of each floor, its living map first, then the oldest. frames : of sessions, by
-    name."""
+    """The joined sessions of each floor, the oldest first. frames : of sessions, by name."""
     floors: dict[str, list[str]] = {}
-    names = [info.name for info in database.sessions() if info.name in frames]
-    for name in sorted(names, key=lambda name: frames[name].role is not SessionRole.LIVING):
+    for name in (info.name for info in database.sessions() if info.name in frames):
         floors.setdefault(frames[name].name, []).append(name)
     return tuple(tuple(names) for names in floors.values())
 

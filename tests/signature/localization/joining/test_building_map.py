@@ -1,4 +1,4 @@
-"""One map of several: what the newest session that is sure of a cell says, or what all of them say."""
+"""One map of several: what the newest session that is sure of a cell says."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pc2grid.geometry import SE2
 from pc2grid.model import FREE, OCCUPIED, THING, UNKNOWN, OccupancyGrid
 from signature.bend import Bend
 from signature.database.protocol import BuildingFrame
-from signature.localization.joining.building_map import building_map, evidence_map
+from signature.localization.joining.building_map import building_map
 
 _ = UNKNOWN
 
@@ -72,32 +72,3 @@ def test_what_the_newest_is_not_sure_of_stays() -> None:
     whole = building_map([(OLD, at()), (unsure, at())])
     assert whole.cells[::-1].tolist() == [[OCCUPIED, OCCUPIED, OCCUPIED], [FREE, THING, OCCUPIED]]
     assert building_map([(unsure, at())]).cells[::-1].tolist() == [[50, 50, _], [50, THING, _]]
-
-
-def test_evidence_adds_up_and_one_session_undoes_what_any_number_said() -> None:
-    """A wall that always stands; a chair that came with the newest session; one that came with the second and
-    stayed; one that went with the newest; and ground that only the first knows."""
-    days = [
-        grid([[OCCUPIED, FREE, FREE, OCCUPIED, 80]]),
-        grid([[OCCUPIED, FREE, OCCUPIED, OCCUPIED, _]]),
-        grid([[OCCUPIED, OCCUPIED, OCCUPIED, FREE, _]]),
-    ]
-    whole = evidence_map([(day, at()) for day in days])
-    assert whole.cells.tolist() == [[99, 50, 99, 50, 80]]
-    # What is less sure counts for less: twice two thirds make four fifths.
-    assert evidence_map([(grid([[67]]), at()), (grid([[67]]), at())]).cells.tolist() == [[80]]
-
-
-def test_things_are_those_of_the_newest_that_is_sure_and_no_sum_is_taken_for_one() -> None:
-    """A table that stays, one that went, and one whose place the newest session has not seen well."""
-    old, new = grid([[THING, THING, THING]]), grid([[THING, FREE, 50]])
-    assert evidence_map([(old, at()), (new, at())]).cells.tolist() == [[THING, 1, THING]]
-    assert evidence_map([(grid([[61]]), at()), (grid([[49]]), at())]).cells.tolist() == [[THING - 1]]
-
-
-def test_the_plane_of_lasers_stays_known() -> None:
-    low, high = (
-        OccupancyGrid(cells=OLD.cells, resolution_m=1.0, origin_m=(0, 0), height_m=h) for h in (0.2, 0.4)
-    )
-    assert evidence_map([(low, at()), (high, at())]).height_m == pytest.approx(0.3)
-    assert evidence_map([(low, at()), (OLD, at())]).height_m is None
