@@ -26,6 +26,7 @@ from pc2grid.errors import (
 from pc2grid.io.nav2_map import save_map
 from pc2grid_cli import console
 from pc2grid_cli.main import app
+from pc2grid_cli.removed import REMOVED
 from signature.database.maintenance import store
 from signature.database.protocol import APPLICATION_ID
 from tests.helpers.databases import make_entry
@@ -80,6 +81,14 @@ def test_the_error_says_what_to_do(
     assert error.hint is not None and hint in error.hint
 
 
+def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """What is said of words that are no command."""
+    terminal = console.Console()
+    code = terminal.run(lambda: app(words, prog_name="pc2grid", standalone_mode=False, obj=terminal))
+    assert code == console.USAGE
+    return capsys.readouterr().err.splitlines()
+
+
 @pytest.mark.parametrize(
     ("command", "hint"),
     [
@@ -99,12 +108,18 @@ def test_the_error_says_what_to_do(
 def test_a_database_without_its_option_gets_it(
     command: str, hint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    terminal = console.Console()
-    words = shlex.split(command)
-    code = terminal.run(lambda: app(words, prog_name="pc2grid", standalone_mode=False, obj=terminal))
-    said = capsys.readouterr().err.splitlines()
-    assert code == console.USAGE and said[0].startswith("pc2grid: error: Missing option")
+    said = refused(shlex.split(command), capsys)
+    assert said[0].startswith("pc2grid: error: Missing option")
     assert said[1] == f"hint: {hint}" and len(said) == 2
+
+
+@pytest.mark.parametrize(("removed", "instead"), REMOVED.items())
+def test_what_was_removed_says_what_to_use(
+    removed: str, instead: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = refused(removed.split()[1:], capsys)
+    assert said[0].startswith("pc2grid: error: No such ")
+    assert said[1:] == [f"hint: {instead}"]
 
 
 @pytest.mark.parametrize("name", ["office.yaml", "a.mcap", "cloud.ply"])

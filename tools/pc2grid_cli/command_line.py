@@ -22,6 +22,7 @@ from typer.main import get_command
 
 from pc2grid_cli.console import Console
 from pc2grid_cli.options import DATABASE
+from pc2grid_cli.removed import REMOVED
 from pc2grid_cli.rerun_target import VIEWER, names_target
 
 # Colours and boxes cost a tenth of a second at every --help; they are for terminals that want them.
@@ -50,6 +51,8 @@ class Command(TyperCommand):
         except Exception as error:  # its class is not public
             if type(error).__name__ == "MissingParameter":
                 error.suggestion = _with_option(self.params, ctx, getattr(error, "param", None), words)  # type: ignore[attr-defined]
+            elif type(error).__name__ == "NoSuchOption":
+                _hint_of_removed(error, ctx, getattr(error, "option_name", ""))
             raise
 
 
@@ -93,10 +96,23 @@ class Group(TyperGroup):
         """Apply the global options that stand before the command."""
         return super().parse_args(ctx, _read(self.params, ctx, args, until_command=True))
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that the words name, with the words behind its name."""
+        try:
+            return super().resolve_command(ctx, args)
+        except Exception as error:  # its class is not public
+            _hint_of_removed(error, ctx, args[0])
+            raise
+
 
 def group(commands: Mapping[str, tuple[str, str]]) -> type[Group]:
     """A group of commands, which are imported when they are used; see `Group.late`."""
     return type("Group", (Group,), {"late": commands})
+
+
+def _hint_of_removed(error: Exception, ctx: Any, word: str) -> None:
+    """Let the error for an unknown command or option say what to use, if there was one of that name."""
+    error.suggestion = REMOVED.get(f"{ctx.command_path} {word}")  # type: ignore[attr-defined]
 
 
 def _with_option(params: Iterable[Any], ctx: typer.Context, missing: Any, words: list[str]) -> str | None:
