@@ -96,7 +96,6 @@ def test_every_document_is_validated_by_a_test() -> None:
         "compare-recordings": "pc2grid_lab/compare/test_recordings.py",
         "compare-sensors": "pc2grid_lab/experiments/test_sensor_matrix.py",
         "compare-signatures": "pc2grid_lab/experiments/test_selection.py",
-        "diff": "pc2grid_cli/test_diff.py",
         "watch": "pc2grid_cli/test_watch.py",
         "watch-check": "pc2grid_cli/test_known_pose.py",
     }

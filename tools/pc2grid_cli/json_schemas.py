@@ -16,8 +16,7 @@ from pydantic import TypeAdapter
 # Before Python 3.12 pydantic does not take the TypedDict of typing.
 from typing_extensions import TypedDict
 
-from pc2grid.mapping.changes import ChangeKind
-from pc2grid.model import Consistency, FourDigits, OdometryCheck, ThreeDigits, UncertainStretch
+from pc2grid.model import Consistency, OdometryCheck, ThreeDigits, UncertainStretch
 from signature.config import Config
 from signature.database.protocol import Problem
 from signature.localization.answer_json import (
@@ -374,37 +373,6 @@ class DbJoin(TypedDict):
     alone: list[str]
 
 
-class Changed(TypedDict):
-    """A patch that changed. kind: came or went. center_m, length_m, width_m, yaw: the smallest rectangle
-    around it, in the frame of the building; yaw is the direction of its longer side. probability: of the
-    change."""
-
-    kind: ChangeKind
-    center_m: list[ThreeDigits]
-    length_m: ThreeDigits
-    width_m: ThreeDigits
-    yaw: FourDigits
-    area_m2: FourDigits
-    probability: FourDigits
-
-
-class Diff(TypedDict):
-    """`pc2grid diff --json`. before, after: the sessions. common_m2: ground that both know; only there
-    anything can have changed. came_m2, went_m2, stood_m2: of obstacles. changes: the largest first."""
-
-    schema_version: Version
-    database: str
-    frame: str
-    before: list[str]
-    after: list[str]
-    common_m2: ThreeDigits
-    came_m2: ThreeDigits
-    went_m2: ThreeDigits
-    stood_m2: ThreeDigits
-    changes: list[Changed]
-    written: list[str]
-
-
 class Export(TypedDict):
     """`pc2grid export --json`; session is null if only a report was written."""
 
@@ -424,7 +392,6 @@ DOCUMENTS: dict[str, type] = {
     "db-remove": DbWrite,
     "db-rename": DbWrite,
     "db-split": DbWrite,
-    "diff": Diff,
     "export": Export,
     "info": Info,
     "info-map": InfoMap,

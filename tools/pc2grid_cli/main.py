@@ -23,7 +23,6 @@ COMMANDS = {
     "relocalize": ("pc2grid_cli.relocalize:relocalize_command", "Find where a recording was made."),
     "watch": ("pc2grid_cli.watch:watch_command", "Find where a running robot is, while it drives."),
     "export": ("pc2grid_cli.export:export_command", "Write a session's map, trajectory, picture or page."),
-    "diff": ("pc2grid_cli.diff:diff_command", "Show what changed in a building between two sessions."),
     "view": ("pc2grid_cli.view:view_command", "Look into a database in the browser, and locate there."),
 }
 DB = {

@@ -19,7 +19,6 @@ SUFFIXES: dict[str, tuple[str, ...]] = {
     "initialpose": (".json", ".yaml", ".yml"),
     "plot": (".png",),
     "report": (".html", ".htm"),
-    "changes": (".png", ".geojson", ".pcd", ".ply"),
 }
 """By option: the suffixes of the files that it writes."""
 _OF_OTHERS = {suffix for known in SUFFIXES.values() for suffix in known} | {".bag", ".db3", ".rrd", ".csv"}
@@ -37,7 +36,7 @@ def check_file(option: str, path: Path | None, force: bool, *, any_suffix: bool 
     if path is None:
         return
     known, suffix = SUFFIXES[option], path.suffix.lower()
-    optional = option not in ("cloud", "graph", "changes")
+    optional = option not in ("cloud", "graph")
     if not any_suffix and suffix not in known and (suffix or not optional):
         raise OutputError(
             f"{path}: --{option} does not write the format {suffix or '(no suffix)'}",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,12 +15,10 @@ from pc2grid.display import counted, probability
 from pc2grid.io.atomic import replace_file
 from pc2grid.matching.agreement import Agreement, Support, agreement
 from pc2grid.matching.walls import Walls
-from pc2grid.model import OCCUPIED_FROM
 
 if TYPE_CHECKING:
     from pc2grid.arrays import F64, U8
     from pc2grid.geometry import SE2
-    from pc2grid.mapping.changes import ChangeKind, MapChanges
     from pc2grid.model import OccupancyGrid, Trajectory
     from signature.database import SubmapDatabase
     from signature.database.protocol import BuildingFrame
@@ -44,8 +42,6 @@ _WIDTH_IN, _GAP_IN = 10.0, 0.55
 _MARGIN = 0.03
 """Around a map, as a share of its longer side; an arrow at its edge must not be cut."""
 _CLOSE_MARGIN_M = 1.0
-_ROOM_M = 0.4
-"""Between a patch that changed and both sides of the rectangle around it."""
 _CLOSE_SHARE = 0.5
 """A close-up is drawn if the query is shorter than this share of the map."""
 
@@ -140,31 +136,6 @@ def draw_building(path: Path, name: str, maps: Mapping[str, tuple[OccupancyGrid,
     for (session, points_m), colour in zip(walls.items(), colours, strict=False):
         axes.plot(*points_m.T, ".", color=colour, ms=2.5, mew=0, alpha=0.7, label=session)
     axes.set_title(f"walls of the sessions in the frame of {name}", loc="left")
-    _finish(figure, axes, path)
-
-
-def draw_changes(path: Path, title: str, before: OccupancyGrid, changes: MapChanges) -> None:
-    """What came, went and stands in both, on the earlier map; a rectangle shows where small things changed.
-
-    before : the earlier map, in the frame of the changes.
-    """
-    from matplotlib.patches import Polygon
-
-    figure, (axes,) = _panels(_known(before), None)
-    # Walls that one of the maps did not see stay pale: nothing is known of their change.
-    seen = replace(before, cells=np.where(before.occupied, OCCUPIED_FROM - 1, before.cells))
-    _draw_map(axes, seen)
-    axes.plot(*changes.stood_m.T, ".", color="#555555", ms=1.2, mew=0, label="stands in both")
-    shown: tuple[tuple[ChangeKind, str], ...] = (("came", VERMILLION), ("went", BLUE))
-    for kind, colour in shown:
-        patches = changes.of(kind)
-        label = f"{kind}: {len(patches)} patches, {changes.area_m2(kind):.1f} m2"
-        points_m = np.concatenate([np.empty((0, 2)), *(patch.points_m for patch in patches)])
-        axes.plot(*points_m.T, ".", color=colour, ms=2.0, mew=0, label=label)
-        for patch in patches:
-            around = replace(patch, length_m=patch.length_m + _ROOM_M, width_m=patch.width_m + _ROOM_M)
-            axes.add_patch(Polygon(around.corners_m(), fill=False, ec=colour, lw=0.7))
-    axes.set_title(title, loc="left")
     _finish(figure, axes, path)
 
 

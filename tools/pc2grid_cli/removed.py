@@ -1,6 +1,7 @@
 """What is said of commands and options that the program had before."""
 
 REMOVED = {
+    "pc2grid diff": "`pc2grid db join --plot OUT.png` draws the walls of joined sessions over each other",
     "pc2grid db update": "`pc2grid db join` puts sessions into one frame, `pc2grid export --map` draws them",
     "pc2grid convert --update": "`--join` puts what is new into the frame of the other sessions",
 }

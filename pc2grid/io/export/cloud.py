@@ -1,5 +1,4 @@
 """Points as PLY or PCD files, as Open3D, CloudCompare and PCL read them: binary, little-endian, float32.
-A number for each point, where there is one, is its `intensity`.
 
 PLY: https://paulbourke.net/dataformats/ply. PCD: version 0.7, see `cloud_files`.
 
@@ -23,14 +22,14 @@ element vertex {n}
 property float x
 property float y
 property float z
-{more}end_header
+end_header
 """
 _PCD = """# .PCD v0.7 - Point Cloud Data file format
 VERSION 0.7
-FIELDS x y z{more}
-SIZE 4 4 4{size}
-TYPE F F F{type}
-COUNT 1 1 1{count}
+FIELDS x y z
+SIZE 4 4 4
+TYPE F F F
+COUNT 1 1 1
 WIDTH {n}
 HEIGHT 1
 VIEWPOINT 0 0 0 1 0 0 0
@@ -38,17 +37,10 @@ POINTS {n}
 DATA binary
 """
 _HEADERS = {".ply": _PLY, ".pcd": _PCD}
-_MORE = {
-    ".ply": {"more": "property float intensity\n"},
-    ".pcd": {"more": " intensity", "size": " 4", "type": " F", "count": " 1"},
-}
-"""What the header says of an intensity."""
 
 
-def write_cloud(path: str | Path, points_m: ArrayLike, intensity: ArrayLike | None = None) -> None:
+def write_cloud(path: str | Path, points_m: ArrayLike) -> None:
     """Write points (N, 3), metres, as `.ply` or `.pcd`, by the suffix; an existing file is replaced.
-
-    intensity : (N,) a number for each point.
 
     Raises OutputError for another suffix or if the file cannot be written.
 
@@ -59,9 +51,5 @@ def write_cloud(path: str | Path, points_m: ArrayLike, intensity: ArrayLike | No
     if header is None:
         raise OutputError(f"{path}: not a kind of cloud file", hint="end its name in .ply or .pcd")
     points = np.asarray(points_m, "<f4").reshape(-1, 3)
-    words = dict.fromkeys(("more", "size", "type", "count"), "")
-    if intensity is not None:
-        points = np.column_stack((points, np.asarray(intensity, "<f4")))
-        words |= _MORE[suffix]
     with replace_file(path) as temporary:
-        temporary.write_bytes(header.format(n=len(points), **words).encode("ascii") + points.tobytes())
+        temporary.write_bytes(header.format(n=len(points)).encode("ascii") + points.tobytes())

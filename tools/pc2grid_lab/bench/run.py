@@ -21,7 +21,6 @@ from pathlib import Path
 from pc2grid.errors import Pc2GridError
 from pc2grid.extras import require
 from pc2grid_lab.bench import (
-    changes,
     large_database,
     live,
     locating,
@@ -59,7 +58,6 @@ MEASURES: dict[str, Measure] = {
     "floors": large_database.floors_time,
     "look-up": locating.look_up_time,
     "relocalize": locating.relocalize_time,
-    "changes": changes.found_changes,
     "live": live.lag,
     "hour": live.memory,
     "fleet": fleet_reading,
