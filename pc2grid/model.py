@@ -7,6 +7,7 @@ a stage cannot change what another one holds.
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -58,6 +59,8 @@ class Scan:
     offsets_s : (N,) float32, when each point was taken relative to `stamp_ns`; None if not recorded.
     T_base_sensor : (4, 4) where the sensor sits on the base; its translation is the origin of the rays.
     T_odom_base : (4, 4) odometry at `stamp_ns`, or None if the log has none there.
+    odometry_gap_s : longest time without a reading of odometry since the last scan that has `T_odom_base`;
+        infinite if that is not known.
     T_first_last : (4, 4) how the base moved from the first to the last of the points' times, by odometry;
         without odometry how it turned, by an IMU; None where that or the times are not recorded.
     T_level_base : (4, 4) attitude at `stamp_ns` by an IMU: z is up, the heading drifts, no translation; None
@@ -80,6 +83,7 @@ class Scan:
     T_first_last: F64 | None = None
     dropped: int = 0
     T_level_base: F64 | None = None
+    odometry_gap_s: float = math.inf
 
     def __post_init__(self) -> None:
         freeze(self, "points_m", np.float32, (None, 3))

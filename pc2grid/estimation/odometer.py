@@ -32,13 +32,16 @@ class Odometer:
     def continues(self, scan: Scan, seconds: float) -> bool:
         """Whether odometry goes on from where it was last known; `seconds` since the last scan.
 
-        It does not if it reports an impossible motion, nor over a gap in the log: its driver may have been
-        restarted meanwhile.
+        It does not if it reports an impossible motion, nor over a gap in which the log has neither scans nor
+        readings: its driver may have been restarted meanwhile. Nor does its first reading: odometry may begin
+        after the first scan, anywhere.
         """
+        if scan.T_odom_base is None:
+            return True
         reported = self.reported(scan)
         usual_s = (scan.stamp_ns - self._begin_ns) * 1e-9 / max(self._scans, 1)
-        gap = seconds > self._parameters.gap * usual_s
-        return reported is None or (not gap and self.is_possible(reported, seconds))
+        gap = min(seconds, scan.odometry_gap_s) > self._parameters.gap * usual_s
+        return reported is not None and not gap and self.is_possible(reported, seconds)
 
     def is_possible(self, motion: F64, seconds: float) -> bool:
         """Whether a robot or a person indoors can make a motion (4, 4) in a time."""

@@ -124,7 +124,7 @@ class Tracker:
         # 1. What is expected: by odometry, or that the motion goes on. What is not plausible comes last.
         steady = self._smoother.steady(seconds, turn := self._turn(scan))
         expected = [self._smoother.after(*steady)]
-        if reading is not None:
+        if reading is not None and reported is not None:
             expected.insert(0 if continues else 1, self._smoother.by_odometry(reading))
         self._count += 1
         if not self.carried and self._count < DECIDING_SCANS and not is_rolling(scan, self._first):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import difflib
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,6 +89,13 @@ class PoseTrack:
         if nearest is None or abs(stamps[nearest] - stamp_ns) > PARAMETERS.hold_ns:
             return None
         return self._pose(nearest)
+
+    def longest_gap_ns(self, begin_ns: int, end_ns: int) -> int:
+        """The longest time without a sample between two times."""
+        inside = self._stamps[
+            bisect.bisect_right(self._stamps, begin_ns) : bisect.bisect_left(self._stamps, end_ns)
+        ]
+        return max(b - a for a, b in itertools.pairwise((begin_ns, *inside, end_ns)))
 
     def _pose(self, index: int) -> F64:
         values = self._poses[index]
@@ -177,8 +185,15 @@ class FrameTree:
     def newest_ns(self, target: str, source: str) -> int:
         """The stamp up to which the moving part of the path between two connected frames is known; 0 if it
         is not known at all, or nothing moves there."""
-        moving = [self._moving[child] for child in self._path(target, source) if child not in self._static]
-        return min((track.newest_ns for track in moving), default=0)
+        return min((track.newest_ns for track in self._moving_tracks(target, source)), default=0)
+
+    def longest_gap_ns(self, target: str, source: str, begin_ns: int, end_ns: int) -> int:
+        """The longest time without a sample of a moving part of the path between two connected frames."""
+        tracks = self._moving_tracks(target, source)
+        return max((track.longest_gap_ns(begin_ns, end_ns) for track in tracks), default=0)
+
+    def _moving_tracks(self, target: str, source: str) -> list[PoseTrack]:
+        return [self._moving[child] for child in self._path(target, source) if child not in self._static]
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> F64 | None:
         """`T_target_source` (4, 4) at a time; None if a moving part of it is not known then.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import heapq
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -266,6 +267,13 @@ class _Poses:
             return found
         return found @ self._T_child_base
 
+    def longest_gap_ns(self, begin_ns: int, end_ns: int) -> int:
+        """The longest time without a reading of odometry between two times."""
+        plan = self._plan
+        if plan.odometry_frame is None:
+            return self._track.longest_gap_ns(begin_ns, end_ns)
+        return self._frames.longest_gap_ns(plan.odometry_frame, plan.choice.base_frame, begin_ns, end_ns)
+
     def level(self, stamp_ns: int) -> F64 | None:
         """`T_level_base` (4, 4) at a time, see `Scan`; None if there is no IMU, or it does not tell."""
         if not self._attitude.received:
@@ -321,6 +329,7 @@ class Stream:
         self._poses = _Poses(plan, frames, source.tally)
         self._stamps = _Stamps(parameters, source.tally)
         self._waiting = _Queue()
+        self._last_read_ns: int | None = None  # stamp of the last scan with odometry
         self._sweep_ns = 0 if SENSOR_MODELS[sensor].image else parameters.sweep_ns
         self._handlers = self._make_handlers()
 
@@ -470,7 +479,9 @@ class Stream:
             self._stamps.check(stamp_ns, log_time_ns, self._waiting.scans)
             T_base_sensor = self._poses.sensor(message.header.frame, stamp_ns)
             scan = self._decoder.scan(message, stamp_ns, T_base_sensor, self._poses.odometry(stamp_ns))
-            scan = replace(scan, T_level_base=self._poses.level(stamp_ns))
+            scan = replace(
+                scan, T_level_base=self._poses.level(stamp_ns), odometry_gap_s=self._odometry_gap_s(stamp_ns)
+            )
             scan = self._with_motion(self._with_further(scan))
         except (PointCloudError, LimitExceeded) as error:
             self._skip(error)
@@ -481,6 +492,8 @@ class Stream:
                 return
             raise UnsupportedSchema(f"{self._plan.scans.topic}: {error.message}", hint=error.hint) from error
         self._stamps.used(stamp_ns, log_time_ns)
+        if scan.T_odom_base is not None:
+            self._last_read_ns = stamp_ns
         self._part.good += 1
         tally = self._source.tally
         tally.scans_read += 1
@@ -490,6 +503,12 @@ class Stream:
         if not len(scan.points_m):
             tally.warn("some scans hold no returns at all")
         yield scan
+
+    def _odometry_gap_s(self, stamp_ns: int) -> float:
+        """The longest time without odometry since the last scan that has a reading; infinite if none has."""
+        if self._last_read_ns is None:
+            return math.inf
+        return 1e-9 * self._poses.longest_gap_ns(self._last_read_ns, stamp_ns)
 
     def _with_further(self, scan: Scan) -> Scan:
         """The scan together with those of the further sensors that are near in time."""

@@ -1,0 +1,125 @@
+"""Inputs from the field at fault in odometry, times, frames or topics: right, refused, or warned of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pc2grid.geometry import SE2
+from pc2grid.simulate import SimulationConfig, simulate_session
+from pc2grid.simulate.config import LaserConfig
+from pc2grid.simulate.session import EPOCH_NS
+from tests.helpers.field import Change, Outcome, altered, convert, field_log
+
+FASTEST_M = 0.15
+"""No step from scan to scan is longer: robots indoors, five to ten scans a second."""
+ELSEWHERE = SE2(7.0, -3.0, 2.0)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A laser on wheels, with odometry as a topic and in tf; 10 scans a second."""
+    path = tmp_path_factory.mktemp("drive") / "drive.mcap"
+    config = SimulationConfig(length_m=5.0, seed=4, laser=LaserConfig(step_deg=1.0))
+    simulate_session(path, sensor="laser", config=config)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(drive: Path) -> Outcome:
+    """What the drive is without a fault."""
+    return convert(drive, drive.parent)
+
+
+def odometry_elsewhere(begin_ns: int) -> Change:
+    """Odometry that begins at a time, at a pose that is not zero."""
+
+    def change(topic: str, message: Any, log_time_ns: int) -> Any:
+        if topic not in ("/odom", "/tf"):
+            return message
+        if log_time_ns < EPOCH_NS + begin_ns:
+            return None
+        pose = message.pose.pose if topic == "/odom" else message.transforms[0].transform
+        at = pose.position if topic == "/odom" else pose.translation
+        turn = pose.orientation if topic == "/odom" else pose.rotation
+        moved = ELSEWHERE @ SE2(at.x, at.y, 2.0 * np.arctan2(turn.z, turn.w))
+        at.x, at.y, turn.z, turn.w = moved.x, moved.y, np.sin(moved.yaw / 2.0), np.cos(moved.yaw / 2.0)
+        return message
+
+    return change
+
+
+def without_returns(change: Change, begin_ns: int, end_ns: int) -> Change:
+    """Scans of a time without returns, too."""
+
+    def emptied(topic: str, message: Any, log_time_ns: int) -> Any:
+        if topic == "/scan" and begin_ns <= log_time_ns - EPOCH_NS < end_ns:
+            message.ranges = np.full_like(message.ranges, np.inf)
+        return change(topic, message, log_time_ns)
+
+    return emptied
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        without_returns(odometry_elsewhere(150_000_000), 3_000_000_000, 3_100_000_000),
+        without_returns(odometry_elsewhere(150_000_000), 0, 250_000_000),
+    ],
+    ids=["then a scan without returns", "first scans without returns"],
+)
+def test_odometry_that_begins_later_moves_nothing(
+    change: Change, drive: Path, whole: Outcome, tmp_path: Path
+) -> None:
+    made = convert(altered(drive, tmp_path / "late.mcap", change), tmp_path)
+    assert made.code == 0
+    assert made.steps_m.max() < 0.1
+    assert made.session is not None and whole.session is not None
+    assert made.session["path_m"] == pytest.approx(whole.session["path_m"], abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "path_m"),
+    [
+        ("real_neato_odom_late", 6.3),
+        ("real_neato_empty_scan", 5.4),
+        ("one_empty_scan", 10.9),
+        ("first_scan_empty", 10.9),
+        ("depth_odom_late", 1.3),
+    ],
+)
+def test_odometry_begins_after_the_first_scan(name: str, path_m: float, tmp_path: Path) -> None:
+    made = convert(field_log(name), tmp_path)
+    assert made.code == 0
+    assert made.steps_m.max() < FASTEST_M
+    assert made.session is not None and made.session["path_m"] == pytest.approx(path_m, abs=0.15)
+
+
+@pytest.mark.parametrize("left_out", ["/tf", "/odom"])
+def test_odometry_goes_on_where_scans_pause(
+    left_out: str, drive: Path, whole: Outcome, tmp_path: Path
+) -> None:
+    """For three seconds there is no scan, then some without returns."""
+
+    def paused(topic: str, message: Any, log_time_ns: int) -> Any:
+        seconds = (log_time_ns - EPOCH_NS) * 1e-9
+        if topic == left_out:
+            return None
+        if topic == "/scan" and 3.0 < seconds < 6.5:
+            message.ranges = np.full_like(message.ranges, np.inf)
+            return None if seconds < 6.0 else message
+        return message
+
+    made = convert(altered(drive, tmp_path / "paused.mcap", paused), tmp_path)
+    assert made.poses is not None and whole.poses is not None
+    assert np.linalg.norm(made.poses[-1][:2, 3] - whole.poses[-1][:2, 3]) < 0.1
+
+
+def test_odometry_counts_where_a_scan_has_one_return(tmp_path: Path) -> None:
+    made = convert(field_log("real_neato_one_return"), tmp_path)
+    assert made.poses is not None
+    assert made.poses[-1][:2, 3] == pytest.approx((-0.07, 0.25), abs=0.1)
+    assert made.steps_m.max() < FASTEST_M
