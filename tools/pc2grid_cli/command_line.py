@@ -118,7 +118,7 @@ def _hint_of_removed(error: Exception, ctx: Any, word: str) -> None:
 def _with_option(params: Iterable[Any], ctx: typer.Context, missing: Any, words: list[str]) -> str | None:
     """The command with the missing option in front of its last word, if that names a database; else None."""
     options = [name for name in getattr(missing, "opts", ()) if name.startswith("-")]
-    if not options or getattr(missing, "metavar", None) != DATABASE or not words:
+    if not options or not str(getattr(missing, "metavar", "")).startswith(DATABASE) or not words:
         return None
     *before, last = words
     if not last.endswith(".submaps") and not last.startswith(("postgresql://", "postgres://")):
