@@ -1,6 +1,6 @@
 """The packages that only some commands need, and how they are asked for: all before any work, all at once.
 
-`pip install .` installs none of them. pc2grid is on no package index, so `pip install '.[viz]'` works only
+`pip install .` installs none of them. pc2grid is on no package index, so `pip install '.[live]'` works only
 where its source is; the packages themselves can be named everywhere.
 """
 
@@ -27,7 +27,6 @@ class Extra:
 
 EXTRAS = {
     "paper": Extra(("mahotas",), ("mahotas",)),
-    "viz": Extra(("rerun",), ("rerun-sdk",)),
     "cluster": Extra(("dask", "distributed"), ("dask", "distributed"), ClusterError),
     "live": Extra(("websockets",), ("websockets",), LiveError),
     "zenoh": Extra(("zenoh",), ("eclipse-zenoh",), LiveError),

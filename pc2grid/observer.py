@@ -7,7 +7,7 @@ anybody is interested. A subclass overrides the methods that it needs.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -38,9 +38,6 @@ class Observer:
         through; None if there is none.
         """
         return nullcontext()
-
-    def on_session(self, name: str) -> None:
-        """The work on the session of this name begins."""
 
     def on_progress(self, share: float) -> None:
         """The share of the present step that is done: 0..1, never decreasing."""
@@ -89,46 +86,3 @@ class ProgressBars(Observer):
         """Moves the bar."""
         if self._update is not None:
             self._update(share)
-
-
-class Observers(Observer):
-    """Passes all news on to several observers, in their order."""
-
-    def __init__(self, *observers: Observer) -> None:
-        self._observers = observers
-
-    @contextmanager
-    def _all_steps(self, what: str, recorded_s: float | None) -> Iterator[None]:
-        with ExitStack() as stack:
-            for observer in self._observers:
-                stack.enter_context(observer.step(what, recorded_s))
-            yield
-
-    def step(self, what: str, recorded_s: float | None = None) -> AbstractContextManager[None]:
-        """Surrounds the step with those of all observers."""
-        return self._all_steps(what, recorded_s)
-
-    def on_session(self, name: str) -> None:
-        """See `Observer.on_session`."""
-        for observer in self._observers:
-            observer.on_session(name)
-
-    def on_progress(self, share: float) -> None:
-        """See `Observer.on_progress`."""
-        for observer in self._observers:
-            observer.on_progress(share)
-
-    def on_scan(self, registered: RegisteredScan) -> None:
-        """See `Observer.on_scan`."""
-        for observer in self._observers:
-            observer.on_scan(registered)
-
-    def on_note(self, text: str) -> None:
-        """See `Observer.on_note`."""
-        for observer in self._observers:
-            observer.on_note(text)
-
-    def on_warning(self, text: str) -> None:
-        """See `Observer.on_warning`."""
-        for observer in self._observers:
-            observer.on_warning(text)

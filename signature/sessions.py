@@ -135,7 +135,6 @@ def build_sessions(
     ['plan']
     """
     path = Path(path)
-    observer.on_session(name)
     if is_drawn_map(path):
         drawn = load_drawn_map(path, config)
         origin = provenance(path, drawn.digest, config, label=label)

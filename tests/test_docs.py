@@ -13,6 +13,7 @@ import os
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 import sys
 import warnings
@@ -483,10 +484,23 @@ def test_an_exported_map_is_read_by_nav2_as_it_was(folder: Path) -> None:
     assert (resolution_m, origin_m) == (grid.resolution_m, grid.origin_m)
 
 
+EXPORT_MCAP = ["export", "building.submaps", "--mcap", "map.mcap"]
+LOCATE_TO_MCAP = ["relocalize", "tuesday.mcap", "-d", "building.submaps", "--output", "answer.mcap"]
+
+
+@pytest.mark.skipif(shutil.which("rerun") is None, reason="rerun is not installed; it is only called")
+def test_rerun_shows_the_map_and_where_the_robot_was(folder: Path) -> None:
+    assert CliRunner().invoke(app, LOCATE_TO_MCAP).exit_code == 0
+    subprocess.run(["rerun", "mcap", "convert", "answer.mcap", "-o", "answer.rrd"], check=True)
+    shown = subprocess.run(
+        ["rerun", "rrd", "print", "answer.rrd"], check=True, capture_output=True, text=True
+    ).stdout
+    assert re.search(r"/map - data columns: .*GridMap:data", shown)
+    assert re.search(r"/tf - data columns: .*Transform3D:translation", shown)
+
+
 def test_foxglove_shows_what_the_layout_names(folder: Path) -> None:
-    export = ["export", "building.submaps", "--mcap", "map.mcap"]
-    locate = ["relocalize", "tuesday.mcap", "-d", "building.submaps", "--output", "answer.mcap"]
-    for arguments in (export, locate):
+    for arguments in (EXPORT_MCAP, LOCATE_TO_MCAP):
         assert CliRunner().invoke(app, arguments).exit_code == 0
     layout = json.loads((ROOT / "examples" / "foxglove.json").read_text())
     panel = layout["configById"]["3D!pc2grid"]
@@ -502,7 +516,12 @@ def test_foxglove_shows_what_the_layout_names(folder: Path) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name in ("map.mcap", "answer.mcap"):
         with (folder / name).open("rb") as stream:
-            for kind, _, message in make_reader(stream).iter_messages():
+            reader = make_reader(stream)
+            assert reader.get_header().profile == "ros2"
+            for kind, channel, message in reader.iter_messages():
+                # By these Foxglove and rerun choose how a topic is read and drawn.
+                assert (kind.encoding, channel.message_encoding) == ("ros2msg", "cdr")
+                assert re.fullmatch(r"(nav|geometry|visualization|tf2)_msgs/msg/\w+", kind.name)
                 again = store.serialize_cdr(store.deserialize_cdr(message.data, kind.name), kind.name)
                 assert bytes(again) == message.data, kind.name
 

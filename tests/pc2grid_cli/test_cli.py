@@ -310,7 +310,7 @@ def after(code: str, *arguments: object, cwd: Path) -> list[str]:
 
 
 # A test of a whole command each: importing a library takes up to a tenth of its time.
-_FOR_PICTURES = ("matplotlib", "PIL", "rich", "rerun", "plotly", "dash")
+_FOR_PICTURES = ("matplotlib", "PIL", "rich", "plotly", "dash")
 _OF_OTHER_SENSORS = ("open3d",)
 _NOT_IN_USE = ("scipy.fft", "scipy.optimize", "scipy.signal", "skimage", "sklearn", "pandas")
 _OF_OTHER_COMMANDS = ("pc2grid.simulate", "pc2grid_lab", "signature.localization.joining", "dask", "psycopg")

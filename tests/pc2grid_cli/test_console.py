@@ -164,7 +164,7 @@ def test_global_options_add_up(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert terminal_of(monkeypatch, "-vvv", "config", "schema").verbose == 3
 
 
-@pytest.mark.parametrize("name", ["-q", "--debug", "--rerun", "-v"])
+@pytest.mark.parametrize("name", ["-q", "--debug", "--json", "-v"])
 def test_a_value_that_looks_like_an_option_stays_a_value(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

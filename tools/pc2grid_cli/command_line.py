@@ -1,7 +1,7 @@
 """How the words of a command are read, in addition to what typer does.
 
-Global options are understood behind the command as well, where people put them. `--dask` and `--rerun` may
-stand without a value, for which typer has no notation. The module of a command is imported when it is used:
+Global options are understood behind the command as well, where people put them. `--dask` may stand
+without a value, for which typer has no notation. The module of a command is imported when it is used:
 here alone the program imports late, so that every other import stands at the top of its file.
 """
 
@@ -23,7 +23,6 @@ from typer.main import get_command
 from pc2grid_cli.console import Console
 from pc2grid_cli.options import DATABASE
 from pc2grid_cli.removed import REMOVED
-from pc2grid_cli.rerun_target import VIEWER, names_target
 
 # Colours and boxes cost a tenth of a second at every --help; they are for terminals that want them.
 _FANCY = sys.stderr.isatty() and sys.stdout.isatty() and not os.environ.get("NO_COLOR")
@@ -35,7 +34,6 @@ _NEW_OBJECTS = 100_000
 when it needs them make about as many. `convert` leaves 2,000 objects in cycles in 150 s of a laser."""
 _WITHOUT_VALUE: dict[str, tuple[str, Callable[[str], bool]]] = {
     "--dask": ("local", lambda word: "://" in word),
-    "--rerun": (VIEWER, names_target),
 }
 """By option: the value that it has if none follows, and whether a following word is a value."""
 

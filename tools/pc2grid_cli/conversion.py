@@ -7,14 +7,14 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
 from pc2grid.display import counted
 from pc2grid.errors import ConfigError, DatabaseError, one_line
 from pc2grid.model import SessionMap
-from pc2grid.observer import Observer, Observers
+from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
 from pc2grid_cli.comparing import comparing
@@ -26,9 +26,6 @@ from signature.conversion_jobs import Job
 from signature.database import Label, maintenance, open_database
 from signature.database.protocol import Entry
 from signature.localization.joining.building import join_sessions
-
-if TYPE_CHECKING:
-    from pc2grid_cli.rerun_stream import Conversions
 
 
 def jobs_of(
@@ -115,7 +112,6 @@ def convert_all(
     force: bool,
     dask: str | None,
     processes: int,
-    rerun: str | None,
     quiet: bool,
     strict: bool,
 ) -> Done:
@@ -124,10 +120,8 @@ def convert_all(
     with contextlib.ExitStack() as stack:
         if len(jobs) > 1:
             stack.enter_context(_note_stored(terminal, done, len(jobs)))
-        shown = None if rerun is None else stack.enter_context(_shown_in(rerun))
-        observer = terminal.observer() if shown is None else Observers(terminal.observer(), shown)
         # If this block is left early, the cluster ends before anything is printed about it.
-        for outcome in stack.enter_context(_outcomes(jobs, dask, processes, observer)):
+        for outcome in stack.enter_context(_outcomes(jobs, dask, processes, terminal.observer())):
             error = _store(outcome, output, keep=keep, force=force)
             if error is not None and len(jobs) == 1:
                 raise error
@@ -142,8 +136,6 @@ def convert_all(
                 for entry in outcome.entries:
                     done.add(entry, quiet=quiet, strict=strict)
                     terminal.note(_odometry_as_text(entry[0]), level=1)
-                    if shown is not None:
-                        shown.show(entry[0], outcome.job.config)
     return done
 
 
@@ -159,13 +151,6 @@ def _outcomes(
     on_cluster = conversion_jobs.on_cluster(jobs, dask, min(processes, len(jobs)), observer)
     with observer.step(f"convert {len(jobs)} recordings"), contextlib.closing(on_cluster) as outcomes:
         yield outcomes
-
-
-def _shown_in(rerun: str) -> Conversions:
-    """What streams conversions to a rerun target; rerun is loaded only for that."""
-    from pc2grid_cli.rerun_stream import Conversions
-
-    return Conversions(rerun)
 
 
 def _store(outcome: conversion_jobs.Outcome, output: str, *, keep: bool, force: bool) -> Exception | None:

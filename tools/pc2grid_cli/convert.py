@@ -10,12 +10,10 @@ from typing import Annotated
 import typer
 
 from pc2grid import extras
-from pc2grid.errors import ConfigError
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, conversion
 from pc2grid_cli import options as options
 from pc2grid_cli.output_files import check_database
-from pc2grid_cli.rerun_target import require_target, url_of
 from pc2grid_cli.stored_sessions import stored_sessions
 from signature.cluster import LOCAL
 from signature.database import Label
@@ -62,7 +60,6 @@ def convert_command(
     join: _Join = None,
     dask: options.Dask = None,
     jobs: options.JobCount = None,
-    rerun: options.Rerun = None,
     config: options.ConfigFile = None,
     set_: options.Assignments = None,
     preset: options.Preset = options.PresetName.default,
@@ -78,7 +75,7 @@ def convert_command(
 
     Example: pc2grid convert monday.mcap -o building.submaps
     """
-    _check(output, rerun, dask=dask, jobs=jobs, several=len(inputs) > 1)
+    _check(output, dask=dask, jobs=jobs)
     settings = options.make_config(
         config,
         set_,
@@ -89,8 +86,6 @@ def convert_command(
         points_voxel_m=points,
         preset=preset,
     )
-    if rerun is not None:
-        require_target(rerun, force)
     label, span = Label(building=building, floor=floor), TimeSpan(start, duration)
     wanted = conversion.jobs_of(inputs, name, settings, span=span, recover=recover, label=label)
     stored = stored_sessions(output, wanted, add=add, force=force)
@@ -104,7 +99,6 @@ def convert_command(
         force=force,
         dask=LOCAL if dask is None and jobs is not None else dask,
         processes=jobs or os.cpu_count() or 1,
-        rerun=rerun,
         quiet=json,
         strict=strict,
     )
@@ -112,24 +106,7 @@ def convert_command(
     conversion.conclude(output, done, len(inputs), json=json)
 
 
-def _check(output: str, rerun: str | None, *, dask: str | None, jobs: int | None, several: bool) -> None:
-    """Raises ConfigError if the options contradict each other or what they need is not installed."""
-    parallel = dask is not None or jobs is not None
-    if rerun is not None:
-        _check_rerun(rerun, several=several, parallel=parallel)
-    extras.require(
-        ({} if rerun is None else {"viz": "--rerun"})
-        | ({} if not parallel else {"cluster": "--dask" if jobs is None else "--jobs"})
-        | extras.of_addresses(output)
-    )
-
-
-def _check_rerun(target: str, *, several: bool, parallel: bool) -> None:
-    """Raises ConfigError if such a conversion cannot be streamed to this target."""
-    if parallel:
-        raise ConfigError("--rerun shows what is done in this process: not with --dask or --jobs")
-    if several and url_of(target) is None:
-        raise ConfigError(
-            "--rerun writes one recording to a file, but there are several inputs",
-            hint="watch them in the viewer: --rerun, or --rerun HOST:PORT",
-        )
+def _check(output: str, *, dask: str | None, jobs: int | None) -> None:
+    """Raises ConfigError if what the options need is not installed."""
+    parallel = {} if dask is None and jobs is None else {"cluster": "--dask" if jobs is None else "--jobs"}
+    extras.require(parallel | extras.of_addresses(output))

@@ -20,12 +20,10 @@ from pc2grid.io.nav2_map import save_map
 from pc2grid.io.trajectory import write_trajectory
 from pc2grid_cli import console
 from pc2grid_cli.foxglove import write_session
-from pc2grid_cli.options import AsJson, Building, Database, Floor, Force, Frame, FrameName, Rerun
+from pc2grid_cli.options import AsJson, Building, Database, Floor, Force, Frame, FrameName
 from pc2grid_cli.output_files import check_file, map_stem
 from pc2grid_cli.picture import draw_session
 from pc2grid_cli.report import write_report
-from pc2grid_cli.rerun_stream import write_session as stream_session
-from pc2grid_cli.rerun_target import require_target, url_of
 from signature.database import open_database
 from signature.localization.joining.building_map import floors_of, map_of
 
@@ -78,9 +76,8 @@ def export_command(
         Path | None, typer.Option("--g2o", metavar="OUT.g2o", help="the pose graph: steps and loops")
     ] = None,
     mcap: Annotated[
-        Path | None, typer.Option("--mcap", metavar="OUT.mcap", help="map, path, submaps for Foxglove")
+        Path | None, typer.Option("--mcap", metavar="OUT.mcap", help="map, path, submaps for Foxglove, rerun")
     ] = None,
-    rerun: Rerun = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="OUT.png", help="a picture of the map")
     ] = None,
@@ -111,12 +108,11 @@ def export_command(
         graph=graph,
         g2o=g2o,
         mcap=mcap,
-        rerun=rerun,
         plot=plot,
         report=report,
         force=force,
     )
-    extras.require(({} if rerun is None else {"viz": "--rerun"}) | extras.of_addresses(database))
+    extras.require(extras.of_addresses(database))
     outputs.check()
     with open_database(database) as opened:
         where = opened.location
@@ -154,13 +150,12 @@ class _Outputs:
     graph: Path | None
     g2o: Path | None
     mcap: Path | None
-    rerun: str | None
     plot: Path | None
     report: Path | None
     force: bool
 
     def files(self) -> list[Path]:
-        """The files of a session, but for those of rerun."""
+        """The files of a session."""
         one = (self.trajectory, self.cloud, self.graph, self.g2o, self.mcap, self.plot)
         return [path for path in one if path is not None] + self.map_files()
 
@@ -171,33 +166,29 @@ class _Outputs:
 
     def of_session(self) -> bool:
         """Whether anything is written of a single session."""
-        return bool(self.files()) or self.rerun is not None
+        return bool(self.files())
 
     def of_building_only(self) -> bool:
         """Whether all that is written of sessions can be of a whole building."""
         wanted = [path for path in (self.cloud, *self.map_files()) if path is not None]
-        return bool(wanted) and len(wanted) == len(self.files()) and self.rerun is None
+        return bool(wanted) and len(wanted) == len(self.files())
 
     def written(self) -> list[Path]:
         """All files, in the order in which they are listed for the user."""
-        paths = self.files() + ([] if self.report is None else [self.report])
-        return paths + ([Path(self.rerun)] if self.rerun is not None and url_of(self.rerun) is None else [])
+        return self.files() + ([] if self.report is None else [self.report])
 
     def check(self) -> None:
         """Raises ConfigError if there is nothing to write, OutputError if a target cannot be written."""
         if not self.of_session() and self.report is None:
             raise ConfigError(
                 "nothing to export",
-                hint="name one of --map, --trajectory, --cloud, --graph, --g2o, --mcap, --rerun, --plot,"
-                " --report",
+                hint="name one of --map, --trajectory, --cloud, --graph, --g2o, --mcap, --plot, --report",
             )
         for option in ("trajectory", "cloud", "graph", "g2o", "mcap", "plot", "report"):
             named = option == "trajectory" and self.trajectory_format is not None
             check_file(option, getattr(self, option), self.force, any_suffix=named)
         for path in self.map_files():
             check_file("map", path, self.force)
-        if self.rerun is not None:
-            require_target(self.rerun, self.force)
 
 
 def _session_name(database: SubmapDatabase, named: str | None) -> str:
@@ -253,7 +244,6 @@ def _write_session(
         (outputs.graph, lambda path: write_graph(path, database.graph(name))),
         (outputs.g2o, lambda path: write_g2o(path, poses, database.loops(name))),
         (outputs.mcap, lambda path: write_session(path, database, name, outputs.force)),
-        (outputs.rerun, lambda target: stream_session(target, database, name)),
         (outputs.plot, lambda path: draw_session(path, database, name)),
     ]
     for wanted, write in writers:

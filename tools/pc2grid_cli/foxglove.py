@@ -1,4 +1,4 @@
-"""Databases and answers as MCAP for Foxglove: `examples/foxglove.json` is a layout that shows them.
+"""Databases and answers as MCAP for Foxglove and rerun: `examples/foxglove.json` is a layout for Foxglove.
 
 Topics: /map, /points (if the session has them), /path, /submaps; for an answer /query_path, /hypotheses,
 /pose and /initialpose too, and map -> odom -> base_link over time. For a map located in another one

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 
 
 ON_THE_WAY = 8
-"""At so many moments on the way the page and rerun say what the answer would have been. Chosen by hand: each
-takes as long as the answer, so that a page takes a few times as long as the answer alone."""
+"""At so many moments on the way the page says what the answer would have been. Chosen by hand: each takes as
+long as the answer, so that a page takes a few times as long as the answer alone."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -94,15 +94,6 @@ WrittenDatabase = Annotated[str, typer.Option("--output", "-o", metavar=DATABASE
 OUTPUT_FOLDER = ("--output", "-o", "--out")
 """Names of the option for the folder of results; --out is the one it had first."""
 
-Rerun = Annotated[
-    str | None,
-    typer.Option(
-        "--rerun",
-        metavar="[HOST:PORT|OUT.rrd]",
-        help="watch in the rerun viewer, here or there, or in a file; needs [viz]",
-    ),
-]
-
 
 def make_config(
     file: Path | None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from pc2grid.io.nav2_map import is_map_file
 from pc2grid.io.trajectory import write_trajectory
 from pc2grid.mapping.drawn_map import is_drawn_map
 from pc2grid.mapping.precision import PRECISION
+from pc2grid.observer import Observer
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
@@ -30,8 +30,6 @@ from pc2grid_cli.nav2_pose import write_initialpose
 from pc2grid_cli.output_files import check_file
 from pc2grid_cli.picture import draw_answer
 from pc2grid_cli.report import write_report
-from pc2grid_cli.rerun_stream import Search, stream_to
-from pc2grid_cli.rerun_target import require_target
 from signature.database.maintenance import is_database
 from signature.localization.in_building import answer_in_building
 
@@ -69,12 +67,10 @@ class _Outputs:
         always = [path for path in (self.plot, self.report) if path is not None]
         return [*self.of_answer(), *always] if located else always
 
-    def refuse(self, reason: str, rerun: str | None) -> None:
+    def refuse(self, reason: str) -> None:
         """Raises ConfigError if there is any."""
         files = ("trajectory", "initialpose", "output", "plot", "report")
         given = [f"--{option}" for option in files if getattr(self, option) is not None]
-        if rerun is not None:
-            given.append("--rerun")
         if given:
             raise ConfigError(f"{given[0]}: {reason}", hint="leave it out, or ask without --check")
 
@@ -129,9 +125,8 @@ def relocalize_command(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="OUT.mcap", help="map, pose, path for Foxglove"),
+        typer.Option("--output", "-o", metavar="OUT.mcap", help="map, pose, path for Foxglove, rerun"),
     ] = None,
-    rerun: options.Rerun = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="OUT.png", help="a picture of the answer")
     ] = None,
@@ -163,7 +158,7 @@ def relocalize_command(
         force=force,
     )
     known = KnownPose(near=near, near_pose=near_pose, check=check, check_topic=check_topic, session=session)
-    _check_options(log, database, outputs, known, rerun)
+    _check_options(log, database, outputs, known)
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity, top_k=top_k
     )
@@ -187,11 +182,10 @@ def relocalize_command(
             settings,
             span=TimeSpan(start, duration),
             recover=recover,
-            rerun=rerun,
-            terminal=console.of(context),
+            observer=console.of(context).observer(),
             known=known,
-            # Only these show it, and it takes time.
-            on_the_way=ON_THE_WAY if report is not None or rerun is not None else 0,
+            # Only the page shows it, and it takes time.
+            on_the_way=ON_THE_WAY if report is not None else 0,
         )
         # Printed first: a file that cannot be written must not cost the answer.
         stated = answer_in_building(found.answer, frames)
@@ -215,16 +209,14 @@ def relocalize_command(
         raise typer.Exit(console.LOSSY)
 
 
-def _check_options(log: Path, database: str, outputs: _Outputs, known: KnownPose, rerun: str | None) -> None:
+def _check_options(log: Path, database: str, outputs: _Outputs, known: KnownPose) -> None:
     """Raises what is wrong with the options before any work is done."""
-    extras.require(({} if rerun is None else {"viz": "--rerun"}) | extras.of_addresses(database))
+    extras.require(extras.of_addresses(database))
     outputs.check()
-    _check_options_for_maps(log, outputs, rerun)
+    _check_options_for_maps(log, outputs)
     known.validate(is_map=is_map_file(log))
     if known.is_check:
-        outputs.refuse("--check judges a pose and finds none", rerun)
-    if rerun is not None:
-        require_target(rerun, outputs.force)
+        outputs.refuse("--check judges a pose and finds none")
     _check_not_swapped(log, database)
 
 
@@ -246,9 +238,9 @@ def _check_not_swapped(log: Path, database: str) -> None:
         )
 
 
-def _check_options_for_maps(log: Path, outputs: _Outputs, rerun: str | None) -> None:
+def _check_options_for_maps(log: Path, outputs: _Outputs) -> None:
     """Raises ConfigError for options that need a robot, if the query is a map."""
-    given = {"--trajectory": outputs.trajectory, "--initialpose": outputs.initialpose, "--rerun": rerun}
+    given = {"--trajectory": outputs.trajectory, "--initialpose": outputs.initialpose}
     for option, value in given.items():
         if value is not None and is_drawn_map(log):
             raise ConfigError(
@@ -263,37 +255,28 @@ def _find(
     *,
     span: TimeSpan,
     recover: bool,
-    rerun: str | None,
-    terminal: console.Console,
+    observer: Observer,
     known: KnownPose,
     on_the_way: int,
 ) -> tuple[Found, Trajectory | None]:
-    """The answer, and the query's poses in the map; both are streamed to `rerun` meanwhile.
+    """The answer, and the query's poses in the map.
 
-    ask : find out, too, what the answer would have been at so many moments on the way.
+    on_the_way : find out, too, what the answer would have been at so many moments on the way.
     """
     if is_drawn_map(log):
         found = find_map(log, database, settings)
         return found, in_map(found.poses, found.answer)
-    with contextlib.ExitStack() as stack:
-        shown = None
-        if rerun is not None:
-            shown = Search(stack.enter_context(stream_to(rerun, log.stem)), database)
-        found = find_log(
-            log,
-            database,
-            settings,
-            span=span,
-            recover=recover,
-            observer=terminal.observer(),
-            watch=None if shown is None else shown.watch,
-            known=known,
-            on_the_way=on_the_way,
-        )
-        located = in_map(found.poses, found.answer)
-        if shown is not None:
-            shown.show(found.answer, located)
-    return found, located
+    found = find_log(
+        log,
+        database,
+        settings,
+        span=span,
+        recover=recover,
+        observer=observer,
+        known=known,
+        on_the_way=on_the_way,
+    )
+    return found, in_map(found.poses, found.answer)
 
 
 def _write(

@@ -2,6 +2,11 @@
 
 REMOVED = {
     "pc2grid diff": "`pc2grid db join --plot OUT.png` draws the walls of joined sessions over each other",
+    **dict.fromkeys(
+        ("pc2grid convert --rerun", "pc2grid export --rerun"),
+        "`pc2grid export --mcap OUT.mcap` writes the map, `rerun OUT.mcap` shows it",
+    ),
+    "pc2grid relocalize --rerun": "`--output OUT.mcap` writes the answer, `rerun OUT.mcap` shows it",
     "pc2grid db update": "`pc2grid db join` puts sessions into one frame, `pc2grid export --map` draws them",
     "pc2grid convert --update": "`--join` puts what is new into the frame of the other sessions",
 }
