@@ -123,3 +123,12 @@ def test_odometry_counts_where_a_scan_has_one_return(tmp_path: Path) -> None:
     assert made.poses is not None
     assert made.poses[-1][:2, 3] == pytest.approx((-0.07, 0.25), abs=0.1)
     assert made.steps_m.max() < FASTEST_M
+
+
+def test_a_few_wild_times_of_points_decide_no_unit(tmp_path: Path) -> None:
+    made = convert(field_log("times_zero_in_a_few_points"), tmp_path)
+    assert made.code == 0
+    assert made.session is not None and made.session["path_m"] == pytest.approx(2.66, abs=0.05)
+    assert made.steps_m.max() < FASTEST_M
+    assert made.session["report"]["points_dropped"] >= 120
+    assert made.warned_of("points whose times in field timestamp are not of their scan are left out")

@@ -6,6 +6,7 @@ Points and times are selected by the same rows, so they belong together.
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +38,9 @@ _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LONGEST_SWEEP_S = 2.0
 _SWEEP_S = (2e-3, LONGEST_SWEEP_S)
 _NEAR_STAMP_S = 10.0  # times this near to zero are relative to the stamp, those near to the stamp absolute
+# Half of the times of a scan lie together. Those farther away than so many times their span are no times of
+# the scan. That needs many points, of which some are looked at. Chosen by hand.
+_FARTHEST_SPANS, _LEAST_TIMES, _SAMPLED_TIMES = 20.0, 50, 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +71,13 @@ def decode(cloud: PointCloud2, *, unit: str = "auto", max_points: int = 20_000_0
     note: str | None = None
     if name is not None:
         values = rows[name].reshape(-1)[index]
-        timed: NDArray[np.bool_] | None = None
-        if values.dtype.kind == "f" and not (finite := np.isfinite(values)).all():
-            values, timed = values[finite], finite
-        seconds, note = _offsets(values, cloud.header.stamp_ns, unit, name)
+        timed = _timed(values)
+        seconds, note = _offsets(values[timed], cloud.header.stamp_ns, unit, name)
         if seconds is not None:
             offsets = seconds.astype(np.float32, copy=False)
-            xyz = xyz if timed is None else xyz[timed]
+            if len(offsets) < len(xyz):
+                xyz = xyz[timed]
+                note = note or f"points whose times in field {name} are not of their scan are left out"
     return Points(xyz, offsets, rows.size - len(xyz), note)
 
 
@@ -145,6 +149,29 @@ def _layout(fields: tuple[tuple[str, int, int, int], ...], step: int, big: bool)
 def _time_field(cloud: PointCloud2) -> str | None:
     names = {name.lower(): name for name, *_ in cloud.fields}
     return next((names[n] for n in _TIME_FIELDS if n in names), None)
+
+
+def _timed(values: NDArray[Any]) -> NDArray[np.bool_] | slice:
+    """Which of the times (N,) are finite, and near those of the other points.
+
+    Drivers leave the time of some points at zero: it must not decide in which unit the others are.
+    """
+    low, high = -math.inf, math.inf
+    sample = values[:: max(len(values) // _SAMPLED_TIMES, 1)].astype(np.float64)
+    sample = np.sort(sample[np.isfinite(sample)])
+    if len(sample) >= _LEAST_TIMES:
+        half = len(sample) // 2
+        with np.errstate(over="ignore"):
+            spans = sample[half:] - sample[:-half]
+        first = int(spans.argmin())
+        reach = _FARTHEST_SPANS * float(spans[first])
+        if reach > 0.0:
+            low, high = float(sample[first]) - reach, float(sample[first + half]) + reach
+    least, most = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
+    if low <= least and most <= high and math.isfinite(most - least):
+        return slice(None)
+    timed: NDArray[np.bool_] = np.isfinite(values) & (values >= low) & (values <= high)
+    return timed
 
 
 def _scale(span: float, unit: str, name: str) -> float:

@@ -111,6 +111,27 @@ def test_times_stay_with_their_points_where_rows_are_dropped() -> None:
     assert found.dropped == 2
 
 
+@pytest.mark.parametrize("wild", [0.0, 4e18, -1e300, math.inf])
+@pytest.mark.parametrize("share", [0.001, 0.3])
+@pytest.mark.parametrize(("scale", "begin_s"), [(1.0, STAMP * 1e-9), (1e9, STAMP * 1e-9), (1e6, -0.1)])
+def test_wild_times_decide_no_unit(wild: float, share: float, scale: float, begin_s: float) -> None:
+    seconds = np.linspace(0.0, 0.1, 2000)
+    points = np.zeros(2000, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<f8")])
+    points["x"], points["t"] = 1.0 + seconds, (begin_s + seconds) * scale
+    odd = np.random.default_rng(3).random(2000) < share
+    points["t"][odd] = wild
+    fields, data = (*XYZ, ("t", 12, 8, 1)), points.tobytes()
+    found = decode(PointCloud2(Header(STAMP, ""), 1, 2000, fields, False, 20, len(data), data))
+    assert found.offsets_s is not None
+    expected = seconds + (begin_s if begin_s < 0 else 0.0)
+    if wild == 0.0 and begin_s < 0.0:  # a time of the scan, as far as one can tell
+        expected = np.where(odd, 0.0, expected)
+        odd[:] = False
+    assert found.dropped == odd.sum()
+    np.testing.assert_allclose(found.offsets_s, expected[~odd], atol=1e-3)
+    assert (found.note is not None) == (found.dropped > 0)
+
+
 def test_no_times_or_all_the_same_is_no_offsets() -> None:
     data = b"".join(struct.pack("<4f", 1, 2, 3, 0.5) for _ in range(3))
     same = decode(PointCloud2(Header(STAMP, ""), 1, 3, (*XYZ, ("t", 12, 7, 1)), False, 16, 48, data))
