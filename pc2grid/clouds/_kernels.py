@@ -1,4 +1,4 @@
-"""Compiled twins of functions of this folder. The plain forms in the modules are their definitions."""
+"""Compiled steps of this folder. The tests compare them with plain forms in numpy."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ def planar_normals(
     sparse_factor: float,
     max_flatness: float,
 ) -> F32:
-    """Twin of `normals.planar_normals_plain`; `order` sorts the hits `away` from the sensor by bearing.
+    """The angle of the normal of the surface at each hit, as `normals.planar_normals` defines it.
+
+    away : (N, 2) hits from the sensor. order : sorts them by their `bearings`.
 
     Measured: 0.06 ms instead of 16 ms a scan of a planar laser, 0.11 instead of 86 ms of a lidar; all of the
     tracking of a scan takes 2 ms and 6 ms.
@@ -79,7 +81,15 @@ def scan_bearings(
     depths: tuple[float, float],
     bearings: int,
 ) -> tuple[F64, F64, F64]:
-    """Twin of `planar_scan.scan_bearings_plain`.
+    """Sort points (N, 3) by bearing.
+
+    sensor : (3,). plane : (4,) with height = plane[:3] . p + plane[3]. band : lowest and highest height of
+    an obstacle. limit : farthest range of an obstacle point. depths : (d, q), obstacle points of one
+    bearing belong to one surface up to a range difference of d + q * range**2.
+
+    Returns for each bearing the range of the nearest obstacle (inf: none) and how far floor and ceiling
+    show it to be free (0: not at all), and for each surface (S, 3) the sums of x and y of its points and
+    their number, by increasing bearing and range.
 
     Measured: 0.6 ms instead of 23 ms a scan of a lidar, 0.015 instead of 0.7 ms of a planar laser.
     """

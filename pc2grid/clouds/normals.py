@@ -30,28 +30,3 @@ def planar_normals(hits_m: F32, origin_m: F64, parameters: CloudParameters = CLO
     bearings = np.arctan2(away[:, 1], away[:, 0])
     order = np.argsort(bearings, kind="stable")
     return compiled(away, order, bearings, p.reach_m, p.reach_per_m, p.sparse_factor, p.max_flatness)
-
-
-def planar_normals_plain(hits_m: F32, origin_m: F64, parameters: CloudParameters = CLOUD_PARAMETERS) -> F32:
-    """`planar_normals` in plain numpy: its definition, and what tests compare the compiled form with."""
-    p = parameters
-    away = hits_m.astype(np.float64) - origin_m
-    ranges = np.hypot(away[:, 0], away[:, 1])
-    bearings = np.arctan2(away[:, 1], away[:, 0])
-    turns = np.abs(bearings[:, None] - bearings)
-    turns = np.minimum(turns, 2.0 * np.pi - turns)
-    distances = np.linalg.norm(away[:, None] - away, axis=2)
-    angles = np.arctan2(-away[:, 1], -away[:, 0])
-    for k in range(len(angles)):
-        for factor in (1.0, p.sparse_factor):
-            reach = factor * (p.reach_m + p.reach_per_m * ranges[k])
-            near = (distances[k] < reach) & (turns[k] <= reach / max(ranges[k], reach))
-            near[k] = True
-            if near.sum() < 3:
-                continue
-            variances, axes = np.linalg.eigh(np.cov(away[near].T, bias=True))
-            if variances[0] < p.max_flatness * variances[1]:
-                normal = axes[:, 0] * (1.0 if axes[:, 0] @ away[k] <= 0.0 else -1.0)
-                angles[k] = np.arctan2(normal[1], normal[0])
-            break
-    return angles.astype(np.float32)

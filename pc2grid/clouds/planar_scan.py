@@ -158,50 +158,6 @@ def project_to_plane(
     )
 
 
-def scan_bearings_plain(
-    points: F32,
-    sensor: F64,
-    plane: F64,
-    band: tuple[float, float],
-    limit: float,
-    depths: tuple[float, float],
-    bearings: int,
-) -> tuple[F64, F64, F64]:
-    """Sort points (N, 3) by bearing: the definition of the compiled form, in plain numpy.
-
-    sensor : (3,). plane : (4,) with height = plane[:3] . p + plane[3]. band : lowest and highest height of
-    an obstacle. limit : farthest range of an obstacle point. depths : (d, q), obstacle points of one
-    bearing belong to one surface up to a range difference of d + q * range**2.
-
-    Returns for each bearing the range of the nearest obstacle (inf: none) and how far floor and ceiling
-    show it to be free (0: not at all), and for each surface (S, 3) the sums of x and y of its points and
-    their number, by increasing bearing and range.
-    """
-    away = points[:, :2].astype(np.float64) - sensor[:2]
-    ranges = np.hypot(away[:, 0], away[:, 1])
-    bearing = np.rint(np.arctan2(away[:, 1], away[:, 0]) * (bearings / (2.0 * np.pi))).astype(int) % bearings
-    height = points.astype(np.float64) @ plane[:3] + plane[3]
-    sensor_height = float(sensor @ plane[:3] + plane[3])
-    low, high = height < band[0], height > band[1]
-    nearest, reach = np.full(bearings, np.inf), np.zeros(bearings)
-    np.maximum.at(reach, bearing[low], ranges[low])
-    if sensor_height < band[1]:
-        part = (band[1] - sensor_height) / (height[high] - sensor_height)
-        np.maximum.at(reach, bearing[high], ranges[high] * part)
-    obstacle = ~(low | high)
-    np.minimum.at(nearest, bearing[obstacle], ranges[obstacle])
-    kept = np.flatnonzero(obstacle & (ranges <= limit))
-    kept = kept[np.lexsort((ranges[kept], bearing[kept]))]
-    surfaces: list[F64] = []
-    last, first_m = -1, 0.0
-    for k in kept:
-        if bearing[k] != last or ranges[k] - first_m > depths[0] + depths[1] * ranges[k] ** 2:
-            last, first_m = bearing[k], ranges[k]
-            surfaces.append(np.zeros(3))
-        surfaces[-1] += points[k, 0], points[k, 1], 1.0
-    return nearest, reach, np.array(surfaces).reshape(-1, 3)
-
-
 def mean_per_cell(sums: F64, cell_m: float) -> F32:
     """Return one point (M, 2) for each cell: the mean of all that falls into it, by first occurrence.
 

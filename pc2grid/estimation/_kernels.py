@@ -1,4 +1,4 @@
-"""Compiled twins of functions of this folder. The plain forms in `point_to_line` are their definitions."""
+"""Compiled steps of this folder. The tests compare them with plain forms in numpy."""
 
 from __future__ import annotations
 
@@ -61,7 +61,14 @@ def normal_equations(
     radius: int,
     scale_m: float,
 ) -> tuple[F64, F64, int]:
-    """Twin of `point_to_line.normal_equations_plain`.
+    """Linearise the point-to-line distances at a pose.
+
+    index : (H, W) row of `moments` (K, sectors, 6) for each cell, or -1. points : (N, 2) and normal_rad :
+    (N,) in their frame. pose : (3,) x, y, yaw of that frame from the corner of cell (0, 0).
+    radius : half width in cells of the neighbourhood. scale_m : scale of the Cauchy weight.
+
+    Returns H (3, 3) and g (3,) of the Gauss-Newton step H d = -g for points of unit variance, and the
+    number of points that found a line.
 
     Measured: 0.09 ms instead of 23 ms for 700 points of a lidar, 0.025 instead of 7 ms for a planar laser; a
     scan needs seven calls, and all of its tracking 6 ms and 2 ms.
@@ -103,7 +110,11 @@ def normal_equations(
 def placement_scores(
     field: F32, points: F64, origin: F64, yaws: F64, first: int, step: int, count: int
 ) -> F32:
-    """Twin of `point_to_line.placement_scores_plain`.
+    """Score all placements of a window. All in cells.
+
+    points : (N, 2) x, y. origin : (2,) middle of the window. yaws : (A,) radians. Shifts are
+    `first` + `step` * k for k below `count`, in x and in y. Returns the means (A, count (y), count (x)) of
+    the field at the points, 0 outside.
 
     Measured: 6 ms instead of 290 ms for 400 points and 20 000 placements.
     """
@@ -129,7 +140,7 @@ def placement_scores(
 def add_factors(
     rows: NDArray[np.intp], error: F64, jacobian: F64, information: F64, kernel: F64, H: F64, g: F64
 ) -> None:
-    """See `graph.add_factors_plain`."""
+    """Add factors, see `graph.Factors`, to the normal equations H and g."""
     dimension, unknowns = jacobian.shape[1], jacobian.shape[2]
     Le, LJ = np.empty(dimension), np.empty((dimension, unknowns))
     for f in range(rows.shape[0]):
@@ -158,7 +169,7 @@ def add_factors(
 
 @njit(cache=True)
 def steps(first: F64, second: F64) -> tuple[F64, F64, F64]:
-    """See `manifold.steps_plain`."""
+    """The steps between poses (N, 4, 4) and their Jacobians, see `manifold.Steps`."""
     count = first.shape[0]
     step, by_first, by_second = np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
     turn, right = np.empty((3, 3)), np.empty((3, 3))

@@ -53,20 +53,6 @@ def normal_equations(factors: Iterable[Factors], count: int) -> tuple[F64, F64]:
     return H, g
 
 
-def add_factors_plain(
-    rows: NDArray[np.intp], error: F64, jacobian: F64, information: F64, kernel: F64, H: F64, g: F64
-) -> None:
-    """Add factors, see `Factors`, to the normal equations.
-
-    The definition of the compiled form, in numpy.
-    """
-    chi2 = np.einsum("fa,fab,fb->f", error, information, error)
-    weight = 1.0 / (1.0 + chi2 / kernel**2)
-    JtL = jacobian.transpose(0, 2, 1) @ (information * weight[:, None, None])
-    np.add.at(H, (rows[:, :, None], rows[:, None, :]), JtL @ jacobian)
-    np.add.at(g, rows, np.einsum("fka,fa->fk", JtL, error))
-
-
 def without(H: F64, g: F64, old: NDArray[np.intp]) -> tuple[F64, F64]:
     """The information (N - O, N - O) and the gradient on the other unknowns when those in `old` (O,) are
     marginalised: the Schur complement."""

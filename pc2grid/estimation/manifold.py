@@ -38,24 +38,6 @@ def steps(first: F64, second: F64) -> Steps:
     return Steps(*_kernels.steps(first, second))
 
 
-def steps_plain(first: F64, second: F64) -> Steps:
-    """The definition of `steps`, in numpy."""
-    R = first[:, :3, :3].transpose(0, 2, 1)
-    turn = R @ second[:, :3, :3]
-    step = np.empty((len(first), 6))
-    step[:, :3] = np.einsum("nab,nb->na", R, second[:, :3, 3] - first[:, :3, 3])
-    step[:, 3:] = _rotation_vectors(turn)
-    # Of the rotation vector only the first term of the series is needed: steps are small, or count little.
-    right = np.eye(3) + 0.5 * _skew(step[:, 3:])
-    by_first, by_second = np.zeros((len(first), 6, 6)), np.zeros((len(first), 6, 6))
-    by_first[:, :3, :3] = -np.eye(3)
-    by_first[:, :3, 3:] = _skew(step[:, :3])
-    by_first[:, 3:, 3:] = -right @ turn.transpose(0, 2, 1)
-    by_second[:, :3, :3] = turn
-    by_second[:, 3:, 3:] = right
-    return Steps(step, by_first, by_second)
-
-
 def carried_on(motion: F64) -> F64:
     """How a change of a pose changes the pose after a motion (4, 4), a matrix (6, 6)."""
     R = motion[:3, :3].T

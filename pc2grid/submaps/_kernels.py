@@ -1,7 +1,4 @@
-"""Compiled twins of the two steps of this folder where compiling pays.
-
-The readable definitions are `skeleton.thin_plain` and `isovist.cast_rays_plain`; the tests compare the two.
-"""
+"""The two steps of this folder where compiling pays. The tests compare them with plain forms in numpy."""
 
 from __future__ import annotations
 
@@ -15,7 +12,10 @@ from pc2grid.model import OCCUPIED_FROM
 
 @numba.njit(cache=True)
 def thin_in_place(flat: NDArray[np.uint8], width: int, border: I64, deletable: NDArray[np.bool_]) -> None:
-    """Thin a 0/1 image in place; `skeleton.thin_plain` is the definition.
+    """Thin a 0/1 image in place.
+
+    In each half of an iteration all pixels are tested on the same image, and those that may go are deleted
+    together. A pixel is tested again only if a neighbour of it has gone.
 
     flat : the image row by row, `width` pixels a row, with a border of zeros. border : indices of the set
     pixels that have a zero neighbour. deletable : (2, 256), by half of an iteration and neighbour code.
@@ -70,7 +70,10 @@ def cast_rays(
 ) -> tuple[F32, NDArray[np.int8]]:
     """Follow the rays of each place (N,) in steps of half a cell; all lengths in cells. Returns (N, B) each.
 
-    `isovist.cast_rays_plain` is the definition; parameters and results are the same.
+    cells : (H, W). rows, columns : (N,) where the rays start, in cells from the grid's corner. limit : length
+    of a ray. patience : steps through unknown cells after which a ray is HIDDEN.
+
+    Returns how far each ray is known to be free (or its wall), and how it ends.
 
     Measured: 20 times as fast as the numpy form at 78 places of fr079 (4 against 87 ms); every described view
     and every query casts rays.

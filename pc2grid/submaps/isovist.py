@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64, freeze
-from pc2grid.model import OCCUPIED, OCCUPIED_FROM, UNKNOWN, OccupancyGrid, Submap
+from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid, Submap
 
 BEARINGS = 360
 
@@ -54,37 +54,6 @@ class Isovist:
     def area_m2(self) -> float:
         """Area of the star-shaped polygon."""
         return float(np.mean(self.ranges_m.astype(np.float64) ** 2) * np.pi)
-
-
-def cast_rays_plain(
-    cells: NDArray[np.int8], rows: F64, columns: F64, limit: float, bearings: int, patience: int
-) -> tuple[F32, NDArray[np.int8]]:
-    """Follow the rays of each place (N,) in steps of half a cell: the definition of `_kernels.cast_rays`.
-
-    cells : (H, W). rows, columns : (N,) where the rays start, in cells from the grid's corner. limit : length
-    of a ray, in cells. patience : steps through unknown cells after which a ray is HIDDEN.
-
-    Returns how far each ray is known to be free (or its wall), in cells, and how it ends; (N, B) each.
-    """
-    shape = (len(rows), bearings)
-    angles = 2.0 * np.pi * np.arange(bearings) / bearings
-    r, c = np.broadcast_to(rows[:, None], shape).copy(), np.broadcast_to(columns[:, None], shape).copy()
-    ranges, ends = np.zeros(shape), np.full(shape, OPEN, np.int8)
-    unknown_run, running = np.zeros(shape, np.int64), np.ones(shape, np.bool_)
-    length = 0.0
-    while length < limit and running.any():
-        r += np.sin(angles) * _STEP_CELLS
-        c += np.cos(angles) * _STEP_CELLS
-        length += _STEP_CELLS
-        inside = (r >= 0) & (r < cells.shape[0]) & (c >= 0) & (c < cells.shape[1])
-        value = np.full(shape, UNKNOWN, np.int8)
-        value[inside] = cells[r[inside].astype(np.int64), c[inside].astype(np.int64)]
-        unknown_run = np.where(value < 0, unknown_run + 1, 0)
-        ranges[running & (value >= 0)] = length
-        ends[running & (value >= OCCUPIED_FROM)] = WALL
-        ends[running & (~inside | (unknown_run > patience))] = HIDDEN
-        running &= ends == OPEN
-    return ranges.astype(np.float32), ends
 
 
 def look_around(

@@ -70,34 +70,11 @@ def thin(mask: BoolGrid, thinning: Thinning = "guo_hall") -> BoolGrid:
 
     guo_hall (default) leaves neither 2x2 blocks nor stairs on slanted lines, so that a line's pixels have
     two neighbours whatever its direction; zhang_suen leaves both, and erases slanted lines two pixels wide.
-    The result is that of `thin_plain`.
     """
     from pc2grid.submaps._kernels import thin_in_place
 
     image, border = _padded(mask)
     thin_in_place(image.reshape(-1), image.shape[1], border, _DELETABLE[thinning])
-    return image[1:-1, 1:-1].view(np.bool_)
-
-
-def thin_plain(mask: BoolGrid, thinning: Thinning = "guo_hall") -> BoolGrid:
-    """The definition of `thin`, in numpy.
-
-    Both algorithms are parallel: in each half of an iteration all pixels are tested on the same image, and
-    those that may go are deleted together. Whether a pixel may go depends on its neighbours alone, so in
-    each half only the pixels are tested of which a neighbour has gone since the same half was last done.
-    """
-    image, border = _padded(mask)
-    flat, steps = image.reshape(-1), _neighbour_steps(image.shape[1])
-    waiting, half = [border, border], 0
-    while len(waiting[0]) or len(waiting[1]):
-        tested = waiting[half][flat[waiting[half]] > 0]
-        gone = tested[_DELETABLE[thinning][half, _codes(flat, image.shape[1], tested)]]
-        flat[gone] = 0
-        touched = np.unique(gone[:, None] + steps)
-        touched = touched[flat[touched] > 0]
-        waiting[half] = touched
-        waiting[1 - half] = np.union1d(waiting[1 - half], touched)
-        half = 1 - half
     return image[1:-1, 1:-1].view(np.bool_)
 
 

@@ -1,4 +1,4 @@
-"""Compiled twins of the comparisons of viewpoints and isovists."""
+"""The comparisons of viewpoints and isovists, compiled. The tests compare them with plain forms in numpy."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ def compare_rotated(
     doubt: float,
     out: F32,
 ) -> None:
-    """Twin of `likeness.plain_rotate_and_compare` for one view, into `out` (B, N).
+    """Likeness of one isovist with others for each rotation by 2 pi s / B, into `out` (B, N).
+
+    The mean over the rays that both sides know of a triangular kernel of the difference of their ranges, with
+    `doubt` added to the number of rays.
 
     own : ranges of some `rays` of the view. others (N, B) : ranges of the viewpoints, `known` or not. Ranges
     that differ by `width` or more are not alike. Sums are exact in 16 bits.
@@ -69,7 +72,12 @@ def best_headings(
     steps: F64,
     out: F32,
 ) -> None:
-    """Twin of `place_index.plain_best_headings`, into `out` (P,)."""
+    """The sum of the `scores` (K, V) of all views at the best heading, into `out` (P,).
+
+    squares : (K, 2) viewpoints in units of the lattice. block, low, shape, first, at : as in
+    `place_index.Raster`. viewpoint, view : (P,) which view is put on which viewpoint. steps :
+    `place_index.steps_between` in units of the lattice.
+    """
     headings, views = steps.shape[0], steps.shape[1]
     for pose in range(len(viewpoint)):
         here, own = viewpoint[pose], view[pose]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64
+from pc2grid.arrays import F32, I64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,25 +57,6 @@ def rotate_and_compare(
             LIKENESS.prior_share * bearings,
             likeness[view],
         )
-    return likeness
-
-
-def plain_rotate_and_compare(
-    ranges_m: F32, seen: NDArray[np.bool_], others_m: F32, others_seen: NDArray[np.bool_]
-) -> F64:
-    """Likeness (V, B, N), 0..1, of isovists (V, B) with others (N, B), for each rotation by 2 pi s / B.
-
-    The mean over the rays that both sides know of a triangular kernel of the difference of their ranges, with
-    `LikenessParameters.prior_share` added to the number of rays.
-    """
-    bearings = ranges_m.shape[1]
-    likeness = np.empty((len(ranges_m), bearings, len(others_m)))
-    for shift in range(bearings):
-        other, known = np.roll(others_m, -shift, axis=1), np.roll(others_seen, -shift, axis=1)
-        both = seen[:, None] & known
-        apart = np.abs(ranges_m[:, None] - other) / (2.0 * LIKENESS.range_scale_m)
-        total = (np.maximum(0.0, 1.0 - apart) * both).sum(axis=2)
-        likeness[:, shift] = total / (both.sum(axis=2) + LIKENESS.prior_share * bearings)
     return likeness
 
 

@@ -213,36 +213,6 @@ def steps_between(views: Sequence[View]) -> F64:
     return np.asarray(np.einsum("hij,abj->habi", turn, points_m[None] - points_m[:, None]), np.float64)
 
 
-def plain_best_headings(
-    scores: F32,
-    squares: F32,
-    block: NDArray[np.int32],
-    low: I64,
-    shape: I64,
-    first: I64,
-    at: NDArray[np.int32],
-    viewpoint: I64,
-    view: I64,
-    steps: F64,
-) -> F32:
-    """(P,) the sum of the `scores` (K, V) of all views at the best heading, the definition of
-    `_kernels.best_headings`.
-
-    squares : (K, 2) viewpoints in units of the lattice. block, low, shape, first, at : as in `Raster`.
-    viewpoint, view : (P,) which view is put on which viewpoint. steps : `steps_between` in units of the
-    lattice.
-    """
-    there = np.rint(squares[viewpoint][:, None, None] + np.moveaxis(steps[:, view], 1, 0)).astype(np.int64)
-    number = block[viewpoint]
-    inside = there - low[number][:, None, None]
-    known = ((inside >= 0) & (inside < shape[number][:, None, None])).all(axis=-1)
-    index = first[number][:, None, None] + inside[..., 0] * shape[number, 1][:, None, None] + inside[..., 1]
-    beside = np.where(known, at[np.where(known, index, 0)], -1)
-    beside[np.arange(len(view)), :, view] = viewpoint[:, None]
-    found = scores[beside, np.arange(scores.shape[1])]
-    return np.asarray(np.where(beside >= 0, found, 0.0).sum(axis=2).max(axis=1), np.float32)
-
-
 def _first_unique(rows: NDArray[np.int32], most: int) -> NDArray[np.int32]:
     """The first `most` different ones, in their order."""
     return rows[np.sort(np.unique(rows, return_index=True)[1])[:most]]

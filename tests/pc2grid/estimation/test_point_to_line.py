@@ -6,16 +6,87 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from pc2grid.arrays import F32, F64
 from pc2grid.estimation._kernels import normal_equations, placement_scores
 from pc2grid.estimation.parameters import CAMERA_MATCHING, MATCHING_PARAMETERS
 from pc2grid.estimation.point_to_line import (
     PointGrid,
     best_placements,
-    normal_equations_plain,
-    placement_scores_plain,
+    sector_of,
 )
 from pc2grid.geometry import SE2
+
+
+def normal_equations_plain(
+    index: NDArray[np.int32],
+    moments: F64,
+    points: F64,
+    normal_rad: F64,
+    pose: F64,
+    cell_m: float,
+    radius: int,
+    scale_m: float,
+) -> tuple[F64, F64, int]:
+    """Linearise the point-to-line distances at a pose, in numpy.
+
+    index : (H, W) row of `moments` (K, sectors, 6) for each cell, or -1. points : (N, 2) and normal_rad :
+    (N,) in their frame. pose : (3,) x, y, yaw of that frame from the corner of cell (0, 0).
+    radius : half width in cells of the neighbourhood. scale_m : scale of the Cauchy weight.
+
+    Returns H (3, 3) and g (3,) of the Gauss-Newton step H d = -g for points of unit variance, and the
+    number of points that found a line.
+    """
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    rotated = points @ np.array([[c, s], [-s, c]])
+    at = rotated + pose[:2]
+    sectors = moments.shape[1]
+    sector = sector_of(normal_rad + pose[2], sectors)
+    H, g, found = np.zeros((3, 3)), np.zeros(3), 0
+    for k, (column, row) in enumerate(np.floor(at / cell_m).astype(int)):
+        if not (radius <= row < index.shape[0] - radius and radius <= column < index.shape[1] - radius):
+            continue
+        cells = index[row - radius : row + radius + 1, column - radius : column + radius + 1]
+        beside = (sector[k] + np.array([-1, 0, 1])) % sectors
+        n, sx, sy, sxx, sxy, syy = moments[cells[cells >= 0]][:, beside].sum(axis=(0, 1))
+        if n < 3:
+            continue
+        mean = np.array([sx, sy]) / n
+        (small, large), axes = np.linalg.eigh(np.array([[sxx, sxy], [sxy, syy]]) / n - np.outer(mean, mean))
+        if large < 1e-4:
+            continue
+        normal = axes[:, 0]
+        r = float(normal @ (at[k] - mean))
+        weight = (1.0 - max(small, 0.0) / large) ** 2 / (1.0 + (r / scale_m) ** 2)
+        J = np.array([normal[0], normal[1], normal[1] * rotated[k, 0] - normal[0] * rotated[k, 1]])
+        H += weight * np.outer(J, J)
+        g += weight * r * J
+        found += 1
+    return H, g, found
+
+
+def placement_scores_plain(
+    field: F32, points: F64, origin: F64, yaws: F64, first: int, step: int, count: int
+) -> F32:
+    """Score all placements of a window, in numpy. All in cells.
+
+    points : (N, 2) x, y. origin : (2,) middle of the window. yaws : (A,) radians. Shifts are
+    `first` + `step` * k for k below `count`, in x and in y. Returns the means (A, count (y), count (x)) of
+    the field at the points, 0 outside.
+    """
+    scores = np.zeros((len(yaws), count, count), dtype=np.float32)
+    shifts = first + step * np.arange(count)
+    for a, yaw in enumerate(yaws):
+        c, s = math.cos(yaw), math.sin(yaw)
+        column, row = np.floor(points @ np.array([[c, s], [-s, c]]) + origin).astype(int).T
+        for r, down in enumerate(shifts):
+            for k, right in enumerate(shifts):
+                y, x = row + down, column + right
+                inside = (y >= 0) & (y < field.shape[0]) & (x >= 0) & (x < field.shape[1])
+                scores[a, r, k] = field[y[inside], x[inside]].sum()
+    mean: F32 = scores / np.float32(max(len(points), 1))
+    return mean
 
 
 def test_points_beside_a_map_are_no_part_of_it_and_a_heap_is_no_line() -> None:

@@ -8,14 +8,48 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pc2grid.arrays import F64
 from pc2grid.estimation import _kernels
 from pc2grid.estimation.belief import PLANAR, SPATIAL, Belief
-from pc2grid.estimation.graph import Factors, add_factors_plain, normal_equations, without
-from pc2grid.estimation.manifold import moved, steps, steps_plain
+from pc2grid.estimation.graph import Factors, normal_equations, without
+from pc2grid.estimation.manifold import Steps, _rotation_vectors, _skew, moved, steps
 from pc2grid.estimation.smoother import Evidence, Smoother
 from pc2grid.geometry import SE2, invert_pose, motion_size, pose_from_rotation_vector
+
+
+def add_factors_plain(
+    rows: NDArray[np.intp], error: F64, jacobian: F64, information: F64, kernel: F64, H: F64, g: F64
+) -> None:
+    """Add factors, see `Factors`, to the normal equations.
+
+    In numpy.
+    """
+    chi2 = np.einsum("fa,fab,fb->f", error, information, error)
+    weight = 1.0 / (1.0 + chi2 / kernel**2)
+    JtL = jacobian.transpose(0, 2, 1) @ (information * weight[:, None, None])
+    np.add.at(H, (rows[:, :, None], rows[:, None, :]), JtL @ jacobian)
+    np.add.at(g, rows, np.einsum("fka,fa->fk", JtL, error))
+
+
+def steps_plain(first: F64, second: F64) -> Steps:
+    """`steps`, in numpy."""
+    R = first[:, :3, :3].transpose(0, 2, 1)
+    turn = R @ second[:, :3, :3]
+    step = np.empty((len(first), 6))
+    step[:, :3] = np.einsum("nab,nb->na", R, second[:, :3, 3] - first[:, :3, 3])
+    step[:, 3:] = _rotation_vectors(turn)
+    # Of the rotation vector only the first term of the series is needed: steps are small, or count little.
+    right = np.eye(3) + 0.5 * _skew(step[:, 3:])
+    by_first, by_second = np.zeros((len(first), 6, 6)), np.zeros((len(first), 6, 6))
+    by_first[:, :3, :3] = -np.eye(3)
+    by_first[:, :3, 3:] = _skew(step[:, :3])
+    by_first[:, 3:, 3:] = -right @ turn.transpose(0, 2, 1)
+    by_second[:, :3, :3] = turn
+    by_second[:, 3:, 3:] = right
+    return Steps(step, by_first, by_second)
+
 
 Odometry = list[F64] | list[None]
 WALLS_ALL_AROUND = np.diag([0.01**-2, 0.01**-2, 0.004**-2])

@@ -6,17 +6,49 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from pc2grid.arrays import F32, F64, I64
 from pc2grid.geometry import SE2
 from pc2grid.simulate import office_floorplan
 from pc2grid.submaps.partition import submap_centers
 from signature.config import RelocalizeConfig
 from signature.localization.query import Query, QueryMap
 from signature.retrieval._kernels import best_headings
-from signature.retrieval.place_index import POSES, PlaceBlock, PlaceIndex, plain_best_headings
+from signature.retrieval.place_index import POSES, PlaceBlock, PlaceIndex
 from signature.retrieval.viewpoints import shortlist_size
 from signature.seen_places import SeenPlaces
 from tests.helpers.simulated_drives import building, drive, office
+
+
+def plain_best_headings(
+    scores: F32,
+    squares: F32,
+    block: NDArray[np.int32],
+    low: I64,
+    shape: I64,
+    first: I64,
+    at: NDArray[np.int32],
+    viewpoint: I64,
+    view: I64,
+    steps: F64,
+) -> F32:
+    """(P,) the sum of the `scores` (K, V) of all views at the best heading.
+
+    squares : (K, 2) viewpoints in units of the lattice. block, low, shape, first, at : as in `Raster`.
+    viewpoint, view : (P,) which view is put on which viewpoint. steps : `steps_between` in units of the
+    lattice.
+    """
+    there = np.rint(squares[viewpoint][:, None, None] + np.moveaxis(steps[:, view], 1, 0)).astype(np.int64)
+    number = block[viewpoint]
+    inside = there - low[number][:, None, None]
+    known = ((inside >= 0) & (inside < shape[number][:, None, None])).all(axis=-1)
+    index = first[number][:, None, None] + inside[..., 0] * shape[number, 1][:, None, None] + inside[..., 1]
+    beside = np.where(known, at[np.where(known, index, 0)], -1)
+    beside[np.arange(len(view)), :, view] = viewpoint[:, None]
+    found = scores[beside, np.arange(scores.shape[1])]
+    return np.asarray(np.where(beside >= 0, found, 0.0).sum(axis=2).max(axis=1), np.float32)
+
 
 OFFICE = building({"office": office()})
 OWN = next(iter(OFFICE.places.blocks()))
