@@ -72,7 +72,10 @@ class ProgressBars(Observer):
             TimeElapsedColumn(),
         )
         shown = console.is_terminal or console.is_jupyter
-        with Progress(*columns, console=console, transient=True, disable=not shown) as bars:
+        if not shown:
+            yield
+            return
+        with Progress(*columns, console=console, transient=True, redirect_stderr=False) as bars:
             task = bars.add_task(what, total=1.0)
             self._update = lambda share: bars.update(task, completed=share)
             yield

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from pc2grid.arrays import F64, freeze
-from pc2grid.display import html_table, probability, short
+from pc2grid.display import html_picture, html_table, map_png, probability, short
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from signature.database.protocol import Label
@@ -98,7 +98,7 @@ class Answer:
     `Verdict`.
     history : how the answer came to be. evidence : what the confidence rests on.
     local_map : what the query has seen, in its odom frame: what the hypotheses were compared with. views_m :
-    where it was described by signatures, in that frame.
+    where it was described by signatures, in that frame. map : of the session of the best hypothesis.
     sessions, labels : all of the database, that `Hypothesis.session_index` counts.
     prior : what became of the prior, None if there was none; "lapsed": registration was lost after the time
     that it is about, so it was not used. excluded : the best place that the prior excludes, if nothing that
@@ -132,6 +132,7 @@ class Answer:
     excluded: Moment | None = None
     in_space: PoseInSpace | None = None
     views_m: tuple[tuple[float, float], ...] = ()
+    map: OccupancyGrid | None = None
     frames: tuple[str | None, ...] = ()
 
     def __repr__(self) -> str:
@@ -155,7 +156,17 @@ class Answer:
         ]
         status = self.status.replace("_", " ")
         title = f"{status}, confidence {probability(self.confidence)}, after {self.path_m:.1f} m"
-        return html_table(title, rows[:_SHOWN], ("place", "session", "pose of the robot", "score", ""))
+        table = html_table(title, rows[:_SHOWN], ("place", "session", "pose of the robot", "score", ""))
+        picture = self._repr_png_()
+        return table if picture is None else table + html_picture(picture, "the query's walls in the map")
+
+    def _repr_png_(self) -> bytes | None:
+        """The map, with the walls of the query at the best hypothesis; None without one."""
+        if self.map is None:
+            return None
+        walls_m = self.local_map.to_point(np.argwhere(self.local_map.occupied))
+        there_m = self.hypotheses[0].fit.T_map_query.apply(walls_m)
+        return map_png(self.map.cells, self.map.resolution_m, self.map.origin_m, centers_m=there_m)
 
     @property
     def label(self) -> Label:

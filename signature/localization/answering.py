@@ -161,5 +161,6 @@ def _answer(index: MapIndex, query: QueryMap, verdict: Verdict, history: tuple[M
         submap_ids=tuple(int(table.submap_id[h.row]) if h.row >= 0 else -1 for h in verdict.hypotheses),
         evidence=verdict.evidence,
         local_map=query.grid,
+        map=index.grids[verdict.hypotheses[0].session_index] if verdict.hypotheses else None,
         views_m=tuple(view.center_m for view in query.views),
     )

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 import pc2grid
 from pc2grid.config import ReadConfig
+from pc2grid.display import CENTRE_GREEN
 from pc2grid.errors import ConfigError, DatabaseError, OutputError
 from pc2grid.io.nav2_map import save_map
 from pc2grid.simulate import SimulationConfig, simulate_session
@@ -38,6 +41,13 @@ def test_a_map_is_found_in_a_map(building: Path) -> None:
     assert answer.status == "located" and answer.label.floor == "2"
     assert answer.T_map_base is not None
     assert (round(answer.T_map_base.x, 1), round(answer.T_map_base.y, 1)) == (4.0, 3.0)
+    picture = answer._repr_png_()
+    assert picture is not None and "data:image/png" in answer._repr_html_()
+    image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR).astype(int)
+    green = np.argwhere(np.abs(image - CENTRE_GREEN).max(axis=2) < 8)
+    height, width = image.shape[:2]
+    # The part that was asked for is 11 m x 9 m of the office, of 20 m x 15 m.
+    assert 0.3 < np.ptp(green[:, 0]) / height < 0.8 and 0.3 < np.ptp(green[:, 1]) / width < 0.8
 
 
 def test_a_map_has_no_robot_whose_pose_could_be_known(building: Path) -> None:
