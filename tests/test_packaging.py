@@ -33,7 +33,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
 
 def test_the_wheel_holds_the_examples_that_readme_names(wheel: zipfile.ZipFile) -> None:
     named = re.findall(r"examples/([\w./-]+\w)", (ROOT / "README.md").read_text("utf-8"))
-    assert {"foxglove.json", "nav2.md", "locate_a_robot.py"} <= set(named)
+    assert {"real.md", "nav2.md", "locate_a_robot.py"} <= set(named)
     held = {name.partition(f"{EXAMPLES}/")[2] for name in wheel.namelist() if EXAMPLES in name}
     assert set(named) <= held, set(named) - held
     assert "nav2.sh" in held
@@ -57,4 +57,4 @@ def test_readme_has_no_link_that_an_index_cannot_follow(wheel: zipfile.ZipFile) 
     assert readme.startswith("# pc2grid") and "pip install" in readme and "relocalize" in readme
     assert re.findall(r"\]\((?!https?:|#)[^)]*\)", readme) == []
     assert "`nav2.md`" in readme, "what was a link is named"
-    assert "leaves behind: a lidar mapped" not in readme, "the line below a picture that is not there"
+    assert "is located in the map of a lidar" not in readme, "the line below a picture that is not there"
