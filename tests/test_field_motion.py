@@ -23,7 +23,7 @@ ELSEWHERE = SE2(7.0, -3.0, 2.0)
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A laser on wheels, with odometry as a topic and in tf; 10 scans a second."""
     path = tmp_path_factory.mktemp("drive") / "drive.mcap"
-    config = SimulationConfig(length_m=5.0, seed=4, laser=LaserConfig(step_deg=1.0))
+    config = SimulationConfig(length_m=5.0, seed=3, laser=LaserConfig(step_deg=1.0))
     simulate_session(path, sensor="laser", config=config)
     return path
 
@@ -132,3 +132,63 @@ def test_a_few_wild_times_of_points_decide_no_unit(tmp_path: Path) -> None:
     assert made.steps_m.max() < FASTEST_M
     assert made.session["report"]["points_dropped"] >= 120
     assert made.warned_of("points whose times in field timestamp are not of their scan are left out")
+
+
+def yaw(sign: float) -> Change:
+    """Odometry whose turns are reversed, or not there."""
+
+    def change(topic: str, message: Any, log_time_ns: int) -> Any:
+        if topic == "/tf":
+            return None
+        if topic == "/odom":
+            turn = message.pose.pose.orientation
+            half = sign * np.arctan2(turn.z, turn.w)
+            turn.z, turn.w = np.sin(half), np.cos(half)
+        return message
+
+    return change
+
+
+def frozen(topic: str, message: Any, log_time_ns: int) -> Any:
+    if topic == "/odom":
+        message.pose.pose.position.x = message.pose.pose.position.y = message.pose.pose.orientation.z = 0.0
+        message.pose.pose.orientation.w = 1.0
+    return None if topic == "/tf" else message
+
+
+def upside_down(topic: str, message: Any, log_time_ns: int) -> Any:
+    if topic == "/scan":
+        message.ranges = message.ranges[::-1].copy()
+    return message
+
+
+def turned(topic: str, message: Any, log_time_ns: int) -> Any:
+    if topic == "/scan":
+        message.angle_min, message.angle_max = message.angle_min + np.pi, message.angle_max + np.pi
+    return message
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (yaw(-1.0), ["odometry turns the other way than the scans"]),
+        (yaw(0.0), ["odometry reports 0.0 rad where the scans show turns of"]),
+        (frozen, ["odometry reports 0.0 m where the scans show", "odometry reports 0.0 rad"]),
+        (upside_down, ["odometry turns the other way than the scans", "upside down"]),
+        (turned, ["odometry reports travel the other way than the scans show"]),
+    ],
+    ids=["yaw reversed", "no yaw", "frozen", "upside down", "turned by half a turn"],
+)
+def test_odometry_that_the_scans_contradict_is_warned_of(
+    change: Change, words: list[str], drive: Path, whole: Outcome, tmp_path: Path
+) -> None:
+    made = convert(altered(drive, tmp_path / "odd.mcap", change), tmp_path)
+    for found in words:
+        assert made.warned_of(found), made.warnings
+    assert len(made.warnings) == len(whole.warnings) + len(words) - ("upside down" in words)
+    assert not any("odometry" in warning for warning in whole.warnings)
+
+
+def test_a_laser_upside_down_is_warned_of(tmp_path: Path) -> None:
+    made = convert(field_log("upside_down_unsaid"), tmp_path, "--duration", "60")
+    assert made.warned_of("the sensor is mounted upside down and tf does not say so")

@@ -11,6 +11,7 @@ from pc2grid.errors import TrackingLost
 from pc2grid.estimation.overruled import stalls
 from pc2grid.estimation.rides import RIDES
 from pc2grid.mapping.consistency import consistency_warning
+from pc2grid.mapping.odometry_warnings import odometry_warnings
 from pc2grid.mapping.part_maps import PartMap
 from pc2grid.mapping.parts import PARTS
 from pc2grid.mapping.precision import precision_warning
@@ -124,8 +125,10 @@ def division_warning(
 
 
 def with_track_warnings(report: ReadReport, track: Track) -> ReadReport:
-    """The report of a recording, with what was assumed and what `ride_warnings` says."""
-    return dataclasses.replace(report, warnings=(*report.warnings, *track.assumptions, *ride_warnings(track)))
+    """The report of a recording, with what was assumed, and what is said of rides and of odometry."""
+    of_odometry = odometry_warnings(track.trajectory, track.readings)
+    warnings = (*report.warnings, *track.assumptions, *ride_warnings(track), *of_odometry)
+    return dataclasses.replace(report, warnings=warnings)
 
 
 def without_points(report: ReadReport) -> ReadReport:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import I64
+from pc2grid.arrays import F64, I64
 from pc2grid.config import ProjectionConfig
 from pc2grid.estimation.overruled import Disagreement
 from pc2grid.geometry import SE2
@@ -25,24 +25,33 @@ if TYPE_CHECKING:
     from pc2grid.estimation.tracker import Tracked, Tracker
 
 
+_NO_READING = np.full((4, 4), np.nan)
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class Track:
     """The results of tracking for all scans of a session.
 
-    trajectory : before loops are closed. disagreements : of odometry, at each scan. riding : (N,) scans on a
+    trajectory : before loops are closed. disagreements : of odometry, at each scan. readings : (N, 4, 4) of
+    odometry, NaN where there is none. riding : (N,) scans on a
     ride from floor to floor. storey : (N,) number of the floor of each in `storeys`. carried : see
-    `Tracker`. with_odometry : whether any scan has an odometry pose. assumptions : what was
+    `Tracker`. assumptions : what was
     assumed since nothing in the recording shows it, as sentences for the user.
     """
 
     trajectory: Trajectory
     disagreements: Sequence[Disagreement | None]
+    readings: F64
     riding: NDArray[np.bool_]
     storey: I64
     storeys: tuple[Storey, ...]
     carried: bool = False
-    with_odometry: bool = False
     assumptions: tuple[str, ...] = ()
+
+    @property
+    def with_odometry(self) -> bool:
+        """Whether any scan has an odometry pose."""
+        return bool(np.isfinite(self.readings).any())
 
     def outside_rides(self) -> Trajectory:
         """The scans that are on no ride."""
@@ -62,11 +71,10 @@ class TrackRecord:
     """Collects a track scan by scan; of a scan it keeps the pose, the health and the floor."""
 
     def __init__(self) -> None:
-        self._stamps, self._poses = array("q"), array("d")
+        self._stamps, self._poses, self._readings = array("q"), array("d"), array("d")
         self._health: list[Health] = []
         self._disagreements: list[Disagreement | None] = []
         self._riding, self._storeys = array("b"), array("q")
-        self._with_odometry = False
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -79,7 +87,7 @@ class TrackRecord:
         self._disagreements.append(tracked.disagreement)
         self._riding.append(tracked.riding)
         self._storeys.append(tracked.storey)
-        self._with_odometry |= scan.T_odom_base is not None
+        self._readings.extend((_NO_READING if scan.T_odom_base is None else scan.T_odom_base).ravel())
 
     def track(self, tracker: Tracker) -> Track:
         """The track of all scans, which were tracked by `tracker`."""
@@ -91,11 +99,11 @@ class TrackRecord:
         return Track(
             trajectory=trajectory,
             disagreements=self._disagreements,
+            readings=np.frombuffer(self._readings).reshape(-1, 4, 4),
             riding=np.array(self._riding, dtype=bool),
             storey=np.array(self._storeys, dtype=np.int64),
             storeys=tracker.storeys,
             carried=tracker.carried,
-            with_odometry=self._with_odometry,
         )
 
 

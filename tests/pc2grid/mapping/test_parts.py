@@ -43,6 +43,7 @@ def on_one_floor(trajectory: Trajectory) -> Track:
     return Track(
         trajectory=trajectory,
         disagreements=[None] * count,
+        readings=np.full((count, 4, 4), np.nan),
         riding=np.zeros(count, np.bool_),
         storey=np.zeros(count, np.int64),
         storeys=(),
