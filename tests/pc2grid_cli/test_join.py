@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pc2grid import load_map
-from pc2grid.errors import ConfigError, DatabaseError, OutputError
+from pc2grid.errors import ConfigError, DatabaseError
 from pc2grid.io.nav2_map import save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid_cli.main import app
@@ -112,11 +112,3 @@ def test_what_is_added_to_a_joined_database_is_joined() -> None:
     run("db split b.submaps west -o y.submaps")
     assert document("convert east.yaml -o y.submaps --add")["joined"] == []
     assert document("convert east.yaml -o y.submaps --add --name too --join")["joined"] != []
-
-
-def test_an_interrupted_join_goes_on_and_leaves_no_file() -> None:
-    run("db join b.submaps --journal compared")
-    assert not Path("compared").exists() and not Path("b.submaps.joining").exists()
-    Path("b.submaps.joining").write_text("mine\n")
-    with pytest.raises(OutputError, match="is no list of compared sessions"):
-        run("db join b.submaps")

@@ -17,7 +17,6 @@ from pc2grid.model import SessionMap
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
-from pc2grid_cli.comparing import comparing
 from pc2grid_cli.json_schemas import Convert, Converted, JoinedSession, plain
 from pc2grid_cli.session_documents import joined_document, session_document
 from signature import conversion_jobs
@@ -209,12 +208,10 @@ def join_added(
     terminal: console.Console,
     *,
     wanted: bool | None,
-    dask: str | None,
-    jobs: int | None,
 ) -> None:
     """Join the new sessions with those that the database holds.
 
-    wanted : None: only if the database holds sessions that are joined already. dask, jobs : see `comparing`.
+    wanted : None: only if the database holds sessions that are joined already.
     """
     names = [document["session"] for document in done.sessions]
     if wanted is False or not names:
@@ -222,8 +219,7 @@ def join_added(
     with open_database(output) as opened:
         if wanted is None and not opened.frames():
             return
-        with comparing(output, dask, jobs) as compare:
-            found = join_sessions(opened, only=names, compare=compare, observer=terminal.observer())
+        found = join_sessions(opened, only=names, observer=terminal.observer())
     maintenance.place(output, found.frames)
     done.joined = [joined_document(name, found.frames[name]) for name in names if name in found.frames]
     for document in done.joined:

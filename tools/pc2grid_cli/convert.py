@@ -102,7 +102,7 @@ def convert_command(
         quiet=json,
         strict=strict,
     )
-    conversion.join_added(output, done, console.of(context), wanted=join, dask=dask, jobs=jobs)
+    conversion.join_added(output, done, console.of(context), wanted=join)
     conversion.conclude(output, done, len(inputs), json=json)
 
 

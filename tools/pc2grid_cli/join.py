@@ -13,18 +13,15 @@ import typer
 from pc2grid.display import counted, probability
 from pc2grid.errors import ConfigError, one_line
 from pc2grid_cli import console
-from pc2grid_cli.comparing import comparing
 from pc2grid_cli.json_schemas import ComparedSessions, DbJoin, plain
-from pc2grid_cli.options import AsJson, Dask, Database, Force, JobCount
+from pc2grid_cli.options import AsJson, Database, Force
 from pc2grid_cli.output_files import check_file
 from pc2grid_cli.picture import draw_building
 from pc2grid_cli.session_documents import joined_document
 from pc2grid_cli.tables import show, table
 from signature.bend import largest_m
 from signature.database import SubmapDatabase, maintenance, open_database
-from signature.database.postgres.server import is_url
 from signature.localization.joining.building import Joined, join_sessions
-from signature.localization.joining.journal import JoinJournal
 from signature.localization.joining.pairing import SessionPair
 
 if TYPE_CHECKING:
@@ -47,26 +44,17 @@ def db_join_command(
         ),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="only say it; nothing is stored")] = False,
-    journal: Annotated[
-        Path | None,
-        typer.Option(
-            "--journal", metavar="FILE", help="of what was compared so far; default: DATABASE.joining"
-        ),
-    ] = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="OUT.png", help="the maps of a building over each other")
     ] = None,
-    dask: Dask = None,
-    jobs: JobCount = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Find out which sessions show one building, and how they lie to each other.
 
-    Sessions with labels of different buildings or floors are not compared; of many, each is compared with
-    those that look most like it. What is found is stored: from then on, answers in a joined session are in
-    the frame of its building; `--frame session` gives them as before. After an interruption the same command
-    goes on from what was compared; for a server, name the --journal.
+    Every two sessions are compared, but for those with labels of different buildings or floors: some
+    seconds a pair. What is found is stored: from then on, answers in a joined session are in the frame of its
+    building; `--frame session` gives them as before.
 
     Example: pc2grid db join building.submaps
     """
@@ -78,27 +66,15 @@ def db_join_command(
                 f"{opened.location}: holds {counted(len(names), 'session')}, and two can be joined",
                 hint="`pc2grid convert LOG --add` adds one, `pc2grid db merge` puts databases together",
             )
-        done = _journal(database, journal)
-        observer = console.of(context).observer()
-        with comparing(database, dask, jobs) as compare:
-            found = join_sessions(opened, frame=frame, journal=done, compare=compare, observer=observer)
+        found = join_sessions(opened, frame=frame, observer=console.of(context).observer())
         if plot is not None:
             draw(plot, opened, found)
     if not dry_run:
         store(database, found, names)
-    if done is not None:
-        done.remove()
     if json:
         console.print_json(plain(DbJoin, _document(maintenance.shown(database), found, names, dry_run)))
     else:
         report(found, names, dry_run=dry_run)
-
-
-def _journal(database: str, named: Path | None) -> JoinJournal | None:
-    """What an interrupted command has compared: beside a file if nothing is named, nowhere for a server."""
-    if named is None and is_url(database):
-        return None
-    return JoinJournal(named or Path(f"{database}.joining"))
 
 
 def store(database: str, found: Joined, names: list[str]) -> None:

@@ -7,6 +7,10 @@ REMOVED = {
         "`pc2grid export --mcap OUT.mcap` writes the map, `rerun OUT.mcap` shows it",
     ),
     "pc2grid relocalize --rerun": "`--output OUT.mcap` writes the answer, `rerun OUT.mcap` shows it",
+    **dict.fromkeys(
+        ("pc2grid db join --journal", "pc2grid db join --dask", "pc2grid db join --jobs"),
+        "one process compares every two sessions, some seconds a pair",
+    ),
     "pc2grid db update": "`pc2grid db join` puts sessions into one frame, `pc2grid export --map` draws them",
     "pc2grid convert --update": "`--join` puts what is new into the frame of the other sessions",
 }

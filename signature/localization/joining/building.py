@@ -7,17 +7,14 @@ sessions lie (`placing`). One pose graph over all that they have measured says h
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from pc2grid.observer import Observer
-from signature.database.protocol import BuildingFrame, SessionInfo
+from signature.database.protocol import BuildingFrame
 from signature.database.rows import no_session
-from signature.localization.joining.comparing import Compare, ToCompare, compare_here
-from signature.localization.joining.journal import JoinJournal, remembered
-from signature.localization.joining.pairing import Buildings, Names, SessionPair, along, rounds_of
+from signature.localization.joining.pairing import Names, SessionPair, compare_pairs
 from signature.localization.joining.placing import anchor_of, buildings_of, place
 from signature.localization.joining.straightening import bodies_of, straighten
 
@@ -41,8 +38,6 @@ def join_sessions(
     *,
     frame: str | None = None,
     only: Collection[str] | None = None,
-    journal: JoinJournal | None = None,
-    compare: Compare | None = None,
     observer: Observer = Observer(),
 ) -> Joined:
     """Which sessions of a database show one building, and how they lie in its frame.
@@ -50,10 +45,9 @@ def join_sessions(
     frame : the session whose map frame is that of its building. None: the frame of those that were joined
     before, else of the session that was stored first. only : sessions that are joined, with the others and
     with each other; the others stay where they are. None: all are joined anew, which `frame` needs.
-    journal : keeps what is compared, and knows what need not be compared again. compare : compares pairs, see
-    `signature.localization.joining.comparing`; None: this process does. observer : gets the progress.
+    observer : gets the progress.
 
-    Of many sessions, each is compared with those that look most like it (`candidates`), each pair once.
+    Every two sessions are compared, so the time grows with the square of their number.
 
     Raises DatabaseError for a name that no session has.
     """
@@ -63,11 +57,7 @@ def join_sessions(
         raise no_session(name, infos, database.location)
     moving = infos.keys() if only is None else only
     stay = {name: at for name, at in known.items() if name in infos and name not in moving}
-    rounds = rounds_of(database, infos, moving)
-    compare = compare or functools.partial(compare_here, database)
-    if journal is not None:
-        compare = remembered(database, journal, compare)
-    pairs = list(_compared(infos, rounds, Buildings(stay), compare, observer))
+    pairs = list(compare_pairs(database, infos, moving, observer))
     joined = [pair for pair in pairs if pair.join.status == "joined"]
     frames = dict(stay)
     accepted: set[Names] = set()
@@ -82,26 +72,3 @@ def join_sessions(
         pairs=tuple(replace(pair, accepted=pair.names in accepted) for pair in pairs),
         frames={name: frames[name] for name in infos if name in frames},
     )
-
-
-def _compared(
-    infos: Mapping[str, SessionInfo],
-    rounds: Sequence[Sequence[Names]],
-    buildings: Buildings,
-    compare: Compare,
-    observer: Observer,
-) -> Iterator[SessionPair]:
-    """Each pair joined, as far as it can be and tells something new, by the rounds before its own: so it does
-    not matter which pair of a round is compared first. buildings : gets all joins."""
-    done, total = 0, sum(map(len, rounds))
-    with observer.step(f"compare {total} pairs of sessions"):
-        for pairs in rounds:
-            wanted = pairs if len(rounds) == 1 else along(buildings.telling(pairs))
-            done += len(pairs) - len(wanted)
-            labels = [tuple(infos[name].provenance.label for name in names) for names in wanted]
-            asked = [ToCompare(*names, a.agrees(b)) for names, (a, b) in zip(wanted, labels, strict=True)]
-            for (target, source), join in zip(wanted, compare(asked), strict=True):
-                buildings.add(target, source, join)
-                yield SessionPair(target=target, source=source, join=join)
-                done += 1
-                observer.on_progress(done / total)

@@ -1,30 +1,26 @@
-"""Which pairs of sessions are compared, in which order, and when enough is known of two buildings.
-
-Of few sessions every two are compared. Of many, each is compared with those that look most like it
-(`candidates`), in rounds: the likeliest of each, then the next ones. After each round the sessions that were
-joined make buildings, and of the next round only those pairs are compared that tell something new: whether
-two buildings are one, until pairs enough say that they are not, and where a session lies in its building,
-until it has joins enough. So the comparisons grow with the number of sessions.
-"""
+"""Sessions compared in pairs: every two that may show one building."""
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Mapping
+import functools
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
 
 from pc2grid.model import same_recording
+from pc2grid.observer import Observer
 from signature.database.protocol import BuildingFrame, SessionInfo
-from signature.localization.joining.candidates import CANDIDATES, LookedAt, candidates
-from signature.localization.joining.join import Join
+from signature.localization.joining.join import Join, JoinableMap, join_maps
 
 if TYPE_CHECKING:
     from signature.database import SubmapDatabase
 
 Names = tuple[str, str]
 """Of two sessions."""
+_KEPT = 30
+"""Prepared maps that stay in memory: no more sessions are joined in a reasonable time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,74 +45,28 @@ def told_apart(a: SessionInfo, b: SessionInfo) -> bool:
     return a.provenance.label.contradicts(b.provenance.label, one_recording=one_recording)
 
 
-def rounds_of(
-    database: SubmapDatabase, infos: Mapping[str, SessionInfo], only: Collection[str]
-) -> list[list[Names]]:
-    """The pairs that may have to be compared, one of them at least of `only`, in rounds: of few sessions all
-    at once, of many the likeliest of each session, then the next ones."""
+def compare_pairs(
+    database: SubmapDatabase, infos: Mapping[str, SessionInfo], only: Collection[str], observer: Observer
+) -> Iterator[SessionPair]:
+    """Every two sessions that labels do not tell apart, joined as far as they can be.
 
-    def comparable(a: str, b: str) -> bool:
-        return not told_apart(infos[a], infos[b])
-
-    if len(infos) <= 1 + CANDIDATES.sessions:
-        return [[(a, b) for a, b in combinations(infos, 2) if {a, b} & {*only} and comparable(a, b)]]
-    places = {name: LookedAt.of(database.seen_places(name)) for name in infos}
-    number = {name: k for k, name in enumerate(infos)}
-    # Of each pair the round in which one of both asks for it first.
-    first: dict[Names, int] = {}
-    for name, others in candidates(places, only, comparable, CANDIDATES).items():
-        for rank, other in enumerate(others):
-            a, b = sorted((name, other), key=number.__getitem__)
-            first[a, b] = min(rank, first.get((a, b), rank))
-    rounds: list[list[Names]] = [[] for _ in range(CANDIDATES.sessions)]
-    for pair, rank in first.items():
-        rounds[rank].append(pair)
-    return rounds
-
-
-class Buildings:
-    """What comparisons have told so far: the sessions of each building hang together by joins.
-
-    The graph of the joins has a node for each session that was joined.
+    only : one of each pair, at least, is of these.
     """
+    pairs = [
+        (a, b) for a, b in combinations(infos, 2) if {a, b} & {*only} and not told_apart(infos[a], infos[b])
+    ]
+    sight_m = database.config().partition.radius_m
 
-    def __init__(self, stay: Mapping[str, BuildingFrame]) -> None:
-        """stay : sessions that lie in buildings already, each as sure as by joins enough."""
-        import networkx as nx
+    @functools.lru_cache(_KEPT)
+    def prepared(name: str) -> JoinableMap:
+        return JoinableMap.of(database.grid(name), database.graph(name), sight_m)
 
-        self._joins = nx.Graph()
-        self._apart: list[Names] = []
-        for members in by_building(stay).values():
-            nx.add_path(self._joins, members, count=CANDIDATES.enough)
-
-    def add(self, a: str, b: str, join: Join) -> None:
-        """The join of two sessions. That it is ambiguous tells nothing."""
-        if join.status == "joined":
-            self._joins.add_edge(a, b, count=1)
-        elif join.status == "different":
-            self._apart.append((a, b))
-
-    def telling(self, pairs: Iterable[Names]) -> list[Names]:
-        """Those of the pairs, the first ones first, that tell something new, even if the others of them say
-        that two buildings are different."""
-        import networkx as nx
-
-        degree = self._joins.degree(weight="count")
-        parts = enumerate(nx.connected_components(self._joins))
-        building = {name: number for number, members in parts for name in members}
-
-        def sides(a: str, b: str) -> frozenset[str | int]:
-            return frozenset((building.get(a, a), building.get(b, b)))
-
-        apart = Counter(sides(a, b) for a, b in self._apart)
-        told = []
-        for a, b in pairs:
-            two = sides(a, b)
-            known = apart[two] if len(two) > 1 else min(degree[a], degree[b])
-            if known < CANDIDATES.enough:
-                told.append((a, b))
-                apart[two] += 1
-        return told
+    with observer.step(f"compare {len(pairs)} pairs of sessions"):
+        for done, (a, b) in enumerate(pairs, start=1):
+            labelled = infos[a].provenance.label.agrees(infos[b].provenance.label)
+            join = join_maps(prepared(a), prepared(b), labelled=labelled)
+            yield SessionPair(target=a, source=b, join=join)
+            observer.on_progress(done / len(pairs))
 
 
 def by_building(frames: Mapping[str, BuildingFrame]) -> dict[str, list[str]]:
@@ -125,17 +75,3 @@ def by_building(frames: Mapping[str, BuildingFrame]) -> dict[str, list[str]]:
     for name, at in frames.items():
         found[at.name].append(name)
     return found
-
-
-def along(pairs: Collection[Names]) -> list[Names]:
-    """The pairs in an order in which neighbours share a session, whose map is prepared once."""
-    import networkx as nx
-
-    graph = nx.Graph(sorted(pairs))
-    place = {name: k for k, name in enumerate(nx.dfs_preorder_nodes(graph))}
-
-    def reached(pair: Names) -> tuple[int, int]:
-        first, last = sorted(place[name] for name in pair)
-        return last, -first
-
-    return sorted(pairs, key=reached)

@@ -13,16 +13,11 @@ import pytest
 from pc2grid.errors import DatabaseError
 from pc2grid.geometry import SE2
 from pc2grid.model import UNKNOWN, OccupancyGrid, Precision, Trajectory
-from signature.cluster import LOCAL
 from signature.config import Config
 from signature.database import Label, SubmapDatabase, maintenance, open_database
 from signature.database.protocol import BuildingFrame
-from signature.localization.joining import comparing, pairing
 from signature.localization.joining.building import join_sessions
 from signature.localization.joining.building_map import map_of
-from signature.localization.joining.candidates import CandidateParameters
-from signature.localization.joining.join import Join, JoinableMap, join_maps
-from signature.localization.joining.journal import JoinJournal
 from signature.sessions import add_sessions, provenance
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, part
 from tests.helpers.session_maps import session, way
@@ -165,51 +160,3 @@ def test_the_map_of_a_building_holds_all_its_sessions(stored: Path) -> None:
     assert whole.free_m2 == pytest.approx(office_m2, rel=0.03)
     # A room of the east, where only that session was, and the corridor, in the frame of the west.
     assert whole.is_free(19.0, 7.0) and whole.is_free(1.0, 7.0) and not whole.is_free(14.5, 10.0)
-
-
-def test_of_many_sessions_each_is_compared_with_few_and_the_same_are_joined(
-    database: SubmapDatabase, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With one candidate each, the two halves of the office propose each other."""
-    monkeypatch.setattr(pairing, "CANDIDATES", CandidateParameters(sessions=1))
-    found = join_sessions(database)
-    assert ("west", "east") in [pair.names for pair in found.pairs] and len(found.pairs) < 3
-    assert found.frames == join_sessions(database, only=["east"]).frames
-
-
-def test_what_was_compared_is_not_compared_again(
-    database: SubmapDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first run ends after two of three pairs; the second compares the third, with the same result."""
-    compared: list[int] = []
-
-    def ends_at(count: int) -> None:
-        def counting(*maps: JoinableMap, labelled: bool) -> Join:
-            if len(compared) == count:
-                raise KeyboardInterrupt
-            compared.append(1)
-            return join_maps(*maps, labelled=labelled)
-
-        monkeypatch.setattr(comparing, "join_maps", counting)
-
-    ends_at(2)
-    with pytest.raises(KeyboardInterrupt):
-        join_sessions(database, journal=JoinJournal(tmp_path / "x.joining"))
-    ends_at(3)
-    resumed = join_sessions(database, journal=JoinJournal(tmp_path / "x.joining"))
-    assert len(compared) == 3
-    monkeypatch.undo()
-    whole = join_sessions(database)
-    assert resumed.frames == whole.frames
-    assert [pair.join.probability for pair in resumed.pairs] == [p.join.probability for p in whole.pairs]
-
-
-def test_processes_find_what_one_process_finds(stored: Path, database: SubmapDatabase) -> None:
-    pytest.importorskip("distributed", reason="the extra cluster is not installed")
-    alone = join_sessions(database)
-    with comparing.comparing_in_processes(str(stored), LOCAL, 2) as compare:
-        together = join_sessions(database, compare=compare)
-    assert together.frames == alone.frames
-    assert [(pair.names, pair.join.probability) for pair in together.pairs] == [
-        (pair.names, pair.join.probability) for pair in alone.pairs
-    ]
