@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     import networkx as nx
 
 SensorKind = Literal["lidar", "laser", "depth"]
+MapOf = Literal["everything", "walls", "raw"]
+"""What a map shows that leaves the program: all that stands somewhere; walls, with things unknown; or the
+cells as they are, which nav2 takes for free below 100."""
 
 # Numbers that a JSON document shows with so many digits.
 TwoDigits = Annotated[float, PlainSerializer(lambda value: round(value, 2), float, when_used="json")]
@@ -38,8 +41,8 @@ OCCUPIED = 100
 # A cell is occupied if it is >= OCCUPIED_FROM, free if 0 <= cell < FREE_BELOW, otherwise undecided.
 OCCUPIED_FROM = 65
 FREE_BELOW = 20
-# A thing on the floor that is no wall, such as a table: undecided for nav2, and told apart from all else that
-# is. Sums of `OccupancyParameters.hit` and `miss` make 56 or 62 percent, not this.
+# A thing on the floor that is no wall, such as a table: an obstacle for robots, but no evidence for a place.
+# Sums of `OccupancyParameters.hit` and `miss` make 56 or 62 percent, not this.
 THING = 60
 
 SLICE_BORDERS_M = (0.6, 1.1)
@@ -271,6 +274,20 @@ class OccupancyGrid:
         """(H, W) cells of things on the floor that are no walls; none where heights are not known."""
         things: BoolGrid = self.cells == THING
         return things
+
+    def told(self, of: MapOf = "everything") -> NDArray[np.int8]:
+        """(H, W) the cells as others are told them: 100 where something stands, 0 where it is free, else -1.
+
+        >>> import numpy as np
+        >>> cells = np.array([[1, 50, THING, 82, -1]])
+        >>> grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0))
+        >>> grid.told().tolist(), grid.told("walls").tolist()
+        ([[0, -1, 100, 100, -1]], [[0, -1, -1, 100, -1]])
+        """
+        if of == "raw":
+            return self.cells
+        stands = self.occupied | self.things if of == "everything" else self.occupied
+        return np.select([stands, self.free], [np.int8(OCCUPIED), np.int8(FREE)], np.int8(UNKNOWN))
 
     @property
     def free_m2(self) -> float:

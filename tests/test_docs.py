@@ -38,7 +38,7 @@ import signature
 from pc2grid_cli import demo
 from pc2grid_cli.main import app
 from tests.helpers import doc_files
-from tests.helpers.nav2_map import oracle
+from tests.helpers.nav2_map import nav2_map
 
 ROOT = Path(__file__).resolve().parent.parent
 FLAGS = doctest.NORMALIZE_WHITESPACE
@@ -430,15 +430,6 @@ def test_the_list_of_modules_shows_every_module(folder: Path) -> None:
 # --- nav2 and Foxglove ------------------------------------------------------------------------------------
 
 
-def nav2_map(yaml_path: Path) -> tuple[np.ndarray, float, tuple[float, float]]:
-    """A map as nav2's map server reads it, by another implementation: cells, metres a cell, origin."""
-    keys = yaml.safe_load(yaml_path.read_text())
-    pixels = cv2.imread(str(yaml_path.parent / keys["image"]), cv2.IMREAD_GRAYSCALE)
-    states = np.array([oracle(grey, keys, keys["mode"]) for grey in range(256)])
-    cells = states[pixels[::-1]]
-    return cells, keys["resolution"], tuple(keys["origin"][:2])
-
-
 def test_example_nav2(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Programs that say how they were called; both commands of pc2grid end with the file to write.
     tools = folder / "bin"
@@ -481,7 +472,8 @@ def test_an_exported_map_is_read_by_nav2_as_it_was(folder: Path) -> None:
     with signature.open_database("building.submaps") as database:
         grid = database.grid("monday")
     assert np.array_equal(cells == 100, grid.occupied) and np.array_equal(cells == 0, grid.free)
-    assert (resolution_m, origin_m) == (grid.resolution_m, grid.origin_m)
+    exact = pytest.approx((grid.resolution_m, *grid.origin_m), rel=5e-16, abs=0.0)
+    assert (resolution_m, *origin_m) == exact
 
 
 EXPORT_MCAP = ["export", "building.submaps", "--mcap", "map.mcap"]

@@ -22,7 +22,7 @@ from pc2grid.errors import MapFileError
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.map_image import GreyImage, encode_image, read_image
 from pc2grid.io.messages.types import FARTHEST_M
-from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from pc2grid.model import FREE, OCCUPIED, UNKNOWN, MapOf, OccupancyGrid
 
 MapMode = Literal["trinary", "scale", "raw"]
 
@@ -33,6 +33,8 @@ _RESOLUTION_M = (1e-3, 100.0)
 # occupancy 0.196078, which a free_thresh of 0.25 would read as free.
 _OCCUPIED_THRESH, _FREE_THRESH = 0.65, 0.196
 _FREE_GREY, _UNKNOWN_GREY, _OCCUPIED_GREY = 254, 205, 0
+# Two roundings, of a cell's edge and of the product, are at most so many units in the last place.
+_DIGITS, _ROUNDED = 12, 2
 _log = logging.getLogger(__name__)
 
 
@@ -115,8 +117,13 @@ def save_map(
     *,
     mode: MapMode = "trinary",
     image_format: Literal["pgm", "png"] = "pgm",
+    of: MapOf = "everything",
+    comment: str = "",
 ) -> tuple[Path, Path]:
     """Write `<stem>.yaml` and `<stem>.pgm` or `.png`; returns both paths. Existing files are replaced.
+
+    of : what a trinary map shows, see `OccupancyGrid.told`; the other modes hold the cells as they are.
+    comment : lines that begin the .yaml; programs that read it skip them.
 
     `scale` needs transparency for unknown cells and therefore always writes png, as nav2's saver does.
     Numbers have full precision (nav2's saver rounds them to three decimals).
@@ -133,9 +140,10 @@ def save_map(
     occupied_thresh, free_thresh = _OCCUPIED_THRESH, _FREE_THRESH
     pixels: NDArray[np.uint8]
     if mode == "trinary":
+        told = grid.told(of)[::-1]
         pixels = np.full(cells.shape, _UNKNOWN_GREY, dtype=np.uint8)
-        pixels[grid.free[::-1]] = _FREE_GREY
-        pixels[grid.occupied[::-1]] = _OCCUPIED_GREY
+        pixels[told == FREE] = _FREE_GREY
+        pixels[told == OCCUPIED] = _OCCUPIED_GREY
     elif mode == "raw":
         pixels = np.where(known, cells, 255).astype(np.uint8)
     else:
@@ -146,7 +154,7 @@ def save_map(
     image_path = stem.with_name(f"{stem.name}.{suffix}")
     yaml_path = stem.with_name(f"{stem.name}.yaml")
     plain = re.fullmatch(r"[A-Za-z_][\w.\-]*", image_path.name)
-    text = (
+    text = "".join(f"# {line}\n" for line in comment.splitlines()) + (
         f"image: {image_path.name if plain else json.dumps(image_path.name)}\n"
         f"mode: {mode}\n"
         f"resolution: {_yaml_number(grid.resolution_m)}\n"
@@ -249,6 +257,9 @@ def _image_path(path: Path, keys: dict[str, Any]) -> Path:
 
 
 def _yaml_number(value: float) -> str:
-    text = repr(float(value))
+    """A number with the fewest digits that tell it apart: -478 cells of 0.05 m are -23.9, and no
+    -23.900000000000002, by what sums and products of floats are rounded."""
+    short = float(f"{value:.{_DIGITS}g}")
+    text = repr(short if abs(short - value) <= _ROUNDED * math.ulp(value) else float(value))
     # PyYAML reads "1e-05" as text, because the mantissa has no decimal point.
     return text.replace("e", ".0e", 1) if "e" in text and "." not in text else text

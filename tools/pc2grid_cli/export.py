@@ -12,12 +12,14 @@ import numpy as np
 import typer
 
 from pc2grid import extras
-from pc2grid.errors import ConfigError, DatabaseError
+from pc2grid._version import __version__
+from pc2grid.errors import ConfigError, DatabaseError, one_line
 from pc2grid.io.export.cloud import write_cloud
 from pc2grid.io.export.g2o import write_g2o
 from pc2grid.io.export.graphml import write_graph
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.nav2_map import is_map_file, save_map
 from pc2grid.io.trajectory import write_trajectory
+from pc2grid.model import THING, MapOf, OccupancyGrid
 from pc2grid_cli import console
 from pc2grid_cli.foxglove import write_session
 from pc2grid_cli.options import AsJson, Building, Database, Floor, Force, Frame, FrameName
@@ -31,7 +33,22 @@ if TYPE_CHECKING:
     from pc2grid.model import Trajectory
     from pc2grid_cli.json_schemas import Export
     from signature.database import SubmapDatabase
-    from signature.database.protocol import BuildingFrame
+    from signature.database.protocol import BuildingFrame, SessionInfo
+
+
+class MapOfName(str, enum.Enum):
+    """What a map shows."""
+
+    everything = "everything"
+    walls = "walls"
+    raw = "raw"
+
+
+_SHOWN: dict[MapOf, str] = {
+    "everything": "what stands there is an obstacle, walls and things such as tables alike",
+    "walls": "things such as tables are unknown, and no obstacles",
+    "raw": f"in percent, {THING} is a thing such as a table; nav2 takes what is below 100 for free",
+}
 
 
 class TrajectoryKind(str, enum.Enum):
@@ -52,6 +69,14 @@ def export_command(
     database: Database,
     map_: Annotated[
         Path | None, typer.Option("--map", metavar="STEM", help="STEM.yaml and STEM.pgm for nav2")
+    ] = None,
+    map_of_: Annotated[
+        MapOfName | None,
+        typer.Option(
+            "--map-of",
+            help="of --map and --mcap; default: everything that stands there is an obstacle; walls: furniture"
+            " is unknown; raw: percent, which nav2 takes for free below 100",
+        ),
     ] = None,
     trajectory: Annotated[
         Path | None, typer.Option("--trajectory", metavar="OUT.tum", help="poses of the base, for evo")
@@ -102,6 +127,7 @@ def export_command(
     terminal = console.of(context)
     outputs = _Outputs(
         map_stem=None if map_ is None else map_stem(map_),
+        map_of=(map_of_ or MapOfName.everything).value,
         trajectory=trajectory,
         trajectory_format=None if format_ is None else _FORMATS[format_],
         cloud=cloud,
@@ -112,6 +138,8 @@ def export_command(
         report=report,
         force=force,
     )
+    if map_of_ is not None and map_ is None and mcap is None:
+        raise ConfigError("--map-of: no map is written", hint="name --map or --mcap, too")
     extras.require(extras.of_addresses(database))
     outputs.check()
     with open_database(database) as opened:
@@ -127,6 +155,8 @@ def export_command(
             _write_session(outputs, opened, name, frames.get(name), terminal)
         if report is not None:
             write_report(report, opened)
+    if outputs.map_of != "everything":
+        terminal.note(f"--map-of {outputs.map_of}: {_SHOWN[outputs.map_of]}")
     for path in outputs.written():
         terminal.note(f"wrote {path}")
     if json:
@@ -144,6 +174,7 @@ class _Outputs:
     """What the command writes; None: not this."""
 
     map_stem: Path | None
+    map_of: MapOf
     trajectory: Path | None
     trajectory_format: Literal["tum", "kitti"] | None
     cloud: Path | None
@@ -216,7 +247,7 @@ def _write_building(
     if others:
         console.warn(f"not joined, and left out: {', '.join(others)}")
     if outputs.map_stem is not None:
-        save_map(map_of(database, names[0], frames), outputs.map_stem)
+        _write_map(outputs.map_stem, database, names, frames, outputs.map_of)
     if outputs.cloud is not None:
         _write_cloud(outputs.cloud, database, names, frames, terminal)
 
@@ -235,7 +266,7 @@ def _write_session(
         raise DatabaseError(f"{database.location}: session {name!r} is an imported map and has no trajectory")
     frames = {} if frame is None else {name: frame}
     writers: list[tuple[Any, Callable[[Any], object]]] = [
-        (outputs.map_stem, lambda stem: save_map(map_of(database, name, frames), stem)),
+        (outputs.map_stem, lambda stem: _write_map(stem, database, [name], frames, outputs.map_of)),
         (
             outputs.trajectory,
             lambda path: write_trajectory(path, _in_building(poses, frame), outputs.trajectory_format),
@@ -243,12 +274,41 @@ def _write_session(
         (outputs.cloud, lambda path: _write_cloud(path, database, [name], frames, terminal)),
         (outputs.graph, lambda path: write_graph(path, database.graph(name))),
         (outputs.g2o, lambda path: write_g2o(path, poses, database.loops(name))),
-        (outputs.mcap, lambda path: write_session(path, database, name, outputs.force)),
+        (outputs.mcap, lambda path: write_session(path, database, name, outputs.force, outputs.map_of)),
         (outputs.plot, lambda path: draw_session(path, database, name)),
     ]
     for wanted, write in writers:
         if wanted is not None:
             write(wanted)
+
+
+def _write_map(
+    stem: Path,
+    database: SubmapDatabase,
+    names: Sequence[str],
+    frames: Mapping[str, BuildingFrame],
+    of: MapOf,
+) -> None:
+    """The map of a session, or of all of a floor that are joined, and what it shows."""
+    planes = dict.fromkeys(_plane(info, database.grid(info.name)) for info in database.sessions(names))
+    save_map(
+        map_of(database, names[0], frames),
+        stem,
+        mode="raw" if of == "raw" else "trinary",
+        of=of,
+        comment=f"pc2grid {__version__}, {' and '.join(planes)}:\n{_SHOWN[of]}",
+    )
+
+
+def _plane(info: SessionInfo, grid: OccupancyGrid) -> str:
+    """At which heights the plan of a session is cut."""
+    if is_map_file(Path(info.provenance.source)):
+        return f"heights as in {one_line(info.provenance.source)}"
+    if info.sensor == "laser":
+        above = "" if grid.height_m is None else f", {grid.height_m:.2f} m above the base"
+        return f"cut in the plane of a laser{above}"
+    band = info.provenance.config.projection
+    return f"cut from {band.band_min_m:g} to {band.band_max_m:g} m above the floor"
 
 
 def _in_building(poses: Trajectory, frame: BuildingFrame | None) -> Trajectory:

@@ -16,7 +16,7 @@ from pc2grid.io.export.mcap import LogWriter, Marker
 
 if TYPE_CHECKING:
     from pc2grid.arrays import F64
-    from pc2grid.model import OccupancyGrid, Trajectory
+    from pc2grid.model import MapOf, OccupancyGrid, Trajectory
     from signature.database import SubmapDatabase
     from signature.localization.answer import Answer
 
@@ -24,11 +24,13 @@ if TYPE_CHECKING:
 _GREEN, _GREY, _PURPLE = (0.0, 0.62, 0.45, 1.0), (0.4, 0.4, 0.4, 0.6), (0.8, 0.47, 0.65, 1.0)
 
 
-def write_session(path: Path, database: SubmapDatabase, session: str, force: bool) -> None:
-    """A session's map, path and submaps, and the poses of its robot over time."""
+def write_session(
+    path: Path, database: SubmapDatabase, session: str, force: bool, of: MapOf = "everything"
+) -> None:
+    """A session's map, path and submaps, and the poses of its robot over time. of : what the map shows."""
     poses = database.trajectory(session)
     with LogWriter(path, force=force) as writer:
-        _write_map(writer, database, session, int(poses.stamps_ns[0]) if len(poses) else 0)
+        _write_map(writer, database, session, int(poses.stamps_ns[0]) if len(poses) else 0, of)
         if len(poses):
             writer.path("/path", poses)
         for stamp_ns, T_session_base in zip(poses.stamps_ns, poses.T_session_base, strict=True):
@@ -74,9 +76,10 @@ def write_located_map(
         writer.pose_with_covariance("/pose", 0, answer.T_map_odom, answer.covariance)
 
 
-def _write_map(writer: LogWriter, database: SubmapDatabase, session: str, stamp_ns: int) -> None:
-    grid = database.grid(session)
-    writer.occupancy_grid("/map", stamp_ns, grid)
+def _write_map(
+    writer: LogWriter, database: SubmapDatabase, session: str, stamp_ns: int, of: MapOf = "everything"
+) -> None:
+    writer.occupancy_grid("/map", stamp_ns, database.grid(session), of=of)
     points = database.points(session)
     if points is not None:
         writer.point_cloud("/points", stamp_ns, "map", points.points_m().astype(np.float32))

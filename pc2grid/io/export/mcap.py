@@ -17,7 +17,7 @@ from pc2grid.arrays import F32, F64
 from pc2grid.geometry import SE2
 from pc2grid.io.atomic import refuse_existing, replace_file
 from pc2grid.io.export import ros_messages as ros
-from pc2grid.model import OccupancyGrid, Trajectory
+from pc2grid.model import MapOf, OccupancyGrid, Trajectory
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
@@ -209,9 +209,11 @@ class LogWriter:
 
     # --- maps and metadata ----------------------------------------------------------------------------
 
-    def occupancy_grid(self, topic: str, stamp_ns: int, grid: OccupancyGrid, frame: str = "map") -> None:
-        """nav_msgs/OccupancyGrid; row 0 has the smallest y, as in `OccupancyGrid`."""
-        self._add(topic, stamp_ns, ros.occupancy_grid(stamp_ns, grid, frame))
+    def occupancy_grid(
+        self, topic: str, stamp_ns: int, grid: OccupancyGrid, frame: str = "map", of: MapOf = "everything"
+    ) -> None:
+        """nav_msgs/OccupancyGrid; row 0 has the smallest y, as in `OccupancyGrid`. of : see its `told`."""
+        self._add(topic, stamp_ns, ros.occupancy_grid(stamp_ns, grid, frame, of))
 
     def markers(self, topic: str, stamp_ns: int, markers: Sequence[Marker], frame: str = "map") -> None:
         """visualization_msgs/MarkerArray in the layout since ROS 2 Humble; shown until replaced."""

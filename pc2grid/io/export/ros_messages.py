@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, quat_xyzw_from_pose
-from pc2grid.model import OccupancyGrid
+from pc2grid.model import MapOf, OccupancyGrid
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -91,12 +91,12 @@ def pose_with_covariance(stamp_ns: int, planar: SE2, covariance: ArrayLike, fram
     return new("geometry_msgs/PoseWithCovarianceStamped", header(stamp_ns, frame), content)
 
 
-def occupancy_grid(stamp_ns: int, grid: OccupancyGrid, frame: str = "map") -> Any:
-    """nav_msgs/OccupancyGrid; row 0 has the smallest y, as in `OccupancyGrid`."""
+def occupancy_grid(stamp_ns: int, grid: OccupancyGrid, frame: str = "map", of: MapOf = "everything") -> Any:
+    """nav_msgs/OccupancyGrid; row 0 has the smallest y, as in `OccupancyGrid`. of : see its `told`."""
     height, width = grid.cells.shape
     origin = pose(SE2(*grid.origin_m).lift())
     info = new("nav_msgs/MapMetaData", time(stamp_ns), grid.resolution_m, width, height, origin)
-    cells = np.ascontiguousarray(grid.cells).reshape(-1)
+    cells = np.ascontiguousarray(grid.told(of)).reshape(-1)
     return new("nav_msgs/OccupancyGrid", header(stamp_ns, frame), info, cells)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,8 @@ from hypothesis.extra import numpy as hnp
 from pc2grid.errors import MapFileError, TrajectoryFileError
 from pc2grid.io.nav2_map import is_map_file, load_map, save_map
 from pc2grid.io.trajectory import read_tum, stamp_ns_from_text, stamp_text, write_tum
-from pc2grid.model import OccupancyGrid, Trajectory
-from tests.helpers.nav2_map import oracle
+from pc2grid.model import THING, OccupancyGrid, Trajectory
+from tests.helpers.nav2_map import nav2_map, oracle
 
 GOOD: dict[str, Any] = {
     "image": "m.pgm",
@@ -62,7 +64,30 @@ def test_maps_survive_saving(mode: Any, image_format: Any, cells: Any, resolutio
         path, _ = save_map(grid, Path(folder) / "a b", mode=mode, image_format=image_format)
         found = load_map(path)
     np.testing.assert_array_equal(found.cells, grid.cells)
-    assert (found.resolution_m, found.origin_m) == (resolution, (x, -x))
+    # As exact as a product of floats: what is off a short number by its rounding is written as that number.
+    read, wanted = (found.resolution_m, *found.origin_m), (resolution, x, -x)
+    assert all(map(partial(math.isclose, rel_tol=5e-16), read, wanted))
+
+
+def test_an_origin_is_written_as_a_person_would(tmp_path: Path) -> None:
+    cells = np.zeros((2, 2), np.int8)
+    for origin_m, text in (
+        ((-478 * 0.05, 3 * 0.1), "[-23.9, 0.3, 0]"),
+        ((1e-05, -0.0), "[1.0e-05, -0.0, 0]"),
+        ((math.pi, 1 / 3), "[3.141592653589793, 0.3333333333333333, 0]"),
+    ):
+        path, _ = save_map(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=origin_m), tmp_path / "m")
+        assert f"origin: {text}\n" in path.read_text()
+        assert np.abs(np.subtract(load_map(path).origin_m, origin_m)).max() < 1e-14
+
+
+def test_a_comment_changes_nothing_that_is_read(tmp_path: Path) -> None:
+    grid = OccupancyGrid(cells=np.array([[0, 60, 100]]), resolution_m=0.05, origin_m=(1.5, 2.0))
+    plain, _ = save_map(grid, tmp_path / "a")
+    told, _ = save_map(grid, tmp_path / "b", comment="image: no.pgm\n--- 1.8 m: \u2028resolution: 7")
+    assert told.read_text().startswith("# image: no.pgm\n# --- 1.8 m: \n# resolution: 7\nimage: b.pgm\n")
+    assert np.array_equal(load_map(told).cells, load_map(plain).cells)
+    assert load_map(told).resolution_m == 0.05
 
 
 def test_grey_205_is_unknown_and_rows_are_flipped(tmp_path: Path) -> None:
@@ -135,6 +160,19 @@ def test_a_map_is_not_saved_in_an_unknown_mode(tmp_path: Path) -> None:
     with pytest.raises(MapFileError, match="mode: 'odd' is not one of"):
         save_map(grid, tmp_path / "m", mode="odd")  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("image_format", ["pgm", "png"])
+def test_things_are_obstacles_unless_walls_alone_are_wanted(tmp_path: Path, image_format: Any) -> None:
+    """By the reader of another: black, white, and grey 205 for nav2's map server."""
+    grid = OccupancyGrid(
+        cells=np.array([[-1, 0, 19, 20], [50, THING, 65, 99]]), resolution_m=0.05, origin_m=(0.0, 0.0)
+    )
+    wanted = {"everything": [-1, 100, 100, 100], "walls": [-1, -1, 100, 100]}
+    for of, upper in wanted.items():
+        path, _ = save_map(grid, tmp_path / "m", image_format=image_format, of=of)  # type: ignore[arg-type]
+        assert nav2_map(path)[0].tolist() == [[-1, 0, 0, -1], upper]
+        assert load_map(path).cells.tolist() == [[-1, 0, 0, -1], upper]
 
 
 def test_a_short_image_is_refused(tmp_path: Path) -> None:
