@@ -1,7 +1,10 @@
-"""An independent reading of nav2 maps, and of what nav2, AMCL and RViz are told, by their own rules."""
+"""An independent reading of nav2 maps, and of what nav2, AMCL and tf2 are told, by their own rules."""
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -51,6 +54,24 @@ def valid_for_nav2(message: Any) -> bool:
     q = message.pose.pose.orientation
     unit = abs(q.x**2 + q.y**2 + q.z**2 + q.w**2 - 1.0) < 1e-4
     return head and unit and all(0.0 <= number <= 1e9 for number in message.pose.covariance)
+
+
+def spread_by_amcl(message: Any) -> list[list[float]]:
+    """nav2_amcl, amcl_node.cpp, `handleInitialPose`: the covariance of x, y, yaw that its particles have."""
+    c = message.pose.covariance
+    return [[c[0], c[1], 0.0], [c[6], c[7], 0.0], [0.0, 0.0, c[35]]]
+
+
+def known_at(edges: Iterable[Any], frames: Sequence[str], stamp_ns: int) -> bool:
+    """tf2: whether frames, the uppermost first, are joined at a time by the transforms of /tf. Between two
+    of an edge it interpolates; it does not extrapolate."""
+    spans = {pair: [math.inf, -math.inf] for pair in itertools.pairwise(frames)}
+    for edge in edges:
+        span = spans.get((edge.header.frame_id, edge.child_frame_id))
+        if span is not None:
+            at_ns = edge.header.stamp.sec * 10**9 + edge.header.stamp.nanosec
+            span[:] = min(span[0], at_ns), max(span[1], at_ns)
+    return all(first <= stamp_ns <= last for first, last in spans.values())
 
 
 def oracle(grey: int, keys: dict[str, Any], mode: str) -> int:

@@ -196,7 +196,7 @@ def test_a_pose_file_is_read_as_it_is_written_and_as_ros2_prints_it(tmp_path: Pa
         assert pose.stamp_ns == 12_000_000_345
         assert (pose.T_map_base.x, pose.T_map_base.y) == (1.0, -2.0)
         assert pose.T_map_base.yaw == pytest.approx(2.5)
-        assert np.allclose(pose.covariance, covariance)
+        assert np.allclose(pose.covariance, np.diag([0.2, 0.3, 0.05]))
 
 
 def test_a_robot_is_told_after_each_metre_whether_its_pose_is_right(rooms: tuple[Path, SE2]) -> None:

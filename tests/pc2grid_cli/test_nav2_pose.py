@@ -15,6 +15,7 @@ from pc2grid.io.nav2_map import save_map
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli import console
 from pc2grid_cli.main import app
+from tests.helpers.nav2_map import spread_by_amcl, valid_for_nav2
 from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import cut, office
 
@@ -83,8 +84,12 @@ def test_a_recording_gives_nav2_and_foxglove_the_same_pose(
     for axis, value in initial["pose"]["pose"]["orientation"].items():
         assert getattr(told.pose.pose.orientation, axis) == pytest.approx(value)
     assert list(told.pose.covariance) == initial["pose"]["covariance"]
-    full = np.reshape(told.pose.covariance, (6, 6))
-    assert np.allclose(full[np.ix_((0, 1, 5), (0, 1, 5))], answer["covariance"])
+    assert valid_for_nav2(told)
+    assert np.array_equal(spread_by_amcl(told), np.diag(np.diagonal(answer["covariance"])))
+    (whole,) = messages(mcap)["/pose"]
+    full = np.reshape(whole.pose.covariance, (6, 6))
+    assert np.array_equal(full[np.ix_((0, 1, 5), (0, 1, 5))], answer["covariance"])
+    assert np.array_equal(full[2:5, 2:5], 1e6 * np.eye(3)) and np.count_nonzero(full) == 12
     assert '"status":"located"' in page.read_text(encoding="utf-8")
 
 

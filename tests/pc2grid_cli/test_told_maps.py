@@ -1,7 +1,8 @@
-"""Maps as the program tells them to others, read by the rules of nav2, AMCL and RViz."""
+"""Maps and poses as the program tells them to others, read by the rules of nav2, AMCL, RViz and tf2."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
 from signature.database import open_database
 from tests.helpers.building_clouds import room_cloud
-from tests.helpers.nav2_map import AMCL, RVIZ, STATIC_LAYER, as_mapped, nav2_map, valid_for_nav2
+from tests.helpers.nav2_map import AMCL, RVIZ, STATIC_LAYER, as_mapped, known_at, nav2_map, valid_for_nav2
 from tests.helpers.simulated_drives import cut, office
 
 BLACK, WHITE, NEITHER = (0, 0, 0), (255, 255, 255), (112, 137, 134)
@@ -83,6 +84,18 @@ def test_so_are_the_maps_of_an_answer(folder: Path, tmp_path: Path) -> None:
     assert_told(told["/query_map"], load_map(folder / "part.yaml"))
 
 
+def test_an_answer_can_be_played_to_nav2(folder: Path, tmp_path: Path) -> None:
+    run("relocalize", folder / "drive.mcap", "-d", folder / "b.submaps", "--output", tmp_path / "out.mcap")
+    told = messages(tmp_path / "out.mcap")
+    edges = [edge for topic, message in told if topic == "/tf" for edge in message.transforms]
+    frames = {topic: message.header.frame_id for topic, message in told if hasattr(message, "header")}
+    assert set(frames.values()) == {"map"}
+    (path,) = (message for topic, message in told if topic == "/query_path")
+    for pose in (*path.poses, dict(told)["/initialpose"], dict(told)["/pose"]):
+        at = pose.header.stamp
+        assert known_at(edges, ("map", "odom", "base_link"), at.sec * 10**9 + at.nanosec)
+
+
 @pytest.mark.parametrize(("of", "table"), [("everything", 100), ("walls", -1), ("raw", THING)])
 def test_a_map_of_walls_leaves_furniture_out(folder: Path, tmp_path: Path, of: str, table: int) -> None:
     grid, stem = as_mapped(office()), tmp_path / "m"
@@ -117,3 +130,13 @@ def test_a_map_says_at_which_heights_it_was_cut(folder: Path, tmp_path: Path) ->
         run("convert", source, "-o", tmp_path / "x.submaps", "--set", "projection.band_max_m=1.5", "--force")
         run("export", tmp_path / "x.submaps", "--map", tmp_path / "x", "--force")
         assert said in (tmp_path / "x.yaml").read_text().splitlines()[0]
+
+
+def test_a_pose_is_told_to_nav2_without_negative_numbers(folder: Path, tmp_path: Path) -> None:
+    pose, mcap = tmp_path / "pose.json", tmp_path / "out.mcap"
+    outputs = ("--initialpose", pose, "--output", mcap)
+    run("relocalize", folder / "drive.mcap", "-d", folder / "b.submaps", *outputs)
+    told = dict(messages(mcap))
+    assert min(told["/pose"].pose.covariance) < 0.0  # the answer has them
+    assert valid_for_nav2(told["/initialpose"])
+    assert json.loads(pose.read_text())["pose"]["covariance"] == list(told["/initialpose"].pose.covariance)

@@ -138,7 +138,7 @@ def test_a_websocket_gives_the_same_answer_and_initialpose(
     assert stamp_ns >= looks[-1]["stamp_ns"]
     position = message.pose.pose.position
     assert math.dist((position.x, position.y), truth_at(here, stamp_ns)) < 0.1
-    assert valid_for_nav2(decoded["/map"])
+    assert all(map(valid_for_nav2, decoded.values()))
     assert np.array_equal(decoded["/map"].data.reshape(office().cells.shape), as_mapped(office()).told())
 
 

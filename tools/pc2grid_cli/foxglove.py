@@ -51,14 +51,15 @@ def write_answer(
         way = database.trajectory(answer.session)
         if len(way):
             writer.path("/path", way, stamp_ns=first)
-        writer.tf(first, "map", "odom", answer.T_map_odom.lift())
         writer.path("/query_path", located, stamp_ns=first)
-        T_odom_map = answer.T_map_odom.inverse().lift()
+        T_map_odom, T_odom_map = answer.T_map_odom.lift(), answer.T_map_odom.inverse().lift()
         for stamp_ns, T_map_base in zip(located.stamps_ns, located.T_session_base, strict=True):
+            # Each time anew: tf2 does not extrapolate from one transform on /tf.
+            writer.tf(int(stamp_ns), "map", "odom", T_map_odom)
             writer.tf(int(stamp_ns), "odom", "base_link", T_odom_map @ T_map_base)
         writer.markers("/hypotheses", last, [_hypotheses(answer)])
-        for topic in ("/pose", "/initialpose"):
-            writer.pose_with_covariance(topic, last, answer.T_map_base, answer.covariance)
+        writer.pose_with_covariance("/pose", last, answer.T_map_base, answer.covariance)
+        writer.initialpose(last, answer.T_map_base, answer.covariance)
 
 
 def write_located_map(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -11,8 +12,9 @@ import numpy as np
 import yaml
 
 from pc2grid.errors import ConfigError
-from pc2grid.geometry import SE2, quat_xyzw_from_pose
+from pc2grid.geometry import SE2
 from pc2grid.io.atomic import replace_file
+from pc2grid.io.export import ros_messages as ros
 from pc2grid.io.map_pose import MapPose
 
 _MOST_BYTES = 1 << 20
@@ -35,23 +37,15 @@ def write_initialpose(path: Path, answer: Answer) -> None:
 def initialpose(stamp_ns: int, T_map_base: SE2, covariance: F64, frame: str = "map") -> dict[str, Any]:
     """geometry_msgs/PoseWithCovarianceStamped, plain types only.
 
-    covariance : (3, 3) of x, y, yaw; becomes 36 numbers, row-major over x, y, z, roll, pitch, yaw.
+    covariance : (3, 3) of x, y, yaw; of these the variances, see `ros_messages.initialpose`.
     """
-
-    full = np.zeros((6, 6))
-    full[np.ix_((0, 1, 5), (0, 1, 5))] = covariance
-    seconds, rest = divmod(stamp_ns, 1_000_000_000)
-    orientation = quat_xyzw_from_pose(T_map_base.lift()).tolist()
-    return {
-        "header": {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": frame},
-        "pose": {
-            "pose": {
-                "position": {"x": float(T_map_base.x), "y": float(T_map_base.y), "z": 0.0},
-                "orientation": dict(zip("xyzw", orientation, strict=True)),
-            },
-            "covariance": full.reshape(-1).tolist(),
-        },
-    }
+    found = ros.initialpose(stamp_ns, T_map_base, covariance, frame)
+    # What rosbags keeps beside the fields of a message are their types.
+    message = dataclasses.asdict(
+        found, dict_factory=lambda items: {k: v for k, v in items if k != "__msgtype__"}
+    )
+    message["pose"]["covariance"] = message["pose"]["covariance"].tolist()
+    return message
 
 
 def read_pose(path: Path) -> MapPose:

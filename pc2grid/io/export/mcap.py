@@ -207,6 +207,10 @@ class LogWriter:
         """geometry_msgs/PoseWithCovarianceStamped of a planar pose; covariance (3, 3) of x, y, yaw."""
         self._add(topic, stamp_ns, ros.pose_with_covariance(stamp_ns, pose, covariance, frame))
 
+    def initialpose(self, stamp_ns: int, pose: SE2, covariance: ArrayLike, frame: str = "map") -> None:
+        """The same on /initialpose, as nav2 takes it."""
+        self._add("/initialpose", stamp_ns, ros.initialpose(stamp_ns, pose, covariance, frame))
+
     # --- maps and metadata ----------------------------------------------------------------------------
 
     def occupancy_grid(

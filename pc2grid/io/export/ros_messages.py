@@ -17,6 +17,10 @@ from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, quat_xyzw_from_pose
 from pc2grid.model import MapOf, OccupancyGrid
 
+_UNOBSERVED = 1e6
+"""Variance of z, roll and pitch of a planar pose, as drivers of robots on wheels write it. nav2 takes 1e9 at
+most."""
+
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
@@ -84,11 +88,24 @@ def serialized(message: Any) -> bytes:
 
 
 def pose_with_covariance(stamp_ns: int, planar: SE2, covariance: ArrayLike, frame: str = "map") -> Any:
-    """geometry_msgs/PoseWithCovarianceStamped of a planar pose; covariance (3, 3) of x, y, yaw."""
-    full = np.zeros((6, 6))
+    """geometry_msgs/PoseWithCovarianceStamped of a planar pose; covariance (3, 3) of x, y, yaw.
+
+    Its 36 numbers are row by row of x, y, z, roll, pitch, yaw; what a plane does not show is `_UNOBSERVED`.
+    """
+    full = np.diag([0.0, 0.0, _UNOBSERVED, _UNOBSERVED, _UNOBSERVED, 0.0])
     full[np.ix_((0, 1, 5), (0, 1, 5))] = np.asarray(covariance, dtype=np.float64).reshape(3, 3)
     content = new("geometry_msgs/PoseWithCovariance", pose(planar.lift()), full.reshape(-1))
     return new("geometry_msgs/PoseWithCovarianceStamped", header(stamp_ns, frame), content)
+
+
+def initialpose(stamp_ns: int, planar: SE2, covariance: ArrayLike, frame: str = "map") -> Any:
+    """The same as nav2 takes it on /initialpose: with variances alone.
+
+    nav2 refuses the message if one of its 36 numbers is negative (`validateMsg` of nav2_ros_common), and a
+    covariance of x, y and yaw mostly is. AMCL reads the variances and, of all others, that of x with y.
+    """
+    variances = np.diag(np.diagonal(np.asarray(covariance, dtype=np.float64)))
+    return pose_with_covariance(stamp_ns, planar, variances, frame)
 
 
 def occupancy_grid(stamp_ns: int, grid: OccupancyGrid, frame: str = "map", of: MapOf = "everything") -> Any:

@@ -79,7 +79,7 @@ class Nav2Publisher:
     def initialpose(self, stamp_ns: int, T_map_base: SE2, covariance: F64) -> None:
         """Publish the pose of the base once, as AMCL and slam_toolbox take it; covariance (3, 3)."""
         self.announce("/initialpose")
-        message = ros.pose_with_covariance(stamp_ns, T_map_base, covariance, self._frame)
+        message = ros.initialpose(stamp_ns, T_map_base, covariance, self._frame)
         self._outlet.publish("/initialpose", ros.serialized(message))
 
     def map(self, stamp_ns: int, grid: OccupancyGrid) -> None:
