@@ -198,6 +198,13 @@ class _Planner:
                 return str(found.header.frame)
         return ""
 
+    def _source_of(self, topic: TopicInfo) -> topics.Source:
+        """Where a topic of scans comes from."""
+        log_time_ns, headers = self._first_headers(topic)
+        if not headers:
+            return topics.Source("", 0)
+        return topics.Source(headers[0].frame, log_time_ns - headers[0].stamp_ns)
+
     def _base_or_sensor(self, found: str | None, sensor_frame: str) -> str:
         if found is not None:
             return found
@@ -215,7 +222,7 @@ class _Planner:
 
     def _sensors(self) -> _Sensors:
         wanted = self._config.topic
-        scans, reason = topics.scan_topic(self._topics, wanted)
+        scans, reason = topics.scan_topic(self._topics, wanted, self._source_of)
         more = topics.further_scan_topics(self._topics, wanted)
         if more:
             reason += f", with {', '.join(t.topic for t in more)}"

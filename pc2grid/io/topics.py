@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from pc2grid.errors import NoScans, TopicError, UnsupportedSchema
 from pc2grid.io.message_source import TopicInfo
@@ -28,10 +29,21 @@ ODOMETRY = ("nav_msgs/Odometry", "foxglove.Odometry", "foxglove.PoseInFrame", "c
 POSES = ("geometry_msgs/PoseWithCovarianceStamped", "geometry_msgs/PoseStamped")
 """Of the base in a map, as localization publishes them."""
 IMU = ("sensor_msgs/Imu",)
+_FIXED = ("odom", "map", "world", "earth", "camera_init")  # REP-105; the last one in LOAM and FAST-LIO
 TF = ("tf2_msgs/TFMessage", "tf/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
 
 
-def scan_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicInfo, str]:
+class Source(NamedTuple):
+    """Of the first message of a topic: its frame, and how long after its stamp it was recorded."""
+
+    frame: str
+    delay_ns: int
+
+
+SourceOf = Callable[[TopicInfo], Source]
+
+
+def scan_topic(topics: Sequence[TopicInfo], wanted: str | None, source_of: SourceOf) -> tuple[TopicInfo, str]:
     """The topic to read scans from, and a sentence that says why.
 
     Raises TopicError if `wanted` is missing or if several topics hold scans, NoScans if none does,
@@ -46,13 +58,31 @@ def scan_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicIn
     # An image and its compressed copy come from the same camera: take the uncompressed one.
     distinct = [t for t in full if not (_is_compressed(t) and any(_raw_twin(t, other) for other in full))]
     if len(distinct) > 1:
-        alike = [t.topic for t in distinct if t.type == distinct[0].type]
-        both = f", or all of one kind: --topic {','.join(alike[:4])}" if len(alike) > 1 else ""
         raise TopicError(
-            f"several topics hold scans: {_listed(distinct)}",
-            hint=f"choose one, e.g. --topic {distinct[0].topic}{both}",
+            f"several topics hold scans: {_listed(distinct)}", hint=_proposal(distinct, source_of)
         )
     return distinct[0], f"the only topic with scans ({distinct[0].type})"
+
+
+def _proposal(topics: Sequence[TopicInfo], source_of: SourceOf) -> str:
+    """What to type where several topics hold scans: one of them, or one of each sensor of its kind.
+
+    Topics of one frame hold the scans of one sensor, filtered or delayed: the first one is proposed. What is
+    in a fixed frame is no longer as it was measured.
+    """
+    sources = {t: source_of(t) for t in topics}
+    of_sensor: dict[str, TopicInfo] = {}
+    for topic in sorted(topics, key=lambda t: sources[t].delay_ns):
+        of_sensor.setdefault(sources[topic].frame, topic)
+    measured = [t for t in topics if t in of_sensor.values() and not is_fixed(sources[t].frame)] or topics[:1]
+    alike = [t.topic for t in measured if t.type == measured[0].type]
+    both = f", or one of each sensor: --topic {','.join(alike[:4])}" if len(alike) > 1 else ""
+    return f"choose one, e.g. --topic {measured[0].topic}{both}"
+
+
+def is_fixed(frame: str) -> bool:
+    """Whether a frame has the name of one that does not move with the robot."""
+    return frame.rpartition("/")[2] in _FIXED
 
 
 def _no_scans(topics: Sequence[TopicInfo], fitting: Sequence[TopicInfo]) -> NoScans:
