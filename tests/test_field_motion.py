@@ -192,3 +192,11 @@ def test_odometry_that_the_scans_contradict_is_warned_of(
 def test_a_laser_upside_down_is_warned_of(tmp_path: Path) -> None:
     made = convert(field_log("upside_down_unsaid"), tmp_path, "--duration", "60")
     assert made.warned_of("the sensor is mounted upside down and tf does not say so")
+
+
+def test_a_cloud_that_is_registered_already_is_taken_back_to_the_sensor(tmp_path: Path) -> None:
+    made = convert(field_log("registered_in_odom"), tmp_path)
+    assert made.code == 0
+    assert made.session is not None
+    assert made.session["path_m"] == pytest.approx(4.65, abs=0.05)
+    assert made.session["area_m2"] == pytest.approx(40.0, abs=2.0)

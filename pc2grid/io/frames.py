@@ -164,6 +164,22 @@ class FrameTree:
         self._cache.clear()
         self._parent[child] = parent
 
+    def static_root(self) -> str | None:
+        """The root of the static transforms, if these form one tree."""
+        roots = {self._above(child)[-1] for child in self._static}
+        return roots.pop() if len(roots) == 1 else None
+
+    def static_leaves(self, frame: str) -> list[str]:
+        """The frames that static transforms put on `frame`, and that carry no further ones."""
+        parents = {self._parent[child] for child in self._static}
+        return [child for child in self._static if child not in parents and frame in self._above(child)]
+
+    def _above(self, frame: str) -> list[str]:
+        """The frame, and those that static transforms lead to from it."""
+        chain = self.chain(frame)
+        moving = (k for k, child in enumerate(chain) if child not in self._static)
+        return chain[: next(moving, len(chain)) + 1]
+
     def chain(self, frame: str) -> list[str]:
         """The frame, its parent, and so on to the root. Raises FrameError if the parents form a circle."""
         chain = {frame: None}  # a dict as an ordered set

@@ -13,10 +13,12 @@ from pc2grid.io import topics
 from pc2grid.io.frames import FrameTree
 from pc2grid.io.message_source import Choice, MessageSource, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
-from pc2grid.io.messages.types import Header
+from pc2grid.io.messages.types import Header, Odometry
 from pc2grid.sensor_model import SENSOR_MODELS
 
 _BASE_FRAMES = ("base_link", "base_footprint")  # REP-105 and REP-120
+_LIDARS = ("lidar", "laser", "velodyne", "livox", "ouster", "os_sensor", "hesai", "pandar", "rslidar")
+"""Parts of the names of frames of lidars."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +50,7 @@ class Plan:
     further : topics of more sensors of the same kind, with the calibration of each, whose scans are put
     together with those of the first. stampless : whether the first scans have stamps of zero, so that the
     time of recording is used instead.
+    mounted : None, unless the points of the scans are in a fixed frame already; then the frame of the sensor.
     """
 
     choice: Choice
@@ -60,6 +63,17 @@ class Plan:
     stampless: bool
     further: tuple[tuple[TopicInfo, TopicInfo | None], ...] = ()
     imu: TopicInfo | None = None
+    mounted: str | None = None
+
+
+def registered(frame: str) -> FrameError:
+    """The error for points that cannot be taken back from a fixed frame to the sensor."""
+    return FrameError(
+        f"the scans are registered already, in the fixed frame {frame}: where the sensor was is not known",
+        hint=f"use what the sensor itself measured (--topic), or record tf from {frame} to the robot's base "
+        "and /tf_static with the sensor; for a sensor whose own frame is named so: "
+        "--set read.assume_identity=true",
+    )
 
 
 def make_plan(source: MessageSource, config: ReadConfig, frames: FrameTree) -> Plan:
@@ -125,6 +139,8 @@ class _Planner:
     def __init__(self, source: MessageSource, config: ReadConfig, frames: FrameTree) -> None:
         self._source, self._config, self._frames = source, config, frames
         self._topics = source.info.topics
+        self._reading: Odometry | None = None  # the first one of the odometry's topic
+        self._points = False  # whether the scans are clouds, which may be in any frame
 
     def plan(self) -> Plan:
         sensors = self._sensors()
@@ -134,9 +150,12 @@ class _Planner:
         sensor_frame = headers[0].frame if headers else ""  # none can be decoded: the stream counts them
         moving = [t for t in self._tf_topics() if not is_static(t)]
         in_tf = odometry.type in topics.TF if odometry else self._config.odometry is None
-        child = self._odometry_child(odometry)
+        self._points = topics.SENSORS[sensors.scans.type] == "lidar"
+        self._reading = self._first_reading(odometry)
+        child = None if self._reading is None else self._reading.child
         found = self._search_tf(moving, sensor_frame, child, first_ns, odometry_too=in_tf)
         sensors.need(found)
+        mounted = self._mounted(sensors, sensor_frame, found)
         base = self._base_or_sensor(found, sensor_frame)
         motion = _Motion(odometry, odometry, None, why)
         if in_tf:
@@ -161,7 +180,25 @@ class _Planner:
             stampless=bool(headers) and not any(header.stamp_ns for header in headers),
             further=tuple(zip(sensors.more, sensors.cameras[1:], strict=True)),
             imu=imu.topic,
+            mounted=mounted,
         )
+
+    def _mounted(self, sensors: _Sensors, sensor_frame: str, base: str | None) -> str | None:
+        """The frame of the sensor, if its points are in a fixed frame; None if they are in its own.
+
+        Raises FrameError if they cannot be taken back to the sensor.
+        """
+        frames = self._frames
+        if base is None or sensor_frame == base or not self._is_fixed(sensor_frame, base):
+            return None
+        if sensors.more or not self._points:
+            raise registered(sensor_frame)
+        leaves = frames.static_leaves(base)
+        named = [leaf for leaf in leaves if any(word in leaf.lower() for word in _LIDARS)] or leaves
+        if len(named) == 1:
+            return named[0]
+        self._source.tally.warn(f"tf does not say where on {base} the sensor sits: its rays begin at {base}")
+        return base
 
     def _imu(self, base: str | None, sensor_frame: str, sensors: _Sensors, motion: _Motion) -> _Motion:
         """The IMU; base : None if the log has no tf. Beside odometry, and with a laser, none is looked for.
@@ -258,13 +295,22 @@ class _Planner:
                 edges = tolerant(decoders[message.channel], message.data, None)
                 self._frames.add_all(edges, static=True)
 
-    def _odometry_child(self, odometry: TopicInfo | None) -> str | None:
+    def _is_fixed(self, frame: str, base: str | None) -> bool:
+        """Whether a frame does not move with the robot: by its name, by the odometry, or above it in tf."""
+        frames, reading = self._frames, self._reading
+        if topics.is_fixed(frame) or (reading is not None and frame == reading.header.frame):
+            return bool(frame)
+        if base is None or base not in frames or frame not in frames.chain(base)[1:]:
+            return False
+        return frames.moving(base, frame) and frame.rpartition("/")[2] not in _BASE_FRAMES
+
+    def _first_reading(self, odometry: TopicInfo | None) -> Odometry | None:
         if odometry is None or odometry.type in topics.TF:
             return None
         decode = decoder_for(odometry)
         for message in self._source.messages({odometry.topic}):
-            found = tolerant(decode, message.data, None)
-            return found.child if found else None
+            found: Odometry | None = tolerant(decode, message.data, None)
+            return found
         return None
 
     def _search_tf(
@@ -301,6 +347,14 @@ class _Planner:
         base = self._base_frame(child)
         if base is not None and sensor_frame == base:
             return base
+        if self._points and self._is_fixed(sensor_frame, base) and not self._config.assume_identity:
+            return self._base_of_odometry(sensor_frame, base)
+        root = frames.static_root() if base is None else None
+        if root is not None and sensor_frame in frames and frames.connected(root, sensor_frame):
+            self._source.tally.warn(
+                f"tf has no {_BASE_FRAMES[0]}: {root}, the root of its static transforms, is taken for it"
+            )
+            return root
         name = sensor_frame or "(empty)"
         if not frames.frames and self._config.base_frame is None and not self._tf_may_be_lost():
             self._source.tally.warn(
@@ -317,6 +371,16 @@ class _Planner:
                 hint="--set read.base_frame=NAME says which is the robot's base",
             )
         raise frames.missing(sensor_frame, base or "the base")
+
+    def _base_of_odometry(self, sensor_frame: str, base: str | None) -> str:
+        """The base frame of points in a fixed frame that tf does not connect to it.
+
+        Raises FrameError unless the odometry is in that frame.
+        """
+        reading = self._reading
+        if reading is None or reading.header.frame != sensor_frame or not (base or reading.child):
+            raise registered(sensor_frame)
+        return base or reading.child
 
     def _tf_may_be_lost(self) -> bool:
         """Whether tf may be among what is lost: a wrong base frame would shift every scan."""

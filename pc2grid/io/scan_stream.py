@@ -29,7 +29,7 @@ from pc2grid.io.further_scans import FurtherScans, together
 from pc2grid.io.message_source import MessageSource, RawMessage, Tally, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Imu, Odometry, ScanMessage, Transform
-from pc2grid.io.read_plan import Plan, is_static, tolerant
+from pc2grid.io.read_plan import Plan, is_static, registered, tolerant
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
 from pc2grid.io.sensors.scan_decoder import ScanDecoder
 from pc2grid.model import Scan
@@ -65,6 +65,8 @@ class StreamParameters:
 
 
 PARAMETERS = StreamParameters()
+_FLOOR_BELOW_M, _FLOOR_SHARE = 0.05, 0.01
+"""A sensor sees so much of its points below itself, as far as the floor is not at its own height; by hand."""
 
 
 class _Waiting(NamedTuple):
@@ -289,6 +291,20 @@ class _Poses:
         T_imu_base[:3, 3] = 0.0
         return T_level_imu @ T_imu_base
 
+    def points(self, frame: str, stamp_ns: int) -> F64:
+        """`T_base_points` (4, 4) of points in a frame: that of the sensor, or a fixed one.
+
+        Raises FrameError, PointCloudError.
+        """
+        base, frames = self._plan.choice.base_frame, self._frames
+        fixed = self._plan.mounted is not None
+        if not fixed or (base in frames and frame in frames and frames.connected(base, frame)):
+            return self.sensor(frame, stamp_ns)
+        T_fixed_base = self.odometry(stamp_ns)
+        if T_fixed_base is None:
+            raise PointCloudError("odometry is unknown at the stamp")
+        return invert_pose(T_fixed_base)
+
     def sensor(self, frame: str, stamp_ns: int) -> F64:
         """`T_base_sensor` (4, 4) of the sensor with this frame. Raises FrameError, PointCloudError."""
         if self._plan.sensor_is_base:
@@ -477,8 +493,10 @@ class Stream:
         stamp_ns, _, log_time_ns, _, message = self._waiting.pop()
         try:
             self._stamps.check(stamp_ns, log_time_ns, self._waiting.scans)
-            T_base_sensor = self._poses.sensor(message.header.frame, stamp_ns)
-            scan = self._decoder.scan(message, stamp_ns, T_base_sensor, self._poses.odometry(stamp_ns))
+            T_base_points = self._poses.points(message.header.frame, stamp_ns)
+            scan = self._decoder.scan(message, stamp_ns, T_base_points, self._poses.odometry(stamp_ns))
+            if self._plan.mounted is not None:
+                scan = self._measured(scan, self._plan.mounted)
             scan = replace(
                 scan, T_level_base=self._poses.level(stamp_ns), odometry_gap_s=self._odometry_gap_s(stamp_ns)
             )
@@ -503,6 +521,17 @@ class Stream:
         if not len(scan.points_m):
             tally.warn("some scans hold no returns at all")
         yield scan
+
+    def _measured(self, scan: Scan, mounted: str) -> Scan:
+        """A scan whose points were in a fixed frame, as one that the sensor with a frame measured.
+
+        Raises FrameError if it cannot have been where tf puts it.
+        """
+        T_base_sensor = self._poses.sensor(mounted, scan.stamp_ns)
+        seen = scan.points_m[:, 2] < T_base_sensor[2, 3] - _FLOOR_BELOW_M
+        if not self._part.good and np.mean(seen) < _FLOOR_SHARE:
+            raise registered(self._plan.choice.sensor_frame or "")
+        return replace(scan, T_base_sensor=T_base_sensor, offsets_s=None)
 
     def _odometry_gap_s(self, stamp_ns: int) -> float:
         """The longest time without odometry since the last scan that has a reading; infinite if none has."""
