@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import networkx as nx
@@ -18,7 +20,7 @@ from pc2grid.errors import OutputError, Pc2GridError
 from pc2grid.io.building_file import building_points
 from pc2grid.io.export.cloud import write_cloud
 from pc2grid.io.export.graphml import write_graph
-from pc2grid.io.trajectory import read_kitti, read_tum
+from pc2grid.io.trajectory import read_kitti, read_tum, write_tum
 from pc2grid.model import Trajectory
 from pc2grid.submaps.junction_graph import junction_graph
 from pc2grid_cli.main import app
@@ -73,15 +75,27 @@ def test_tum_and_kitti_by_suffix_or_by_name(database: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.skipif(shutil.which("evo_traj") is None, reason="evo is not installed (GPL: only called)")
-def test_evo_reads_trajectories_over_the_map(database: Path, tmp_path: Path) -> None:
+def test_evo_reads_trajectories_over_the_map(
+    database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     export(database, "--trajectory", tmp_path / "t.tum", "--map", tmp_path / "m")
     export(database, "--trajectory", tmp_path / "t.kitti")
+    monkeypatch.setenv("HOME", str(tmp_path))  # evo keeps settings there
+    monkeypatch.setenv("MPLBACKEND", "agg")
+
+    def evo(*words: str) -> str:
+        return subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+
     over_map = ("--ref", "t.tum", "--ros_map_yaml", "m.yaml", "--save_plot", "p.png", "--plot_mode", "xy")
-    for arguments in (("tum", "t.tum", *over_map), ("kitti", "t.kitti")):
-        done = subprocess.run(
-            ["evo_traj", *arguments], cwd=tmp_path, capture_output=True, text=True, check=True
-        )
-        assert "40 poses, 7.800m path length" in done.stdout
+    for words in (("tum", "t.tum", *over_map), ("kitti", "t.kitti")):
+        assert "40 poses, 7.800m path length" in evo("evo_traj", *words)
+    assert any(path.stat().st_size > 1000 for path in tmp_path.glob("p*.png"))
+    # Beside a truth that jumps 0.1 m to and fro.
+    beside = way().T_session_base.copy()
+    beside[1::2, 1, 3] += 0.1
+    write_tum(tmp_path / "truth.tum", replace(way(), T_session_base=beside))
+    rmse = re.search(r"rmse\s+([0-9.]+)", evo("evo_ape", "tum", "truth.tum", "t.tum"))
+    assert rmse is not None and float(rmse[1]) == pytest.approx(0.1 / 2**0.5, abs=1e-6)
 
 
 @pytest.mark.parametrize("suffix", ["ply", "pcd"])
