@@ -97,6 +97,24 @@ def test_drives_that_contradict_each_other_are_not_judged() -> None:
     assert row.truth is None and len(row.queries) == 3
 
 
+def test_answers_both_ways_judge_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two answers in each direction, which alone are too few: b in the map of a, a in that of b."""
+    monkeypatch.setattr(judging, "sessions", lambda *_: {"map": None})
+    a_in_b = Pair(query="a", map="b", kind="other day", window_s=1.0, windows=3)
+    wrong = SE2(-5.0, 2.0, 2.0)
+    known = {
+        B_IN_A: [located("b", k, T_A_B @ pose(k)) for k in range(2)],
+        a_in_b: [located("a", k, T_A_B.inverse() @ pose(k)) for k in range(2, 4)]
+        + [located("a", 4, wrong @ pose(4))],
+    }
+    first, second = Known(known).row(B_IN_A), Known(known).row(a_in_b)
+    assert (first.truth, first.agreeing) == (second.truth, second.agreeing) == ("agreement", 4)
+    assert [query.right for query in first.queries] == [True, True]
+    assert [query.right for query in second.queries] == [True, True, False]
+    del known[a_in_b]
+    assert Known(known).row(B_IN_A).truth is None
+
+
 def test_elsewhere_nothing_is_right() -> None:
     pair = Pair(query="b", map="plan", kind="elsewhere", window_s=1.0, windows=2)
     row = Known({pair: [located("b", 0, SE2()), located("b", 1, SE2(), status="not_found")]}).row(pair)

@@ -216,8 +216,28 @@ class Judge:
             own = [replace(one, where=self._own(query, one)) for one in windows]
             return "clouds", own, {(0, _SESSION): by_clouds}
         shared = self._shared(pair) if map_.sensor == "map" else None
-        windows, frames = shared or (windows, _agreed(windows))
+        windows, frames = shared or (windows, _agreed([*_said(windows), *self._said_back(pair)]))
         return ("agreement" if frames else None), windows, frames
+
+    def _said_back(self, pair: Pair) -> Iterator[tuple[tuple[int, str], Clue]]:
+        """What the drive of the map says, asked in the map of this query: it is of the same two trajectories.
+
+        Nothing where true poses place one of them, or where it was not asked.
+        """
+        wanted = (pair.map, pair.query, pair.until_s)
+        back = next((p for p in self._catalogue.pairs if (p.query, p.map, p.until_s) == wanted), None)
+        recordings = [self._catalogue.recordings[name] for name in (pair.query, pair.map)]
+        if (
+            pair.until_s is not None
+            or back is None
+            or any(r.poses for r in recordings)
+            or self._problem(back)
+        ):
+            return
+        parts, names = (list(sessions(self._folder, r.name)) for r in recordings)
+        for (number, session), clue in _said(self._located_windows(back)):
+            turned = Clue(clue.T_map_base, clue.T_drive_base, clue.query, clue.weight)
+            yield (parts.index(session), names[number]), turned
 
     def _own(self, query: Recording, one: LocatedWindow) -> tuple[int, SE2] | None:
         """Where the base is at the end of a window, by the trajectory that its cloud lies along."""
@@ -253,7 +273,7 @@ class Judge:
                 continue
             drives = {p.query: moved for p in in_map if (moved := self._in_root(p, root.name)) is not None}
             if pair.query in drives and len(drives) > 1:
-                return drives[pair.query], _agreed([one for windows in drives.values() for one in windows])
+                return drives[pair.query], _agreed(_said(one for found in drives.values() for one in found))
         return None
 
     def _in_root(self, pair: Pair, root: str) -> list[LocatedWindow] | None:
@@ -264,7 +284,7 @@ class Judge:
         link = next((p for p in self._catalogue.pairs if (p.query, p.map, p.until_s) == wanted), None)
         if link is None or self._problem(link):
             return None
-        frame = _agreed(self._located_windows(link)).get((0, _SESSION))
+        frame = _agreed(_said(self._located_windows(link))).get((0, _SESSION))
         if frame is None:
             return None
         return [
@@ -300,14 +320,20 @@ def _steps(trajectory: Trajectory) -> list[int]:
     return first
 
 
-def _agreed(windows: Iterable[LocatedWindow]) -> Frames:
-    """How the parts of drives lie in the sessions of a map, by the best place of every answer."""
-    groups: dict[tuple[int, str], list[Clue]] = {}
+def _said(windows: Iterable[LocatedWindow]) -> Iterator[tuple[tuple[int, str], Clue]]:
+    """The part of the drive, the session of the map, and the best place of every answer."""
     for one in windows:
         if one.where is not None and one.places and one.answer is not None:
             session, T_map_base, _ = one.places[0]
             clue = Clue(one.where[1], T_map_base, (one.query, one.window), float(one.answer["confidence"]))
-            groups.setdefault((one.where[0], session), []).append(clue)
+            yield (one.where[0], session), clue
+
+
+def _agreed(said: Iterable[tuple[tuple[int, str], Clue]]) -> Frames:
+    """How the parts of drives lie in the sessions of a map, by what answers have said."""
+    groups: dict[tuple[int, str], list[Clue]] = {}
+    for key, clue in said:
+        groups.setdefault(key, []).append(clue)
     found = ((key, agreed_frame(clues)) for key, clues in groups.items())
     return {key: frame for key, frame in found if frame is not None}
 
