@@ -7,16 +7,19 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema
+import numpy as np
+import open3d
 import pytest
 from typer.testing import CliRunner
 
 from pc2grid.io.nav2_map import save_map
 from pc2grid.model import OccupancyGrid
 from pc2grid.simulate import SimulationConfig, simulate_session
+from pc2grid.simulate.scene import extrude
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app
 from pc2grid_lab.experiments.recordings import catalogue
-from pc2grid_lab.experiments.recordings.catalogue import Pair, Recording
+from pc2grid_lab.experiments.recordings.catalogue import Drive, Pair, Recording
 from tests.helpers.json_schema import closed
 from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import plan
@@ -31,7 +34,17 @@ RECORDINGS = (
         poses="a.tum",
         of_base=True,
     ),
-    Recording(name="b", file="b.mcap", building="office", sensor="laser"),
+    Recording(name="b", file="b.mcap", building="office", sensor="laser", same_place=(0, 1)),
+    Recording(
+        name="driven",
+        file="floor.obj",
+        building="office",
+        sensor="lidar",
+        drive=Drive(sensor="lidar", length_m=18.0, seed=2),
+        mapped=False,
+        poses="floor.obj",
+        of_base=True,
+    ),
     Recording(name="hall.yaml", file="hall.yaml", building="hall", sensor="map", quick=True),
     Recording(name="broken", file="broken.mcap", building="office", sensor="laser"),
     Recording(name="gone", file="gone.mcap", building="office", sensor="laser"),
@@ -42,6 +55,7 @@ PAIRS = (
     Pair(query="a", map="broken", kind="other day", window_s=8.0, windows=1),
     Pair(query="broken", map="a", kind="other day", window_s=8.0, windows=1),
     Pair(query="a", map="gone", kind="other day", window_s=8.0, windows=1),
+    Pair(query="driven", map="a", kind="other sensor", window_s=6.0, windows=4, within_s=(0.0, 32.0)),
     Pair(query="b", map="hall.yaml", kind="elsewhere", window_s=8.0, windows=1, quick=True),
 )
 
@@ -55,12 +69,18 @@ def rooms() -> OccupancyGrid:
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two drives of a laser through one office, a recording that is none, and the map of another building."""
+    """Two drives of a laser through an office; its 3D scan; no recording; the map of another building."""
     folder = tmp_path_factory.mktemp("data")
     for name, seed, length_m in (("a", 3, 40.0), ("b", 5, 30.0)):
         slow: dict[str, Any] = {"laser": {"rate_hz": 4.0}, "length_m": length_m, "seed": seed, "clutter": 0}
         config = SimulationConfig.model_validate(slow)
         simulate_session(folder / f"{name}.mcap", sensor="laser", grid=rooms(), config=config)
+    walls = extrude(rooms(), 2.2)
+    mesh = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(walls.vertices_m.astype(float)),
+        open3d.utility.Vector3iVector(walls.triangles.astype(np.int32)),
+    )
+    open3d.io.write_triangle_mesh(str(folder / "floor.obj"), mesh)
     (folder / "broken.mcap").write_bytes(b"no recording")
     save_map(plan(12.0, 9.0, [(0, 4, 7, 4), (7, 6, 7, 9), (3, 6, 3, 9)]), folder / "hall")
     return folder
@@ -87,10 +107,12 @@ def test_a_small_run(data: Path, tmp_path: Path) -> None:
     maps = {row["name"]: row for row in document["maps"]}
     assert maps["a"]["error_m"] < RESOLUTION_M and maps["a"]["compared"] > 0.99 and maps["a"]["parts"] == 1
     assert maps["a"]["cpu_s"] > 0.5 and 35 < maps["a"]["metres"] < 45
-    assert maps["b"]["truth"] == "none" and maps["b"]["error_m"] is None
+    assert maps["hall.yaml"]["truth"] == "none" and maps["hall.yaml"]["error_m"] is None
+    # The robot starts between its first two scans, so that they are not quite at one place.
+    assert maps["b"]["truth"] == "loops" and 0.0 < maps["b"]["error_m"] < 0.15 and "driven" not in maps
     assert "broken.mcap" in maps["broken"]["problem"]
     assert maps["gone"]["problem"] == "not in the data folder"
-    later, other, no_map, no_query, missing, elsewhere = document["pairs"]
+    later, other, no_map, no_query, missing, driven, elsewhere = document["pairs"]
     assert later["truth"] == "poses"
     found = [q for q in later["queries"] if q["status"] == "located"]
     assert found and all(q["right"] and q["error_m"] < 3 * RESOLUTION_M for q in found)
@@ -101,6 +123,11 @@ def test_a_small_run(data: Path, tmp_path: Path) -> None:
     )
     assert "no map" in no_map["problem"] and no_query["problem"]
     assert missing["problem"] == "gone.mcap: not in the data folder"
+    assert driven["sensors"] == "driven lidar in laser" and driven["agreeing"] >= 3
+    assert [q["start_s"] for q in driven["queries"]] == [0.0, 8.667, 17.333, 26.0]
+    assert all(q["right"] for q in driven["queries"])
+    (drive,) = (tmp_path / "drives").glob("*.mcap")
+    made_ns = drive.stat().st_mtime_ns
     assert [q["status"] for q in elsewhere["queries"]] == ["not_found"]
     assert document["changes"] == []
 
@@ -119,6 +146,7 @@ def test_a_small_run(data: Path, tmp_path: Path) -> None:
     assert "- b in a: right 0 ->" in again.stdout
     assert json.loads((tmp_path / "before.json").read_text())["maps"] == document["maps"]
     assert "Changed since the run before" in (tmp_path / "before.md").read_text()
+    assert drive.stat().st_mtime_ns == made_ns
 
 
 @pytest.mark.usefixtures("small")

@@ -202,9 +202,15 @@ def test_the_matrix_of_sensors_shows_its_gaps() -> None:
         pair_row("right", sensors="depth in laser"),
         pair_row("right", "right", sensors="lidar", kind="elsewhere"),
         pair_row("right", sensors="laser in map"),
+        pair_row("right", "wrong", sensors="driven lidar in laser"),
+        pair_row("right", sensors="driven depth"),
     ]
     lines = sensor_matrix(table(*rows))
     cells = {line.split("|")[1].strip(): [c.strip() for c in line.split("|")[2:-1]] for line in lines[2:5]}
     assert cells["lidar"] == ["-", "-", "-", "-"]
     assert cells["depth"] == ["-", "-", "1 of 1, 0 wrong (1 building)", "-"]
     assert cells["laser"] == ["-", "-", "1 of 3, 1 wrong (2 buildings)", "1 of 1, 0 wrong (1 building)"]
+    driven = {line.split("|")[1].strip(): [c.strip() for c in line.split("|")[2:-1]] for line in lines[10:13]}
+    assert driven["driven lidar"] == ["-", "-", "1 of 2, 1 wrong (1 building)", "-"]
+    assert driven["driven depth"] == ["-", "1 of 1, 0 wrong (1 building)", "-", "-"]
+    assert driven["laser"] == ["-"] * 4  # what is not driven stands in the table above

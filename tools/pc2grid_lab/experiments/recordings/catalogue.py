@@ -10,14 +10,19 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from typing import Literal
 
+from pc2grid.model import SensorKind
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.replay import evenly_spaced
 
-Kind = Literal["later part", "fewer scans", "other day", "other sensor", "published map", "elsewhere"]
-"""How the query of a pair differs from what its map was made from. "elsewhere": it is of another building."""
+Kind = Literal[
+    "later part", "fewer scans", "same recording", "other day", "other sensor", "published map", "elsewhere"
+]
+"""How the query of a pair differs from what its map was made from. "same recording": all of it is the map,
+and the query may lack odometry. "elsewhere": it is of another building."""
 KINDS: tuple[Kind, ...] = (
     "later part",
     "fewer scans",
+    "same recording",
     "other day",
     "other sensor",
     "published map",
@@ -26,14 +31,26 @@ KINDS: tuple[Kind, ...] = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Drive:
+    """A simulated drive through the real 3D scan of a building. seed : of its way and of its obstacles."""
+
+    sensor: SensorKind
+    length_m: float
+    seed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Recording:
     """A recording, or a map, as one run of `pc2grid convert` takes it.
 
     file : below the data folder. building : recordings of one building are one group of the statistics.
+    drive : what is recorded in the 3D scan `file`; None: the file is the recording.
     options : of `convert` and of `relocalize`; map_options : of `convert` only. every : only every nth of
-        its scans is used.
+        its scans is used. mapped : whether all of it becomes a map, which is a row of the page.
     truth : what its trajectory is compared with, relations or poses; None: there is none.
+    same_place : numbers of scans between which the sensor came back to where it was.
     poses : true poses that place its windows, in one frame for all recordings that name the same `poses`.
+        Both of a drive are what the simulation knows, in the frame of the scan.
     late_s : by how much its stamps are later than those of the true poses: some drivers stamp a scan at its
         end.
     of_base : whether these are poses of the base, not of the sensor.
@@ -47,16 +64,24 @@ class Recording:
     file: str
     building: str
     sensor: Literal["lidar", "depth", "laser", "map"]
+    drive: Drive | None = None
     options: tuple[str, ...] = ()
     map_options: tuple[str, ...] = ()
     every: int = 1
+    mapped: bool = True
     truth: str | None = None
+    same_place: tuple[int, ...] = ()
     poses: str | None = None
     late_s: float = 0.0
     of_base: bool = False
     storeys: bool = False
     quick: bool = False
     scans_s: tuple[float, float] | None = None
+
+    @property
+    def sensor_shown(self) -> str:
+        """The sensor as the page names it."""
+        return self.sensor if self.drive is None else f"driven {self.sensor}"
 
     def span_s(self, length_s: float) -> tuple[float, float]:
         """From when to when there are scans, in a recording of `length_s`."""
@@ -69,7 +94,7 @@ class Pair:
 
     query, map : names of recordings. until_s : only so many seconds of `map` become the map; None: all of it.
     window_s : length of a window. windows : how many, evenly spread over the recording, in the map of its own
-        beginning over what comes after it.
+        beginning over what comes after it. within_s : seconds of the recording over which they are spread.
     """
 
     query: str
@@ -78,6 +103,7 @@ class Pair:
     window_s: float
     windows: int
     until_s: float | None = None
+    within_s: tuple[float, float] | None = None
     quick: bool = False
 
     @property
@@ -158,6 +184,43 @@ def _kitchen(name: str, *, map_options: tuple[str, ...] = ()) -> Recording:
     )
 
 
+def _corridor(name: str, *, odometry: bool = True, quick: bool = False) -> Recording:
+    poses = "depth/corridor_phone/corridor.tum"
+    return Recording(
+        name=name,
+        file="depth/corridor_phone/corridor.mcap",
+        building="corridor",
+        sensor="depth",
+        options=() if odometry else ("--odometry", "none"),
+        truth=poses,
+        poses=poses,
+        of_base=True,
+        quick=quick,
+    )
+
+
+def _small_room(name: str, file: str) -> Recording:
+    return _laser(name, "small room", file=f"laser/small_room/{file}", same_place=(0, 326, 649))
+
+
+_SCAN = "lidar/fr079_floor.ply"
+
+
+def _driven(name: str, sensor: SensorKind, length_m: float, seed: int, *, mapped: bool = True) -> Recording:
+    """A drive through the 3D scan of fr079's floor."""
+    return Recording(
+        name=name,
+        file=_SCAN,
+        building="fr079",
+        sensor=sensor,
+        drive=Drive(sensor=sensor, length_m=length_m, seed=seed),
+        mapped=mapped,
+        truth=_SCAN,
+        poses=_SCAN,
+        of_base=True,
+    )
+
+
 def _hall(every: int, name: str, *, map_options: tuple[str, ...] = (), quick: bool = False) -> Recording:
     return Recording(
         name=name,
@@ -193,6 +256,8 @@ RECORDINGS: tuple[Recording, ...] = (
     _phone("room_b", points=True),
     _kitchen("kitchen"),
     _kitchen("kitchen with points", map_options=_POINTS),
+    _corridor("corridor", quick=True),
+    _corridor("corridor without odometry", odometry=False),
     _corrected("fr079", "fr079"),
     _corrected("intel", "intel"),
     _corrected("csail", "csail", quick=True),
@@ -219,11 +284,19 @@ RECORDINGS: tuple[Recording, ...] = (
     _kidnap("kidnap dec14 before", "dec14_before.mcap", (0.0, 48.3)),
     _kidnap("kidnap may9 before", "may9_before.mcap", (40.1, 117.3)),
     _kidnap("kidnap may9 after", "may9_after.mcap", (22.4, 83.1)),
+    _laser("hallway", "hallway", file="laser/hallway/hallway.mcap"),
+    _laser("hallway2", "hallway", file="laser/hallway/hallway2.mcap"),
+    _small_room("small room", "indoor_small_01.mcap"),
+    _small_room("small room, 360 bins", "indoor_small_01_360.mcap"),
     _laser("birmingham", "birmingham", file="laser/birmingham/lgfloor2.mcap"),
     # One turn takes 0.125 s. Its headings fit the true ones best 0.12 s before its stamps.
     _jarvis("nav", late_s=0.12, quick=True),
     _jarvis("safety", quick=True),
-    _map("fr079_floor.ply", "lidar/fr079_floor.ply", "fr079"),
+    _driven("fr079 lidar", "lidar", 150.0, 1000),
+    _driven("fr079 depth", "depth", 150.0, 1000),
+    _driven("fr079 lidar again", "lidar", 70.0, 1, mapped=False),
+    _driven("fr079 depth again", "depth", 70.0, 1, mapped=False),
+    _map("fr079_floor.ply", _SCAN, "fr079"),
     _map("fr079.yaml", "maps/fr079.yaml", "fr079"),
     _map("intel.yaml", "maps/intel.yaml", "intel"),
     _map("csail.yaml", "maps/csail.yaml", "csail"),
@@ -233,7 +306,7 @@ RECORDINGS: tuple[Recording, ...] = (
     _map("wean.yaml", "laser/wean/wean.yaml", "wean", quick=True),
     _map("lgfloor.yaml", "laser/birmingham/lgfloor.yaml", "birmingham"),
 )
-"""Everything that becomes a map, in the order of the page."""
+"""Everything that becomes a map or is asked in one, in the order of the page."""
 
 
 def _later(name: str, until_s: float, window_s: float, windows: int, *, quick: bool = False) -> Pair:
@@ -252,6 +325,24 @@ def _pair(kind: Kind, query: str, map_: str, window_s: float, windows: int, *, q
     return Pair(query=query, map=map_, kind=kind, window_s=window_s, windows=windows, quick=quick)
 
 
+def _across(query: str, map_: str) -> Pair:
+    """Another sensor on fr079's floor. The log is asked every 50 s, 7 m in the median."""
+    if query == "fr079":
+        return replace(_pair("other sensor", query, map_, 40.0, 21), within_s=(0.0, 1040.0))
+    return _pair("other sensor", query, map_, 14.0, 10)
+
+
+def _in_corridor(query: str, *, quick: bool = False) -> Pair:
+    """Every 8 s in the map of the same walk, made with odometry."""
+    within_s = (4.0, 68.0)
+    return replace(_pair("same recording", query, "corridor", 8.0, 8, quick=quick), within_s=within_s)
+
+
+def _under_nav(query: str, window_s: float) -> Pair:
+    """A laser whose height is not known, or is that of a robot, in the map of another building's at 2.0 m."""
+    return _pair("elsewhere", query, "jarvis nav", window_s, 4)
+
+
 PAIRS: tuple[Pair, ...] = (
     # Windows of 3 to 8 m of travel, or 20 s where the robot hardly moves.
     _later("hall", 10.0, 4.0, 4),
@@ -266,6 +357,8 @@ PAIRS: tuple[Pair, ...] = (
     _later("csail", 250.0, 6.0, 10, quick=True),
     _later("killian", 900.0, 8.0, 10),
     _later("aces", 700.0, 15.0, 10),
+    _in_corridor("corridor", quick=True),
+    _in_corridor("corridor without odometry"),
     _pair("other day", "wean 1", "wean 2", 20.0, 8),
     _pair("other day", "wean 3", "wean 2", 20.0, 8),
     _pair("other day", "wean 2", "wean 1", 20.0, 8, quick=True),
@@ -275,13 +368,24 @@ PAIRS: tuple[Pair, ...] = (
     _pair("other day", "kidnap dec14 before", "kidnap dec13 before", 10.0, 6),
     _pair("other day", "kidnap dec13 before", "kidnap may9 before", 10.0, 8),
     _pair("other day", "workshop_1_changed", "workshop_1", 4.0, 8),
+    _pair("other day", "hallway", "hallway2", 8.0, 8),
+    _pair("other day", "hallway2", "hallway", 6.0, 6),
     _pair("other day", "room_b", "room_a", 5.0, 4, quick=True),
     _pair("other day", "room_a", "room_b", 5.0, 8),
     _pair("other day", "room_b", "room_a with points", 5.0, 4),
     _pair("other day", "room_a", "room_b with points", 5.0, 8),
     _pair("other sensor", "jarvis safety", "jarvis nav", 6.0, 6, quick=True),
     _pair("other sensor", "jarvis nav", "jarvis safety", 6.0, 6, quick=True),
-    _pair("other sensor", "fr079", "fr079_floor.ply", 25.0, 10),
+    # Lidar and depth camera are driven through the real 3D scan of the floor; the laser and its log are real.
+    _across("fr079", "fr079 lidar"),
+    _across("fr079", "fr079 depth"),
+    _across("fr079", "fr079_floor.ply"),
+    _across("fr079 lidar again", "fr079"),
+    _across("fr079 lidar again", "fr079 depth"),
+    _across("fr079 lidar again", "fr079_floor.ply"),
+    _across("fr079 depth again", "fr079"),
+    _across("fr079 depth again", "fr079 lidar"),
+    _across("fr079 depth again", "fr079_floor.ply"),
     _pair("published map", "wean 1", "wean.yaml", 20.0, 8, quick=True),
     _pair("published map", "wean 3", "wean.yaml", 20.0, 8),
     _pair("published map", "birmingham", "lgfloor.yaml", 15.0, 10),
@@ -304,6 +408,21 @@ PAIRS: tuple[Pair, ...] = (
     _pair("elsewhere", "room_a", "hall with points", 5.0, 8),
     _pair("elsewhere", "e1r_office_a", "room_b with points", 4.0, 4),
     _pair("elsewhere", "jarvis nav", "room_a", 6.0, 2),
+    _under_nav("fr079", 20.0),
+    _under_nav("intel", 25.0),
+    _under_nav("csail", 6.0),
+    _under_nav("killian", 8.0),
+    _under_nav("aces", 15.0),
+    _under_nav("acapulco", 15.0),
+    _under_nav("belgioioso", 15.0),
+    _under_nav("orebro", 15.0),
+    _under_nav("workshop_1", 4.0),
+    _under_nav("wean 2", 20.0),
+    _under_nav("kidnap dec13 before", 10.0),
+    _under_nav("kidnap may9 before", 10.0),
+    _under_nav("hallway", 8.0),
+    _under_nav("small room, 360 bins", 10.0),
+    _under_nav("birmingham", 15.0),
 )
 """All pairs, in the order of the page."""
 
@@ -339,7 +458,9 @@ class Catalogue:
         return Catalogue(
             recordings=known,
             mapped=tuple(
-                r for r in RECORDINGS if (r.quick or not quick) and wanted(r.name, r.building, r.sensor)
+                r
+                for r in RECORDINGS
+                if r.mapped and (r.quick or not quick) and wanted(r.name, r.building, r.sensor)
             ),
             pairs=tuple(
                 p
@@ -355,7 +476,7 @@ class Catalogue:
 
         They begin at whole milliseconds, as commands are told: else the last scan might be another one.
         """
-        first_s, last_s = self.recordings[pair.query].span_s(length_s)
+        first_s, last_s = pair.within_s or self.recordings[pair.query].span_s(length_s)
         if pair.map == pair.query and pair.until_s is not None:
             first_s = pair.until_s
         spans = evenly_spaced(first_s, last_s, pair.windows, pair.window_s)

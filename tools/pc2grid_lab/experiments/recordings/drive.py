@@ -62,9 +62,10 @@ class RecordedDrive:
         """Of a recording whose whole map is in the folder."""
         parts = tuple(sessions(folder, recording.name).values())
         late_ns = round(recording.late_s * 1e9)
-        if recording.poses is None:
+        poses = folder.poses(recording)
+        if poses is None:
             return RecordedDrive(parts, None, late_ns)
-        truth = read_tum(folder.data / recording.poses)
+        truth = read_tum(poses)
         if not recording.of_base:
             T_sensor_base = invert_pose(mount(folder, recording))
             truth = replace(truth, T_session_base=truth.T_session_base @ T_sensor_base)

@@ -108,7 +108,7 @@ class Judge:
             "map": pair.map_name,
             "kind": pair.kind,
             "building": map_.building,
-            "sensors": query.sensor if query.sensor == map_.sensor else f"{query.sensor} in {map_.sensor}",
+            "sensors": " in ".join(dict.fromkeys((query.sensor_shown, map_.sensor_shown))),
         }
         try:
             return self._judged(pair, query, map_, row)

@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 
 from pc2grid.geometry import SE2
+from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Trajectory
 from pc2grid_lab.experiments.recordings.catalogue import Recording
 from pc2grid_lab.experiments.recordings.children import Finished, kept
-from pc2grid_lab.experiments.recordings.drive import mount, sessions
+from pc2grid_lab.experiments.recordings.drive import config_of, mount, sessions
 from pc2grid_lab.experiments.recordings.rows import NOT_RUN, MapRow
 from pc2grid_lab.experiments.recordings.run import Folder
 from pc2grid_lab.experiments.recordings.warned import warned
-from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
+from pc2grid_lab.experiments.slam_relations import Relations, read_relations, relation_error
 from pc2grid_lab.experiments.trajectory_error import TrajectoryError, trajectory_error
 
 MISSING = "not in the data folder"
@@ -29,7 +30,7 @@ def map_row(recording: Recording, folder: Folder) -> MapRow:
     row: dict[str, Any] = {
         "name": recording.name,
         "building": recording.building,
-        "sensor": recording.sensor,
+        "sensor": recording.sensor_shown,
     }
     if folder.missing(recording):
         return MapRow(**row, problem=MISSING)
@@ -74,21 +75,30 @@ def _figures(recording: Recording, folder: Folder, done: Finished) -> dict[str, 
 
 def _error(recording: Recording, folder: Folder) -> dict[str, Any]:
     """The error of a trajectory against its truth; of a recording in parts, that of each part by itself."""
-    if recording.truth is None:
+    parts, truth = list(sessions(folder, recording.name).values()), folder.truth(recording)
+    if recording.same_place:
+        return {"truth": "loops", **_relation_error(parts, _loops(recording, folder), SE2())}
+    if truth is None:
         return {}
-    parts = list(sessions(folder, recording.name).values())
-    truth = folder.data / recording.truth
     if truth.suffix == ".relations":
-        return {
-            "truth": "relations",
-            **_relation_error(parts, truth, SE2.from_matrix(mount(folder, recording))),
-        }
+        T_base_sensor = SE2.from_matrix(mount(folder, recording))
+        return {"truth": "relations", **_relation_error(parts, read_relations(truth), T_base_sensor)}
     return {"truth": "poses", **_pose_error(parts, truth)}
 
 
-def _relation_error(parts: Sequence[Trajectory], truth: Path, T_base_sensor: SE2) -> dict[str, float]:
+def _loops(recording: Recording, folder: Folder) -> Relations:
+    """From each scan of `Recording.same_place` to the next one the sensor has not moved."""
+    with open_log(folder.source(recording), config_of(recording).read) as log:
+        stamps = {number: scan.stamp_ns for number, scan in enumerate(log.scans())}
+    there = np.array([stamps[number] for number in recording.same_place])
+    return Relations(first_ns=there[:-1], second_ns=there[1:], T_first_second=np.zeros((len(there) - 1, 3)))
+
+
+def _relation_error(
+    parts: Sequence[Trajectory], relations: Relations, T_base_sensor: SE2
+) -> dict[str, float]:
     """Mean errors over the relations that lie in one part."""
-    relations, offset_m = read_relations(truth), (T_base_sensor.x, T_base_sensor.y)
+    offset_m = (T_base_sensor.x, T_base_sensor.y)
     found = [relation_error(part, relations, base_to_reference_m=offset_m) for part in parts]
     found = [error for error in found if error.used]
     if not found:

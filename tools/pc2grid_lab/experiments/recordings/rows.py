@@ -33,8 +33,8 @@ class MapRow:
 
     problem : why there is no map; empty if there is one. parts : sessions it became. lost : share of its
         scans that are in no map. over_bare : processor time over that of bare KISS-ICP; lidar only.
-    error_m, error_deg : of its trajectory, by relations the mean error, by poses the RMS distance. bare_m :
-        the same of bare KISS-ICP. compared : share of the relations or scans that could be compared.
+    error_m, error_deg : of its trajectory, by relations and loops the mean error, by poses the RMS distance.
+        bare_m : the same of bare KISS-ICP. compared : share of the relations or scans that could be compared.
     """
 
     name: str
@@ -49,7 +49,7 @@ class MapRow:
     parts: int | None = None
     lost: float | None = None
     warnings: tuple[Warned, ...] = ()
-    truth: Literal["relations", "poses", "none"] = "none"
+    truth: Literal["relations", "poses", "loops", "none"] = "none"
     error_m: float | None = None
     error_deg: float | None = None
     bare_m: float | None = None

@@ -16,7 +16,9 @@ from pc2grid.io import open_log
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.children import Finished, keep, kept, pc2grid, python_module
+from pc2grid_lab.experiments.recordings.driven import digest_of_drive, write_drive
 from pc2grid_lab.experiments.recordings.thinned import write_thinned
+from pc2grid_lab.experiments.stored import in_processes
 
 _RESULTS = ("maps", "bare", "answers")
 """Folders of results."""
@@ -35,11 +37,30 @@ class Folder:
     work: Path
 
     def source(self, recording: Recording) -> Path:
-        """The file that the commands read; of a thinned recording it is made on the way."""
-        if recording.every == 1:
-            return self.data / recording.file
-        file = Path(recording.file)
-        return self.work / "thinned" / f"{file.stem}_{recording.every}{file.suffix}"
+        """The file that the commands read; if it is thinned or driven, `_make` makes it.
+
+        Drives are kept beside the work of all versions: they are made again when they would differ.
+        """
+        file = self.data / recording.file
+        if recording.drive is not None:
+            made = f"{_plain(recording.name)}.{digest_of_drive(file, recording.drive)}.mcap"
+            return self.work.parents[1] / "drives" / made
+        if recording.every > 1:
+            return self.work / "thinned" / f"{file.stem}_{recording.every}{file.suffix}"
+        return file
+
+    def truth(self, recording: Recording) -> Path | None:
+        """The file of `Recording.truth`."""
+        return self._true(recording, recording.truth)
+
+    def poses(self, recording: Recording) -> Path | None:
+        """The file of `Recording.poses`."""
+        return self._true(recording, recording.poses)
+
+    def _true(self, recording: Recording, file: str | None) -> Path | None:
+        if file is None:
+            return None
+        return self.data / file if recording.drive is None else self.source(recording).with_suffix(".tum")
 
     def map(self, name: str) -> Path:
         """The database of a map, beside the result of `convert`."""
@@ -98,23 +119,19 @@ def run_all(
     advance : called with the share of the commands that is done.
     """
     pairs = [p for p in catalogue.pairs if not _gap(catalogue, folder, p)]
-    tasks = _made(catalogue, folder, pairs)
+    maps = _maps(catalogue, folder, pairs)
+    read = {r.name: r for r, _ in maps.values()} | {p.query: catalogue.recordings[p.query] for p in pairs}
+    waiting = [(folder, r) for r in read.values() if not folder.source(r).exists()]
+    in_processes(_make, waiting, jobs=jobs, advance=lambda share: None)
+    tasks = [_convert(folder, name, recording, until_s) for name, (recording, until_s) in maps.items()]
+    lidars = [r for r in catalogue.mapped if r.sensor == "lidar" and not folder.missing(r)]
+    tasks += [_bare(folder, recording) for recording in lidars]
     windows = sum(pair.windows for pair in pairs)
     for done in _run(tasks, jobs):
         advance(done / (len(tasks) + windows))
     questions = [task for pair in pairs for task in _questions(catalogue, folder, pair)]
     for done in _run(questions, jobs):
         advance((len(tasks) + done) / (len(tasks) + windows))
-
-
-def _made(catalogue: Catalogue, folder: Folder, pairs: Sequence[Pair]) -> list[_Task]:
-    """The commands that make maps, and bare KISS-ICP; the recordings that they read are thinned."""
-    maps = _maps(catalogue, folder, pairs)
-    for recording in [*(r for r, _ in maps.values()), *(catalogue.recordings[p.query] for p in pairs)]:
-        _thin(folder, recording)
-    tasks = [_convert(folder, name, recording, until_s) for name, (recording, until_s) in maps.items()]
-    lidars = [r for r in catalogue.mapped if r.sensor == "lidar" and not folder.missing(r)]
-    return tasks + [_bare(folder, recording) for recording in lidars]
 
 
 def _maps(
@@ -126,16 +143,22 @@ def _maps(
     }
     for pair in pairs:
         maps[pair.map_name] = (catalogue.recordings[pair.map], pair.until_s)
-        if pair.kind != "elsewhere":  # its windows are placed by the trajectory of the whole recording
-            maps[pair.query] = (catalogue.recordings[pair.query], None)
+        query = catalogue.recordings[pair.query]
+        if pair.kind != "elsewhere" and query.mapped:  # the trajectory of all of it places its windows
+            maps[pair.query] = (query, None)
     return maps
 
 
-def _thin(folder: Folder, recording: Recording) -> None:
-    target = folder.source(recording)
-    if recording.every > 1 and not target.exists():
+def _make(folder: Folder, recording: Recording) -> None:
+    """Make a recording that is thinned or driven."""
+    file, target = folder.data / recording.file, folder.source(recording)
+    if recording.drive is not None:
+        for old in target.parent.glob(f"{_plain(recording.name)}.*"):
+            old.unlink()
+        write_drive(file, target, recording.drive)
+    elif recording.every > 1:
         target.parent.mkdir(parents=True, exist_ok=True)
-        write_thinned(folder.data / recording.file, target, recording.every)
+        write_thinned(file, target, recording.every)
 
 
 def _questions(catalogue: Catalogue, folder: Folder, pair: Pair) -> list[_Task]:
@@ -197,8 +220,8 @@ def _convert(folder: Folder, name: str, recording: Recording, until_s: float | N
 
 
 def _bare(folder: Folder, recording: Recording) -> _Task:
-    truth = recording.truth
-    poses = () if truth is None or not truth.endswith(".tum") else (folder.data / truth,)
+    truth = folder.truth(recording)
+    poses = () if truth is None or truth.suffix != ".tum" else (truth,)
     return _Task(
         folder.bare(recording.name), lambda: python_module(_BARE, folder.source(recording), *poses), 0.0
     )
