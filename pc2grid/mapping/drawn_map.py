@@ -81,7 +81,7 @@ def load_drawn_map(path: str | Path, config: Config = Config()) -> DrawnMap:
         T_map_file = level_cloud(points, floor_z=config.read.floor_z)
         level = transform_points(T_map_file, points)
         # Viewpoints, unlike `drivable_plan(level)`, also know the ground that furniture hides from above, as
-        # the map of a robot does; `examples/sensors.md` compares the two.
+        # the map of a robot does.
         grid = map_cloud(level, config.projection, origin_m=T_map_file[:3, 3])
     except MapFileError as error:
         if str(path) in error.message:

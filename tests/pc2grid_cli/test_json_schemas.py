@@ -92,7 +92,6 @@ def test_every_document_is_validated_by_a_test() -> None:
         "compare-floors": "pc2grid_lab/compare/test_floors.py",
         "compare-maps": "pc2grid_lab/experiments/test_map_quality.py",
         "compare-peers": "pc2grid_lab/experiments/test_peers.py",
-        "compare-real": "pc2grid_lab/experiments/test_real_sensors.py",
         "compare-recordings": "pc2grid_lab/compare/test_recordings.py",
         "compare-sensors": "pc2grid_lab/experiments/test_sensor_matrix.py",
         "compare-signatures": "pc2grid_lab/experiments/test_selection.py",

@@ -123,7 +123,7 @@ def test_a_scan_and_a_log_of_one_building_are_left_out_together(tmp_path: Path) 
     real, sensors = evidence_files(tmp_path)
     log = {"log": "fr079", "map": "fr079"}
     rows = [one | log for one in json.loads(real.read_text()) if one["log"] == "b"]
-    floor = {"building": "floor", "query_building": "floor"}
+    floor = {"building": "fr079_floor", "query_building": "fr079_floor"}
     trials = [one | floor for one in json.loads(sensors.read_text())["trials"]]
     real.write_text(json.dumps(rows))
     sensors.write_text(json.dumps(trials))  # a list, as `compare sensors` keeps them for each drive

@@ -46,7 +46,6 @@ CONFIG = {
 COMPARE = {
     "log": ("pc2grid_lab.compare.log:compare_log_command", "Later parts of a log in a map of its beginning."),
     "maps": ("pc2grid_lab.compare.maps:compare_maps_command", "Maps and trajectories against the truth."),
-    "real": ("pc2grid_lab.compare.real:compare_real_command", "Three sensors on one real floor."),
     "recordings": (
         "pc2grid_lab.compare.recordings:compare_recordings_command",
         "Every real recording, and what changed.",
@@ -104,7 +103,7 @@ def options(
 app.add_typer(
     typer.Typer(
         cls=group(COMPARE),
-        help="Measure: log, maps, real, recordings, sensors, signatures, floors, peers, the paper's tables.",
+        help="Measure: log, maps, recordings, sensors, signatures, floors, peers, the paper's tables.",
         no_args_is_help=True,
     ),
     name="compare",

@@ -11,6 +11,7 @@ REMOVED = {
         ("pc2grid db join --journal", "pc2grid db join --dask", "pc2grid db join --jobs"),
         "one process compares every two sessions, some seconds a pair",
     ),
+    "pc2grid compare real": "its rows are those of `pc2grid compare recordings DATA --only 'other sensor'`",
     "pc2grid db update": "`pc2grid db join` puts sessions into one frame, `pc2grid export --map` draws them",
     "pc2grid convert --update": "`--join` puts what is new into the frame of the other sessions",
 }

@@ -8,7 +8,6 @@ from typing import Any, Literal
 from typing_extensions import TypedDict
 
 from pc2grid_lab.experiments.metrics import ConfidenceError, MatrixCell, QueryCounts
-from pc2grid_lab.experiments.real_sensors import RealCell
 from pc2grid_lab.experiments.recordings.changes import RowChange
 from pc2grid_lab.experiments.recordings.rows import MapRow, PairRow
 from pc2grid_lab.experiments.trial import Trial
@@ -123,24 +122,6 @@ class CompareRecordings(TypedDict):
     changes: list[RowChange]
 
 
-class CompareReal(TypedDict):
-    """`pc2grid compare real --json`, and its real.json.
-
-    T_floor_log: x, y, yaw of the log's frame in the 3D scan's, null if no two answers agree. across: answers
-    across the two; agreeing: whose first place agrees with it.
-    """
-
-    schema_version: Version
-    floor: str
-    log: str
-    T_floor_log: list[float] | None
-    agreeing: int
-    across: int
-    setting: dict[str, float]
-    cells: list[RealCell]
-    trials: list[Trial]
-
-
 class Elsewhere(TypedDict):
     """What was answered to queries from another building."""
 
@@ -246,7 +227,6 @@ DOCUMENTS: dict[str, type] = {
     "compare-maps": CompareMaps,
     "compare-paper": ComparePaper,
     "compare-peers": ComparePeers,
-    "compare-real": CompareReal,
     "compare-recordings": CompareRecordings,
     "compare-sensors": CompareSensors,
     "compare-signatures": CompareSignatures,

@@ -3,7 +3,7 @@
     python -m pc2grid_lab.bench.fit_posterior EVIDENCE.json ...
 
 Each file is one that `real_queries` or `recorded_queries` has written, one of the folder trials/ of `pc2grid
-compare sensors`, or the document of `compare real` or `compare log --json`. An answer is judged by a fit
+compare sensors`, or the document of `compare log --json`. An answer is judged by a fit
 without all answers whose query or map is of one of its buildings. Prints the parameters for
 `signature.localization.posterior`, the log loss, by kind of pair and distance how many answers are right, and
 how many would be located by the parameters in use and by those fitted without the building, rightly and
@@ -51,8 +51,8 @@ SHARE_FOUND = 0.5
 map."""
 COVERAGES = (0.5, 0.6, 0.7, 0.8, 0.9)
 """At which the risk is printed."""
-PARTS_OF = {"floor": "fr079", "fr079_floor": "fr079"}
-"""Physical building of what `compare real` and the data call otherwise: the 3D scan is one floor of fr079."""
+PARTS_OF = {"fr079_floor": "fr079"}
+"""Physical building of what the data call otherwise: the 3D scan is one floor of fr079."""
 
 
 @dataclass(frozen=True, slots=True)

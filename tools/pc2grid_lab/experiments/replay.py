@@ -140,13 +140,6 @@ class Replay:
         )
         return MappedPart(sensor_map, mapped_xy, true_xy, made.report.warnings)
 
-    def T_world_map(self, trajectory: Trajectory) -> SE2:
-        """The frame of a map in the world of the true poses, fitted over the trajectory of the map.
-
-        Raises ConfigError if fewer than two of its scans have a true pose.
-        """
-        return SE2.fit(*self._pairs(trajectory))
-
     def _pairs(self, trajectory: Trajectory) -> tuple[F64, F64]:
         """Positions (N, 2) of the scans of a trajectory that have a true pose, in it and in the world.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from pc2grid.geometry import SE2
 from pc2grid.model import SensorKind, SessionMap
@@ -15,24 +14,21 @@ from signature.database import open_database
 from signature.localization.map_index import MapIndex
 from signature.sessions import add_session, provenance
 
-MapKind = SensorKind | Literal["scan"]
-"""The sensor that has made a map; or "scan", a 3D scan of the building that is a map as it is."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorMap:
-    """The map of the building `name` that one sensor has made, or its 3D scan, ready to be searched.
+    """The map of the building `name` that one sensor has made, ready to be searched.
 
     T_plan_map : the frame of the map in the true plan.
     """
 
     name: str
-    sensor: MapKind
+    sensor: SensorKind
     T_plan_map: SE2
     index: MapIndex
 
     @staticmethod
-    def load(path: Path, *, name: str, sensor: MapKind, config: Config) -> SensorMap:
+    def load(path: Path, *, name: str, sensor: SensorKind, config: Config) -> SensorMap:
         """Read what `save_map` has written, as the map of the building `name`."""
         with open_database(path) as database:
             index = MapIndex.of(database, config)

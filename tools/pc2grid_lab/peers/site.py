@@ -58,8 +58,8 @@ class SiteParameters:
     cloud_voxel_m : edge of the voxels that clouds are thinned to; each matcher thins further as it needs.
     near_m : a query is covered if the share `JudgementParameters.mapped` of its last planar scan lies so near
         to a wall of the map. Only covered queries have a right answer.
-    map_length_m, rate_hz, columns, clutter : of the lidar that is simulated in a 3D scan, as in
-        `compare real`.
+    map_length_m, rate_hz, columns, clutter : of the lidar that is simulated in a 3D scan, as those of
+        `compare recordings`.
     """
 
     mapped: float = 0.55
