@@ -12,7 +12,7 @@ from pc2grid.geometry import SE2
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid.simulate.config import LaserConfig
 from pc2grid.simulate.session import EPOCH_NS
-from tests.helpers.field import Change, Outcome, altered, convert, field_log
+from tests.helpers.field import Change, Outcome, altered, convert, field_log, info
 
 FASTEST_M = 0.15
 """No step from scan to scan is longer: robots indoors, five to ten scans a second."""
@@ -200,3 +200,37 @@ def test_a_cloud_that_is_registered_already_is_taken_back_to_the_sensor(tmp_path
     assert made.session is not None
     assert made.session["path_m"] == pytest.approx(4.65, abs=0.05)
     assert made.session["area_m2"] == pytest.approx(40.0, abs=2.0)
+
+
+@pytest.mark.parametrize("left_out", ["", "/odom"])
+def test_scans_by_another_clock_than_the_odometry_are_warned_of(
+    left_out: str, drive: Path, tmp_path: Path
+) -> None:
+    def since_boot(topic: str, message: Any, log_time_ns: int) -> Any:
+        if topic == "/scan":
+            message.header.stamp.sec -= 1_690_000_000
+        return None if topic == left_out else message
+
+    path = altered(drive, tmp_path / "boot.mcap", since_boot)
+    words = f"odometry from {'/tf' if left_out else '/odom'} are 1,690,000,000 s apart and never meet"
+    described, made = info(path), convert(path, tmp_path)
+    assert any(words in warning for warning in described["warnings"])
+    assert described["choice"]["odometry_topic"] is None
+    assert made.warned_of(words)
+    assert made.session is not None and made.session["odometry"]["compared"] == 0
+
+
+def test_odometry_of_other_times_is_warned_of(drive: Path, tmp_path: Path) -> None:
+    def before(topic: str, message: Any, log_time_ns: int) -> Any:
+        late = topic in ("/odom", "/tf") and log_time_ns > EPOCH_NS + 1_000_000_000
+        return None if late or (topic == "/scan" and log_time_ns < EPOCH_NS + 5_000_000_000) else message
+
+    made = convert(altered(drive, tmp_path / "before.mcap", before), tmp_path)
+    assert made.warned_of("no scan has odometry: that from /odom is of other times")
+
+
+def test_scans_since_boot_with_odometry_of_the_day_are_warned_of(tmp_path: Path) -> None:
+    path = field_log("scan_clock_since_boot")
+    words = "the clocks of the scans and of the odometry from /odom are 1,700,001,000 s apart"
+    assert any(words in warning for warning in info(path)["warnings"])
+    assert convert(path, tmp_path, "--duration", "20").warned_of(words)

@@ -26,11 +26,14 @@ class LookAheadParameters:
     """How much of a log is read to find out how to read it; chosen by hand.
 
     tf_ns : log time behind the first scan within which tf must connect the sensor to the base.
+    clocks_ns : scans and odometry whose stamps differ by more, each from the time of its recording, are of
+        two clocks.
     odometry_ns : log time behind the first scan within which odometry in tf must begin.
     scans : number of scans whose headers are read.
     """
 
     tf_ns: int = 60_000_000_000
+    clocks_ns: int = 5_000_000_000
     odometry_ns: int = 5_000_000_000
     scans: int = 5
 
@@ -51,6 +54,7 @@ class Plan:
     together with those of the first. stampless : whether the first scans have stamps of zero, so that the
     time of recording is used instead.
     mounted : None, unless the points of the scans are in a fixed frame already; then the frame of the sensor.
+    period_ns : the longest time between two of the first scans; 0 if there is only one.
     """
 
     choice: Choice
@@ -64,6 +68,7 @@ class Plan:
     further: tuple[tuple[TopicInfo, TopicInfo | None], ...] = ()
     imu: TopicInfo | None = None
     mounted: str | None = None
+    period_ns: int = 0
 
 
 def registered(frame: str) -> FrameError:
@@ -141,6 +146,7 @@ class _Planner:
         self._topics = source.info.topics
         self._reading: Odometry | None = None  # the first one of the odometry's topic
         self._points = False  # whether the scans are clouds, which may be in any frame
+        self._odometry_delay_ns = 0  # from the stamp of the odometry to its recording
 
     def plan(self) -> Plan:
         sensors = self._sensors()
@@ -160,6 +166,7 @@ class _Planner:
         motion = _Motion(odometry, odometry, None, why)
         if in_tf:
             motion = self._motion_in_tf(found, moving, why)
+        motion = self._of_one_clock(motion, first_ns, headers)
         imu = self._imu(found, sensor_frame, sensors, motion)
         return Plan(
             choice=Choice(
@@ -181,6 +188,7 @@ class _Planner:
             further=tuple(zip(sensors.more, sensors.cameras[1:], strict=True)),
             imu=imu.topic,
             mounted=mounted,
+            period_ns=max((b.stamp_ns - a.stamp_ns for a, b in itertools.pairwise(headers)), default=0),
         )
 
     def _mounted(self, sensors: _Sensors, sensor_frame: str, base: str | None) -> str | None:
@@ -304,12 +312,31 @@ class _Planner:
             return False
         return frames.moving(base, frame) and frame.rpartition("/")[2] not in _BASE_FRAMES
 
+    def _of_one_clock(self, motion: _Motion, first_ns: int, headers: list[Header]) -> _Motion:
+        """The odometry, unless its stamps are of another clock than the scans' and nobody asked for it.
+
+        first_ns, headers : of the first scans; the log time of the first one.
+        """
+        stamp_ns = headers[0].stamp_ns if headers else 0
+        apart_ns = (first_ns - stamp_ns if stamp_ns else 0) - self._odometry_delay_ns
+        if motion.name is None or abs(apart_ns) <= LOOK_AHEAD.clocks_ns:
+            return motion
+        self._source.tally.warn(
+            f"the clocks of the scans and of the odometry from {motion.name} are {abs(apart_ns) * 1e-9:,.0f} "
+            "s apart and never meet: that odometry says nothing of the scans; record both by one clock"
+        )
+        if self._config.odometry is not None:
+            return motion
+        return _Motion(None, None, None, f"odometry from {motion.name} is of another clock")
+
     def _first_reading(self, odometry: TopicInfo | None) -> Odometry | None:
         if odometry is None or odometry.type in topics.TF:
             return None
         decode = decoder_for(odometry)
         for message in self._source.messages({odometry.topic}):
             found: Odometry | None = tolerant(decode, message.data, None)
+            if found is not None and found.header.stamp_ns:
+                self._odometry_delay_ns = message.log_time_ns - found.header.stamp_ns
             return found
         return None
 
@@ -334,6 +361,8 @@ class _Planner:
                 size = len(frames.frames)
                 edges = tolerant(decoders[message.channel], message.data, None)
                 frames.add_all(edges, log_time_ns=message.log_time_ns)
+                if odometry_too and edges and edges[-1].header.stamp_ns:
+                    self._odometry_delay_ns = message.log_time_ns - edges[-1].header.stamp_ns
                 if len(frames.frames) > size:
                     base = self._connected_base(sensor_frame, child)
         return base if base is not None else self._base_without_tf(sensor_frame, child)

@@ -67,6 +67,8 @@ class StreamParameters:
 PARAMETERS = StreamParameters()
 _FLOOR_BELOW_M, _FLOOR_SHARE = 0.05, 0.01
 """A sensor sees so much of its points below itself, as far as the floor is not at its own height; by hand."""
+_MOST_PERIODS = 1.1  # that the beams of a laser's scan take; stamps jitter
+_UP = math.cos(math.radians(45.0))  # an axis that points more upwards than this
 
 
 class _Waiting(NamedTuple):
@@ -317,6 +319,12 @@ class _Poses:
         found = self._frames.lookup(base, frame, stamp_ns)
         if found is None:
             raise PointCloudError("tf is unknown at the stamp")
+        if self._images and "optical" not in frame and found[2, 2] > _UP:
+            self._tally.warn(
+                f"the images are in frame {frame}, whose z axis points up, where that of a camera points "
+                "forward (REP-103): x is taken for forward; correct it to the camera's optical frame"
+            )
+            return found @ T_BODY_OPTICAL
         return found
 
 
@@ -377,6 +385,10 @@ class Stream:
             yield from self.take(message)
         yield from self.release_all()
         part.finish(self._plan.scans.topic, self._parameters.max_bad_share)
+        if self._last_read_ns is None and self._plan.choice.odometry_topic is not None:
+            self._source.tally.warn(
+                f"no scan has odometry: that from {self._plan.choice.odometry_topic} is of other times"
+            )
 
     def take(self, message: RawMessage) -> Iterator[Scan]:
         """Take in one message, and yield the scans that need not wait any longer."""
@@ -495,6 +507,7 @@ class Stream:
             self._stamps.check(stamp_ns, log_time_ns, self._waiting.scans)
             T_base_points = self._poses.points(message.header.frame, stamp_ns)
             scan = self._decoder.scan(message, stamp_ns, T_base_points, self._poses.odometry(stamp_ns))
+            scan = self._within_period(scan)
             if self._plan.mounted is not None:
                 scan = self._measured(scan, self._plan.mounted)
             scan = replace(
@@ -521,6 +534,18 @@ class Stream:
         if not len(scan.points_m):
             tally.warn("some scans hold no returns at all")
         yield scan
+
+    def _within_period(self, scan: Scan) -> Scan:
+        """A scan of a laser without the times of its beams, if these last longer than until the next scan."""
+        longest_s, offsets_s = _MOST_PERIODS * self._plan.period_ns * 1e-9, scan.offsets_s
+        if not SENSOR_MODELS[scan.sensor].planar or offsets_s is None or not len(offsets_s) or not longest_s:
+            return scan
+        if np.ptp(offsets_s) <= longest_s:
+            return scan
+        self._source.tally.warn(
+            "time_increment makes scans longer than the time from one to the next: it is ignored"
+        )
+        return replace(scan, offsets_s=None)
 
     def _measured(self, scan: Scan, mounted: str) -> Scan:
         """A scan whose points were in a fixed frame, as one that the sensor with a frame measured.
