@@ -116,18 +116,6 @@ class Health(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Storey:
-    """A floor that a recording reaches.
-
-    group : heights are comparable between storeys of one group; a ride in a lift begins a new one, since it
-        shows no height. height_m : above the first storey of the group.
-    """
-
-    group: int
-    height_m: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RegisteredScan:
     """A scan with its pose in the frame of its session.
 
@@ -619,9 +607,6 @@ class SessionMap:
     odometry : how well odometry agrees with the scans; None if that is not known.
     precision : how exactly its places lie to each other; None if that is not known.
     points : the points of the recording in space; None if they were not asked for, or there are none.
-    floor : name of the floor within its recording; None if the recording does not leave it.
-    floor_height_m : of that floor above the lowest one that the recording reaches before it takes a lift;
-        None if it does not leave its floor, and behind a lift, which shows no height.
 
     >>> import numpy as np
     >>> import pc2grid
@@ -645,8 +630,6 @@ class SessionMap:
     odometry: OdometryCheck | None = None
     precision: Precision | None = None
     points: PointMap | None = None
-    floor: str | None = None
-    floor_height_m: float | None = None
     report: ReadReport = field(default_factory=ReadReport)
 
     def __post_init__(self) -> None:
@@ -704,19 +687,3 @@ def is_part_of(name: str, session: str) -> bool:
     """
     head, mark, number = name.rpartition("#")
     return mark == "#" and head == session and number.isdecimal()
-
-
-def same_recording(name: str, other: str) -> bool:
-    """Whether two sessions are parts of one recording.
-
-    >>> same_recording("monday", "monday#2"), same_recording("monday#3", "monday#2")
-    (True, True)
-    >>> same_recording("monday", "tuesday#2")
-    False
-    """
-
-    def first(part: str) -> str:
-        head, mark, number = part.rpartition("#")
-        return head if mark and number.isdecimal() else part
-
-    return first(name) == first(other)

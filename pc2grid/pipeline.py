@@ -13,7 +13,6 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import Config
 from pc2grid.errors import NoScans
 from pc2grid.estimation.ground_model import is_rolling
-from pc2grid.mapping.floors import floor_heights, floor_names
 from pc2grid.mapping.keyframe_points import KeyframePoints
 from pc2grid.mapping.keyframes import Keyframes
 from pc2grid.mapping.local_maps import CAMERA_LOCAL_MAPS, LOCAL_MAPS
@@ -61,10 +60,10 @@ def follow(
 ) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
     """Each scan with its pose, and its planar scan, as they come.
 
-    The memory needed is that of one local map, however many scans there are. Scans on the way to
-    another floor, and the first one there, count as lost. So do those of a sensor in the hand without
-    odometry as long as few of its last scans fix their poses (`pc2grid.mapping.report.not_held`); their
-    planar scans are empty, since the map that these are cut out of is not to be trusted either.
+    The memory needed is that of one local map, however many scans there are. Those of a sensor in the hand
+    without odometry count as lost as long as few of its last scans fix their poses
+    (`pc2grid.mapping.report.not_held`); their planar scans are empty, since the map that these are cut out
+    of is not to be trusted either.
 
     observer : is warned of that, once, and of a start without a floor in view
         (`pc2grid.estimation.first_floor`). Raises TrackingLost if it is so at the last scan.
@@ -84,10 +83,8 @@ def follow(
         if tracker.carried and scan.T_odom_base is None:
             unaided.append(registered.health)
             fault = not_held(unaided, "the last scans")
-        if tracked.riding or tracked.arrived or fault is not None:
-            # A ride resets the pose: earlier scans do not constrain it.
-            registered = dataclasses.replace(registered, health=Health.LOST)
         if fault is not None:
+            registered = dataclasses.replace(registered, health=Health.LOST)
             planar_scan = planar_scan.emptied()
             if not warned and len(unaided) == HELD_SCANS:
                 warned = True
@@ -164,18 +161,14 @@ def build_maps(
     if not track.with_odometry:
         _check_without_odometry(track, planar, str(log.info.path))
     kept = long_enough(parts)
-    reached = [part.storey for part in kept]
-    floors, heights_m = floor_names(track.storeys, reached), floor_heights(track.storeys, reached)
     read = with_track_warnings(log.report(), track)
     if planar and config.projection.points_voxel_m is not None:
         read = without_points(read)
-    reports = part_reports(read, session, parts, kept, floors, slopes_unseen=planar)
+    reports = part_reports(read, session, parts, kept)
     maps = tuple(
         _session_map(
             part,
             reports[k],
-            floors[k],
-            heights_m[k],
             session=part_name(session, k),
             sensor=sensor,
             config=config,
@@ -189,7 +182,7 @@ def build_maps(
 def _check_without_odometry(track: Track, planar: bool, name: str) -> None:
     """Raise TrackingLost if the scans of a laser, or of a sensor in the hand, do not tell where they are."""
     if planar or track.carried:
-        check_followed(track.outside_rides(), name)
+        check_followed(track.trajectory, name)
     if track.carried:
         fault = not_held(track.trajectory.health, name)
         if fault is not None:
@@ -199,8 +192,6 @@ def _check_without_odometry(track: Track, planar: bool, name: str) -> None:
 def _session_map(
     part: PartMap,
     report: ReadReport,
-    floor: str | None,
-    floor_height_m: float | None,
     *,
     session: str,
     sensor: SensorKind,
@@ -220,8 +211,6 @@ def _session_map(
         odometry=part.odometry,
         precision=part.precision,
         points=part.points,
-        floor=floor,
-        floor_height_m=floor_height_m,
         report=report,
     )
 

@@ -19,7 +19,7 @@ from pc2grid.time_span import TimeSpan
 from signature.cluster import connected
 from signature.config import Config
 from signature.database.protocol import Entry, Label, Provenance
-from signature.sessions import build_sessions, describe_all, digest_of, on_floors, provenance
+from signature.sessions import build_sessions, describe_all, digest_of, provenance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,12 +87,8 @@ def convert(job: Job, observer: Observer = Observer()) -> tuple[Entry, ...]:
         label=job.label,
         observer=observer,
     )
-    maps, origins = on_floors(maps, origin)
     with observer.step("describe"):
-        return tuple(
-            (part, describe_all(part, job.config, observer), made_from)
-            for part, made_from in zip(maps, origins, strict=True)
-        )
+        return tuple((part, describe_all(part, job.config, observer), origin) for part in maps)
 
 
 def here(jobs: Sequence[Job], observer: Observer = Observer()) -> Generator[Outcome, None, None]:

@@ -22,7 +22,7 @@ from signature.database import Label, open_database
 from signature.database.maintenance import exists
 from signature.database.postgres.server import is_url
 from signature.localization.localizer import MapIndex, locate_in, locate_map
-from signature.sessions import add_sessions, build_sessions, on_floors
+from signature.sessions import add_sessions, build_sessions
 
 if TYPE_CHECKING:
     from pc2grid.io.recording import Log
@@ -81,8 +81,7 @@ def convert(
         label=label,
         observer=observer or ProgressBars(),
     )
-    maps, origins = on_floors(maps, origin)
-    add_sessions(database, list(zip(maps, origins, strict=True)), config, keep=add, force=force)
+    add_sessions(database, [(made, origin) for made in maps], config, keep=add, force=force)
     return max(maps, key=lambda part: part.trajectory.length_m)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import platform
 from collections.abc import Sequence
-from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -155,47 +154,6 @@ def build_sessions(
             )
         origin = provenance(path, log.digest(), config, span=span, label=label)
     return maps, origin
-
-
-def on_floors(
-    maps: Sequence[SessionMap], origin: Provenance
-) -> tuple[tuple[SessionMap, ...], tuple[Provenance, ...]]:
-    """The maps of one recording and the provenance of each, whose label names its floor.
-
-    A recording that reaches several floors has names of its own for them (`SessionMap.floor`). The floor of
-    `origin.label` replaces these if it names all, in the order in which they were reached, with commas
-    between: "2,3,2". Otherwise the first map's report says that it is not used.
-
-    >>> import pc2grid, signature
-    >>> sessions, origin = build_sessions("map.yaml", "plan", signature.Config(), label=Label(floor="north"))
-    >>> [each.label.floor for each in on_floors(sessions, origin)[1]]
-    ['north']
-    """
-    own = list(dict.fromkeys(part.floor for part in maps if part.floor is not None))
-    if not own:
-        return tuple(maps), (origin,) * len(maps)
-    label, wanted = origin.label, origin.label.floor
-    given = [] if wanted is None else [word.strip() for word in wanted.split(",")]
-    if wanted is not None and len(given) != len(own):
-        warning = (
-            f"the floor {wanted!r} is not used: the recording reaches {len(own)} floors; name each, in this "
-            f"order, with commas between: {', '.join(own)}"
-        )
-        report = replace(maps[0].report, warnings=(*maps[0].report.warnings, warning))
-        maps, given = (replace(maps[0], report=report), *maps[1:]), []
-    names = dict(zip(own, given or own, strict=True))
-    labels = [
-        label
-        if part.floor is None
-        else replace(
-            label,
-            floor=names[part.floor],
-            told_apart=not given,
-            floor_height_m=part.floor_height_m,
-        )
-        for part in maps
-    ]
-    return tuple(maps), tuple(replace(origin, label=each) for each in labels)
 
 
 def digest_of(path: Path, config: Config) -> str:

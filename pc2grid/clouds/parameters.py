@@ -29,15 +29,6 @@ class CloudParameters:
         strip, such as the foot of a wall, does not determine the tilt.
     step_tilt_rad, step_height_m : largest change of the floor against what was expected.
 
-    Slopes:
-
-    steepest_floor_rad : what rises by more is an obstacle, and no slope that is mapped like level ground
-        (`RideParameters.steep_rad`).
-    floor_noise_m : a point of the floor may be higher by so much, as depths are noisy.
-    floor_gap_m : between two points of a floor along a bearing, at most. A camera with 120 rows, 0.6 m above
-        the floor, has a row every 0.4 m at 5 m.
-    slope_bearings : number of bearings around the sensor in each of which the floor is followed outward.
-
     Normals:
 
     reach_m, reach_per_m : radius of the neighbourhood of a hit, and its growth with the range, since the
@@ -68,11 +59,6 @@ class CloudParameters:
     min_plane_extent_m: float = 0.15
     step_tilt_rad: float = math.radians(3.0)
     step_height_m: float = 0.06
-
-    steepest_floor_rad: float = math.radians(12.0)
-    floor_noise_m: float = 0.02
-    floor_gap_m: float = 0.5
-    slope_bearings: int = 720
 
     reach_m: float = 0.08
     reach_per_m: float = 0.02

@@ -17,7 +17,6 @@ from pc2grid.clouds.ground import Ground
 from pc2grid.clouds.heights import heights_seen
 from pc2grid.clouds.normals import planar_normals
 from pc2grid.clouds.parameters import CLOUD_PARAMETERS, CloudParameters
-from pc2grid.clouds.slope import flatten_slopes
 from pc2grid.config import ProjectionConfig
 from pc2grid.model import SensorKind
 from pc2grid.sensor_model import SENSOR_MODELS
@@ -120,9 +119,8 @@ def project_to_plane(
 
     A bearing is free up to its nearest obstacle. Without an obstacle it is free up to the farthest return
     on the floor or, for a ray that rises to a ceiling or an overhang, up to where the ray leaves the
-    height band. A ramp that a camera sees ahead is floor. Obstacle points of one bearing that are no
-    farther apart than the noise of the `sensor` become one hit at their mean, which is more accurate than
-    each of them.
+    height band. Obstacle points of one bearing that are no farther apart than the noise of the `sensor`
+    become one hit at their mean, which is more accurate than each of them.
     """
     from pc2grid.clouds._kernels import scan_bearings
 
@@ -134,8 +132,6 @@ def project_to_plane(
         cell_m = 0.5 * config.resolution_m  # a planar laser has few beams: nearly all of them are kept
     else:
         plane, band = np.array([*ground.normal, ground.offset_m]), (config.band_min_m, config.band_max_m)
-        if model.narrow:
-            points = flatten_slopes(points, origin, ground, band, parameters)
         cell_m = config.resolution_m
     # Two standard deviations of the noise on either side of the mean.
     depths = (cell_m, 4.0 * model.noise_per_m2)

@@ -66,11 +66,6 @@ class CarriedSensor:
         self._thinned = ThinnedScan(np.empty((0, 3)), np.empty(0))  # the scan taken last
 
     @property
-    def ground(self) -> None:
-        """The floor in the base frame changes with every step."""
-        return None
-
-    @property
     def map(self) -> SpaceMap | None:
         """The local map in space; None before the first scan and after `restart`."""
         return self._map

@@ -14,7 +14,6 @@ import numpy as np
 
 from pc2grid.arrays import F32, F64
 from pc2grid.clouds.depth_limit import DepthLimit
-from pc2grid.clouds.ground import Ground
 from pc2grid.clouds.planar_scan import PlanarScan, project_to_plane
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.estimation.belief import KERNEL, PLANAR, Belief
@@ -34,10 +33,7 @@ from pc2grid.sensor_model import SENSOR_MODELS
 
 
 class SensorOnWheels:
-    """Places the scans of a sensor whose base stands on the floor.
-
-    ground : the floor in the base frame; None for a planar laser.
-    """
+    """Places the scans of a sensor whose base stands on the floor."""
 
     free = PLANAR
 
@@ -57,11 +53,6 @@ class SensorOnWheels:
         self._planar_scan: PlanarScan
         self._registered, self._unaided = SE2(), True
         self._latest: deque[tuple[PlanarScan, SE2]] = deque(maxlen=parameters.followed)
-
-    @property
-    def ground(self) -> Ground | None:
-        """The floor in the base frame."""
-        return self._floor.ground
 
     def start(self, scan: Scan, points_m: F32, at: SE2) -> F64:
         """Begin with a scan whose base is at a place of the session frame; returns its pose (4, 4),

@@ -16,7 +16,6 @@ from typing import Protocol
 import numpy as np
 
 from pc2grid.arrays import F32, F64
-from pc2grid.clouds.ground import Ground
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.estimation.belief import KERNEL, Belief
 from pc2grid.estimation.manifold import steps
@@ -56,10 +55,6 @@ class PlacingSensor(Protocol):
     """
 
     free: tuple[int, ...]
-
-    @property
-    def ground(self) -> Ground | None:
-        """The floor in the base frame; None where that changes or is not seen."""
 
     def start(self, scan: Scan, points_m: F32, at: SE2) -> F64:
         """Begin with a scan whose base is at a place of the session frame; returns its pose (4, 4),

@@ -28,10 +28,9 @@ from pc2grid.estimation.on_wheels import SensorOnWheels
 from pc2grid.estimation.overruled import Disagreement
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.estimation.placing import Placed, Placer, PlacingSensor
-from pc2grid.estimation.rides import Ride, RideWatch
 from pc2grid.estimation.smoother import IN_THE_HAND, SMOOTHER, Evidence, Smoother
 from pc2grid.geometry import SE2, invert_pose
-from pc2grid.model import Health, RegisteredScan, Scan, Storey
+from pc2grid.model import Health, RegisteredScan, Scan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,8 +42,6 @@ class Tracked:
     keyframe : whether the robot had moved enough for the scan to become part of the local map.
     restart : the first keyframe after tracking was lost: its pose relative to those before is unknown.
     disagreement : of odometry with the pose; None for a lost scan, and where there is nothing to compare.
-    riding : on the way to another floor: the scan belongs to none, see `Ride`. arrived : the first scan after
-    a ride to another floor. storey : number of the floor, see `Tracker.storeys`.
     """
 
     registered: RegisteredScan
@@ -52,9 +49,6 @@ class Tracked:
     keyframe: bool
     restart: bool = False
     disagreement: Disagreement | None = None
-    riding: bool = False
-    arrived: bool = False
-    storey: int = 0
 
 
 class Tracker:
@@ -74,9 +68,8 @@ class Tracker:
         self._parameters = parameters
         self._first: Scan | None = None
         self._count = 0  # scans since the first one
-        self._last: tuple[Scan, F64] | None = None  # with its final pose T_session_base
+        self._last: Scan | None = None
         self._odometer = Odometer(parameters=parameters)
-        self._rides = RideWatch()
         self._keyframe: SE2 | None = None  # where the last one was
         self._restarted = False  # no keyframe has been reported since tracking started again
         # These three depend on how the sensor is carried; `start` makes them from the first scan.
@@ -85,13 +78,8 @@ class Tracker:
         self._health = HealthJudge(parameters)
 
     @property
-    def storeys(self) -> tuple[Storey, ...]:
-        """The floors so far, in the order in which they were first reached."""
-        return tuple(self._rides.storeys)
-
-    @property
     def carried(self) -> bool:
-        """Whether the sensor is in the hand, so that tilts and heights say nothing of a slope."""
+        """Whether the sensor is in the hand."""
         return self._sensor.free == SPATIAL
 
     def start(self, scan: Scan) -> Tracked:
@@ -111,14 +99,13 @@ class Tracker:
         pose = self._sensor.start(scan, points, at)
         self._smoother = Smoother(self._sensor.free, SMOOTHER if rolling else IN_THE_HAND)
         self._smoother.start(self._flat(pose), self._reading(scan))
-        return self._finish(scan, points, pose, Health.FINE, np.eye(4))
+        return self._finish(scan, points, pose, Health.FINE)
 
     def track(self, scan: Scan) -> Tracked:
         """Track the next scan; stamps must increase."""
         if self._last is None:
             return self.start(scan)
-        last, last_pose = self._last
-        seconds = (scan.stamp_ns - last.stamp_ns) * 1e-9
+        seconds = (scan.stamp_ns - self._last.stamp_ns) * 1e-9
         reading, reported = self._reading(scan), self._odometer.reported(scan)
         continues = self._odometer.continues(scan, seconds)
         # 1. What is expected: by odometry, or that the motion goes on. What is not plausible comes last.
@@ -140,8 +127,7 @@ class Tracker:
         bridged = placed.motion is not None or (reading is not None and continues)
         health = self._health.judge(placed, bridged=bridged)
         pose = self._sensor.levelled(estimate.pose)
-        travelled = invert_pose(last_pose) @ pose if reported is None or not continues else reported
-        tracked = self._finish(scan, points, pose, health, travelled)
+        tracked = self._finish(scan, points, pose, health)
         if self._health.gives_up:
             self._restart()
         return tracked
@@ -153,31 +139,20 @@ class Tracker:
         self._smoother.start(self._flat(placed.pose), evidence.T_odom_base)
         return self._smoother.belief
 
-    def _finish(self, scan: Scan, points: F32, pose: F64, health: Health, travelled: F64) -> Tracked:
-        """Extend the maps by a scan if it is worth it, and remember its final pose.
-
-        travelled : (4, 4) motion since the scan before, by the wheels where they are known: tracking in the
-        plane errs on stairs.
-        """
+    def _finish(self, scan: Scan, points: F32, pose: F64, health: Health) -> Tracked:
+        """Extend the maps by a scan if it is worth it, and remember its final pose."""
         lost = health is Health.LOST
         planar_scan = self._sensor.cut(scan, points, pose, lost=lost)
-        ride = Ride()
-        if not self.carried:  # a hand tilts as it likes
-            forward_m = float(travelled[0, 3])
-            ride = self._rides.observe(scan, points, planar_scan, pose, forward_m, self._sensor.ground)
-        if ride.arrived:
-            self._restart()
-        extended = not lost and len(planar_scan.hits_m) > 0 and self._is_due(pose)
-        if extended:
+        keyframe = not lost and len(planar_scan.hits_m) > 0 and self._is_due(pose)
+        if keyframe:
             self._keyframe = SE2.from_matrix(pose)
             self._sensor.extend(pose)
-        keyframe = extended and not ride.riding
         restart = keyframe and self._restarted
         self._restarted &= not keyframe
         found = None if lost else self._odometer.disagreement(scan, pose)
         if health is Health.FINE and found is not None and found.overrules:
             health = Health.OVERRULED
-        self._last = scan, pose
+        self._last = scan
         self._odometer.remember(scan, pose)
         deskewed = dataclasses.replace(scan, points_m=points, offsets_s=None)
         return Tracked(
@@ -186,9 +161,6 @@ class Tracker:
             keyframe=keyframe,
             restart=restart,
             disagreement=found,
-            riding=ride.riding,
-            arrived=ride.arrived,
-            storey=self._rides.storey,
         )
 
     def _is_due(self, pose: F64) -> bool:
@@ -216,7 +188,7 @@ class Tracker:
     def _turn(self, scan: Scan) -> F64 | None:
         """The turn (4, 4) of a sensor in the hand since the last scan, by its IMU; None if that is not known,
         and beside odometry."""
-        before = None if self._last is None else self._last[0].T_level_base
+        before = None if self._last is None else self._last.T_level_base
         unaided = self.carried and scan.T_odom_base is None
         if not unaided or before is None or scan.T_level_base is None:
             return None

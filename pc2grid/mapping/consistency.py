@@ -106,29 +106,23 @@ def consistency_warning(
     consistency: Consistency,
     trajectory: Trajectory,
     *,
-    slopes_unseen: bool = False,
     with_odometry: bool = False,
 ) -> str | None:
     """One sentence that says where a map is bent and what to do; None if it is not bent.
 
-    slopes_unseen : the sensor shows no slope, so stairs or a ramp may be what bends the map. with_odometry :
-    the recording has odometry, so that it need not be advised.
+    with_odometry : the recording has odometry, so that it need not be advised.
     """
     if not consistency.bent or not consistency.stretches:
         return None
     longest = consistency.stretches[0]
     start_ns = int(trajectory.stamps_ns[0])
     from_s, to_s = ((stamp - start_ns) * 1e-9 for stamp in (longest.from_ns, longest.to_ns))
-    slope = (
-        "; if the robot was on stairs or a ramp there, which a 2D laser does not show, convert each floor by "
-        "itself, with --floor"
-    )
     return (
         f"the map contradicts itself along {consistency.contradicted:.0%} of the travel and is probably "
         f"bent: near x {longest.x_m:.1f}, y {longest.y_m:.1f} m, {from_s:.0f} to {to_s:.0f} s after the "
         "first scan, walls stand on ground that other scans saw free; look there in the report, and record "
         f"that part again{'' if with_odometry else ' with odometry'}, or leave it out with --start and "
-        "--duration" + (slope if slopes_unseen else "")
+        "--duration"
     )
 
 

@@ -77,18 +77,14 @@ class LoopCloser:
         self._travelled_m = array("d")  # at each local map; a lost part counts as `lost_m`
         self._drift_m = 0.0  # travel since the pose was last certain
 
-    def extend(self, keyframe: Keyframe, storey: int = 0) -> None:
-        """Take the keyframe that was appended last; every few metres this completes a local map.
-
-        storey : number of the floor; loops are closed only within a floor, however alike two floors look. It
-        changes only with a keyframe that restarts.
-        """
+    def extend(self, keyframe: Keyframe) -> None:
+        """Take the keyframe that was appended last; every few metres this completes a local map."""
         if len(self._keyframes):
             step = self._keyframes.last_pose().inverse() @ keyframe.T_session_base
             self._travel_m += math.hypot(step.x, step.y) + self._parameters.turn_m_per_rad * abs(step.yaw)
             if self._travel_m > self._parameters.travel_m or keyframe.restart:
                 self._complete_local_map()
-        self._keyframes.append(keyframe, storey)
+        self._keyframes.append(keyframe)
 
     def finish(self) -> SettledKeyframes:
         """The settled poses; without a loop and without walls they are the tracked ones."""
@@ -163,11 +159,10 @@ class LoopCloser:
     def _overlaps(self, newest: int) -> Iterator[Edge]:
         """Verified overlaps of the newest local map with older ones, near its tracked pose."""
         window_m, window_rad = self._parameters.window(self._drift_m)
-        nodes, storey = self._graph.nodes, self._stretches.storey
+        nodes = self._graph.nodes
         # The local map before the newest is left out: tracking matched both against the same walls.
         before = nodes[: max(newest - 1, 0), :2]
         distance_m = np.hypot(*(before - nodes[newest, :2]).T)
-        distance_m[[storey(k) != storey(newest) for k in range(len(before))]] = np.inf
         near_m = self._parameters.near_m + window_m
         for older in spread_over_visits(distance_m, near_m, self._parameters.compared):
             edge = self._compare(older, newest, window_m, window_rad)

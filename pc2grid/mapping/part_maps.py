@@ -23,7 +23,7 @@ from pc2grid.model import Consistency, Loop, OccupancyGrid, OdometryCheck, Point
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class PartMap:
-    """The map of a part of a session; storey : number of its floor."""
+    """The map of a part of a session."""
 
     grid: OccupancyGrid
     trajectory: Trajectory
@@ -32,7 +32,6 @@ class PartMap:
     odometry: OdometryCheck
     precision: Precision
     points: PointMap | None = None
-    storey: int = 0
 
 
 def draw_parts(
@@ -41,16 +40,13 @@ def draw_parts(
     closed: SettledKeyframes,
     projection: ProjectionConfig,
 ) -> list[PartMap]:
-    """The map of each part of a session in a frame of its own, compared with its scans.
-
-    The scans of a ride are in no part.
-    """
+    """The map of each part of a session in a frame of its own, compared with its scans."""
     tracked = track.trajectory
     part, T_part_base = _settled(tracked, closed)
     everywhere = dataclasses.replace(tracked, T_session_base=T_part_base)
     drawn = []
     for number in range(int(part.max(initial=0)) + 1):
-        scans = np.flatnonzero((part == number) & ~track.riding)
+        scans = np.flatnonzero(part == number)
         own = [k for k, other in enumerate(closed.parts.tolist()) if other == number]
         poses = [SE2.from_matrix(T_part_base[closed.scans[k]]) for k in own]
         grid = grid_of(zip((keyframes[k] for k in own), poses, strict=True), projection)
@@ -69,7 +65,6 @@ def draw_parts(
                 precision=precision_of(
                     trajectory, np.searchsorted(scans, anchor_scans), closed.sigma_m[anchored]
                 ),
-                storey=int(track.storey[closed.scans[own[0]]]) if own else 0,
             )
         )
     return drawn

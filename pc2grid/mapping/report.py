@@ -7,9 +7,8 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
+from pc2grid.arrays import F64
 from pc2grid.errors import TrackingLost
-from pc2grid.estimation.overruled import stalls
-from pc2grid.estimation.rides import RIDES
 from pc2grid.mapping.consistency import consistency_warning
 from pc2grid.mapping.odometry_warnings import odometry_warnings
 from pc2grid.mapping.part_maps import PartMap
@@ -30,6 +29,8 @@ HELD_SCANS = 100
 """While a recording is followed, so many of the last scans are judged by that share; chosen by hand."""
 _WARN_DEGENERATE = 0.1
 """Share of degenerate scans above which the report says so; chosen by hand."""
+_STOREY_M = 2.0
+"""A hand lifts a sensor by less than this, and storeys are at least 2.4 m high; chosen by hand."""
 
 
 def check_followed(trajectory: Trajectory, name: str) -> None:
@@ -67,9 +68,6 @@ def part_reports(
     session: str,
     parts: Sequence[PartMap],
     kept: Sequence[PartMap],
-    floors: Sequence[str | None],
-    *,
-    slopes_unseen: bool,
 ) -> list[ReadReport]:
     """The report of each part that is kept, with the warnings of registration and of its map.
 
@@ -78,7 +76,7 @@ def part_reports(
     elsewhere = sum(len(part.trajectory) for part in kept[1:])
     warnings, skipped = list(report.warnings), dict(report.scans_skipped)
     if len(parts) > 1:
-        warnings.append(division_warning(session, parts, kept, floors))
+        warnings.append(division_warning(session, parts, kept))
     left_out = sum(len(part.trajectory) for part in parts) - elsewhere - len(kept[0].trajectory)
     if left_out:
         skipped["in a part too short to be of use"] = left_out
@@ -89,15 +87,10 @@ def part_reports(
         warnings=tuple(warnings),
     )
     others = [ReadReport(scans_read=len(part.trajectory)) for part in kept[1:]]
-    return [
-        _with_warnings(r, part, slopes_unseen=slopes_unseen)
-        for r, part in zip([first, *others], kept, strict=True)
-    ]
+    return [_with_warnings(r, part) for r, part in zip([first, *others], kept, strict=True)]
 
 
-def division_warning(
-    session: str, parts: Sequence[PartMap], kept: Sequence[PartMap], floors: Sequence[str | None]
-) -> str:
+def division_warning(session: str, parts: Sequence[PartMap], kept: Sequence[PartMap]) -> str:
     """One sentence that says into what a recording was divided, where, and what to do."""
     start_ns = min(int(part.trajectory.stamps_ns[0]) for part in parts if len(part.trajectory))
 
@@ -105,9 +98,7 @@ def division_warning(
         return (int(part.trajectory.stamps_ns[0]) - start_ns) * 1e-9
 
     named = ", ".join(
-        f"{part_name(session, k)} "
-        + (f"(floor {floors[k]}) " if floors[k] is not None else "")
-        + f"from {begin_s(part):.0f} s ({part.trajectory.length_m:.0f} m)"
+        f"{part_name(session, k)} from {begin_s(part):.0f} s ({part.trajectory.length_m:.0f} m)"
         for k, part in enumerate(kept)
     )
     advice = "come back to known places more often, to keep them together"
@@ -115,19 +106,18 @@ def division_warning(
         advice = f"record with odometry, or {advice}"
     short = len(parts) - len(kept)
     dropped = f"; {short} shorter than {PARTS.least_travel_m:.0f} m left out" if short else ""
-    if len({part.storey for part in parts}) == len(parts):
-        return f"the recording goes over {len(parts)} floors: {named}{dropped}"
     return (
         f"the recording falls into {len(parts)} parts whose places relative to each other are not known, "
-        "because tracking was lost, stairs or a lift lay between, or the map would contradict itself: "
+        "because tracking was lost, or the map would contradict itself: "
         f"{named}{dropped}; {advice}"
     )
 
 
 def with_track_warnings(report: ReadReport, track: Track) -> ReadReport:
-    """The report of a recording, with what was assumed, and what is said of rides and of odometry."""
+    """The report of a recording, with what was assumed, and what is said of odometry and of heights."""
     of_odometry = odometry_warnings(track.trajectory, track.readings)
-    warnings = (*report.warnings, *track.assumptions, *ride_warnings(track), *of_odometry)
+    of_heights = height_warnings(track.heights_m, track.trajectory)
+    warnings = (*report.warnings, *track.assumptions, *of_heights, *of_odometry)
     return dataclasses.replace(report, warnings=warnings)
 
 
@@ -137,44 +127,22 @@ def without_points(report: ReadReport) -> ReadReport:
     return dataclasses.replace(report, warnings=(*report.warnings, no_points))
 
 
-def ride_warnings(track: Track) -> list[str]:
-    """What may have been a ride to another floor that did not divide the recording, or a slope that was not
-    noticed: where, and what to do."""
-    if not len(track.trajectory):
+def height_warnings(heights_m: F64, trajectory: Trajectory) -> list[str]:
+    """At most one sentence: that scans are as high (N,) above others as another floor is, and what to do."""
+    known = np.flatnonzero(np.isfinite(heights_m))
+    rise_m = heights_m[known] - heights_m[known[:1]]
+    away = known[np.abs(rise_m) > _STOREY_M]
+    if not len(away):
         return []
-    stamps_ns, heights_m = track.trajectory.stamps_ns, track.trajectory.T_session_base[:, 2, 3]
-    advice = "the map shows two floors as one: convert each by itself, with --start, --duration and --floor"
-    warnings = []
-    if len(track.riding) and track.riding[-1]:
-        last = int(np.flatnonzero(~track.riding)[-1]) if not track.riding.all() else -1
-        begin_s = (stamps_ns[last + 1] - stamps_ns[0]) * 1e-9
-        lost = len(track.riding) - 1 - last
-        warnings.append(
-            f"from {begin_s:.0f} s after the first scan on, the robot is on a slope that leads to another "
-            f"floor, or less than {RIDES.settled_m:.0f} m behind it: these {lost} scans are in no map; "
-            "record more of that floor"
-        )
-    for stall in stalls(stamps_ns.tolist(), track.disagreements):
-        from_s, to_s = ((stamp_ns - stamps_ns[0]) * 1e-9 for stamp_ns in (stall.from_ns, stall.to_ns))
-        warnings.append(
-            f"from {from_s:.0f} to {to_s:.0f} s after the first scan odometry reports "
-            f"{stall.reported_m:.1f} m of travel, and the scans show {stall.moved_m:.1f} m: unless the "
-            "wheels spun, the robot was on a slope that was not noticed, and the map is wrong there; leave "
-            "that part out with --start and --duration"
-        )
-    away = np.flatnonzero(np.abs(heights_m - heights_m[0]) > RIDES.storey_m)
-    if track.carried and len(away):
-        begin_s = (stamps_ns[away[0]] - stamps_ns[0]) * 1e-9
-        farthest_m = float(max(heights_m - heights_m[0], key=abs))
-        where = f"{abs(farthest_m):.1f} m {'above' if farthest_m > 0 else 'below'}"
-        warnings.append(
-            f"the sensor in the hand is up to {where} its first height, and more than {RIDES.storey_m:.1f} m "
-            f"from {begin_s:.0f} s after the first scan on; if that was by stairs, {advice}"
-        )
-    return warnings
+    begin_s = (trajectory.stamps_ns[away[0]] - trajectory.stamps_ns[0]) * 1e-9
+    return [
+        f"the height changes by {np.ptp(rise_m):.1f} m, and from {begin_s:.0f} s after the first scan on by "
+        f"more than {_STOREY_M:.1f} m: a map is one floor, and this one shows several as one; cut the "
+        "recording there, with --start and --duration, and name each floor with --floor"
+    ]
 
 
-def _with_warnings(report: ReadReport, part: PartMap, *, slopes_unseen: bool) -> ReadReport:
+def _with_warnings(report: ReadReport, part: PartMap) -> ReadReport:
     """The report of a part with the warnings of registration and of the map added."""
     trajectory = part.trajectory
     lost = sum(h is Health.LOST for h in trajectory.health)
@@ -193,12 +161,7 @@ def _with_warnings(report: ReadReport, part: PartMap, *, slopes_unseen: bool) ->
             f"{weak} of {total} scans did not fix the pose in every direction: there it rests on odometry "
             "or on the motion before"
         )
-    bent = consistency_warning(
-        part.consistency,
-        trajectory,
-        slopes_unseen=slopes_unseen,
-        with_odometry=part.odometry.compared > 0,
-    )
+    bent = consistency_warning(part.consistency, trajectory, with_odometry=part.odometry.compared > 0)
     if bent is not None:
         warnings.append(bent)
     uncertain = precision_warning(part.precision, trajectory)

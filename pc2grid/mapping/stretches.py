@@ -70,13 +70,7 @@ class Stretches:
         if self._begin >= stop:
             return False
         begin = max(stop - self._parameters.stretch_maps, 0)
-        while self.storey(begin) != self.storey(stop - 1):
-            begin += 1
         return self._ask(range(begin, stop))
-
-    def storey(self, number: int) -> int:
-        """The floor of a local map."""
-        return self._keyframes.storeys[self._local_maps.runs[number].start]
 
     def latest(self) -> range:
         """The local maps of the stretch that was asked for last."""
@@ -120,7 +114,6 @@ class Stretches:
                     probability=found.probability,
                 )
                 for found in self._recognizer.recognize(self._draw(index, numbers))
-                if self.storey(self._asked[found.older].start) == self.storey(numbers.start)
             ]
         )
         return True

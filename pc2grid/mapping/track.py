@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pc2grid.arrays import F64, I64
 from pc2grid.config import ProjectionConfig
@@ -18,7 +17,7 @@ from pc2grid.mapping.keyframe_points import KeyframePoints
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.loop_closure import LoopCloser
 from pc2grid.mapping.unseen_hits import UnseenHits
-from pc2grid.model import Health, Scan, Storey, Trajectory
+from pc2grid.model import Health, Scan, Trajectory
 from pc2grid.sensor_model import SENSOR_MODELS
 
 if TYPE_CHECKING:
@@ -33,18 +32,13 @@ class Track:
     """The results of tracking for all scans of a session.
 
     trajectory : before loops are closed. disagreements : of odometry, at each scan. readings : (N, 4, 4) of
-    odometry, NaN where there is none. riding : (N,) scans on a
-    ride from floor to floor. storey : (N,) number of the floor of each in `storeys`. carried : see
-    `Tracker`. assumptions : what was
+    odometry, NaN where there is none. carried : see `Tracker`. assumptions : what was
     assumed since nothing in the recording shows it, as sentences for the user.
     """
 
     trajectory: Trajectory
     disagreements: Sequence[Disagreement | None]
     readings: F64
-    riding: NDArray[np.bool_]
-    storey: I64
-    storeys: tuple[Storey, ...]
     carried: bool = False
     assumptions: tuple[str, ...] = ()
 
@@ -53,9 +47,11 @@ class Track:
         """Whether any scan has an odometry pose."""
         return bool(np.isfinite(self.readings).any())
 
-    def outside_rides(self) -> Trajectory:
-        """The scans that are on no ride."""
-        return chosen(self.trajectory, np.flatnonzero(~self.riding))
+    @property
+    def heights_m(self) -> F64:
+        """(N,) by odometry, as a base on wheels is tracked in the plane; without odometry as tracked."""
+        poses = self.readings if self.with_odometry else self.trajectory.T_session_base
+        return poses[:, 2, 3]
 
 
 def chosen(trajectory: Trajectory, scans: I64) -> Trajectory:
@@ -68,13 +64,12 @@ def chosen(trajectory: Trajectory, scans: I64) -> Trajectory:
 
 
 class TrackRecord:
-    """Collects a track scan by scan; of a scan it keeps the pose, the health and the floor."""
+    """Collects a track scan by scan; of a scan it keeps the pose, the reading of odometry and the health."""
 
     def __init__(self) -> None:
         self._stamps, self._poses, self._readings = array("q"), array("d"), array("d")
         self._health: list[Health] = []
         self._disagreements: list[Disagreement | None] = []
-        self._riding, self._storeys = array("b"), array("q")
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -85,8 +80,6 @@ class TrackRecord:
         self._poses.extend(tracked.registered.T_session_base.ravel())
         self._health.append(tracked.registered.health)
         self._disagreements.append(tracked.disagreement)
-        self._riding.append(tracked.riding)
-        self._storeys.append(tracked.storey)
         self._readings.extend((_NO_READING if scan.T_odom_base is None else scan.T_odom_base).ravel())
 
     def track(self, tracker: Tracker) -> Track:
@@ -100,9 +93,6 @@ class TrackRecord:
             trajectory=trajectory,
             disagreements=self._disagreements,
             readings=np.frombuffer(self._readings).reshape(-1, 4, 4),
-            riding=np.array(self._riding, dtype=bool),
-            storey=np.array(self._storeys, dtype=np.int64),
-            storeys=tracker.storeys,
             carried=tracker.carried,
         )
 
@@ -128,7 +118,6 @@ class KeyframeSelection:
         self._points = points
         self._unseen_hits = UnseenHits(projection.max_range_m, projection.resolution_m)
         self._latest: Keyframe | None = None
-        self._storey = 0  # of the latest keyframe
 
     def add(self, tracked: Tracked, *, index: int) -> None:
         """The next scan, number `index` of the session."""
@@ -136,12 +125,11 @@ class KeyframeSelection:
         if tracked.keyframe:
             self.finish()
             self._latest = Keyframe(index, tracked.planar_scan, pose, tracked.restart)
-            self._storey = tracked.storey
             self._unseen_hits.restart(tracked.planar_scan, pose)
             scan = tracked.registered.scan
             if self._points is not None and not SENSOR_MODELS[scan.sensor].planar:
                 self._points.append(index, scan)
-        elif self._latest is not None and not tracked.riding and tracked.registered.health is not Health.LOST:
+        elif self._latest is not None and tracked.registered.health is not Health.LOST:
             self._unseen_hits.add(tracked.planar_scan, pose)
 
     def finish(self) -> None:
@@ -149,4 +137,4 @@ class KeyframeSelection:
         if self._latest is not None:
             complete = dataclasses.replace(self._latest, unseen_hits_m=self._unseen_hits.take())
             self._keyframes.append(complete)
-            self._closer.extend(self._latest, self._storey)
+            self._closer.extend(self._latest)

@@ -1,4 +1,4 @@
-"""What loop closure keeps of each keyframe: its scan, its floor and its tracked pose."""
+"""What loop closure keeps of each keyframe: its scan and its tracked pose."""
 
 from __future__ import annotations
 
@@ -14,26 +14,24 @@ from pc2grid.mapping.keyframes import Keyframe
 class TrackedKeyframes:
     """Keyframes as they were tracked, before loops are closed; a sequence that only grows.
 
-    scans : number of the scan of each. storeys : number of its floor.
+    scans : number of the scan of each.
     restarts : keyframes whose pose relative to the one before is unknown: tracking was lost, or the session
         was cut.
     """
 
     def __init__(self) -> None:
         self.scans = array("q")
-        self.storeys = array("q")
         self.restarts: set[int] = set()
         self._poses = array("d")  # x, y, yaw of one after the other
 
     def __len__(self) -> int:
         return len(self.scans)
 
-    def append(self, keyframe: Keyframe, storey: int) -> None:
+    def append(self, keyframe: Keyframe) -> None:
         """Add one."""
         if keyframe.restart:
             self.restarts.add(len(self))
         self.scans.append(keyframe.index)
-        self.storeys.append(storey)
         pose = keyframe.T_session_base
         self._poses.extend((pose.x, pose.y, pose.yaw))
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
-from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.io.atomic import refuse_existing
 from pc2grid.io.export.mcap import LogWriter
@@ -17,10 +15,8 @@ from pc2grid.io.trajectory import write_tum
 from pc2grid.model import OccupancyGrid, SensorKind, Trajectory
 from pc2grid.simulate.building import Building
 from pc2grid.simulate.config import DepthConfig, LaserConfig, SimulationConfig
-from pc2grid.simulate.imu import SimulatedImu
-from pc2grid.simulate.odometry import SimulatedOdometry
-from pc2grid.simulate.sensors import Sensor, depth_intrinsics, laser_angle_min, laser_time_increment
-from pc2grid.simulate.session import EPOCH_NS, Reading, prepare_session
+from pc2grid.simulate.sensors import depth_intrinsics, laser_angle_min, laser_time_increment
+from pc2grid.simulate.session import EPOCH_NS, Reading, Session, prepare_session
 
 BASE_FRAME, ODOM_FRAME = "base_link", "odom"
 TOPICS: dict[SensorKind, str] = {
@@ -48,59 +44,6 @@ class SimulatedSession:
     duration_s: float
     length_m: float
     clutter: int
-
-
-class Motion(Protocol):
-    """A drive, of which only time and length are recorded as such."""
-
-    @property
-    def duration_s(self) -> float:
-        """From start to end."""
-
-    @property
-    def length_m(self) -> float:
-        """In the plan."""
-
-
-class Recordable(Protocol):
-    """A session as it is recorded: what determines the readings, and the readings."""
-
-    @property
-    def sensor(self) -> Sensor:
-        """What the robot carries."""
-
-    @property
-    def clutter(self) -> Sequence[object]:
-        """The movable objects that could be placed."""
-
-    @property
-    def drive(self) -> Motion:
-        """The true motion."""
-
-    @property
-    def odometry(self) -> SimulatedOdometry | None:
-        """What the wheels measure."""
-
-    @property
-    def imu(self) -> SimulatedImu | None:
-        """What an IMU measures."""
-
-    @property
-    def config(self) -> SimulationConfig:
-        """The settings."""
-
-    @property
-    def scan_count(self) -> int:
-        """Whole scans of the drive."""
-
-    def readings(self) -> Iterator[Reading]:
-        """The scans."""
-
-    def pose(self, time_s: float) -> F64:
-        """The true T_map_base (4, 4)."""
-
-    def in_space(self, pose: SE2, time_s: float) -> F64:
-        """A pose on the floor as that of the base (4, 4)."""
 
 
 def simulate_session(
@@ -141,7 +84,7 @@ def refuse_existing_recording(out: str | Path, force: bool) -> None:
 
 def record_session(
     out: str | Path,
-    session: Recordable,
+    session: Session,
     *,
     progress: Callable[[float], None] | None = None,
     force: bool = False,
@@ -180,7 +123,7 @@ def record_session(
     )
 
 
-def _write_odometry(log: LogWriter, session: Recordable, sent: int, until_s: float) -> int:
+def _write_odometry(log: LogWriter, session: Session, sent: int, until_s: float) -> int:
     """Write the odometry up to a time, from message `sent` on; returns how many messages are written then."""
     odometry = session.odometry
     if odometry is None:
@@ -194,7 +137,7 @@ def _write_odometry(log: LogWriter, session: Recordable, sent: int, until_s: flo
     return end
 
 
-def _write_reading(log: LogWriter, session: Recordable, reading: Reading) -> None:
+def _write_reading(log: LogWriter, session: Session, reading: Reading) -> None:
     """Write one scan as the driver of its sensor publishes it."""
     sensor, values, stamp_ns = session.sensor, reading.values_m, reading.stamp_ns
     topic, config = TOPICS[sensor.kind], sensor.config

@@ -261,27 +261,3 @@ def plan_route(
     lengths = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     last = min(int(np.searchsorted(lengths, length_m)), len(points) - 1)
     return Route(points[: last + 1], turns[turns < last])
-
-
-def plan_way(
-    grid: OccupancyGrid,
-    blocked: NDArray[np.bool_],
-    start_m: tuple[float, float],
-    end_m: tuple[float, float],
-    least_m: float,
-) -> F64:
-    """Points (N, 2) of a short way between two places, `least_m` away from everything that is not free.
-
-    Raises ConfigError if there is no way.
-    """
-    clearance = clearance_m(grid.free & ~blocked, grid.resolution_m)
-    lattice = _lattice(grid, clearance, least_m, start_m)
-    first, last = (int(np.argmin(np.linalg.norm(lattice.points_m - at, axis=1))) for at in (start_m, end_m))
-    away, before = dijkstra(lattice.graph, directed=False, indices=first, return_predecessors=True)
-    if not np.isfinite(away[last]):
-        raise ConfigError(f"there is no way from {start_m} to {end_m}", hint="use less clutter")
-    path = [last]
-    while path[-1] != first:
-        path.append(int(before[path[-1]]))
-    line = np.concatenate(([start_m], lattice.points_m[path[::-1]], [end_m]))
-    return _smooth(_resample(line), grid, clearance, least_m)

@@ -139,51 +139,35 @@ class Session:
 
     def scan(self, reading: Reading) -> Scan:
         """A reading as the scan that `pc2grid.io` decodes from the recording, but for what an IMU says."""
-        return scan_of(reading, self.sensor, self.odometry, self.in_space)
+        T = self.sensor.T_base_sensor
+        kept = np.isfinite(reading.values_m)
+        points = (reading.values_m[kept, None] * self.sensor.directions[kept]).astype(np.float32)
+        moving = bool(self.sensor.offsets_s.any())
+        offsets = self.sensor.offsets_s[kept].astype(np.float32) if moving else None
+        motion = None
+        if offsets is not None and len(offsets):
+            ends_s = (reading.time_s + float(s) for s in (offsets.min(), offsets.max()))
+            first, last = (self._odometry_at(time_s) for time_s in ends_s)
+            motion = None if first is None or last is None else invert_pose(first) @ last
+        return Scan(
+            stamp_ns=reading.stamp_ns,
+            points_m=(points @ T[:3, :3].T + T[:3, 3]).astype(np.float32),
+            T_base_sensor=T,
+            sensor=self.sensor.kind,
+            offsets_s=offsets,
+            T_odom_base=self._odometry_at(reading.time_s),
+            T_first_last=motion,
+            dropped=int((~kept).sum()),
+        )
+
+    def _odometry_at(self, time_s: float) -> F64 | None:
+        """T_odom_base (4, 4) by the odometry; None if there is none."""
+        return None if self.odometry is None else self.in_space(self.odometry.at(time_s), time_s)
 
     def scans(self) -> Iterator[tuple[Scan, SE2]]:
         """Scans in the base frame, not deskewed, with the true T_map_base at their stamps."""
         for reading in self.readings():
             yield self.scan(reading), self.drive.pose(reading.time_s)
-
-
-def _on_the_floor(pose: SE2, time_s: float) -> F64:
-    return pose.lift()
-
-
-def scan_of(
-    reading: Reading,
-    sensor: Sensor,
-    odometry: SimulatedOdometry | None,
-    in_space: Callable[[SE2, float], F64] = _on_the_floor,
-) -> Scan:
-    """A reading as the scan that `pc2grid.io` decodes from the recording.
-
-    in_space : a pose on the floor, at a time, as that of the base (4, 4).
-    """
-
-    def odometry_at(time_s: float) -> F64 | None:
-        return None if odometry is None else in_space(odometry.at(time_s), time_s)
-
-    T = sensor.T_base_sensor
-    kept = np.isfinite(reading.values_m)
-    points = (reading.values_m[kept, None] * sensor.directions[kept]).astype(np.float32)
-    moving = bool(sensor.offsets_s.any())
-    offsets = sensor.offsets_s[kept].astype(np.float32) if moving else None
-    motion = None
-    if offsets is not None and len(offsets):
-        first, last = (odometry_at(reading.time_s + float(s)) for s in (offsets.min(), offsets.max()))
-        motion = None if first is None or last is None else invert_pose(first) @ last
-    return Scan(
-        stamp_ns=reading.stamp_ns,
-        points_m=(points @ T[:3, :3].T + T[:3, 3]).astype(np.float32),
-        T_base_sensor=T,
-        sensor=sensor.kind,
-        offsets_s=offsets,
-        T_odom_base=odometry_at(reading.time_s),
-        T_first_last=motion,
-        dropped=int((~kept).sum()),
-    )
 
 
 def _rays(poses: F64, mount_m: F64, directions: F64) -> F32:

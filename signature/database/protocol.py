@@ -37,44 +37,26 @@ class Label:
     """Where a session was recorded; None: not known.
 
     building, floor : in the user's words.
-    told_apart : the name of the floor was generated, because its recording reaches several floors; it is
-        comparable only within that recording.
-    floor_height_m : of the floor above the lowest one of its recording, where stairs or ramps join them.
     """
 
     building: str | None = None
     floor: str | None = None
-    told_apart: bool = False
-    floor_height_m: float | None = None
 
     def __str__(self) -> str:
-        floor = f"floor {self.floor}" if self.told_apart and self.floor else self.floor
-        if floor and self.floor_height_m is not None:
-            floor += f" at {self.floor_height_m:.1f} m"
-        return ", ".join(word for word in (self.building, floor) if word) or "no label"
+        return ", ".join(word for word in (self.building, self.floor) if word) or "no label"
 
     def fits(self, building: str | None, floor: str | None) -> bool:
         """Whether it is this building and floor; None: any, "": those that were not given."""
         return building in (None, self.building or "") and floor in (None, self.floor or "")
 
-    def comparable(self, other: Label, *, one_recording: bool) -> bool:
-        """Whether the names of the two floors mean the same."""
-        return one_recording or not (self.told_apart or other.told_apart)
-
-    def contradicts(self, other: Label, *, one_recording: bool = False) -> bool:
-        """Whether the two name different buildings, or different floors; None differs from nothing.
-
-        one_recording : both sessions are parts of one recording.
-        """
-        pairs = [(self.building, other.building)]
-        if self.comparable(other, one_recording=one_recording):
-            pairs.append((self.floor, other.floor))
+    def contradicts(self, other: Label) -> bool:
+        """Whether the two name different buildings, or different floors; None differs from nothing."""
+        pairs = ((self.building, other.building), (self.floor, other.floor))
         return any(a is not None and b is not None and a != b for a, b in pairs)
 
-    def agrees(self, other: Label, *, one_recording: bool = False) -> bool:
+    def agrees(self, other: Label) -> bool:
         """Whether the two name the same building, and the same floor or none."""
-        known = self.building is not None and self.building == other.building and self.floor == other.floor
-        return known and self.comparable(other, one_recording=one_recording)
+        return self.building is not None and self == other
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

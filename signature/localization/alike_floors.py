@@ -15,7 +15,6 @@ import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.matching.two_way_score import Fit
-from pc2grid.model import same_recording
 from signature.localization.hypotheses import Hypothesis, fitted
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import evidence_of
@@ -64,9 +63,8 @@ def _alike(index: MapIndex, query: QueryMap, here: int) -> Iterator[tuple[int, S
 def _other_floor(index: MapIndex, here: int, there: int) -> bool:
     """Whether two sessions are of one building, and of different floors of it."""
     label, other = index.labels[here], index.labels[there]
-    one_recording = same_recording(index.sessions[here], index.sessions[there])
-    one_building = one_recording or (label.building is not None and label.building == other.building)
-    return one_building and label.contradicts(other, one_recording=one_recording)
+    one_building = label.building is not None and label.building == other.building
+    return one_building and label.contradicts(other)
 
 
 def _aligned(index: MapIndex, here: int, there: int) -> SE2 | None:

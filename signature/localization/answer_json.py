@@ -117,9 +117,7 @@ class Result(TypedDict):
     """What is found. frame: of the building, in which the poses are if the session was joined with others;
     null: the map frame of the session. T_map_odom puts the query's own frame into it. confidence: the
     probability that the best hypothesis is right. hypotheses: best first. prior: null if nothing was known
-    beforehand. in_space: null if the map or the query has no points. floor_height_m: of the floor, above the
-    lowest one that the map's recording reaches by stairs or ramps; null if it reaches one only, and behind a
-    lift."""
+    beforehand. in_space: null if the map or the query has no points."""
 
     schema_version: Version
     status: Status
@@ -127,7 +125,6 @@ class Result(TypedDict):
     frame: str | None
     building: str | None
     floor: str | None
-    floor_height_m: float | None
     pose: StampedPose | None
     T_map_odom: Pose | None
     confidence: float
@@ -158,7 +155,6 @@ def document(answer: answer.Answer) -> AnswerDocument:
         "frame": answer.frame,
         "building": answer.label.building,
         "floor": answer.label.floor,
-        "floor_height_m": answer.label.floor_height_m,
         "pose": stamped,
         "T_map_odom": None if answer.T_map_odom is None else _pose(answer.T_map_odom),
         "confidence": answer.confidence,

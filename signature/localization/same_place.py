@@ -20,7 +20,7 @@ from pc2grid.matching.refinement import refine
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import SearchMap
-from pc2grid.model import UNKNOWN, OccupancyGrid, same_recording
+from pc2grid.model import UNKNOWN, OccupancyGrid
 from signature.localization.hypotheses import Hypothesis, same_pose
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import log_likelihood_ratio
@@ -91,10 +91,9 @@ def _one_place(index: MapIndex, query: QueryMap, a: Hypothesis, b: Hypothesis) -
     ):
         return True
     label, other = index.labels[a.session_index], index.labels[b.session_index]
-    one_recording = same_recording(index.sessions[a.session_index], index.sessions[b.session_index])
-    if label.contradicts(other, one_recording=one_recording):
+    if label.contradicts(other):
         return False
-    labelled = label.agrees(other, one_recording=one_recording)
+    labelled = label.agrees(other)
     on, grid = index.maps[a.session_index], index.grids[b.session_index]
     return surroundings_agree(query, a, on, b, grid, labelled=labelled)
 

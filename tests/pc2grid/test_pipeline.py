@@ -24,7 +24,6 @@ from pc2grid.simulate import SimulationConfig, prepare_session, simulate_session
 from pc2grid.simulate.config import LaserConfig
 from pc2grid.simulate.session import Session
 from pc2grid.time_span import TimeSpan
-from pc2grid_lab import worlds
 from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
 from tests.helpers.rooms import RESOLUTION_M
 
@@ -155,23 +154,30 @@ def test_a_robot_that_was_carried_elsewhere_makes_two_maps(
     (said, *_) = [w for w in maps[0].report.warnings if "falls into 2 parts" in w]
     assert "robot#2 from 3" in said and "come back to known places" in said
     assert "odometry" not in said  # it has that
-    parts: Any = [SimpleNamespace(trajectory=m.trajectory, odometry=OdometryCheck(), storey=0) for m in maps]
-    said = division_warning("robot", parts, parts, [None, None])
+    parts: Any = [SimpleNamespace(trajectory=m.trajectory, odometry=OdometryCheck()) for m in maps]
+    said = division_warning("robot", parts, parts)
     assert "record with odometry, or come back to known places" in said
     assert longest.session == "robot" and "is used here, without" in longest.report.warnings[-1]
 
 
-def test_a_laser_that_goes_upstairs_contradicts_itself_there(tmp_path: Path) -> None:
-    """It shows no slope, so both floors and the stairs are drawn into one map."""
-    house = worlds.HouseConfig(visits=(0, 1), alike=True)
-    config = SimulationConfig(
-        length_m=3.0, seed=3, building_seed=3, laser=LaserConfig(rate_hz=5.0, step_deg=1.0)
-    )
-    worlds.simulate_session(tmp_path / "house.mcap", sensor="laser", house=house, config=config)
-    with open_log(tmp_path / "house.mcap") as log:
-        (made,) = build_maps(log, session="house")
-    (warning,) = made.report.warnings
-    assert "contradicts itself" in warning and "stairs" in warning and "--floor" in warning
+@pytest.mark.parametrize(("rise_m", "warned"), [(3.0, True), (-3.0, True), (0.5, False)])
+def test_a_recording_that_leaves_its_floor_is_to_be_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rise_m: float, warned: bool
+) -> None:
+    """Its odometry rises in the middle; before the first reading there is no height."""
+    config = SimulationConfig(length_m=1.5, seed=3, laser=LaserConfig(rate_hz=5.0, step_deg=1.0))
+    made = simulate_session(tmp_path / "drive.mcap", sensor="laser", config=config)
+    with open_log(made.path) as log:
+        scans = list(log.scans())
+        for k in range(1, len(scans)):
+            T_odom_base = np.array(scans[k].T_odom_base)
+            T_odom_base[2, 3] = 7.0 + rise_m * (k > len(scans) // 2)
+            scans[k] = replace(scans[k], T_odom_base=T_odom_base)
+        scans[0] = replace(scans[0], T_odom_base=None)
+        monkeypatch.setattr(log, "scans", lambda *_: iter(scans))
+        (mapped,) = build_maps(log, session="drive")
+    said = [text for text in mapped.report.warnings if "the height changes by 3.0 m" in text]
+    assert len(said) == warned and all("--start" in text and "--floor" in text for text in said)
 
 
 def test_no_scans_no_trajectory() -> None:

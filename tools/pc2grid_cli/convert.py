@@ -26,10 +26,7 @@ _Name = Annotated[str | None, typer.Option("--name", help="of the session; defau
 _Building = Annotated[
     str | None, typer.Option("--building", metavar="NAME", help="where it was recorded; answers name it")
 ]
-_Floor = Annotated[
-    str | None,
-    typer.Option("--floor", metavar="NAME", help="the same, within it; of several floors: A,B,A in order"),
-]
+_Floor = Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, within it")]
 _Points = Annotated[
     float | None,
     typer.Option(

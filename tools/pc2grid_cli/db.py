@@ -61,7 +61,6 @@ def _document(s: SessionInfo) -> StoredInfo:
         "sensor": s.sensor,
         "building": s.provenance.label.building,
         "floor": s.provenance.label.floor,
-        "floor_height_m": s.provenance.label.floor_height_m,
         "source": s.provenance.source,
         "digest": s.digest,
         "submaps": s.submaps,

@@ -244,13 +244,11 @@ class PrecisionSummary(TypedDict):
 
 class Converted(TypedDict):
     """What became of one input. digest: sha256 of it, hex. area_m2: free space. consistency, odometry,
-    precision: null for an imported map. floor_height_m: above the lowest floor of its recording, null if that
-    is not known."""
+    precision: null for an imported map."""
 
     session: str
     building: str | None
     floor: str | None
-    floor_height_m: float | None
     source: str
     digest: str
     sensor: str
@@ -291,14 +289,12 @@ class Convert(TypedDict):
 
 class StoredInfo(TypedDict):
     """A session of a database, with the versions and settings that made it. consistency: null for an imported
-    map, and for a session that was stored before it was measured. floor_height_m: above the lowest floor of
-    its recording, null if that is not known."""
+    map, and for a session that was stored before it was measured."""
 
     name: str
     sensor: str
     building: str | None
     floor: str | None
-    floor_height_m: float | None
     source: str
     digest: str
     submaps: int

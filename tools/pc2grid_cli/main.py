@@ -55,7 +55,6 @@ COMPARE = {
         "pc2grid_lab.compare.signatures:compare_signatures_command",
         "What each signature contributes, beside chance.",
     ),
-    "floors": ("pc2grid_lab.compare.floors:compare_floors_command", "Houses whose floors have one plan."),
     "peers": (
         "pc2grid_lab.compare.peers:compare_peers_command",
         "Other programs, the same maps and queries.",
@@ -103,7 +102,7 @@ def options(
 app.add_typer(
     typer.Typer(
         cls=group(COMPARE),
-        help="Measure: log, maps, recordings, sensors, signatures, floors, peers, the paper's tables.",
+        help="Measure: log, maps, recordings, sensors, signatures, peers, the paper's tables.",
         no_args_is_help=True,
     ),
     name="compare",

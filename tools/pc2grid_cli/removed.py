@@ -11,6 +11,12 @@ REMOVED = {
         ("pc2grid db join --journal", "pc2grid db join --dask", "pc2grid db join --jobs"),
         "one process compares every two sessions, some seconds a pair",
     ),
+    "pc2grid compare floors": "a recording is one floor: cut it with `--start` and `--duration`",
+    **dict.fromkeys(
+        ("pc2grid simulate --floors", "pc2grid simulate --ride", "pc2grid simulate --slope"),
+        "a recording is one floor: `pc2grid simulate` makes one for each `--seed`",
+    ),
+    "pc2grid simulate --alike": "a recording is one floor: the same `--seed` places the same objects",
     "pc2grid compare real": "its rows are those of `pc2grid compare recordings DATA --only 'other sensor'`",
     "pc2grid db update": "`pc2grid db join` puts sessions into one frame, `pc2grid export --map` draws them",
     "pc2grid convert --update": "`--join` puts what is new into the frame of the other sessions",

@@ -18,7 +18,6 @@ def session_document(session: SessionMap, origin: Provenance) -> Converted:
         "session": session.session,
         "building": origin.label.building,
         "floor": origin.label.floor,
-        "floor_height_m": origin.label.floor_height_m,
         "source": origin.source,
         "digest": origin.digest,
         "sensor": session.sensor,

@@ -9,7 +9,7 @@ from pc2grid.model import is_part_of
 from pc2grid_cli.output_files import check_database_name
 from signature.config import Config
 from signature.conversion_jobs import Job
-from signature.database import Label, Provenance, maintenance, open_database
+from signature.database import Provenance, maintenance, open_database
 from signature.database.postgres.server import is_url
 from signature.sessions import digest_of
 
@@ -91,7 +91,7 @@ def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
 def _made_otherwise(was: Provenance, job: Job) -> str:
     """How a stored session differs from a job but for the input, as the end of a sentence; empty: not."""
     wanted = job.made_from(was.digest)
-    if not _label_kept(was.label, wanted.label):
+    if was.label != wanted.label:
         return (
             f"; its session {job.name!r} has the label {str(was.label)!r}, this one would have"
             f" {str(wanted.label)!r} (--building, --floor)"
@@ -127,13 +127,3 @@ def _changed(was: Provenance, job: Job) -> bool:
         return digest_of(job.path, job.config) != was.digest
     except Pc2GridError:
         return False  # the input cannot be read; with --force its error is shown
-
-
-def _label_kept(was: Label, wanted: Label) -> bool:
-    """Whether a stored session, the first of its recording, has the label of the options.
-
-    The floors of a recording may have got names of their own; several names may be given, see `on_floors`.
-    """
-    if was.told_apart or (wanted.floor is not None and was.floor == wanted.floor.split(",")[0].strip()):
-        return was.building == wanted.building
-    return was == wanted

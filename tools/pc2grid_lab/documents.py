@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 # Before Python 3.12 pydantic, which makes the schemas, does not take the TypedDict of typing.
 from typing_extensions import TypedDict
@@ -41,37 +41,6 @@ class CompareLog(TypedDict):
     without_truth: int
     tally: QueryCounts
     trials: list[Trial]
-
-
-class FloorRow(TypedDict):
-    """A house of `pc2grid compare floors`, and what became of it; see `pc2grid_lab.experiments.floors`.
-    in_the_map: queries of which the map of their floor shows half of the walls."""
-
-    seed: int
-    way: Literal["stairs", "lift", "logs"]
-    alike: bool
-    sensor: str
-    visits: list[int]
-    length_m: float
-    query_m: float
-    queries: int
-    told_apart: bool
-    named: bool
-    right: int
-    wrong: int
-    ambiguous: int
-    not_found: int
-    misplaced: int
-    in_the_map: int
-    not_found_in_the_map: int
-
-
-class CompareFloors(TypedDict):
-    """`pc2grid compare floors --json`: a row a house. program: changes with any of its source files."""
-
-    schema_version: Version
-    program: str
-    rows: list[FloorRow]
 
 
 class CompareMaps(TypedDict):
@@ -222,7 +191,6 @@ class CompareSensors(TypedDict):
 
 
 DOCUMENTS: dict[str, type] = {
-    "compare-floors": CompareFloors,
     "compare-log": CompareLog,
     "compare-maps": CompareMaps,
     "compare-paper": ComparePaper,

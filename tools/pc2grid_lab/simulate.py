@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,15 +15,8 @@ from pc2grid.simulate import Building, SimulatedSession, load_building
 from pc2grid_cli import console
 from pc2grid_cli.options import AsJson, Force, SensorName
 from pc2grid_lab.documents import Simulate
-from pc2grid_lab.worlds import ChangeConfig, HouseConfig, WorldConfig, simulate_session
+from pc2grid_lab.worlds import ChangeConfig, WorldConfig, simulate_session
 from pc2grid_lab.worlds.change import Change
-
-
-class RideName(str, enum.Enum):
-    """How a robot changes floors."""
-
-    stairs = "stairs"
-    lift = "lift"
 
 
 def simulate_command(
@@ -53,14 +45,6 @@ def simulate_command(
         typer.Option(metavar="X Y", help="where to start in the map; default: anywhere"),
     ] = None,
     building_seed: Annotated[int, typer.Option(min=0, help="which office, when no building is given")] = 0,
-    floors: Annotated[
-        int, typer.Option(min=1, max=20, help="visited one after the other; each has the office's plan")
-    ] = 1,
-    ride: Annotated[RideName, typer.Option(help="how the robot gets from floor to floor")] = RideName.stairs,
-    slope: Annotated[
-        float, typer.Option(min=0.02, max=0.8, help="of the stairs; ramps if flatter than 0.3")
-    ] = 0.6,
-    alike: Annotated[bool, typer.Option("--alike", help="the same movable objects on every floor")] = False,
     no_odometry: Annotated[bool, typer.Option("--no-odometry", help="leave odometry out of the log")] = False,
     force: Force = False,
     json: AsJson = False,
@@ -68,7 +52,7 @@ def simulate_command(
     """Drive a robot through a building and record it: OUT.mcap, and OUT.tum with the true poses.
 
     A cloud or a mesh of a real building is driven through as it is: its floor is found and levelled, and
-    rays hit its surfaces. With --floors, --length is driven on each floor.
+    rays hit its surfaces.
 
     Example: pc2grid simulate map.yaml drive.mcap --sensor depth --length 20
     """
@@ -89,22 +73,17 @@ def simulate_command(
         building_seed=building_seed,
         odometry={"enabled": not no_odometry},
     )
-    house = None
-    if floors > 1:
-        _refuse_on_floors(config)
-        house = HouseConfig(visits=tuple(range(floors)), ride=ride.value, slope=slope, alike=alike)
     with console.of(context).progress(f"simulate {sensor.value}") as update:
         made, differs = simulate_session(
             files[-1],
             sensor=sensor.value,
             grid=grid,
-            house=house,
             config=config,
             progress=update,
             force=force,
         )
-    if made.clutter < clutter * floors:
-        console.warn(f"only {made.clutter} of {clutter * floors} pieces of clutter could be placed")
+    if made.clutter < clutter:
+        console.warn(f"only {made.clutter} of {clutter} pieces of clutter could be placed")
     if json:
         console.print_json(_document(made, differs))
         return
@@ -132,20 +111,6 @@ def _world(change: dict[str, float], **given: Any) -> WorldConfig:
     except ValidationError as error:
         first = error.errors()[0]
         raise ConfigError(f"{first['loc'][0]}: {first['msg']}, got {first['input']}") from error
-
-
-def _refuse_on_floors(config: WorldConfig) -> None:
-    """Raises typer.BadParameter for what is of a single floor."""
-    change = config.change
-    for value, option in (
-        (change.doors, "--change"),
-        (config.walkers, "--walkers"),
-        (change.relief_per_m, "--relief"),
-    ):
-        if value:
-            raise typer.BadParameter(f"{option} is for a single floor, not with --floors")
-    if change.glass or change.mirrors or config.start_m is not None:
-        raise typer.BadParameter("--glass, --mirrors and --start are for a single floor")
 
 
 def _document(made: SimulatedSession, differs: Change) -> Simulate:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
 
-from pc2grid.model import same_recording
 from pc2grid.observer import Observer
 from signature.database.protocol import BuildingFrame, SessionInfo
 from signature.localization.joining.join import Join, JoinableMap, join_maps
@@ -41,8 +40,7 @@ class SessionPair:
 
 def told_apart(a: SessionInfo, b: SessionInfo) -> bool:
     """Whether labels say that two sessions are not of one floor of one building."""
-    one_recording = same_recording(a.name, b.name)
-    return a.provenance.label.contradicts(b.provenance.label, one_recording=one_recording)
+    return a.provenance.label.contradicts(b.provenance.label)
 
 
 def compare_pairs(

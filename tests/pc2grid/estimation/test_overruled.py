@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pc2grid.config import Config
-from pc2grid.estimation.overruled import Disagreement, check_odometry, stalls
+from pc2grid.estimation.overruled import Disagreement, check_odometry
 from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, OdometryCheck, Overruled, Scan
@@ -33,32 +33,6 @@ def test_scans_that_follow_closely_are_one_stretch() -> None:
         ),
     )
     assert check_odometry([], []) == OdometryCheck()
-
-
-def steps(reported_m: list[float], moved_m: list[float]) -> list[Disagreement | None]:
-    """What is found of scans between which odometry and the poses make so much travel."""
-    return [
-        Disagreement(abs(a - b), 0.0, False, reported_m=a, moved_m=b)
-        for a, b in zip(reported_m, moved_m, strict=True)
-    ]
-
-
-def test_poses_that_stay_behind_the_wheels_for_metres_are_a_stall() -> None:
-    """No step differs by more than 6 cm."""
-    reported = [0.06] * 300
-    moved = [0.06] * 100 + [0.001] * 120 + [0.06] * 80
-    stamps_ns = [k * 10**8 for k in range(300)]
-    (stall,) = stalls(stamps_ns, [None, *steps(reported, moved)[1:]])
-    assert 8 * 10**9 <= stall.from_ns <= 10 * 10**9 and 22 * 10**9 <= stall.to_ns <= 24 * 10**9
-    assert stall.reported_m > 7.0 and stall.moved_m < 0.4 * stall.reported_m
-    assert not stalls(stamps_ns, steps(reported, [0.05] * 300))  # wheels that slip by a sixth
-    assert not stalls(stamps_ns, steps([0.0] * 300, [0.0] * 300))
-
-
-def test_bunched_odometry_is_no_stall() -> None:
-    """Five steps are reported together, and the scans show each."""
-    stamps_ns = [k * 10**8 for k in range(300)]
-    assert not stalls(stamps_ns, steps([0.0, 0.0, 0.0, 0.0, 0.5] * 60, [0.1] * 300))
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from pc2grid.mapping.loop_parameters import LoopParameters
 from pc2grid.mapping.part_maps import PartMap, doubtful_scans, draw_parts, long_enough
 from pc2grid.mapping.parts import Conflict, connected, cuts_for
 from pc2grid.mapping.pose_graph import Edge
-from pc2grid.mapping.report import part_reports, ride_warnings, with_track_warnings
+from pc2grid.mapping.report import height_warnings, part_reports, with_track_warnings
 from pc2grid.mapping.settled import SettledKeyframes
 from pc2grid.mapping.track import Track
 from pc2grid.model import (
@@ -38,15 +38,12 @@ WITHOUT_LOOPS = LoopParameters(compared=0)
 
 
 def on_one_floor(trajectory: Trajectory) -> Track:
-    """What tracking says of scans without a ride."""
+    """What tracking says of scans on one floor."""
     count = len(trajectory)
     return Track(
         trajectory=trajectory,
         disagreements=[None] * count,
         readings=np.full((count, 4, 4), np.nan),
-        riding=np.zeros(count, np.bool_),
-        storey=np.zeros(count, np.int64),
-        storeys=(),
     )
 
 
@@ -206,9 +203,7 @@ def test_a_part_too_short_to_belong_enough_is_left_out_and_counted() -> None:
     kept = long_enough([long, short, other])
     assert kept == [long, other]
     read = ReadReport(scans_read=300, bytes_lost=7)
-    first, second = part_reports(
-        read, "log", [long, short, other], kept, [None] * len(kept), slopes_unseen=True
-    )
+    first, second = part_reports(read, "log", [long, short, other], kept)
     assert first.scans_skipped == {"in a part too short to be of use": len(short.trajectory)}
     assert first.scans_read + second.scans_read == 300 and first.bytes_lost == 7 and not second.lossy
     (warning,) = first.warnings
@@ -216,15 +211,15 @@ def test_a_part_too_short_to_belong_enough_is_left_out_and_counted() -> None:
     assert long_enough([short]) == [short]
 
 
-def test_rides_that_did_not_divide_a_recording_are_named() -> None:
+def test_a_sensor_that_is_carried_to_another_floor_is_told_of_once() -> None:
     heights_m = np.repeat((0.0, 3.0), 10)
     poses = np.tile(np.eye(4), (20, 1, 1))
-    poses[:, 2, 3] = heights_m
     stamps_ns = np.arange(20) * 10**9
-    track = on_one_floor(Trajectory(stamps_ns=stamps_ns, T_session_base=poses, health=(Health.FINE,) * 20))
-    assert not ride_warnings(track)
-    assert with_track_warnings(ReadReport(), replace(track, assumptions=("so",))).warnings == ("so",)
-    (by_hand,) = ride_warnings(replace(track, carried=True))
-    assert "3.0 m above" in by_hand and "from 10 s" in by_hand
-    (unfinished,) = ride_warnings(replace(track, riding=np.arange(20) >= 15))
-    assert "from 15 s" in unfinished and "these 5 scans" in unfinished
+    way = Trajectory(stamps_ns=stamps_ns, T_session_base=poses, health=(Health.FINE,) * 20)
+    (warning,) = height_warnings(heights_m, way)
+    assert "changes by 3.0 m" in warning and "from 10 s" in warning
+    assert not height_warnings(0.5 * heights_m, way)
+    assert not height_warnings(np.full(20, np.nan), way)
+    poses[:, 2, 3] = heights_m
+    track = replace(on_one_floor(way), readings=poses, assumptions=("so",))
+    assert with_track_warnings(ReadReport(), track).warnings == ("so", warning)

@@ -241,7 +241,6 @@ CASES: list[tuple[str, Change, str]] = [
     ("info", info(odometry__overruled=-1), "overruled is -1"),
     ("info", info(odometry__stretches=[{}]), "stretches: has no distance_m"),
     ("info", info(provenance__label__floor=2), "floor is 2 instead of text"),
-    ("info", info(provenance__label__told_apart=1), "told_apart is 1 instead of true or false"),
     ("info", info(mood="fair"), "info: unknown mood"),
     ("info", info(name="tuesday"), "filed as 'monday', '', '', but is 'tuesday'"),
     ("info", row(floor="2"), "filed as 'monday', '', '2', but is 'monday' of no label"),

@@ -10,7 +10,6 @@ from typing import cast as typed
 import numpy as np
 
 from pc2grid.arrays import F32, F64
-from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid, Scan, SensorKind
 from pc2grid.simulate import Building, Session, SimulatedSession, SimulationConfig, office_floorplan
@@ -20,7 +19,6 @@ from pc2grid.simulate.scene import Scene
 from pc2grid.simulate.session import Cast, plan_session
 from pc2grid_lab.worlds.change import NO_CHANGE, Change, change_building
 from pc2grid_lab.worlds.config import WorldConfig
-from pc2grid_lab.worlds.house import HouseConfig, prepare_house_session
 from pc2grid_lab.worlds.panes import Panes
 from pc2grid_lab.worlds.walkers import Walker, send_walkers
 
@@ -105,21 +103,11 @@ def simulate_session(
     *,
     sensor: SensorKind,
     grid: OccupancyGrid | Building | None = None,
-    house: HouseConfig | None = None,
     config: SimulationConfig | None = None,
     progress: Callable[[float], None] | None = None,
     force: bool = False,
 ) -> tuple[SimulatedSession, Change]:
-    """As `pc2grid.simulate_session`, in a world; returns what was written, and what differs from the plan.
-
-    house : drive through several floors with the plan of the office, `config.length_m` on each; not with a
-        grid. The ground truth has z = 0 on floor 0.
-    """
+    """As `pc2grid.simulate_session`, in a world; returns what was written, and what differs from the plan."""
     refuse_existing_recording(out, force)
-    if house is None:
-        session = prepare_session(sensor=sensor, grid=grid, config=config)
-        return record_session(out, session, progress=progress, force=force), session.change
-    if grid is not None:
-        raise ConfigError("a house has the plan of an office", hint="leave out the building, or the floors")
-    in_house = prepare_house_session(sensor=sensor, house=house, config=config)
-    return record_session(out, in_house, progress=progress, force=force), NO_CHANGE
+    session = prepare_session(sensor=sensor, grid=grid, config=config)
+    return record_session(out, session, progress=progress, force=force), session.change

@@ -15,7 +15,7 @@ from pc2grid_lab.experiments.recordings.rows import MapRow, PairRow, QueryRow, T
 from pc2grid_lab.experiments.recordings.warned import warned
 
 BENT = "the map contradicts itself along 6% of the travel and is probably bent: near x 1.0, y 2.0 m"
-LIFT = "the robot stood in a room as small as a lift, its door out of sight, 5 s after the first scan"
+HEIGHT = "the height changes by 3.0 m, and from 5 s after the first scan on it is more than 2.0 m"
 ODD = "something that no one has heard of before"
 
 
@@ -112,10 +112,10 @@ def test_a_slower_machine_is_no_change_but_a_slower_row_is() -> None:
 
 
 def test_warnings_that_come_and_go() -> None:
-    old = map_row(warnings=warned([BENT], storeys=False, error_m=0.4), error_m=0.4)
-    new = map_row(warnings=warned([LIFT, ODD], storeys=False, error_m=0.4), error_m=0.4)
+    old = map_row(warnings=warned([BENT], error_m=0.4), error_m=0.4)
+    new = map_row(warnings=warned([HEIGHT, ODD], error_m=0.4), error_m=0.4)
     assert {(c.text, c.worse) for c in changes(table(old), table(new))} == {
-        ("new warning: lift (false)", True),
+        ("new warning: height (false)", True),
         ("new warning: something that no one has (unknown)", False),
         ("no longer warned of: bent (right)", True),
     }
@@ -125,7 +125,7 @@ def test_warnings_that_come_and_go() -> None:
     ("error_m", "verdict"), [(0.03, "false"), (0.4, "right"), (0.17, "unknown"), (None, "unknown")]
 )
 def test_whether_a_bent_map_is_bent(error_m: float | None, verdict: str) -> None:
-    (warning,) = warned([BENT], storeys=False, error_m=error_m)
+    (warning,) = warned([BENT], error_m=error_m)
     assert (warning.about, warning.verdict) == ("bent", verdict)
 
 
@@ -168,7 +168,7 @@ def test_fewer_answers_of_the_quick_form_judge_less() -> None:
 
 def test_the_page_shows_each_row() -> None:
     rows = (
-        map_row(warnings=warned([BENT], storeys=False, error_m=0.03)),
+        map_row(warnings=warned([BENT], error_m=0.03)),
         map_row("wean|3", problem="internal error: KeyError", error_m=None),
         pair_row("right", "wrong", "refused"),
         pair_row(problem="laser/x.mcap: not in the data folder", query="x"),

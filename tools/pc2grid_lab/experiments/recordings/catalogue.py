@@ -54,7 +54,6 @@ class Recording:
     late_s : by how much its stamps are later than those of the true poses: some drivers stamp a scan at its
         end.
     of_base : whether these are poses of the base, not of the sensor.
-    storeys : whether it goes over several floors, so that a warning of stairs and lifts is right.
     quick : whether it belongs to the quick form.
     scans_s : seconds after its begin between which there are scans; given where another message lies days
         apart from them.
@@ -74,7 +73,6 @@ class Recording:
     poses: str | None = None
     late_s: float = 0.0
     of_base: bool = False
-    storeys: bool = False
     quick: bool = False
     scans_s: tuple[float, float] | None = None
 

@@ -67,7 +67,7 @@ def _figures(recording: Recording, folder: Folder, done: Finished) -> dict[str, 
         "over_bare": done.cpu_s / bare_of["cpu_s"] if bare_of else None,
         "parts": len(stored),
         "lost": skipped / read if read else None,
-        "warnings": warned(texts, storeys=recording.storeys, error_m=error.get("error_m")),
+        "warnings": warned(texts, error_m=error.get("error_m")),
         "bare_m": bare_of.get("ate_m"),
         **error,
     }

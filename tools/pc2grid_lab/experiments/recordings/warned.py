@@ -10,11 +10,7 @@ from pc2grid_lab.experiments.recordings.rows import Verdict, Warned
 _ABOUT = {
     "bent": r"contradicts itself",
     "loose": r"^no loop ties",
-    "lift": r"as small as a lift",
-    "ends on a slope": r"is on a slope that leads to another floor",
-    "slope unnoticed": r"on a slope that was not noticed",
-    "left its height": r"the sensor in the hand is up to",
-    "floors": r"^the recording goes over \d+ floors",
+    "height": r"^the height changes by",
     "parts": r"^the recording falls into \d+ parts",
     "lost": r"^registration was lost",
     "weak": r"did not fix the pose in every direction",
@@ -23,17 +19,14 @@ _ABOUT = {
     "empty scans": r"hold no returns",
 }
 _SHAPE = ("bent", "loose")
-_STOREYS = ("lift", "ends on a slope", "slope unnoticed", "left its height", "floors")
 EXACT_M, WRONG_M = 0.1, 0.25
 """A map with a smaller error is not bent, one with a larger is. Chosen by hand: what a doubled wall needs."""
 
 
-def warned(texts: Iterable[str], *, storeys: bool, error_m: float | None) -> tuple[Warned, ...]:
-    """Each warning with its verdict. storeys : whether the recording goes over several floors. error_m : of
-    the trajectory, None if it is not known.
-    """
+def warned(texts: Iterable[str], *, error_m: float | None) -> tuple[Warned, ...]:
+    """Each warning with its verdict. error_m : of the trajectory, None if it is not known."""
     return tuple(
-        Warned(about=about, verdict=_verdict(about, storeys, error_m), text=text)
+        Warned(about=about, verdict=_verdict(about, error_m), text=text)
         for text in texts
         for about in [_about(text)]
     )
@@ -47,9 +40,9 @@ def _about(text: str) -> str:
     return " ".join(text.split()[:5])
 
 
-def _verdict(about: str, storeys: bool, error_m: float | None) -> Verdict:
-    if about in _STOREYS:
-        return "right" if storeys else "false"
+def _verdict(about: str, error_m: float | None) -> Verdict:
+    if about == "height":  # each of the recordings is of one floor
+        return "false"
     if about in _SHAPE and error_m is not None:
         if error_m < EXACT_M:
             return "false"
