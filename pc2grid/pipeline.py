@@ -18,8 +18,7 @@ from pc2grid.mapping.keyframes import Keyframes
 from pc2grid.mapping.local_maps import CAMERA_LOCAL_MAPS, LOCAL_MAPS
 from pc2grid.mapping.loop_closure import LoopCloser
 from pc2grid.mapping.loop_parameters import EXACT_TRACKING, LOOPS
-from pc2grid.mapping.part_maps import PartMap, doubtful_scans, draw_parts, long_enough, with_points
-from pc2grid.mapping.parts import PARTS
+from pc2grid.mapping.part_maps import PartMap, draw_parts, long_enough, with_points
 from pc2grid.mapping.report import (
     HELD_SCANS,
     check_followed,
@@ -134,8 +133,8 @@ def build_maps(
 ) -> tuple[SessionMap, ...]:
     """Turn a recording into a map, or into several if its parts cannot be placed to each other.
 
-    That is so where tracking was lost, or where the map of the whole would contradict itself, and no loop
-    joins what lies before and after (`pc2grid.mapping.parts`). The first map has the name `session`, the
+    That is so where tracking was lost, and no loop joins what lies before and after
+    (`pc2grid.mapping.parts`). The first map has the name `session`, the
     others `session#2`, `session#3`, ...; each has its own frame, the base at its first scan. The first map's
     report also holds the counts of the whole recording.
 
@@ -267,7 +266,7 @@ def _map(
     """Track the scans, close the loops, and draw a map of each part; see `build_maps`. Returns what tracking
     says, too.
 
-    A part whose map contradicts itself is divided, and drawn again. whole : all scans are one part.
+    whole : all scans are one part.
     """
     projection = config.projection
     assumptions: list[str] = []
@@ -294,12 +293,6 @@ def _map(
         if whole:
             closed = closed.undivided()
         parts = draw_parts(keyframes, track, closed, projection)
-        for _ in range(0 if whole else PARTS.rounds):
-            divided = closer.divide(doubtful_scans(parts, track.trajectory))
-            if divided is None:
-                break
-            closed = divided
-            parts = draw_parts(keyframes, track, closed, projection)
         if points is not None:
             parts = with_points(parts, track, closed, points)
     return parts, track

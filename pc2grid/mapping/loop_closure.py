@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator
 from itertools import compress
 
 import numpy as np
@@ -29,7 +29,7 @@ from pc2grid.mapping.local_maps import LOCAL_MAPS, LocalMapParameters, LocalMaps
 from pc2grid.mapping.loop_candidates import CANDIDATES, Candidate, CandidateParameters, LoopCandidates
 from pc2grid.mapping.loop_parameters import LOOPS, LoopParameters
 from pc2grid.mapping.loop_verification import LoopVerification, spread_over_visits
-from pc2grid.mapping.parts import PARTS, Conflict, PartParameters, conflicts_of, connected, cuts_for
+from pc2grid.mapping.parts import PARTS, PartParameters, connected
 from pc2grid.mapping.place_recognition import PlaceRecognizer
 from pc2grid.mapping.pose_graph import Edge, Solution
 from pc2grid.mapping.session_graph import SessionGraph
@@ -93,27 +93,6 @@ class LoopCloser:
         self._complete_local_map()
         if self._stretches.finish():
             self._close_candidates()
-        return self._settled_keyframes()
-
-    def divide(self, doubtful: Sequence[range]) -> SettledKeyframes | None:
-        """After `finish`: cut the session where its local maps contradict each other, and settle it again.
-
-        doubtful : scans of the stretches that contradict the map of their part.
-        A cut leaves open how its two sides lie to each other, as a restart of tracking does, so that loops
-        which the tracked poses ruled out may join them again. Loops between segments that contradict each
-        other are removed. Returns None if there is nothing to change.
-        """
-        segment = self._segments()
-        conflicts = self._conflicts(doubtful)
-        cuts = set(cuts_for(conflicts, segment))
-        between = [(segment[c.older], segment[c.newer]) for c in conflicts if c.mutual]
-        apart = {(first, second) for first, second in between if first != second}
-        removed = self._graph.remove_loops(apart, segment)
-        if not cuts and not removed:
-            return None
-        self._cut(cuts)
-        self._close_candidates()
-        self._search_behind(cuts)
         return self._settled_keyframes()
 
     # --- during the session -------------------------------------------------------------------------------
@@ -265,7 +244,7 @@ class LoopCloser:
     # --- segments and parts -------------------------------------------------------------------------------
 
     def _segments(self) -> I64:
-        """(N,) number of the segment of each local map; a new one begins at each restart or cut."""
+        """(N,) number of the segment of each local map; a new one begins at each restart."""
         restarts = self._keyframes.restarts
         begins = [number > 0 and run.start in restarts for number, run in enumerate(self._local_maps.runs)]
         return np.cumsum(begins, dtype=np.int64)
@@ -274,39 +253,3 @@ class LoopCloser:
         """(N,) number of the part of each local map."""
         loops = [edge for edge in compress(self._graph.edges, solution.accepted) if edge.loop]
         return connected(self._segments(), loops, self._part_parameters)
-
-    def _conflicts(self, doubtful: Sequence[range]) -> list[Conflict]:
-        """The local maps that contradict each other, one of them in a doubtful stretch of scans."""
-        scans = np.array(self._keyframes.scans)
-        suspect = [
-            any(scans[run[0]] < stretch.stop and scans[run[-1]] >= stretch.start for stretch in doubtful)
-            for run in self._local_maps.runs
-        ]
-        part = self._parts(self._graph.solution())
-        return list(
-            conflicts_of(
-                self._local_maps,
-                self._graph.nodes,
-                part,
-                np.array(suspect),
-                self._parameters.near_m,
-                self._part_parameters,
-            )
-        )
-
-    def _cut(self, cuts: Collection[int]) -> None:
-        """Begin a new segment at some local maps."""
-        self._graph.cut(cuts)
-        runs = self._local_maps.runs
-        lost_m = self._parameters.lost_m * np.cumsum([number in cuts for number in range(len(runs))])
-        self._travelled_m = array("d", np.array(self._travelled_m) + lost_m)
-        self._keyframes.restarts |= {runs[cut].start for cut in cuts}
-
-    def _search_behind(self, cuts: Collection[int]) -> None:
-        """Search loops of the first local maps behind each cut, as after a restart of tracking."""
-        known = {(edge.first, edge.second) for edge in self._graph.edges}
-        for cut in sorted(cuts):
-            self._drift_m = self._parameters.lost_m
-            stop = min(cut + self._parameters.stretch_maps, len(self._graph))
-            found = [edge for number in range(cut, stop) for edge in self._overlaps(number)]
-            self._close([edge for edge in found if (edge.first, edge.second) not in known])

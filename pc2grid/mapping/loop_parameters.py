@@ -21,7 +21,7 @@ class LoopParameters:
 
     Which pairs are compared:
 
-    near_m : older local maps within this distance may overlap the newest one, or contradict it.
+    near_m : older local maps within this distance may overlap the newest one.
     compared : older local maps that the newest is compared with.
 
     How far is searched: as far as tracking may have drifted since the pose was last certain.

@@ -87,19 +87,6 @@ def long_enough(parts: Sequence[PartMap]) -> list[PartMap]:
     return kept or [max(parts, key=lambda part: part.trajectory.length_m)]
 
 
-def doubtful_scans(parts: Iterable[PartMap], tracked: Trajectory) -> list[range]:
-    """The scans of the session in the stretches that contradict the map of their part, if that is bent."""
-    return [
-        range(
-            int(np.searchsorted(tracked.stamps_ns, stretch.from_ns)),
-            int(np.searchsorted(tracked.stamps_ns, stretch.to_ns)) + 1,
-        )
-        for part in parts
-        if part.consistency.bent
-        for stretch in part.consistency.stretches
-    ]
-
-
 def _settled(tracked: Trajectory, closed: SettledKeyframes) -> tuple[I64, F64]:
     """The part (N,) of each scan, and its pose (N, 4, 4) in the frame of the part after loop closure.
 

@@ -108,8 +108,7 @@ def division_warning(session: str, parts: Sequence[PartMap], kept: Sequence[Part
     dropped = f"; {short} shorter than {PARTS.least_travel_m:.0f} m left out" if short else ""
     return (
         f"the recording falls into {len(parts)} parts whose places relative to each other are not known, "
-        "because tracking was lost, or the map would contradict itself: "
-        f"{named}{dropped}; {advice}"
+        f"because tracking was lost: {named}{dropped}; {advice}"
     )
 
 

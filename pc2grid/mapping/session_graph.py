@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
 from dataclasses import replace
 from itertools import compress
 
@@ -61,34 +60,9 @@ class SessionGraph:
 
     def solve(self) -> Solution:
         """Solve for the poses that agree best with all edges."""
-        solution = self.solution()
+        solution = optimise(self.nodes, self.edges, self._walls)
         self.nodes = solution.poses
         return solution
-
-    def solution(self) -> Solution:
-        """What `solve` would find."""
-        return optimise(self.nodes, self.edges, self._walls)
-
-    def remove_loops(self, between: Collection[tuple[int, int]], segment: I64) -> bool:
-        """Remove the loops between pairs of segments, older and newer; whether there were any.
-
-        segment : (N,) number of the segment of each local map.
-        """
-        before = len(self.edges)
-        self.edges = [
-            edge
-            for edge in self.edges
-            if not edge.loop or (segment[edge.first], segment[edge.second]) not in between
-        ]
-        return len(self.edges) < before
-
-    def cut(self, cuts: Collection[int]) -> None:
-        """Forget the tracked steps to some local maps, as if tracking had been lost before them."""
-        unknown = self._parameters.tracked_information(0.0, restart=True)
-        for k, edge in enumerate(self.edges):
-            if not edge.loop and edge.second in cuts:
-                self.edges[k] = replace(edge, information=unknown)
-                self._step_information.pop((edge.first, edge.second), None)
 
     def sigmas(self, solution: Solution, part: I64) -> F64:
         """Standard deviation (N,) in metres of the position of each local map within its part (N,).

@@ -15,8 +15,7 @@ class TrackedKeyframes:
     """Keyframes as they were tracked, before loops are closed; a sequence that only grows.
 
     scans : number of the scan of each.
-    restarts : keyframes whose pose relative to the one before is unknown: tracking was lost, or the session
-        was cut.
+    restarts : keyframes whose pose relative to the one before is unknown: tracking was lost.
     """
 
     def __init__(self) -> None:

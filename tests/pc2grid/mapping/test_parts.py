@@ -1,4 +1,4 @@
-"""A session whose parts cannot be placed to each other is divided; loops join what they can."""
+"""A session that was lost in between is divided there; loops join what they can."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pc2grid.geometry import SE2
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.loop_closure import LoopCloser
 from pc2grid.mapping.loop_parameters import LoopParameters
-from pc2grid.mapping.part_maps import PartMap, doubtful_scans, draw_parts, long_enough
-from pc2grid.mapping.parts import Conflict, connected, cuts_for
+from pc2grid.mapping.part_maps import PartMap, draw_parts, long_enough
+from pc2grid.mapping.parts import connected
 from pc2grid.mapping.pose_graph import Edge
 from pc2grid.mapping.report import height_warnings, part_reports, with_track_warnings
 from pc2grid.mapping.settled import SettledKeyframes
@@ -85,17 +85,13 @@ def begin_of_second_lap() -> int:
 
 def mapped(
     keyframes: Keyframes, trajectory: Trajectory, parameters: LoopParameters
-) -> tuple[LoopCloser, SettledKeyframes, list[PartMap]]:
+) -> tuple[SettledKeyframes, list[PartMap]]:
     closer = LoopCloser(keyframes, parameters=parameters)
     # The closer compares with older keyframes, so all may be there from the beginning.
     for keyframe in keyframes:
         closer.extend(keyframe)
     closed = closer.finish()
-    return (
-        closer,
-        closed,
-        draw_parts(keyframes, on_one_floor(trajectory), closed, ProjectionConfig()),
-    )
+    return closed, draw_parts(keyframes, on_one_floor(trajectory), closed, ProjectionConfig())
 
 
 def wrong_m(part: PartMap, truths: list[SE2], first: int = 0) -> float:
@@ -108,7 +104,7 @@ def wrong_m(part: PartMap, truths: list[SE2], first: int = 0) -> float:
 
 def test_a_restart_that_no_loop_joins_gives_two_parts_each_in_its_own_frame() -> None:
     keyframes, trajectory, truths = keyframes_of(SE2(3.0, -2.0, 1.0), lost=True)
-    _, closed, parts = mapped(keyframes, trajectory, WITHOUT_LOOPS)
+    closed, parts = mapped(keyframes, trajectory, WITHOUT_LOOPS)
     middle = begin_of_second_lap()
     assert closed.parts.tolist() == [0] * middle + [1] * (len(truths) - middle)
     assert [len(part.trajectory) for part in parts] == [middle, len(truths) - middle]
@@ -120,42 +116,10 @@ def test_a_restart_that_no_loop_joins_gives_two_parts_each_in_its_own_frame() ->
 
 def test_a_restart_that_loops_join_gives_one_part() -> None:
     keyframes, trajectory, truths = keyframes_of(SE2(0.8, -0.6, 0.15), lost=True)
-    _, closed, (part,) = mapped(keyframes, trajectory, LoopParameters())
+    closed, (part,) = mapped(keyframes, trajectory, LoopParameters())
     assert closed.segments.max() == 1 and not closed.parts.any()
     assert any(loop.accepted for loop in part.loops)
     assert wrong_m(part, truths) < 2 * RESOLUTION_M
-
-
-def test_a_map_that_contradicts_itself_is_divided_into_parts_that_do_not() -> None:
-    keyframes, trajectory, _ = keyframes_of(SE2(0.9, 0.5, 0.3))
-    closer, closed, (whole,) = mapped(keyframes, trajectory, WITHOUT_LOOPS)
-    assert whole.consistency.bent and closed.segments.max() == 0
-    divided = closer.divide(doubtful_scans([whole], trajectory))
-    assert divided is not None
-    parts = draw_parts(keyframes, on_one_floor(trajectory), divided, ProjectionConfig())
-    assert len(parts) == 2 and not any(part.consistency.bent for part in parts)
-    # The place of the cut is not known better than to a local map.
-    assert abs(len(parts[0].trajectory) - begin_of_second_lap()) < 30
-    assert closer.divide(doubtful_scans(parts, trajectory)) is None
-
-
-def test_loops_may_join_what_was_divided() -> None:
-    """The blunder of tracking is larger than what is searched for loops where no restart is known."""
-    keyframes, trajectory, truths = keyframes_of(SE2(1.6, 0.3, 0.25))
-    closer, _, (whole,) = mapped(keyframes, trajectory, WITHOUT_LOOPS)
-    closer._parameters = LoopParameters()
-    divided = closer.divide(doubtful_scans([whole], trajectory))
-    assert divided is not None and not divided.parts.any() and divided.segments.max() >= 1
-    (part,) = draw_parts(keyframes, on_one_floor(trajectory), divided, ProjectionConfig())
-    assert wrong_m(part, truths) < 0.4 < wrong_m(whole, truths)
-    assert not part.consistency.bent
-
-
-def test_a_good_map_is_not_divided_even_if_asked() -> None:
-    keyframes, trajectory, _ = keyframes_of()
-    closer, _, (whole,) = mapped(keyframes, trajectory, LoopParameters())
-    assert not doubtful_scans([whole], trajectory)
-    assert closer.divide([range(len(trajectory))]) is None
 
 
 @pytest.mark.parametrize(
@@ -173,14 +137,6 @@ def test_loops_join_segments(
 ) -> None:
     edges = [Edge(first, second, SE2(), np.eye(3), loop=True) for first, second in loops]
     assert connected(np.array(segments), edges).tolist() == parts
-
-
-def test_a_segment_is_cut_where_it_contradicts_itself_mutually() -> None:
-    segment = np.array([0, 0, 0, 0, 0, 1, 1, 1])
-    once = [Conflict(0, 2, False), Conflict(5, 7, False), Conflict(1, 7, True)]
-    assert cuts_for(once, segment) == []
-    mutual = [Conflict(0, 2, False), Conflict(1, 3, True), Conflict(2, 4, True)]
-    assert cuts_for(mutual, segment) == [2, 4]
 
 
 def part_of(length_m: float, begin_ns: int) -> PartMap:
