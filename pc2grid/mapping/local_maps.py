@@ -153,7 +153,6 @@ class LocalMaps:
         self._keyframes = keyframes
         self._parameters = parameters
         self.runs: list[range] = []
-        self._settled: F64 | None = None
         self._drawn: OrderedDict[int, LocalMap] = OrderedDict()
 
     def append(self, run: range) -> None:
@@ -174,11 +173,6 @@ class LocalMaps:
         run = self.runs[number]
         return run[len(run) // 2]
 
-    def redraw(self, settled: F64) -> None:
-        """From now on, draw with settled keyframe poses (K, 3), x, y, yaw, in place of the tracked ones."""
-        self._settled = settled
-        self._drawn.clear()
-
     def __getitem__(self, number: int) -> LocalMap:
         if number not in self._drawn:
             run, anchor = self.runs[number], self.anchor(number)
@@ -194,12 +188,5 @@ class LocalMaps:
     def keyframes(self, numbers: range, anchor: int) -> tuple[list[Keyframe], list[SE2]]:
         """Keyframes, and their poses T_anchor_base in the frame of the keyframe `anchor`."""
         keyframes = [self._keyframes[k] for k in numbers]
-        T_anchor_session = self._pose(self._keyframes[anchor], anchor).inverse()
-        poses = [T_anchor_session @ self._pose(f, k) for f, k in zip(keyframes, numbers, strict=True)]
-        return keyframes, poses
-
-    def _pose(self, keyframe: Keyframe, number: int) -> SE2:
-        """T_session_base of a keyframe: settled, or as tracked if loops are not closed yet."""
-        if self._settled is None:
-            return keyframe.T_session_base
-        return pose_at(self._settled, number)
+        T_anchor_session = self._keyframes[anchor].T_session_base.inverse()
+        return keyframes, [T_anchor_session @ keyframe.T_session_base for keyframe in keyframes]
