@@ -13,8 +13,9 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import Config
 from pc2grid.errors import NoScans
 from pc2grid.estimation.ground_model import is_rolling
+from pc2grid.geometry import SE2
 from pc2grid.mapping.keyframe_points import KeyframePoints
-from pc2grid.mapping.keyframes import Keyframes
+from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.local_maps import CAMERA_LOCAL_MAPS, LOCAL_MAPS
 from pc2grid.mapping.loop_closure import LoopCloser
 from pc2grid.mapping.loop_parameters import EXACT_TRACKING, LOOPS
@@ -27,7 +28,7 @@ from pc2grid.mapping.report import (
     with_track_warnings,
     without_points,
 )
-from pc2grid.mapping.track import KeyframeSelection, Track, TrackRecord
+from pc2grid.mapping.track import Track, TrackRecord
 from pc2grid.model import (
     Health,
     Loop,
@@ -286,8 +287,7 @@ def _map(
             parameters=EXACT_TRACKING if narrow or in_hand else LOOPS,
             local_map_parameters=CAMERA_LOCAL_MAPS if narrow else LOCAL_MAPS,
         )
-        selection = KeyframeSelection(keyframes, projection, closer, points)
-        track = _track(scans, _tracker(config), selection, observer)
+        track = _track(scans, _tracker(config), keyframes, closer, points, observer)
         track = dataclasses.replace(track, assumptions=tuple(assumptions))
         closed = closer.finish()
         if whole:
@@ -307,16 +307,27 @@ def _first_of(scans: Iterable[Scan]) -> tuple[Scan | None, Iterator[Scan]]:
 
 
 def _track(
-    scans: Iterable[Scan], tracker: Tracker, selection: KeyframeSelection, observer: Observer
+    scans: Iterable[Scan],
+    tracker: Tracker,
+    keyframes: Keyframes,
+    closer: LoopCloser,
+    points: KeyframePoints | None,
+    observer: Observer,
 ) -> Track:
-    """Track all scans and select keyframes, from which local maps are made and loops closed on the way."""
+    """Track all scans, keep the keyframes, and close loops on the way."""
     record = TrackRecord()
     for scan in scans:
         tracked = tracker.track(scan)
-        selection.add(tracked, index=len(record))
+        registered = tracked.registered
+        if tracked.keyframe:
+            pose = SE2.from_matrix(registered.T_session_base)
+            keyframe = Keyframe(len(record), tracked.planar_scan, pose, tracked.restart)
+            keyframes.append(keyframe)
+            closer.extend(keyframe)
+            if points is not None and not SENSOR_MODELS[scan.sensor].planar:
+                points.append(keyframe.index, registered.scan)
         record.append(scan, tracked)
-        observer.on_scan(tracked.registered)
-    selection.finish()
+        observer.on_scan(registered)
     return record.track(tracker)
 
 

@@ -7,11 +7,10 @@ import struct
 import tempfile
 from array import array
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.arrays import F32
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
 from pc2grid.errors import OutputError
@@ -21,8 +20,8 @@ from pc2grid.model import OccupancyGrid
 
 IN_MEMORY_BYTES = 32 << 20  # chosen by hand: about an hour of a 2D laser
 # index, stamp, restart; T_session_base; origin of the sensor and height of its plane (NaN: none); hits,
-# bearings, low things, heights and unseen_hits
-_HEADER = struct.Struct("<qqq 3d 3d 5q")
+# bearings, low things and heights
+_HEADER = struct.Struct("<qqq 3d 3d 4q")
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,15 +30,12 @@ class Keyframe:
 
     index : number of its scan in the session. T_session_base : as tracked, before loops are closed.
     restart : the first keyframe after tracking was lost: its pose relative to those before is not measured.
-    unseen_hits_m : (N, 2) in its frame, hits of the scans up to the next keyframe in cells where this
-        keyframe has none (see `UnseenHits`).
     """
 
     index: int
     planar_scan: PlanarScan
     T_session_base: SE2
     restart: bool = False
-    unseen_hits_m: F32 = field(default_factory=lambda: np.empty((0, 2), np.float32))
 
 
 class Keyframes:
@@ -63,12 +59,10 @@ class Keyframes:
         start, end = self._starts[number], self._starts[number + 1]
         self._file.seek(start)
         data = self._file.read(end - start)
-        index, stamp_ns, restart, x, y, yaw, *origin, hits, bearings, low, heights, unseen_hits = (
-            _HEADER.unpack_from(data)
-        )
+        index, stamp_ns, restart, x, y, yaw, *origin, hits, bearings, low, _ = _HEADER.unpack_from(data)
         values = np.frombuffer(data, np.float32, offset=_HEADER.size)
-        ends = np.cumsum((2 * hits, hits, bearings, 2 * low, heights))
-        hits_m, normal_rad, free_m, low_m, seen_at, unseen_hits_m = np.split(values, ends)
+        ends = np.cumsum((2 * hits, hits, bearings, 2 * low))
+        hits_m, normal_rad, free_m, low_m, seen_at = np.split(values, ends)
         return Keyframe(
             index,
             PlanarScan(
@@ -83,7 +77,6 @@ class Keyframes:
             ),
             SE2(x, y, yaw),
             bool(restart),
-            unseen_hits_m.reshape(unseen_hits, 2),
         )
 
     def append(self, keyframe: Keyframe) -> None:
@@ -100,12 +93,10 @@ class Keyframes:
                 len(a)
                 for a in (planar_scan.hits_m, planar_scan.free_m, planar_scan.low_m, planar_scan.heights)
             ),
-            len(keyframe.unseen_hits_m),
         )
         arrays = (
             *(planar_scan.hits_m, planar_scan.normal_rad, planar_scan.free_m, planar_scan.low_m),
             planar_scan.heights,
-            keyframe.unseen_hits_m,
         )
         data = header + b"".join(np.ascontiguousarray(a, np.float32).tobytes() for a in arrays)
         try:
@@ -129,5 +120,4 @@ def grid_of(keyframes: Iterable[tuple[Keyframe, SE2]], projection: ProjectionCon
     builder = GridBuilder(projection)
     for keyframe, pose in keyframes:
         builder.add(keyframe.planar_scan, pose)
-        builder.add_unseen_hits(pose.apply(keyframe.unseen_hits_m))
     return builder.grid()

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F64, I64, SUBPIXEL_BITS, U8, polygon_corners
+from pc2grid.arrays import I64, SUBPIXEL_BITS, U8, polygon_corners
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
 from pc2grid.errors import LimitExceeded
 from pc2grid.geometry import SE2
-from pc2grid.model import FREE, OCCUPIED, OCCUPIED_FROM, THING, UNKNOWN, OccupancyGrid
+from pc2grid.model import FREE, OCCUPIED, THING, UNKNOWN, OccupancyGrid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,9 +28,6 @@ class OccupancyParameters:
         threshold, two misses make it free. A hit weighs two misses, so a thin wall that passing rays graze
         stays; three misses clear a person who has left.
     body_m : radius of the robot's body around the origin of the base, where no obstacle can be.
-    wall_window, wall_cells : an unseen hit is drawn if fewer occupied cells than `wall_cells` lie in the
-        square of `wall_window` cells around it. In front of a drawn wall there are more, and the hit is the
-        wall's noise; where a wall has a gap or ends there are fewer.
     lone_window, lone_cells : a cell that was hit once is noise if at least `lone_cells` cells in the square
         of `lone_window` around it were hit more often.
     merged : marks of cells that are collected before each cell is reduced to one entry.
@@ -40,8 +37,6 @@ class OccupancyParameters:
     miss: int = -75
     limit: int = 500
     body_m: float = 0.15
-    wall_window: int = 5
-    wall_cells: int = 5
     lone_window: int = 3
     lone_cells: int = 3
     merged: int = 200_000
@@ -133,7 +128,7 @@ class GridBuilder:
         self._parameters = parameters
         self._walls, self._things = _Tiles(parameters.limit), _Tiles(parameters.limit)
         self._heights_m: tuple[float, float] | None = None  # lowest and highest plane; NaN: not of planes
-        self._unseen_hits, self._heights = _Marks(parameters.merged), _Marks(parameters.merged)
+        self._heights = _Marks(parameters.merged)
 
     def add(self, planar_scan: PlanarScan, T_grid_base: SE2) -> None:
         """Draw one planar scan taken at `T_grid_base`.
@@ -176,11 +171,6 @@ class GridBuilder:
         self._walls.add(update, int(low[0]), int(low[1]))
         self._check_size(len(self._walls.log_odds) * _TILE * _TILE)
 
-    def add_unseen_hits(self, hits_m: F64) -> None:
-        """Add obstacles (N, 2), metres, that are drawn only in cells that no planar scan observes."""
-        cells = np.floor(hits_m / self._config.resolution_m).astype(np.int64)
-        self._unseen_hits.add(cells, np.zeros(len(cells), np.uint8))
-
     def grid(self) -> OccupancyGrid:
         """The map so far: 0..100 where observed, unknown elsewhere, cropped to the observed part."""
         tiles = self._walls.log_odds
@@ -204,7 +194,6 @@ class GridBuilder:
             cells[r : r + _TILE, c : c + _TILE] = known
             summed[r : r + _TILE, c : c + _TILE] = log_odds
         self._erase_lone_hits(cells, summed)
-        self._draw_unseen_hits(cells, (min(rows) * _TILE, min(columns) * _TILE))
         known_rows = np.flatnonzero((cells >= FREE).any(axis=1))
         known_columns = np.flatnonzero((cells >= FREE).any(axis=0))
         r0, r1 = int(known_rows[0]), int(known_rows[-1]) + 1
@@ -230,13 +219,6 @@ class GridBuilder:
         """Of the plane that all planar scans are of; None if they are not of one."""
         low_m, high_m = self._heights_m or (math.nan, math.nan)
         return low_m if high_m - low_m < self._config.resolution_m else None
-
-    def _draw_unseen_hits(self, cells: NDArray[np.int8], first: tuple[int, int]) -> None:
-        """Draw the unseen hits in unknown cells (H, W); `first` is the cell that is (0, 0) there."""
-        row, column, _ = self._unseen_hits.within(first, cells.shape)
-        walls = _count_around(cells >= OCCUPIED_FROM, self._parameters.wall_window)
-        kept = (cells[row, column] == UNKNOWN) & (walls[row, column] < self._parameters.wall_cells)
-        cells[row[kept], column[kept]] = round(float(_percent(np.float64(self._parameters.hit))))
 
     def _erase_lone_hits(self, cells: NDArray[np.int8], log_odds: NDArray[np.int16]) -> None:
         """Make cells (H, W) unknown that were hit once, never observed free, beside cells hit more often.

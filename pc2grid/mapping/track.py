@@ -1,4 +1,4 @@
-"""The tracked scans of a session, and which of them become keyframes."""
+"""The tracked scans of a session."""
 
 from __future__ import annotations
 
@@ -10,15 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pc2grid.arrays import F64, I64
-from pc2grid.config import ProjectionConfig
 from pc2grid.estimation.overruled import Disagreement
-from pc2grid.geometry import SE2
-from pc2grid.mapping.keyframe_points import KeyframePoints
-from pc2grid.mapping.keyframes import Keyframe, Keyframes
-from pc2grid.mapping.loop_closure import LoopCloser
-from pc2grid.mapping.unseen_hits import UnseenHits
 from pc2grid.model import Health, Scan, Trajectory
-from pc2grid.sensor_model import SENSOR_MODELS
 
 if TYPE_CHECKING:
     from pc2grid.estimation.tracker import Tracked, Tracker
@@ -95,46 +88,3 @@ class TrackRecord:
             readings=np.frombuffer(self._readings).reshape(-1, 4, 4),
             carried=tracker.carried,
         )
-
-
-class KeyframeSelection:
-    """Stores the keyframes of a session and passes them to the loop closure.
-
-    A keyframe is stored when the next one begins, together with the hits of the scans between them that the
-    keyframe itself did not see.
-
-    points : gets the points in space of each keyframe; None: they are not kept.
-    """
-
-    def __init__(
-        self,
-        keyframes: Keyframes,
-        projection: ProjectionConfig,
-        closer: LoopCloser,
-        points: KeyframePoints | None = None,
-    ) -> None:
-        self._keyframes = keyframes
-        self._closer = closer
-        self._points = points
-        self._unseen_hits = UnseenHits(projection.max_range_m, projection.resolution_m)
-        self._latest: Keyframe | None = None
-
-    def add(self, tracked: Tracked, *, index: int) -> None:
-        """The next scan, number `index` of the session."""
-        pose = SE2.from_matrix(tracked.registered.T_session_base)
-        if tracked.keyframe:
-            self.finish()
-            self._latest = Keyframe(index, tracked.planar_scan, pose, tracked.restart)
-            self._unseen_hits.restart(tracked.planar_scan, pose)
-            scan = tracked.registered.scan
-            if self._points is not None and not SENSOR_MODELS[scan.sensor].planar:
-                self._points.append(index, scan)
-        elif self._latest is not None and tracked.registered.health is not Health.LOST:
-            self._unseen_hits.add(tracked.planar_scan, pose)
-
-    def finish(self) -> None:
-        """Store the latest keyframe, if there is one."""
-        if self._latest is not None:
-            complete = dataclasses.replace(self._latest, unseen_hits_m=self._unseen_hits.take())
-            self._keyframes.append(complete)
-            self._closer.extend(self._latest)

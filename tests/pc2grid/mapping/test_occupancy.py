@@ -137,26 +137,6 @@ def test_memory_goes_with_what_was_visited_not_with_the_rectangle_around_it() ->
     assert grid.cells.shape[1] * grid.resolution_m > 790 and 0 <= state(grid, 796.5, 0.5) < 50
 
 
-def test_unseen_hits_are_drawn_in_unknown_cells_only() -> None:
-    builder = GridBuilder(ProjectionConfig())
-    builder.add(disc(2.0), SE2())
-    before = builder.grid()
-    builder.add_unseen_hits(np.array([[0.52, 0.52], [2.52, 0.02], [900.0, 0.0]]))
-    after = builder.grid()
-    assert state(after, 0.52, 0.52) == state(before, 0.52, 0.52) < 50
-    assert state(after, 2.52, 0.02) >= 65
-
-
-def test_unseen_hit_beside_a_drawn_wall_is_its_noise() -> None:
-    behind, away = (2.02, -0.12), (2.52, 0.02)
-    builder = GridBuilder(ProjectionConfig())
-    builder.add(disc(2.0), SE2())
-    builder.add_unseen_hits(np.array([behind, away]))
-    grid = builder.grid()
-    assert state(grid, *away) >= 65
-    assert state(grid, *behind) == -1
-
-
 def test_lone_hit_beside_a_wall_is_noise_until_it_is_repeated() -> None:
     strayed, away = (1.92, 0.02), (0.0, 2.5)
     once = disc(2.0)
@@ -174,17 +154,6 @@ def test_lone_hit_beside_a_wall_is_noise_until_it_is_repeated() -> None:
         assert state(grid, *away) >= 65  # met as seldom, but nothing stands beside it
         assert state(grid, *strayed) >= 65 if times == 2 else state(grid, *strayed) == -1
         assert occupied_at(grid, once.hits_m).all()
-
-
-def test_wall_is_continued_by_unseen_hits() -> None:
-    planar_scan = disc(2.0)
-    gap = np.abs(planar_scan.hits_m[:, 1] - 1.0) < 0.15
-    builder = GridBuilder(ProjectionConfig())
-    builder.add(dataclasses.replace(planar_scan, hits_m=planar_scan.hits_m[~gap]), SE2())
-    missing = planar_scan.hits_m[gap & (planar_scan.hits_m[:, 0] > 0)]
-    assert (occupied_at(builder.grid(), missing)).mean() < 0.1
-    builder.add_unseen_hits(missing.astype(np.float64)[::4])
-    assert occupied_at(builder.grid(), missing).mean() > 0.8
 
 
 def occupied_at(grid: OccupancyGrid, points: NDArray[np.floating]) -> NDArray[np.bool_]:
