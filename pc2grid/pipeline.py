@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from itertools import chain
 from typing import TYPE_CHECKING
@@ -47,6 +47,7 @@ from pc2grid.submaps.partition import divide
 from pc2grid.time_span import TimeSpan
 
 if TYPE_CHECKING:
+    from pc2grid.estimation.carried import Beginning
     from pc2grid.estimation.tracker import Tracker
     from pc2grid.io import Log
     from pc2grid.mapping.place_recognition import PlaceRecognizer
@@ -65,8 +66,9 @@ def follow(
     (`pc2grid.mapping.report.not_held`); their planar scans are empty, since the map that these are cut out
     of is not to be trusted either.
 
-    observer : is warned of that, once, and of a start without a floor in view
-        (`pc2grid.estimation.first_floor`). Raises TrackingLost if it is so at the last scan.
+    observer : is warned of that, once, and of scans before the first that shows which way is up, which are
+        left out (`pc2grid.estimation.carried.begin`). Raises TrackingLost if it is so at the last
+        scan.
 
     >>> import pc2grid
     >>> with pc2grid.open_log("tuesday.mcap") as log:
@@ -77,7 +79,11 @@ def follow(
     tracker = _tracker(config)
     unaided: deque[Health] = deque(maxlen=HELD_SCANS)  # of a sensor in the hand, without odometry
     fault, warned = None, False
-    for scan in _with_vertical(scans, config, observer, observer.on_warning):
+    rest = iter(scans)
+    beginning = _begin(rest)
+    if beginning.warning is not None:
+        observer.on_warning(beginning.warning)
+    for scan in chain(beginning.scans, rest):
         tracked = tracker.track(scan)
         registered, planar_scan = tracked.registered, tracked.planar_scan
         if tracker.carried and scan.T_odom_base is None:
@@ -270,10 +276,10 @@ def _map(
     whole : all scans are one part.
     """
     projection = config.projection
-    assumptions: list[str] = []
-    first, scans = _first_of(_with_vertical(scans, config, observer, assumptions.append))
-    narrow = first is not None and SENSOR_MODELS[first.sensor].narrow
-    in_hand = first is not None and not is_rolling(first)
+    rest = iter(scans)
+    beginning = _begin(rest)
+    narrow = any(SENSOR_MODELS[scan.sensor].narrow for scan in beginning.scans[:1])
+    in_hand = not all(is_rolling(scan) for scan in beginning.scans[:1])
     with ExitStack() as stack:
         keyframes = stack.enter_context(closing(Keyframes()))
         points = None
@@ -287,8 +293,9 @@ def _map(
             parameters=EXACT_TRACKING if narrow or in_hand else LOOPS,
             local_map_parameters=CAMERA_LOCAL_MAPS if narrow else LOCAL_MAPS,
         )
+        scans = chain(beginning.scans, rest)
         track = _track(scans, _tracker(config), keyframes, closer, points, observer)
-        track = dataclasses.replace(track, assumptions=tuple(assumptions))
+        track = dataclasses.replace(track, left_out=beginning.left_out, warning=beginning.warning)
         closed = closer.finish()
         if whole:
             closed = closed.undivided()
@@ -296,14 +303,6 @@ def _map(
         if points is not None:
             parts = with_points(parts, track, closed, points)
     return parts, track
-
-
-def _first_of(scans: Iterable[Scan]) -> tuple[Scan | None, Iterator[Scan]]:
-    """The first of the scans, None if there is none, and an iterator over all."""
-    rest = iter(scans)
-    for first in rest:
-        return first, chain((first,), rest)
-    return None, rest
 
 
 def _track(
@@ -331,16 +330,11 @@ def _track(
     return record.track(tracker)
 
 
-def _with_vertical(
-    scans: Iterable[Scan],
-    config: Config,
-    observer: Observer,
-    assumed: Callable[[str], object],
-) -> Iterator[Scan]:
-    """The scans, see `pc2grid.estimation.first_floor`; loaded late, like the tracker."""
-    from pc2grid.estimation.first_floor import with_vertical
+def _begin(scans: Iterator[Scan]) -> Beginning:
+    """The first scans, see `pc2grid.estimation.carried`; loaded late, like the tracker."""
+    from pc2grid.estimation.carried import begin
 
-    return with_vertical(scans, config, observer, assumed)
+    return begin(scans)
 
 
 def _tracker(config: Config) -> Tracker:

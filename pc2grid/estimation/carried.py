@@ -9,8 +9,9 @@ believed, else it is lost.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.upright import level_floor
 from pc2grid.config import ProjectionConfig
 from pc2grid.estimation.belief import KERNEL, SPATIAL, Belief
+from pc2grid.estimation.ground_model import is_rolling
 from pc2grid.estimation.manifold import moved, steps
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.estimation.placing import Estimate, Fit
@@ -38,12 +40,14 @@ class CarriedParameters:
     residual_weight_per_m : of two placements the one with the larger agreement - weight * residual is taken.
     starts : placements that a search refines in space. turned_rad : by how much these may be turned, a
         standard deviation: more than a step of the search.
+    most_waiting : scans that wait for one that shows the floor, at most: some 50 MB.
     """
 
     least_agreement: float = 0.85
     residual_weight_per_m: float = 5.0
     starts: int = 10
     turned_rad: float = 0.1
+    most_waiting: int = 100
 
 
 CARRIED = CarriedParameters()
@@ -179,3 +183,39 @@ def first_pose(scan: Scan, points_m: F32) -> F64:
         if ground is None or ground.normal @ up < LEVEL.level:
             return leveling(up)
     return np.eye(4) if ground is None else ground.leveling()
+
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """The first scans of a session, of which none is missing but those `left_out`.
+
+    warning : what was left out, or assumed, as a sentence for the user; None: nothing.
+    """
+
+    scans: Sequence[Scan]
+    left_out: int = 0
+    warning: str | None = None
+
+
+def begin(scans: Iterator[Scan], parameters: CarriedParameters = CARRIED) -> Beginning:
+    """Take scans up to the first that shows which way is up: with it a session begins.
+
+    If none of the first scans does, all of them are kept: the sensor is taken to be held level.
+    """
+    waiting: list[Scan] = []
+    unknown = "no floor, and neither odometry nor an IMU says which way is up"
+    for scan in islice(scans, parameters.most_waiting):
+        waiting.append(scan)
+        if not _knows_vertical(scan):
+            continue
+        left_out = len(waiting) - 1
+        said = f"{left_out} scans show {unknown}: they are left out; begin with the floor in view"
+        return Beginning([scan], left_out, said if left_out else None)
+    said = f"the scans show {unknown}: the sensor is taken to be held level; begin with the floor in view"
+    return Beginning(waiting, warning=said if waiting else None)
+
+
+def _knows_vertical(scan: Scan) -> bool:
+    """Whether it is on wheels, or odometry, an IMU or a floor in view tells the vertical."""
+    known = scan.T_odom_base is not None or scan.T_level_base is not None
+    return known or is_rolling(scan) or level_floor(scan, scan.points_m) is not None

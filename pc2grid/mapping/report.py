@@ -114,10 +114,14 @@ def division_warning(session: str, parts: Sequence[PartMap], kept: Sequence[Part
 
 def with_track_warnings(report: ReadReport, track: Track) -> ReadReport:
     """The report of a recording, with what was assumed, and what is said of odometry and of heights."""
-    of_odometry = odometry_warnings(track.trajectory, track.readings)
-    of_heights = height_warnings(track.heights_m, track.trajectory)
-    warnings = (*report.warnings, *track.assumptions, *of_heights, *of_odometry)
-    return dataclasses.replace(report, warnings=warnings)
+    warnings, skipped = [*report.warnings], dict(report.scans_skipped)
+    if track.warning is not None:
+        warnings.append(track.warning)
+    if track.left_out:
+        skipped["before one that shows the floor"] = track.left_out
+    warnings += height_warnings(track.heights_m, track.trajectory)
+    warnings += odometry_warnings(track.trajectory, track.readings)
+    return dataclasses.replace(report, scans_skipped=skipped, warnings=tuple(warnings))
 
 
 def without_points(report: ReadReport) -> ReadReport:

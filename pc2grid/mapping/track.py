@@ -25,15 +25,16 @@ class Track:
     """The results of tracking for all scans of a session.
 
     trajectory : before loops are closed. disagreements : of odometry, at each scan. readings : (N, 4, 4) of
-    odometry, NaN where there is none. carried : see `Tracker`. assumptions : what was
-    assumed since nothing in the recording shows it, as sentences for the user.
+    odometry, NaN where there is none. carried : see `Tracker`.
+    left_out : scans before the first of the trajectory. warning : why, or what was assumed of that.
     """
 
     trajectory: Trajectory
     disagreements: Sequence[Disagreement | None]
     readings: F64
     carried: bool = False
-    assumptions: tuple[str, ...] = ()
+    left_out: int = 0
+    warning: str | None = None
 
     @property
     def with_odometry(self) -> bool:

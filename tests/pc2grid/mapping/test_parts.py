@@ -177,5 +177,6 @@ def test_a_sensor_that_is_carried_to_another_floor_is_told_of_once() -> None:
     assert not height_warnings(0.5 * heights_m, way)
     assert not height_warnings(np.full(20, np.nan), way)
     poses[:, 2, 3] = heights_m
-    track = replace(on_one_floor(way), readings=poses, assumptions=("so",))
-    assert with_track_warnings(ReadReport(), track).warnings == ("so", warning)
+    track = replace(on_one_floor(way), readings=poses, left_out=3, warning="so")
+    report = with_track_warnings(ReadReport(), track)
+    assert report.warnings == ("so", warning) and list(report.scans_skipped.values()) == [3]
