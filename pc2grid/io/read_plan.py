@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import FrameError, NoScans, PointCloudError, UnsupportedSchema
+from pc2grid.errors import FrameError, NoScans, PointCloudError, TopicError, UnsupportedSchema
 from pc2grid.io import topics
 from pc2grid.io.frames import FrameTree
 from pc2grid.io.message_source import Choice, MessageSource, TopicInfo
@@ -161,6 +161,7 @@ class _Planner:
         child = None if self._reading is None else self._reading.child
         found = self._search_tf(moving, sensor_frame, child, first_ns, odometry_too=in_tf)
         sensors.need(found)
+        self._check_joined(sensors.more, sensor_frame, found)
         mounted = self._mounted(sensors, sensor_frame, found)
         base = self._base_or_sensor(found, sensor_frame)
         motion = _Motion(odometry, odometry, None, why)
@@ -190,6 +191,19 @@ class _Planner:
             mounted=mounted,
             period_ns=max((b.stamp_ns - a.stamp_ns for a, b in itertools.pairwise(headers)), default=0),
         )
+
+    def _check_joined(self, more: Sequence[TopicInfo], sensor_frame: str, base: str | None) -> None:
+        """Raise TopicError for a topic with the scans of the first sensor, published again.
+
+        In the frame of the base, sensors are not told apart.
+        """
+        for topic in more:
+            if sensor_frame != base and self._source_of(topic).frame == sensor_frame:
+                raise TopicError(
+                    f"{topic.topic} is in frame {sensor_frame} of the first topic: one sensor is not put "
+                    "together with itself",
+                    hint="name a topic of each sensor, such as --topic /front,/rear, or only one",
+                )
 
     def _mounted(self, sensors: _Sensors, sensor_frame: str, base: str | None) -> str | None:
         """The frame of the sensor, if its points are in a fixed frame; None if they are in its own.

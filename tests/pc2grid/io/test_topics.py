@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from pc2grid.config import ReadConfig
 from pc2grid.errors import TopicError
 from tests.helpers.recordings import STEP, T0, Message, read, ros, write_mcap
 
@@ -29,3 +30,9 @@ def test_the_driver_s_own_scans_are_proposed_and_one_sensor_is_not_joined_with_i
     with pytest.raises(TopicError, match="several topics hold scans") as error:
         read(write_mcap(tmp_path / "a.mcap", robot_with_copies()))
     assert error.value.hint == "choose one, e.g. --topic /scan"
+
+
+def test_a_sensor_is_not_put_together_with_itself(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", robot_with_copies())
+    with pytest.raises(TopicError, match="/a_stable_scan is in frame laser of the first topic"):
+        read(path, ReadConfig(topic="/scan,/a_stable_scan"))
