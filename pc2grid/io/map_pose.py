@@ -32,15 +32,15 @@ class MapPose:
     covariance: F64 | None = None
 
 
-def last_map_pose(source: MessageSource, topic: str, base_frame: str, end_ns: int | None = None) -> MapPose:
-    """The last pose on a topic of a pose, an odometry or tf, recorded before `end_ns` (None: of all).
+def last_map_pose(source: MessageSource, topic: str, base_frame: str, end_ns: int) -> MapPose:
+    """The last pose on a topic of a pose, an odometry or tf, recorded before `end_ns`.
 
     Raises TopicError, UnsupportedSchema, FrameError, or NoScans if there is no pose.
     """
     poses = map_poses(source.info.topics, topic, base_frame)
     for message in source.messages(poses.topics, None, end_ns):
         poses.take(message)
-    return poses.newest(source.info.end_ns)
+    return poses.newest(end_ns)
 
 
 class MapPoses(Protocol):
@@ -68,6 +68,39 @@ def map_poses(known: Sequence[TopicInfo], topic: str, base_frame: str) -> MapPos
     """
     channel = _channel(known, topic)
     return _TfPoses(known, base_frame) if channel.type in topics.TF else _TopicPoses(channel)
+
+
+class BelievedPose:
+    """The newest pose on a topic as messages come.
+
+    newest : None before the first. problem : why the last message gave none, such as tf that lacks the map.
+    topics : those whose messages are used; empty until `find` has found it.
+    """
+
+    def __init__(self, topic: str) -> None:
+        self.newest: MapPose | None = None
+        self.problem: FrameError | None = None
+        self.topics: frozenset[str] = frozenset()
+        self._topic = topic
+        self._poses: MapPoses | None = None
+
+    def find(self, known: Sequence[TopicInfo], base_frame: str) -> None:
+        """Look for the topic. Raises TopicError, UnsupportedSchema."""
+        self._poses = map_poses(known, self._topic, base_frame)
+        self.topics = self._poses.topics
+
+    def take(self, message: RawMessage) -> None:
+        """Take in a message; those of other topics are left alone."""
+        if self._poses is None or message.channel.topic not in self.topics:
+            return
+        self._poses.take(message)
+        self.problem = None
+        try:
+            self.newest = self._poses.newest(message.log_time_ns)
+        except NoScans:
+            return
+        except FrameError as error:
+            self.problem = error
 
 
 class _TopicPoses:

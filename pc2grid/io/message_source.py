@@ -38,7 +38,8 @@ class LogInfo:
     """The facts about a recording that are known without decoding it.
 
     format : `mcap/ros2`, `mcap/ros1`, `bag/ros1`, `db3/ros2`, `folder/ply`, ...
-    start_ns, end_ns : first and last log time; 0 and 0 if there is no message.
+    start_ns, end_ns : first and last log time of all messages; 0 and 0 if there is none. Of an open `Log`
+    these are the times of the scans.
     message_count : None if unknown.
     """
 
@@ -53,7 +54,7 @@ class LogInfo:
 
     @property
     def duration_s(self) -> float:
-        """Time between the first and the last message."""
+        """Time from the start to the end."""
         return (self.end_ns - self.start_ns) * 1e-9
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from types import TracebackType
 
@@ -11,14 +12,15 @@ import numpy as np
 
 from pc2grid.config import ReadConfig
 from pc2grid.display import html_table, short
-from pc2grid.errors import ConfigError
+from pc2grid.errors import ConfigError, LogError
 from pc2grid.io.containers.detect import open_source
 from pc2grid.io.error_translation import guarded, guarded_stream
 from pc2grid.io.frames import FrameTree
 from pc2grid.io.map_pose import MapPose, last_map_pose
-from pc2grid.io.message_source import Choice, LogInfo, MessageSource
+from pc2grid.io.message_source import Choice, LogInfo, MessageSource, RawMessage
 from pc2grid.io.read_plan import Plan, make_plan
-from pc2grid.io.scan_stream import Stream
+from pc2grid.io.scan_stream import Part, Stream
+from pc2grid.io.scan_times import with_scan_times
 from pc2grid.model import ReadReport, Scan
 
 
@@ -44,18 +46,23 @@ def open_log(path: str | Path, config: ReadConfig | None = None, *, recover: boo
 
 
 class Log:
-    """An open recording. Use as a context manager.
-
-    info : the facts that are known without decoding a message.
-    """
+    """An open recording. Use as a context manager."""
 
     def __init__(self, source: MessageSource, config: ReadConfig) -> None:
-        self.info: LogInfo = source.info
         self._source = source
         self._config = config
         self._plan: Plan | None = None
         self._frames = FrameTree()
         self._digest: str | None = None
+        self._stream: Stream | None = None
+
+    @functools.cached_property
+    def info(self) -> LogInfo:
+        """The facts that are known without decoding a message; its times are those of the scans."""
+        try:
+            return guarded(self._source.info.path, lambda: with_scan_times(self._source, self._config.topic))
+        except LogError:  # said again where the scans are read
+            return self._source.info
 
     def __repr__(self) -> str:
         info = self.info
@@ -82,6 +89,10 @@ class Log:
         """Close the files."""
         self._source.close()
 
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """All messages of some topics as they stand in the recording, by log time. Raises LogError."""
+        return guarded_stream(self._source.info.path, self._source.messages(topics))
+
     def digest(self) -> str:
         """SHA-256 (hex) of the file, or of all files of a folder one after another, in reading order."""
         if self._digest is None:
@@ -103,7 +114,8 @@ class Log:
         Raises TopicError, NoScans, UnsupportedSchema or FrameError.
         """
         if self._plan is None:
-            self._plan = guarded(self.info.path, lambda: make_plan(self._source, self._config, self._frames))
+            read, path = (self._source, self._config, self._frames), self._source.info.path
+            self._plan = guarded(path, lambda: make_plan(*read))
         return self._plan.choice
 
     def map_pose(self, topic: str, end_s: float | None = None) -> MapPose:
@@ -114,12 +126,12 @@ class Log:
 
         Raises TopicError, UnsupportedSchema, FrameError, NoScans if there is no such pose.
         """
-        base_frame = self.choose().base_frame
-        end_ns = None if end_s is None else self.info.start_ns + round(end_s * 1e9)
-        return guarded(self.info.path, lambda: last_map_pose(self._source, topic, base_frame, end_ns))
+        base_frame, info = self.choose().base_frame, self.info
+        end_ns = info.end_ns + 1 if end_s is None else info.start_ns + round(end_s * 1e9)
+        return guarded(info.path, lambda: last_map_pose(self._source, topic, base_frame, end_ns))
 
     def scans(self, start_s: float = 0.0, duration_s: float | None = None) -> Iterator[Scan]:
-        """Stream the scans from `start_s` seconds after the log's start on, for `duration_s` seconds.
+        """Stream the scans from `start_s` seconds after the first one on, for `duration_s` seconds.
 
         Stamps increase strictly. Scans that cannot be decoded are skipped and counted in `report`.
 
@@ -133,8 +145,21 @@ class Log:
         self.choose()
         plan = self._plan
         assert plan is not None
-        stream = guarded(
-            self.info.path,
-            lambda: Stream(self._source, self._config, self._frames, plan, start_s, duration_s),
-        )
-        return guarded_stream(self.info.path, stream.run())
+        path, part = self._source.info.path, self._part(start_s, duration_s)
+        read = self._source, self._config, self._frames, plan, part
+        self._stream = guarded(path, lambda: Stream(*read))
+        return guarded_stream(path, self._stream.run())
+
+    @property
+    def last_scan_ns(self) -> int:
+        """The log time of the last scan that `scans` has given; 0 before the first."""
+        return 0 if self._stream is None else self._stream.last_log_ns
+
+    def _part(self, start_s: float, duration_s: float | None) -> Part:
+        if not start_s and duration_s is None:
+            return Part()
+        info = self.info
+        start_ns = info.start_ns + round(start_s * 1e9)
+        end_ns = None if duration_s is None else start_ns + round(duration_s * 1e9)
+        name = f"from {start_s:g} s" + ("" if duration_s is None else f" for {duration_s:g} s")
+        return Part(start_ns if start_s else None, end_ns, name, info.duration_s)

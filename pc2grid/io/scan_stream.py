@@ -81,23 +81,26 @@ class _Waiting(NamedTuple):
     message: ScanMessage
 
 
-class _Part:
+class Part:
     """The part of the log that is read, and how many of its scans could be decoded.
 
-    holds : of a log time, whether a scan recorded then is wanted.
+    start_ns, end_ns : log times of its scans; None: from the first one on, to the last one.
     """
 
-    def __init__(self, source: MessageSource, start_s: float, duration_s: float | None) -> None:
-        self.start_ns = source.info.start_ns + round(start_s * 1e9)
-        self.end_ns = None if duration_s is None else self.start_ns + round(duration_s * 1e9)
-        self._name = f"from {start_s:g} s" + ("" if duration_s is None else f" for {duration_s:g} s")
-        self._length_s = source.info.duration_s
+    def __init__(
+        self, start_ns: int | None = None, end_ns: int | None = None, name: str = "", length_s: float = 0.0
+    ) -> None:
+        """name, length_s : for errors, which seconds of how many are wanted."""
+        self.start_ns, self.end_ns = start_ns, end_ns
+        self._name, self._length_s = name, length_s
         self.count = self.good = self._bad = 0
         self._error: Pc2GridError | None = None
 
     def holds(self, log_time_ns: int) -> bool:
-        """See above."""
-        return log_time_ns >= self.start_ns and (self.end_ns is None or log_time_ns < self.end_ns)
+        """Whether a scan recorded then is wanted."""
+        return (self.start_ns is None or log_time_ns >= self.start_ns) and (
+            self.end_ns is None or log_time_ns < self.end_ns
+        )
 
     def skipped(self, error: Pc2GridError, topic: str, patience: int) -> None:
         """Count a scan that cannot be used. Raises after too many from the beginning on."""
@@ -109,7 +112,8 @@ class _Part:
     def finish(self, topic: str, max_bad_share: float) -> None:
         """Raises NoScans if there were none, LogCorrupt or PointCloudError if too many were bad."""
         if self.count == 0:
-            raise NoScans(f"{topic}: no scan {self._name}", hint=f"the log lasts {self._length_s:.1f} s")
+            hint = f"the log lasts {self._length_s:.1f} s"
+            raise NoScans(f"{topic}: no scan {self._name}".rstrip(), hint=hint)
         if self.good == 0 or self._bad > max_bad_share * self.count:
             raise self._mostly_bad(topic)
 
@@ -337,13 +341,13 @@ class Stream:
         config: ReadConfig,
         frames: FrameTree,
         plan: Plan,
-        start_s: float = 0.0,
-        duration_s: float | None = None,
+        part: Part | None = None,
         parameters: StreamParameters | None = None,
     ) -> None:
+        """part : of the recording; None: all of it."""
         self._source, self._plan = source, plan
         self._parameters = parameters = parameters or PARAMETERS
-        self._part = _Part(source, start_s, duration_s)
+        self._part = part or Part()
         sensor = plan.choice.sensor
         self._decoder = ScanDecoder(plan.scans.topic, sensor, decoder_for(plan.scans), config)
         self._further = [
@@ -379,7 +383,7 @@ class Stream:
     def run(self) -> Iterator[Scan]:
         """Yield the scans of the source. Raises as `Log.scans` says."""
         margin_ns, part = self._parameters.margin_ns, self._part
-        low = max(part.start_ns - margin_ns, 0) if part.start_ns > self._source.info.start_ns else None
+        low = None if part.start_ns is None else max(part.start_ns - margin_ns, 0)
         high = None if part.end_ns is None else part.end_ns + margin_ns
         for message in self._source.messages(self.topics, low, high):
             yield from self.take(message)

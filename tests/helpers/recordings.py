@@ -300,3 +300,18 @@ def check_drive(scans: Sequence[Scan], count: int = 12) -> None:
         np.testing.assert_array_equal(scan.points_m, expected)
         assert scan.T_odom_base is not None
         np.testing.assert_allclose(scan.T_odom_base[:3, 3], [0.1 * i, 0, 0], atol=1e-12)
+
+
+def laser_drive(count: int = 120, step_ns: int = 100_000_000) -> list[Message]:
+    """A laser that moves 0.05 m a scan, with odometry between the scans, and static tf at the beginning
+    only."""
+    from tests.helpers.recordings import T0
+
+    to = ros()
+    messages = [to.tf(T0, "base_link", "laser", 0.2, topic="/tf_static")]
+    for i in range(count):
+        stamp = T0 + i * step_ns
+        messages.append(to.laser("/scan", stamp, [1.0 + 0.01 * ((i + k) % 7) for k in range(30)]))
+        messages.append(to.odometry("/odom", stamp, 0.05 * i))
+        messages.append(to.odometry("/odom", stamp + step_ns // 2, 0.05 * i + 0.025))
+    return messages

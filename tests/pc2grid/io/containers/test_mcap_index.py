@@ -208,6 +208,6 @@ def test_every_message_passes_through_the_reader_of_mcap(
 
     monkeypatch.setattr(StreamReader, "_read_record", noted)
     with open_log(path) as log:
-        found = [bytes(m.data) for m in log._source.messages({t.topic for t in log.info.topics})]
+        found = [bytes(m.data) for m in log._source.messages({t.topic for t in log._source.info.topics})]
     assert len(found) == len(drive())
     assert sorted(seen) == sorted(found)

@@ -55,8 +55,6 @@ class Recording:
         end.
     of_base : whether these are poses of the base, not of the sensor.
     quick : whether it belongs to the quick form.
-    scans_s : seconds after its begin between which there are scans; given where another message lies days
-        apart from them.
     """
 
     name: str
@@ -74,16 +72,11 @@ class Recording:
     late_s: float = 0.0
     of_base: bool = False
     quick: bool = False
-    scans_s: tuple[float, float] | None = None
 
     @property
     def sensor_shown(self) -> str:
         """The sensor as the page names it."""
         return self.sensor if self.drive is None else f"driven {self.sensor}"
-
-    def span_s(self, length_s: float) -> tuple[float, float]:
-        """From when to when there are scans, in a recording of `length_s`."""
-        return self.scans_s or (0.0, length_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,8 +159,8 @@ def _phone(name: str, *, odometry: bool = True, points: bool = False, quick: boo
     )
 
 
-def _kidnap(name: str, file: str, scans_s: tuple[float, float], *, quick: bool = False) -> Recording:
-    return _laser(name, "kidnap", file=f"laser/kidnap/{file}", scans_s=scans_s, quick=quick)
+def _kidnap(name: str, file: str, *, quick: bool = False) -> Recording:
+    return _laser(name, "kidnap", file=f"laser/kidnap/{file}", quick=quick)
 
 
 def _kitchen(name: str, *, map_options: tuple[str, ...] = ()) -> Recording:
@@ -277,11 +270,11 @@ RECORDINGS: tuple[Recording, ...] = (
     _laser("wean 1", "wean", file="laser/wean/robotdata1.mcap", quick=True),
     _laser("wean 2", "wean", file="laser/wean/robotdata2.mcap"),
     _laser("wean 3", "wean", file="laser/wean/robotdata3.mcap"),
-    _kidnap("kidnap dec13 before", "dec13_before.mcap", (0.0, 86.1), quick=True),
-    _kidnap("kidnap dec13 after", "dec13_after.mcap", (0.0, 73.3), quick=True),
-    _kidnap("kidnap dec14 before", "dec14_before.mcap", (0.0, 48.3)),
-    _kidnap("kidnap may9 before", "may9_before.mcap", (40.1, 117.3)),
-    _kidnap("kidnap may9 after", "may9_after.mcap", (22.4, 83.1)),
+    _kidnap("kidnap dec13 before", "dec13_before.mcap", quick=True),
+    _kidnap("kidnap dec13 after", "dec13_after.mcap", quick=True),
+    _kidnap("kidnap dec14 before", "dec14_before.mcap"),
+    _kidnap("kidnap may9 before", "may9_before.mcap"),
+    _kidnap("kidnap may9 after", "may9_after.mcap"),
     _laser("hallway", "hallway", file="laser/hallway/hallway.mcap"),
     _laser("hallway2", "hallway", file="laser/hallway/hallway2.mcap"),
     _small_room("small room", "indoor_small_01.mcap"),
@@ -474,7 +467,7 @@ class Catalogue:
 
         They begin at whole milliseconds, as commands are told: else the last scan might be another one.
         """
-        first_s, last_s = pair.within_s or self.recordings[pair.query].span_s(length_s)
+        first_s, last_s = pair.within_s or (0.0, length_s)
         if pair.map == pair.query and pair.until_s is not None:
             first_s = pair.until_s
         spans = evenly_spaced(first_s, last_s, pair.windows, pair.window_s)
