@@ -5,8 +5,7 @@
     python3 nav2_node.py building.submaps --topic /scan_front
 
 Messages are taken as their bytes (raw=True) and decoded by pc2grid, so no message package is needed for
-sensors. Without rclpy, `pc2grid watch ws://robot:8765` and `zenoh://robot:7447` do the same from another
-computer.
+sensors. Without rclpy, `pc2grid watch ws://robot:8765` does the same from another computer.
 """
 
 from __future__ import annotations
@@ -37,8 +36,6 @@ except ModuleNotFoundError:
 
 class RclpyFeed(Feed):
     """The topics of the node's ROS graph as a feed, and where messages are published."""
-
-    realtime = True
 
     def __init__(self, node: Any, topic: str | None) -> None:
         super().__init__("this robot", ReadConfig(topic=topic))

@@ -29,7 +29,6 @@ EXTRAS = {
     "paper": Extra(("mahotas",), ("mahotas",)),
     "cluster": Extra(("dask", "distributed"), ("dask", "distributed"), ClusterError),
     "live": Extra(("websockets",), ("websockets",), LiveError),
-    "zenoh": Extra(("zenoh",), ("eclipse-zenoh",), LiveError),
     "postgres": Extra(("psycopg",), ("'psycopg[binary]'",), DatabaseError),
     "bench": Extra(("faiss",), ("faiss-cpu",)),
     "docs": Extra(("mkdocs", "material", "mkdocstrings"), ("mkdocs-material", "'mkdocstrings[python]'")),
@@ -37,7 +36,6 @@ EXTRAS = {
 _OF_ADDRESSES = {
     "ws": "live",
     "wss": "live",
-    "zenoh": "zenoh",
     "postgresql": "postgres",
     "postgres": "postgres",
 }

@@ -137,8 +137,6 @@ NOT_RUN = {
     "createdb": "needs a PostgreSQL server; test_postgres.py brings one",
     "pc2grid view": "serves until Ctrl-C; see test_view.py",
     "pc2grid watch ws://": "needs a robot; test_watch.py has one",
-    "pc2grid watch zenoh://": "needs a robot; test_watch.py has one",
-    "pc2grid watch recordings/tuesday": "needs a recorder; test_recording_feed.py has one",
     "pc2grid convert logs": "several processes; test_conversion_jobs.py does it",
 }
 SHORTER = {"--length 20": "--length 1"}

@@ -32,12 +32,10 @@ def with_scan_times(source: MessageSource, wanted: str | None) -> LogInfo:
         return info
     last_ns = _last_ns(source, names, first_ns)
     of_scans = replace(info, start_ns=first_ns, end_ns=last_ns)
-    early, late = first_ns - info.start_ns > _FAR_NS, info.end_ns - last_ns > _FAR_NS
-    told = ()
-    if early or late:
-        others = [t.topic for t in info.topics if t.topic not in names and t.message_count != 0]
-        told = tuple(_strays(source, of_scans, others))
-    return replace(of_scans, warnings=(*info.warnings, *told))
+    if max(first_ns - info.start_ns, info.end_ns - last_ns) <= _FAR_NS:
+        return of_scans
+    others = [t.topic for t in info.topics if t.topic not in names and t.message_count != 0]
+    return replace(of_scans, warnings=(*info.warnings, *_strays(source, of_scans, others)))
 
 
 def _strays(source: MessageSource, scans: LogInfo, names: Collection[str]) -> list[str]:

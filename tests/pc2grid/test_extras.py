@@ -88,7 +88,6 @@ def test_a_package_that_is_broken_is_missing(tmp_path: Path, monkeypatch: pytest
             LiveError,
             "pip install websockets 'psycopg[binary]'",
         ),
-        ("watch zenoh://robot -d {0}/no.submaps", ("zenoh",), LiveError, "pip install eclipse-zenoh"),
         ("view {0}/no.submaps wss://robot", ("live",), LiveError, "pip install websockets"),
         ("db info postgresql://h/d", ("postgres",), DatabaseError, "pip install 'psycopg[binary]'"),
     ],

@@ -17,6 +17,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from typer.testing import CliRunner
 
+from pc2grid.io import open_log
 from pc2grid.io.nav2_map import save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
@@ -26,7 +27,7 @@ from pc2grid_cli.watch import ResetPolicy
 from tests.helpers.interruptible import interruptible
 from tests.helpers.json_schema import closed
 from tests.helpers.nav2_map import as_mapped, valid_for_nav2
-from tests.helpers.robot import Recorded, Robot, ZenohRobot
+from tests.helpers.robot import Recorded, Robot
 from tests.helpers.simulated_drives import office
 
 START_M = (10.0, 7.0)
@@ -108,16 +109,27 @@ def test_relocalize_says_the_same(
             assert math.dist((moment["x"], moment["y"]), (pose["x"], pose["y"])) < 0.05
 
 
-def test_standard_input_gives_the_same_answer(here: Path, expected: list[tuple[Any, ...]]) -> None:
-    words = ["watch", "-", "-d", "plan.submaps", "--json", "--keep"]
-    with (here / "tuesday.mcap").open("rb") as stream:
-        run = subprocess.run(
-            [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *words],
-            stdin=stream,
-            stdout=subprocess.PIPE,
-            check=True,
-        )
-    assert answer_of([json.loads(line) for line in run.stdout.splitlines()]) == expected
+def test_every_scan_of_a_recording_is_used_and_it_says_the_same_each_time(
+    here: Path, capsys: pytest.CaptureFixture[str], expected: list[tuple[Any, ...]]
+) -> None:
+    code, looks, _ = watch(capsys, "tuesday.mcap", "--keep")
+    assert code == 0
+    assert answer_of(looks) == expected
+    with open_log("tuesday.mcap") as log:
+        first_ns = next(log.scans()).stamp_ns
+        assert looks[-1]["scans"] == sum(scan.stamp_ns <= looks[-1]["stamp_ns"] for scan in log.scans())
+    assert first_ns < looks[0]["stamp_ns"]
+    assert {(look["dropped"], look["reconnected"], look["lag_s"]) for look in looks} == {(0, 0, 0.0)}
+    _, again, _ = watch(capsys, "tuesday.mcap", "--keep")
+    assert [look | {"elapsed_s": 0.0} for look in again] == [look | {"elapsed_s": 0.0} for look in looks]
+
+
+def test_a_recording_in_real_time_is_a_robot_that_gives_the_same_answer(
+    here: Path, capsys: pytest.CaptureFixture[str], expected: list[tuple[Any, ...]]
+) -> None:
+    code, looks, err = watch(capsys, "tuesday.mcap", "--real-time")
+    assert code == 0, err
+    assert answer_of(looks) == expected[: len(looks)]
 
 
 def test_a_websocket_gives_the_same_answer_and_initialpose(
@@ -140,26 +152,6 @@ def test_a_websocket_gives_the_same_answer_and_initialpose(
     assert math.dist((position.x, position.y), truth_at(here, stamp_ns)) < 0.1
     assert all(map(valid_for_nav2, decoded.values()))
     assert np.array_equal(decoded["/map"].data.reshape(office().cells.shape), as_mapped(office()).told())
-
-
-def test_zenoh_gives_the_same_answer_and_initialpose(
-    here: Path, capsys: pytest.CaptureFixture[str], expected: list[tuple[Any, ...]]
-) -> None:
-    pytest.importorskip("zenoh", reason="needs the extra [zenoh]")
-    kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
-    with ZenohRobot(Recorded.read(here / "tuesday.mcap")).running(listens=(("/initialpose", kind),)) as robot:
-        code, looks, err = watch(capsys, robot.url, "--publish", "initialpose")
-        end_s = time.monotonic() + 20.0
-        while not robot.published and time.monotonic() < end_s:
-            time.sleep(0.01)
-        published = list(robot.published)
-    assert code == 0, err
-    assert answer_of(looks) == expected[: len(looks)]
-    ((_, _, data),) = published
-    message = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, kind)
-    stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-    position = message.pose.pose.position
-    assert math.dist((position.x, position.y), truth_at(here, stamp_ns)) < 0.1
 
 
 def test_map_to_odom_is_published_until_the_program_is_stopped(here: Path) -> None:
@@ -210,10 +202,13 @@ def test_words_for_people(here: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (["rosbridge://robot"], 1, "is not known"),
+        (["rosbridge://robot"], 1, "rosbridge:// cannot be followed"),
+        (["zenoh://robot:7447"], 1, "zenoh:// cannot be followed"),
+        (["-"], 1, "standard input cannot be followed"),
         (["tuesday.mcap", "--publish", "tf"], 2, "takes no messages"),
         (["tuesday.mcap", "--topic", "/points"], 1, "no topic /points"),
-        (["plan.submaps"], 1, "not a recording that can be followed"),
+        (["plan.submaps"], 1, "not a recording"),
+        (["tuesday.mcap", "--real-time", "--publish", "tf"], 2, "takes no messages"),
     ],
 )
 def test_mistakes(
@@ -226,13 +221,11 @@ def test_mistakes(
 
 
 def test_a_robot_that_is_silent_is_given_up(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A recording without an end that does not grow."""
-    data = (here / "tuesday.mcap").read_bytes()
-    cut = here / "cut.mcap"
-    cut.write_bytes(data[: len(data) // 20])
-    code, looks, err = watch(capsys, "cut.mcap", "--timeout", "0.5")
+    pytest.importorskip("websockets", reason="needs the extra [live]")
+    with Robot(Recorded.read(here / "tuesday.mcap"), begin_topic="/none").running() as robot:
+        code, looks, err = watch(capsys, robot.url, "--timeout", "0.5")
     assert (code, looks) == (1, [])
-    assert "/scan" in err or "no topics" in err or "no topic with scans" in err
+    assert "/scan: no message yet" in err
 
 
 def test_resets_are_paused_and_bounded() -> None:

@@ -21,8 +21,8 @@ from signature.localization.pose_check import check_pose
 
 if TYPE_CHECKING:
     from pc2grid.io import Log
-    from pc2grid.io.live.live_log import LiveLog
     from pc2grid.model import RegisteredScan
+    from pc2grid_cli.followed import Followed
     from pc2grid_cli.json_schemas import CheckedPoseJudgement, RelocalizeCheck, WatchCheck
     from signature.config import Config
     from signature.database import SubmapDatabase
@@ -89,15 +89,15 @@ def _document(checked: PoseCheck, log: Log, path: Path, where: str, scans: int) 
     }
 
 
-def live_document(look: PoseLook, live: LiveLog, where: str) -> WatchCheck:
+def live_document(look: PoseLook, drive: Followed, where: str) -> WatchCheck:
     """The document of one check of a running robot's own pose."""
     return {
         **_judgement(look.checked, where),
         "path_m": look.checked.path_m,
-        "scans": live.report().scans_read,
-        "dropped": live.feed.counts.dropped,
-        "reconnected": live.feed.counts.reconnected,
-        "lag_s": live.lag_s,
+        "scans": drive.report().scans_read,
+        "dropped": drive.counts.dropped,
+        "reconnected": drive.counts.reconnected,
+        "lag_s": drive.lag_s,
         "elapsed_s": look.elapsed_s,
     }
 

@@ -49,7 +49,7 @@ def view_command(
         str | None,
         typer.Argument(
             metavar="[ws://ROBOT:8765|RECORDING]",
-            help="a robot to be followed on the page, or a recording that is being written; see watch",
+            help="a robot to be followed on the page, or a recording that is replayed there; see watch",
         ),
     ] = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free")] = 0,
@@ -188,11 +188,11 @@ class Locator:
         localizer, progress = Localizer(self._prepared()), Progress(self.events)
         with (
             open_live(source, config.read) as live,
-            Follower(localizer, beside=live.feed.realtime, step_m=config.relocalize.step_m) as follower,
+            Follower(localizer, beside=True, step_m=config.relocalize.step_m) as follower,
         ):
 
             def poll() -> bool:
-                for sentence in live.feed.news.take():
+                for sentence in live.news.take():
                     console.warn(sentence)
                 for look in follower.take():
                     _tell(progress, look)
@@ -200,8 +200,8 @@ class Locator:
 
             live.on_poll = poll
             self.events.publish("begin", {"source": source})
-            while not live.ended:
-                for registered, planar_scan in follow(live.scans(), config):
+            for scans in live.parts():
+                for registered, planar_scan in follow(scans, config):
                     progress.add(registered)
                     follower.add(registered, planar_scan)
                     poll()

@@ -17,13 +17,15 @@ from pc2grid import extras
 from pc2grid.display import probability
 from pc2grid.errors import ConfigError, TrackingLost, one_line
 from pc2grid.geometry import SE2
+from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.nav2 import Nav2Publisher
-from pc2grid.io.live.targets import open_live
+from pc2grid.io.live.targets import is_robot
 from pc2grid.pipeline import follow
 from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.check_pose import as_text as check_as_text
 from pc2grid_cli.check_pose import live_document
+from pc2grid_cli.followed import followed
 from pc2grid_cli.known_pose import KnownPose
 from pc2grid_cli.locate import searched
 from signature.localization.answer_json import in_space_document
@@ -35,8 +37,8 @@ from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseLook, PoseWatch
 
 if TYPE_CHECKING:
-    from pc2grid.io.live.live_log import LiveLog
     from pc2grid.io.live.nav2 import Outlet
+    from pc2grid_cli.followed import Followed
     from pc2grid_cli.json_schemas import Watch
     from signature.config import Config
     from signature.database import SubmapDatabase
@@ -61,8 +63,8 @@ def watch_command(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="ws://ROBOT:8765|zenoh://ROBOT:7447|RECORDING|-",
-            help="a robot with foxglove_bridge or rmw_zenoh; a recording, also a growing one; - for stdin",
+            metavar="ws://ROBOT:8765|RECORDING",
+            help="a robot with foxglove_bridge, or a finished recording, of which every scan is used",
         ),
     ],
     database: options.SearchedDatabase,
@@ -105,9 +107,12 @@ def watch_command(
         str, typer.Option("--map-frame", metavar="FRAME", help="the frame of what is published")
     ] = "map",
     frame: options.Frame = options.FrameName.building,
-    last: Annotated[
-        float, typer.Option("--last", min=0.0, metavar="S", help="seconds of a recording to begin with")
-    ] = 30.0,
+    real_time: Annotated[
+        bool,
+        typer.Option(
+            "--real-time", help="replay the recording at its own pace; scans may be dropped, as of a robot"
+        ),
+    ] = False,
     timeout: Annotated[
         float | None, typer.Option("--timeout", min=0.0, metavar="S", help="give up after so many seconds")
     ] = None,
@@ -119,7 +124,8 @@ def watch_command(
     assume_identity: options.AssumeIdentity = False,
     json: Annotated[bool, typer.Option("--json", help="a JSON document on each line, one a look")] = False,
 ) -> None:
-    """Find where a running robot is, while it drives. Exit code 4: it was not located.
+    """Find where a running robot is, while it drives, or was while it was recorded. Exit code 4: it was not
+    located.
 
     With --check-topic, say after each metre whether it is where it believes to be. Exit code 4: at last it
     was not.
@@ -132,33 +138,36 @@ def watch_command(
     )
     known = KnownPose(near=near, check_topic=check_topic, session=session)
     prior = known.region()
-    if check_topic is not None and (publish is not Publish.none or publish_map):
+    publishes = publish is not Publish.none or publish_map
+    if publishes and check_topic is not None:
         raise ConfigError("--check-topic and --publish do not go together", hint="run `watch` twice")
+    if publishes and not is_robot(source):
+        raise ConfigError(f"--publish: {source} takes no messages", hint="ws://ROBOT:8765 does")
     terminal = console.of(context)
     end_s = math.inf if timeout is None else time.monotonic() + timeout
     with (
         searched(database, building, floor) as (opened, damaged),
-        open_live(source, settings.read, last_s=last) as live,
+        followed(source, settings.read, real_time=real_time) as drive,
     ):
         for damage in damaged:
             console.warn(f"{opened.location}: damaged and left out: {damage}")
-        following = _Following(live, opened, settings, end_s, terminal)
+        following = _Following(drive, opened, settings, end_s, terminal)
         if check_topic is not None:
             good = _check(following, check_topic, session, as_json=json)
         else:
             frames = opened.frames() if frame is options.FrameName.building else {}
-            with _Robot.of(live, opened, publish, publish_map, map_frame, frames) as robot:
+            with _Robot.of(drive, opened, publish, publish_map, map_frame, frames) as robot:
                 good = _search(following, robot, prior, keep or publish is Publish.tf, as_json=json)
-        _summarize(live, terminal)
+        _summarize(drive, terminal)
     if not good:
         raise typer.Exit(console.UNSURE)
 
 
 @dataclass(frozen=True)
 class _Following:
-    """A robot that is followed until `end_s` of `time.monotonic`, or until nothing comes any more."""
+    """A robot, or a recording of one, that is followed until `end_s` of `time.monotonic`, or to its end."""
 
-    live: LiveLog
+    drive: Followed
     database: SubmapDatabase
     settings: Config
     end_s: float
@@ -172,32 +181,33 @@ class _Following:
 
     def run(self, follower: Follower[LookT], use: Callable[[LookT], bool]) -> None:
         """Feed `follower` with scans. use : what to do with each look; true if that was enough."""
-        live, config = self.live, self.config
+        drive, config = self.drive, self.config
         over = False
 
         def poll() -> bool:
             nonlocal over
-            _tell_news(live)
+            _tell_news(drive)
             for look in follower.take():
                 over = over or use(look)
             over = over or time.monotonic() > self.end_s
             return over
 
-        live.on_poll = poll
-        choice = live.choose()
-        self.terminal.note(f"{live.feed.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
-        while not live.ended and not over:
+        drive.on_poll = poll
+        choice = drive.choose()
+        self.terminal.note(f"{drive.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
+        for scans in drive.parts():
             try:
-                for registered, planar_scan in follow(live.scans(), config, self.terminal.observer()):
+                for registered, planar_scan in follow(scans, config, self.terminal.observer()):
                     follower.add(registered, planar_scan)
                     if poll():
                         break
             except TrackingLost as error:
                 console.warn(str(error))
+            if over:
+                return
             follower.restart()
-        if not over:
-            follower.finish()
-            poll()
+        follower.finish()
+        poll()
 
 
 def _search(
@@ -207,16 +217,16 @@ def _search(
 
     prior : where the robot is at the beginning, as far as it is known. forever : go on when it is located.
     """
-    live, config = following.live, following.config
+    drive, config = following.drive, following.config
     index = MapIndex.of(following.database, config, following.terminal.observer())
     localizer = Localizer(index if prior is None else index.within(prior))
     located = False
-    with Follower(localizer, beside=live.feed.realtime, step_m=config.relocalize.step_m) as follower:
+    with Follower(localizer, beside=drive.realtime, step_m=config.relocalize.step_m) as follower:
 
         def use(look: Look) -> bool:
             nonlocal located
             look = look_in_building(look, robot.frames)
-            _print(look, live, robot, robot.tell(look, follower.lock), as_json=as_json)
+            _print(look, drive, robot, robot.tell(look, follower.lock), as_json=as_json)
             located = look.state in ("located", "recovered")
             return located and not forever
 
@@ -226,24 +236,24 @@ def _search(
 
 def _check(following: _Following, topic: str, session: str | None, *, as_json: bool) -> bool:
     """Follow the robot, and judge the pose that it believes in; whether the last one was fine."""
-    live, config = following.live, following.config
-    live.listen_to_pose(topic)
+    drive, config = following.drive, following.config
+    drive.listen_to_pose(topic)
     index = MapIndex.of(following.database, config, following.terminal.observer())
-    watch = PoseWatch(index, lambda: live.believed, session)
+    watch = PoseWatch(index, lambda: drive.believed, session)
     fine = False
-    with Follower(watch, beside=live.feed.realtime, step_m=config.relocalize.step_m) as follower:
+    with Follower(watch, beside=drive.realtime, step_m=config.relocalize.step_m) as follower:
 
         def use(look: PoseLook) -> bool:
             nonlocal fine
             fine = look.checked.status == "fine"
             if as_json:
-                console.print_json_line(live_document(look, live, following.database.location))
+                console.print_json_line(live_document(look, drive, following.database.location))
             else:
                 print(check_as_text(look.checked), flush=True)
             return False
 
         following.run(follower, use)
-    if live.believed is None:
+    if drive.believed is None:
         console.warn(f"{topic}: no pose of the robot in a map; nothing was checked")
     return fine
 
@@ -286,7 +296,7 @@ class _Robot:
     buildings that looks are in, by session.
     """
 
-    live: LiveLog
+    live: LiveLog | None
     database: SubmapDatabase
     sessions: dict[str, SessionInfo]
     publish: Publish
@@ -300,14 +310,15 @@ class _Robot:
     @staticmethod
     @contextlib.contextmanager
     def of(
-        live: LiveLog,
+        drive: Followed,
         database: SubmapDatabase,
         publish: Publish,
         publish_map: bool,
         map_frame: str,
         frames: Mapping[str, BuildingFrame],
     ) -> Iterator[_Robot]:
-        """Raises ConfigError if the source takes no messages, LiveError if the robot does not."""
+        """Raises LiveError if the robot takes no messages."""
+        live = drive if isinstance(drive, LiveLog) else None
         robot = _Robot(
             live=live,
             database=database,
@@ -320,21 +331,17 @@ class _Robot:
         )
         topics = [f"/{publish.value}"] if publish is not Publish.none else []
         topics += ["/map"] if publish_map else []
-        if not topics:
+        if live is None or not topics:
             yield robot
             return
-
-        feed = live.feed
-        if not hasattr(feed, "advertise"):
-            raise ConfigError(f"--publish: {feed.name} takes no messages", hint="ws://ROBOT:8765 does")
-        with Nav2Publisher(cast("Outlet", feed), map_frame) as robot.publisher:
+        with Nav2Publisher(cast("Outlet", live.feed), map_frame) as robot.publisher:
             robot.publisher.announce(*topics)
             yield robot
 
     def tell(self, look: Look, lock: threading.Lock) -> list[str]:
         """Publish what follows from a look; returns the topics. lock : is held to read the database."""
-        publisher = self.publisher
-        if publisher is None:
+        publisher, live = self.publisher, self.live
+        if publisher is None or live is None:
             return []
         if look.state == "lost":
             self.pose_is_due = True
@@ -352,39 +359,38 @@ class _Robot:
         if self.publish is Publish.initialpose and self.pose_is_due and self.resets.allows():
             self.pose_is_due = False
             assert look.answer.covariance is not None
-            stamp_ns, T_map_base = self._now(look)
+            stamp_ns, T_map_base = _now(look, live)
             publisher.initialpose(stamp_ns, T_map_base, look.answer.covariance)
             told.append("/initialpose")
         elif self.publish is Publish.tf:
-            T_map_odom, odom_frame = look.T_map_odom, self.live.odometry_frame
+            T_map_odom, odom_frame = look.T_map_odom, live.odometry_frame
             if T_map_odom is None or odom_frame is None:
                 console.warn("--publish tf: the robot has no odometry; nothing is published")
                 return told
-            publisher.start_tf(odom_frame, T_map_odom, self.live.now_ns)
+            publisher.start_tf(odom_frame, T_map_odom, live.now_ns)
             told.append("/tf")
         return told
 
-    def _now(self, look: Look) -> tuple[int, SE2]:
-        """The stamp of the newest odometry and the pose of the base there: the look is about an earlier
-        scan."""
-        T_map_odom, newest = look.T_map_odom, self.live.newest_odometry()
-        if T_map_odom is None or newest is None:
-            assert look.T_map_base is not None
-            return look.registered.scan.stamp_ns, look.T_map_base
-        stamp_ns, T_odom_base = newest
-        return stamp_ns, T_map_odom @ SE2.from_matrix(T_odom_base)
+
+def _now(look: Look, live: LiveLog) -> tuple[int, SE2]:
+    """The stamp of the newest odometry and the pose of the base there: the look is about an earlier scan."""
+    T_map_odom, newest = look.T_map_odom, live.newest_odometry()
+    if T_map_odom is None or newest is None:
+        assert look.T_map_base is not None
+        return look.registered.scan.stamp_ns, look.T_map_base
+    stamp_ns, T_odom_base = newest
+    return stamp_ns, T_map_odom @ SE2.from_matrix(T_odom_base)
 
 
-def _tell_news(live: LiveLog) -> bool:
-    for sentence in live.feed.news.take():
+def _tell_news(drive: Followed) -> None:
+    for sentence in drive.news.take():
         console.warn(sentence)
-    return False
 
 
-def _summarize(live: LiveLog, terminal: console.Console) -> None:
+def _summarize(drive: Followed, terminal: console.Console) -> None:
     """What was left out, at the end."""
-    _tell_news(live)
-    report, counts = live.report(), live.feed.counts
+    _tell_news(drive)
+    report, counts = drive.report(), drive.counts
     for warning in report.warnings:
         console.warn(warning)
     skipped = sum(report.scans_skipped.values())
@@ -396,10 +402,10 @@ def _summarize(live: LiveLog, terminal: console.Console) -> None:
         )
 
 
-def _print(look: Look, live: LiveLog, robot: _Robot, published: list[str], *, as_json: bool) -> None:
+def _print(look: Look, drive: Followed, robot: _Robot, published: list[str], *, as_json: bool) -> None:
     """What one look said, on stdout."""
     if as_json:
-        console.print_json_line(_document(look, live, robot, published))
+        console.print_json_line(_document(look, drive, robot, published))
     else:
         print(as_text(look, published), flush=True)
 
@@ -420,8 +426,8 @@ def as_text(look: Look, published: list[str]) -> str:
     )
 
 
-def _document(look: Look, live: LiveLog, robot: _Robot, published: list[str]) -> Watch:
-    answer, pose, T_map_odom, counts = look.answer, look.T_map_base, look.T_map_odom, live.feed.counts
+def _document(look: Look, drive: Followed, robot: _Robot, published: list[str]) -> Watch:
+    answer, pose, T_map_odom, counts = look.answer, look.T_map_base, look.T_map_odom, drive.counts
     document: Watch = {
         "schema_version": 1,
         "state": look.state,
@@ -435,10 +441,10 @@ def _document(look: Look, live: LiveLog, robot: _Robot, published: list[str]) ->
         "in_space": in_space_document(answer),
         "confidence": answer.confidence,
         "published": published,
-        "scans": live.report().scans_read,
+        "scans": drive.report().scans_read,
         "dropped": counts.dropped,
         "reconnected": counts.reconnected,
-        "lag_s": live.lag_s,
+        "lag_s": drive.lag_s,
         "elapsed_s": look.elapsed_s,
     }
     if look.session is not None and pose is not None and answer.covariance is not None:

@@ -38,21 +38,15 @@ class Feed:
     A kind of connection derives from it. It calls `_offer` for each topic, `_refresh` when topics came or
     went, and puts messages into `_inbox`, also from other threads.
 
-    name : for the user. realtime : whether messages are lost that are not received in time. counts, news : of
-    what happened. connected : whether messages can arrive now.
+    name : for the user. counts, news : of what happened. connected : whether messages can arrive now.
     """
 
-    realtime = False
-
-    def __init__(
-        self, name: str, config: ReadConfig, inbox: InboxParameters = INBOX, *, by_log_time: bool = False
-    ) -> None:
-        """by_log_time : as of `Inbox`."""
+    def __init__(self, name: str, config: ReadConfig, inbox: InboxParameters = INBOX) -> None:
         self.name = name
         self.counts, self.news = FeedCounts(), News()
         self.connected = True
         self._over = False
-        self._inbox = Inbox(self.counts, inbox, by_log_time=by_log_time)
+        self._inbox = Inbox(self.counts, inbox)
         self._lock = threading.RLock()
         self._topics: dict[tuple[str, str], TopicInfo] = {}
         self._offered: dict[Hashable, TopicInfo] = {}
@@ -71,9 +65,11 @@ class Feed:
             return tuple(self._topics.values())
 
     def want(self, topics: Collection[str]) -> None:
-        """From now on, only messages of these topics are asked for."""
+        """From now on, only messages of these topics are asked for, and scans that wait too long are
+        dropped."""
         with self._lock:
             self._wanted = frozenset(topics)
+        self._inbox.prepared()
         self._refresh()
 
     def receive(self, timeout_s: float) -> Arrived | None:
@@ -87,9 +83,11 @@ class Feed:
         """Messages of these topics that have arrived and not been received yet."""
         return self._inbox.pending(topics)
 
-    def keep_up(self) -> None:
-        """From now on scans may be dropped: the messages that arrived during the preparations are used up."""
-        self._inbox.keep_up()
+    @property
+    def keeps_up(self) -> bool:
+        """Whether scans that wait too long are dropped: not before those are used that waited during the
+        preparations."""
+        return self._inbox.keeps_up
 
     def close(self) -> None:
         """Release connections, threads and files."""

@@ -193,8 +193,6 @@ class FoxgloveWebsocket(Feed):
     The number of a subscription is that of its channel.
     """
 
-    realtime = True
-
     def __init__(
         self,
         url: str,

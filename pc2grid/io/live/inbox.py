@@ -38,11 +38,13 @@ class FeedCounts:
 class InboxParameters:
     """How much may wait; chosen by hand.
 
-    most_lag_s : a scan that has waited longer than this is dropped when a newer one arrives. math.inf: never.
+    most_lag_s : a scan that has waited longer than this is dropped when a newer one arrives.
+    catch_up_s : time for what waited during the preparations to be used up, before scans are dropped.
     most_bytes, most_messages : of all messages that wait; beyond, the oldest are dropped.
     """
 
     most_lag_s: float = 0.1
+    catch_up_s: float = 10.0
     most_bytes: int = 256_000_000
     most_messages: int = 100_000
 
@@ -52,11 +54,10 @@ INBOX = InboxParameters()
 
 @dataclass(slots=True)
 class _Entry:
-    """A message that waits; None once it is dropped. due_s : the time that its lag is counted from."""
+    """A message that waits; None once it is dropped."""
 
     message: RawMessage | None
     arrived_s: float
-    due_s: float
     size: int
 
 
@@ -70,37 +71,37 @@ class Inbox:
         self,
         counts: FeedCounts,
         parameters: InboxParameters = INBOX,
-        *,
-        by_log_time: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """by_log_time : lag is counted in log time, for recordings, whose messages arrive in blocks."""
-        self._counts, self._parameters, self._by_log_time = counts, parameters, by_log_time
-        self._clock = clock
+        self._counts, self._parameters, self._clock = counts, parameters, clock
         self._entries: deque[_Entry] = deque()
         self._scans: deque[_Entry] = deque()
         self._bytes = 0
         self._changed = threading.Condition()
-        self._strict = False
+        self._patient_until_s = math.inf
 
-    def keep_up(self) -> None:
-        """From now on scans that wait too long are dropped."""
+    @property
+    def keeps_up(self) -> bool:
+        """Whether scans that wait too long are dropped."""
+        return self._clock() >= self._patient_until_s
+
+    def prepared(self) -> None:
+        """The preparations are over: once what waits now is used up, scans that wait too long are dropped."""
         with self._changed:
-            self._strict = True
+            self._patient_until_s = self._clock() + self._parameters.catch_up_s
 
     def put(self, message: RawMessage) -> None:
         """Add a message that has just arrived."""
         now_s = self._clock()
-        due_s = message.log_time_ns * 1e-9 if self._by_log_time else now_s
-        entry = _Entry(message, now_s, due_s, len(message.data))
+        entry = _Entry(message, now_s, len(message.data))
         with self._changed:
             self._counts.arrived += 1
             self._entries.append(entry)
             self._bytes += entry.size
             if message.channel.type in topics.SENSORS:
                 self._scans.append(entry)
-                limit_s = self._parameters.most_lag_s if self._strict else math.inf
-                while len(self._scans) > 1 and due_s - self._scans[0].due_s > limit_s:
+                limit_s = self._parameters.most_lag_s if self.keeps_up else math.inf
+                while len(self._scans) > 1 and now_s - self._scans[0].arrived_s > limit_s:
                     self._drop(self._scans.popleft())
             while self._bytes > self._parameters.most_bytes and len(self._scans) > 1:
                 self._drop(self._scans.popleft())
@@ -131,6 +132,8 @@ class Inbox:
                     if entry.message is not None:
                         self._bytes -= entry.size
                         return Arrived(entry.message, entry.arrived_s)
+                if math.isfinite(self._patient_until_s):
+                    self._patient_until_s = 0.0
                 left_s = end_s - self._clock()
                 if left_s <= 0 or not self._changed.wait(left_s):
                     return None

@@ -99,7 +99,7 @@ def lag(folder: Path, quick: bool) -> Iterator[Row]:
             with Follower(localizer, beside=True) as follower:
                 for registered, planar_scan in follow(live.scans(), opened.config()):
                     # The lag is that of the scan before; those held back for the plan have waited on purpose.
-                    if live.keeps_up:
+                    if live.feed.keeps_up:
                         lags.append(live.lag_s)
                     count += 1
                     follower.add(registered, planar_scan)
@@ -172,7 +172,6 @@ class Stopped:
 class ToAndFro:
     """A feed of a recording that is played forwards and backwards, with stamps that go on."""
 
-    realtime = False
     connected = True
 
     def __init__(self, path: Path, robot_s: float) -> None:
@@ -227,9 +226,6 @@ class ToAndFro:
 
     def want(self, topics: object) -> None:
         """All messages are sent."""
-
-    def keep_up(self) -> None:
-        """Nothing is dropped."""
 
     def pending(self, topics: object) -> Sequence[object]:
         """Nothing waits."""

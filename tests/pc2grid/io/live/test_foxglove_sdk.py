@@ -18,8 +18,7 @@ from pc2grid.io.live.foxglove_websocket import FoxgloveWebsocket
 from pc2grid.io.live.inbox import InboxParameters
 from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.nav2 import POSE, Nav2Publisher
-from tests.helpers.growing import laser_drive
-from tests.helpers.recordings import write_mcap
+from tests.helpers.recordings import laser_drive, write_mcap
 from tests.helpers.robot import Recorded
 
 pytest.importorskip("websockets", reason="needs the extra [live]")

@@ -21,8 +21,7 @@ from pc2grid.io.live.inbox import InboxParameters
 from pc2grid.io.live.live_log import LiveLog, LiveParameters
 from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.model import OccupancyGrid, Scan
-from tests.helpers.growing import laser_drive
-from tests.helpers.recordings import write_mcap
+from tests.helpers.recordings import laser_drive, write_mcap
 from tests.helpers.robot import SUBPROTOCOLS, Recorded, Robot
 
 websockets = pytest.importorskip("websockets", reason="needs the extra [live]")

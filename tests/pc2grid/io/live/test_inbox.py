@@ -37,8 +37,8 @@ def fill(inbox: Inbox, clock: Clock, seconds: range) -> None:
 
 def test_scans_are_dropped_rather_than_late_and_transforms_are_kept() -> None:
     counts, clock = FeedCounts(), Clock()
-    inbox = Inbox(counts, InboxParameters(most_lag_s=2.0), clock=clock)
-    inbox.keep_up()
+    inbox = Inbox(counts, InboxParameters(most_lag_s=2.0, catch_up_s=0.0), clock=clock)
+    inbox.prepared()
     fill(inbox, clock, range(10))
     found = drain(inbox)
     assert [t for topic, t in found if topic == "/scan"] == [7, 8, 9]
@@ -65,13 +65,22 @@ def test_memory_is_bounded_even_then() -> None:
     assert len(drain(few)) == 6
 
 
-def test_a_recording_is_late_by_log_time_and_not_by_when_its_block_was_read() -> None:
+def test_what_waited_during_the_preparations_may_be_used_up_first() -> None:
     counts, clock = FeedCounts(), Clock()
-    inbox = Inbox(counts, InboxParameters(most_lag_s=2.0), by_log_time=True, clock=clock)
-    inbox.keep_up()
-    for second in range(10):
-        inbox.put(RawMessage(SCAN, second * 10**9, b""))
-    assert [t // 10**9 for _, t in drain(inbox)] == [7, 8, 9]
+    inbox = Inbox(counts, InboxParameters(most_lag_s=2.0, catch_up_s=20.0), clock=clock)
+    inbox.prepared()
+    fill(inbox, clock, range(10))
+    assert len(drain(inbox)) == 20
+    fill(inbox, clock, range(10, 20))
+    assert [t for topic, t in drain(inbox) if topic == "/scan"] == [17, 18, 19]
+
+
+def test_but_not_for_ever() -> None:
+    counts, clock = FeedCounts(), Clock()
+    inbox = Inbox(counts, InboxParameters(most_lag_s=2.0, catch_up_s=6.0), clock=clock)
+    inbox.prepared()
+    fill(inbox, clock, range(10))
+    assert [t for topic, t in drain(inbox) if topic == "/scan"] == [7, 8, 9]
 
 
 def test_get_waits_for_another_thread() -> None:

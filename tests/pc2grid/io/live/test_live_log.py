@@ -13,20 +13,17 @@ from pc2grid.io.live.feed import News
 from pc2grid.io.live.inbox import Arrived, FeedCounts
 from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.message_source import RawMessage, TopicInfo
-from tests.helpers.growing import laser_drive
-from tests.helpers.recordings import Message
+from tests.helpers.recordings import T0, Message, laser_drive, ros
 
 
 class Given:
-    """A feed of messages that are all there; the clock says when the last one arrived."""
+    """A feed of messages that are all there; by its clock scans arrive as they were sent."""
 
     name = "given"
     connected = True
-    realtime = False
 
     def __init__(self, messages: Sequence[Message]) -> None:
         self.counts, self.news = FeedCounts(), News()
-        self.kept_up = False
         self.now_s = 0.0
         self.wanted: frozenset[str] | None = None
         self._topics: dict[str, TopicInfo] = {}
@@ -49,13 +46,13 @@ class Given:
         if not self._waiting:
             self.now_s += timeout_s
             return None
-        return Arrived(self._waiting.popleft(), self.now_s)
+        message = self._waiting.popleft()
+        if message.channel.topic == "/scan":
+            self.now_s = max(self.now_s, (message.log_time_ns - T0) * 1e-9)
+        return Arrived(message, self.now_s)
 
     def pending(self, topics: Collection[str]) -> Sequence[RawMessage]:
         return [m for m in self._waiting if m.channel.topic in topics]
-
-    def keep_up(self) -> None:
-        self.kept_up = True
 
     def close(self) -> None:
         pass
@@ -101,8 +98,6 @@ def test_a_clock_that_is_set_begins_a_new_part(jump_s: int) -> None:
     messages = laser_drive(120)
     later = laser_drive(240)[361:]
     offset_ns = jump_s * 10**9
-    from tests.helpers.recordings import T0, ros
-
     set_back = [
         ros().laser("/scan", m.log_time_ns + offset_ns, [1.0] * 30)._replace(log_time_ns=m.log_time_ns)
         if m.topic == "/scan"
@@ -150,9 +145,12 @@ def test_lag_is_the_time_from_arrival_to_the_end_of_the_use() -> None:
     assert live.lag_s > 0.009
 
 
-def test_scans_may_be_dropped_once_the_preparations_are_over() -> None:
-    live, feed = live_log(laser_drive(60))
-    live.choose()
-    assert not feed.kept_up
-    list(live.scans())
-    assert feed.kept_up
+def test_a_message_from_another_week_hides_no_scan() -> None:
+    """A late transform moved all others out of what is held back: "no message in the log"."""
+    messages = laser_drive(60)
+    week_ns = 7 * 24 * 3600 * 10**9
+    stray = ros().tf(T0 + week_ns, "base_link", "camera", 0.1, topic="/tf_static")
+    live, feed = live_log([*messages[:30], stray, *messages[30:]])
+    assert len(list(live.scans())) == 60
+    feed.now_s = 6.0
+    assert live.now_ns() < T0 + week_ns

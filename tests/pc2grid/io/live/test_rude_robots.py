@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,12 +23,10 @@ from pc2grid.io import open_log
 from pc2grid.io.live.foxglove_websocket import ConnectionParameters, FoxgloveWebsocket
 from pc2grid.io.live.inbox import InboxParameters
 from pc2grid.io.live.live_log import LiveLog
-from pc2grid.io.live.zenoh_session import Token, ZenohSession
 from pc2grid.model import Scan
-from tests.helpers.growing import laser_drive
 from tests.helpers.memory import bounded_memory
-from tests.helpers.recordings import STEP, T0, ros, write_mcap
-from tests.helpers.robot import Recorded, Robot, ZenohRobot, attachment
+from tests.helpers.recordings import STEP, T0, laser_drive, ros, write_mcap
+from tests.helpers.robot import Recorded, Robot
 
 PATIENT = InboxParameters(most_lag_s=1e6)
 QUICK = ConnectionParameters(first_s=0.3, least_pause_s=0.001, most_pause_s=0.01)
@@ -140,97 +137,6 @@ def test_a_websocket_that_sends_garbage(
     assert any("not understood" in sentence for sentence in said)
     assert max(map(len, said)) < 1000 and len(said) < 3 * len(FRAMES)
     assert "Traceback" not in capfd.readouterr().err
-
-
-TOKENS = [
-    "@ros2_lv/0", "@ros2_lv/0/a/b/c/MP/%/%/n/%scan", "@ros2_lv/0/a/0/0/XX/%/%/n/%scan/t/h/q/more",
-    "@ros2_lv/0/a/0/1/MP/%/%/n/%/sensor_msgs::msg::dds_::LaserScan_/h/::,10:,:,:,,",
-    "@ros2_lv/0/a/0/2/MP/%/%/n/%%%rude/sensor_msgs::msg::dds_::LaserScan_/h/::,10:,:,:,,",
-    "@ros2_lv/0/a/0/3/MP/%/%/n/%a%%b/sensor_msgs::msg::dds_::PointCloud2_/h/::,10:,:,:,,",
-    "@ros2_lv/0/a/0/4/MP/%/%/n/%rude%/sensor_msgs::msg::dds_::LaserScan_/h/2:9:x",
-    "@ros2_lv/0/a/0/5/MP/%/%/n/%odd/::::/h/q",
-    "@ros2_lv/0/a/0/6/MS/%/%/n/%initialpose/::/h/2",
-    "@ros2_lv/0/a/0/7/MP/%/%/n/%tf/tf2_msgs::msg::dds_::TFMessage_/h/::",
-    "@ros2_lv/0/" + "/".join("x" * 200 for _ in range(40)),
-]  # fmt: skip
-
-
-def test_tokens_that_are_none_are_left_alone() -> None:
-    rng = random.Random(1)
-    letters = "@ros2_lv/0MPS%:_ax" + "/" * 12
-    for key in [*TOKENS, *("".join(rng.choices(letters, k=rng.randint(0, 80))) for _ in range(2000))]:
-        token = Token.of(key)
-        if token is not None:
-            assert isinstance(token.info.topic, str) and token.best_effort in (True, False)
-
-
-def test_a_token_that_is_none_does_not_hide_the_others(recording: Path) -> None:
-    """Each in turn comes first: a key that zenoh does not take ended the subscription to all."""
-    zenoh = pytest.importorskip("zenoh", reason="needs the extra [zenoh]")
-    with ZenohRobot(Recorded.read(recording)).running() as robot:
-        feed = ZenohSession(robot.url, ReadConfig())
-        try:
-            for key in [*TOKENS, "@ros2_lv/0/a/0/8/MP/%/%/n/%rude/a::msg::dds_::PointCloud2_/h/::"]:
-                feed._take_token(SimpleNamespace(key_expr=key, kind=zenoh.SampleKind.PUT))
-            end_s = time.monotonic() + 30.0
-            subscribed: set[str] = set()
-            while not {"/scan", "/tf_static"} <= subscribed and time.monotonic() < end_s:
-                time.sleep(0.01)
-                subscribed = {topic for topic, _ in list(feed._subscriptions)}
-            assert {"/scan", "/tf_static", "/tf"} <= subscribed
-            assert {topic.topic for topic in feed.topics()} >= {"/scan", "/odom", "/rude"}
-        finally:
-            feed.close()
-
-
-def test_a_zenoh_router_with_garbage(
-    recording: Path, expected: list[Scan], capfd: pytest.CaptureFixture[str]
-) -> None:
-    """Tokens of topics that are none come before those of the robot, and its scans among lies."""
-    zenoh = pytest.importorskip("zenoh", reason="needs the extra [zenoh]")
-    found: list[Scan] = []
-    end_s = time.monotonic() + 60.0
-    robot = ZenohRobot(Recorded.read(recording), speed=3.0)
-    payloads = [b"", b"\0" * 40, *lying_clouds()]
-    attachments = [b"", b"source_timestamp", b"\xff" * 30, attachment(-(2**63)), attachment(2**63 - 1)]
-    with bounded_memory(2 * MOST_BYTES), robot.running():
-        config = zenoh.Config()
-        for key, value in (
-            ("mode", '"client"'),
-            ("connect/endpoints", f'["tcp/127.0.0.1:{robot.port}"]'),
-            ("scouting/multicast/enabled", "false"),
-        ):
-            config.insert_json5(key, value)
-        with zenoh.open(config) as rude:
-            kept = []
-            for token in TOKENS:
-                try:
-                    kept.append(rude.liveliness().declare_token(token))
-                except zenoh.ZError:
-                    continue  # zenoh itself refuses it
-            assert len(kept) > 5
-            feed = ZenohSession(robot.url, ReadConfig(), PATIENT)
-            with LiveLog(feed, ReadConfig()) as live:
-                count = 0
-
-                def poll() -> bool:
-                    nonlocal count
-                    count += 1
-                    if len(found) > 20 and count % 3 == 0:
-                        key = f"0/scan/sensor_msgs::msg::dds_::LaserScan_/RIHS01_{'0' * 64}"
-                        k = count // 3
-                        lie = attachments[k % len(attachments)]
-                        rude.put(key, payloads[k % len(payloads)], attachment=lie)
-                    return len(found) >= len(expected) or time.monotonic() > end_s
-
-                live.on_poll = poll
-                while not live.ended:
-                    found.extend(live.scans())
-                report = live.report()
-    assert {scan.stamp_ns for scan in expected} <= {scan.stamp_ns for scan in found}
-    assert sum(report.scans_skipped.values()) > 0
-    said = capfd.readouterr().err
-    assert "Traceback" not in said and "ZError" not in said, said
 
 
 @pytest.mark.parametrize("kind", ["laser", "cloud"])

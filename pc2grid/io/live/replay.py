@@ -1,0 +1,73 @@
+"""A finished recording that is replayed at its own pace, as if it were a robot."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+from pc2grid.config import ReadConfig
+from pc2grid.errors import LogError
+from pc2grid.io.live.feed import Feed
+from pc2grid.io.live.inbox import INBOX, Arrived, InboxParameters
+from pc2grid.io.message_source import RawMessage
+from pc2grid.io.read_plan import published_once
+from pc2grid.io.recording import Log, open_log
+from pc2grid.io.scan_stream import PARAMETERS
+
+
+class Replay(Feed):
+    """The messages of a recording, each as long after its first scan as it was recorded."""
+
+    def __init__(self, path: Path, config: ReadConfig, inbox: InboxParameters = INBOX) -> None:
+        """Raises what `open_log` does."""
+        super().__init__(str(path), config, inbox)
+        self._log = open_log(path, config)
+        self._error: LogError | None = None
+        self._stop = threading.Event()
+        for topic in self._log.info.topics:
+            self._offer((topic.topic, topic.type), topic)
+        self._refresh()
+        self._thread = threading.Thread(target=self._play, args=(self._log,), name="replay", daemon=True)
+        self._thread.start()
+
+    def receive(self, timeout_s: float) -> Arrived | None:
+        """See Feed. Raises LogError where the recording is damaged."""
+        arrived = super().receive(timeout_s)
+        if arrived is None and self._error is not None:
+            raise self._error
+        return arrived
+
+    def close(self) -> None:
+        """Stop, and close the recording."""
+        super().close()
+        self._stop.set()
+        self._thread.join()
+        self._log.close()
+
+    def _play(self, log: Log) -> None:
+        try:
+            self._send(log)
+        except LogError as error:
+            self._error = error
+        self._over = True
+        self._inbox.wake()
+
+    def _send(self, log: Log) -> None:
+        """Send what is published once, then the others in their time."""
+        names = {t.topic: published_once(t) for t in log.info.topics}
+        for message in log.messages({name for name, once in names.items() if once}):
+            self._put(message)
+        begin_s, begin_ns = time.monotonic(), log.info.start_ns
+        end_ns = log.info.end_ns + PARAMETERS.margin_ns
+        for message in log.messages({name for name, once in names.items() if not once}):
+            if message.log_time_ns > end_ns:
+                return
+            wait_s = (message.log_time_ns - begin_ns) * 1e-9 - (time.monotonic() - begin_s)
+            if self._stop.wait(max(wait_s, 0.0)):
+                return
+            self._put(message)
+
+    def _put(self, message: RawMessage) -> None:
+        if (message.channel.topic, message.channel.type) in self._subscriptions:
+            self._inbox.put(message)
