@@ -1,20 +1,18 @@
 """What is decided of a query: the masses of the places that are found, and the status that they give.
 
 located      one place has at least the mass `RelocalizeConfig.accept`
-ambiguous    the best place, or one that fits equally well, is at least as likely as none in the map
+ambiguous    the best place, or one that fits equally well, is at least as likely as none in the map; so where
+             maps show one place and nothing says so, because their sessions are not joined
 not_found    all else
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from pc2grid.matching.two_way_score import Fit
-from signature.localization.alike_floors import alike_elsewhere
 from signature.localization.answer import Status, Verdict
 from signature.localization.hypotheses import Hypothesis, same_pose
 from signature.localization.map_index import MapIndex
@@ -25,7 +23,6 @@ from signature.localization.posterior import (
     tail_of,
 )
 from signature.localization.query import QueryMap
-from signature.localization.same_place import places_of
 
 Place = tuple[Hypothesis, ...]
 PriorOf = Callable[[Place], float]
@@ -69,11 +66,7 @@ def judge(
     best = ordered[0][0]
     walls = index.maps_for(query)[best.session_index].walls
     evidence[0] = replace(evidence[0], tail=tail_of(query, best.fit, walls))
-    # On a floor that looks alike, too, the same place has mass.
-    floors, shares = alike_elsewhere(index, query, best) if evidence[0].log_odds() > 0.0 else ([], [])
-    beside = (prior[0] * np.array(shares)).tolist()
-    mass = masses([*evidence, *evidence[:1] * len(floors)], [*prior, *beside]).tolist()
-    ordered += [(h,) for h in floors if not any(_same(query, h, o) for place in ordered for o in place)]
+    mass = masses(evidence, prior).tolist()
     in_the_map = evidence[0].log_odds() + math.log(prior[0]) >= 0.0
     status: Status = "ambiguous" if in_the_map else "not_found"
     return Verdict(
@@ -81,7 +74,7 @@ def judge(
         confidence=mass[0],
         hypotheses=tuple(h for place in ordered for h in place),
         places=tuple(number for number, place in enumerate(ordered) for _ in place),
-        masses=tuple(mass[: len(ordered)]),
+        masses=tuple(mass),
         evidence=evidence[0],
     )
 
@@ -93,7 +86,24 @@ def _allowed(index: MapIndex, query: QueryMap, places: Sequence[Place]) -> tuple
     return [place for place in inside if place], excluded
 
 
-def _same(query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
-    """Whether two hypotheses in one session put the query at one place."""
-    bases = [h.fit.T_map_query @ query.T_odom_base for h in (a, b)]
-    return a.session_index == b.session_index and same_pose(*bases)
+def places_of(index: MapIndex, query: QueryMap, hypotheses: Iterable[Hypothesis]) -> list[Place]:
+    """The hypotheses by place, best first. Those in the maps of joined sessions are one place if they put the
+    query at one pose of their building; a place has one hypothesis a session."""
+    places: list[Place] = []
+    for h in hypotheses:
+        for number, place in enumerate(places):
+            elsewhere = h.session_index not in {other.session_index for other in place}
+            if elsewhere and any(_one_place(index, query, h, other) for other in place):
+                places[number] = (*place, h)
+                break
+        else:
+            places.append((h,))
+    return places
+
+
+def _one_place(index: MapIndex, query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
+    """Whether two hypotheses in the maps of two sessions are one pose of the building of both."""
+    frames = index.joined(a.session_index, b.session_index)
+    return frames is not None and same_pose(
+        *(at.placed(h.fit.T_map_query @ query.T_odom_base) for at, h in zip(frames, (a, b), strict=True))
+    )

@@ -12,7 +12,6 @@ import numpy as np
 
 from pc2grid.arrays import F64, I64
 from pc2grid.errors import DatabaseCorrupt
-from pc2grid.geometry import SE2
 from pc2grid.matching.walls import at_all_heights
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid, PointMap
@@ -105,7 +104,6 @@ class MapIndex:
                 lambda i: SearchMap.of(at_all_heights(self.grids[i])), count, most_prepared
             ),
         }
-        self.alike_floors: dict[tuple[int, int], SE2 | None] = {}  # see `signature.localization.alike_floors`
         self._free: LazySequence[F64] = LazySequence(lambda i: free_squares(self.grids[i]), count)
         self.places = Places(
             table,

@@ -9,6 +9,7 @@ right one is decided by loop closure (`pc2grid.mapping.loop_candidates`), which 
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,13 +18,14 @@ from functools import lru_cache
 import numpy as np
 
 from pc2grid.mapping.place_recognition import Recognition, Stretch
+from pc2grid.matching.two_way_score import Fit
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
-from signature.localization.hypotheses import Hypothesis, verify
+from signature.localization.hypotheses import verify
 from signature.localization.lazy_maps import LazySequence
+from signature.localization.posterior import log_likelihood_ratio
 from signature.localization.query import QueryMap, query_of
-from signature.localization.same_place import SAME_PLACE
 from signature.retrieval.viewpoints import Places
 from signature.retrieval.vote import retrieve
 from signature.similarity import SignatureTable
@@ -38,6 +40,8 @@ class RecognitionParameters:
     placements : placements that are aligned.
     maps : prepared maps of earlier stretches that stay in memory, about 4 MB each.
     least : hypotheses that are less probable are not reported.
+    neutral, sharpness : s_0 and k of `probability`, fitted to simulated sessions in the plans of fr079 and
+        intel.
     """
 
     views: int = 12
@@ -45,6 +49,18 @@ class RecognitionParameters:
     placements: int = 30
     maps: int = 16
     least: float = 0.3
+    neutral: float = 0.627
+    sharpness: float = 16.2
+
+    def probability(self, fit: Fit) -> float:
+        """How probable it is that two maps that fit so well show one place, rivals left aside, 0..1.
+
+        logit p = k min(1, W/100) (l(s) - l(s_0)) with the score s, the wall points W that it rests on, and
+        l(a) = ln a - ln(1.2 - a).
+        """
+        k = self.sharpness * min(1.0, fit.compared / 100.0)
+        least = log_likelihood_ratio(self.neutral)
+        return 1.0 / (1.0 + math.exp(-k * (log_likelihood_ratio(fit.score) - least)))
 
 
 RECOGNITION = RecognitionParameters()
@@ -97,7 +113,7 @@ class SessionRecognizer:
                 probability=probability,
             )
             for found in verify(query, proposals, places, maps, self._config)
-            if (probability := probability_of(found, query)) >= self._parameters.least
+            if (probability := self._parameters.probability(found.fit)) >= self._parameters.least
         ]
 
     def _remember(self, grid: OccupancyGrid, query: QueryMap) -> None:
@@ -126,12 +142,6 @@ class SessionRecognizer:
             resolution_m=resolution_m,
             origin_m=origin_m,
         )
-
-
-def probability_of(hypothesis: Hypothesis, query: QueryMap) -> float:
-    """How probable it is that a map shows the place of the query at all, rivals left aside, 0..1."""
-    fit = hypothesis.fit
-    return SAME_PLACE.probability(fit.score, fit.compared)
 
 
 def recognizer_for(config: Config) -> SessionRecognizer | None:

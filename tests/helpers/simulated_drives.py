@@ -16,6 +16,7 @@ from pc2grid.submaps.isovist import WALL, isovist
 from pc2grid.submaps.partition import partition
 from signature.config import Config
 from signature.database import Label
+from signature.database.protocol import BuildingFrame
 from signature.describe import describe
 from signature.localization.map_index import MapIndex
 from signature.similarity import SignatureTable
@@ -119,8 +120,9 @@ def building(
     grids: dict[str, OccupancyGrid],
     config: Config | None = None,
     labels: dict[str, Label] | None = None,
+    joined: dict[str, SE2] | None = None,
 ) -> MapIndex:
-    """A database in memory."""
+    """A database in memory. joined : where sessions lie in the frame of one building."""
     config = config or Config()
     signatures, centers, sessions, ids = [], [], [], []
     for index, grid in enumerate(grids.values()):
@@ -130,7 +132,12 @@ def building(
             sessions.append(index)
             ids.append(submap.submap_id)
     table = SignatureTable.of(signatures, centers, submap_id=ids, session_index=sessions)
-    return MapIndex(grids, table, config, config, labels)
+    exact = ((0.0, 0.0, 0.0),) * 3
+    frames = {
+        name: BuildingFrame(name="building", T_building_session=T, covariance=exact)
+        for name, T in (joined or {}).items()
+    }
+    return MapIndex(grids, table, config, config, labels, frames=frames)
 
 
 def cut(grid: OccupancyGrid, x0: float, y0: float, x1: float, y1: float) -> OccupancyGrid:

@@ -75,12 +75,13 @@ def test_a_single_session_is_refused_and_says_what_to_do() -> None:
 
 def test_answers_are_in_the_frame_of_the_building_unless_that_of_the_session_is_asked_for() -> None:
     """The drive is in the east; its end in the frame of the west follows from where the east was cut out."""
+    run("db split b.submaps east -o alone.submaps")
     poses = read_tum(Path("drive.tum")).planar()
     T = T_OFFICE_EAST
     for database, frame, named, expected in (
         ("joined.submaps", "building", "west", T.apply(poses[-1:, :2])[0]),
         ("joined.submaps", "session", None, poses[-1, :2]),
-        ("b.submaps", "building", None, poses[-1, :2]),
+        ("alone.submaps", "building", None, poses[-1, :2]),
     ):
         answer = document(f"relocalize drive.mcap -d {database} --frame {frame} --trajectory out.tum --force")
         assert answer["frame"] == named
@@ -112,3 +113,13 @@ def test_what_is_added_to_a_joined_database_is_joined() -> None:
     run("db split b.submaps west -o y.submaps")
     assert document("convert east.yaml -o y.submaps --add")["joined"] == []
     assert document("convert east.yaml -o y.submaps --add --name too --join")["joined"] != []
+
+
+def test_one_place_in_two_sessions_is_ambiguous_until_they_are_joined() -> None:
+    run("convert east.yaml -o twice.submaps --name monday")
+    run("convert east.yaml -o twice.submaps --add --name tuesday")
+    asked = CliRunner().invoke(app, ["relocalize", "drive.mcap", "-d", "twice.submaps"])
+    assert asked.exit_code == 4 and "ambiguous: 2 places fit" in asked.stdout
+    assert "monday and tuesday are not joined" in asked.stderr and "`pc2grid db join twice" in asked.stderr
+    run("db join twice.submaps")
+    assert "located in" in run("relocalize drive.mcap -d twice.submaps")

@@ -194,6 +194,7 @@ def relocalize_command(
         for path in outputs.written(located=located is not None):
             console.of(context).note(f"wrote {path}")
         _warn_of_missing_points(found, opened)
+        _warn_of_unjoined(found.answer, opened)
     if located is None:
         for path in outputs.of_answer():
             console.warn(f"{path}: not written, there is no answer to put into it")
@@ -384,6 +385,22 @@ def _warn_of_missing_points(found: Found, database: SubmapDatabase) -> None:
             "the map keeps no points in space; `pc2grid convert --points 0.05` keeps them: what the sensor"
             " sees above and below the plane of the map then tells places apart, too"
         )
+
+
+def _warn_of_unjoined(answer: Answer, database: SubmapDatabase) -> None:
+    """Say what may make one place of two, where the best of them are in sessions that are not joined."""
+    if answer.status != "ambiguous" or 1 not in answer.places:
+        return
+    a, b = (answer.hypotheses[answer.places.index(place)].session_index for place in (0, 1))
+    one, other = answer.sessions[a], answer.sessions[b]
+    frames = database.frames()
+    joined = one in frames and other in frames and frames[one].name == frames[other].name
+    if one == other or joined or answer.labels[a].contradicts(answer.labels[b]):
+        return
+    console.warn(
+        f"{one_line(one)} and {one_line(other)} are not joined: if they show one building, `pc2grid db join"
+        f" {database.location}` makes one place of these two"
+    )
 
 
 def as_text(answer: Answer, *, is_map: bool = False) -> str:

@@ -42,7 +42,6 @@ from signature.localization.joining.pieces import (
 )
 from signature.localization.posterior import NO_EVIDENCE, POSTERIOR, Evidence, evidence_of, masses
 from signature.localization.query import QueryMap
-from signature.localization.same_place import SAME_PLACE
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -60,6 +59,7 @@ class JoinParameters:
     accept : least probability. A wrong answer is one, a wrong join makes all later answers wrong.
     labelled : prior odds that two sessions show one floor if their labels say so, relative to those of other
         sessions, which the posterior begins with.
+    wall_m : the ground that a session knows is widened by this, so that the walls at its edge count.
     """
 
     around_m: float = 1.0
@@ -67,6 +67,7 @@ class JoinParameters:
     least_m2: float = 20.0
     accept: float = 0.99
     labelled: float = 10.0
+    wall_m: float = 0.4
 
 
 JOIN = JoinParameters()
@@ -361,10 +362,10 @@ def _status(
 
 
 def known_part(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE2) -> OccupancyGrid:
-    """The source without what the target does not know, widened by `SamePlace.wall_m` for walls."""
+    """The source without what the target does not know, widened by `JoinParameters.wall_m`."""
     import cv2
 
-    n = math.ceil(SAME_PLACE.wall_m / target.resolution_m)
+    n = math.ceil(JOIN.wall_m / target.resolution_m)
     known = cv2.dilate((target.cells != UNKNOWN).astype(np.uint8), np.ones((2 * n + 1, 2 * n + 1), np.uint8))
     cells = np.argwhere(source.cells != UNKNOWN)
     inside = _looked_up(known.astype(bool), target, T_target_source.apply(source.to_point(cells)))

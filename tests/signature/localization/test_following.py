@@ -138,12 +138,16 @@ def test_after_a_restart_a_located_robot_is_recovered() -> None:
     check_poses(looks)
 
 
-def test_the_same_place_in_another_session_is_the_same_place() -> None:
+def test_one_place_in_two_sessions_is_one_if_they_are_joined() -> None:
     """A database of two maps of one floor: the pose stays in the map in which it was found first."""
     both = building({"monday": office(), "tuesday": office()})
     looks = looks_of(Localizer(both), list(stretch(FIRST)))
-    sessions = {look.session for look, _ in looks if look.state == "located"}
-    assert len(sessions) == 1
+    assert {look.state for look, _ in looks} == {"searching"}
+    last = looks[-1][0].answer
+    assert last.status == "ambiguous" and last.masses[:2] == (last.masses[0],) * 2
+    both = building({"monday": office(), "tuesday": office()}, joined={"monday": HERE, "tuesday": HERE})
+    looks = looks_of(Localizer(both), list(stretch(FIRST)))
+    assert len({look.session for look, _ in looks if look.state == "located"}) == 1
     assert "doubtful" not in {look.state for look, _ in looks}
 
 

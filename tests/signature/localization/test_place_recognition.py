@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
+import pytest
 
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.mapping.place_recognition import Stretch
+from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from signature.config import Config
-from signature.localization.place_recognition import RecognitionParameters, SessionRecognizer
+from signature.localization.place_recognition import RECOGNITION, RecognitionParameters, SessionRecognizer
 
 
 def rooms(seed: int) -> OccupancyGrid:
@@ -65,3 +69,12 @@ def test_an_earlier_place_is_recognised_and_a_new_one_is_not() -> None:
     assert math.hypot(best.T_older_newest.x - again.x, best.T_older_newest.y - again.y) < 0.1
     assert abs(wrap_angle(best.T_older_newest.yaw - again.yaw)) < 0.02
     assert all(recognition.older < 4 for recognition in found)
+
+
+def test_two_maps_show_one_place_the_surer_the_more_walls_agree() -> None:
+    def probability(score: float, compared: float) -> float:
+        return RECOGNITION.probability(cast(Fit, SimpleNamespace(score=score, compared=compared)))
+
+    assert probability(0.627, 1000.0) == pytest.approx(0.5)
+    assert probability(0.9, 100.0) > 0.99 > probability(0.9, 10.0) > 0.5
+    assert probability(0.3, 1000.0) < 0.01

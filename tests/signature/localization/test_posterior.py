@@ -18,7 +18,6 @@ from signature.localization.posterior import (
     tempered,
 )
 from signature.localization.query import QueryMap
-from signature.localization.same_place import SAME_PLACE
 
 AGREEMENTS = np.linspace(0.0, 1.0, 11).tolist()
 WALLS = [5.0, 30.0, 100.0, 300.0, 2000.0]
@@ -129,9 +128,3 @@ def test_what_differs_between_equal_places_is_chance() -> None:
     """Their scores are equal, as the one that agrees less lies on more known ground."""
     twins = evidence_of([found(0.9, 0.85), found(0.9, 0.95)], QUERY)
     assert twins[0] == twins[1] and twins[0].forward == 0.95
-
-
-def test_surroundings_are_the_same_if_enough_walls_agree() -> None:
-    assert SAME_PLACE.probability(0.627, 1000.0) == pytest.approx(0.5)
-    assert SAME_PLACE.probability(0.9, 100.0) > 0.99 > SAME_PLACE.probability(0.9, 10.0) > 0.5
-    assert SAME_PLACE.probability(0.3, 1000.0) < 0.01

@@ -19,12 +19,11 @@ import numpy as np
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.model import OccupancyGrid
 from pc2grid_lab.bench.real_queries import STANDING_SCANS, parser_of, read_all
-from pc2grid_lab.experiments.answers import localize
+from pc2grid_lab.experiments.answers import localize, share_known
 from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.peers.site import is_covered
 from signature.localization.answer import Answer
 from signature.localization.map_index import MapIndex
-from signature.localization.same_place import share_known
 
 TRAVEL_M = (0.0, 3.0, 10.0)
 ELSEWHERE_M = (1.0, 3.0, 5.0, 8.0)

@@ -31,6 +31,7 @@ from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.partition import partition
+from pc2grid_lab.experiments.answers import unseen_by
 from pc2grid_lab.experiments.registered_session import RegisteredSession, register
 from pc2grid_lab.experiments.replay import Replay
 from signature.config import Config
@@ -39,7 +40,6 @@ from signature.localization.hypotheses import Hypothesis
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import evidence_of, tail_of
 from signature.localization.query import Query, QueryMap
-from signature.localization.same_place import unseen_by
 from signature.similarity import SignatureTable
 
 MAPPED_S = {"fr079": 600.0, "intel": 900.0, "csail": 250.0, "killian": 900.0}

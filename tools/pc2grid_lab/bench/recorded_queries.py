@@ -25,6 +25,7 @@ from pc2grid.model import OccupancyGrid
 from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.bench.real_queries import evidence_list
+from pc2grid_lab.experiments.answers import unseen_by
 from pc2grid_lab.experiments.frames import apart
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair
 from pc2grid_lab.experiments.recordings.drive import config_of
@@ -34,7 +35,6 @@ from signature.config import Config
 from signature.database import SubmapDatabase, open_database
 from signature.localization.map_index import MapIndex
 from signature.localization.query import Query, QueryMap
-from signature.localization.same_place import unseen_by
 
 OTHERS = ("fr079", "wean 2", "kidnap dec13 before", "workshop_1", "birmingham", "csail", "jarvis nav", "hall")
 """Maps that the queries of other buildings are asked in, in turn or all."""

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
+import numpy as np
+
+from pc2grid.arrays import BoolGrid
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.model import RegisteredScan
+from pc2grid.geometry import SE2
+from pc2grid.model import UNKNOWN, OccupancyGrid, RegisteredScan
 from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
+
+_WALL_M = 0.4
+"""What a query has seen is widened by this: the far side of a wall does not count as unseen. By hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,3 +71,26 @@ def localize(
             yield answers(count)
     if after is None:
         yield answers(count)
+
+
+def share_known(grid: OccupancyGrid, seen: OccupancyGrid, T_map_query: SE2) -> float:
+    """The share of what a query has seen that a map knows, if the query lies at a pose."""
+    cells = np.argwhere(seen.cells != UNKNOWN)
+    at = grid.to_cell(T_map_query.apply(seen.to_point(cells)))
+    inside: BoolGrid = np.all((at >= 0) & (at < grid.cells.shape), axis=1)
+    inside[inside] = grid.cells[at[inside, 0], at[inside, 1]] != UNKNOWN
+    return float(inside.mean()) if len(inside) else 0.0
+
+
+def unseen_by(query: QueryMap, grid: OccupancyGrid, T_map_query: SE2) -> OccupancyGrid:
+    """A map in which all that a query has seen, placed at a pose, is made unknown."""
+    known = query.grid.cells != UNKNOWN
+    n = math.ceil(_WALL_M / grid.resolution_m)
+    known = cv2.dilate(known.astype(np.uint8), np.ones((2 * n + 1, 2 * n + 1), np.uint8)).astype(bool)
+    cells = np.argwhere(grid.cells != UNKNOWN)
+    at = query.grid.to_cell(T_map_query.inverse().apply(grid.to_point(cells)))
+    inside: BoolGrid = np.all((at >= 0) & (at < query.grid.cells.shape), axis=1)
+    inside[inside] = known[at[inside, 0], at[inside, 1]]
+    left = grid.cells.copy()
+    left[cells[inside, 0], cells[inside, 1]] = UNKNOWN
+    return replace(grid, cells=left)
