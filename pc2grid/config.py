@@ -46,6 +46,12 @@ class ReadConfig(Section):
     depth_stride: int = Field(
         2, ge=1, le=16, description="every n-th row and column of a depth image is used"
     )
+    depth_unit_m: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="unit of depth images, m, such as 0.0002; null: 16UC1 in millimetres, 32FC1 in metres",
+    )
     point_time: Literal["auto", "s", "ms", "us", "ns", "none"] = Field(
         "auto", description="unit of the per-point times of a cloud; none: ignore them"
     )

@@ -315,6 +315,21 @@ def no_scans(folder: Path) -> str:
     return CONVERT
 
 
+@fault(14, 1, errors.NoScans, "livox_ros_driver/CustomMsg", "with xfer_format 0 the livox driver publishes")
+def scans_of_a_type_of_their_driver(folder: Path) -> str:
+    records = [("/livox/lidar", "livox_ros_driver/msg/CustomMsg", "ros2msg", b"uint8 line", b"\0\1\0\0\1")]
+    raw_log(folder / "log.mcap", records)
+    return CONVERT
+
+
+@fault(14, 1, errors.NoScans, "/stereo/image (sensor_msgs/Image) holds depth images", "--topic /stereo/image")
+def depth_images_that_are_not_called_so(folder: Path) -> str:
+    images = [ros().image("/stereo/image", T0 + i, np.full((6, 8), 900, "<u2"), "16UC1") for i in range(3)]
+    colours = ros().image("/left/image", T0, np.zeros((6, 8), np.uint8), "mono8")
+    log(folder, [ros().camera("/stereo/camera_info", T0, 8, 6, 10.0), colours, *images])
+    return CONVERT
+
+
 @fault(15, 1, errors.TopicError, "several topics hold scans", "/points", "/rear", "--topic /points")
 def two_lidars(folder: Path) -> str:
     log(folder, recording(CLOUDS, *(c._replace(topic="/rear") for c in CLOUDS)))
@@ -598,7 +613,7 @@ def depth_of_an_unknown_encoding(folder: Path) -> str:
     return depth_log(folder, "64FC1", 1.0)
 
 
-@fault(37, 0, None, "hold no returns at all", "log: 3 depth scans", "0 m2 free, 0 submaps")
+@fault(37, 1, errors.NoScans, "/depth/image: none of 3 scans holds a return", "nothing came back")
 def depth_of_zeros(folder: Path) -> str:
     return depth_log(folder, unit=0.0)
 

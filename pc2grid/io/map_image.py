@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.errors import MapFileError
-from pc2grid.io.sensors import png
+from pc2grid.io.sensors.png_header import MAGIC as PNG_MAGIC
+from pc2grid.io.sensors.png_header import read_header
 
 MAX_CELLS = 100_000_000
 _MAX_TEXT_CELLS = 10_000_000  # each number of a text becomes a Python object
@@ -38,8 +39,8 @@ def read_image(path: Path) -> GreyImage:
     data = _content(path)
     if data[:2] in (b"P5", b"P2"):
         return _decode_pgm(path, data)
-    if data[:8] == png.MAGIC:
-        data = _checked_png(path, data)
+    if data[:8] == PNG_MAGIC:
+        _check_png(path, data)
     elif data[:2] == b"BM":
         _check_bmp(path, data)
     else:
@@ -85,15 +86,15 @@ def _check_size(path: Path, width: int, height: int) -> None:
         raise MapFileError(f"{path}: {width} x {height} pixels; the limit is {MAX_CELLS} cells")
 
 
-def _checked_png(path: Path, data: bytes) -> bytes:
+def _check_png(path: Path, data: bytes) -> None:
+    """Check what OpenCV would take memory for; damage to the rest it sees by the checksums."""
     try:
-        found = png.inspect(data)
+        found = read_header(data)
     except ValueError as error:
         raise MapFileError(f"{path}: a damaged PNG: {error}", hint="copy or save the map again") from error
     if found.bits > 8:
         raise MapFileError(f"{path}: {found.bits} bits per channel", hint="save the map with 8 bits")
     _check_size(path, found.width, found.height)
-    return found.data
 
 
 def _check_bmp(path: Path, data: bytes) -> None:

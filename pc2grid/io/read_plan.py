@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -14,8 +15,10 @@ from pc2grid.io.frames import FrameTree
 from pc2grid.io.message_source import Choice, MessageSource, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Header, Odometry
+from pc2grid.io.sensors.depth import holds_depths
 from pc2grid.sensor_model import SENSOR_MODELS
 
+_LAST_FLOAT = struct.Struct("<f")
 _BASE_FRAMES = ("base_link", "base_footprint")  # REP-105 and REP-120
 _LIDARS = ("lidar", "laser", "velodyne", "livox", "ouster", "os_sensor", "hesai", "pandar", "rslidar")
 """Parts of the names of frames of lidars."""
@@ -55,6 +58,7 @@ class Plan:
     time of recording is used instead.
     mounted : None, unless the points of the scans are in a fixed frame already; then the frame of the sensor.
     period_ns : the longest time between two of the first scans; 0 if there is only one.
+    depth_unit_m : that of the depth images, as the settings or the log say it; None: that of their encoding.
     """
 
     choice: Choice
@@ -69,6 +73,7 @@ class Plan:
     imu: TopicInfo | None = None
     mounted: str | None = None
     period_ns: int = 0
+    depth_unit_m: float | None = None
 
 
 def registered(frame: str) -> FrameError:
@@ -190,6 +195,7 @@ class _Planner:
             imu=imu.topic,
             mounted=mounted,
             period_ns=max((b.stamp_ns - a.stamp_ns for a, b in itertools.pairwise(headers)), default=0),
+            depth_unit_m=self._config.depth_unit_m or self._recorded_depth_unit_m(),
         )
 
     def _check_joined(self, more: Sequence[TopicInfo], sensor_frame: str, base: str | None) -> None:
@@ -222,6 +228,18 @@ class _Planner:
         self._source.tally.warn(f"tf does not say where on {base} the sensor sits: its rays begin at {base}")
         return base
 
+    def _recorded_depth_unit_m(self) -> float | None:
+        """The unit that librealsense writes into its recordings, as a std_msgs/Float32; None if it is not."""
+        unit = topics.depth_unit_topic(self._topics)
+        if unit is None:
+            return None
+        message = next(self._source.messages({unit.topic}), None)
+        value = 0.0 if message is None else _LAST_FLOAT.unpack(bytes(message.data)[-_LAST_FLOAT.size :])[0]
+        if not 0 < value <= 1:
+            return None
+        self._source.tally.warn(f"depths are in units of {value:.3g} m, as {unit.topic} says")
+        return float(value)
+
     def _imu(self, base: str | None, sensor_frame: str, sensors: _Sensors, motion: _Motion) -> _Motion:
         """The IMU; base : None if the log has no tf. Beside odometry, and with a laser, none is looked for.
 
@@ -250,12 +268,17 @@ class _Planner:
 
     def _first_frame(self, topic: TopicInfo) -> str:
         """The frame of the first message that can be decoded; empty if there is none."""
+        found = self._first(topic)
+        return "" if found is None else str(found.header.frame)
+
+    def _first(self, topic: TopicInfo) -> Any:
+        """The first message that can be decoded; None if there is none."""
         decode = decoder_for(topic)
         for message in self._source.messages({topic.topic}):
             found = tolerant(decode, message.data, None)
             if message.channel == topic and found is not None:
-                return str(found.header.frame)
-        return ""
+                return found
+        return None
 
     def _source_of(self, topic: TopicInfo) -> topics.Source:
         """Where a topic of scans comes from."""
@@ -281,7 +304,13 @@ class _Planner:
 
     def _sensors(self) -> _Sensors:
         wanted = self._config.topic
-        scans, reason = topics.scan_topic(self._topics, wanted, self._source_of)
+        try:
+            scans, reason = topics.scan_topic(self._topics, wanted, self._source_of)
+        except NoScans:
+            image = self._unnamed_depth() if wanted is None else None
+            if image is None:
+                raise
+            raise topics.proposed(image, self._topics) from None
         more = topics.further_scan_topics(self._topics, wanted)
         if more:
             reason += f", with {', '.join(t.topic for t in more)}"
@@ -289,6 +318,12 @@ class _Planner:
         if SENSOR_MODELS[topics.SENSORS[scans.type]].image:
             cameras = [topics.camera_info_topic(t, self._topics) for t in (scans, *more)]
         return _Sensors(scans, more, cameras, reason)
+
+    def _unnamed_depth(self) -> TopicInfo | None:
+        """A topic of depth images whose name does not say so; None if there is none."""
+        images = [t for t in self._topics if topics.is_image(t) and t.message_count != 0]
+        firsts = ((topic, self._first(topic)) for topic in images)
+        return next((topic for topic, image in firsts if image is not None and holds_depths(image)), None)
 
     def _sensor_moves(self, base: str | None, sensor_frame: str) -> bool:
         """Whether the sensor moves on the robot. base : None if the log has no tf."""

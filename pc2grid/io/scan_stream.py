@@ -31,6 +31,7 @@ from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Imu, Odometry, ScanMessage, Transform
 from pc2grid.io.read_plan import Plan, is_static, registered, tolerant
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
+from pc2grid.io.sensors.floor_depth import FloorDepth
 from pc2grid.io.sensors.scan_decoder import ScanDecoder
 from pc2grid.model import Scan
 from pc2grid.sensor_model import SENSOR_MODELS
@@ -69,6 +70,9 @@ _FLOOR_BELOW_M, _FLOOR_SHARE = 0.05, 0.01
 """A sensor sees so much of its points below itself, as far as the floor is not at its own height; by hand."""
 _MOST_PERIODS = 1.1  # that the beams of a laser's scan take; stamps jitter
 _UP = math.cos(math.radians(45.0))  # an axis that points more upwards than this
+_EMPTY_HINT = (
+    "is the sensor covered, or the unit of its ranges wrong? metres are expected; another topic: --topic"
+)
 
 
 class _Waiting(NamedTuple):
@@ -82,7 +86,7 @@ class _Waiting(NamedTuple):
 
 
 class Part:
-    """The part of the log that is read, and how many of its scans could be decoded.
+    """The part of the log that is read, how many of its scans could be decoded, and their returns.
 
     start_ns, end_ns : log times of its scans; None: from the first one on, to the last one.
     """
@@ -93,7 +97,7 @@ class Part:
         """name, length_s : for errors, which seconds of how many are wanted."""
         self.start_ns, self.end_ns = start_ns, end_ns
         self._name, self._length_s = name, length_s
-        self.count = self.good = self._bad = 0
+        self.count = self.good = self.returns = self._bad = 0
         self._error: Pc2GridError | None = None
 
     def holds(self, log_time_ns: int) -> bool:
@@ -109,13 +113,19 @@ class Part:
         if self._bad >= patience and not self.good:
             raise self._mostly_bad(topic)
 
-    def finish(self, topic: str, max_bad_share: float) -> None:
-        """Raises NoScans if there were none, LogCorrupt or PointCloudError if too many were bad."""
+    def finish(self, topic: str, max_bad_share: float, empty: str) -> None:
+        """Raises NoScans if there were none or all were empty, LogCorrupt or PointCloudError if too many were
+        bad.
+
+        empty : why the last empty scan was so.
+        """
         if self.count == 0:
             hint = f"the log lasts {self._length_s:.1f} s"
             raise NoScans(f"{topic}: no scan {self._name}".rstrip(), hint=hint)
         if self.good == 0 or self._bad > max_bad_share * self.count:
             raise self._mostly_bad(topic)
+        if not self.returns:
+            raise NoScans(f"{topic}: none of {self.good} scans holds a return: {empty}", hint=_EMPTY_HINT)
 
     def _mostly_bad(self, topic: str) -> Pc2GridError:
         assert self._error is not None
@@ -196,7 +206,8 @@ class _Poses:
         self._plan, self._frames, self._tally = plan, frames, tally
         self._track = PoseTrack()
         self._T_child_base: F64 | None = None
-        self._images = SENSOR_MODELS[plan.choice.sensor].image
+        model = SENSOR_MODELS[plan.choice.sensor]
+        self._images, self._planar = model.image, model.planar
         self._attitude = Attitude()
         self._imu_frame = ""
         self.frame = plan.odometry_frame
@@ -314,8 +325,10 @@ class _Poses:
     def sensor(self, frame: str, stamp_ns: int) -> F64:
         """`T_base_sensor` (4, 4) of the sensor with this frame. Raises FrameError, PointCloudError."""
         if self._plan.sensor_is_base:
-            # REP-103: images are in optical axes (z forward); without tf they are turned here.
-            optical = self._images or frame.endswith("_optical") or "_optical_" in frame
+            # REP-103: images are in optical axes (z forward); without tf they are turned here. A LaserScan is
+            # by its definition in the x-y plane of its frame, whatever the frame is called.
+            named = frame.endswith("_optical") or "_optical_" in frame
+            optical = self._images or (named and not self._planar)
             return T_BODY_OPTICAL if optical else np.eye(4)
         base = self._plan.choice.base_frame
         if frame != base and frame not in self._frames:
@@ -349,17 +362,27 @@ class Stream:
         self._parameters = parameters = parameters or PARAMETERS
         self._part = part or Part()
         sensor = plan.choice.sensor
-        self._decoder = ScanDecoder(plan.scans.topic, sensor, decoder_for(plan.scans), config)
-        self._further = [
-            FurtherScans(t, camera, ScanDecoder(t.topic, sensor, decoder_for(t), config))
-            for t, camera in plan.further
-        ]
+        self._config = config
+        self._decoder = self._decoder_of(plan.scans, plan.camera)
+        self._further = [FurtherScans(t, camera, self._decoder_of(t, camera)) for t, camera in plan.further]
+        self._floor = FloorDepth()
         self._poses = _Poses(plan, frames, source.tally)
         self._stamps = _Stamps(parameters, source.tally)
         self._waiting = _Queue()
         self._last_read_ns: int | None = None  # stamp of the last scan with odometry
         self._sweep_ns = 0 if SENSOR_MODELS[sensor].image else parameters.sweep_ns
         self._handlers = self._make_handlers()
+
+    def _decoder_of(self, topic: TopicInfo, camera: TopicInfo | None) -> ScanDecoder:
+        return ScanDecoder(
+            topic.topic,
+            self._plan.choice.sensor,
+            decoder_for(topic),
+            self._config,
+            camera_topic="" if camera is None else camera.topic,
+            depth_unit_m=self._plan.depth_unit_m,
+            fixed_frame=self._plan.mounted is not None,
+        )
 
     def _make_handlers(self) -> dict[TopicInfo, Callable[[Any, int], None]]:
         """By topic, what takes in its messages. Reads the first CameraInfo of the source."""
@@ -388,7 +411,7 @@ class Stream:
         for message in self._source.messages(self.topics, low, high):
             yield from self.take(message)
         yield from self.release_all()
-        part.finish(self._plan.scans.topic, self._parameters.max_bad_share)
+        part.finish(self._plan.scans.topic, self._parameters.max_bad_share, self._decoder.empty)
         if self._last_read_ns is None and self._plan.choice.odometry_topic is not None:
             self._source.tally.warn(
                 f"no scan has odometry: that from {self._plan.choice.odometry_topic} is of other times"
@@ -535,8 +558,10 @@ class Stream:
         tally.points_dropped += scan.dropped
         for note in self._decoder.notes:
             tally.warn(note)
-        if not len(scan.points_m):
-            tally.warn("some scans hold no returns at all")
+        self._part.returns += len(scan.points_m)
+        if SENSOR_MODELS[scan.sensor].image and not self._plan.sensor_is_base:
+            for warning in self._floor.warnings(scan.points_m, scan.T_base_sensor, self._decoder.unit_m):
+                tally.warn(warning)
         yield scan
 
     def _within_period(self, scan: Scan) -> Scan:

@@ -32,6 +32,18 @@ IMU = ("sensor_msgs/Imu",)
 _FIXED = ("odom", "map", "world", "earth", "camera_init")  # REP-105; the last one in LOAM and FAST-LIO
 TF = ("tf2_msgs/TFMessage", "tf/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
 
+_SCANS_ARE = "scans are PointCloud2, LaserScan, or a depth Image with a CameraInfo"
+# What drivers publish instead of one of these, by a part of the type's name; and what to do about it.
+_ADVICE = {
+    "livox": "with xfer_format 0 the livox driver publishes PointCloud2: record that; or play this recording "
+    "through a converter from CustomMsg to PointCloud2, and record its topic",
+    "MultiEchoLaserScan": "laser_proc makes LaserScan of it: record /first, or play the recording through it",
+    "Packet": "these are raw packets: play the recording through the sensor's driver, and record PointCloud2",
+    "VelodyneScan": "these are raw packets: play the recording through velodyne_pointcloud, and record "
+    "/velodyne_points",
+    "sensor_msgs/PointCloud": "point_cloud_converter makes PointCloud2 of it: play the recording through it",
+}
+
 
 class Source(NamedTuple):
     """Of the first message of a topic: its frame, and how long after its stamp it was recorded."""
@@ -91,9 +103,23 @@ def _no_scans(topics: Sequence[TopicInfo], fitting: Sequence[TopicInfo]) -> NoSc
     if image := next((t for t in topics if _is_depth_image(t)), None):
         return _no_camera_info(image)
     there = _listed(topics) if topics else "the log has no topics at all"
+    return NoScans(f"no topic with scans; there is: {there}", hint=_advice_on(topics))
+
+
+def _advice_on(topics: Sequence[TopicInfo]) -> str:
+    """What to do to get scans from topics that hold none."""
+    found = ((t, advice) for t in topics for part, advice in _ADVICE.items() if part in t.type)
+    topic, advice = next(found, (None, _SCANS_ARE))
+    return advice if topic is None else f"{topic.topic} is {topic.type}: {advice}"
+
+
+def proposed(image: TopicInfo, topics: Sequence[TopicInfo]) -> NoScans:
+    """The error for a log whose only scans are depth images on a topic whose name does not say so."""
+    if not any(t.type in CAMERA_INFOS for t in topics):
+        return _no_camera_info(image)
     return NoScans(
-        f"no topic with scans; there is: {there}",
-        hint="scans are PointCloud2, LaserScan, or a depth Image with a CameraInfo",
+        f"no topic with scans by its name, but {image.topic} ({image.type}) holds depth images",
+        hint=f"--topic {image.topic} uses them",
     )
 
 
@@ -211,8 +237,19 @@ def _fits(topic: TopicInfo, topics: Sequence[TopicInfo]) -> bool:
 
 
 def _is_depth_image(topic: TopicInfo) -> bool:
+    return is_image(topic) and "depth" in topic.topic.lower()
+
+
+def is_image(topic: TopicInfo) -> bool:
+    """Whether a topic holds images, of depths or of colours."""
     kind = SENSORS.get(topic.type)
-    return kind is not None and SENSOR_MODELS[kind].image and "depth" in topic.topic.lower()
+    return kind is not None and SENSOR_MODELS[kind].image
+
+
+def depth_unit_topic(topics: Sequence[TopicInfo]) -> TopicInfo | None:
+    """The topic on which librealsense records the unit of its depth images, an option of the sensor."""
+    named = (t for t in topics if "/option/depth_units/value" in t.topic.lower().replace(" ", "_"))
+    return next((t for t in named if t.type == "std_msgs/Float32" and t.message_count != 0), None)
 
 
 def _named(topics: Sequence[TopicInfo], fitting: Sequence[TopicInfo], wanted: str) -> TopicInfo:
@@ -227,7 +264,7 @@ def _named(topics: Sequence[TopicInfo], fitting: Sequence[TopicInfo], wanted: st
     if not usable:
         raise UnsupportedSchema(
             f"{wanted}: is of type {same[0].type or 'unknown'}",
-            hint="scans are PointCloud2, LaserScan, or a depth Image with a CameraInfo",
+            hint=_advice_on(same[:1]),
         )
     if usable[0].message_count == 0:
         raise NoScans(f"{wanted}: no message in the log")

@@ -85,15 +85,25 @@ class Ros:
         )
         return self.message(topic, stamp_ns, content)
 
-    def laser(self, topic: str, stamp_ns: int, ranges: ArrayLike, frame: str = "laser") -> Message:
-        """Beams from -pi/2, 0.01 rad apart, 0.1 to 30 m."""
+    def laser(
+        self,
+        topic: str,
+        stamp_ns: int,
+        ranges: ArrayLike,
+        frame: str = "laser",
+        *,
+        angles: tuple[float, float] = (-np.pi / 2, 0.01),
+        angle_max: float | None = None,
+        limits_m: tuple[float, float] = (0.1, 30.0),
+    ) -> Message:
+        """angles : of the first beam, and from beam to beam. angle_max : None: that of the last beam."""
         values = np.asarray(ranges, np.float32)
-        end = -np.pi / 2 + 0.01 * (len(values) - 1)
-        none = np.zeros(0, np.float32)
-        header = self.header(stamp_ns, frame)
+        first, step = angles
+        end = first + step * (len(values) - 1) if angle_max is None else angle_max
         content = self.make(
-            "sensor_msgs/LaserScan", header, -np.pi / 2, end, 0.01, 0.0, 0.1, 0.1, 30.0, values, none
-        )
+            "sensor_msgs/LaserScan", self.header(stamp_ns, frame), first, end, step, 0.0, 0.1, *limits_m,
+            values, np.zeros(0, np.float32),
+        )  # fmt: skip
         return self.message(topic, stamp_ns, content)
 
     def image(
@@ -115,15 +125,25 @@ class Ros:
         )
 
     def camera(
-        self, topic: str, stamp_ns: int, width: int, height: int, focal: float, *, distortion: int = 5
+        self,
+        topic: str,
+        stamp_ns: int,
+        width: int,
+        height: int,
+        focal: float,
+        *,
+        d: ArrayLike = (0.0,) * 5,
+        k: ArrayLike | None = None,
+        p: ArrayLike | None = None,
+        model: str = "plumb_bob",
     ) -> Message:
-        """A camera whose axis meets pixel (0, 0); `distortion` is the number of coefficients, all zero."""
-        k = np.array([focal, 0, 0, 0, focal, 0, 0, 0, 1.0])
-        p = np.array([focal, 0, 0, 0, 0, focal, 0, 0, 0, 0, 1.0, 0])
+        """A camera whose axis meets pixel (1, 1), unless k and p say otherwise."""
+        usual = [[focal, 0, 1, 0], [0, focal, 1, 0], [0, 0, 1, 0]]
+        k, p = (np.array(usual, float)[:, :n] if m is None else m for m, n in ((k, 3), (p, 4)))
         roi = self.make("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
-        header = self.header(stamp_ns, "camera_optical")
+        header, k, p = self.header(stamp_ns, "camera_optical"), np.ravel(k).astype(float), np.ravel(p)
         content = self.make(
-            "sensor_msgs/CameraInfo", header, height, width, "plumb_bob", np.zeros(distortion), k,
+            "sensor_msgs/CameraInfo", header, height, width, model, np.asarray(d), k,
             np.eye(3).reshape(-1), p, 0, 0, roi,
         )  # fmt: skip
         return self.message(topic, stamp_ns, content)
@@ -136,14 +156,15 @@ class Ros:
         x_m: float,
         *,
         z_m: float = 0.0,
+        quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
         topic: str = "/tf",
         late_ns: int = 0,
     ) -> Message:
-        """One transform without rotation; recorded `late_ns` after its stamp."""
+        """One transform; recorded `late_ns` after its stamp."""
         transform = self.make(
             "geometry_msgs/Transform",
             self.make("geometry_msgs/Vector3", x_m, 0.0, z_m),
-            self.make("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0),
+            self.make("geometry_msgs/Quaternion", *quaternion),
         )
         edge = self.make("geometry_msgs/TransformStamped", self.header(stamp_ns, parent), child, transform)
         return self.message(topic, stamp_ns + late_ns, self.make("tf2_msgs/TFMessage", [edge]))

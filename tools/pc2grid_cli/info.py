@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from datetime import datetime, timezone
 from pathlib import Path
@@ -13,7 +14,6 @@ from rich import markup
 from rich.console import Console
 from rich.table import Table
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import Pc2GridError, one_line
 from pc2grid.geometry import invert_pose, transform_points
 from pc2grid.io import open_log
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 _WIDEST = 1000
 """Characters of the widest table of topics."""
+_TRIED_SCANS = 10
+"""So many scans are read, to say what convert would say of them."""
 
 
 def info_command(
@@ -62,7 +64,7 @@ def info_command(
         for warning in of_map["warnings"]:
             warn(warning)
         return
-    document = describe(Path(log), topic=topic, recover=recover)
+    document = describe(Path(log), topic=topic, recover=recover, assignments=set_)
     if json:
         print_json(document)
     else:
@@ -121,18 +123,23 @@ def _map_as_text(d: InfoMap) -> str:
     )
 
 
-def describe(path: Path, *, topic: str | None = None, recover: bool = False) -> Info:
+def describe(
+    path: Path, *, topic: str | None = None, recover: bool = False, assignments: list[str] | None = None
+) -> Info:
     """The document of a recording. If convert could not use it, `choice` is null and `problem` says why.
 
-    Reads the log's summary and a few messages only, unless it has no summary.
+    Reads the log's summary, a few messages and the first scans only, unless it has no summary.
     Raises LogError if the file cannot be opened.
     """
-    with open_log(path, ReadConfig(topic=topic), recover=recover) as log:
+    config = make_config(None, assignments, topic=topic)
+    with open_log(path, config.read, recover=recover) as log:
         found = log.info
         choice: ChosenTopics | None = None
         problem: str | None = None
         try:
             chosen = log.choose()
+            for _ in itertools.islice(log.scans(), _TRIED_SCANS):
+                pass
         except Pc2GridError as error:
             problem = str(error)
         else:

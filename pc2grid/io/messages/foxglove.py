@@ -188,8 +188,7 @@ def _raw_image(m: Any) -> Image:
 
 
 def _compressed_image(m: Any) -> CompressedImage:
-    """Only png is lossless and holds 16 bits; depth in it is in millimetres."""
-    return CompressedImage(_header(m), "16UC1; png" if m.format == "png" else str(m.format), _bytes(m.data))
+    return CompressedImage(_header(m), str(m.format), _bytes(m.data))
 
 
 def _camera_info(m: Any) -> CameraInfo:

@@ -1,15 +1,14 @@
 """Depth images to points in the camera's optical frame (x right, y down, z forward; REP-103).
 
-The rays of the pixels are computed once for a camera and multiplied by the depths. Open3D's
-`create_from_depth_image` gives the same points in half the time (0.8 instead of 1.6 ms for every second pixel
-of 640 x 480), but cannot undistort, so it would be a second path beside this one. The png takes 2.9 ms.
+Open3D's `create_from_depth_image` gives the same points in half the time (0.8 instead of 1.6 ms for every
+second pixel of 640 x 480), but cannot undistort, so it would be a second path beside this one. The png takes
+2.9 ms.
 """
 
 from __future__ import annotations
 
-import functools
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -17,16 +16,30 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64
 from pc2grid.errors import LimitExceeded, PointCloudError, UnsupportedSchema
-from pc2grid.io.messages.types import CameraInfo, CompressedImage, Image
-from pc2grid.io.sensors import png
+from pc2grid.io.messages.types import Bytes, CameraInfo, CompressedImage, Image
+from pc2grid.io.sensors import rvl
+from pc2grid.io.sensors.camera import pixel_rays
+from pc2grid.io.sensors.png_header import MAGIC, read_header
 from pc2grid.io.sensors.pointcloud2 import Points
 
 # REP-103: body x forward, y left, z up from optical z forward, x right, y down.
 T_BODY_OPTICAL: F64 = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-_STEEPEST = 1e3  # largest x / z and y / z of a ray: 0.06 degrees from the image plane
+_METRE_M, _MILLIMETRE_M = 1.0, 1e-3
+_LAYOUTS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _CONFIG_HEADER = struct.Struct("<iff")  # compressed_depth_image_transport: format, depth_param a and b
+_RVL_SIZE = struct.Struct("<II")  # the same: columns, rows
+
+
+class _Depths(NamedTuple):
+    """values : those of the used pixels, of which one is `unit_m` metres if nothing else is said.
+    shape : rows and columns of all pixels.
+    """
+
+    values: F32
+    unit_m: float
+    shape: tuple[int, ...]
 
 
 def decode(
@@ -36,33 +49,48 @@ def decode(
     rectified: bool = False,
     stride: int = 1,
     max_points: int = 20_000_000,
+    unit_m: float | None = None,
+    camera: str = "CameraInfo",
 ) -> Points:
-    """Points of a depth image; pixels without a return (0, NaN, inf, 65535 mm) are dropped.
+    """Points of a depth image; pixels without a return (0, NaN, inf, 65535 of 16 bits) are dropped.
 
     rectified : the image is undistorted already, so `info.p` describes it and not `info.k` with `info.d`.
-    stride : use every n-th row and column.
+    stride : use every n-th row and column. unit_m : of a depth; None: millimetres in 16 bits, metres in
+    floats (REP 118). camera : how errors name `info`.
 
     Raises PointCloudError if image and camera do not fit, UnsupportedSchema for another encoding.
     """
     if isinstance(image, Image):
-        depth_m = _raw_depth(image, max_points, stride)
-        height, width = image.height, image.width
+        values, usual_m, (height, width) = _raw_depth(image, max_points, stride)
     else:
-        depth_m, (height, width) = _compressed_depth(image, max_points, stride)
+        values, usual_m, (height, width) = _compressed_depth(image, max_points, stride)
     if (info.height, info.width) not in ((height, width), (0, 0)):
         raise PointCloudError(
             f"a depth image of {width} x {height} pixels with a CameraInfo of {info.width} x {info.height}"
         )
-    rays = _rays(height, width, info.k, info.p, info.d, info.distortion_model, rectified, stride)
-    flat = depth_m.reshape(-1)
+    rays = pixel_rays(height, width, info.k, info.p, info.d, info.distortion_model, rectified, stride, camera)
+    unit_m = unit_m or usual_m
+    flat = values.reshape(-1) * np.float32(unit_m)
     keep = np.isfinite(flat) & (flat > 0)
     points = rays[keep] * flat[keep, None]
-    return Points(points, None, len(flat) - len(points))
+    return Points(points, None, len(flat) - len(points), unit_m=unit_m)
 
 
-def _raw_depth(image: Image, max_points: int, stride: int) -> F32:
-    """(H, W) metres."""
-    layout = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}.get(image.encoding)
+def holds_depths(image: Image | CompressedImage) -> bool:
+    """Whether an image is one of depths, by its encoding or content: the name of a topic may not say so."""
+    if isinstance(image, Image):
+        return image.encoding in ("16UC1", "32FC1")
+    if image.format.partition(";")[0].strip() in _LAYOUTS:
+        return True
+    try:
+        header = read_header(memoryview(image.data)[_png_start(image.data) :])
+    except ValueError:
+        return False
+    return (header.bits, header.channels) == (16, 1)
+
+
+def _raw_depth(image: Image, max_points: int, stride: int) -> _Depths:
+    layout = _LAYOUTS.get(image.encoding)
     if layout is None:
         raise UnsupportedSchema(
             f"an image of encoding {image.encoding!r:.40} is not a depth image",
@@ -78,60 +106,78 @@ def _raw_depth(image: Image, max_points: int, stride: int) -> F32:
             f"{image.encoding}"
         )
     if not needed:
-        return np.empty((0, 0), dtype=np.float32)
+        return _Depths(np.empty((0, 0), np.float32), _METRE_M, (image.height, image.width))
     shape, strides = (image.height, image.width), (step, dtype.itemsize)
-    return _metres(np.ndarray(shape, dtype, buffer=image.data, strides=strides)[::stride, ::stride])
+    values = np.ndarray(shape, dtype, buffer=image.data, strides=strides)[::stride, ::stride]
+    return _Depths(_floats(values), _METRE_M if dtype.kind == "f" else _MILLIMETRE_M, shape)
 
 
-def _metres(values: NDArray[Any]) -> F32:
-    """16-bit millimetres or float metres to float32 metres; 65535 means "too far" for some sensors."""
+def _floats(values: NDArray[Any]) -> F32:
+    """Depths as float32; 65535 means "too far" for some sensors."""
     if values.dtype.kind == "u":
-        return np.where(values == 65535, 0, values).astype(np.float32) * np.float32(1e-3)
+        values = np.where(values == 65535, 0, values)
     return values.astype(np.float32)
 
 
-def _compressed_depth(image: CompressedImage, max_points: int, stride: int) -> tuple[F32, tuple[int, int]]:
-    """(H, W) metres and the size before the stride, of image_transport's compressedDepth or a plain png.
+def _compressed_depth(image: CompressedImage, max_points: int, stride: int) -> _Depths:
+    """Of image_transport's compressedDepth, or a plain png.
 
-    The format is a text such as `16UC1; compressedDepth png`. Before the png there are 12 bytes: a format
-    code and the parameters a and b by which 32FC1 was quantised, `depth = a / (value - b)`.
+    The format is a text such as `16UC1; compressedDepth png`, but other writers say only `png`, or nothing:
+    a png of 16 bits is what it is. Before it there may be 12 bytes: a format code and the parameters a and b
+    by which 32FC1 was quantised, `depth = a / (value - b)`, zero for 16UC1.
     """
     encoding, _, transport = (part.strip() for part in image.format.partition(";"))
-    if encoding not in ("16UC1", "mono16", "32FC1") or "rvl" in transport or "jpeg" in transport:
+    data = memoryview(image.data)
+    start = _png_start(data)
+    readable = encoding in _LAYOUTS and "jpeg" not in transport
+    if not readable and bytes(data[start : start + len(MAGIC)]) != MAGIC:
         raise UnsupportedSchema(
             f"a compressed image of format {image.format!r:.60} is not read",
-            hint="supported: 16UC1 or 32FC1; compressedDepth png",
+            hint="supported: a png of 16 bits, and compressedDepth (png or rvl) of 16UC1 or 32FC1",
         )
-    data = memoryview(image.data)
-    quantised = (0.0, 0.0)
-    if "compressedDepth" in transport or bytes(data[:8]) != png.MAGIC:
-        if len(data) < _CONFIG_HEADER.size:
-            raise PointCloudError("a compressedDepth image is shorter than its header")
-        _, a, b = _CONFIG_HEADER.unpack_from(data)
-        quantised = (a, b)
-        data = data[_CONFIG_HEADER.size :]
-    values = _pixels(data, max_points)
+    if len(data) < start:
+        raise PointCloudError("a compressedDepth image is shorter than its header")
+    a, b = _CONFIG_HEADER.unpack_from(data)[1:] if start else (0.0, 0.0)
+    values = (_rvl_pixels if "rvl" in transport else _pixels)(data[start:], max_points)
     kept = values[::stride, ::stride]
-    metres = _metres(kept) if encoding != "32FC1" else _dequantised(kept, *quantised)
-    return metres, values.shape
+    if encoding == "32FC1" or (encoding not in _LAYOUTS and a > 0):
+        return _Depths(_dequantised(kept, a, b), _METRE_M, values.shape)
+    return _Depths(_floats(kept), _MILLIMETRE_M, values.shape)
+
+
+def _png_start(data: Bytes) -> int:
+    """Where the image begins: behind the header of compressedDepth, unless the data is a plain png."""
+    return 0 if bytes(data[: len(MAGIC)]) == MAGIC else _CONFIG_HEADER.size
 
 
 def _pixels(data: memoryview, max_points: int) -> NDArray[np.uint16]:
-    """(H, W) the values of a png of 16 bits, examined before it is expanded."""
+    """(H, W) the values of a png of 16 bits."""
     try:
-        found = png.inspect(data)
+        found = read_header(data)
     except ValueError as error:
         raise PointCloudError(f"the png of a depth image is damaged: {error}") from error
     _check_size(found.height, found.width, max_points)
     if (found.bits, found.channels) != (16, 1):
         raise PointCloudError("the png of a depth image has not one channel of 16 bits")
     try:
-        values = cv2.imdecode(np.frombuffer(found.data, np.uint8), cv2.IMREAD_UNCHANGED)
+        values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         values = None
     if values is None or values.shape != (found.height, found.width) or values.dtype != np.uint16:
         raise PointCloudError("the png of a depth image is damaged")
     return values.astype(np.uint16, copy=False)
+
+
+def _rvl_pixels(data: memoryview, max_points: int) -> NDArray[np.uint16]:
+    """(H, W) the values of an rvl of image_transport, which begins with the size."""
+    if len(data) < _RVL_SIZE.size:
+        raise PointCloudError("the rvl of a depth image is damaged: it is cut off")
+    width, height = _RVL_SIZE.unpack_from(data)
+    _check_size(height, width, max_points)
+    try:
+        return rvl.decode(data[_RVL_SIZE.size :], height * width).reshape(height, width)
+    except ValueError as error:
+        raise PointCloudError(f"the rvl of a depth image is damaged: {error}") from error
 
 
 def _dequantised(values: NDArray[np.uint16], a: float, b: float) -> F32:
@@ -147,47 +193,3 @@ def _check_size(height: int, width: int, max_points: int) -> None:
             f"a depth image of {width} x {height} pixels; the limit is {max_points} points",
             hint="--set read.max_points=N raises it",
         )
-
-
-@functools.lru_cache(maxsize=2)
-def _rays(
-    height: int,
-    width: int,
-    k: tuple[float, ...],
-    p: tuple[float, ...],
-    d: tuple[float, ...],
-    distortion_model: str,
-    rectified: bool,
-    stride: int,
-) -> F32:
-    """(n, 3) directions of the used pixels, row-major, scaled to z = 1."""
-    if rectified and p[0] > 0 and p[5] > 0:
-        fx, cx, fy, cy = p[0], p[2], p[5], p[6]
-        d = ()
-    else:
-        fx, cx, fy, cy = k[0], k[2], k[4], k[5]
-    if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
-        raise PointCloudError(f"a CameraInfo without focal length (fx {fx}, fy {fy})")
-    u, v = np.arange(0, width, stride, dtype=float), np.arange(0, height, stride, dtype=float)
-    with np.errstate(over="ignore"):  # infinite rays are refused below
-        x, y = (u - cx) / fx, ((v - cy) / fy)[:, None]
-    if any(d):
-        columns, rows = np.meshgrid(u, v)
-        x, y = _undistorted(columns, rows, np.reshape(k, (3, 3)), np.asarray(d), distortion_model)
-    if not max(np.abs(x).max(initial=0.0), np.abs(y).max(initial=0.0)) < _STEEPEST:
-        raise PointCloudError("a CameraInfo whose camera looks sideways or backwards")
-    rays = np.ones((len(v), len(u), 3), np.float32)
-    rays[..., 0], rays[..., 1] = x, y
-    return rays.reshape(-1, 3)
-
-
-def _undistorted(u: F64, v: F64, k: F64, d: F64, model: str) -> tuple[F64, F64]:
-    pixels = np.stack((u.reshape(-1), v.reshape(-1)), axis=1)[:, None, :]
-    if model in ("equidistant", "fisheye"):
-        rays = cv2.fisheye.undistortPoints(pixels, k, d[:4])
-    elif model in ("plumb_bob", "rational_polynomial", ""):
-        rays = cv2.undistortPoints(pixels, k, d)
-    else:
-        raise UnsupportedSchema(f"the distortion model {model!r:.40} is not read")
-    x, y = (rays[:, 0, axis].astype(np.float64).reshape(u.shape) for axis in (0, 1))
-    return x, y

@@ -37,6 +37,8 @@ _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 # turn in one unit only.
 LONGEST_SWEEP_S = 2.0
 _SWEEP_S = (2e-3, LONGEST_SWEEP_S)
+FARTHEST_HALF_M = 100.0  # half of the returns of a scan in a building are nearer; chosen by hand
+NO_RETURN = "nothing came back (0, NaN or inf)"
 _NEAR_STAMP_S = 10.0  # times this near to zero are relative to the stamp, those near to the stamp absolute
 # Half of the times of a scan lie together. Those farther away than so many times their span are no times of
 # the scan. That needs many points, of which some are looked at. Chosen by hand.
@@ -48,13 +50,24 @@ class Points:
     """Returns of one scan in the sensor's frame.
 
     xyz_m : (N, 3) finite. offsets_s : (N,) relative to the stamp, or None. dropped : returns left out.
-    note : a sentence for the user on how the times were interpreted, or None.
+    notes : sentences for the user on how the message was interpreted. empty : why there is no point at all,
+    if there is none. unit_m : of the numbers in the message.
     """
 
     xyz_m: F32 | F64
     offsets_s: F32 | None
     dropped: int
-    note: str | None = None
+    notes: tuple[str, ...] = ()
+    empty: str = NO_RETURN
+    unit_m: float = 1.0
+
+
+def check_metres(ranges: NDArray[np.floating], hint: str) -> None:
+    """Raise PointCloudError for the ranges of a scan that cannot be metres: no building is so wide."""
+    if len(ranges) and float(np.median(ranges)) > FARTHEST_HALF_M:
+        raise PointCloudError(
+            f"half of its returns are farther than {FARTHEST_HALF_M:g} m; metres are expected", hint=hint
+        )
 
 
 def decode(cloud: PointCloud2, *, unit: str = "auto", max_points: int = 20_000_000) -> Points:
@@ -78,7 +91,7 @@ def decode(cloud: PointCloud2, *, unit: str = "auto", max_points: int = 20_000_0
             if len(offsets) < len(xyz):
                 xyz = xyz[timed]
                 note = note or f"points whose times in field {name} are not of their scan are left out"
-    return Points(xyz, offsets, rows.size - len(xyz), note)
+    return Points(xyz, offsets, rows.size - len(xyz), () if note is None else (note,))
 
 
 def _returns(rows: NDArray[Any]) -> tuple[F32 | F64, NDArray[np.integer]]:

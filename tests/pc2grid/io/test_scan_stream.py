@@ -187,15 +187,15 @@ def test_an_empty_scan_is_kept(tmp_path: Path) -> None:
 
 
 def test_one_outlier_is_dropped_and_a_global_frame_refused(tmp_path: Path) -> None:
-    far = ros().cloud("/points", T0, [[1, 2, 3], [1e30, 0, 0], [0, -1e7, 0], [0, 900, 0]])
+    far = ros().cloud("/points", T0, [[1, 2, 3]] * 3 + [[1e30, 0, 0], [0, -1e7, 0], [0, 900, 0]])
     (scan,), report = read(write_mcap(tmp_path / "a.mcap", [far]))
-    np.testing.assert_array_equal(scan.points_m, np.float32([[1, 2, 3], [0, 900, 0]]))
+    np.testing.assert_array_equal(scan.points_m, np.float32([[1, 2, 3]] * 3 + [[0, 900, 0]]))
     assert scan.dropped == report.points_dropped == 2
     utm = [ros().cloud("/points", T0 + i * STEP, [[4.5e5, 5.4e6, 100]]) for i in range(3)]
     with pytest.raises(PointCloudError, match=r"farther than 1000 m .*UTM"):
         read(write_mcap(tmp_path / "b.mcap", utm))
     (scan,), _ = read(tmp_path / "a.mcap", ReadConfig(max_range_m=2e7))
-    assert len(scan.points_m) == 3
+    assert len(scan.points_m) == 5
 
 
 # --- schemas (17, 19) and checksums (8) ---------------------------------------------------------------

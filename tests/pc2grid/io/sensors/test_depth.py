@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import operator
 import struct
 from pathlib import Path
 
@@ -16,11 +18,11 @@ from tests.helpers.recordings import T0, Message, raw_log, read, ros, write_mcap
 INFO = "/camera/depth/camera_info"
 TOPIC = "/camera/depth/image_raw"
 EVERY_PIXEL = ReadConfig(depth_stride=1)
-# Pixel (row 1, column 2) at 2.5 m with focal length 100 and axis at (0, 0), in body axes: x forward.
+# Pixel (row 1, column 2) at 2.5 m with focal length 100 and axis at (1, 1), in body axes: x forward.
 DEPTH_M = np.zeros((4, 6), np.float32)
 DEPTH_M[1, 2] = 2.5
 DEPTH_M[3, 0] = 1.25
-EXPECTED = np.float32([[2.5, -2.5 * 2 / 100, -2.5 * 1 / 100], [1.25, 0, -1.25 * 3 / 100]])
+EXPECTED = np.float32([[2.5, -2.5 * 1 / 100, 0], [1.25, 1.25 * 1 / 100, -1.25 * 2 / 100]])
 
 
 def png(values: np.ndarray) -> bytes:
@@ -41,6 +43,35 @@ def quantised(a: float, b: float) -> bytes:
     return struct.pack("<iff", 0, a, b) + png(values)
 
 
+def rvl(values: np.ndarray) -> bytes:
+    """compressedDepth with RVL, pixel by pixel as in the paper of A. D. Wilson."""
+    nibbles: list[int] = []
+
+    def put(number: int) -> None:
+        while True:
+            more = number > 7
+            nibbles.append((number & 7) | (8 if more else 0))
+            number >>= 3
+            if not more:
+                return
+
+    flat, at, previous = values.reshape(-1).astype(int).tolist(), 0, 0
+    while at < len(flat):
+        for wanted in (False, True):
+            run = list(itertools.takewhile(bool if wanted else operator.not_, flat[at:]))
+            put(len(run))
+            at += len(run)
+            for value in run if wanted else []:
+                put(2 * (value - previous) if value >= previous else -2 * (value - previous) - 1)
+                previous = value
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [
+        sum(n << (28 - 4 * i) for i, n in enumerate(nibbles[k : k + 8])) for k in range(0, len(nibbles), 8)
+    ]
+    return bytes(12) + struct.pack("<II", *values.shape[::-1]) + struct.pack(f"<{len(words)}I", *words)
+
+
+RVL = "16UC1; compressedDepth rvl"
 MILLIMETRES = np.round(DEPTH_M * 1000).astype(np.uint16)
 WITH_NAN = np.where(DEPTH_M == 0, np.nan, DEPTH_M).astype(np.float32)
 RAW = {
@@ -57,6 +88,11 @@ COMPRESSED = {
     "compressedDepth of old": (bytes(12) + png(MILLIMETRES), "16UC1; compressedDepth"),
     "plain png": (png(MILLIMETRES), "16UC1; png compressed "),
     "quantised": (quantised(100.0, 7.0), "32FC1; compressedDepth png"),
+    "named png": (png(MILLIMETRES), "png"),
+    "without a format": (png(MILLIMETRES), ""),
+    "compressedDepth without a format": (bytes(12) + png(MILLIMETRES), ""),
+    "quantised without a format": (quantised(100.0, 7.0), "png"),
+    "rvl": (rvl(MILLIMETRES), RVL),
 }
 
 
@@ -89,8 +125,8 @@ def test_a_quantised_image_is_as_exact_as_its_quantisation(tmp_path: Path) -> No
 
 def test_zeros_are_no_returns_and_the_scan_is_kept(tmp_path: Path) -> None:
     nothing = np.zeros((4, 6), np.uint16)
-    path = with_camera(tmp_path / "a.mcap", ros().image(TOPIC, T0, nothing, "16UC1"))
-    (scan,), report = read(path, EVERY_PIXEL)
+    images = [ros().image(TOPIC, T0 + i, p, "16UC1") for i, p in enumerate((nothing, MILLIMETRES))]
+    (scan, _), report = read(with_camera(tmp_path / "a.mcap", *images), EVERY_PIXEL)
     assert len(scan.points_m) == 0
     assert scan.dropped == 24
     assert any("no returns at all" in w for w in report.warnings)
@@ -99,7 +135,7 @@ def test_zeros_are_no_returns_and_the_scan_is_kept(tmp_path: Path) -> None:
 def test_stride_takes_every_other_row_and_column(tmp_path: Path) -> None:
     path = with_camera(tmp_path / "a.mcap", ros().image(TOPIC, T0, np.full((4, 6), 1000, np.uint16), "16UC1"))
     (scan,), _ = read(path, ReadConfig(depth_stride=2))
-    np.testing.assert_allclose(scan.points_m[:, 1:] * -100, [[u, v] for v in (0, 2) for u in (0, 2, 4)])
+    np.testing.assert_allclose(scan.points_m[:, 1:] * -100, [[u, v] for v in (-1, 1) for u in (-1, 1, 3)])
 
 
 def test_a_tf_is_taken_instead_of_the_rule_for_optical_frames(tmp_path: Path) -> None:
@@ -110,7 +146,7 @@ def test_a_tf_is_taken_instead_of_the_rule_for_optical_frames(tmp_path: Path) ->
         to.image(TOPIC, T0, DEPTH_M, "32FC1"),
     )
     (scan,), _ = read(path, EVERY_PIXEL)
-    np.testing.assert_allclose(scan.points_m[0], [0.5 + 0.05, 0.025, 2.5], atol=1e-6)
+    np.testing.assert_allclose(scan.points_m[0], [0.5 + 0.025, 0.0, 2.5], atol=1e-6)
 
 
 def test_no_camera_info(tmp_path: Path) -> None:
@@ -137,13 +173,17 @@ def test_no_camera_info(tmp_path: Path) -> None:
         (ros().image(TOPIC, T0, np.ones((5, 6), np.float32), "32FC1"), PointCloudError, "6 x 5 .* of 6 x 4"),
         (ros().image(TOPIC, T0, np.ones((4, 6), np.uint8), "16UC1"), PointCloudError, "24 bytes .rows of 6."),
         (ros().image(TOPIC, T0, np.ones((4, 6), np.uint8), "rgb8"), UnsupportedSchema, "'rgb8' is not"),
-        (ros().compressed(TOPIC, T0, b"\0" * 40, "16UC1; compressedDepth png"), PointCloudError, "not a PNG"),
+        (ros().compressed(TOPIC, T0, b"\0" * 50, "16UC1; compressedDepth png"), PointCloudError, "not a PNG"),
         (ros().compressed(TOPIC, T0, b"\0" * 4, "16UC1; compressedDepth png"), PointCloudError, "its header"),
         (ros().compressed(TOPIC, T0, bytes(12) + png(MILLIMETRES)[:60], "16UC1; compressedDepth png"),
          PointCloudError, "png of a depth image is damaged"),
         (ros().compressed(TOPIC, T0, png(np.ones((4, 6), "u1")), "16UC1; png"), PointCloudError, "16 bit"),
-        (ros().compressed(TOPIC, T0, b"", "16UC1; compressedDepth rvl"), UnsupportedSchema, "rvl"),
         (ros().compressed(TOPIC, T0, b"", "bgr8; jpeg compressed bgr8"), UnsupportedSchema, "jpeg"),
+        (ros().compressed(TOPIC, T0, png(np.ones((4, 6), "u1")), "png"), PointCloudError, "16 bit"),
+        (ros().compressed(TOPIC, T0, bytes(60), ""), UnsupportedSchema, "format '' is not read"),
+        (ros().compressed(TOPIC, T0, rvl(MILLIMETRES)[:20], RVL), PointCloudError, "rvl .* is damaged"),
+        (ros().compressed(TOPIC, T0, rvl(MILLIMETRES)[:-4], RVL), PointCloudError, "rvl .* is damaged"),
+        (ros().compressed(TOPIC, T0, rvl(MILLIMETRES) + bytes(200), RVL), PointCloudError, "longer than"),
     ],
 )  # fmt: skip
 def test_images_that_do_not_fit(tmp_path: Path, image: Message, error: type[Exception], words: str) -> None:
@@ -151,10 +191,91 @@ def test_images_that_do_not_fit(tmp_path: Path, image: Message, error: type[Exce
         read(with_camera(tmp_path / "a.mcap", image), EVERY_PIXEL)
 
 
-def test_a_camera_without_focal_length(tmp_path: Path) -> None:
-    to = ros()
-    path = write_mcap(
-        tmp_path / "a.mcap", [to.camera(INFO, T0, 6, 4, 0.0), to.image(TOPIC, T0, DEPTH_M, "32FC1")]
-    )
-    with pytest.raises(PointCloudError, match="without focal length"):
+def test_every_image_survives_rvl(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    values = rng.integers(0, 60_000, (48, 64)).astype(np.uint16) * (rng.random((48, 64)) < 0.7)
+    images = [
+        ros().compressed(TOPIC + "/compressedDepth", T0, rvl(values.astype(np.uint16)), RVL),
+        ros().image(TOPIC, T0, values.astype(np.uint16), "16UC1"),
+    ]
+    found = [
+        read(with_camera(tmp_path / "a.mcap", i, width=64, height=48), EVERY_PIXEL)[0][0] for i in images
+    ]
+    np.testing.assert_array_equal(found[0].points_m, found[1].points_m)
+
+
+NO_CAMERA = {
+    "no focal length": ({"k": np.zeros(9), "p": np.zeros(12)}, "a camera without focal length"),
+    "fy of 1": ({"k": [80, 0, 0, 0, 1, 0, 0, 0, 0]}, "fx 80 and fy 1 are of no camera"),
+    "no centre": ({"k": [5, 0, 0, 0, 5, 0, 0, 0, 1]}, r"the centre \(0, 0\) lies outside the image of 6 x 4"),
+    "transposed": ({"k": [5, 0, 0, 0, 5, 0, 3, 2, 1]}, "the centre"),
+    "of another size": ({"k": [50, 0, 30, 0, 50, 20, 0, 0, 1]}, r"the centre \(30, 20\)"),
+    "not in pixels": ({"k": [0.4, 0, 0.5, 0, 0.6, 0.5, 0, 0, 1]}, "fx 0.4 is of no camera with 6 columns"),
+    "six coefficients": ({"d": np.full(6, 1e-3)}, "6 coefficients of distortion; plumb_bob has 5"),
+    "two of a fisheye": ({"d": [0.1, 0.1], "model": "equidistant"}, "2 coefficients .* equidistant has 4"),
+    "not finite": ({"d": [0.1, np.nan, 0, 0, 0]}, "a coefficient of distortion is not finite"),
+}
+
+
+@pytest.mark.parametrize("case", NO_CAMERA)
+def test_a_camera_info_of_no_camera_is_named(tmp_path: Path, case: str) -> None:
+    changes, words = NO_CAMERA[case]
+    camera = ros().camera(INFO, T0, 6, 4, 100.0, **changes)
+    path = write_mcap(tmp_path / "a.mcap", [camera, ros().image(TOPIC, T0, DEPTH_M, "32FC1")])
+    with pytest.raises(PointCloudError, match=f"{INFO}: {words}") as caught:
         read(path)
+    assert "calibrate the camera" in str(caught.value.hint)
+
+
+def test_a_k_of_zeros_beside_a_p(tmp_path: Path) -> None:
+    camera = ros().camera(INFO, T0, 6, 4, 100.0, k=np.zeros(9))
+    path = write_mcap(tmp_path / "a.mcap", [camera, ros().image(TOPIC, T0, DEPTH_M, "32FC1")])
+    np.testing.assert_allclose(read(path, EVERY_PIXEL)[0][0].points_m, EXPECTED, atol=1e-6)
+
+
+def test_depths_in_millimetres_where_metres_are_expected(tmp_path: Path) -> None:
+    image = ros().image(TOPIC, T0, (1000 * DEPTH_M).astype(np.float32), "32FC1")
+    path = with_camera(tmp_path / "a.mcap", image)
+    with pytest.raises(PointCloudError, match="metres") as caught:
+        read(path, EVERY_PIXEL)
+    assert "read.depth_unit_m=0.001" in str(caught.value.hint)
+    (scan,), _ = read(path, EVERY_PIXEL.model_copy(update={"depth_unit_m": 0.001}))
+    np.testing.assert_allclose(scan.points_m, EXPECTED, atol=1e-6)
+
+
+def floor_ahead(unit_m: float, height_m: float = 0.5) -> list[Message]:
+    """Six images of a level floor, 1 m to 10 m ahead of a camera that tf puts at a height."""
+    to, focal, below = ros(), 40.0, np.arange(30) - 0.001
+    depth_m = np.repeat(0.5 * focal / np.where(below > 0, below, 1e-3)[:, None], 20, axis=1)
+    values = np.where(depth_m < 10, depth_m / unit_m, 0).astype(np.uint16)
+    messages = [
+        to.tf(T0, "base_link", "camera", 0.0, z_m=height_m, quaternion=OPTICAL, topic="/tf_static"),
+        to.camera(INFO, T0, 20, 30, focal, k=[focal, 0, 10, 0, focal, 0.001, 0, 0, 1]),
+    ]
+    return messages + [to.image(TOPIC, T0 + i, values, "16UC1", frame="camera") for i in range(6)]
+
+
+OPTICAL = (-0.5, 0.5, -0.5, 0.5)
+
+
+def test_a_floor_that_lies_too_deep_tells_of_the_unit(tmp_path: Path) -> None:
+    """A camera of 0.2 mm, read in millimetres, sees the floor five times as far below."""
+    path = write_mcap(tmp_path / "a.mcap", floor_ahead(0.0002))
+    (warning,) = [w for w in read(path)[1].warnings if "depth_unit_m" in w]
+    assert "5.0 times as far under the camera as tf says (0.50 m)" in warning
+    assert "--set read.depth_unit_m=0.0002" in warning
+    scans, report = read(path, ReadConfig(depth_unit_m=0.0002))
+    assert not report.warnings
+    np.testing.assert_allclose(scans[0].points_m[:, 2], 0.0, atol=0.02)
+    for messages in (floor_ahead(0.001), floor_ahead(0.0002, height_m=0.0)):
+        assert not read(write_mcap(tmp_path / "b.mcap", messages))[1].warnings
+
+
+@pytest.mark.parametrize("name", ["Depth Units", "Depth_Units"])
+def test_the_unit_that_a_realsense_bag_names(tmp_path: Path, name: str) -> None:
+    to = ros()
+    unit = to.message(f"/device_0/sensor_0/option/{name}/value", T0, to.make("std_msgs/Float32", 0.0002))
+    image = to.image(TOPIC, T0, np.round(DEPTH_M / 0.0002).astype(np.uint16), "mono16")
+    (scan,), report = read(with_camera(tmp_path / "a.mcap", unit, image), EVERY_PIXEL)
+    np.testing.assert_allclose(scan.points_m, EXPECTED, atol=1e-5)
+    assert any("units of 0.0002 m" in w for w in report.warnings)

@@ -136,8 +136,7 @@ def test_no_times_or_all_the_same_is_no_offsets() -> None:
     data = b"".join(struct.pack("<4f", 1, 2, 3, 0.5) for _ in range(3))
     same = decode(PointCloud2(Header(STAMP, ""), 1, 3, (*XYZ, ("t", 12, 7, 1)), False, 16, 48, data))
     assert same.offsets_s is None
-    assert same.note is not None
-    assert "all the same" in same.note
+    assert "all the same" in same.notes[0]
     assert decode(PointCloud2(Header(STAMP, ""), 1, 3, XYZ, False, 16, 48, data)).offsets_s is None
 
 
