@@ -10,6 +10,7 @@ import json
 import logging
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from pc2grid.arrays import hand_over
 from pc2grid.errors import MapFileError
 from pc2grid.io.atomic import replace_file
-from pc2grid.io.map_image import GreyImage, encode_image, read_image
+from pc2grid.io.map_image import MAX_CELLS, GreyImage, encode_image, read_image
 from pc2grid.io.messages.types import FARTHEST_M
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, MapOf, OccupancyGrid
 
@@ -35,6 +36,8 @@ _OCCUPIED_THRESH, _FREE_THRESH = 0.65, 0.196
 _FREE_GREY, _UNKNOWN_GREY, _OCCUPIED_GREY = 254, 205, 0
 # Two roundings, of a cell's edge and of the product, are at most so many units in the last place.
 _DIGITS, _ROUNDED = 12, 2
+_LEAST_YAW_RAD = 1e-9
+_ROUNDED_CELLS = 1e-6  # a corner of a rotated map so near to a corner of a cell is there
 _log = logging.getLogger(__name__)
 
 
@@ -43,11 +46,14 @@ def is_map_file(path: Path) -> bool:
     return path.suffix in (".yaml", ".yml") and path.name != "metadata.yaml" and not path.is_dir()
 
 
-def load_map(yaml_path: str | Path) -> OccupancyGrid:
-    """Read a `map.yaml` with its image, as nav2_map_server's map_io does.
+def load_map(yaml_path: str | Path, warn: Callable[[str], object] = _log.warning) -> OccupancyGrid:
+    """Read a `map.yaml` with its image, as nav2_map_server's map_io does, but for two differences.
 
-    Trinary: above `occupied_thresh` 100, below `free_thresh` 0, else -1. Scale: linear between the
-    thresholds, not opaque -1. Raw: the pixel value if 0..100, else -1.
+    Trinary: above `occupied_thresh` 100, below `free_thresh` 0, else -1; but grey 205, which map savers write
+    for unknown, stays -1 beside lighter pixels. Scale: linear between the thresholds, not opaque -1. Raw: the
+    pixel value if 0..100, else -1. A map whose origin is rotated is turned into the axes of its frame.
+
+    warn : gets a sentence for the user on each of these differences.
 
     Raises MapFileError naming the key or the image that is wrong.
 
@@ -57,7 +63,7 @@ def load_map(yaml_path: str | Path) -> OccupancyGrid:
     """
     yaml_path = Path(yaml_path)
     keys = _read_yaml(yaml_path)
-    image_path = _image_path(yaml_path, keys)
+    image_path = _image_path(yaml_path, keys, warn)
     mode = keys.get("mode", "trinary")
     resolution_m = _number(yaml_path, keys, "resolution")
     if not _RESOLUTION_M[0] <= resolution_m <= _RESOLUTION_M[1]:
@@ -65,25 +71,69 @@ def load_map(yaml_path: str | Path) -> OccupancyGrid:
             f"{yaml_path}: resolution: expected {_RESOLUTION_M[0]:g} .. {_RESOLUTION_M[1]:g} m per pixel, "
             f"found {resolution_m:g}"
         )
-    origin = _origin(yaml_path, keys)
+    x_m, y_m, yaw_rad = _origin(yaml_path, keys)
     negate = _flag(yaml_path, keys, "negate")
-    occupied_thresh = _number(yaml_path, keys, "occupied_thresh")
-    free_thresh = _number(yaml_path, keys, "free_thresh")
-    if not 0.0 <= free_thresh <= occupied_thresh <= 1.0:
-        raise MapFileError(
-            f"{yaml_path}: free_thresh: expected 0 <= free_thresh <= occupied_thresh <= 1, "
-            f"found {free_thresh} and {occupied_thresh}"
-        )
+    occupied_thresh, free_thresh = _thresholds(yaml_path, keys)
     if mode not in ("trinary", "scale", "raw"):
         raise MapFileError(f"{yaml_path}: mode: {_shown(mode)} is not one of trinary, scale, raw")
     image = read_image(image_path)
     table = _cell_of(image, mode, negate, occupied_thresh, free_thresh)
+    if mode == "trinary" and _frees_unknown(image, table):
+        warn(
+            f"{yaml_path}: free_thresh {free_thresh:g} would make grey {_UNKNOWN_GREY} free, which map "
+            f"savers write for unknown: it stays unknown; free_thresh: {_FREE_THRESH} says so in the .yaml"
+        )
+        table[_UNKNOWN_GREY] = UNKNOWN
     cells = np.empty(image.values.shape, np.int8)
     for row, target in enumerate(
         cells[::-1]
     ):  # row by row: the index takes eight times the memory of a pixel
         target[:] = table[image.values[row], 0 if image.alpha is None else image.alpha[row]]
-    return OccupancyGrid(cells=hand_over(cells), resolution_m=resolution_m, origin_m=origin)
+    grid = OccupancyGrid(cells=hand_over(cells), resolution_m=resolution_m, origin_m=(x_m, y_m))
+    if abs(yaw_rad) <= _LEAST_YAW_RAD:
+        return grid
+    warn(
+        f"{yaml_path}: the origin is rotated by {yaw_rad:g} rad, which nav2's costmap ignores: the map is "
+        "turned into the axes of its frame"
+    )
+    return _turned(yaml_path, grid, yaw_rad)
+
+
+def _frees_unknown(image: GreyImage, table: NDArray[np.int8]) -> bool:
+    """Whether the thresholds make unknown pixels free, in an image that has lighter ones for free space."""
+    if image.top != 255 or image.alpha is not None or table[_UNKNOWN_GREY] != FREE:
+        return False
+    return bool((image.values == _UNKNOWN_GREY).any() and image.values.max() > _UNKNOWN_GREY)
+
+
+def _turned(path: Path, grid: OccupancyGrid, yaw_rad: float) -> OccupancyGrid:
+    """The map in cells along the axes of its frame; `grid` is as if it were not rotated about its origin.
+
+    A cell is what the map has at its centre, and occupied too where the centre of an occupied cell of the map
+    falls: walls of one cell stay closed.
+    """
+    height, width = grid.cells.shape
+    R = np.array([[math.cos(yaw_rad), -math.sin(yaw_rad)], [math.sin(yaw_rad), math.cos(yaw_rad)]])
+    corners = np.array([(0, 0), (width, 0), (0, height), (width, height)]) @ R.T
+    low = np.floor(corners.min(axis=0) + _ROUNDED_CELLS)
+    columns, rows = np.ceil(corners.max(axis=0) - _ROUNDED_CELLS - low).astype(int)
+    if rows * columns > MAX_CELLS:
+        raise MapFileError(
+            f"{path}: rotated, the map has {columns} x {rows} cells; the limit is {MAX_CELLS}",
+            hint="rotate the image, and set the yaw to 0",
+        )
+    cells = np.full((rows, columns), UNKNOWN, np.int8)
+    x = low[0] + np.arange(columns) + 0.5
+    for row in range(rows):
+        y = np.full(columns, low[1] + row + 0.5)
+        column, line = np.floor(R.T @ np.stack((x, y))).astype(int)
+        inside = (column >= 0) & (column < width) & (line >= 0) & (line < height)
+        cells[row, inside] = grid.cells[line[inside], column[inside]]
+    walls = np.argwhere(grid.occupied)[:, ::-1] + 0.5
+    column, row = np.clip(np.floor(walls @ R.T - low).astype(int), 0, (columns - 1, rows - 1)).T
+    cells[row, column] = OCCUPIED
+    x_m, y_m = np.array(grid.origin_m) + low * grid.resolution_m
+    return OccupancyGrid(cells=cells, resolution_m=grid.resolution_m, origin_m=(float(x_m), float(y_m)))
 
 
 def _cell_of(
@@ -223,6 +273,17 @@ def _number(path: Path, keys: dict[str, Any], key: str) -> float:
         raise MapFileError(f"{path}: {key}: expected a finite number, found {_shown(value)}") from None
 
 
+def _thresholds(path: Path, keys: dict[str, Any]) -> tuple[float, float]:
+    """occupied_thresh and free_thresh."""
+    occupied, free = _number(path, keys, "occupied_thresh"), _number(path, keys, "free_thresh")
+    if not 0.0 <= free <= occupied <= 1.0:
+        raise MapFileError(
+            f"{path}: free_thresh: expected 0 <= free_thresh <= occupied_thresh <= 1, "
+            f"found {free} and {occupied}"
+        )
+    return occupied, free
+
+
 def _flag(path: Path, keys: dict[str, Any], key: str) -> bool:
     value = _value(path, keys, key)
     named = {"0": False, "1": True, "False": False, "True": True}.get(_shown(value).strip("'").capitalize())
@@ -231,7 +292,8 @@ def _flag(path: Path, keys: dict[str, Any], key: str) -> bool:
     return named
 
 
-def _origin(path: Path, keys: dict[str, Any]) -> tuple[float, float]:
+def _origin(path: Path, keys: dict[str, Any]) -> tuple[float, float, float]:
+    """x and y in metres, and the yaw in radians."""
     value = _value(path, keys, "origin")
     try:
         x, y, yaw = (_as_float(v) for v in value)
@@ -239,20 +301,15 @@ def _origin(path: Path, keys: dict[str, Any]) -> tuple[float, float]:
         raise MapFileError(f"{path}: origin: expected [x, y, yaw], found {_shown(value)}") from None
     if max(abs(x), abs(y)) > FARTHEST_M:
         raise MapFileError(f"{path}: origin: {x:g}, {y:g} m is nowhere on earth")
-    if abs(yaw) > 1e-9:
-        raise MapFileError(
-            f"{path}: origin: a map rotated by yaw {yaw} is not supported",
-            hint="rotate the image and set yaw to 0; nav2's static layer ignores it, too",
-        )
-    return x, y
+    return x, y, yaw
 
 
-def _image_path(path: Path, keys: dict[str, Any]) -> Path:
+def _image_path(path: Path, keys: dict[str, Any], warn: Callable[[str], object]) -> Path:
     name = _value(path, keys, "image")
     if not isinstance(name, str) or not name or "\0" in name:
         raise MapFileError(f"{path}: image: expected a file name, found {_shown(name)}")
     if ".." in Path(name).parts:
-        _log.warning("%s: image: %s leaves the folder of the map", path, name)
+        warn(f"{path}: image: {name} leaves the folder of the map")
     return path.parent / name  # an absolute name stays absolute, as in nav2
 
 

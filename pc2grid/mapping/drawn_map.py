@@ -67,13 +67,15 @@ def load_drawn_map(path: str | Path, config: Config = Config()) -> DrawnMap:
     """
     path = Path(path)
     if is_map_file(path):
-        grid = load_map(path)
+        warnings: list[str] = []
+        grid = load_map(path, warnings.append)
         return DrawnMap(
             grid=grid,
             kind="nav2 map",
             T_map_file=np.eye(4),
             level_points_m=np.empty((0, 3)),
             digest=_digest_of_nav2_map(path, grid),
+            warnings=tuple(warnings),
         )
     kind = kind_of(path)
     try:
@@ -99,7 +101,11 @@ def load_drawn_map(path: str | Path, config: Config = Config()) -> DrawnMap:
 
 def digest_of_map(path: Path) -> str:
     """The sha256 of `DrawnMap.digest`, without drawing the map."""
-    return _digest_of_nav2_map(path, load_map(path)) if is_map_file(path) else digest_of_building(path)
+    return (
+        _digest_of_nav2_map(path, load_map(path, warn=lambda sentence: None))
+        if is_map_file(path)
+        else digest_of_building(path)
+    )
 
 
 def _digest_of_nav2_map(path: Path, grid: OccupancyGrid) -> str:

@@ -103,7 +103,7 @@ def test_grey_205_is_unknown_and_rows_are_flipped(tmp_path: Path) -> None:
         ("resolution", "[1]"),
         ("image", "none.pgm"),
         ("origin", "[0, 0]"),
-        ("origin", "[0, 0, 0.5]"),
+        ("origin", "[0, 0, .inf]"),
         ("negate", "maybe"),
         ("free_thresh", 0.9),
         ("mode", "odd"),
@@ -129,7 +129,7 @@ def test_exponents_read_as_in_nav2(tmp_path: Path) -> None:
     ("key", "good", "bad"),
     [
         ("resolution", [1e-3, 100.0], [0.9e-3, 101]),
-        ("origin", [[1e8, -1e8, 0], [0, 0, 1e-9]], [[1.1e8, 0, 0], [0, 0, 2e-9], [0, 0], [0, 0, 0, 0], "a"]),
+        ("origin", [[1e8, -1e8, 0], [0, 0, 3.14]], [[1.1e8, 0, 0], [0, 0], [0, 0, 0, 0], "a"]),
         ("occupied_thresh", [0.196, 1.0], [0.19, 1.01]),
         ("free_thresh", [0.0, 0.65], [-0.01, 0.66]),
         ("negate", [0, 1, "0", "1", True, "false"], [2, -1, "", [0], 0.5, 10**30]),
@@ -147,6 +147,40 @@ def test_a_shade_at_a_threshold_is_neither(tmp_path: Path) -> None:
     keys = {**GOOD, "negate": 1, "occupied_thresh": 0.2, "free_thresh": 0.2}  # 0.2 is shade 51
     path = write_map(tmp_path, keys, bytes([50, 51, 52, 0, 255, 51]))
     assert load_map(path).cells.tolist() == [[0, 100, -1], [0, -1, 100]]
+
+
+def test_grey_205_stays_unknown_whatever_the_threshold(tmp_path: Path) -> None:
+    """Map savers write it for unknown, and some of them a free_thresh of 0.25 beside it."""
+    keys, said = {**GOOD, "free_thresh": 0.25}, list[str]()
+    pixels = bytes([205, 254, 0, 204, 206, 254])
+    grid = load_map(write_map(tmp_path, keys, pixels), said.append)
+    assert grid.cells.tolist() == [[0, 0, 0], [-1, 0, 100]]
+    assert "free_thresh 0.25 would make grey 205 free" in said[0]
+    assert load_map(write_map(tmp_path, GOOD, pixels), said.append).cells[1, 0] == -1
+    darker = load_map(write_map(tmp_path, keys, bytes([205] * 5 + [0])), said.append)
+    assert (darker.cells == 0).sum() == 5, "without a lighter grey, 205 is what is free"
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize("yaw_rad", [math.pi, -math.pi / 2, 3.14, 0.7])
+def test_a_rotated_map_is_turned_about_its_origin(tmp_path: Path, yaw_rad: float) -> None:
+    """Every cell of the image lies where the yaml says, and walls stay closed."""
+    cells = np.zeros((30, 50), np.int8)
+    cells[:, 20] = cells[12, 20:] = 100
+    saved, _ = save_map(OccupancyGrid(cells=cells, resolution_m=0.1, origin_m=(2.0, -1.0)), tmp_path / "m")
+    saved.write_text(saved.read_text().replace("-1.0, 0]", f"-1.0, {yaw_rad}]"))
+    said: list[str] = []
+    grid = load_map(saved, said.append)
+    assert f"rotated by {yaw_rad:g} rad" in said[0]
+    rows, columns = np.indices(cells.shape)
+    across, up = 0.1 * (columns + 0.5), 0.1 * (rows + 0.5)
+    x = 2.0 + math.cos(yaw_rad) * across - math.sin(yaw_rad) * up
+    y = -1.0 + math.sin(yaw_rad) * across + math.cos(yaw_rad) * up
+    at = np.floor((np.stack((y, x), -1) - grid.origin_m[::-1]) / 0.1).astype(int)
+    found = grid.cells[at[..., 0], at[..., 1]]
+    assert (found[cells == 100] == 100).all()
+    assert (found == cells).mean() > 0.95
+    assert (grid.cells == 0).sum() == pytest.approx((cells == 0).sum(), rel=0.03)
 
 
 def test_what_is_a_map_and_what_is_a_recording(tmp_path: Path) -> None:
