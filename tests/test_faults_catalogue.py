@@ -209,6 +209,15 @@ def compressed(folder: Path) -> str:
     return CONVERT
 
 
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 4096\n"
+
+
+@fault(4, 1, errors.NotALog, "log.mcap: not a recording; looks like a Git LFS pointer", "git lfs pull")
+def pointer_to_a_recording(folder: Path) -> str:
+    (folder / "log.mcap").write_bytes(POINTER)
+    return CONVERT
+
+
 @fault(4, 0, None, same=True)
 def bag_that_is_called_mcap(folder: Path) -> str:
     """The name of a file does not matter."""
@@ -724,6 +733,19 @@ fault(46, 1, errors.MapFileError, "m.png: a colour image")(
     image_of(np.full((9, 9, 3), (9, 99, 200), np.uint8))
 )
 fault(46, 1, errors.MapFileError, "m.png: 16 bits")(image_of(np.zeros((9, 9), np.uint16)))
+
+
+fault(46, 1, errors.MapFileError, "m.pgm: a Git LFS pointer", "git lfs pull")(map_with("", "", POINTER))
+
+
+@pytest.mark.parametrize("name", ["m.yaml", "m.ply", "m.stl", "clouds/0.pcd", "m.submaps"])
+@pytest.mark.fault(4)
+def test_pointers_of_git_in_place_of_files(tmp_path: Path, name: str, run: Callable[..., Any]) -> None:
+    (tmp_path / "clouds").mkdir()
+    (tmp_path / name).write_bytes(POINTER)
+    code, _, said = run(f"info {name.split('/')[0]}", tmp_path)
+    assert "git lfs pull" in said
+    assert code == (0 if name.startswith("clouds") else 1)
 
 
 @fault(46, 2, errors.ConfigError, "bad.toml", "not TOML")

@@ -23,6 +23,7 @@ import numpy as np
 from pc2grid.arrays import F64, I64
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogError, MapFileError
+from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
 from pc2grid.io.messages.cloud_files import parser
 from pc2grid.io.messages.types import Header
 from pc2grid.io.sensors.pointcloud2 import decode
@@ -164,6 +165,9 @@ def _files(path: Path) -> list[Path]:
         )
     if not path.is_file():
         raise MapFileError(f"{path}: no such file", hint="check the path")
+    with _opened(path) as content:
+        if is_lfs_pointer(content.read(_HEADER_BYTES)):
+            raise MapFileError(f"{path}: a Git LFS pointer to a cloud or mesh", hint=LFS_HINT)
     return [path]
 
 

@@ -14,8 +14,14 @@ from typing import TypeVar, cast
 from pc2grid.errors import LogCorrupt, LogError, Pc2GridError, one_line
 
 RECOVER_HINT = "--recover reads what is whole"
+LFS_HINT = "`git lfs pull` in its repository fetches the file itself"
 
 T = TypeVar("T")
+
+
+def is_lfs_pointer(head: bytes) -> bool:
+    """Whether a file that begins so is what Git leaves in place of a large file that was not fetched."""
+    return head.startswith(b"version https://git-lfs")
 
 
 def translated(path: Path, error: Exception, hint: str | None = None) -> Pc2GridError:

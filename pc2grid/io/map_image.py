@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.errors import MapFileError
+from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
 from pc2grid.io.sensors.png_header import MAGIC as PNG_MAGIC
 from pc2grid.io.sensors.png_header import read_header
 
@@ -44,6 +45,8 @@ def read_image(path: Path) -> GreyImage:
     elif data[:2] == b"BM":
         _check_bmp(path, data)
     else:
+        if is_lfs_pointer(data):
+            raise MapFileError(f"{path}: a Git LFS pointer to an image", hint=LFS_HINT)
         raise MapFileError(f"{path}: not an image of a map", hint="nav2 maps are 8-bit pgm, png or bmp")
     return _decoded(path, data)
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pc2grid.arrays import hand_over
 from pc2grid.errors import MapFileError
 from pc2grid.io.atomic import replace_file
+from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
 from pc2grid.io.map_image import MAX_CELLS, GreyImage, encode_image, read_image
 from pc2grid.io.messages.types import FARTHEST_M
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, MapOf, OccupancyGrid
@@ -229,6 +230,8 @@ def _read_yaml(path: Path) -> dict[str, Any]:
             text = file.read(_MAX_YAML_BYTES + 1)
     except OSError as error:
         raise MapFileError(f"{path}: {error.strerror}") from error
+    if is_lfs_pointer(text):
+        raise MapFileError(f"{path}: a Git LFS pointer to a map.yaml", hint=LFS_HINT)
     if len(text) > _MAX_YAML_BYTES:
         raise MapFileError(f"{path}: larger than {_MAX_YAML_BYTES} bytes: not a map.yaml")
     try:

@@ -19,6 +19,7 @@ from pc2grid.arrays import F64
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LimitExceeded, LogCorrupt, TrajectoryFileError
 from pc2grid.geometry import invert_pose
+from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
 from pc2grid.io.message_source import LogInfo, RawMessage, Tally, TopicInfo
 from pc2grid.io.messages.cloud_messages import pack_cloud, pack_pose
 from pc2grid.io.trajectory import is_rigid, lines_of, read_kitti, read_tum, stamp_ns_from_text
@@ -95,9 +96,12 @@ class CloudFolder:
                 hint="--set read.max_record_bytes=N raises it",
             )
         try:
-            return path.read_bytes()
+            content = path.read_bytes()
         except OSError as error:
             raise LogCorrupt(f"{path}: cannot be read: {error.strerror}") from error
+        if is_lfs_pointer(content):
+            raise LogCorrupt(f"{path}: a Git LFS pointer to a cloud", hint=LFS_HINT)
+        return content
 
 
 def _clouds_of(folder: Path, tally: Tally) -> list[Path]:

@@ -12,6 +12,7 @@ from pc2grid.io.containers import cloud_folder, rosbag2_folder
 from pc2grid.io.containers.bag import BagSource
 from pc2grid.io.containers.db3 import Db3Source
 from pc2grid.io.containers.mcap import McapSource
+from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
 from pc2grid.io.message_source import MessageSource
 
 _MCAP = b"\x89MCAP0\r\n"
@@ -112,6 +113,8 @@ def _looks_like(head: bytes) -> str:
         b"# .PCD": "a PCD cloud",
         b"ply": "a PLY cloud",
     }
+    if is_lfs_pointer(head):
+        return "a Git LFS pointer to one"
     for mark, name in kinds.items():
         if head.startswith(mark):
             return name
@@ -123,6 +126,8 @@ def _looks_like(head: bytes) -> str:
 
 
 def _advice(head: bytes) -> str:
+    if is_lfs_pointer(head):
+        return LFS_HINT
     if head.startswith((b"\x1f\x8b", b"PK\x03\x04", b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18")):
         return "unpack it first"
     if head.startswith(b"#ROSBAG V"):

@@ -6,6 +6,7 @@ import sqlite3
 from pathlib import Path
 
 from pc2grid.errors import DatabaseCorrupt, NotADatabase
+from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
 from signature.database.codec import SALVAGE
 from signature.database.protocol import APPLICATION_ID, FORMAT, OLDER_ID, refused_version
 from signature.database.rows import definitions
@@ -61,6 +62,8 @@ def _header(path: Path) -> tuple[bytes, int]:
         raise NotADatabase(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if not header:
         raise NotADatabase(f"{path}: empty file, a database that was never filled", hint=CONVERT)
+    if is_lfs_pointer(header):
+        raise NotADatabase(f"{path}: a Git LFS pointer to a database", hint=LFS_HINT)
     if not header.startswith(b"SQLite format 3\0"):
         raise NotADatabase(
             f"{path}: not a pc2grid database",
