@@ -31,7 +31,6 @@ from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Imu, Odometry, ScanMessage, Transform
 from pc2grid.io.read_plan import Plan, is_static, registered, tolerant
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
-from pc2grid.io.sensors.floor_depth import FloorDepth
 from pc2grid.io.sensors.scan_decoder import ScanDecoder
 from pc2grid.model import Scan
 from pc2grid.sensor_model import SENSOR_MODELS
@@ -362,10 +361,10 @@ class Stream:
         self._parameters = parameters = parameters or PARAMETERS
         self._part = part or Part()
         sensor = plan.choice.sensor
-        self._config = config
-        self._decoder = self._decoder_of(plan.scans, plan.camera)
-        self._further = [FurtherScans(t, camera, self._decoder_of(t, camera)) for t, camera in plan.further]
-        self._floor = FloorDepth()
+        self._decoder = self._decoder_of(plan.scans, plan.camera, config)
+        self._further = [
+            FurtherScans(t, camera, self._decoder_of(t, camera, config)) for t, camera in plan.further
+        ]
         self._poses = _Poses(plan, frames, source.tally)
         self._stamps = _Stamps(parameters, source.tally)
         self._waiting = _Queue()
@@ -373,12 +372,12 @@ class Stream:
         self._sweep_ns = 0 if SENSOR_MODELS[sensor].image else parameters.sweep_ns
         self._handlers = self._make_handlers()
 
-    def _decoder_of(self, topic: TopicInfo, camera: TopicInfo | None) -> ScanDecoder:
+    def _decoder_of(self, topic: TopicInfo, camera: TopicInfo | None, config: ReadConfig) -> ScanDecoder:
         return ScanDecoder(
             topic.topic,
             self._plan.choice.sensor,
             decoder_for(topic),
-            self._config,
+            config,
             camera_topic="" if camera is None else camera.topic,
             depth_unit_m=self._plan.depth_unit_m,
             fixed_frame=self._plan.mounted is not None,
@@ -559,9 +558,6 @@ class Stream:
         for note in self._decoder.notes:
             tally.warn(note)
         self._part.returns += len(scan.points_m)
-        if SENSOR_MODELS[scan.sensor].image and not self._plan.sensor_is_base:
-            for warning in self._floor.warnings(scan.points_m, scan.T_base_sensor, self._decoder.unit_m):
-                tally.warn(warning)
         yield scan
 
     def _within_period(self, scan: Scan) -> Scan:

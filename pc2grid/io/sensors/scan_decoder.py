@@ -15,6 +15,7 @@ from pc2grid.errors import PointCloudError
 from pc2grid.geometry import pose_from_xyz_quat
 from pc2grid.io.messages.types import CameraInfo, ScanMessage, valid_pose
 from pc2grid.io.sensors import depth, laserscan, pointcloud2
+from pc2grid.io.sensors.floor_depth import FloorDepth
 from pc2grid.io.sensors.pointcloud2 import FARTHEST_HALF_M, Points, check_metres
 from pc2grid.model import Scan, SensorKind
 from pc2grid.sensor_model import SENSOR_MODELS
@@ -31,7 +32,6 @@ class ScanDecoder:
     """Decodes scans of one topic; keeps the camera's calibration between them.
 
     notes : sentences for the user. empty : why the last scan without a return has none.
-    unit_m : of the numbers in the last message.
     """
 
     def __init__(
@@ -48,7 +48,8 @@ class ScanDecoder:
         """depth_unit_m : None: that of the encoding. fixed_frame : points are in one, not in the sensor's."""
         self.camera: CameraInfo | None = None
         self.notes: list[str] = []
-        self.empty, self.unit_m = "", 1.0
+        self.empty = ""
+        self._floor = FloorDepth()
         self._camera_topic = camera_topic
         self._depth_unit_m = depth_unit_m
         self._fixed_frame = fixed_frame
@@ -77,6 +78,8 @@ class ScanDecoder:
         if near is not None:
             xyz, offsets = xyz[near], None if offsets is None else offsets[near]
         points = _to_base(xyz, T_base_sensor)
+        if SENSOR_MODELS[self._sensor].image:
+            self.notes += self._floor.warnings(points, T_base_sensor, found.unit_m)
         return Scan(
             stamp_ns=stamp_ns,
             points_m=points,
@@ -88,7 +91,7 @@ class ScanDecoder:
         )
 
     def _note(self, found: Points) -> None:
-        notes, self.unit_m = found.notes, found.unit_m
+        notes = found.notes
         if not len(found.xyz_m):
             self.empty = found.empty
             notes = (*notes, f"some scans hold no returns at all: {found.empty}")

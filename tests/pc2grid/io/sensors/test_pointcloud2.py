@@ -129,7 +129,7 @@ def test_wild_times_decide_no_unit(wild: float, share: float, scale: float, begi
         odd[:] = False
     assert found.dropped == odd.sum()
     np.testing.assert_allclose(found.offsets_s, expected[~odd], atol=1e-3)
-    assert (found.note is not None) == (found.dropped > 0)
+    assert bool(found.notes) == (found.dropped > 0)
 
 
 def test_no_times_or_all_the_same_is_no_offsets() -> None:
