@@ -58,11 +58,6 @@ COMMANDS = [
     ("relocalize-check", "relocalize drive.mcap -d b.submaps --check 99 99 0", 4),
     ("export", "export b.submaps --map out --report out.html", 0),
     ("export", "export b.submaps --report out.html", 0),
-    (
-        "compare-log",
-        "compare log drive.mcap --truth drive.tum --of-base --map 0..2 --queries 1 --length 1",
-        0,
-    ),
     ("db-info", "db info b.submaps", 0),
     ("db-check", "db check b.submaps", 0),
     ("db-check", "db check damaged.submaps", 1),

@@ -102,7 +102,7 @@ def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> list[str]:
         ("convert l.mcap", "pc2grid convert --help"),
         ("relocalize q.mcap b.sqlite", "pc2grid relocalize --help"),
         ("relocalize q.mcap --topic b.submaps", "pc2grid relocalize --help"),
-        ("compare log l.mcap t.submaps", "pc2grid compare log --help"),
+        ("relocalize l.mcap t.sqlite3", "pc2grid relocalize --help"),
     ],
 )
 def test_a_database_without_its_option_gets_it(

@@ -78,7 +78,7 @@ def evidence_files(folder: Path) -> list[Path]:
         )
     files = [folder / "real.json", folder / "sensors.json"]
     files[0].write_text(json.dumps(rows))
-    files[1].write_text(json.dumps({"trials": trials}))
+    files[1].write_text(json.dumps(trials))
     return files
 
 
@@ -124,8 +124,8 @@ def test_a_scan_and_a_log_of_one_building_are_left_out_together(tmp_path: Path) 
     log = {"log": "fr079", "map": "fr079"}
     rows = [one | log for one in json.loads(real.read_text()) if one["log"] == "b"]
     floor = {"building": "fr079_floor", "query_building": "fr079_floor"}
-    trials = [one | floor for one in json.loads(sensors.read_text())["trials"]]
+    trials = [one | floor for one in json.loads(sensors.read_text())]
     real.write_text(json.dumps(rows))
-    sensors.write_text(json.dumps(trials))  # a list, as `compare sensors` keeps them for each drive
+    sensors.write_text(json.dumps(trials))
     refused = run(real, sensors)
     assert refused.returncode != 0 and "without fr079 not both kinds" in refused.stderr

@@ -44,11 +44,10 @@ CONFIG = {
 }
 # Commands of the laboratory. No module of the product imports it: it is loaded by name when it is asked for.
 COMPARE = {
-    "log": ("pc2grid_lab.compare.log:compare_log_command", "Later parts of a log in a map of its beginning."),
     "maps": ("pc2grid_lab.compare.maps:compare_maps_command", "Maps and trajectories against the truth."),
     "recordings": (
         "pc2grid_lab.compare.recordings:compare_recordings_command",
-        "Every real recording, and what changed.",
+        "Real recordings as maps, located in each other; and what changed.",
     ),
     "sensors": ("pc2grid_lab.compare.sensors:compare_sensors_command", "Each sensor in the maps of each."),
     "signatures": (
@@ -102,7 +101,7 @@ def options(
 app.add_typer(
     typer.Typer(
         cls=group(COMPARE),
-        help="Measure: log, maps, recordings, sensors, signatures, peers, the paper's tables.",
+        help="Measure: maps, recordings, sensors, signatures, peers, the paper's tables.",
         no_args_is_help=True,
     ),
     name="compare",

@@ -7,10 +7,9 @@ from typing import Any
 # Before Python 3.12 pydantic, which makes the schemas, does not take the TypedDict of typing.
 from typing_extensions import TypedDict
 
-from pc2grid_lab.experiments.metrics import ConfidenceError, MatrixCell, QueryCounts
+from pc2grid_lab.experiments.metrics import ConfidenceError, MatrixCell
 from pc2grid_lab.experiments.recordings.changes import RowChange
 from pc2grid_lab.experiments.recordings.rows import MapRow, PairRow
-from pc2grid_lab.experiments.trial import Trial
 from pc2grid_lab.peers.outcome import PeerCell, PeerTrial
 from signature.localization.answer_json import Version
 
@@ -28,19 +27,6 @@ class Simulate(TypedDict):
     length_m: float
     clutter: int
     change: dict[str, float]
-
-
-class CompareLog(TypedDict):
-    """`pc2grid compare log --json`. map_s: from and to, seconds of the recording. tally: counts of the
-    queries."""
-
-    schema_version: Version
-    log: str
-    map_s: list[float]
-    length_s: float
-    without_truth: int
-    tally: QueryCounts
-    trials: list[Trial]
 
 
 class CompareMaps(TypedDict):
@@ -191,7 +177,6 @@ class CompareSensors(TypedDict):
 
 
 DOCUMENTS: dict[str, type] = {
-    "compare-log": CompareLog,
     "compare-maps": CompareMaps,
     "compare-paper": ComparePaper,
     "compare-peers": ComparePeers,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +148,28 @@ def test_a_small_run(data: Path, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "before.json").read_text())["maps"] == document["maps"]
     assert "Changed since the run before" in (tmp_path / "before.md").read_text()
     assert drive.stat().st_mtime_ns == made_ns
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small")
+def test_ones_own_recordings_need_no_catalogue(data: Path, tmp_path: Path) -> None:
+    """Later parts of a drive are located in the map of its beginning, and judged by the poses beside it."""
+    own = tmp_path / "own"
+    own.mkdir()
+    for suffix in (".mcap", ".tum"):
+        shutil.copy(data / f"b{suffix}", own / f"mine{suffix}")
+    (own / "torn.mcap").write_bytes(b"no recording")
+    document = json.loads(compare(own, tmp_path / "out", "--of-base", "--json").stdout)
+    mine, torn = document["maps"]
+    assert (mine["name"], mine["building"], mine["truth"]) == ("mine.mcap", "own", "poses")
+    assert mine["error_m"] < RESOLUTION_M and "torn.mcap" in torn["problem"]
+    (later,) = document["pairs"]
+    assert (later["kind"], later["truth"]) == ("later part", "poses") and len(later["queries"]) == 4
+    assert any(query["right"] and query["status"] == "located" for query in later["queries"])
+    assert all(query["right"] for query in later["queries"] if query["status"] == "located")
+    (tmp_path / "empty").mkdir()
+    done = CliRunner().invoke(app, ["compare", "recordings", str(tmp_path / "empty")])
+    assert "holds no recording" in str(done.exception)
 
 
 @pytest.mark.usefixtures("small")

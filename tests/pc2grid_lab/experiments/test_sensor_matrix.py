@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import jsonschema
@@ -13,6 +13,7 @@ import pytest
 from pc2grid.simulate import SimulationConfig, office_floorplan
 from pc2grid_cli.console import json_text
 from pc2grid_cli.json_schemas import schema
+from pc2grid_lab.compare import matrix_report
 from pc2grid_lab.compare.sensors import _document
 from pc2grid_lab.experiments.ablation import Independence
 from pc2grid_lab.experiments.metrics import matrix, reliability
@@ -25,6 +26,18 @@ from signature.localization.localizer import MapIndex
 from signature.similarity import SignatureTable
 from tests.helpers.json_schema import closed
 from tests.helpers.trials import trial
+
+
+def test_a_trial_consists_of_plain_json_types() -> None:
+    stored = json.loads(json.dumps(asdict(trial(error_m=None))))
+    assert trial(**stored) == trial(error_m=None)
+
+
+def test_all_nine_cells_of_the_matrix_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    matrix_report.tables([], [])
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    sensors = ("lidar", "laser", "depth")
+    assert [row[:2] for row in rows if row[-1:] == ["0"]] == [[m, q] for m in sensors for q in sensors]
 
 
 def test_a_cell_counts_the_trials_in_the_map_of_their_own_building() -> None:

@@ -2,13 +2,12 @@
 
     python -m pc2grid_lab.bench.fit_posterior EVIDENCE.json ...
 
-Each file is one that `real_queries` or `recorded_queries` has written, one of the folder trials/ of `pc2grid
-compare sensors`, or the document of `compare log --json`. An answer is judged by a fit
-without all answers whose query or map is of one of its buildings. Prints the parameters for
-`signature.localization.posterior`, the log loss, by kind of pair and distance how many answers are right, and
-how many would be located by the parameters in use and by those fitted without the building, rightly and
-wrongly; the risk at several coverages; and what would be located if the least mass to answer were chosen
-without the building, too.
+Each file is one that `real_queries` or `recorded_queries` has written, or one of the folder trials/ of
+`pc2grid compare sensors`. An answer is judged by a fit without all answers whose query or map is of one of
+its buildings. Prints the parameters for `signature.localization.posterior`, the log loss, by kind of pair
+and distance how many answers are right, and how many would be located by the parameters in use and by those
+fitted without the building, rightly and wrongly; the risk at several coverages; and what would be located
+if the least mass to answer were chosen without the building, too.
 
 Queries whose place was found and all others weigh the same in the fit, however many of each there are.
 """
@@ -97,7 +96,7 @@ def of_rows(rows: list[dict[str, Any]]) -> Iterator[Answered]:
 
 
 def of_trials(trials: list[dict[str, Any]]) -> Iterator[Answered]:
-    """Answers of the `compare` commands."""
+    """Answers of `compare sensors`."""
     names = ("forward", "walls", "backward", "looked_at", "lead", "likeness")
     for trial in trials:
         if trial.get("likeness") is None or trial.get("query_building") is None:
@@ -118,8 +117,6 @@ def of_trials(trials: list[dict[str, Any]]) -> Iterator[Answered]:
 def read(file: Path) -> list[Answered]:
     """The answers of one file. Raises SystemExit for results of an earlier version."""
     document = json.loads(file.read_text())
-    if isinstance(document, dict):
-        return list(of_trials(document["trials"]))
     if document and "in_building" in document[0]:
         return list(of_trials(document))
     # Before equal places shared their mass, each was compared with them.

@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -25,15 +25,15 @@ import numpy as np
 
 from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.io import open_log
+from pc2grid.io import Log, open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.matching.two_way_score import score_fit
-from pc2grid.model import OccupancyGrid
+from pc2grid.model import OccupancyGrid, Trajectory
 from pc2grid.submaps.partition import partition
 from pc2grid_lab.experiments.answers import unseen_by
+from pc2grid_lab.experiments.frames import number_at
 from pc2grid_lab.experiments.registered_session import RegisteredSession, register
-from pc2grid_lab.experiments.replay import Replay
 from signature.config import Config
 from signature.describe import describe
 from signature.localization.hypotheses import Hypothesis
@@ -56,11 +56,10 @@ Drawn = tuple[OccupancyGrid, list[RegisteredSession]]
 def read(data: Path, name: str, queries: int, kept: Path, config: Config) -> Drawn:
     """The map of the first part of a log, and its later parts as registered queries."""
     with open_log(data / "laser" / f"{name}.mcap") as log:
-        truth = read_tum(data / "laser" / f"{name}_corrected.tum")
-        replay = Replay(log, truth, config)
+        true_pose = of_base(log, read_tum(data / "laser" / f"{name}_corrected.tum"))
         builder, last = GridBuilder(config.projection), None
         for scan in log.scans(0.0, MAPPED_S[name]):
-            pose = replay.truth(scan.stamp_ns)
+            pose = true_pose(scan.stamp_ns)
             if pose is None:
                 continue
             step = pose if last is None else last.inverse() @ pose
@@ -73,10 +72,22 @@ def read(data: Path, name: str, queries: int, kept: Path, config: Config) -> Dra
         for start_s in np.linspace(MAPPED_S[name] + 2.0, end_s - 60.0, queries).tolist():
             file = kept / f"{name}.{start_s:.1f}.npz"
             if not file.exists():
-                scans = ((scan, replay.truth(scan.stamp_ns)) for scan in log.scans(start_s, 60.0))
+                scans = ((scan, true_pose(scan.stamp_ns)) for scan in log.scans(start_s, 60.0))
                 register(scans, config, sensor="laser", until_m=DISTANCES_M[-1] + 0.5).save(file)
             driven.append(RegisteredSession.load(file))
     return builder.grid(), driven
+
+
+def of_base(log: Log, truth: Trajectory) -> Callable[[int], SE2 | None]:
+    """The true pose of the base at a stamp, None if there is none. truth : poses of the sensor."""
+    T_sensor_base = SE2.from_matrix(next(iter(log.scans())).T_base_sensor).inverse()
+    poses = [pose @ T_sensor_base for pose in truth.poses()]
+
+    def true_pose(stamp_ns: int) -> SE2 | None:
+        number = number_at(truth.stamps_ns, stamp_ns)
+        return None if number is None else poses[number]
+
+    return true_pose
 
 
 def index_of(name: str, grid: OccupancyGrid, config: Config) -> MapIndex:

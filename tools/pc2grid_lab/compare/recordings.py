@@ -15,9 +15,10 @@ from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
-from pc2grid_lab.experiments.recordings.catalogue import Catalogue
+from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.changes import changes
 from pc2grid_lab.experiments.recordings.judging import judged_table
+from pc2grid_lab.experiments.recordings.own import own_recordings, state_of
 from pc2grid_lab.experiments.recordings.page import change_lines, page
 from pc2grid_lab.experiments.recordings.program import commit, digest
 from pc2grid_lab.experiments.recordings.rows import Table
@@ -27,7 +28,9 @@ from pc2grid_lab.experiments.stored import write_text
 
 def compare_recordings_command(
     context: typer.Context,
-    data: Annotated[Path, typer.Argument(metavar="DATA", help="the folder of real recordings")],
+    data: Annotated[
+        Path, typer.Argument(metavar="DATA", help="the folder of real recordings, or one of your own")
+    ],
     out: Annotated[
         Path, typer.Option(*OUTPUT_FOLDER, metavar="FOLDER", help="for maps and answers; run again to go on")
     ] = Path("real-recordings"),
@@ -46,16 +49,28 @@ def compare_recordings_command(
             "--only", metavar="PATTERN", help="of recordings, buildings, sensors or kinds, such as 'wean*'"
         ),
     ] = None,
+    of_base: Annotated[
+        bool,
+        typer.Option(
+            "--of-base", help="poses in NAME.tum beside NAME.mcap are of the base, not of the sensor"
+        ),
+    ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="a small part of all, always the same")] = False,
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="processes at a time")] = 2,
     as_json: options.AsJson = False,
 ) -> None:
     """Map every real recording, locate parts of it in other maps, and tell what changed since the last time.
 
+    Of recordings that the catalogue does not name, later parts are located in the map of the beginning. They
+    are judged by NAME.tum or NAME.relations beside them; without, by whether the answers fit together.
+
     Example: pc2grid compare recordings data --output real-recordings --quick
     """
-    catalogue = _catalogue(data, only, quick)
-    work = out / "work" / digest()
+    if not data.is_dir():
+        raise ConfigError(f"{data}: no such folder", hint="give the folder of recordings")
+    own = own_recordings(data, without=out, of_base=of_base)
+    catalogue = _catalogue(data, own, only, quick)
+    work = out / "work" / (digest() + state_of(data, own[0]))
     make_folder(work)
     _remove_others(work)
     folder = Folder(data.absolute(), work.absolute())
@@ -80,11 +95,15 @@ def compare_recordings_command(
         print(f"changed since {before.commit} ({kept}):", *(change_lines(changed) or ["- nothing"]), sep="\n")
 
 
-def _catalogue(data: Path, only: str | None, quick: bool) -> Catalogue:
-    """What is run. Raises ConfigError if there is nothing."""
-    if not data.is_dir():
-        raise ConfigError(f"{data}: no such folder", hint="give the folder of recordings")
-    catalogue = Catalogue.of(only=only, quick=quick)
+def _catalogue(
+    data: Path, own: tuple[list[Recording], list[Pair]], only: str | None, quick: bool
+) -> Catalogue:
+    """What is run: what the catalogue names, and one's own. Raises ConfigError if there is nothing."""
+    named = Catalogue.in_folder(data)
+    recordings, pairs = [*named[0], *own[0]], [*named[1], *own[1]]
+    if not recordings:
+        raise ConfigError(f"{data}: holds no recording", hint="they end in .mcap, .bag or .db3")
+    catalogue = Catalogue.of(recordings, pairs, only=only, quick=quick)
     if not catalogue.mapped and not catalogue.pairs:
         raise ConfigError(f"--only {only}: no recording, building, sensor or kind is named so")
     return catalogue

@@ -29,13 +29,12 @@ def judge(
     seed: int,
     travel_m: float,
     look_up_ms: float,
-    right_m: float = JUDGEMENT.right_m,
 ) -> Trial:
     """The answer to a query, compared with the truth.
 
     T_plan_base : true pose of the base at the query's last scan, in the frame that `SensorMap.T_plan_map`
         maps to.
-    building : the one that the query comes from. right_m : largest error of position of a right answer.
+    building : the one that the query comes from.
     """
     in_building, index = sensor_map.name == building, sensor_map.index
     T_map_base = sensor_map.T_plan_map.inverse() @ T_plan_base
@@ -45,7 +44,7 @@ def judge(
     right = False
     if answer.hypotheses:
         error_m, error_rad = apart(T_map_base, answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base)
-        right = in_building and error_m <= right_m and error_rad <= JUDGEMENT.right_rad
+        right = in_building and error_m <= JUDGEMENT.right_m and error_rad <= JUDGEMENT.right_rad
     signature = index.made_with.signature
     return Trial(
         building=sensor_map.name,

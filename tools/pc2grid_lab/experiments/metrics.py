@@ -117,36 +117,3 @@ class ConfidenceError:
             expected_error=sum(differences) / len(trials) if trials else None,
             reliability=bands,
         )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class QueryCounts:
-    """Counts of the queries of one recording.
-
-    inside: the map covers what they saw, by the truth; only these have a right answer. right, wrong: of
-    those, located and right, located and wrong; unsure: not located. outside: the others. refused: of those,
-    not located, as it should be; wrong_outside: of those, located and wrong.
-    """
-
-    inside: int
-    right: int
-    wrong: int
-    unsure: int
-    outside: int
-    refused: int
-    wrong_outside: int
-
-    @staticmethod
-    def of(trials: Sequence[Trial]) -> QueryCounts:
-        """A query outside the map that is located and right (at its edge) is counted in `outside` only."""
-        inside = [t for t in trials if t.in_map]
-        outside = [t for t in trials if not t.in_map]
-        return QueryCounts(
-            inside=len(inside),
-            right=sum(t.status == "located" and t.right for t in inside),
-            wrong=sum(t.status == "located" and not t.right for t in inside),
-            unsure=sum(t.status != "located" for t in inside),
-            outside=len(outside),
-            refused=sum(t.status != "located" for t in outside),
-            wrong_outside=sum(t.status == "located" and not t.right for t in outside),
-        )

@@ -41,8 +41,7 @@ class Trial:
     there is none; alone: the same by each combination of signatures, without isovists. forward, walls,
     backward, looked_at, lead, likeness: the evidence of the decision, see
     `signature.localization.posterior`; agreement: the better one of forward and backward. In the results
-    of earlier versions, forward, backward, looked_at and likeness are null. map_bent_m: how far the map
-    around the true place lies from where the map as a whole puts it; null in simulation. query_building: of
+    of earlier versions, forward, backward, looked_at and likeness are null. query_building: of
     the query; null in the results of earlier versions.
     """
 
@@ -68,7 +67,6 @@ class Trial:
     backward: float | None = None
     looked_at: float | None = None
     likeness: float | None = None
-    map_bent_m: float | None = None
     query_building: str | None = None
 
     @property

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pc2grid_lab.experiments.recordings.catalogue import KINDS, PAIRS, RECORDINGS, Catalogue
+from pc2grid_lab.experiments.recordings.catalogue import KINDS, PAIRS, RECORDINGS, Catalogue, evenly_spaced
 
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[4] / ".." / "shared" / "data"))
 needs_data = pytest.mark.skipif(not (DATA / "README.md").is_file(), reason="PC2GRID_DATA is not there")
@@ -70,6 +70,13 @@ def test_windows_begin_where_commands_are_told_to() -> None:
     catalogue = Catalogue.of()
     starts = [w.start_s for pair in catalogue.pairs for _, w in catalogue.windows(pair, 1000.0 / 3.0)]
     assert all(start == float(f"{start:.3f}") for start in starts)
+
+
+def test_windows_are_spread_over_the_time_left() -> None:
+    spans = evenly_spaced(600.0, 1060.0, 10, 40.0)
+    assert [span.start_s for span in spans[:2]] == pytest.approx([600.0, 600.0 + 420.0 / 9])
+    assert {span.duration_s for span in spans} == {40.0} and spans[-1].start_s == pytest.approx(1020.0)
+    assert len({span.start_s for span in evenly_spaced(100.0, 110.0, 3, 40.0)}) == 1
 
 
 def test_windows_of_a_later_part_come_after_the_map() -> None:

@@ -6,13 +6,16 @@ recording: another recording is another row, and no other file changes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
+from pathlib import Path
 from typing import Literal
+
+import numpy as np
 
 from pc2grid.model import SensorKind
 from pc2grid.time_span import TimeSpan
-from pc2grid_lab.experiments.replay import evenly_spaced
 
 Kind = Literal[
     "later part", "fewer scans", "same recording", "other day", "other sensor", "published map", "elsewhere"
@@ -28,6 +31,10 @@ KINDS: tuple[Kind, ...] = (
     "published map",
     "elsewhere",
 )
+
+
+Source = Literal["lidar", "depth", "laser", "map", "unknown"]
+"""What a recording is of; "map": it is a map or a 3D scan; "unknown": it cannot be read."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +67,7 @@ class Recording:
     name: str
     file: str
     building: str
-    sensor: Literal["lidar", "depth", "laser", "map"]
+    sensor: Source
     drive: Drive | None = None
     options: tuple[str, ...] = ()
     map_options: tuple[str, ...] = ()
@@ -418,6 +425,12 @@ PAIRS: tuple[Pair, ...] = (
 """All pairs, in the order of the page."""
 
 
+def evenly_spaced(first_s: float, last_s: float, count: int, duration_s: float) -> tuple[TimeSpan, ...]:
+    """`count` parts of `duration_s`, evenly distributed over the time from `first_s` to `last_s`."""
+    starts_s = np.linspace(first_s, max(last_s - duration_s, first_s), count)
+    return tuple(TimeSpan(float(start_s), duration_s) for start_s in starts_s)
+
+
 _QUICK_EVERY = 2
 """The quick form asks for every second window."""
 
@@ -436,26 +449,42 @@ class Catalogue:
     quick: bool = False
 
     @staticmethod
-    def of(*, only: str | None = None, quick: bool = False) -> Catalogue:
+    def in_folder(data: Path) -> tuple[tuple[Recording, ...], tuple[Pair, ...]]:
+        """The recordings and pairs of this file, if the folder has one of the recordings; else nothing."""
+        if any((data / recording.file).exists() for recording in RECORDINGS):
+            return RECORDINGS, PAIRS
+        return (), ()
+
+    @staticmethod
+    def of(
+        recordings: Sequence[Recording] | None = None,
+        pairs: Sequence[Pair] | None = None,
+        *,
+        only: str | None = None,
+        quick: bool = False,
+    ) -> Catalogue:
         """What the quick form holds, or all; of it what `only` names.
 
-        only : a pattern of the shell for names of recordings, buildings or kinds of pairs.
+        recordings, pairs : of which; None: those of this file. only : a pattern of the shell for names of
+            recordings, buildings or kinds of pairs.
         """
+        recordings = RECORDINGS if recordings is None else recordings
+        pairs = PAIRS if pairs is None else pairs
 
         def wanted(*names: str) -> bool:
             return only is None or any(fnmatch(name, only) for name in names)
 
-        known = {recording.name: recording for recording in RECORDINGS}
+        known = {recording.name: recording for recording in recordings}
         return Catalogue(
             recordings=known,
             mapped=tuple(
                 r
-                for r in RECORDINGS
+                for r in recordings
                 if r.mapped and (r.quick or not quick) and wanted(r.name, r.building, r.sensor)
             ),
             pairs=tuple(
                 p
-                for p in PAIRS
+                for p in pairs
                 if (p.quick or not quick)
                 and wanted(p.query, p.map, p.kind, known[p.query].building, known[p.map].building)
             ),

@@ -14,7 +14,6 @@ from pc2grid.geometry import SE2
 from pc2grid.io import open_log
 from pc2grid.model import OccupancyGrid, Trajectory
 from pc2grid.pipeline import follow
-from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_frame, is_right
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
@@ -212,7 +211,7 @@ class Judge:
                     if (frame := self._true_frame(map_, trajectory)) is not None
                 },
             )
-        if (by_clouds := self._by_clouds(query, map_)) is not None:
+        if pair.until_s is None and (by_clouds := self._by_clouds(query, map_)) is not None:
             own = [replace(one, where=self._own(query, one)) for one in windows]
             return "clouds", own, {(0, _SESSION): by_clouds}
         shared = self._shared(pair) if map_.sensor == "map" else None
@@ -248,7 +247,7 @@ class Judge:
     def _by_clouds(self, query: Recording, map_: Recording) -> Frame | None:
         """The frame of a recording in the map of another one, by the clouds of both; None if they have none,
         or do not tell."""
-        if any(r.sensor == "map" or SENSOR_MODELS[r.sensor].planar for r in (query, map_)):
+        if any(r.sensor not in ("lidar", "depth") for r in (query, map_)):
             return None
         drives, clouds = [self._drive(recording).parts[0] for recording in (query, map_)], []
         for recording, drive in zip((query, map_), drives, strict=True):

@@ -47,9 +47,9 @@ def page(table: Table, changed: Sequence[RowChange] = ()) -> str:
 
 
 def _about(table: Table) -> list[str]:
-    form = "The quick form of `make real`" if table.quick else "`make real`"
+    form = "The quick form of `compare recordings`" if table.quick else "`pc2grid compare recordings`"
     return [
-        f"{form}: every recording of the data folder goes through `convert`, and parts of them through",
+        f"{form}: every recording of a folder goes through `convert`, and parts of them through",
         "`relocalize`, each as a process of its own with one thread. The next run is compared with this page",
         "(`real.json`). Times are processor time, user and system, with the start of the program.",
         "",
