@@ -22,7 +22,7 @@ from pc2grid.model import FREE, OCCUPIED, THING, UNKNOWN, OccupancyGrid
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OccupancyParameters:
-    """Numbers of the occupancy grid; chosen by hand, checked by `pc2grid compare maps` on simulated drives.
+    """Numbers of the occupancy grid; chosen by hand, checked on simulated drives.
 
     hit, miss, limit : log-odds in hundredths, as int16 adds them. One hit makes a cell occupied by nav2's
         threshold, two misses make it free. A hit weighs two misses, so a thin wall that passing rays graze

@@ -34,9 +34,8 @@ if TYPE_CHECKING:
 class PrecisionParameters:
     """Numbers of the estimate.
 
-    promised_m : standard deviation of a position from which a place is called uncertain. An answer of
-        relocalization is called right within this distance (`compare recordings`). Beyond it, an answer that is
-        exact to the walls around it is off in the map by more than that as often as one in three.
+    promised_m : standard deviation of a position from which a place is called uncertain. Beyond it, an answer
+        that is exact to the walls around it is off in the map by more than that as often as one in three.
     rounds : in which the weights of the places are found; they change little after two.
     most_places : whose covariance is computed, evenly chosen. It is interpolated between them, so that the
         time grows linearly with the length of a session.

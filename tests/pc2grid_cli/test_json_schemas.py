@@ -84,7 +84,6 @@ def test_documents_are_as_their_schema_says(
 def test_every_document_is_validated_by_a_test() -> None:
     elsewhere = {
         "compare-paper": "pc2grid_lab/compare/test_paper.py",
-        "compare-maps": "pc2grid_lab/experiments/test_map_quality.py",
         "compare-peers": "pc2grid_lab/experiments/test_peers.py",
         "compare-recordings": "pc2grid_lab/compare/test_recordings.py",
         "compare-sensors": "pc2grid_lab/experiments/test_sensor_matrix.py",

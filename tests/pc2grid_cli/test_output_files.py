@@ -56,7 +56,6 @@ EXPORT, LOCATE = "export none.submaps", "relocalize none.mcap -d none.submaps"
         ("simulate taken.mcap --sensor laser", "taken.tum: exists already"),
         ("demo -o /proc/demo", "/proc/demo: cannot make this folder: "),
         ("compare sensors part.yaml -o /proc/out", "/proc/out: cannot make this folder: "),
-        ("compare maps part.yaml -o /proc/out", "/proc/out: cannot make this folder: "),
     ],
 )
 def test_what_cannot_be_written_is_refused_before_any_work(

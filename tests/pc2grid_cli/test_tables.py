@@ -10,7 +10,6 @@ import pytest
 import pc2grid_cli
 from pc2grid_cli import tables
 from pc2grid_cli.tables import show, table
-from pc2grid_lab.compare import maps as compare_maps
 
 
 def test_a_table_has_a_title_on_the_left_and_numbers_on_the_right(capsys: pytest.CaptureFixture[str]) -> None:
@@ -44,23 +43,3 @@ def test_no_command_draws_a_comparison_of_its_own() -> None:
             made = node.func.id if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
             assert made not in ("Table", "Console"), f"{path.name}: use pc2grid_cli.tables"
     assert Path(tables.__file__).parent == folder
-
-
-def test_maps_are_compared_in_two_tables_that_fit_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    errors = {"ate_m": 0.0421, "rpe_m": 0.0052, "translation_m": 0.0, "rotation_deg": 0.0}
-    grid = {"occupied_right": 0.991, "walls_found": 0.95, "free_wrong": 0.001, "unseen_free": float("nan")}
-    row = {
-        **{"plan": "maps/freiburg-079.yaml", "sensor": "lidar", "seed": 1, "odometry": True, "ours": errors},
-        **{"bare": errors, "grid": grid, "lost": 0.0, "degenerate": 0.02, "loops": 12},
-        **{"map_ms": 3.0, "bare_ms": 2.0},
-    }
-    columns = compare_maps._PLAN
-    show(
-        compare_maps._table("paths", columns, [*compare_maps._SIMULATED, *compare_maps._HEALTH], [row]),
-        compare_maps._table("cells", columns, compare_maps._CELLS, [row]),
-    )
-    lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 120
-    paths, cells = (line.split() for line in lines if "freiburg-079" in line)
-    assert paths[1:] == ["lidar", "1", "yes", "0.042", "0.005", "0.042", "0.00", "2.00", "12", "1.50"]
-    assert cells[4:] == ["99.10", "95.00", "0.10", "-"]

@@ -44,7 +44,6 @@ CONFIG = {
 }
 # Commands of the laboratory. No module of the product imports it: it is loaded by name when it is asked for.
 COMPARE = {
-    "maps": ("pc2grid_lab.compare.maps:compare_maps_command", "Maps and trajectories against the truth."),
     "recordings": (
         "pc2grid_lab.compare.recordings:compare_recordings_command",
         "Real recordings as maps, located in each other; and what changed.",
@@ -101,7 +100,7 @@ def options(
 app.add_typer(
     typer.Typer(
         cls=group(COMPARE),
-        help="Measure: maps, recordings, sensors, signatures, peers, the paper's tables.",
+        help="Measure: recordings, sensors, signatures, peers, the paper's tables.",
         no_args_is_help=True,
     ),
     name="compare",

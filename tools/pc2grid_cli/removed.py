@@ -17,7 +17,10 @@ REMOVED = {
         "a recording is one floor: `pc2grid simulate` makes one for each `--seed`",
     ),
     "pc2grid simulate --alike": "a recording is one floor: the same `--seed` places the same objects",
-    "pc2grid compare log": "`pc2grid compare recordings FOLDER`, with NAME.tum beside NAME.mcap",
+    **dict.fromkeys(
+        ("pc2grid compare log", "pc2grid compare maps"),
+        "`pc2grid compare recordings FOLDER`, with true poses in NAME.tum beside NAME.mcap",
+    ),
     "pc2grid compare real": "its rows are those of `pc2grid compare recordings DATA --only 'other sensor'`",
     "pc2grid watch --last": "a finished recording is followed whole, and ws://ROBOT:8765 while it runs",
     "pc2grid db update": "`pc2grid db join` puts sessions into one frame, `pc2grid export --map` draws them",

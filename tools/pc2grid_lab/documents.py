@@ -29,13 +29,6 @@ class Simulate(TypedDict):
     change: dict[str, float]
 
 
-class CompareMaps(TypedDict):
-    """`pc2grid compare maps --json`: a row a session, with the errors of its trajectory and of its cells."""
-
-    schema_version: Version
-    rows: list[dict[str, Any]]
-
-
 class ComparePaper(TypedDict):
     """`pc2grid compare paper --json`: a cell a map, method and noise level, measured beside published."""
 
@@ -177,7 +170,6 @@ class CompareSensors(TypedDict):
 
 
 DOCUMENTS: dict[str, type] = {
-    "compare-maps": CompareMaps,
     "compare-paper": ComparePaper,
     "compare-peers": ComparePeers,
     "compare-recordings": CompareRecordings,

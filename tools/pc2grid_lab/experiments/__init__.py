@@ -1,7 +1,6 @@
 """Experiments that measure how good the program is.
 
 The paper's experiment: `paper_experiment`, with `noise`, `paper_tables`, `paper_task`. Real recordings:
-`recordings`. Relocalization across sensors: `sensor_matrix`, with `registered_session`, `sensor_map`,
-`judgement`, `trial`, `metrics`, `ablation`. Maps compared with the truth: `map_quality`, with
-`slam_relations`, `trajectory_error`, `true_floor`.
+`recordings`, with `slam_relations`, `trajectory_error`. Relocalization across sensors: `sensor_matrix`, with
+`registered_session`, `sensor_map`, `judgement`, `trial`, `metrics`, `ablation`.
 """
