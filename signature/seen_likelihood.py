@@ -124,11 +124,11 @@ class SeenStatistics:
     def load(path: Path = _FILE) -> SeenStatistics:
         """Read what `save` has written; by default the statistics that come with the program.
 
-        `pc2grid compare signatures office:1 fr079.yaml intel.yaml --fit simulated.npz` has made a fifth of
+        `python -m pc2grid_lab.fit.simulated FOLDER office:1 fr079.yaml intel.yaml` has made a fifth of
         the variation within one place: 18 simulated sessions in each of these plans, 6 each by lidar, laser
         and depth camera, after 1, 3 and 8 m of travel, in the maps of all three sensors, with 30 pieces of
         clutter and a fifth of the doors and of the furniture changed in each session. All else is of the real
-        logs of fr079, intel, csail and killian, by `pc2grid_lab.bench.fit_signatures`.
+        logs of fr079, intel, csail and killian, by `pc2grid_lab.fit.signatures`.
         """
         with np.load(path, allow_pickle=False) as file:
             return SeenStatistics(**{name: file[name].astype(np.float64) for name in file.files})

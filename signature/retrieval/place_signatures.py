@@ -83,7 +83,7 @@ class PlaceSignatures:
 
 @functools.cache
 def place_statistics() -> SeenStatistics:
-    """The statistics that come with the program, by `pc2grid_lab.bench.fit_signatures` of real logs."""
+    """The statistics that come with the program, by `pc2grid_lab.fit.signatures` of real logs."""
     return SeenStatistics.load(_FILE)
 
 

@@ -274,7 +274,7 @@ def test_closed_pipe_is_quiet(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "command",
     ["", "demo", "simulate", "info", "convert", "relocalize", "compare", "compare paper",
-     "compare sensors", "compare signatures", "export", "db", "db info",
+     "compare sensors", "compare recordings", "export", "db", "db info",
      "db check", "db merge", "db copy", "config", "config dump"],
 )  # fmt: skip
 def test_every_command_explains_itself(tmp_path: Path, command: str) -> None:

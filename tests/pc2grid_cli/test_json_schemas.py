@@ -87,7 +87,6 @@ def test_every_document_is_validated_by_a_test() -> None:
         "compare-peers": "pc2grid_lab/experiments/test_peers.py",
         "compare-recordings": "pc2grid_lab/compare/test_recordings.py",
         "compare-sensors": "pc2grid_lab/experiments/test_sensor_matrix.py",
-        "compare-signatures": "pc2grid_lab/experiments/test_selection.py",
         "watch": "pc2grid_cli/test_watch.py",
         "watch-check": "pc2grid_cli/test_known_pose.py",
     }

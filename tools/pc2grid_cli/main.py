@@ -49,10 +49,6 @@ COMPARE = {
         "Real recordings as maps, located in each other; and what changed.",
     ),
     "sensors": ("pc2grid_lab.compare.sensors:compare_sensors_command", "Each sensor in the maps of each."),
-    "signatures": (
-        "pc2grid_lab.compare.signatures:compare_signatures_command",
-        "What each signature contributes, beside chance.",
-    ),
     "peers": (
         "pc2grid_lab.compare.peers:compare_peers_command",
         "Other programs, the same maps and queries.",
@@ -100,7 +96,7 @@ def options(
 app.add_typer(
     typer.Typer(
         cls=group(COMPARE),
-        help="Measure: recordings, sensors, signatures, peers, the paper's tables.",
+        help="Measure: recordings, sensors, peers, the paper's tables.",
         no_args_is_help=True,
     ),
     name="compare",

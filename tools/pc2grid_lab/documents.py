@@ -94,64 +94,6 @@ class Ablation(TypedDict):
     recall: dict[str, dict[str, dict[str, float | None]]]
 
 
-class SelectionRow(TypedDict):
-    """One way to select places, in one building or a city of many, after travel_m metres.
-
-    found, right: share of the queries whose place is selected, and that are located rightly, each with its
-    5th and 95th percentile by session; right and wrong, the share located wrongly, are null if not tried.
-    places, looked_at: how many there are and how many are selected; processor_ms: median processor time
-    of the selection and the comparison of isovists.
-    """
-
-    scope: str
-    selector: str
-    travel_m: float
-    queries: int
-    sessions: int
-    places: int
-    looked_at: int
-    found: list[float]
-    right: list[float] | None
-    wrong: float | None
-    processor_ms: float
-
-
-class ScaleRow(TypedDict):
-    """Selection among very many places, by all signatures of what was seen: share of the queries whose place
-    is selected, with its 5th and 95th percentile by session, and median processor time of the selection."""
-
-    places: int
-    selector: str
-    share: float
-    travel_m: float
-    query_sensor: str
-    queries: int
-    found: list[float]
-    processor_ms: float
-
-
-class SeenApart(TypedDict):
-    """How well signatures of what was seen separate one place seen by two sensors from two places: area under
-    the curve, its 5th and 95th percentile, and pairs compared."""
-
-    auc: float
-    low: float
-    high: float
-    same: int
-    other: int
-
-
-class CompareSignatures(TypedDict):
-    """`pc2grid compare signatures --json`, and its signatures.json."""
-
-    schema_version: Version
-    plans: list[str]
-    setting: dict[str, float]
-    rows: list[SelectionRow]
-    scale: list[ScaleRow]
-    independence: dict[str, SeenApart]
-
-
 class CompareSensors(TypedDict):
     """`pc2grid compare sensors --json`, and its matrix.json. outside_the_map: trials where the map has not
     been. change: by plan, what differs in a session from the plan, mean of some sessions."""
@@ -174,7 +116,6 @@ DOCUMENTS: dict[str, type] = {
     "compare-peers": ComparePeers,
     "compare-recordings": CompareRecordings,
     "compare-sensors": CompareSensors,
-    "compare-signatures": CompareSignatures,
     "simulate": Simulate,
 }
 """By command."""

@@ -36,15 +36,20 @@ def compare_sensors_command(
         typer.Argument(help="Floor plans: MAP.yaml files; of several, each query is also sought in another."),
     ],
     out: options.OutputFolder = Path("sensor-matrix"),
-    queries: options.QuerySessions = 10,
-    map_length: options.MapLength = 200.0,
-    clutter: options.Clutter = 30,
-    change: options.Change = 0.0,
-    rate: options.Rate = 10.0,
+    queries: Annotated[int, typer.Option("--queries", min=1, help="query sessions a plan and sensor")] = 10,
+    map_length: Annotated[float, typer.Option("--map-length", help="metres driven to make a map")] = 200.0,
+    clutter: Annotated[
+        int, typer.Option("--clutter", help="things in the way, different in each session")
+    ] = 30,
+    change: Annotated[
+        float,
+        typer.Option("--change", min=0, max=1, help="share of doors and furniture that differ, by session"),
+    ] = 0.0,
+    rate: Annotated[float, typer.Option("--rate", help="scans a second, of every sensor")] = 10.0,
     travel: Annotated[
         float, typer.Option("--travel", min=1.0, help="Metres that a query drives at most.")
     ] = 15.0,
-    seed: options.FirstSeed = 1,
+    seed: Annotated[int, typer.Option("--seed", help="of the first query session")] = 1,
     jobs: options.Jobs = None,
     as_json: options.AsJson = False,
 ) -> None:

@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from pc2grid.arrays import F32, F64
+from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
-from pc2grid.submaps.isovist import look_around
 from pc2grid.submaps.partition import view_at
 from pc2grid_lab.experiments.calibration import area
 from pc2grid_lab.experiments.metrics import recall
@@ -28,10 +27,6 @@ from signature.config import SignatureConfig
 from signature.describe import Signature, describe
 from signature.localization.query import QueryMap
 from signature.retrieval.viewpoints import Places
-from signature.seen import seen_signatures
-from signature.seen_likelihood import COMBINATIONS as SEEN_COMBINATIONS
-from signature.seen_likelihood import SeenStatistics, seen_weights
-from signature.seen_places import PROFILE_BEARINGS
 from signature.similarity import SignatureTable, histogram_distance, structural_factor
 
 PARTS = ("boundary", "freespace", "symmetry")
@@ -147,77 +142,6 @@ def _append(
 ) -> None:
     for name, distance in distances.items():
         found[name].append(distance[chosen])
-
-
-def seen_independence(
-    buildings: Sequence[Sequence[SensorMap]], *, draws: int = 100, seed: int = 0
-) -> dict[str, tuple[float, float, float, int, int]]:
-    """As `independence`, by the signatures of what was seen: for each combination of them.
-
-    The area under the curve, its 5th and 95th percentile when pairs are drawn anew (bootstrap; by place,
-    since all pairs of a place depend on each other), and the numbers of pairs at one place and at two.
-    """
-    same, other = _seen_pairs(buildings)
-    rng = np.random.default_rng(seed)
-    statistics = SeenStatistics.load()
-    found = {}
-    for names in reversed(SEEN_COMBINATIONS):
-        weights, spread = seen_weights(*names), statistics.spread(names)
-        one, two = (
-            -spread.log_ratio(
-                ((weights.of_places(a) - weights.of_places(b)) ** 2).sum(axis=1), 2.0 - a[:, -1] - b[:, -1]
-            )
-            for a, b, _ in (same, other)
-        )
-        measured = Independence(combination="+".join(names), same=one, other=two)
-        places, first = np.unique(same[2], return_inverse=True)
-        order = np.argsort(first, kind="stable")
-        starts = np.searchsorted(first[order], np.arange(len(places) + 1))
-        drawn = []
-        few = two[rng.integers(0, len(two), min(len(two), 20_000))] if len(two) else two
-        for _ in range(draws if len(places) else 0):
-            chosen = rng.integers(0, len(places), len(places))
-            rows = np.concatenate([order[starts[k] : starts[k + 1]] for k in chosen])
-            drawn.append(replace(measured, same=one[rows], other=few).auc)
-        low, high = np.percentile(drawn, (5.0, 95.0)).tolist() if drawn else (float("nan"),) * 2
-        found[measured.combination] = (measured.auc, low, high, len(one), len(two))
-    return found
-
-
-Rows = tuple[F32, F32, NDArray[np.int64]]
-"""Pairs of descriptions (P, K), and the number of the place of each pair (P,)."""
-
-
-def _seen_pairs(buildings: Sequence[Sequence[SensorMap]]) -> tuple[Rows, Rows]:
-    """What was seen of one place by two sensors, and of two places of one map that are far apart."""
-    same: list[Rows] = []
-    other: list[Rows] = []
-    first = 0
-    for maps in buildings:
-        for one in maps:
-            places = one.index.places
-            centers = places.table.center_m
-            mine = _described(one, centers)
-            a, b = np.nonzero(cdist(centers, centers) >= FAR_M)
-            other.append((mine[a], mine[b], first + a))
-            for two in maps:
-                if two is one:
-                    continue
-                T_two_one = two.T_plan_map.inverse() @ one.T_plan_map
-                there = T_two_one.apply(centers)
-                free = np.array([_is_free(two.index.grids[0], point) for point in there], bool)
-                same.append((mine[free], _described(two, there[free]), first + np.flatnonzero(free)))
-            first += len(centers)
-    return tuple(
-        tuple(np.concatenate(column) for column in zip(*rows, strict=True)) for rows in (same, other)
-    )  # type: ignore[return-value]
-
-
-def _described(sensor_map: SensorMap, points_m: F64) -> F32:
-    """The signatures (N, C) of what is seen from points of a map."""
-    sight_m = sensor_map.index.places.sight_m
-    seen = look_around(sensor_map.index.grids[0], points_m, sight_m, bearings=PROFILE_BEARINGS)
-    return seen_signatures(*seen, sight_m)
 
 
 def _is_free(grid: OccupancyGrid, point_m: F64) -> bool:

@@ -1,10 +1,10 @@
 """Do the signatures find the place? Real logs, beside a shortlist drawn at random and none at all.
 
-    python -m pc2grid_lab.bench.real_retrieval DATA FOLDER [--logs csail,...] [--floors 24] [--locate]
+    python -m pc2grid_lab.fit.retrieval DATA FOLDER [--logs csail,...] [--floors 24] [--locate]
 
 The map of a building is that of the first part of its log at true poses, the queries are later parts after
 1, 3 and 8 m. The other places are of office floors. FOLDER holds `without_NAME.npz` and
-`without_NAME.places.npz` for each log: statistics that `fit_signatures` has learned without this building.
+`without_NAME.places.npz` for each log: statistics that `signatures` has learned without this building.
 For each selector, printed is the share of queries of which a right place is selected among 0.64 % and 5 % (at
 least 50) of the places.
 
@@ -27,10 +27,10 @@ from scipy.spatial.distance import cdist
 
 from pc2grid.arrays import I64
 from pc2grid.geometry import SE2, wrap_angle
-from pc2grid_lab.bench.fit_signatures import queries_with_truth
-from pc2grid_lab.bench.real_queries import MAPPED_S, Drawn, index_of, read
-from pc2grid_lab.experiments.selection import TRAVELS_M, office_floor, shuffled
 from pc2grid_lab.experiments.trial import JUDGEMENT
+from pc2grid_lab.fit.queries import TRAVELS_M, office_floor
+from pc2grid_lab.fit.real_queries import MAPPED_S, Drawn, index_of, read
+from pc2grid_lab.fit.signatures import queries_with_truth
 from signature.config import Config
 from signature.localization.decision import judge
 from signature.localization.map_index import MapIndex
@@ -106,6 +106,12 @@ class Building:
         if among is not None and selector in (SHUFFLED, ANY_LOOK):
             among = rng.permutation(among)
         return self.indexes[selector].select(query.views, most, among)
+
+
+def shuffled(index: PlaceIndex, rng: np.random.Generator) -> PlaceIndex:
+    """The same viewpoints, each with the signatures of another one: all but they is the same."""
+    order = rng.permutation(len(index))
+    return replace(index, vectors=index.vectors[order], hidden=index.hidden[order])
 
 
 def right_places(query: QueryMap, T_map_query: SE2, places: SignatureTable) -> I64:

@@ -5,10 +5,10 @@ the decision is measured, not mapping. Later parts of every log, registered as a
 Each is asked in its own map once more with all that it sees there made unknown ("blanked"): a place that the
 map lacks, in a building that it knows.
 
-    python -m pc2grid_lab.bench.real_queries DATA OUT.json [--logs fr079,intel] [--queries 24]
+    python -m pc2grid_lab.fit.real_queries DATA OUT.json [--logs fr079,intel] [--queries 24]
 
 DATA holds `laser/NAME.mcap` and `laser/NAME_corrected.tum`; the registered queries are kept beside OUT.
-`real_answers` counts what is answered, `fit_posterior` fits the posterior.
+`real_answers` counts what is answered, `posterior` fits the posterior.
 """
 
 from __future__ import annotations

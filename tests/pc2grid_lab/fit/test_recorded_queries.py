@@ -3,9 +3,9 @@
 import math
 
 from pc2grid.time_span import TimeSpan
-from pc2grid_lab.bench.fit_posterior import of_rows
-from pc2grid_lab.bench.recorded_queries import Window, rows
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue
+from pc2grid_lab.fit.posterior import of_rows
+from pc2grid_lab.fit.recorded_queries import Window, rows
 from signature.config import Config
 from signature.localization.query import Query
 from tests.helpers.simulated_drives import building, drive, office, plan

@@ -1,7 +1,7 @@
 """Counts the answers to real laser logs in maps of their own earlier part, or of other buildings.
 
-    python -m pc2grid_lab.bench.real_answers DATA FOLDER [--logs fr079,intel] [--queries 24]
-    python -m pc2grid_lab.bench.real_answers DATA FOLDER --elsewhere [--logs fr079,intel] [--queries 24]
+    python -m pc2grid_lab.fit.real_answers DATA FOLDER [--logs fr079,intel] [--queries 24]
+    python -m pc2grid_lab.fit.real_answers DATA FOLDER --elsewhere [--logs fr079,intel] [--queries 24]
 
 The experiment of `real_queries`, but asked as a user asks: standing (six scans), after 3 m and
 after 10 m. A query is covered if half of its last scan lies within 0.2 m of a wall of the map at its true
@@ -18,9 +18,9 @@ import numpy as np
 
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.model import OccupancyGrid
-from pc2grid_lab.bench.real_queries import STANDING_SCANS, parser_of, read_all
 from pc2grid_lab.experiments.answers import localize, share_known
 from pc2grid_lab.experiments.registered_session import RegisteredSession
+from pc2grid_lab.fit.real_queries import STANDING_SCANS, parser_of, read_all
 from pc2grid_lab.peers.site import is_covered
 from signature.localization.answer import Answer
 from signature.localization.map_index import MapIndex

@@ -1,11 +1,11 @@
 """The windows of `pc2grid compare recordings`, asked once more: what tells for each place that is found.
 
-    python -m pc2grid_lab.bench.recorded_queries DATA WORK OUT.json [--everywhere]
+    python -m pc2grid_lab.fit.recorded_queries DATA WORK OUT.json [--everywhere]
 
 DATA is the folder of recordings, WORK the one in which `compare recordings` has kept its maps and answers.
 Each window is asked in its map and in that of another building, with --everywhere in those of seven or eight;
 where the map knows its place, also with all that it sees there made unknown ("blanked"), and standing, by its
-last scan alone. `fit_posterior` fits the posterior to them; the rows are those of `real_queries`.
+last scan alone. `posterior` fits the posterior to them; the rows are those of `real_queries`.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from pc2grid.io import open_log
 from pc2grid.model import OccupancyGrid
 from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
-from pc2grid_lab.bench.real_queries import evidence_list
 from pc2grid_lab.experiments.answers import unseen_by
 from pc2grid_lab.experiments.frames import apart
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair
 from pc2grid_lab.experiments.recordings.drive import config_of
 from pc2grid_lab.experiments.recordings.judging import Judge
 from pc2grid_lab.experiments.recordings.run import Folder
+from pc2grid_lab.fit.real_queries import evidence_list
 from signature.config import Config
 from signature.database import SubmapDatabase, open_database
 from signature.localization.map_index import MapIndex

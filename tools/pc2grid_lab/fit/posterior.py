@@ -1,6 +1,6 @@
 """Fits the posterior to queries whose truth is known, and judges it on buildings that were left out.
 
-    python -m pc2grid_lab.bench.fit_posterior EVIDENCE.json ...
+    python -m pc2grid_lab.fit.posterior EVIDENCE.json ...
 
 Each file is one that `real_queries` or `recorded_queries` has written, or one of the folder trials/ of
 `pc2grid compare sensors`. An answer is judged by a fit without all answers whose query or map is of one of

@@ -1,4 +1,4 @@
-"""`pc2grid_lab.bench.fit_posterior`, run as its users run it, on made answers whose model is known."""
+"""`pc2grid_lab.fit.posterior`, run as its users run it, on made answers whose model is known."""
 
 import json
 import os
@@ -13,7 +13,7 @@ import numpy as np
 
 from signature.localization.posterior import POSTERIOR, Evidence, masses
 
-SCRIPT = Path(__file__).parents[2] / "tools" / "pc2grid_lab" / "bench" / "fit_posterior.py"
+SCRIPT = Path(__file__).parents[3] / "tools" / "pc2grid_lab" / "fit" / "posterior.py"
 TRUTH = replace(POSTERIOR, bias=-4.0, fit=2.0, lead=4.0)
 
 

@@ -1,18 +1,18 @@
 """Learn the weights of the signatures from real logs besides simulated sessions.
 
 Walls that are drawn from real scans vary more than simulated ones, and real buildings are less alike than
-simulated floors. Of the statistics that `pc2grid compare signatures ... --fit SIMULATED.npz` has learned,
-by all three sensors, a fifth of the variation within one place is kept; the rest, the variation between
-places and the means are those of real logs. Pairs are views of later parts of a log, and the same points of
-a map of its first part; other places are those of the other logs' maps, of drawn maps, and of office floors.
+simulated floors. Of the statistics that `simulated` has learned, by all three sensors, a fifth of the
+variation within one place is kept; the rest, the variation between places and the means are those of real
+logs. Pairs are views of later parts of a log, and the same points of a map of its first part; other
+places are those of the other logs' maps, of drawn maps, and of office floors.
 
-    python -m pc2grid_lab.bench.fit_signatures DATA SIMULATED.npz OUT.npz [--without csail] [--maps aces,...]
+    python -m pc2grid_lab.fit.signatures DATA SIMULATED.npz OUT.npz [--without csail] [--maps aces,...]
 
 The weights of the signatures of places, by which the first look is taken, are learned from the same logs, and
 from the place of the map that is nearest to each view; they are written to OUT.places.npz.
 
 DATA is as of `real_queries`; with `maps/NAME.yaml`, maps of buildings without queries. The building that is
-to be judged is left out by --without; `real_retrieval` judges.
+to be judged is left out by --without; `retrieval` judges.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from scipy.spatial import cKDTree
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import OccupancyGrid
-from pc2grid_lab.bench.real_queries import MAPPED_S, Drawn, index_of, read
 from pc2grid_lab.experiments.registered_session import RegisteredSession
-from pc2grid_lab.experiments.seen_pairs import pairs_of
-from pc2grid_lab.experiments.selection import TRAVELS_M, office_floor, queries_of
 from pc2grid_lab.experiments.sensor_map import SensorMap
 from pc2grid_lab.experiments.trial import JUDGEMENT
+from pc2grid_lab.fit.queries import TRAVELS_M, office_floor, queries_of
+from pc2grid_lab.fit.real_queries import MAPPED_S, Drawn, index_of, read
+from pc2grid_lab.fit.seen_pairs import pairs_of
 from signature.boundary import boundary_bins
 from signature.config import Config
 from signature.freespace import freespace_bins
