@@ -124,7 +124,9 @@ def run_all(
     waiting = [(folder, r) for r in read.values() if not folder.source(r).exists()]
     in_processes(_make, waiting, jobs=jobs, advance=lambda share: None)
     tasks = [_convert(folder, name, recording, until_s) for name, (recording, until_s) in maps.items()]
-    lidars = [r for r in catalogue.mapped if r.sensor == "lidar" and not folder.missing(r)]
+    lidars = [
+        r for r in catalogue.mapped if r.sensor == "lidar" and r.drive is None and not folder.missing(r)
+    ]
     tasks += [_bare(folder, recording) for recording in lidars]
     windows = sum(pair.windows for pair in pairs)
     for done in _run(tasks, jobs):
