@@ -19,7 +19,7 @@ from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.local_maps import CAMERA_LOCAL_MAPS, LOCAL_MAPS
 from pc2grid.mapping.loop_closure import LoopCloser
 from pc2grid.mapping.loop_parameters import EXACT_TRACKING, LOOPS
-from pc2grid.mapping.part_maps import PartMap, draw_parts, long_enough, with_points
+from pc2grid.mapping.part_maps import PartMap, draw_parts, long_enough
 from pc2grid.mapping.report import (
     HELD_SCANS,
     check_followed,
@@ -294,21 +294,18 @@ def _map(
             local_map_parameters=CAMERA_LOCAL_MAPS if narrow else LOCAL_MAPS,
         )
         scans = chain(beginning.scans, rest)
-        track = _track(scans, _tracker(config), keyframes, closer, points, observer)
+        track = _track(scans, _tracker(config), closer, points, observer)
         track = dataclasses.replace(track, left_out=beginning.left_out, warning=beginning.warning)
         closed = closer.finish()
         if whole:
             closed = closed.undivided()
-        parts = draw_parts(keyframes, track, closed, projection)
-        if points is not None:
-            parts = with_points(parts, track, closed, points)
+        parts = draw_parts(keyframes, track, closed, projection, points)
     return parts, track
 
 
 def _track(
     scans: Iterable[Scan],
     tracker: Tracker,
-    keyframes: Keyframes,
     closer: LoopCloser,
     points: KeyframePoints | None,
     observer: Observer,
@@ -320,11 +317,9 @@ def _track(
         registered = tracked.registered
         if tracked.keyframe:
             pose = SE2.from_matrix(registered.T_session_base)
-            keyframe = Keyframe(len(record), tracked.planar_scan, pose, tracked.restart)
-            keyframes.append(keyframe)
-            closer.extend(keyframe)
+            closer.add(Keyframe(len(record), tracked.planar_scan, pose, tracked.restart))
             if points is not None and not SENSOR_MODELS[scan.sensor].planar:
-                points.append(keyframe.index, registered.scan)
+                points.append(len(record), registered.scan)
         record.append(scan, tracked)
         observer.on_scan(registered)
     return record.track(tracker)

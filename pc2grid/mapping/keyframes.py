@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pc2grid.arrays import F64
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
 from pc2grid.errors import OutputError
@@ -19,9 +20,8 @@ from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid
 
 IN_MEMORY_BYTES = 32 << 20  # chosen by hand: about an hour of a 2D laser
-# index, stamp, restart; T_session_base; origin of the sensor and height of its plane (NaN: none); hits,
-# bearings, low things and heights
-_HEADER = struct.Struct("<qqq 3d 3d 4q")
+# stamp; origin of the sensor and height of its plane (NaN: none); hits, bearings, low things and heights
+_HEADER = struct.Struct("<q 3d 4q")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +41,19 @@ class Keyframe:
 class Keyframes:
     """The keyframes of a session, a sequence that only grows.
 
-    If they exceed `in_memory_bytes`, they are written to a temporary file without a name: memory does not
-    grow with the length of the session, and a killed process leaves no file behind.
+    If their planar scans exceed `in_memory_bytes`, they are written to a temporary file without a name:
+    memory does not grow with the length of the session, and a killed process leaves no file behind.
+
+    scans : (K,) number of the scan of each. restarts : those whose pose relative to the one before is not
+    known.
     """
 
     def __init__(self, in_memory_bytes: int = IN_MEMORY_BYTES) -> None:
         self._file = tempfile.SpooledTemporaryFile(max_size=in_memory_bytes)  # noqa: SIM115
         self._starts = array("q", [0])
+        self.scans = array("q")
+        self.restarts: set[int] = set()
+        self._poses = array("d")  # x, y, yaw of one after the other
 
     def __len__(self) -> int:
         return len(self._starts) - 1
@@ -59,12 +65,12 @@ class Keyframes:
         start, end = self._starts[number], self._starts[number + 1]
         self._file.seek(start)
         data = self._file.read(end - start)
-        index, stamp_ns, restart, x, y, yaw, *origin, hits, bearings, low, _ = _HEADER.unpack_from(data)
+        stamp_ns, *origin, hits, bearings, low, _ = _HEADER.unpack_from(data)
         values = np.frombuffer(data, np.float32, offset=_HEADER.size)
         ends = np.cumsum((2 * hits, hits, bearings, 2 * low))
         hits_m, normal_rad, free_m, low_m, seen_at = np.split(values, ends)
         return Keyframe(
-            index,
+            self.scans[number],
             PlanarScan(
                 stamp_ns=stamp_ns,
                 hits_m=hits_m.reshape(-1, 2),
@@ -75,18 +81,15 @@ class Keyframes:
                 height_m=None if math.isnan(origin[2]) else origin[2],
                 heights=seen_at.astype(np.uint8),
             ),
-            SE2(x, y, yaw),
-            bool(restart),
+            self.pose(number),
+            number in self.restarts,
         )
 
     def append(self, keyframe: Keyframe) -> None:
         """Add one. Raises OutputError if the disk is full."""
         planar_scan, pose = keyframe.planar_scan, keyframe.T_session_base
         header = _HEADER.pack(
-            keyframe.index,
             planar_scan.stamp_ns,
-            keyframe.restart,
-            *(pose.x, pose.y, pose.yaw),
             *planar_scan.origin_m,
             math.nan if planar_scan.height_m is None else planar_scan.height_m,
             *(
@@ -108,7 +111,19 @@ class Keyframes:
                 f"{tempfile.gettempdir()}: no room for the scans of the map: {error.strerror}",
                 hint="set TMPDIR to a folder on a larger disk",
             ) from error
+        if keyframe.restart:
+            self.restarts.add(len(self))
         self._starts.append(self._starts[-1] + len(data))
+        self.scans.append(keyframe.index)
+        self._poses.extend((pose.x, pose.y, pose.yaw))
+
+    def poses(self) -> F64:
+        """T_session_base of all as tracked, (K, 3): x, y, yaw."""
+        return np.array(self._poses).reshape(-1, 3)
+
+    def pose(self, number: int) -> SE2:
+        """T_session_base of one as tracked."""
+        return SE2(*self._poses[3 * number : 3 * number + 3])
 
     def close(self) -> None:
         """Delete the file."""

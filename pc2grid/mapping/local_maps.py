@@ -188,5 +188,5 @@ class LocalMaps:
     def keyframes(self, numbers: range, anchor: int) -> tuple[list[Keyframe], list[SE2]]:
         """Keyframes, and their poses T_anchor_base in the frame of the keyframe `anchor`."""
         keyframes = [self._keyframes[k] for k in numbers]
-        T_anchor_session = self._keyframes[anchor].T_session_base.inverse()
+        T_anchor_session = self._keyframes.pose(anchor).inverse()
         return keyframes, [T_anchor_session @ keyframe.T_session_base for keyframe in keyframes]

@@ -35,14 +35,13 @@ from pc2grid.mapping.pose_graph import Edge, Solution
 from pc2grid.mapping.session_graph import SessionGraph
 from pc2grid.mapping.settled import SettledKeyframes, interpolate_corrections
 from pc2grid.mapping.stretches import Stretches
-from pc2grid.mapping.tracked_keyframes import TrackedKeyframes
 from pc2grid.model import Loop
 
 
 class LoopCloser:
-    """Closes loops while a session is recorded; of a keyframe it keeps only the pose.
+    """Closes loops while a session is recorded.
 
-    keyframes : of the session; local maps are drawn from them when needed.
+    keyframes : gets those of the session; local maps are drawn from them when needed.
     recognizer : asked for every stretch of travel; None: loops are searched near the tracked pose only.
     projection : how the grids for the recognizer are drawn; None: the defaults.
     """
@@ -60,7 +59,7 @@ class LoopCloser:
     ) -> None:
         self._parameters = parameters
         self._part_parameters = part_parameters
-        self._keyframes = TrackedKeyframes()
+        self._keyframes = keyframes
         self._local_maps = LocalMaps(keyframes, local_map_parameters)
         self._verification = LoopVerification(self._local_maps, parameters)
         self._graph = SessionGraph(parameters)
@@ -77,10 +76,10 @@ class LoopCloser:
         self._travelled_m = array("d")  # at each local map; a lost part counts as `lost_m`
         self._drift_m = 0.0  # travel since the pose was last certain
 
-    def extend(self, keyframe: Keyframe) -> None:
-        """Take the keyframe that was appended last; every few metres this completes a local map."""
+    def add(self, keyframe: Keyframe) -> None:
+        """Keep the next keyframe; every few metres this completes a local map."""
         if len(self._keyframes):
-            step = self._keyframes.last_pose().inverse() @ keyframe.T_session_base
+            step = self._keyframes.pose(len(self._keyframes) - 1).inverse() @ keyframe.T_session_base
             self._travel_m += math.hypot(step.x, step.y) + self._parameters.turn_m_per_rad * abs(step.yaw)
             if self._travel_m > self._parameters.travel_m or keyframe.restart:
                 self._complete_local_map()

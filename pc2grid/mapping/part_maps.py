@@ -39,8 +39,12 @@ def draw_parts(
     track: Track,
     closed: SettledKeyframes,
     projection: ProjectionConfig,
+    points: KeyframePoints | None = None,
 ) -> list[PartMap]:
-    """The map of each part of a session in a frame of its own, compared with its scans."""
+    """The map of each part of a session in a frame of its own, compared with its scans.
+
+    points : in space, of the keyframes; None: the maps have none.
+    """
     tracked = track.trajectory
     part, T_part_base = _settled(tracked, closed)
     everywhere = dataclasses.replace(tracked, T_session_base=T_part_base)
@@ -65,20 +69,10 @@ def draw_parts(
                 precision=precision_of(
                     trajectory, np.searchsorted(scans, anchor_scans), closed.sigma_m[anchored]
                 ),
+                points=None if points is None else points.registered(T_part_base, part == number),
             )
         )
     return drawn
-
-
-def with_points(
-    parts: Sequence[PartMap], track: Track, closed: SettledKeyframes, points: KeyframePoints
-) -> list[PartMap]:
-    """The maps with the points in space of their keyframes."""
-    part, T_part_base = _settled(track.trajectory, closed)
-    return [
-        dataclasses.replace(mapped, points=points.registered(T_part_base, part == number))
-        for number, mapped in enumerate(parts)
-    ]
 
 
 def long_enough(parts: Sequence[PartMap]) -> list[PartMap]:

@@ -12,12 +12,11 @@ import numpy as np
 
 from pc2grid.config import ProjectionConfig
 from pc2grid.geometry import SE2
-from pc2grid.mapping.keyframes import grid_of
+from pc2grid.mapping.keyframes import Keyframes, grid_of
 from pc2grid.mapping.local_maps import LocalMaps, pose_at
 from pc2grid.mapping.loop_candidates import Candidate, LoopCandidates
 from pc2grid.mapping.loop_parameters import LoopParameters
 from pc2grid.mapping.place_recognition import PlaceRecognizer, Stretch
-from pc2grid.mapping.tracked_keyframes import TrackedKeyframes
 
 
 class Stretches:
@@ -30,7 +29,7 @@ class Stretches:
     def __init__(
         self,
         local_maps: LocalMaps,
-        keyframes: TrackedKeyframes,
+        keyframes: Keyframes,
         candidates: LoopCandidates,
         parameters: LoopParameters,
         recognizer: PlaceRecognizer | None,

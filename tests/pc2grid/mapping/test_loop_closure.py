@@ -129,11 +129,9 @@ def closed(
     poses: list[SE2], planar_scans: list[PlanarScan], restart: int | None = None, **options: Any
 ) -> tuple[F64, SettledKeyframes]:
     """Settled poses of all keyframes, and the result of loop closure."""
-    keyframes = Keyframes()
-    closer = LoopCloser(keyframes, **options)
+    closer = LoopCloser(Keyframes(), **options)
     for k, (pose, planar_scan) in enumerate(zip(poses, planar_scans, strict=True)):
-        keyframes.append(Keyframe(k, planar_scan, pose, restart=k == restart))
-        closer.extend(keyframes[k])
+        closer.add(Keyframe(k, planar_scan, pose, restart=k == restart))
     found = closer.finish()
     return interpolate_corrections(array(poses), found.scans, found.poses), found
 

@@ -49,13 +49,13 @@ def on_one_floor(trajectory: Trajectory) -> Track:
 
 def keyframes_of(
     blunder: SE2 | None = None, *, lost: bool = False
-) -> tuple[Keyframes, Trajectory, list[SE2]]:
+) -> tuple[list[Keyframe], Trajectory, list[SE2]]:
     """Keyframes of laps through the office, with the true poses.
 
     blunder : the tracked pose of the second lap is wrong by this from its first scan on. lost : tracking says
         so, because it started again there.
     """
-    keyframes, stamps, poses, truths = Keyframes(), [], [], []
+    keyframes, stamps, poses, truths = [], [], [], []
     wrong, middle = SE2(), begin_of_second_lap()
     for registered, planar_scan, truth in two_laps():
         begins = len(poses) == middle
@@ -84,14 +84,14 @@ def begin_of_second_lap() -> int:
 
 
 def mapped(
-    keyframes: Keyframes, trajectory: Trajectory, parameters: LoopParameters
+    keyframes: list[Keyframe], trajectory: Trajectory, parameters: LoopParameters
 ) -> tuple[SettledKeyframes, list[PartMap]]:
-    closer = LoopCloser(keyframes, parameters=parameters)
-    # The closer compares with older keyframes, so all may be there from the beginning.
+    kept = Keyframes()
+    closer = LoopCloser(kept, parameters=parameters)
     for keyframe in keyframes:
-        closer.extend(keyframe)
+        closer.add(keyframe)
     closed = closer.finish()
-    return closed, draw_parts(keyframes, on_one_floor(trajectory), closed, ProjectionConfig())
+    return closed, draw_parts(kept, on_one_floor(trajectory), closed, ProjectionConfig())
 
 
 def wrong_m(part: PartMap, truths: list[SE2], first: int = 0) -> float:

@@ -111,11 +111,9 @@ def closed(seed: int) -> tuple[int, int, int]:
     rng = np.random.default_rng(seed)
     walls, truth = equal_corridors(), driven(rng)
     poses = tracked(truth, rng)
-    keyframes = Keyframes()
-    closer = LoopCloser(keyframes, recognizer=SessionRecognizer(Config()))
+    closer = LoopCloser(Keyframes(), recognizer=SessionRecognizer(Config()))
     for k, (pose, true) in enumerate(zip(poses, truth, strict=True)):
-        keyframes.append(Keyframe(k, scan_at(true, walls, rng), pose))
-        closer.extend(keyframes[k])
+        closer.add(Keyframe(k, scan_at(true, walls, rng), pose))
     accepted = [loop for loop in closer.finish().loops if loop.accepted]
     false = again = 0
     for loop in accepted:
