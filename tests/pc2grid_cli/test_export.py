@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import subprocess
@@ -19,7 +18,6 @@ from pc2grid.config import ReadConfig
 from pc2grid.errors import OutputError, Pc2GridError
 from pc2grid.io.building_file import building_points
 from pc2grid.io.export.cloud import write_cloud
-from pc2grid.io.export.graphml import write_graph
 from pc2grid.io.trajectory import read_kitti, read_tum, write_tum
 from pc2grid.model import Trajectory
 from pc2grid.submaps.junction_graph import junction_graph
@@ -111,20 +109,15 @@ def test_walls_as_points(database: Path, tmp_path: Path, suffix: str) -> None:
     assert not points[:, 2].any()
 
 
-def test_ways_as_graphs(database: Path, tmp_path: Path) -> None:
+def test_ways_as_a_graph(database: Path, tmp_path: Path) -> None:
     export(database, "--graph", tmp_path / "w.graphml")
-    export(database, "--graph", tmp_path / "w.json")
     wanted = junction_graph(office(), Config().partition)
-    document = json.loads((tmp_path / "w.json").read_text())
-    for graph in (
-        nx.read_graphml(tmp_path / "w.graphml", node_type=int),
-        nx.node_link_graph(document, edges="edges"),
-    ):
-        assert nx.utils.edges_equal(graph.edges, wanted.edges)
-        for node, about in wanted.nodes(data=True):
-            assert (graph.nodes[node]["x_m"], graph.nodes[node]["y_m"]) == about["center_m"]
-            assert graph.nodes[node]["kind"] == about["kind"]
-        assert all(graph.edges[e]["length_m"] == wanted.edges[e]["length_m"] for e in wanted.edges)
+    graph = nx.read_graphml(tmp_path / "w.graphml", node_type=int)
+    assert nx.utils.edges_equal(graph.edges, wanted.edges)
+    for node, about in wanted.nodes(data=True):
+        assert (graph.nodes[node]["x_m"], graph.nodes[node]["y_m"]) == about["center_m"]
+        assert graph.nodes[node]["kind"] == about["kind"]
+    assert all(graph.edges[e]["length_m"] == wanted.edges[e]["length_m"] for e in wanted.edges)
 
 
 def read_g2o(path: Path) -> tuple[dict[int, np.ndarray], list[tuple[int, int, np.ndarray, np.ndarray]]]:
@@ -181,8 +174,6 @@ def test_gtsam_reads_the_pose_graph(database: Path, tmp_path: Path) -> None:
 def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"\.ply or \.pcd"):
         write_cloud(tmp_path / "x.las", np.zeros((1, 3)))
-    with pytest.raises(OutputError, match=r"\.graphml or \.json"):
-        write_graph(tmp_path / "x.dot", nx.Graph())
     assert list(tmp_path.iterdir()) == []
 
 

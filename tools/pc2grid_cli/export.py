@@ -95,7 +95,7 @@ def export_command(
     ] = None,
     graph: Annotated[
         Path | None,
-        typer.Option("--graph", metavar="OUT.graphml|.json", help="junctions, ends, and the ways between"),
+        typer.Option("--graph", metavar="OUT.graphml", help="junctions, ends, and the ways between"),
     ] = None,
     g2o: Annotated[
         Path | None, typer.Option("--g2o", metavar="OUT.g2o", help="the pose graph: steps and loops")

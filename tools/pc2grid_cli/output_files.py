@@ -12,7 +12,7 @@ SUFFIXES: dict[str, tuple[str, ...]] = {
     "trajectory": (".tum", ".kitti", ".txt"),
     "map": (".yaml", ".yml", ".pgm"),
     "cloud": (".ply", ".pcd"),
-    "graph": (".graphml", ".json"),
+    "graph": (".graphml",),
     "g2o": (".g2o",),
     "mcap": (".mcap",),
     "output": (".mcap",),
@@ -36,7 +36,7 @@ def check_file(option: str, path: Path | None, force: bool, *, any_suffix: bool 
     if path is None:
         return
     known, suffix = SUFFIXES[option], path.suffix.lower()
-    optional = option not in ("cloud", "graph")
+    optional = option != "cloud"
     if not any_suffix and suffix not in known and (suffix or not optional):
         raise OutputError(
             f"{path}: --{option} does not write the format {suffix or '(no suffix)'}",
