@@ -9,7 +9,6 @@ ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 # Hundreds of processes are started: without byte code, each compiles 200 modules, 0.4 s.
 BYTE_CODE = PYTHONDONTWRITEBYTECODE=
 PYTEST_ARGS ?=
-BENCH_ARGS ?=
 
 .PHONY: help demo test check bench real fuzz picture docs clean
 .DEFAULT_GOAL = help
@@ -18,7 +17,7 @@ help:
 	@echo 'make demo    simulate two robots, map with one, find the other; leaves a picture in demo_out/'
 	@echo 'make test    run the tests (PYTEST_ARGS="-k name" for some of them)'
 	@echo 'make check   lint, format, types, import order'
-	@echo 'make bench   measure against the goals (BENCH_ARGS="--only convert --quick" for some of it)'
+	@echo 'make bench   time and memory of describe, look up and convert'
 	@echo 'make real    every real recording, against examples/real.md (QUICK=1: some of them); data: PC2GRID_DATA'
 	@echo 'make fuzz    20,000 mutations of every kind of input; then kill -9 and crowds, 200 times and a minute'
 	@echo 'make picture list the modules by what they import, in CONTRIBUTING.md'
@@ -43,8 +42,7 @@ check: $(READY)
 	$(BIN)/lint-imports
 
 bench: $(READY)
-	$(BIN)/python -m pip install -q -c constraints.txt -e '.[bench,postgres]'
-	$(ONE_THREAD) $(BIN)/python -m pc2grid_lab.bench.run $(BENCH_ARGS)
+	$(ONE_THREAD) $(BIN)/python -m pc2grid_lab.bench.run
 
 # Real recordings, where there are any. A whole run replaces the table that the next run is compared with.
 REAL_DATA = $(or $(PC2GRID_DATA),../shared/data)

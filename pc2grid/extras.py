@@ -30,7 +30,6 @@ EXTRAS = {
     "cluster": Extra(("dask", "distributed"), ("dask", "distributed"), ClusterError),
     "live": Extra(("websockets",), ("websockets",), LiveError),
     "postgres": Extra(("psycopg",), ("'psycopg[binary]'",), DatabaseError),
-    "bench": Extra(("faiss",), ("faiss-cpu",)),
     "docs": Extra(("mkdocs", "material", "mkdocstrings"), ("mkdocs-material", "'mkdocstrings[python]'")),
 }
 _OF_ADDRESSES = {

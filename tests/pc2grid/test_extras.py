@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -127,24 +126,3 @@ def test_a_robot_is_not_waited_for_without_the_package(monkeypatch: pytest.Monke
     missing(monkeypatch, "live")
     with pytest.raises(LiveError, match="`live`"):
         open_live("ws://127.0.0.1:1")
-
-
-def test_the_benchmark_says_so_before_it_measures(tmp_path: Path) -> None:
-    """As `make bench` runs it."""
-    (tmp_path / "faiss.py").write_text("raise ImportError('no faiss here')")
-    arguments = [
-        "-m",
-        "pc2grid_lab.bench.run",
-        "--only",
-        "help",
-        "--only",
-        "retrieve",
-        "--out",
-        tmp_path / "r",
-    ]
-    environment = {"PYTHONPATH": f"{tmp_path}:{ROOT}:{ROOT / 'tools'}", "PATH": "/usr/bin:/bin"}
-    done = subprocess.run(
-        [sys.executable, *arguments], env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 2 and "pip install faiss-cpu" in done.stderr and "Traceback" not in done.stderr
-    assert not (tmp_path / "r").exists()

@@ -1,110 +1,93 @@
-"""Measure the program and compare the figures with the goals: `make bench`.
+"""Measure time and memory of the program: `make bench`.
 
-python -m pc2grid_lab.bench.run [--only NAME]... [--quick] [--out DIR]
-
-Machines differ and their load varies. Therefore the figures are medians of interleaved runs, and ratios where
-there is another program to compare with. The table is printed to stdout and written, with the machine and the
-versions, to DIR/bench.md and DIR/bench.json.
+A simulated lidar drives through an office, 10 m and 40 m far, and 8 m from another place. Printed are
+processor times, with one thread, and peak memory: of `pc2grid convert` of the first two, also over bare
+KISS-ICP; of describing a submap; and of a look-up of the third drive in the map of the second one. Those of
+real recordings are in `examples/real.md`.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import sys
+import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from pc2grid.errors import Pc2GridError
-from pc2grid.extras import require
-from pc2grid_lab.bench import (
-    large_database,
-    live,
-    locating,
-    points,
-    reading,
-    space,
-    submaps,
-)
-from pc2grid_lab.bench.measure import ROOT, Row, machine, table
+from pc2grid.io import open_log
+from pc2grid.pipeline import follow
+from pc2grid.simulate import SimulationConfig, simulate_session
+from pc2grid_lab.experiments.recordings.children import Finished, pc2grid, python_module
+from signature.database import SubmapDatabase, open_database
+from signature.describe import describe
+from signature.localization.localizer import Localizer
+from signature.localization.map_index import MapIndex
 
-Measure = Callable[[Path, bool], Iterator[Row]]
-
-
-def fleet_reading(folder: Path, quick: bool) -> Iterator[Row]:
-    """`fleet.fleet_reading`, imported only when it runs, because PostgreSQL's libraries are an extra."""
-    from pc2grid_lab.bench import fleet
-
-    yield from fleet.fleet_reading(folder, quick)
+Figure = tuple[str, float, str]
+"""What was measured, how much, and its unit."""
+_BARE = "pc2grid_lab.experiments.recordings.bare_kiss"
+_TIMES = 5
 
 
-MEASURES: dict[str, Measure] = {
-    "help": reading.help_time,
-    "info": reading.info_time,
-    "decode": reading.decode_speed,
-    "convert": reading.convert_time,
-    "memory": reading.convert_memory,
-    "growth": reading.growth,
-    "points": points.kept,
-    "space": space.poses,
-    "twins": space.twins,
-    "describe": submaps.describe_time,
-    "align": submaps.align_time,
-    "retrieve": large_database.retrieve_time,
-    "open": large_database.open_time,
-    "floors": large_database.floors_time,
-    "look-up": locating.look_up_time,
-    "relocalize": locating.relocalize_time,
-    "live": live.lag,
-    "hour": live.memory,
-    "fleet": fleet_reading,
-}
+def figures(folder: Path) -> Iterator[Figure]:
+    """All figures. folder : for the recordings and the databases."""
+    for name, length_m, seed in (("short", 10.0, 0), ("long", 40.0, 0), ("query", 8.0, 1)):
+        config = SimulationConfig(length_m=length_m, seed=seed)
+        simulate_session(folder / f"{name}.mcap", sensor="lidar", config=config)
+    yield from _converting(folder)
+    with open_database(folder / "long.submaps") as database:
+        yield from _describing(database)
+        yield from _looking_up(database, folder / "query.mcap")
 
-_EXTRAS = {"retrieve": "bench", "fleet": "postgres"}
+
+def _converting(folder: Path) -> Iterator[Figure]:
+    for name in ("short", "long"):
+        log = folder / f"{name}.mcap"
+        made = _done(pc2grid("convert", log, "-o", folder / f"{name}.submaps", "--json"))
+        bare = _done(python_module(_BARE, log))
+        (session,) = made.document["sessions"]
+        what = f"convert of {session['path_m']:.0f} m, {session['scans']} scans"
+        yield f"{what}: a scan", 1e3 * made.cpu_s / session["scans"], "ms"
+        yield f"{what}: over bare KISS-ICP", made.cpu_s / bare.document["cpu_s"], "x"
+        yield f"{what}: peak memory", made.peak_mb, "MB"
+
+
+def _describing(database: SubmapDatabase) -> Iterator[Figure]:
+    (info,) = database.sessions()
+    config = database.config().signature
+    taken = [_cpu_ms(lambda one=submap: describe(one, config)) for submap in database.submaps(info.name)]
+    yield f"describe a submap, median of {len(taken)}", statistics.median(taken), "ms"
+
+
+def _looking_up(database: SubmapDatabase, log: Path) -> Iterator[Figure]:
+    config = database.config()
+    localizer = Localizer(MapIndex.of(database, config))
+    with open_log(log) as opened:
+        for registered, planar_scan in follow(opened.scans(), config):
+            localizer.add(registered, planar_scan)
+    status = localizer.answer().status
+    taken = [_cpu_ms(localizer.answer) for _ in range(_TIMES)]
+    yield f"look up 8 m and decide ({status}), median of {_TIMES}", statistics.median(taken), "ms"
+
+
+def _done(finished: Finished) -> Finished:
+    """Raises RuntimeError for a command that failed."""
+    if finished.failed:
+        raise RuntimeError(finished.error)
+    return finished
+
+
+def _cpu_ms(action: Callable[[], object]) -> float:
+    begin = time.process_time()
+    action()
+    return 1e3 * (time.process_time() - begin)
 
 
 def main() -> None:
-    """Run the measures and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--only", action="append", choices=MEASURES, help="one measure; repeatable")
-    parser.add_argument("--quick", action="store_true", help="smaller inputs, fewer rounds: a smoke test")
-    parser.add_argument(
-        "--out", type=Path, default=ROOT / "results", help="folder for bench.md and bench.json"
-    )
-    arguments = parser.parse_args()
-    chosen = arguments.only or MEASURES
-    try:
-        require({name: what for what, name in _EXTRAS.items() if what in chosen})
-    except Pc2GridError as error:
-        parser.error(str(error))
-    facts = {"command": " ".join(["python -m pc2grid_lab.bench.run", *sys.argv[1:]]), **machine()}
-    facts["data"] = "with PC2GRID_DATA" if os.environ.get("PC2GRID_DATA") else "simulated only"
-    rows: list[Row] = []
-    for name in chosen:
-        begin = time.perf_counter()
-        with tempfile.TemporaryDirectory(prefix="bench-") as folder:
-            try:
-                rows += MEASURES[name](Path(folder), arguments.quick)
-            except Exception as error:
-                rows.append(Row(what=name, measured=None, unit="", note=f"failed: {error}"))
-        print(f"{name}: {time.perf_counter() - begin:.0f} s", file=sys.stderr)
-        facts["load"] = f"{os.getloadavg()[0]:.1f} processes, including this one"
-        write(arguments.out, rows, facts, quick=arguments.quick)
-    print((arguments.out / "bench.md").read_text(), end="")
-
-
-def write(folder: Path, rows: list[Row], facts: dict[str, str], *, quick: bool) -> None:
-    """Write the rows so far to bench.md and bench.json, after every measure, because all take long."""
-    folder.mkdir(parents=True, exist_ok=True)
-    text = table(rows) + "\n\n" + "\n".join(f"{key}: {value}" for key, value in facts.items()) + "\n"
-    (folder / "bench.md").write_text(text)
-    document = {"machine": facts, "quick": quick, "rows": [row.to_json() for row in rows]}
-    (folder / "bench.json").write_text(json.dumps(document, indent=1) + "\n")
+    """Print the figures as they are measured."""
+    with tempfile.TemporaryDirectory(prefix="bench-") as folder:
+        for what, value, unit in figures(Path(folder)):
+            print(f"{what:<50} {value:10.3g} {unit}", flush=True)
 
 
 if __name__ == "__main__":

@@ -31,11 +31,6 @@ class ChangeConfig(Section):
         default=0.1, ge=0, le=1, description="share of the rays that glass returns at an angle"
     )
 
-    @classmethod
-    def of_share(cls, share: float) -> ChangeConfig:
-        """Doors and furniture changed by a share."""
-        return cls(doors=share, furniture=share)
-
 
 class WorldConfig(SimulationConfig):
     """One session in a world. The same configuration gives the same bytes."""
