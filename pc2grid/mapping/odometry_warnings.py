@@ -23,9 +23,9 @@ _LEAST_MOTION = 0.1
 """Motions of less than this, in metres or radians, are noise; chosen by hand."""
 _LEAST_TRAVEL_M, _LEAST_TURN_RAD = 2.0, 1.5
 """Less than this in all says nothing of odometry; chosen by hand."""
-_OPPOSITE, _NOTHING = -0.5, 0.25
-"""Shares of what the scans show. Odometry that reports less than the first has the sign wrong; with less than
-the second either way it knows nothing. In eight real recordings it reports .93 to 1.15."""
+_OPPOSITE, _LEAST, _MOST = -0.5, 0.25, 1.75
+"""Shares of what the scans show. Odometry that reports less than the first has the sign wrong; what is not
+between the others is no measure of it. In eight real recordings it reports .93 to 1.15."""
 
 
 class _Compared(NamedTuple):
@@ -52,18 +52,18 @@ def odometry_warnings(trajectory: Trajectory, readings: F64) -> list[str]:
             "odometry reports travel the other way than the scans show: the sensor is mounted turned by half "
             "a turn and tf does not say so, or odometry counts backwards"
         )
-    elif travel.shown >= _LEAST_TRAVEL_M and abs(travel.share) < _NOTHING:
+    elif travel.shown >= _LEAST_TRAVEL_M and not _LEAST <= travel.share <= _MOST:
         warnings.append(
             f"odometry reports {travel.reported:.1f} m where the scans show {travel.shown:.1f} m of travel, "
-            "or in another direction: it stands still, or the sensor is mounted otherwise than tf says; "
-            "--odometry none ignores it"
+            "or in another direction: it stands still, has another unit, or the sensor is mounted otherwise "
+            "than tf says; --odometry none ignores it"
         )
     if turns.shown >= _LEAST_TURN_RAD and turns.share < _OPPOSITE:
         warnings.append(
             "odometry turns the other way than the scans: the sensor is mounted upside down and tf does not "
             "say so, which mirrors the map, or odometry has left and right exchanged"
         )
-    elif turns.shown >= _LEAST_TURN_RAD and abs(turns.share) < _NOTHING:
+    elif turns.shown >= _LEAST_TURN_RAD and not _LEAST <= turns.share <= _MOST:
         warnings.append(
             f"odometry reports {turns.reported:.1f} rad where the scans show turns of {turns.shown:.1f} rad "
             "in all, or about another axis; --odometry none ignores it"
