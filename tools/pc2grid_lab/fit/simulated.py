@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import itertools
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 from pc2grid.geometry import SE2
@@ -46,12 +47,12 @@ def asked(
     plans: Mapping[str, OccupancyGrid], drives: PlanDrives, queries: int, config: Config
 ) -> Iterator[tuple[QueryMap, SE2, list[SensorMap]]]:
     """Each query with its true frame in the plan, and the maps of that plan."""
-    for name, plan in plans.items():
+    for name in plans:
         for sensor in SENSORS:
-            drives.make_map(name, lambda plan=plan: plan, sensor)
+            drives.make_map(name, partial(plans.__getitem__, name), sensor)
         maps = [drives.read_map(name, sensor) for sensor in SENSORS]
         for sensor, seed in itertools.product(SENSORS, range(1, queries + 1)):
-            session = drives.drive(name, lambda plan=plan: plan, sensor, seed)
+            session = drives.drive(name, partial(plans.__getitem__, name), sensor, seed)
             for _, query, T_plan_query in queries_of(session, config):
                 yield query, T_plan_query, maps
             print(f"{name}, {sensor}, {seed}", flush=True)
