@@ -46,8 +46,8 @@ FREE_BELOW = 20
 THING = 60
 
 SLICE_BORDERS_M = (0.6, 1.1)
-"""Heights above the floor between the slices that maps are compared in: seats and legs are below, tables and
-worktops between, and only what is tall is above. Chosen by hand."""
+"""Heights above the floor between the slices in which something stands or not: seats and legs are below,
+tables and worktops between, and only what is tall is above. Chosen by hand."""
 SLICES = len(SLICE_BORDERS_M) + 1
 """Number of slices. A byte of heights has bit k set if slice k was observed to be occupied somewhere, and bit
 k + SLICES if it was observed to be free and nowhere occupied."""

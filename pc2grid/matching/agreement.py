@@ -61,6 +61,7 @@ def agreement(target: Walls, query: Walls, T_map_query: SE2) -> Agreement:
     unknown ground: then it supports the pose, otherwise it speaks against it. With the usual numbers that is
     a wall of the map within 0.14 m.
     """
+    query, target = query.facing(target), target.facing(query)
     fits, known = _fits(query, target, T_map_query)
     support = np.where(known, np.where(fits, Support.FITS, Support.CONTRADICTED), Support.UNKNOWN)
     met, looked_at = _fits(target, query, T_map_query.inverse())
@@ -74,5 +75,5 @@ def agreement(target: Walls, query: Walls, T_map_query: SE2) -> Agreement:
 
 def _fits(walls: Walls, other: Walls, T_other_walls: SE2) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which wall points (N,) have a wall of the other side near, and which lie on ground that it knows."""
-    likelihood, known = other.field.at(T_other_walls.apply(walls.points_m))
+    likelihood, known = other.field.at(T_other_walls.apply(walls.points_m), above=walls.only_explain)
     return likelihood >= LIKELIHOOD.neutral, known

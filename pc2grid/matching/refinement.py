@@ -7,7 +7,6 @@ over the points of (1 - field)^2 is minimised, with the bilinear interpolation's
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,28 +65,15 @@ def refine(
     points, with a prior as wide as the neighbourhood that the field can see: a direction that the walls do
     not constrain gets that width, not infinity.
     """
-    return refine_all([(field, points_m)], T_map_query, center_m, parameters)
-
-
-def refine_all(
-    parts: Sequence[tuple[LikelihoodField, F32]],
-    T_map_query: SE2,
-    center_m: tuple[float, float],
-    parameters: RefinementParameters = REFINEMENT,
-) -> tuple[SE2, F64]:
-    """`refine` by points that each have a field of their own; all fields have the same cells."""
-    field = parts[0][0]
     res = field.resolution_m
     center = np.asarray(center_m, np.float64)
-    local = [(one.values, *((points_m - center) / res).T.copy()) for one, points_m in parts]
+    x, y = ((points_m - center) / res).T.copy()
     start = (T_map_query.apply(center[None])[0] - field.origin_m) / res
     pose = np.array([start[0], start[1], T_map_query.yaw])
-    count = sum(len(x) for _, x, _ in local)
-    if count >= 4 * parameters.few_points:
-        every = count // parameters.few_points
-        few = [(values, x[::every].copy(), y[::every].copy()) for values, x, y in local]
-        pose, _, _ = gauss_newton(few, pose, parameters)
-    pose, hessian, misfit = gauss_newton(local, pose, parameters)
+    if len(x) >= 4 * parameters.few_points:
+        every = len(x) // parameters.few_points
+        pose, _, _ = gauss_newton(field.values, x[::every].copy(), y[::every].copy(), pose, parameters)
+    pose, hessian, misfit = gauss_newton(field.values, x, y, pose, parameters)
     per_cell = np.array([res, res, 1.0])
     information = hessian / np.outer(per_cell, per_cell)
     information /= parameters.correlated * max(misfit, parameters.least_misfit)
@@ -101,19 +87,18 @@ def refine_all(
 
 
 def gauss_newton(
-    parts: Sequence[tuple[U8, F64, F64]], pose: F64, parameters: RefinementParameters = REFINEMENT
+    values: U8, x: F64, y: F64, pose: F64, parameters: RefinementParameters = REFINEMENT
 ) -> tuple[F64, F64, float]:
     """The pose (tx, ty, yaw; cells) of points improved, the Hessian (3, 3) and the mean squared misfit.
 
-    parts : likelihood fields (H, W) uint8, and the x and y (M,) of the points that lie on each.
+    values : likelihood field (H, W). x, y : (M,) of the points.
     """
     from pc2grid.matching._kernels import normal_equations
 
     pose, misfit = pose.copy(), 1.0
     hessian = np.zeros((3, 3))
     for _ in range(parameters.steps):
-        each = [normal_equations(values, x, y, pose[0], pose[1], pose[2]) for values, x, y in parts]
-        hessian, gradient, total, count = (sum(terms) for terms in zip(*each, strict=True))
+        hessian, gradient, total, count = normal_equations(values, x, y, pose[0], pose[1], pose[2])
         if count < parameters.least_points:
             break
         misfit = total / count

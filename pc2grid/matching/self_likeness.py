@@ -7,7 +7,6 @@ corridor", not which one or where in it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,7 +14,7 @@ import numpy as np
 from numpy import fft
 
 from pc2grid.arrays import F64, U8
-from pc2grid.matching.walls import Slice, Walls
+from pc2grid.matching.walls import Walls
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,22 +43,18 @@ def self_likeness(walls: Walls, parameters: LikenessParameters = LIKENESS) -> fl
     As of two maps (`two_way_score`): the geometric mean, forward and backward, of the mean likelihood of the
     wall points on known ground. All slides at once, as correlations by the fast Fourier transform.
     """
-    parts: Sequence[Walls | Slice] = walls.slices or (walls,)
-    total = sum(part.weight for part in parts)
+    total = walls.weight
     if total <= 0.0:
         return 0.0
     n = max(round(parameters.cell_m / walls.field.resolution_m), 1)
     cell_m = n * walls.field.resolution_m
-    drawn = [_drawn(part, n) for part in parts]
+    drawn = _drawn(walls, n)
     reach = round(parameters.farthest_m / cell_m)
-    shape = [cv2.getOptimalDFTSize(n + reach) for n in drawn[0][0].shape]
-    spectra = [[fft.rfft2(image, shape) for image in images] for images in drawn]
+    shape = [cv2.getOptimalDFTSize(n + reach) for n in drawn[0].shape]
+    points, *grounds = (fft.rfft2(image, shape) for image in drawn)
     slides = np.arange(-reach, reach + 1)
     fits, overlap = (
-        fft.irfft2(sum(np.conj(spectrum[0]) * spectrum[k] for spectrum in spectra), shape)[
-            np.ix_(slides, slides)
-        ]
-        for k in (1, 2)
+        fft.irfft2(np.conj(points) * ground, shape)[np.ix_(slides, slides)] for ground in grounds
     )
     there = np.where(overlap > 1e-6, fits / np.maximum(overlap, 1e-6), 0.0)
     length_m = cell_m * np.hypot(slides[:, None], slides)
@@ -70,7 +65,7 @@ def self_likeness(walls: Walls, parameters: LikenessParameters = LIKENESS) -> fl
     return math.sqrt(float(both_ways.max())) if len(both_ways) else 0.0
 
 
-def _drawn(walls: Walls | Slice, n: int) -> tuple[F64, F64, F64]:
+def _drawn(walls: Walls, n: int) -> tuple[F64, F64, F64]:
     """(H, W) each, in squares of n by n cells: weight of the wall points, mean likelihood of the known
     ground, and whether at least half of it is known."""
     field = walls.field

@@ -3,9 +3,9 @@
 One way alone is not enough. The walls of a small query fit into many places; but at the wrong ones the map
 has walls where the query has seen free space.
 
-Where both sides tell at which heights they have seen what stands there, they are compared in the slices of
-heights that both have seen (`pc2grid.matching.walls.Slice`). Where only one side tells, it is reduced to what
-stands at all heights before (`pc2grid.matching.walls.at_all_heights`).
+What each side must have seen of the other's walls is told by `pc2grid.matching.walls.Walls.facing`. A laser
+passes under tables: what stands at some heights only explains what the laser sees, and does not contradict
+its free space.
 
 A wall that the map has seen from its other side only, as it does not know the ground in front of it, may be
 the right one: walls are thin. But a query along the outer wall of a building fits the rooms behind it, too.
@@ -21,14 +21,14 @@ sees free space.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
 from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField
-from pc2grid.matching.walls import Slice, Walls, comparable
+from pc2grid.matching.walls import Walls
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,16 +78,14 @@ class Fit:
 
 def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) -> Fit:
     """Score the query at a pose on the map `target`."""
-    above, below = target.is_above(query.height_m), query.is_above(target.height_m)
-    pairs, T_query_map = comparable(target, query), T_map_query.inverse()
-    forth = [_sums(mine, on.field, T_map_query, above) for on, mine in pairs]
-    back = [_sums(on, mine.field, T_query_map, below) for on, mine in pairs]
-    (seen, likelihood, behind), (looked_at, returned, _) = np.sum((forth, back), axis=1).tolist()
-    weight = sum(mine.weight for _, mine in pairs)
+    mine, theirs, T_query_map = query.facing(target), target.facing(query), T_map_query.inverse()
+    seen, likelihood, behind = _sums(mine, target.field, T_map_query).tolist()
+    looked_at, returned, _ = _sums(theirs, query.field, T_query_map).tolist()
+    weight = mine.weight
     forward = (likelihood + LIKELIHOOD.neutral * (weight - seen)) / weight if weight else 0.0
     backward = scored = returned / looked_at if looked_at else 0.0
-    if below:
-        observed = float(_sums(target, query.field, T_query_map)[0])
+    if theirs.only_explain:
+        observed = float(_sums(replace(theirs, only_explain=False), query.field, T_query_map)[0])
         scored = (returned + LIKELIHOOD.neutral * (observed - looked_at)) / observed if observed else 0.0
     return Fit(
         T_map_query=T_map_query,
@@ -101,22 +99,20 @@ def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) ->
     )
 
 
-def _sums(walls: Walls | Slice, field: LikelihoodField, T_field_walls: SE2, above: bool = False) -> F64:
-    """(3,) what `plain_known_sums` says of walls on a field. above : see `LikelihoodField.at`."""
+def _sums(walls: Walls, field: LikelihoodField, T_field_walls: SE2) -> F64:
+    """(3,) what `plain_known_sums` says of walls on a field."""
     from pc2grid.matching._kernels import known_sums
 
-    least = LIKELIHOOD.neutral_value + 1 if above else 0
+    least = LIKELIHOOD.neutral_value + 1 if walls.only_explain else 0
     pose = T_field_walls.x, T_field_walls.y, T_field_walls.yaw
     on = field.values, field.known, field.resolution_m, field.origin_m
     return np.array(known_sums(*on, walls.points_m, walls.before_m, walls.weights, pose, least))
 
 
-def plain_known_sums(
-    walls: Walls | Slice, field: LikelihoodField, T_field_walls: SE2, above: bool = False
-) -> F64:
+def plain_known_sums(walls: Walls, field: LikelihoodField, T_field_walls: SE2) -> F64:
     """(3,) of the wall points on known ground: their weight, the weighted sum of their likelihoods, 0..1, and
     the weight of those that were seen from unknown ground."""
-    likelihood, known = field.at(T_field_walls.apply(walls.points_m), above=above)
+    likelihood, known = field.at(T_field_walls.apply(walls.points_m), above=walls.only_explain)
     _, before = field.at(T_field_walls.apply(walls.before_m))
     weights = walls.weights[known].astype("f8")
     return np.array([weights.sum(), weights @ likelihood[known], weights[~before[known]].sum()])

@@ -1,5 +1,9 @@
 """A grid as what two maps are compared by: wall points, how surely they stay, and a likelihood field.
 
+What one side has seen is explained by what stands on the other side at any height: that is the field. It is
+contradicted only by what it must have seen itself, and has not: these are the points, which depend on how
+much the other side sees (`Walls.facing`).
+
 Small things that stand alone may have been moved between two visits, walls stay. So a wall point counts by
 the size of the connected object that it belongs to.
 
@@ -10,14 +14,15 @@ on the side that they were seen from (`seen_from`).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64, U8, BoolGrid, cells_of
+from pc2grid.arrays import F32, I64, BoolGrid, cells_of
 from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField, padded_grid
-from pc2grid.model import FREE, OCCUPIED, SLICES, UNKNOWN, OccupancyGrid
+from pc2grid.model import SLICES, OccupancyGrid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,100 +47,72 @@ class WallParameters:
 
 
 WALLS = WallParameters()
-_ANY_HEIGHT = (1 << SLICES) - 1
-"""What stands at heights that are not known is compared at all of them."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Slice:
-    """What stands in a slice of heights, walls and things. A counter is a wall if only its front is seen, a
-    thing if the camera looks over it; below its top both views agree.
-
-    field : likelihood field of the cells that are occupied there; known are those, and those observed to be
-        free there.
-    points_m, weights : middles of the cells along the edges, thinned and weighted as those of `Walls`; a cell
-        that is occupied in several slices counts once.
-    """
-
-    field: LikelihoodField
-    points_m: F32
-    weights: F32
-
-    @staticmethod
-    def all_of(grid: OccupancyGrid, parameters: WallParameters = WALLS) -> tuple[Slice, ...]:
-        """The slices of a grid, lowest first; none if it does not tell heights."""
-        if grid.heights is None:
-            return ()
-        things = _things(grid, parameters)
-        standing, passed = _standing(grid, things)
-        count = sum((standing >> k & 1).astype(np.uint8) for k in range(SLICES))
-        weight = np.where(things, parameters.movable, 1.0) / np.maximum(count, 1)
-        return tuple(
-            Slice._of(grid, (standing >> k & 1) > 0, (passed >> k & 1) > 0, weight, parameters)
-            for k in range(SLICES)
-        )
-
-    @staticmethod
-    def _of(grid: OccupancyGrid, stands: BoolGrid, passed: BoolGrid, weight: F64, p: WallParameters) -> Slice:
-        """One slice. stands : (H, W) cells that are occupied there. passed : those of cells with something at
-        another height that are free there. weight : of each cell."""
-        cells = cells_of(stands & ~_inside(stands))
-        cells = cells[thin_evenly(grid.to_point(cells), p.spacing_m)]
-        steady = steadiness(stands, cells, grid.resolution_m, p) * weight[cells[:, 0], cells[:, 1]]
-        known = stands | passed | grid.free
-        return Slice(
-            field=LikelihoodField.around(stands, known, grid.resolution_m, grid.origin_m),
-            points_m=grid.to_point(cells).astype(np.float32),
-            weights=steady.astype(np.float32),
-        )
-
-    @property
-    def before_m(self) -> F32:
-        """As `Walls.before_m`: which side of them was seen does not matter, as their heights are known."""
-        return self.points_m
-
-    @property
-    def weight(self) -> float:
-        """The number of points, by weight."""
-        return float(self.weights.sum(dtype=np.float64))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Walls:
     """A grid prepared for alignment.
 
-    field : its likelihood field.
-    points_m : (K, 2) float32 centres of occupied cells, one per square of `WallParameters.spacing_m`, in the
-        grid's frame.
+    field : likelihood field of what stands at any height.
+    points_m : (K, 2) float32 centres of the cells that something stands in, of what is solid those along its
+        edges, one per square of `WallParameters.spacing_m`, in the grid's frame.
     before_m : (K, 2) float32, points on the ground in front of them, on which the other side is asked for
         what it knows; `points_m` themselves if it does not matter which side of a wall was seen.
     weights : (K,) float32, 0..1, how surely each of them stays where it is, see `steadiness`.
-    slices : what stands at each height; empty if the grid does not tell.
     height_m : see `OccupancyGrid.height_m`.
+    at_all_heights : with the points of what no ray was seen to pass, at any height; None if the grid does not
+        tell heights.
+    only_explain : whether the other side need not have seen these points, wherever it sees free space.
     """
 
     field: LikelihoodField
     points_m: F32
     before_m: F32
     weights: F32
-    slices: tuple[Slice, ...] = ()
     height_m: float | None = None
+    at_all_heights: Walls | None = None
+    only_explain: bool = False
 
     @staticmethod
     def of(grid: OccupancyGrid, parameters: WallParameters = WALLS, *, margin_m: float = 0.0) -> Walls:
         """Prepare a grid; the field gets `margin_m` of unknown cells on each side."""
-        padded = padded_grid(grid, margin_m)
-        cells = cells_of(padded.occupied)
-        cells = cells[thin_evenly(padded.to_point(cells), parameters.spacing_m)]
-        points_m = padded.to_point(cells).astype(np.float32)
+        grid = padded_grid(grid, margin_m)
+        if grid.heights is None:
+            return Walls._of(grid, grid.occupied, grid.occupied, parameters)
+        stands = grid.occupied | _things(grid, parameters)
+        never_passed = stands & (grid.heights < 1 << SLICES)
+        return replace(
+            Walls._of(grid, stands, _edges(stands), parameters),
+            at_all_heights=Walls._of(grid, stands, _edges(never_passed), parameters),
+        )
+
+    @staticmethod
+    def _of(grid: OccupancyGrid, stands: BoolGrid, shown: BoolGrid, parameters: WallParameters) -> Walls:
+        """stands, shown : (H, W) the cells of the field, and those of the points."""
+        cells = cells_of(shown)
+        cells = cells[thin_evenly(grid.to_point(cells), parameters.spacing_m)]
+        points_m = grid.to_point(cells).astype(np.float32)
+        weights = steadiness(shown, cells, grid.resolution_m, parameters)
+        weights[grid.things[cells[:, 0], cells[:, 1]]] *= parameters.movable
         return Walls(
-            field=LikelihoodField.of(padded),
+            field=LikelihoodField.around(stands, stands | grid.free, grid.resolution_m, grid.origin_m),
             points_m=points_m,
             before_m=points_m,
-            weights=steadiness(padded.occupied, cells, padded.resolution_m, parameters),
-            slices=Slice.all_of(padded, parameters),
+            weights=weights,
             height_m=grid.height_m,
         )
+
+    def facing(self, other: Walls) -> Walls:
+        """The walls as they are compared with the other side.
+
+        A side that tells heights has looked at all of them, and must have seen all that stands. One that does
+        not tell them may be a laser, which sees a single plane: it must have seen what stands at all heights,
+        and of a table nothing. If that plane is known to be clearly above the one of these walls, it need not
+        have seen any of them. It is not known of a laser that tf does not lift above its base.
+        """
+        walls = self.at_all_heights if other.at_all_heights is None else self
+        above_m = (other.height_m or math.nan) - (self.height_m or math.nan)
+        return replace(walls or self, only_explain=above_m > WALLS.plane_m)
 
     def seen_from(self, free: F32) -> Walls:
         """The walls with the ground in front of them, on the side that they were seen from.
@@ -154,45 +131,24 @@ class Walls:
         )
         length = np.maximum(np.hypot(*gradient.T), np.finfo(np.float32).tiny)
         away_m = 2.0 * LIKELIHOOD.sigma_m * gradient / length[:, None]
-        return replace(self, before_m=(self.points_m + away_m).astype(np.float32))
+        part = self.at_all_heights and self.at_all_heights.seen_from(free)
+        return replace(self, before_m=(self.points_m + away_m).astype(np.float32), at_all_heights=part)
 
-    def is_above(self, height_m: float | None) -> bool:
-        """Whether these are walls of one plane that is clearly higher than another plane."""
-        if self.height_m is None or height_m is None:
-            return False
-        return self.height_m - height_m > WALLS.plane_m
+    def mirrored(self) -> Walls:
+        """With x turned into -x."""
+        flip = np.array((-1.0, 1.0), np.float32)
+        return replace(
+            self,
+            field=self.field.mirrored(),
+            points_m=self.points_m * flip,
+            before_m=self.before_m * flip,
+            at_all_heights=self.at_all_heights and self.at_all_heights.mirrored(),
+        )
 
     @property
     def weight(self) -> float:
         """The number of wall points, by weight."""
         return float(self.weights.sum(dtype=np.float64))
-
-
-def comparable(target: Walls, query: Walls) -> tuple[tuple[Walls | Slice, Walls | Slice], ...]:
-    """The parts of two maps that are compared: their slices if both have some, else all heights in one."""
-    return tuple(zip(target.slices, query.slices, strict=False)) or ((target, query),)
-
-
-def at_all_heights(grid: OccupancyGrid, parameters: WallParameters = WALLS) -> OccupancyGrid:
-    """What any planar laser sees of a grid that tells heights, whatever its own height: what stands somewhere
-    and no ray was seen to pass. What stands at some heights only is unknown: things, which are moved about.
-    """
-    standing, passed = _standing(grid, _things(grid, parameters))
-    stands = (standing > 0) & (passed == 0)
-    cells = np.full(grid.cells.shape, UNKNOWN, np.int8)
-    cells[grid.free] = FREE
-    cells[stands & ~_inside(stands)] = OCCUPIED
-    return replace(grid, cells=cells, heights=None)
-
-
-def _standing(grid: OccupancyGrid, things: BoolGrid) -> tuple[U8, U8]:
-    """(H, W) each: the slices in which something was seen to stand in a cell, and those in which rays have
-    passed it. Where the heights of what stands are not known, it stands in all of them. things : (H, W), see
-    `_things`."""
-    assert grid.heights is not None
-    heights = np.where(grid.heights, grid.heights, np.uint8(_ANY_HEIGHT))
-    heights[~(grid.occupied | things)] = 0
-    return heights & np.uint8(_ANY_HEIGHT), heights >> np.uint8(SLICES)
 
 
 def _things(grid: OccupancyGrid, parameters: WallParameters) -> BoolGrid:
@@ -203,12 +159,13 @@ def _things(grid: OccupancyGrid, parameters: WallParameters) -> BoolGrid:
     return things
 
 
-def _inside(stands: BoolGrid) -> BoolGrid:
-    """The cells (H, W) of things that have all their neighbours in them: nothing sees these."""
+def _edges(stands: BoolGrid) -> BoolGrid:
+    """The cells (H, W) of what stands without those that have all their neighbours in it: nothing sees
+    these."""
     import cv2
 
     inside: BoolGrid = cv2.erode(stands.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return inside
+    return stands & ~inside
 
 
 def steadiness(

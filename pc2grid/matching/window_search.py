@@ -21,7 +21,6 @@ so a wall of one cell cannot be missed between two poses.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -81,32 +80,26 @@ class SearchMap:
     """A map prepared to be searched.
 
     walls : its wall points and likelihood field, with a margin of `MARGIN_M`.
-    images : (F L, SQUARE, SQUARE, H, W) uint8, L sliding maxima of the field within each of `REACHES_M`; of a
-        map searched by heights, those of each of F slices, one after the other. The cells that lie alike in
-        their squares are an image of their own, with a margin of a tile of neutral squares.
+    images : (L, SQUARE, SQUARE, H, W) uint8, L sliding maxima of the field within each of `REACHES_M`. The
+        cells that lie alike in their squares are an image of their own, with a margin of a tile of neutral
+        squares.
     """
 
     walls: Walls
     images: U8
 
     @staticmethod
-    def of(grid: OccupancyGrid, *, from_below: bool = False, by_heights: bool = False) -> SearchMap:
+    def of(grid: OccupancyGrid, *, from_below: bool = False) -> SearchMap:
         """Prepare a map. Everything outside it counts as unknown.
 
         from_below : for queries in a lower plane, to which its free space is as unknown ground.
-        by_heights : for queries that tell heights; the map must, too.
         """
         walls = Walls.of(grid, margin_m=MARGIN_M)
-        fields = [part.field.values for part in walls.slices] if by_heights else [walls.field.values]
+        values = walls.field.values
         if from_below:
-            lifted = LIKELIHOOD.neutral * 255.0 + (1.0 - LIKELIHOOD.neutral) * fields[0]
-            fields = [np.where(walls.field.known, lifted, fields[0]).astype(np.uint8)]
-        return SearchMap(walls=walls, images=_images(fields, grid.resolution_m))
-
-    @property
-    def by_heights(self) -> bool:
-        """Whether it is searched slice by slice."""
-        return len(self.images) > len(REACHES_M)
+            lifted = LIKELIHOOD.neutral * 255.0 + (1.0 - LIKELIHOOD.neutral) * values
+            values = np.where(walls.field.known, lifted, values).astype(np.uint8)
+        return SearchMap(walls=walls, images=_images(values, grid.resolution_m))
 
     @property
     def field(self) -> LikelihoodField:
@@ -114,26 +107,25 @@ class SearchMap:
         return self.walls.field
 
 
-def _images(fields: Sequence[U8], resolution_m: float) -> U8:
-    """`SearchMap.images` of F fields (H, W)."""
+def _images(field: U8, resolution_m: float) -> U8:
+    """`SearchMap.images` of a field (H, W)."""
     import cv2
 
     reaches = [math.ceil(reach_m / resolution_m - 1e-6) for reach_m in REACHES_M]
-    height, width = (-(-side // SQUARE) for side in fields[0].shape)
+    height, width = (-(-side // SQUARE) for side in field.shape)
     above, left = TILE
-    shape = len(fields), len(reaches), SQUARE, SQUARE, height + 2 * above, width + 2 * left
+    shape = len(reaches), SQUARE, SQUARE, height + 2 * above, width + 2 * left
     images = np.full(shape, LIKELIHOOD.neutral_value, np.uint8)
-    below, right = height * SQUARE - fields[0].shape[0], width * SQUARE - fields[0].shape[1]
-    for field, of_field in zip(fields, images, strict=True):
-        maxima = cv2.copyMakeBorder(field, 0, below, 0, right, cv2.BORDER_REPLICATE)
-        for image, (before, reach) in zip(of_field, pairwise([0, *reaches]), strict=True):
-            # The maximum over a square of maxima over squares is that over the sum of both squares.
-            side = 2 * (reach - before) + 1
-            square = cv2.getStructuringElement(cv2.MORPH_RECT, (side, side))
-            maxima = cv2.dilate(maxima, square, borderType=cv2.BORDER_REPLICATE)
-            cells = maxima.reshape(height, SQUARE, width, SQUARE).transpose(1, 3, 0, 2)
-            image[..., above : above + height, left : left + width] = cells
-    return images.reshape(-1, *shape[2:])
+    below, right = height * SQUARE - field.shape[0], width * SQUARE - field.shape[1]
+    maxima = cv2.copyMakeBorder(field, 0, below, 0, right, cv2.BORDER_REPLICATE)
+    for image, (before, reach) in zip(images, pairwise([0, *reaches]), strict=True):
+        # The maximum over a square of maxima over squares is that over the sum of both squares.
+        side = 2 * (reach - before) + 1
+        square = cv2.getStructuringElement(cv2.MORPH_RECT, (side, side))
+        maxima = cv2.dilate(maxima, square, borderType=cv2.BORDER_REPLICATE)
+        cells = maxima.reshape(height, SQUARE, width, SQUARE).transpose(1, 3, 0, 2)
+        image[..., above : above + height, left : left + width] = cells
+    return images
 
 
 def search_windows(
@@ -147,8 +139,7 @@ def search_windows(
 ) -> F64:
     """The best distinct poses of a point set in boxes of poses, best first.
 
-    points_m : (M, 2) at most `MOST_POINTS` points, relative to the point that they rotate about; for a map
-    searched by heights (M, 3), with the number of the slice that each is in.
+    points_m : (M, 2) at most `MOST_POINTS` points, relative to the point that they rotate about.
     boxes : (B, 3) x, y, yaw of the centres of the boxes, with half widths `half_t_m` and `half_a_rad`; all
     squares of the lattice that one touches are searched. Many are searched faster if they have one heading.
 
@@ -163,7 +154,7 @@ def search_windows(
     origin = np.array([*target.field.origin_m, 0.0])
     boxes = (np.asarray(boxes, np.float64) - origin) / (res, res, 1.0)
     turns = headings(half_a_rad, 2.0 * parameters.step_rad)
-    points = np.asarray(points_m, np.float64) / ((res, res, 1.0)[: points_m.shape[1]])
+    points = np.asarray(points_m, np.float64) / res
     half_a_rad /= len(turns)
     keep = min(parameters.keep if parameters.most > 1 else 1.0, BOUND_SLACK)
     found = _best(target, points, Tiles.of(boxes, half_t_m / res), turns, half_a_rad, parameters.floor, keep)
@@ -244,11 +235,10 @@ def levels_of(points: F64, half_a_rad: float, target: SearchMap) -> I64:
     that, by a cell. -1 where a point is moved farther than any covers, so that it may be on a wall."""
     res = target.field.resolution_m
     away = np.hypot(points[:, 0], points[:, 1])
-    slices = points[:, 2].astype(np.int64) if points.shape[1] > 2 else np.zeros(len(points), np.int64)
     halves = ((0.5 * SQUARE, 1.0), (0.5 * SQUARE, 0.5), (0.25 * SQUARE, 0.5), (0.5, 0.5))
     reach = np.array([half_t + away * share * half_a_rad for half_t, share in halves])
     covered = reach - 0.5 <= REACHES_M[-1] / res
-    return np.where(covered, levels_for(reach, res) + len(REACHES_M) * slices, -1)
+    return np.where(covered, levels_for(reach, res), -1)
 
 
 def headings(half_a_rad: float, step_rad: float) -> F64:

@@ -10,11 +10,10 @@ import numpy as np
 
 from pc2grid.arrays import F32, F64
 from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.matching.refinement import refine, refine_all
+from pc2grid.matching.refinement import refine
 from pc2grid.matching.two_way_score import Fit, score_fit
-from pc2grid.matching.walls import comparable, thin_evenly
+from pc2grid.matching.walls import thin_evenly
 from pc2grid.matching.window_search import (
-    MOST_POINTS,
     SEARCH,
     SearchMap,
     SearchParameters,
@@ -98,7 +97,7 @@ def verify(
         rows = np.array([p.row for p in members])
         poses = search_windows(
             maps[session],
-            _searched(query, maps[session], center),
+            coarse_points(query.walls.facing(maps[session].walls).points_m, center),
             np.array([(*p.at_m, p.yaw_rad) for p in members]),
             half_t_m=0.5 * HYPOTHESES.square_m,
             half_a_rad=HYPOTHESES.half_a_rad,
@@ -135,7 +134,7 @@ def search_whole_map(
     center = (query.T_odom_base.x, query.T_odom_base.y)
     poses = search_windows(
         target,
-        _searched(query, target, center),
+        coarse_points(query.walls.facing(target.walls).points_m, center),
         np.insert(free_xy_m, 2, 0.0, axis=1),
         half_t_m=0.5 * HYPOTHESES.square_m,
         half_a_rad=math.pi,
@@ -154,7 +153,7 @@ def fitted(query: QueryMap, session_index: int, row: int, target: SearchMap, T_m
     """The hypothesis that the query lies at a pose, which is refined first."""
     pose, covariance = _refined(query, target, T_map_query)
     covariance = covariance + np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))
-    fit = score_fit(target.walls, query.walls_for(target.walls), pose, covariance)
+    fit = score_fit(target.walls, query.walls, pose, covariance)
     return Hypothesis(session_index=session_index, row=row, fit=fit)
 
 
@@ -164,11 +163,9 @@ def _refined(query: QueryMap, target: SearchMap, T_map_query: SE2) -> tuple[SE2,
     The walls of the query are brought onto those of the map. Of two planes at different heights it is the
     walls of the higher one, since things near a wall in the lower one would be drawn onto it.
     """
-    walls = query.walls_for(target.walls)
-    if not target.walls.is_above(walls.height_m):
-        pairs = comparable(target.walls, walls)
-        parts = [(on.field, mine.points_m) for on, mine in pairs]
-        return refine_all(parts, T_map_query, query.center_m)
+    walls = query.walls.facing(target.walls)
+    if not walls.only_explain:
+        return refine(target.field, walls.points_m, T_map_query, query.center_m)
     center_m = T_map_query.apply(np.array([query.center_m]))[0]
     back, covariance = refine(
         walls.field, target.walls.points_m, T_map_query.inverse(), (center_m[0], center_m[1])
@@ -221,16 +218,6 @@ def coarse_points(points_m: F32, center_m: tuple[float, float]) -> F32:
     away_m = np.hypot(local[:, 0], local[:, 1])
     near, far = local[away_m < p.near_m], local[(away_m >= p.near_m) & (away_m < p.far_m)]
     return np.concatenate((_few(near), _few(far)))
-
-
-def _searched(query: QueryMap, target: SearchMap, center_m: tuple[float, float]) -> F32:
-    """The points of a query that are searched for on a map, relative to `center_m`: (M, 2), or if the map is
-    searched by heights (M, 3), with the number of the slice of each."""
-    if not target.by_heights:
-        return coarse_points(query.walls_for(target.walls).points_m, center_m)
-    parts = [coarse_points(part.points_m, center_m) for part in query.walls.slices]
-    points = np.concatenate([np.insert(part, 2, k, axis=1) for k, part in enumerate(parts)])
-    return points[:: max(-(-len(points) // MOST_POINTS), 1)]
 
 
 def _few(points_m: F32) -> F32:

@@ -12,7 +12,6 @@ import numpy as np
 
 from pc2grid.arrays import F64, I64
 from pc2grid.errors import DatabaseCorrupt
-from pc2grid.matching.walls import at_all_heights
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid, PointMap
 from pc2grid.observer import Observer
@@ -93,17 +92,9 @@ class MapIndex:
         self.maps: LazySequence[SearchMap] = LazySequence(
             lambda i: SearchMap.of(self.grids[i]), count, most_prepared
         )
-        self._facing: dict[str, LazySequence[SearchMap]] = {
-            "lower plane": LazySequence(
-                lambda i: SearchMap.of(self.grids[i], from_below=True), count, most_prepared
-            ),
-            "heights": LazySequence(
-                lambda i: SearchMap.of(self.grids[i], by_heights=True), count, most_prepared
-            ),
-            "a laser": LazySequence(
-                lambda i: SearchMap.of(at_all_heights(self.grids[i])), count, most_prepared
-            ),
-        }
+        self._from_above: LazySequence[SearchMap] = LazySequence(
+            lambda i: SearchMap.of(self.grids[i], from_below=True), count, most_prepared
+        )
         self._free: LazySequence[F64] = LazySequence(lambda i: free_squares(self.grids[i]), count)
         self.places = Places(
             table,
@@ -228,15 +219,11 @@ class MapIndex:
         return self._worth_keeping(query, found)
 
     def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
-        """The maps as they are searched for a query: by heights if both tell them; if only the map does, what
-        any laser sees of it; to a query in a lower plane, their free space is unknown."""
-        height_m, by_heights = query.walls.height_m, bool(query.walls.slices)
+        """The maps as they are searched for a query: to one in a lower plane, their free space is unknown."""
 
         def facing(i: int) -> SearchMap:
-            if self.grids[i].heights is not None:
-                return self._facing["heights" if by_heights else "a laser"][i]
-            lower = not by_heights and self.maps[i].walls.is_above(height_m)
-            return self._facing["lower plane"][i] if lower else self.maps[i]
+            below = query.walls.facing(self.maps[i].walls).only_explain
+            return (self._from_above if below else self.maps)[i]
 
         return LazySequence(facing, len(self.maps), 0)
 

@@ -119,8 +119,10 @@ class SessionRecognizer:
     def _remember(self, grid: OccupancyGrid, query: QueryMap) -> None:
         """Add the newest stretch to the places that later ones are looked up in."""
         index = len(self._stored)
-        cells = zlib.compress(np.ascontiguousarray(grid.cells, np.int8).tobytes(), 1)
-        self._stored.append((cells, grid.cells.shape, grid.resolution_m, grid.origin_m))
+        layers = np.stack([grid.cells] if grid.heights is None else [grid.cells, grid.heights.view(np.int8)])
+        self._stored.append(
+            (zlib.compress(layers.tobytes(), 1), layers.shape, grid.resolution_m, grid.origin_m)
+        )
         table = SignatureTable.of(
             [view.signature for view in query.views],
             [view.center_m for view in query.views],
@@ -136,9 +138,11 @@ class SessionRecognizer:
         self._places = Places(table, grids, self._made_with.partition.radius_m, [0.0] * count, known)
 
     def _grid(self, index: int) -> OccupancyGrid:
-        cells, shape, resolution_m, origin_m = self._stored[index]
+        layers, shape, resolution_m, origin_m = self._stored[index]
+        cells, *heights = np.frombuffer(zlib.decompress(layers), np.int8).reshape(shape)
         return OccupancyGrid(
-            cells=np.frombuffer(zlib.decompress(cells), np.int8).reshape(shape),
+            cells=cells,
+            heights=heights[0].view(np.uint8) if heights else None,
             resolution_m=resolution_m,
             origin_m=origin_m,
         )

@@ -144,7 +144,7 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
     number = near.region.session_index
     T_map_query = T_map_base @ seen.T_odom_base.inverse()
     walls = index.maps_for(seen)[number].walls
-    fit = score_fit(walls, seen.walls_for(walls), T_map_query, np.zeros((3, 3)))
+    fit = score_fit(walls, seen.walls, T_map_query, np.zeros((3, 3)))
     believed = Hypothesis(session_index=number, row=-1, fit=fit)
     # All mass was near the pose before what was seen lately. So of two equal rooms it is in the nearer one.
     answer = localizer.answer(

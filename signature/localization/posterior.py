@@ -182,7 +182,7 @@ def masses(
 
 def tail_of(query: QueryMap, fit: Fit, walls: Walls) -> tuple[float, ...]:
     """`Evidence.tail` of a query at a pose on a map; empty for a drawn map."""
-    above = walls.is_above(query.walls.height_m)
+    above = query.walls.facing(walls).only_explain
     likelihood = points = 0.0
     tail = []
     for count, keyframe in enumerate(reversed(query.keyframes), start=1):

@@ -21,7 +21,7 @@ from pc2grid.geometry import SE2, transform_points
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.matching.icp_in_space import SpatialView
 from pc2grid.matching.self_likeness import self_likeness
-from pc2grid.matching.walls import Walls, at_all_heights
+from pc2grid.matching.walls import Walls
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.submaps.isovist import HIDDEN, isovist, look_around
@@ -92,16 +92,6 @@ class QueryMap:
     T_odom_prior: SE2 | None = None
     since_prior_m: float = 0.0
     keyframes: tuple[Keyframe, ...] = ()
-
-    def walls_for(self, target: Walls) -> Walls:
-        """The walls as they are compared with a map: with one that tells no heights, those that any laser can
-        have seen."""
-        return self._at_all_heights if self.grid.heights is not None and not target.slices else self.walls
-
-    @cached_property
-    def _at_all_heights(self) -> Walls:
-        walls = Walls.of(at_all_heights(self.grid))
-        return walls.seen_from(self.grid.free.astype(np.float32)) if self.keyframes else walls
 
     @cached_property
     def likeness(self) -> float:

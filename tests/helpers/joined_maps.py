@@ -46,4 +46,4 @@ def in_frame(grid: OccupancyGrid, T_grid_frame: SE2) -> OccupancyGrid:
 
 
 def joinable(grid: OccupancyGrid) -> JoinableMap:
-    return JoinableMap.of(grid, junction_graph(grid), 5.0)
+    return JoinableMap(grid=grid, graph=junction_graph(grid), sight_m=5.0)

@@ -79,21 +79,12 @@ _MIRROR = np.array((-1.0, 1.0), np.float32)
 class JoinableMap:
     """The map of a session, prepared to be joined when it first matters.
 
-    grid : all heights in one, see `of`. graph : its junction graph. sight_m : what is visible is described up
-    to this distance.
+    graph : its junction graph. sight_m : what is visible is described up to this distance.
     """
 
     grid: OccupancyGrid
     graph: nx.Graph
     sight_m: float
-
-    @staticmethod
-    def of(grid: OccupancyGrid, graph: nx.Graph, sight_m: float) -> JoinableMap:
-        """The map with all heights in one: the other session may be that of a laser, which sees a single one.
-
-        graph : the junction graph of the map. sight_m : what is visible is described up to this distance.
-        """
-        return JoinableMap(grid=replace(grid, heights=None), graph=graph, sight_m=sight_m)
 
     @cached_property
     def landmarks(self) -> Landmarks:
@@ -190,7 +181,7 @@ def join_maps(
 
     labelled : labels say that both are of one floor of one building.
     """
-    points_m = source.walls.points_m
+    points_m = source.walls.facing(target.walls).points_m
     prior = parameters.labelled if labelled else 1.0
     candidates = _candidates(target, source.landmarks, points_m, source.pieces, parameters)
     join = _best(target, source, candidates, (), prior, parameters)
@@ -213,7 +204,7 @@ def _best(
 
     By branch and bound: what is not judged is neither joined nor more probable than the best.
     """
-    fits = PieceFits.of([candidate.fits for candidate in (*candidates, *decoys)], source.pieces)
+    fits = PieceFits.of([candidate.fits for candidate in (*candidates, *decoys)])
     found = [_evidence(source, one, k, fits) for k, one in enumerate(candidates)]
     bounds = [_bound(evidence, prior) for evidence in found]
     best = UNJOINED

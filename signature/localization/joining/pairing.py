@@ -57,7 +57,7 @@ def compare_pairs(
 
     @functools.lru_cache(_KEPT)
     def prepared(name: str) -> JoinableMap:
-        return JoinableMap.of(database.grid(name), database.graph(name), sight_m)
+        return JoinableMap(grid=database.grid(name), graph=database.graph(name), sight_m=sight_m)
 
     with observer.step(f"compare {len(pairs)} pairs of sessions"):
         for done, (a, b) in enumerate(pairs, start=1):

@@ -51,37 +51,23 @@ class Piece:
 
     def mirrored(self) -> Piece:
         """With x turned into -x."""
-        field, flip = self.walls.field, np.array((-1.0, 1.0), np.float32)
-        right_m = field.origin_m[0] + field.values.shape[1] * field.resolution_m
-        flipped = replace(
-            field,
-            values=np.ascontiguousarray(field.values[:, ::-1]),
-            known=np.ascontiguousarray(field.known[:, ::-1]),
-            origin_m=(-right_m, field.origin_m[1]),
-        )
-        walls = replace(
-            self.walls,
-            field=flipped,
-            points_m=self.walls.points_m * flip,
-            before_m=self.walls.before_m * flip,
-            slices=(),
-        )
-        return Piece(walls, (-self.center_m[0], self.center_m[1]))
+        return Piece(self.walls.mirrored(), (-self.center_m[0], self.center_m[1]))
 
 
 def pieces_of(grid: OccupancyGrid) -> tuple[Piece, ...]:
-    """The squares of a map without heights that hold enough walls."""
+    """The squares of a map that hold enough walls."""
     side = round(PIECES.side_m / grid.resolution_m)
     height, width = grid.cells.shape
     found = []
     for row in range(0, height, side):
         for column in range(0, width, side):
-            cells = grid.cells[row : row + side, column : column + side]
+            here = np.s_[row : row + side, column : column + side]
+            cells, heights = grid.cells[here], None if grid.heights is None else grid.heights[here]
             if not (cells > UNKNOWN).any():
                 continue
             x, y = grid.origin_m
             origin_m = (x + column * grid.resolution_m, y + row * grid.resolution_m)
-            walls = Walls.of(replace(grid, cells=cells, origin_m=origin_m))
+            walls = Walls.of(replace(grid, cells=cells, heights=heights, origin_m=origin_m))
             if walls.weight >= PIECES.least_walls:
                 at_x, at_y = walls.points_m.mean(axis=0).tolist()
                 found.append(Piece(walls, (at_x, at_y)))
@@ -101,7 +87,8 @@ def align_pieces(
             nearest = np.argmin(np.hypot(*(centers_m[trusted] - centers_m[number]).T))
             start = fits[trusted[int(nearest)]].T_map_query
         piece = pieces[number]
-        pose, covariance = refine(target.field, piece.walls.points_m, start, piece.center_m)
+        points_m = piece.walls.facing(target.walls).points_m
+        pose, covariance = refine(target.field, points_m, start, piece.center_m)
         fits[number] = fit = score_fit(target.walls, piece.walls, pose, covariance)
         if fit.known_agreement_both_ways >= PIECES.follows:
             trusted.append(number)
@@ -123,18 +110,15 @@ class PieceFits:
     agreement: F64
 
     @staticmethod
-    def of(fits: Sequence[Sequence[Fit]], pieces: Sequence[Piece]) -> PieceFits:
+    def of(fits: Sequence[Sequence[Fit]]) -> PieceFits:
         """From the fits of all pieces under each transform."""
-        weights = np.array([piece.walls.weight for piece in pieces])
 
         def column(name: str) -> F64:
-            return np.array([[getattr(fit, name) for fit in row] for row in fits]).reshape(
-                len(fits), len(pieces)
-            )
+            return np.array([[getattr(fit, name) for fit in row] for row in fits], ndmin=2)
 
         looked_at = column("looked_at")
         return PieceFits(
-            seen=column("overlap") * weights,
+            seen=column("compared"),
             looked_at=looked_at,
             forward=column("forward"),
             backward=np.where(looked_at > 0.0, column("backward"), LIKELIHOOD.neutral),
@@ -168,7 +152,7 @@ class Link:
 
 def links_of(pieces: Sequence[Piece], fits: Sequence[Fit]) -> tuple[Link, ...]:
     """The pieces that agree with the target. Those on ground that it hardly knows do not count."""
-    seen = [fit.overlap * piece.walls.weight for piece, fit in zip(pieces, fits, strict=True)]
+    seen = [fit.compared for fit in fits]
     shown = [k for k, walls in enumerate(seen) if walls >= PIECES.least_walls] or [int(np.argmax(seen))]
     kept = [k for k in shown if fits[k].known_agreement_both_ways >= PIECES.follows] or shown
     noise = np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))

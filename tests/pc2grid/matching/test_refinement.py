@@ -35,7 +35,7 @@ def test_the_compiled_normal_equations_are_the_plain_ones(near: tuple[float, flo
     assert fast[3] == plain[3] >= REFINEMENT.least_points
     for a, b in zip(fast, plain, strict=True):
         assert np.allclose(a, b, rtol=1e-9, atol=1e-9)
-    pose, _, _ = gauss_newton([(FIELD.values, x, y)], np.array([*near, 0.3]), ONE_STEP)
+    pose, _, _ = gauss_newton(FIELD.values, x, y, np.array([*near, 0.3]), ONE_STEP)
     H, g = plain[:2]
     step = np.linalg.solve(H + np.diag(0.05 * np.diag(H) + 1e-3), g)
     size = math.hypot(step[0], step[1])
@@ -51,10 +51,10 @@ def test_a_step_of_the_refinement_is_two_cells_at_most() -> None:
     field[:] = np.exp(-0.5 * (away / sigma) ** 2) * 255
     x, y = np.zeros(40), np.linspace(-15, 15, 40)
     start = np.array([40.5 - 2.2 * sigma, 40.0, 0.0])
-    (tx, ty, _), _, _ = gauss_newton([(field, x, y)], start, ONE_STEP)
+    (tx, ty, _), _, _ = gauss_newton(field, x, y, start, ONE_STEP)
     assert math.hypot(tx - start[0], ty - 40.0) == pytest.approx(2.0, abs=1e-9)
     assert tx > start[0]
-    (tx, _, yaw), _, _ = gauss_newton([(field, x, y)], start, RefinementParameters(steps=30))
+    (tx, _, yaw), _, _ = gauss_newton(field, x, y, start, RefinementParameters(steps=30))
     assert tx == pytest.approx(40.5, abs=0.05) and yaw == pytest.approx(0.0, abs=1e-3)
 
 

@@ -10,7 +10,7 @@ import pytest
 from pc2grid.geometry import SE2
 from pc2grid.matching.likelihood_field import LIKELIHOOD
 from pc2grid.matching.refinement import refine
-from pc2grid.matching.two_way_score import _sums, plain_known_sums, score_fit
+from pc2grid.matching.two_way_score import Fit, _sums, plain_known_sums, score_fit
 from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import SearchMap, search_windows
 from pc2grid.model import THING, UNKNOWN, OccupancyGrid
@@ -42,12 +42,12 @@ def test_unknown_ground_is_neutral() -> None:
 
 
 @pytest.mark.parametrize("pose", [SE2(), SE2(9.3, 6.1, 0.7), SE2(1.0, 13.0, -2.0), SE2(60.0, 0.0, 0.1)])
-@pytest.mark.parametrize("above", [False, True])
-def test_the_compiled_sums_are_the_plain_ones(pose: SE2, above: bool) -> None:
+@pytest.mark.parametrize("only_explain", [False, True])
+def test_the_compiled_sums_are_the_plain_ones(pose: SE2, only_explain: bool) -> None:
     """Within the map, over its edge, and beside it."""
     grid = office_part((10.0, 7.0))
-    walls = Walls.of(grid).seen_from(grid.free.astype(np.float32))
-    fast, plain = (sums(walls, TARGET.field, pose, above) for sums in (_sums, plain_known_sums))
+    walls = replace(Walls.of(grid).seen_from(grid.free.astype(np.float32)), only_explain=only_explain)
+    fast, plain = (sums(walls, TARGET.field, pose) for sums in (_sums, plain_known_sums))
     assert fast == pytest.approx(plain, rel=1e-5, abs=1e-9)  # one adds in single precision
 
 
@@ -93,7 +93,7 @@ def test_what_was_moved_costs_less_than_a_missing_wall() -> None:
     assert joined < apart < 1.0
 
 
-def kitchen(seen: str) -> Walls:
+def kitchen(seen: str, *, tells_heights: bool = True) -> Walls:
     """A counter 2.4 m long in front of a wall, 0.6 m away: its front is seen, or it is looked over."""
     cells = np.full((60, 80), UNKNOWN, np.int8)
     heights = np.zeros((60, 80), np.uint8)
@@ -102,19 +102,20 @@ def kitchen(seen: str) -> Walls:
     if seen != "front":
         cells[31:42, 10:58], heights[31:42, 10:58] = THING, 0b100_010
         cells[42, 10:58], heights[42, 10:58] = 100, 0b000_100
-    return Walls.of(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0), heights=heights))
+    told = heights if tells_heights else None
+    return Walls.of(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0), heights=told))
 
 
-def test_walls_are_compared_at_the_heights_that_both_have_seen() -> None:
-    """The front is a wall in one map and a thing in the other. With heights it is the same, and the wall
-    behind the counter does not fit onto the front, which is as long, but lower."""
-    front, over = kitchen("front"), kitchen("over")
+def test_a_counter_is_the_same_by_its_front_and_looked_over() -> None:
+    """The front is a wall in one map and a thing in the other, and explains it. Without heights the thing is
+    unknown, and the wall behind the counter, which is as long, is taken for the front."""
     onto_front = SE2(0.0, -0.6, 0.0)
+    front, over = kitchen("front"), kitchen("over")
     right, wrong = (score_fit(front, over, pose, np.eye(3)) for pose in (SE2(), onto_front))
-    assert right.known_agreement_both_ways > 0.9 > right.score > wrong.score + 0.2
-    flat = [replace(walls, slices=()) for walls in (front, over)]
-    right, wrong = (score_fit(*flat, pose, np.eye(3)) for pose in (SE2(), onto_front))
-    assert wrong.score > right.score
+    assert right.known_agreement_both_ways > 0.99 and wrong.known_agreement_both_ways < 0.7
+    front, over = (kitchen(seen, tells_heights=False) for seen in ("front", "over"))
+    right, wrong = (score_fit(front, over, pose, np.eye(3)) for pose in (SE2(), onto_front))
+    assert right.overlap == 0.0 and wrong.known_agreement_both_ways > 0.99
 
 
 @pytest.mark.parametrize("value", [UNKNOWN, 0, 100])
@@ -170,23 +171,51 @@ def test_planes_near_to_each_other_and_unknown_heights_are_compared_in_full() ->
         assert fit.overlap == 1.0 and fit.known_agreement < 0.8
 
 
-def with_table(x_m: float) -> Walls:
-    """The same room with a table of 1 x 2 m whose middle is at (x, 0), seen by a camera."""
+ROOM_WEIGHT = seen_from_the_middle(None).weight
+TABLE = np.s_[31:51, 11:51]
+
+
+def with_table(heights_of_it: int) -> Walls:
+    """The same room with something of 2 x 1 m at one end, seen at all heights: its heights, see `SLICES`."""
     cells = np.full((82, 122), 0, np.int8)
     cells[[0, -1], :] = cells[:, [0, -1]] = 100
-    column = round((x_m + 3.05) / 0.05)
-    cells[31:51, column - 20 : column + 20] = THING
-    heights = np.select(
-        [cells == 100, cells == THING], [np.uint8(0b000_111), np.uint8(0b100_010)], np.uint8(0)
-    )
+    heights = np.where(cells == 100, np.uint8(0b000_111), np.uint8(0))
+    cells[TABLE], heights[TABLE] = THING, heights_of_it
     return Walls.of(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-3.05, -2.05), heights=heights))
 
 
+AT_ONE_HEIGHT, AT_ALL_HEIGHTS = 0b101_010, 0b000_111
+
+
+@pytest.mark.parametrize("laser_asks", [True, False])
+def test_what_stands_at_one_height_explains_a_laser_and_does_not_contradict_it(laser_asks: bool) -> None:
+    """One laser sees a table, as it is at the height of its top. Another one passes under it."""
+    table = with_table(AT_ONE_HEIGHT)
+
+    def fit(laser: Walls) -> Fit:
+        return score_fit(*((table, laser) if laser_asks else (laser, table)), SE2(), np.eye(3))
+
+    passes, meets = fit(seen_from_the_middle(None)), fit(seen_from_the_middle(None, TABLE))
+    for one in (passes, meets):
+        assert one.known_agreement_both_ways > 0.99 and one.overlap > 0.99  # corners of the table are rounded
+    walls_of_laser = (meets.compared, meets.looked_at)[0 if laser_asks else 1]
+    assert walls_of_laser > ROOM_WEIGHT + 50.0  # the table is explained, and not left out as unknown ground
+    assert passes.compared == passes.looked_at == ROOM_WEIGHT
+
+
+@pytest.mark.parametrize("laser_asks", [True, False])
+def test_what_stands_at_all_heights_contradicts_a_laser_that_did_not_see_it(laser_asks: bool) -> None:
+    cupboard, laser = with_table(AT_ALL_HEIGHTS), seen_from_the_middle(None)
+    fit = score_fit(*((cupboard, laser) if laser_asks else (laser, cupboard)), SE2(), np.eye(3))
+    assert fit.known_agreement_both_ways < 0.9
+
+
 def test_a_table_tells_where_the_walls_do_not() -> None:
-    """In a room that looks the same turned by 180 degrees, the table at one end decides."""
-    room, turned = with_table(-1.5), SE2(0.0, 0.0, np.pi)
-    right, wrong = (score_fit(room, with_table(-1.5), pose, np.eye(3)) for pose in (SE2(), turned))
-    assert right.score > 0.95 > wrong.score + 0.05
+    """In a room that looks the same turned by 180 degrees, the table at one end decides, if both have looked
+    at all heights. A laser's map may have missed it."""
+    room, turned = with_table(AT_ONE_HEIGHT), SE2(0.0, 0.0, np.pi)
+    right, wrong = (score_fit(room, room, pose, np.eye(3)) for pose in (SE2(), turned))
+    assert right.score > 0.99 > wrong.score + 0.05
     no_table = seen_from_the_middle(None)
-    unaware = [score_fit(no_table, with_table(-1.5), pose, np.eye(3)).score for pose in (SE2(), turned)]
-    assert unaware[0] == pytest.approx(unaware[1], abs=0.02) and unaware[1] > 0.95  # a laser's map: neutral
+    unaware = [score_fit(no_table, room, pose, np.eye(3)).score for pose in (SE2(), turned)]
+    assert unaware[0] == pytest.approx(unaware[1], abs=0.02) and unaware[1] > 0.95

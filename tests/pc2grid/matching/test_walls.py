@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from pc2grid.matching.walls import WALLS, Walls, at_all_heights, steadiness, thin_evenly
-from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid
+from pc2grid.matching.walls import WALLS, WallParameters, Walls, steadiness, thin_evenly
+from pc2grid.model import OCCUPIED, THING, OccupancyGrid
 
 
 def test_a_wall_point_counts_by_the_size_of_its_object() -> None:
@@ -54,24 +56,45 @@ def test_thinning_keeps_the_first_point_of_each_square(seed: int, count: int, fa
     assert np.array_equal(thin_evenly(points, 0.4), np.sort(first))
 
 
-def test_a_laser_sees_what_stands_at_all_heights() -> None:
+OF_A_LASER = Walls.of(
+    OccupancyGrid(cells=np.zeros((40, 40), np.int8), resolution_m=0.05, origin_m=(0.0, 0.0))
+)
+
+
+def test_a_laser_must_have_seen_what_stands_at_all_heights() -> None:
     """A table top, under and over which rays have passed, and a cupboard, of which the upper half was seen:
-    nothing has passed below. A laser may see the table or not, and sees the cupboard at any height."""
+    nothing has passed below. Both explain what a laser sees. It may miss the table, and not the cupboard. Who
+    has looked at all heights must have seen both."""
     cells, heights = np.zeros((2, 40, 40), np.int8)
-    cells[10, 5:35], heights[10, 5:35] = OCCUPIED, 0b101_010
+    cells[10, 5:35], heights[10, 5:35] = THING, 0b101_010
+    cells[11:15, 5:35], heights[11:15, 5:35] = THING, 0b101_010
     cells[30, 5:35], heights[30, 5:35] = OCCUPIED, 0b000_110
-    grid = OccupancyGrid(cells=cells, heights=heights, resolution_m=0.05, origin_m=(0.0, 0.0))
-    seen = at_all_heights(grid)
-    assert set(seen.cells[10, 5:35].tolist()) == {UNKNOWN}
-    assert set(seen.cells[30, 5:35].tolist()) == {OCCUPIED}
-    assert seen.free[20].all()
-    assert seen.heights is None
+    walls = Walls.of(OccupancyGrid(cells=cells, heights=heights, resolution_m=0.05, origin_m=(0.0, 0.0)))
+    assert (walls.field.values[[12, 30], 10:30] == 255).all()
+    missed, seen = walls.facing(OF_A_LASER), walls.facing(walls)
+    assert np.allclose(missed.points_m[:, 1], 30.5 * 0.05)
+    table = seen.points_m[:, 1] < 1.0
+    assert table.any() and missed.weight == pytest.approx(float(seen.weights[~table].sum()))
+    # A thing, 1.6 m long with a cell on each side.
+    assert seen.weights[table] == pytest.approx(WALLS.movable * 1.6 / WALLS.fixed_m)
 
 
-def test_a_laser_sees_the_rim_of_a_thing_and_not_its_inside() -> None:
+def test_of_a_thing_its_edges_must_have_been_seen_and_not_its_inside() -> None:
     cells = np.zeros((40, 40), np.int8)
     cells[10:30, 10:30] = OCCUPIED
     grid = OccupancyGrid(cells=cells, heights=np.zeros_like(cells), resolution_m=0.05, origin_m=(0.0, 0.0))
-    seen = at_all_heights(grid)
-    assert (seen.cells[11:29, 11:29] == UNKNOWN).all()
-    assert np.count_nonzero(seen.occupied) == 4 * 19  # whose heights are not known stands at all of them
+    walls = Walls.of(grid, WallParameters(spacing_m=0.05))
+    # What stands at heights that are not known stands at all of them.
+    assert len(walls.facing(OF_A_LASER).points_m) == len(walls.facing(walls).points_m) == 4 * 19
+
+
+@pytest.mark.parametrize(
+    ("mine_m", "other_m", "only_explain"),
+    [(0.1, 2.0, True), (2.0, 0.1, False), (0.1, 0.4, False), (None, 2.0, False), (0.0, 2.0, False)],
+)
+def test_a_laser_clearly_above_need_not_have_seen_anything(
+    mine_m: float | None, other_m: float, only_explain: bool
+) -> None:
+    """Of a laser that tf does not lift above its base, nobody has said how high it is."""
+    mine, other = replace(OF_A_LASER, height_m=mine_m), replace(OF_A_LASER, height_m=other_m)
+    assert mine.facing(other).only_explain is only_explain

@@ -9,11 +9,11 @@ import numpy as np
 from pc2grid.arrays import F32
 from pc2grid.geometry import SE2
 from pc2grid.matching.window_search import SearchMap
-from pc2grid.model import OCCUPIED, OccupancyGrid
+from pc2grid.model import OccupancyGrid
 from signature.config import Config
 from signature.localization.hypotheses import HYPOTHESES, coarse_points, fitted
 from signature.localization.query import query_of
-from tests.helpers.simulated_drives import building, office
+from tests.helpers.simulated_drives import building, office, with_tables
 
 CENTER_M = (3.0, -2.0)
 
@@ -49,13 +49,8 @@ def test_a_pose_is_not_stated_more_exactly_than_the_map_is_drawn() -> None:
     assert np.all(stated < (0.1, 0.1, 0.01))  # a tenth of a robot's width: what is aligned is known
 
 
-def test_a_laser_and_a_lidar_are_compared_on_the_walls_that_any_laser_sees() -> None:
-    """Tables that the lidar has seen over and under hide no place from a laser, which has not seen them."""
-    of_laser = office()
-    cells, heights = of_laser.cells.copy(), np.zeros(of_laser.cells.shape, np.uint8)
-    tables = np.flatnonzero(of_laser.free)[::7]
-    cells.flat[tables], heights.flat[tables] = OCCUPIED, 0b101_010
-    of_lidar = replace(of_laser, cells=cells, heights=heights)
+def test_tables_that_a_lidar_has_seen_over_and_under_hide_no_place_from_a_laser() -> None:
+    of_laser, of_lidar = office(), with_tables(office())
     at_map = SE2(0.04, -0.03, 0.01)
 
     def agreement(query: OccupancyGrid, target: OccupancyGrid) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -15,6 +16,7 @@ from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from signature.config import Config
 from signature.localization.place_recognition import RECOGNITION, RecognitionParameters, SessionRecognizer
+from tests.helpers.simulated_drives import with_tables
 
 
 def rooms(seed: int) -> OccupancyGrid:
@@ -69,6 +71,17 @@ def test_an_earlier_place_is_recognised_and_a_new_one_is_not() -> None:
     assert math.hypot(best.T_older_newest.x - again.x, best.T_older_newest.y - again.y) < 0.1
     assert abs(wrap_angle(best.T_older_newest.yaw - again.yaw)) < 0.02
     assert all(recognition.older < 4 for recognition in found)
+
+
+def test_tables_that_were_seen_over_and_under_do_not_hide_an_earlier_place() -> None:
+    """They were carried away since. They hide it if nothing tells at which heights they stood."""
+    tables, probable = with_tables(rooms(1)), []
+    for earlier in (tables, replace(tables, heights=None)):
+        recognizer = SessionRecognizer(Config())
+        recognizer.recognize(stretch(0, earlier))
+        (found,) = recognizer.recognize(stretch(1, rooms(1)))
+        probable.append(found.probability)
+    assert probable[0] > 0.99 > 0.9 > probable[1]
 
 
 def test_two_maps_show_one_place_the_surer_the_more_walls_agree() -> None:

@@ -100,7 +100,7 @@ def map_of(path: Path, name: str, mirrored: bool = False) -> JoinableMap:
     if mirrored:
         grid = replace(grid, cells=grid.cells[:, ::-1].copy())
         graph = junction_graph(grid, config.partition)
-    return JoinableMap.of(grid, graph, config.partition.radius_m)
+    return JoinableMap(grid=grid, graph=graph, sight_m=config.partition.radius_m)
 
 
 def truth(a: Session, b: Session, others: Sequence[Session]) -> SE2 | None:

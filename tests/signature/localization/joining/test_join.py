@@ -15,7 +15,7 @@ from signature.localization.joining.graph_matching import Alignment, align_graph
 from signature.localization.joining.join import JOIN, Join, join_maps
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, joinable, part
 from tests.helpers.rooms import RESOLUTION_M
-from tests.helpers.simulated_drives import office, plan
+from tests.helpers.simulated_drives import office, plan, with_tables
 
 MIDDLE_M = (9.5, 7.0)
 """The middle of the strip that both know, in the map of the west."""
@@ -45,7 +45,20 @@ def test_a_map_that_tells_heights_is_cut_in_the_same_pieces() -> None:
     tells = joinable(replace(west.grid, heights=heights))
     assert len(tells.pieces) == len(west.pieces) > 1  # the map is larger than a piece
     for piece, same in zip(tells.pieces, west.pieces, strict=True):
-        assert np.array_equal(piece.walls.points_m, same.walls.points_m)
+        # Where walls meet, they are solid, and have no points inside.
+        assert 0.9 * same.walls.weight < piece.walls.weight <= same.walls.weight
+
+
+@pytest.mark.parametrize("lidar_asked", [True, False])
+def test_tables_of_a_lidar_do_not_part_it_from_a_laser(lidar_asked: bool) -> None:
+    """They contradict its free space if nothing tells at which heights they stand."""
+    tables = with_tables(west.grid)
+    flat = replace(tables, heights=None)
+    told, untold = (
+        join_maps(*((joinable(grid), east) if lidar_asked else (east, joinable(grid))))
+        for grid in (tables, flat)
+    )
+    assert told.status == "joined" and told.agreement > 0.95 > 0.6 > untold.agreement
 
 
 def test_it_does_not_matter_which_of_the_two_is_asked() -> None:
