@@ -23,6 +23,10 @@ _ANSWERED = (0, 3, 4)
 """Exit codes of a command that did its work: done, with loss of data, without a confident answer."""
 
 
+_STOPPED = (130, 143)
+"""Exit codes of a command that was interrupted or asked to end."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finished:
     """What became of one command.
@@ -39,6 +43,11 @@ class Finished:
     peak_mb: float
     document: Any
     error: str = ""
+
+    @property
+    def stopped(self) -> bool:
+        """Whether somebody stopped it, so that nothing is known of what it would have done."""
+        return self.code in _STOPPED
 
     @property
     def failed(self) -> bool:

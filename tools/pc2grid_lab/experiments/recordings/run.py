@@ -194,7 +194,9 @@ def _run(tasks: Sequence[_Task], jobs: int) -> Iterator[int]:
 
 
 def _do(task: _Task) -> None:
-    keep(task.file, task.do())
+    done = task.do()
+    if not done.stopped:  # else the next run does it
+        keep(task.file, done)
 
 
 def _convert(folder: Folder, name: str, recording: Recording, until_s: float | None) -> _Task:
