@@ -579,7 +579,7 @@ class Stream:
         """
         T_base_sensor = self._poses.sensor(mounted, scan.stamp_ns)
         seen = scan.points_m[:, 2] < T_base_sensor[2, 3] - _FLOOR_BELOW_M
-        if not self._part.good and np.mean(seen) < _FLOOR_SHARE:
+        if len(seen) and not self._part.returns and np.mean(seen) < _FLOOR_SHARE:
             raise registered(self._plan.choice.sensor_frame or "")
         return replace(scan, T_base_sensor=T_base_sensor, offsets_s=None)
 
