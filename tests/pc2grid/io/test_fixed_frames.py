@@ -67,6 +67,16 @@ def test_what_cannot_be_taken_back_is_refused(messages: list[Message], tmp_path:
     assert "--topic" in str(error.value.hint)
 
 
+def test_a_first_cloud_without_points_decides_nothing(tmp_path: Path) -> None:
+    mount, _, *rest = registered()
+    empty = ros().cloud("/registered", T0, np.empty((0, 3)), frame="odom")
+    scans, _ = read(write_mcap(tmp_path / "a.mcap", [mount, empty, *rest]))
+    assert len(scans) == 5
+    path = write_mcap(tmp_path / "b.mcap", [empty, *rest])
+    with pytest.raises(FrameError, match="registered already"):
+        read(path)
+
+
 def test_a_sensor_whose_own_frame_is_merely_named_like_a_fixed_one(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", registered("map", tf=False, mount=False))
     (scan, *_), _ = read(path, ReadConfig(assume_identity=True))
