@@ -99,7 +99,7 @@ def test_the_answer_is_printed_although_a_picture_cannot_be_written(
 def test_the_output_of_a_command_has_the_same_option_everywhere() -> None:
     group: Any = get_command(app)
     folders = [group.commands["demo"]]
-    folders += [group.commands["compare"].commands[name] for name in ("paper", "sensors", "maps")]
+    folders += [group.commands["compare"].commands[name] for name in ("paper", "sensors", "recordings")]
     for command in folders:
         (option,) = [param for param in command.command.params if "--output" in param.opts]
         assert {"-o", "--output", "--out"} <= set(option.opts), command.name
