@@ -193,7 +193,7 @@ def test_compiling_is_noted_once(capsys: pytest.CaptureFixture[str]) -> None:
         with terminal.observer().step("work"):
             assert numba.njit(lambda x: x + 1)(1) == 2
             assert numba.njit(lambda x: x + 2)(1) == 3
-    assert capsys.readouterr().err.count("compiling, once") == 1
+    assert capsys.readouterr().err.count("compiling what") == 1
 
 
 def test_the_version_needs_no_command(
