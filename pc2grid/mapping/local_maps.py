@@ -153,6 +153,7 @@ class LocalMaps:
         self._keyframes = keyframes
         self._parameters = parameters
         self.runs: list[range] = []
+        self._settled: F64 | None = None
         self._drawn: OrderedDict[int, LocalMap] = OrderedDict()
 
     def append(self, run: range) -> None:
@@ -173,6 +174,11 @@ class LocalMaps:
         run = self.runs[number]
         return run[len(run) // 2]
 
+    def redraw(self, settled: F64) -> None:
+        """From now on, draw with settled keyframe poses (K, 3), x, y, yaw, in place of the tracked ones."""
+        self._settled = settled
+        self._drawn.clear()
+
     def __getitem__(self, number: int) -> LocalMap:
         if number not in self._drawn:
             run, anchor = self.runs[number], self.anchor(number)
@@ -188,5 +194,9 @@ class LocalMaps:
     def keyframes(self, numbers: range, anchor: int) -> tuple[list[Keyframe], list[SE2]]:
         """Keyframes, and their poses T_anchor_base in the frame of the keyframe `anchor`."""
         keyframes = [self._keyframes[k] for k in numbers]
-        T_anchor_session = self._keyframes.pose(anchor).inverse()
-        return keyframes, [T_anchor_session @ keyframe.T_session_base for keyframe in keyframes]
+        T_anchor_session = self._pose(anchor).inverse()
+        return keyframes, [T_anchor_session @ self._pose(k) for k in numbers]
+
+    def _pose(self, number: int) -> SE2:
+        """T_session_base of a keyframe: settled, or as tracked if loops are not closed yet."""
+        return self._keyframes.pose(number) if self._settled is None else pose_at(self._settled, number)

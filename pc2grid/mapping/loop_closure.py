@@ -143,10 +143,14 @@ class LoopCloser:
         distance_m = np.hypot(*(before - nodes[newest, :2]).T)
         near_m = self._parameters.near_m + window_m
         for older in spread_over_visits(distance_m, near_m, self._parameters.compared):
-            guess = self._graph.relative(older, newest)
-            edge = self._verification.edge(older, newest, guess, window_m, window_rad)
+            edge = self._compare(older, newest, window_m, window_rad)
             if edge is not None:
                 yield edge
+
+    def _compare(self, older: int, newer: int, window_m: float, window_rad: float) -> Edge | None:
+        """The measured relative pose of two local maps, near the present one; None if they do not match."""
+        guess = self._graph.relative(older, newer)
+        return self._verification.edge(older, newer, guess, window_m, window_rad)
 
     # --- place recognition --------------------------------------------------------------------------------
 
@@ -177,7 +181,7 @@ class LoopCloser:
 
     def _settled_keyframes(self) -> SettledKeyframes:
         """Solve the pose graph; the poses, loops and parts that this gives."""
-        solution = self._graph.solve()
+        solution = self._settle()
         scans, anchors = self._keyframes.scans, self._local_maps.anchors()
         loops = tuple(
             Loop(
@@ -201,6 +205,21 @@ class LoopCloser:
             anchors=np.array(anchors, dtype=np.int64),
             sigma_m=self._graph.sigmas(solution, part),
         )
+
+    def _settle(self) -> Solution:
+        """Solve the pose graph.
+
+        The overlaps were measured on local maps that are as bent as tracking drifts. So these are drawn again
+        with the poses that are found, and compared again.
+        """
+        self._graph.solve()
+        self._local_maps.redraw(self._settled())
+        p, edges = self._parameters, self._graph.edges
+        again = (
+            self._compare(e.first, e.second, p.certain_m, p.certain_rad) if e.loop else None for e in edges
+        )
+        self._graph.edges = [new or old for new, old in zip(again, edges, strict=True)]
+        return self._graph.solve()
 
     def _settled(self) -> F64:
         """Keyframe poses (K, 3) that follow the anchors of their local maps.
