@@ -335,7 +335,8 @@ class _Poses:
         found = self._frames.lookup(base, frame, stamp_ns)
         if found is None:
             raise PointCloudError("tf is unknown at the stamp")
-        if self._images and "optical" not in frame and found[2, 2] > _UP:
+        of_images = self._images and frame != self._imu_frame
+        if of_images and "optical" not in frame and found[2, 2] > _UP:
             self._tally.warn(
                 f"the images are in frame {frame}, whose z axis points up, where that of a camera points "
                 "forward (REP-103): x is taken for forward; correct it to the camera's optical frame"
