@@ -169,6 +169,11 @@ class Answer:
         return map_png(self.map.cells, self.map.resolution_m, self.map.origin_m, centers_m=there_m)
 
     @property
+    def slipped(self) -> float:
+        """Probability that the query lay at the best place until it was carried away or tracking slipped."""
+        return self.masses[0] * self.evidence.slipped() if self.masses else 0.0
+
+    @property
     def label(self) -> Label:
         """Building and floor of the session it was located in, as far as they are known."""
         return Label() if self.status != "located" else self.labels[self.hypotheses[0].session_index]

@@ -6,6 +6,7 @@ both sides have points.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 from typing import Literal
@@ -15,7 +16,8 @@ import numpy as np
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from signature.localization.answer import Answer, Moment, Verdict
-from signature.localization.decision import PriorOf, anywhere, decide, judge
+from signature.localization.belief import Masses
+from signature.localization.decision import PriorOf, anywhere, decide, judge, with_slip
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.in_space import settle_in_space
 from signature.localization.map_index import MapIndex
@@ -54,6 +56,7 @@ def answer_query(
     verdict = decide(index, seen, found, prior_of)
     clock.lap("decide")
     verdict, prior, excluded = _with_prior(index, seen, verdict, prior_of)
+    verdict = _with_slip(index, query, verdict)
     clock.lap("decide")
     in_space = None
     if query.in_space is not None:
@@ -81,6 +84,19 @@ def _with_prior(
     excluded = best.hypotheses and not index.allows(query, best.hypotheses[0])
     verdict = judge(index, query, everywhere, prior_of)
     return verdict, "used", moment_of(index.whole, query, best) if excluded else None
+
+
+def _with_slip(index: MapIndex, query: Query, verdict: Verdict) -> Verdict:
+    """The verdict, by what the scans since the likeliest slip say alone."""
+    evidence = verdict.evidence
+    if not evidence.tail or min(evidence.tail) >= 0.0:
+        return verdict
+    since = query.since(evidence.scans_since).map()
+    alone = decide(index, since, index.look_up(since))
+    here = Masses.of(since, alone).mass([verdict.hypotheses[0]])
+    found = alone.confidence and math.exp(alone.evidence.log_odds()) / alone.confidence
+    elsewhere = 1.0 + found * (sum(alone.masses) - here)
+    return with_slip(verdict, elsewhere, index.config.accept)
 
 
 def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:

@@ -65,7 +65,7 @@ def judge(
     ordered, prior, evidence = (list(each) for each in zip(*known, strict=True))
     best = ordered[0][0]
     walls = index.maps_for(query)[best.session_index].walls
-    evidence[0] = replace(evidence[0], tail=tail_of(query, best.fit, walls))
+    evidence[0] = replace(evidence[0], tail=tail_of(query, best.fit, walls, index.config.step_m))
     mass = masses(evidence, prior).tolist()
     in_the_map = evidence[0].log_odds() + math.log(prior[0]) >= 0.0
     status: Status = "ambiguous" if in_the_map else "not_found"
@@ -77,6 +77,16 @@ def judge(
         masses=tuple(mass),
         evidence=evidence[0],
     )
+
+
+def with_slip(verdict: Verdict, since: float, accept: float) -> Verdict:
+    """The verdict with `Evidence.since` of its first place. accept : least confidence to be located."""
+    evidence = replace(verdict.evidence, since=since)
+    more = verdict.masses[0] * (evidence.slipped() - verdict.evidence.slipped())
+    masses = tuple(mass / (1.0 + more) for mass in verdict.masses)
+    doubtful = verdict.status == "located" and masses[0] < accept
+    status: Status = "ambiguous" if doubtful else verdict.status
+    return replace(verdict, status=status, confidence=masses[0], masses=masses, evidence=evidence)
 
 
 def _allowed(index: MapIndex, query: QueryMap, places: Sequence[Place]) -> tuple[list[Place], list[Fit]]:

@@ -25,6 +25,7 @@ from signature.localization.belief import Belief, State
 from signature.localization.decision import PriorOf, judge
 from signature.localization.hypotheses import HYPOTHESES, Hypothesis
 from signature.localization.map_index import MapIndex
+from signature.localization.posterior import POSTERIOR
 from signature.localization.prior import Prior
 from signature.localization.query import Query, QueryMap
 
@@ -143,7 +144,7 @@ class Localizer:
 
     def look(self) -> Moment:
         """Search the database now. Raises NoScans if no scan could be used."""
-        query, found = self._search()
+        query, found = self._search(self.query)
         verdict = judge(self.index, query, found, partial(self._belief.prior, query))
         self._clock.lap("decide")
         self._belief.add(query, verdict)
@@ -164,25 +165,43 @@ class Localizer:
         known : hypotheses to be compared, too. prior_of : of each place; None: by the looks before the last
         metres. Raises NoScans if no scan could be used.
         """
-        query, found = self._search(known)
+        if prior_of is not None:
+            return self._answer(self.query, known, prior_of)
+        return self._since_slip()[1]
+
+    def _since_slip(self) -> tuple[Query, Answer]:
+        """The answer; by the scans since the robot was carried away or tracking slipped, if that is more
+        likely than not."""
+        query, answer = self.query, self._answer(self.query)
+        while answer.slipped >= POSTERIOR.likely:
+            query = query.since(answer.evidence.scans_since)
+            answer = self._answer(query)
+        return query, answer
+
+    def _answer(
+        self, query: Query, known: tuple[Hypothesis, ...] = (), prior_of: PriorOf | None = None
+    ) -> Answer:
+        seen, found = self._search(query, known)
         return answer_query(
             self.index,
-            self.query,
             query,
+            seen,
             found,
-            prior_of=prior_of or partial(self._belief.prior, query),
+            prior_of=prior_of or partial(self._belief.prior, seen),
             history=tuple(self._history),
             clock=self._clock,
         )
 
-    def _search(self, known: tuple[Hypothesis, ...] = ()) -> tuple[QueryMap, tuple[Hypothesis, ...]]:
-        """The query, and what retrieval proposes for it beside the hypotheses of the last look."""
-        query = self.query.map()
+    def _search(
+        self, query: Query, known: tuple[Hypothesis, ...] = ()
+    ) -> tuple[QueryMap, tuple[Hypothesis, ...]]:
+        """A query, and what retrieval proposes for it beside the hypotheses of the last look."""
+        seen = query.map()
         self._clock.lap("describe")
-        _, carried = self._last_look
-        found = self.index.look_up(query, (*carried, *known))
+        part, _, carried = self._last
+        found = self.index.look_up(seen, (*(carried if part == seen.part else ()), *known))
         self._clock.lap("look_up")
-        return query, found
+        return seen, found
 
     def restart(self) -> None:
         """The scans do not go on from those before: what comes next is a search of its own, everywhere."""
@@ -220,7 +239,7 @@ class Localizer:
         if not is_time and not (self.located and self.query.lost_scans == _LOST_SCANS):
             return None
         try:
-            answer = self.answer()
+            self.query, answer = self._since_slip()
         except NoScans:  # the scans since the start, or since registration was lost, show nothing
             return None
         query = self.query.map()

@@ -1,9 +1,9 @@
 """The posterior over places and "not in this map": one equation decides every answer.
 
     mass(h)  =  prior(h) exp(z_h) / N                        the query lies at h
-    lost(h)  =  prior(h) exp(z_h) sum_k s exp(-c r_hk) / N   it lay there until tracking slipped before scan k
+    lost(h)  =  mass(h) A sum_k s exp(-c r_hk)               it lay there until it slipped before scan k
     nowhere  =  1 / N                                        it lies at no place of this map
-    N        =  1 + sum_h prior(h) exp(z_h) (1 + sum_k s exp(-c r_hk))
+    N        =  1 + sum_h prior(h) exp(z_h) (1 + A sum_k s exp(-c r_hk))
 
     z_h = b + c (f_h + g_h) + d t_h
     f = l(a_f) n_f / (n_f + few),    g = l(a_b) n_b / (n_b + few),    l(a) = ln a - ln(1.2 - a)
@@ -20,8 +20,12 @@
   no examples of it. What tells for the best of them tells for each, so they share the mass by their priors.
 - like, how well the query fits onto itself, slid along (`pc2grid.matching.self_likeness`): the walls of a
   bare corridor tell no place along it from another.
-- r_hk, the log-likelihood of the scans from k on, f of these alone: where tracking slips, the scans before
-  fit and those after do not, and nothing tells where the robot is now. s is the rate of slips, per scan.
+- r_hk, the log-likelihood of the scans from k on, f of these alone, a metre, times the metres since: where
+  tracking slips or the robot is carried away, the scans before fit and those after do not. s is the rate of
+  slips, per scan. As in a test by the least sum (Page 1954, "Continuous inspection schemes"), what has
+  contradicted for long tells more; metres count, because neighbouring scans see the same walls.
+- A, what the scans since the likeliest slip can be: "nowhere" and each other place of the map, found for
+  these scans alone. 1 as long as nothing contradicts the place.
 
 `located` means that one place has at least the mass `RelocalizeConfig.accept`; `ambiguous`, that the best
 place is at least as likely as "nowhere", z + ln prior >= 0; `not_found` all else.
@@ -103,7 +107,9 @@ class Evidence:
     `pc2grid.matching.walls.steadiness`. backward, looked_at : the other way round, from whichever side.
     lead : score less that of the best place that does not fit equally well, at most `longest_lead` of it.
     likeness : `pc2grid.matching.self_likeness` of the query.
-    tail : r_k, log-likelihood of the scans from the k-th one on, the last one first.
+    tail : r_k, log-likelihood of the scans from the k-th one on, the last one first, up to the second one
+    of the query. since : A, what they can
+    be elsewhere, as a multiple of "nowhere".
     """
 
     forward: float
@@ -113,6 +119,7 @@ class Evidence:
     lead: float
     likeness: float
     tail: tuple[float, ...] = ()
+    since: float = 1.0
 
     @property
     def agreement(self) -> float:
@@ -136,9 +143,14 @@ class Evidence:
             return -math.inf
         return float(np.dot((p.bias, p.fit, p.lead), self.terms))
 
+    @property
+    def scans_since(self) -> int:
+        """How many scans there are since the likeliest slip."""
+        return 1 + min(range(len(self.tail)), key=self.tail.__getitem__)
+
     def slipped(self, p: PosteriorParameters = POSTERIOR) -> float:
         """Mass of "it lay here, but tracking slipped", as a multiple of the mass of the place."""
-        return float(p.slip * np.exp(-p.fit * np.array(self.tail)).sum())
+        return float(p.slip * self.since * np.exp(-p.fit * np.array(self.tail)).sum())
 
 
 NO_EVIDENCE = Evidence(forward=0.0, walls=0.0, backward=0.0, looked_at=0.0, lead=0.0, likeness=0.0)
@@ -180,18 +192,21 @@ def masses(
     return np.asarray(odds / (math.exp(-highest) + odds.sum() + lost))
 
 
-def tail_of(query: QueryMap, fit: Fit, walls: Walls) -> tuple[float, ...]:
-    """`Evidence.tail` of a query at a pose on a map; empty for a drawn map."""
+def tail_of(query: QueryMap, fit: Fit, walls: Walls, step_m: float) -> tuple[float, ...]:
+    """`Evidence.tail` of a query at a pose on a map; empty for a drawn map. step_m : travel after which scans
+    are new evidence."""
     above = query.walls.facing(walls).only_explain
     likelihood = points = 0.0
     tail = []
-    for count, keyframe in enumerate(reversed(query.keyframes), start=1):
+    # Before the first scan there was nothing to slip from.
+    for count, keyframe in enumerate(reversed(query.keyframes[1:]), start=1):
         hits_m = (fit.T_map_query @ keyframe.T_odom_base).apply(keyframe.planar_scan.hits_m)
         values, known = walls.field.at(hits_m, above=above)
         likelihood += float(values[known].sum())
         points += float(np.count_nonzero(known))
         mean = likelihood / points if points else 0.0
-        tail.append(tempered(mean, points / count))
+        steps = (query.path_m - keyframe.path_m) / step_m
+        tail.append(tempered(mean, points / count) * max(steps, 1.0))
     return tuple(tail)
 
 

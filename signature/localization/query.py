@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -148,6 +149,14 @@ class QueryInSpace:
         while self._spacing.path_m - self._views[0][0] > QUERY.space_m:
             self._views.popleft()
 
+    def since(self, travel_m: float) -> QueryInSpace:
+        """The same without the scans from before the last so many metres of travel."""
+        later = QueryInSpace()
+        later._spacing, later.T_odom_base = copy(self._spacing), self.T_odom_base
+        first_m = self._spacing.path_m - travel_m
+        later._views.extend(view for view in self._views if view[0] >= first_m)
+        return later
+
     @property
     def views(self) -> tuple[SpatialView, ...]:
         """The scans, oldest first."""
@@ -221,6 +230,17 @@ class Query:
         self._keyframes.append(newest)
         while path_m - self._keyframes[0].path_m > self._config.window_m:
             self._keyframes.popleft()
+
+    def since(self, scans: int) -> Query:
+        """The query that begins with the last so many `QueryMap.keyframes`: a part of its own."""
+        keyframes = self.map().keyframes[-scans:]
+        begin_m = keyframes[0].path_m
+        later = Query(self._made_with, self._config, prior_ns=self._prior_ns)
+        later.in_space = None if self.in_space is None else self.in_space.since(self.path_m - begin_m)
+        later.part, later.first_ns = self.part + 1, keyframes[0].planar_scan.stamp_ns
+        later._keyframes.extend(replace(k, path_m=k.path_m - begin_m) for k in keyframes)
+        later._newest = later._keyframes[-1]
+        return later
 
     def map(self) -> QueryMap:
         """What has been seen over the last metres, described as the database is.

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
@@ -96,17 +97,23 @@ def test_a_robot_that_is_seen_being_carried_away_is_lost_and_then_recovered() ->
     check_poses(looks)
 
 
-def test_a_robot_that_is_carried_away_unseen_is_recovered_all_the_same() -> None:
-    """It was put down before a scan showed anything, so odometry says that it is where it was."""
-    steps = list(stretch([FIRST[0], (3.6, 7.0)]))
+@pytest.mark.parametrize("corners", [[FIRST[0], (3.6, 7.0)], FIRST])
+def test_a_robot_that_is_carried_away_unseen_is_recovered_all_the_same(
+    corners: list[tuple[float, float]],
+) -> None:
+    """It was put down before a scan showed anything, so odometry says that it is where it was. However much
+    it has seen before, it is found by what it has seen since."""
+    steps = list(stretch(corners))
     end = SE2.from_matrix(steps[-1][0].T_session_base)
     localizer = Localizer(OFFICE)
-    looks = looks_of(localizer, [*steps, *stretch(SECOND, end)])
+    before = looks_of(localizer, steps)
+    looks = looks_of(localizer, list(stretch(SECOND, end)))
     states = [look.state for look, _ in looks]
     at = states.index("recovered")
-    assert "located" in states[:at] and states[at - 1] in ("doubtful", "lost")
+    assert before[-1][0].state == "located" and at <= 2
     assert set(states[at + 1 :]) == {"located"}
-    check_poses(looks[at:])
+    assert all(look.answer.path_m < 3.0 + n for n, (look, _) in enumerate(looks[at:]))
+    check_poses([*before, *looks[at:]])
 
 
 def test_a_robot_elsewhere_is_never_located() -> None:

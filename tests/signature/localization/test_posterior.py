@@ -65,6 +65,9 @@ def test_scans_that_contradict_the_place_move_its_mass_to_slipped() -> None:
     fits, contradicts = tempered(0.9, 200.0), tempered(0.1, 200.0)
     assert mass(replace(USUAL, tail=(fits,) * 50)) == pytest.approx(mass(USUAL), abs=0.01)
     assert mass(replace(USUAL, tail=(contradicts,) * 10 + (fits,) * 40)) < 0.5
+    # A little contradiction is enough where these scans alone fit another place.
+    some = replace(USUAL, tail=(tempered(0.4, 200.0),) * 5 + (fits,) * 45)
+    assert mass(some) > 0.9 and mass(replace(some, since=100.0)) < 0.6
     # A single one that is seen from the same place may be a person who stands in the way.
     assert mass(replace(USUAL, tail=(tempered(0.5, 200.0), *(fits,) * 49))) > 0.9
 

@@ -165,7 +165,7 @@ def evidence_list(index: MapIndex, query: QueryMap, found: tuple[Hypothesis, ...
     evidence = list(evidence_of([h.fit for h in found], query))
     if found:
         walls = index.maps[found[0].session_index].walls
-        evidence[0] = replace(evidence[0], tail=tail_of(query, found[0].fit, walls))
+        evidence[0] = replace(evidence[0], tail=tail_of(query, found[0].fit, walls, index.config.step_m))
     return [asdict(one) for one in evidence]
 
 
