@@ -9,7 +9,7 @@ from typing_extensions import TypedDict
 
 from pc2grid_lab.experiments.metrics import ConfidenceError, MatrixCell
 from pc2grid_lab.experiments.recordings.changes import RowChange
-from pc2grid_lab.experiments.recordings.rows import MapRow, PairRow
+from pc2grid_lab.experiments.recordings.rows import FollowedRow, MapRow, PairRow
 from pc2grid_lab.peers.outcome import PeerCell, PeerTrial
 from signature.localization.answer_json import Version
 
@@ -67,6 +67,7 @@ class CompareRecordings(TypedDict):
     cpu_s: float
     maps: list[MapRow]
     pairs: list[PairRow]
+    followed: list[FollowedRow]
     changes: list[RowChange]
 
 

@@ -19,8 +19,9 @@ from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid.simulate.scene import extrude
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app
-from pc2grid_lab.experiments.recordings import catalogue
+from pc2grid_lab.experiments.recordings import catalogue, kidnaps
 from pc2grid_lab.experiments.recordings.catalogue import Drive, Pair, Recording
+from pc2grid_lab.experiments.recordings.kidnaps import Followed
 from tests.helpers.json_schema import closed
 from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import plan
@@ -91,6 +92,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(catalogue, "RECORDINGS", RECORDINGS)
     monkeypatch.setattr(catalogue, "PAIRS", PAIRS)
+    followed = (Followed(before="b", map="a"), Followed(before="b", map="a", after="b"))
+    monkeypatch.setattr(kidnaps, "FOLLOWED", followed)
 
 
 def compare(data: Path, out: Path, *options: str) -> Any:
@@ -130,10 +133,17 @@ def test_a_small_run(data: Path, tmp_path: Path) -> None:
     (drive,) = (tmp_path / "drives").glob("*.mcap")
     made_ns = drive.stat().st_mtime_ns
     assert [q["status"] for q in elsewhere["queries"]] == ["not_found"]
+    free, carried = document["followed"]
+    assert free["judged"] == free["located"] > 10 and free["wrong"] == free["alarms"] == 0
+    assert free["noticed_s"] is None and free["shown"] and carried["knew"] and carried["shown"]
+    assert 0.0 <= carried["noticed_s"] <= carried["again_s"] < 15.0 and carried["again_m"] < 6.0
+    assert carried["wrong"] == carried["alarms"] == 0
     assert document["changes"] == []
 
     page = (tmp_path / "real.md").read_text()
+    words = " ".join(page.split())
     assert "| a | office | laser |" in page and "broken.mcap" in page and "No answer is wrong." in page
+    assert "| a | b | b |" in page and "Of 1 kidnaps of a robot that knew where it was, 1 are" in words
     kept = json.loads((tmp_path / "real.json").read_text())
     assert {**kept, "changes": []} == document
 

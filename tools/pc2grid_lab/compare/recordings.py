@@ -18,6 +18,7 @@ from pc2grid_cli.output_files import make_folder
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.changes import changes
 from pc2grid_lab.experiments.recordings.judging import judged_table
+from pc2grid_lab.experiments.recordings.kidnaps import followed_in, task
 from pc2grid_lab.experiments.recordings.own import own_recordings, state_of
 from pc2grid_lab.experiments.recordings.page import change_lines, page
 from pc2grid_lab.experiments.recordings.program import commit, digest
@@ -74,11 +75,21 @@ def compare_recordings_command(
     make_folder(work)
     _remove_others(work)
     folder = Folder(data.absolute(), work.absolute())
+    followed = followed_in(catalogue, folder, only)
+    if not (catalogue.mapped or catalogue.pairs or followed):
+        raise ConfigError(f"--only {only}: no recording, building, sensor or kind is named so")
     terminal = console.of(context)
     with terminal.progress("recordings") as advance:
-        run_all(catalogue, folder, jobs=jobs, advance=advance)
+        run_all(
+            catalogue,
+            folder,
+            mapped={name for one in followed for name in (one.before, one.map)},
+            further=[task(catalogue, folder, one) for one in followed],
+            jobs=jobs,
+            advance=advance,
+        )
     with terminal.progress("judge") as advance:
-        found = judged_table(catalogue, folder, program=digest(), commit=commit(), advance=advance)
+        found = judged_table(catalogue, folder, followed, program=digest(), commit=commit(), advance=advance)
     kept = table or out / "real.json"
     before = _read(kept)
     changed = [] if before is None else changes(before, found)
@@ -103,10 +114,7 @@ def _catalogue(
     recordings, pairs = [*named[0], *own[0]], [*named[1], *own[1]]
     if not recordings:
         raise ConfigError(f"{data}: holds no recording", hint="they end in .mcap, .bag or .db3")
-    catalogue = Catalogue.of(recordings, pairs, only=only, quick=quick)
-    if not catalogue.mapped and not catalogue.pairs:
-        raise ConfigError(f"--only {only}: no recording, building, sensor or kind is named so")
-    return catalogue
+    return Catalogue.of(recordings, pairs, only=only, quick=quick)
 
 
 def _read(file: Path) -> Table | None:

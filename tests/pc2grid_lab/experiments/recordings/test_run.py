@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pc2grid_lab.experiments.recordings.children import Finished, kept
-from pc2grid_lab.experiments.recordings.run import _run, _Task
+from pc2grid_lab.experiments.recordings.run import Task, _run
 
 
 @pytest.mark.parametrize(("code", "is_kept"), [(0, True), (1, True), (-11, True), (130, False), (143, False)])
@@ -15,5 +15,5 @@ def test_a_command_that_was_stopped_is_done_by_the_next_run(tmp_path: Path, code
     """A crash is a result; somebody who ends the program is none."""
     done = Finished(code=code, cpu_s=1.0, wall_s=1.0, peak_mb=1.0, document=None)
     file = tmp_path / "answers" / "a.json"
-    assert list(_run([_Task(file, lambda: done, 0.0)], 1)) == [1]
+    assert list(_run([Task(file, lambda: done, 0.0)], 1)) == [1]
     assert (kept(file) is not None) == is_kept

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -114,10 +115,11 @@ def _wait(child: subprocess.Popen[bytes], end_s: float) -> resource.struct_rusag
 
 
 def _parsed(text: bytes) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return None
+    """A JSON document, or several of them, one a line, as a list; None if it is neither."""
+    for parse in (json.loads, lambda lines: [json.loads(line) for line in lines.splitlines()] or None):
+        with contextlib.suppress(ValueError):
+            return parse(text)
+    return None
 
 
 def _error(code: int, complaint: str) -> str:

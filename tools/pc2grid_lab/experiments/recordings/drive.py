@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +13,8 @@ from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, interpolate_pose, invert_pose, leveling
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
-from pc2grid.model import Trajectory
+from pc2grid.model import OccupancyGrid, Trajectory
+from pc2grid.pipeline import follow
 from pc2grid_cli.options import make_config
 from pc2grid_lab.experiments.frames import fit_frame
 from pc2grid_lab.experiments.recordings.catalogue import Recording
@@ -29,6 +31,11 @@ _CARRIED_NS = 5_000_000_000
 _AHEAD_M = 3.0
 """The heading of a pose counts there as much as the position of a point so far ahead; as in
 `RegisteredSession.T_world_odom`."""
+
+_BEFORE_S = 2.0
+"""A scan is looked for from so long before its stamp on."""
+_KNOWN_M = 0.2
+"""A wall hit lies on known ground if the map knows a cell this near: noise puts hits behind the wall."""
 
 
 def sessions(folder: Folder, name: str) -> dict[str, Trajectory]:
@@ -144,3 +151,29 @@ def config_of(recording: Recording) -> Config:
     """The settings that the commands read a recording with."""
     given = dict(zip(recording.options[::2], recording.options[1::2], strict=True))
     return make_config(None, None, topic=given.get("--topic"), odometry=given.get("--odometry"))
+
+
+def hits_at(folder: Folder, recording: Recording, stamp_ns: int) -> F64:
+    """(N, 2) walls that the scan with that stamp shows, in the axes of the base."""
+    config = config_of(recording)
+    with open_log(folder.source(recording), config.read) as log:
+        start_s = max((stamp_ns - log.info.start_ns) * 1e-9 - _BEFORE_S, 0.0)
+        last = None
+        for scan in log.scans(start_s, 2.0 * _BEFORE_S):
+            if last is not None and scan.stamp_ns > stamp_ns:
+                break
+            last = scan
+        assert last is not None  # `scans` raises NoScans
+        ((_, planar_scan),) = follow([last], config)
+    return np.asarray(planar_scan.hits_m, np.float64)
+
+
+def known_share(grid: OccupancyGrid, points_m: F64) -> float:
+    """Share 0..1 of points (N, 2) in the map frame that have a known cell within `_KNOWN_M`; 0 without."""
+    if not len(points_m):
+        return 0.0
+    reach = round(_KNOWN_M / grid.resolution_m)
+    known = cv2.dilate((grid.cells >= 0).astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    cells = grid.to_cell(points_m)
+    inside = ((cells >= 0) & (cells < known.shape)).all(axis=1)
+    return float(known[tuple(cells[inside].T)].sum() / len(points_m))

@@ -6,30 +6,25 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
 from pc2grid.model import OccupancyGrid, Trajectory
-from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_frame, is_right
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.children import Finished, kept
 from pc2grid_lab.experiments.recordings.clouds import cloud_along, registered_clouds
-from pc2grid_lab.experiments.recordings.drive import RecordedDrive, config_of, sessions
+from pc2grid_lab.experiments.recordings.drive import RecordedDrive, config_of, hits_at, known_share, sessions
+from pc2grid_lab.experiments.recordings.kidnaps import Followed, FollowedJudge
 from pc2grid_lab.experiments.recordings.mapped import MISSING, map_row, said
 from pc2grid_lab.experiments.recordings.rows import NOT_RUN, PairRow, QueryRow, Table, Truth
 from pc2grid_lab.experiments.recordings.run import Folder
 from pc2grid_lab.experiments.trial import JUDGEMENT
 from signature.database import open_database
 
-_KNOWN_M = 0.2
-"""A wall hit lies on known ground if the map knows a cell this near: noise puts hits behind the wall."""
-_LAST_S = 2.0
-"""The last scan of a window lies within this of its end."""
 _SESSION = "map"
 """The first session of a map, see `run`."""
 Frames = dict[tuple[int, str], Frame]
@@ -41,6 +36,7 @@ _STEP_M = 0.3
 def judged_table(
     catalogue: Catalogue,
     folder: Folder,
+    followed: Sequence[Followed] = (),
     *,
     program: str,
     commit: str,
@@ -59,6 +55,7 @@ def judged_table(
         cpu_s=folder.cpu_s(),
         maps=maps,
         pairs=tuple(rows),
+        followed=tuple(map(FollowedJudge(catalogue, folder).row, followed)),
     )
 
 
@@ -180,19 +177,7 @@ class Judge:
         else:
             true = drive.true_pose(stamp_ns)
             where = None if true is None else (-1, true)
-        return LocatedWindow(pair.query, number, span, done, where, self._last_hits(query, span, stamp_ns))
-
-    def _last_hits(self, query: Recording, span: TimeSpan, stamp_ns: int) -> F64:
-        """(N, 2) walls that the last scan of a window shows, in the axes of the base."""
-        config, end_s = config_of(query), span.start_s + (span.duration_s or 0.0)
-        start_s = max(end_s - _LAST_S, span.start_s)
-        with open_log(self._folder.source(query), config.read) as log:
-            last = None
-            for scan in log.scans(start_s, end_s - start_s):
-                last = scan if scan.stamp_ns <= stamp_ns or last is None else last
-            assert last is not None  # `scans` raises NoScans
-            ((_, planar_scan),) = follow([last], config)
-        return np.asarray(planar_scan.hits_m, np.float64)
+        return LocatedWindow(pair.query, number, span, done, where, hits_at(self._folder, query, stamp_ns))
 
     def _frames(
         self, pair: Pair, query: Recording, map_: Recording
@@ -406,14 +391,3 @@ def _best(
     ranks = (order.index(place) for (_, _, place), (right, _) in zip(places, judged, strict=True) if right)
     right, error_m = judged[0]
     return {"right": right, "error_m": error_m, "rank": next(ranks, None)}
-
-
-def known_share(grid: OccupancyGrid, points_m: F64) -> float:
-    """Share 0..1 of points (N, 2) in the map frame that have a known cell within `_KNOWN_M`; 0 without."""
-    if not len(points_m):
-        return 0.0
-    reach = round(_KNOWN_M / grid.resolution_m)
-    known = cv2.dilate((grid.cells >= 0).astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
-    cells = grid.to_cell(points_m)
-    inside = ((cells >= 0) & (cells < known.shape)).all(axis=1)
-    return float(known[tuple(cells[inside].T)].sum() / len(points_m))

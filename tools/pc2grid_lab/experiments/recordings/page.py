@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
+from textwrap import wrap
 
 from pc2grid_lab.experiments.recordings.catalogue import KINDS
 from pc2grid_lab.experiments.recordings.chance import clopper_pearson
 from pc2grid_lab.experiments.recordings.changes import RowChange
-from pc2grid_lab.experiments.recordings.rows import NOT_RUN, Counts, MapRow, PairRow, Table
+from pc2grid_lab.experiments.recordings.rows import NOT_RUN, Counts, FollowedRow, MapRow, PairRow, Table
 
 _MARKS = {"right": "", "false": " (false)", "unknown": " (?)"}
 _READING = ("no tf", "gaps", "empty scans")
@@ -32,6 +34,7 @@ def page(table: Table, changed: Sequence[RowChange] = ()) -> str:
             "",
             *_places(table),
             "",
+            *_followed(table),
             "## By sensor",
             "",
             *sensor_matrix(table),
@@ -287,6 +290,75 @@ def _building_cells(name: str, inside: Sequence[PairRow], outside: Sequence[Pair
         _share(counts.covered_right, counts.covered),
         _share(counts.wrong, counts.right + counts.wrong),
         _share(other.wrong, other.queries),
+    ]
+
+
+_FOLLOWED = (
+    ("map", "recording", "carried to"),
+    ("noticed, s", "m", "located again, s", "m", "told", "judged", "wrong", "false alarms"),
+    ("",),
+)
+
+
+def _followed(table: Table) -> list[str]:
+    """Recordings that were followed, carried away and not."""
+    rows = table.followed
+    if not rows:
+        return []
+    return [
+        "## Carried away",
+        "",
+        *_markdown(_FOLLOWED, [_followed_cells(row) for row in rows]),
+        "",
+        *wrap(_about_followed(rows), 105),
+        "",
+    ]
+
+
+def _about_followed(rows: Sequence[FollowedRow]) -> str:
+    knew = [row for row in rows if row.after is not None and row.knew]
+    shown = [row for row in knew if row.shown]
+    return (
+        "`watch` follows two recordings as one, the second a second after the first, with wheels that did "
+        "not turn in between; without a second one, nobody carries the robot. The map is of another session. "
+        f"Of {len(knew)} kidnaps of a robot that knew where it was, {_count('noticed_s', knew)} are noticed, "
+        f"{_middle('noticed_s', knew)} s and {_middle('noticed_m', knew)} m after it was put down, in the "
+        f"median. In {len(shown)} of them the map shows what it sees there; it is located again "
+        f"{_count('again_s', shown)} times, {_middle('again_s', shown)} s and {_middle('again_m', shown)} m "
+        "after, in the median; what never happens counts as longest. A false alarm gives up a "
+        "right place though nobody carried the robot and the map shows what it sees: "
+        f"{sum(row.alarms for row in rows)} in {len(rows)} rows. Of {sum(row.judged for row in rows)} places "
+        f"that can be judged, {sum(row.wrong for row in rows)} are wrong."
+    )
+
+
+def _count(name: str, rows: Sequence[FollowedRow]) -> int:
+    return sum(getattr(row, name) is not None for row in rows)
+
+
+def _middle(name: str, rows: Sequence[FollowedRow]) -> str:
+    """The median, where what never happened is longest."""
+    values = (getattr(row, name) for row in rows)
+    ordered = sorted(math.inf if value is None else value for value in values)
+    middle = ordered[len(ordered) // 2] if ordered else math.inf
+    return f"{middle:.1f}" if math.isfinite(middle) else "no"
+
+
+def _followed_cells(row: FollowedRow) -> list[str]:
+    names = [row.map, row.before, row.after or ""]
+    if row.problem:
+        return [*names, *[""] * 8, row.problem]
+    times = (row.noticed_s, row.noticed_m, row.again_s, row.again_m)
+    note = "" if row.after is None or row.knew else "was not located before"
+    if row.after is not None and row.knew and not row.shown:
+        note = "the map does not show where it was put down"
+    return [
+        *names,
+        *(_number(value, 1) for value in times),
+        *(str(count) for count in (row.located, row.judged)),
+        _strong(row.wrong),
+        _strong(row.alarms),
+        note,
     ]
 
 

@@ -168,6 +168,42 @@ class PairRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FollowedRow:
+    """A recording that `watch` followed in the map of another session.
+
+    after : the recording that the robot was carried to; None: it was not carried away. problem : why there is
+        no result. located, judged, wrong : looks that told a place, of them those that can be judged, and
+        wrong ones; without those between the kidnap and its notice, which tell the old place. alarms : how
+        often a right place was given up before it was carried away, though the map shows what it saw.
+    shown : whether the map shows what the robot sees where it is put down. knew : whether it was located
+        until it was carried away.
+    noticed_s, noticed_m : time and travel until the first look that it is not where it was; again_s, again_m
+        until it is located where it is; None: never.
+    """
+
+    before: str
+    after: str | None
+    map: str
+    building: str
+    problem: str = ""
+    shown: bool = False
+    located: int = 0
+    judged: int = 0
+    wrong: int = 0
+    alarms: int = 0
+    knew: bool = False
+    noticed_s: float | None = None
+    noticed_m: float | None = None
+    again_s: float | None = None
+    again_m: float | None = None
+
+    @property
+    def name(self) -> str:
+        """Of the row."""
+        return f"{self.before}{'' if self.after is None else f', {self.after}'} followed in {self.map}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
     """All rows of a run, and what made them: program, cpu_s (all commands together), quick."""
 
@@ -177,6 +213,7 @@ class Table:
     cpu_s: float
     maps: tuple[MapRow, ...]
     pairs: tuple[PairRow, ...]
+    followed: tuple[FollowedRow, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """In plain types; numbers are rounded to what the page could show."""
@@ -186,7 +223,7 @@ class Table:
     def to_text(self) -> str:
         """The same as a JSON text with a line for each row, so that versions can be compared."""
         document = self.to_json()
-        rows = {name: document.pop(name) for name in ("maps", "pairs")}
+        rows = {name: document.pop(name) for name in ("maps", "pairs", "followed")}
         head = json.dumps(document)[1:-1]
         lists = (
             f'"{name}": [\n' + ",\n".join(json.dumps(row) for row in found) + "\n]"

@@ -6,7 +6,7 @@ already is not computed again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ from pc2grid_lab.experiments.recordings.driven import digest_of_drive, write_dri
 from pc2grid_lab.experiments.recordings.thinned import write_thinned
 from pc2grid_lab.experiments.stored import in_processes
 
-_RESULTS = ("maps", "bare", "answers")
+_RESULTS = ("maps", "bare", "answers", "followed")
 """Folders of results."""
 _BARE = "pc2grid_lab.experiments.recordings.bare_kiss"
 
@@ -43,7 +43,7 @@ class Folder:
         """
         file = self.data / recording.file
         if recording.drive is not None:
-            made = f"{_plain(recording.name)}.{digest_of_drive(file, recording.drive)}.mcap"
+            made = f"{plain(recording.name)}.{digest_of_drive(file, recording.drive)}.mcap"
             return self.work.parents[1] / "drives" / made
         if recording.every > 1:
             return self.work / "thinned" / f"{file.stem}_{recording.every}{file.suffix}"
@@ -64,7 +64,7 @@ class Folder:
 
     def map(self, name: str) -> Path:
         """The database of a map, beside the result of `convert`."""
-        return self.work / "maps" / f"{_plain(name)}.submaps"
+        return self.work / "maps" / f"{plain(name)}.submaps"
 
     def result(self, name: str) -> Path:
         """The result of `convert` for a map."""
@@ -72,11 +72,11 @@ class Folder:
 
     def bare(self, name: str) -> Path:
         """The result of bare KISS-ICP."""
-        return self.work / "bare" / f"{_plain(name)}.json"
+        return self.work / "bare" / f"{plain(name)}.json"
 
     def answer(self, pair: Pair, window: TimeSpan) -> Path:
         """The result of `relocalize` for a window."""
-        named = f"{_plain(pair.query)}.in.{_plain(pair.map_name)}"
+        named = f"{plain(pair.query)}.in.{plain(pair.map_name)}"
         return self.work / "answers" / f"{named}.{window.start_s:.2f}s.{window.duration_s:g}s.json"
 
     def missing(self, recording: Recording) -> bool:
@@ -94,12 +94,13 @@ class Folder:
             return (opened.info.end_ns - opened.info.start_ns) * 1e-9
 
 
-def _plain(name: str) -> str:
+def plain(name: str) -> str:
+    """A name as a part of the name of a file."""
     return "".join(c if c.isalnum() or c in "-.+" else "_" for c in name)
 
 
 @dataclass(frozen=True, slots=True)
-class _Task:
+class Task:
     """One command: where its result is kept, what is done, and a guess of its time that orders the tasks."""
 
     file: Path
@@ -111,15 +112,19 @@ def run_all(
     catalogue: Catalogue,
     folder: Folder,
     *,
+    mapped: Collection[str] = (),
+    further: Sequence[Task] = (),
     jobs: int = 2,
     advance: Callable[[float], None] = lambda share: None,
 ) -> None:
     """Run every command whose result the folder does not hold.
 
-    advance : called with the share of the commands that is done.
+    further : commands beside those of the catalogue, in the maps of the recordings `mapped`. advance : called
+        with the share of the commands that is done.
     """
     pairs = [p for p in catalogue.pairs if not _gap(catalogue, folder, p)]
     maps = _maps(catalogue, folder, pairs)
+    maps |= {name: (catalogue.recordings[name], None) for name in mapped}
     read = {r.name: r for r, _ in maps.values()} | {p.query: catalogue.recordings[p.query] for p in pairs}
     waiting = [(folder, r) for r in read.values() if not folder.source(r).exists()]
     in_processes(_make, waiting, jobs=jobs, advance=lambda share: None)
@@ -128,11 +133,11 @@ def run_all(
         r for r in catalogue.mapped if r.sensor == "lidar" and r.drive is None and not folder.missing(r)
     ]
     tasks += [_bare(folder, recording) for recording in lidars]
-    windows = sum(pair.windows for pair in pairs)
+    windows = sum(pair.windows for pair in pairs) + len(further)
     for done in _run(tasks, jobs):
         advance(done / (len(tasks) + windows))
     questions = [task for pair in pairs for task in _questions(catalogue, folder, pair)]
-    for done in _run(questions, jobs):
+    for done in _run([*questions, *further], jobs):
         advance((len(tasks) + done) / (len(tasks) + windows))
 
 
@@ -155,7 +160,7 @@ def _make(folder: Folder, recording: Recording) -> None:
     """Make a recording that is thinned or driven."""
     file, target = folder.data / recording.file, folder.source(recording)
     if recording.drive is not None:
-        for old in target.parent.glob(f"{_plain(recording.name)}.*"):
+        for old in target.parent.glob(f"{plain(recording.name)}.*"):
             old.unlink()
         write_drive(file, target, recording.drive)
     elif recording.every > 1:
@@ -163,7 +168,7 @@ def _make(folder: Folder, recording: Recording) -> None:
         write_thinned(file, target, recording.every)
 
 
-def _questions(catalogue: Catalogue, folder: Folder, pair: Pair) -> list[_Task]:
+def _questions(catalogue: Catalogue, folder: Folder, pair: Pair) -> list[Task]:
     """A task a window; none where there is no map, or where the recording cannot be opened."""
     query = catalogue.recordings[pair.query]
     if not folder.map(pair.map_name).exists():
@@ -179,7 +184,7 @@ def _gap(catalogue: Catalogue, folder: Folder, pair: Pair) -> bool:
     return any(folder.missing(catalogue.recordings[name]) for name in (pair.query, pair.map))
 
 
-def _run(tasks: Sequence[_Task], jobs: int) -> Iterator[int]:
+def _run(tasks: Sequence[Task], jobs: int) -> Iterator[int]:
     """Do the tasks, the longest first, and yield how many are done."""
     waiting = sorted((task for task in tasks if kept(task.file) is None), key=lambda task: -task.weight)
     with ThreadPoolExecutor(jobs) as pool:
@@ -193,13 +198,13 @@ def _run(tasks: Sequence[_Task], jobs: int) -> Iterator[int]:
             raise
 
 
-def _do(task: _Task) -> None:
+def _do(task: Task) -> None:
     done = task.do()
     if not done.stopped:  # else the next run does it
         keep(task.file, done)
 
 
-def _convert(folder: Folder, name: str, recording: Recording, until_s: float | None) -> _Task:
+def _convert(folder: Folder, name: str, recording: Recording, until_s: float | None) -> Task:
     database, source = folder.map(name), folder.source(recording)
     options: list[str | Path] = [
         *recording.options,
@@ -220,18 +225,18 @@ def _convert(folder: Folder, name: str, recording: Recording, until_s: float | N
         return pc2grid("-q", "convert", source, *options)
 
     size = source.stat().st_size if source.exists() else 0
-    return _Task(folder.result(name), do, float(size))
+    return Task(folder.result(name), do, float(size))
 
 
-def _bare(folder: Folder, recording: Recording) -> _Task:
+def _bare(folder: Folder, recording: Recording) -> Task:
     truth = folder.truth(recording)
     poses = () if truth is None or truth.suffix != ".tum" else (truth,)
-    return _Task(
+    return Task(
         folder.bare(recording.name), lambda: python_module(_BARE, folder.source(recording), *poses), 0.0
     )
 
 
-def _locate(folder: Folder, recording: Recording, pair: Pair, window: TimeSpan) -> _Task:
+def _locate(folder: Folder, recording: Recording, pair: Pair, window: TimeSpan) -> Task:
     span = ("--start", f"{window.start_s:.3f}", "--duration", f"{window.duration_s:g}")
     arguments: tuple[str | Path, ...] = (
         folder.source(recording),
@@ -240,4 +245,4 @@ def _locate(folder: Folder, recording: Recording, pair: Pair, window: TimeSpan) 
         *recording.options,
         *span,
     )
-    return _Task(folder.answer(pair, window), lambda: pc2grid("-q", "relocalize", *arguments, "--json"), 0.0)
+    return Task(folder.answer(pair, window), lambda: pc2grid("-q", "relocalize", *arguments, "--json"), 0.0)
