@@ -31,8 +31,8 @@ from signature.localization.query import QueryMap
 
 State = Literal["searching", "located", "doubtful", "lost", "recovered"]
 """searching: not located yet. located: one place has at least the mass `RelocalizeConfig.accept`. doubtful:
-none has, but the robot is more likely than not where it was. lost: it is not. recovered: located elsewhere,
-or again after it was lost."""
+none has, nor has all else together than where the robot was. lost: this has, or the robot was carried away.
+recovered: located elsewhere, or again after it was lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,14 +86,16 @@ def kept(query: QueryMap) -> float:
 class Belief:
     """The masses of the looks since the start of the last window, and what they say of a running robot."""
 
-    def __init__(self) -> None:
+    def __init__(self, accept: float) -> None:
+        """accept : least mass to say where the robot is, and to say that it is not where it was."""
+        self._accept = accept
         self._looks: list[Masses] = []
         self._place: tuple[int, tuple[Hypothesis, ...]] | None = None  # part and place of the last "located"
         self._was_located = False
 
     @property
     def located(self) -> bool:
-        """Whether the robot is more likely than not where it was located last."""
+        """Whether the robot is held to be where it was located last."""
         return self._place is not None
 
     @property
@@ -136,7 +138,7 @@ class Belief:
             all_of = (h for h, number in zip(look.hypotheses, look.places, strict=True) if number == place)
             self._place = look.part, (best, *(h for h in all_of if h is not best))
             return "located" if goes_on else "recovered"
-        if here >= POSTERIOR.likely:
+        if here > 1.0 - self._accept:
             return "doubtful"
         self._place = None
         return "lost" if self._was_located else "searching"

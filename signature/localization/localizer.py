@@ -93,7 +93,7 @@ class Localizer:
         prior_ns : time at which the pose of the query is wanted (`QueryMap.T_odom_prior`), if not that of the
             prior. query : scans that several localizers share; whoever shares them adds to it.
         """
-        self._belief = Belief()
+        self._belief = Belief(index.config.accept)
         self._history: deque[Moment] = deque()
         self._begin(index, query, prior_ns)
 

@@ -134,8 +134,8 @@ class WatchedMap(TypedDict):
 
 class Watch(TypedDict):
     """A line of `pc2grid watch --json`: what one look at the database said. state: searching (not located
-    yet), located, doubtful (more likely than not where it was, but not surely), lost, recovered (located
-    elsewhere or again). pose: of the base at `stamp_ns`; null unless the status is `located`. T_map_odom: of
+    yet), located, doubtful (certain neither where it was nor elsewhere), lost, recovered (located elsewhere
+    or again). pose: of the base at `stamp_ns`; null unless the status is `located`. T_map_odom: of
     the robot's own odometry frame. frame: of the building, in which the pose is; null: the map frame of the
     session. in_space: null if the map or the scans have no points. confidence: the probability that the best
     place is right. published: topics on which it was said. lag_s, elapsed_s: seconds from a scan's arrival to

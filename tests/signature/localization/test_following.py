@@ -13,6 +13,7 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from signature.config import Config, RelocalizeConfig
+from signature.localization.belief import Belief, Masses
 from signature.localization.localizer import Localizer, Look
 from signature.localization.prior import Prior
 from tests.helpers.simulated_drives import building, drive, office, plan
@@ -114,6 +115,18 @@ def test_a_robot_that_is_carried_away_unseen_is_recovered_all_the_same(
     assert set(states[at + 1 :]) == {"located"}
     assert all(look.answer.path_m < 3.0 + n for n, (look, _) in enumerate(looks[at:]))
     check_poses([*before, *looks[at:]])
+
+
+def test_a_place_is_given_up_when_it_is_as_certain_that_the_robot_is_not_there() -> None:
+    localizer = Localizer(OFFICE)
+    looks_of(localizer, list(stretch(FIRST)))
+    found = Masses.of(localizer.query.map(), localizer.answer())
+    belief = Belief(accept=0.75)
+    states = [
+        belief.follow(replace(found, masses=(mass, *found.masses[1:])), found.hypotheses[0] if sure else None)
+        for mass, sure in ((0.9, True), (0.5, False), (0.3, False), (0.8, True), (0.2, False), (0.5, False))
+    ]
+    assert states == ["located", "doubtful", "doubtful", "located", "lost", "lost"]
 
 
 def test_a_robot_elsewhere_is_never_located() -> None:
