@@ -20,6 +20,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
+from pc2grid.errors import ConfigError
 from pc2grid_cli.console import Console
 from pc2grid_cli.options import DATABASE
 from pc2grid_cli.removed import REMOVED
@@ -29,6 +30,8 @@ _FANCY = sys.stderr.isatty() and sys.stdout.isatty() and not os.environ.get("NO_
 MARKUP: Literal["rich"] | None = "rich" if _FANCY else None
 """How typer prints help."""
 
+LABORATORY = "pc2grid_lab"
+"""The package that a clone of the repository has, and the wheel has not."""
 _NEW_OBJECTS = 100_000
 """After so many new objects the collector looks for cycles, not after 700: the libraries that a command loads
 when it needs them make about as many. `convert` leaves 2,000 objects in cycles in 150 s of a laser."""
@@ -66,7 +69,15 @@ class LateCommand(TyperCommand):
     def command(self) -> Any:
         """The command itself."""
         name, _, function = self._function.partition(":")
-        module = import_module(name)
+        try:
+            module = import_module(name)
+        except ModuleNotFoundError as error:
+            if error.name != LABORATORY:
+                raise
+            raise ConfigError(
+                f"pc2grid compare {self.name}: the laboratory is not installed; it is no part of the package",
+                hint="in a clone of pc2grid's repository: pip install -e .",
+            ) from None
         if not gc.isenabled():  # `main` has stopped it. What is imported stays: it need not be walked through
             gc.freeze()
             gc.set_threshold(_NEW_OBJECTS)
