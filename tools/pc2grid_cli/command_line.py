@@ -1,8 +1,8 @@
 """How the words of a command are read, in addition to what typer does.
 
-Global options are understood behind the command as well, where people put them. `--dask` may stand
-without a value, for which typer has no notation. The module of a command is imported when it is used:
-here alone the program imports late, so that every other import stands at the top of its file.
+Global options are understood behind the command as well, where people put them. The module of a command is
+imported when it is used: here alone the program imports late, so that every other import stands at the top of
+its file.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import gc
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from importlib import import_module
 from typing import Any, ClassVar, Literal
@@ -35,17 +35,13 @@ LABORATORY = "pc2grid_lab"
 _NEW_OBJECTS = 100_000
 """After so many new objects the collector looks for cycles, not after 700: the libraries that a command loads
 when it needs them make about as many. `convert` leaves 2,000 objects in cycles in 150 s of a laser."""
-_WITHOUT_VALUE: dict[str, tuple[str, Callable[[str], bool]]] = {
-    "--dask": ("local", lambda word: "://" in word),
-}
-"""By option: the value that it has if none follows, and whether a following word is a value."""
 
 
 class Command(TyperCommand):
     """A command that takes the global options."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Apply the global options, and complete options that stand without a value."""
+        """Apply the global options."""
         words = _read(self.params, ctx, args, until_command=False)
         try:
             return super().parse_args(ctx, list(words))
@@ -152,13 +148,7 @@ def _read(params: Iterable[Any], ctx: typer.Context, words: list[str], *, until_
         if word == "--" or (until_command and not word.startswith("-")):
             break
         position += 1
-        if word in _WITHOUT_VALUE and word in names:
-            value, is_value = _WITHOUT_VALUE[word]
-            if position < len(words) and is_value(words[position]):
-                value = words[position]
-                position += 1
-            left.append(f"{word}={value}")
-        elif word in names and not names[word].is_flag and not names[word].count:
+        if word in names and not names[word].is_flag and not names[word].count:
             left += [word, *words[position : position + names[word].nargs]]
             position += names[word].nargs
         elif not console.apply(word):
