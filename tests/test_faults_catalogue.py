@@ -370,20 +370,20 @@ def another_type(folder: Path) -> str:
     return CONVERT + " --topic /points"
 
 
-@fault(19, 1, errors.UnsupportedSchema, "/points", "differently from ROS", "uint32 height")
+@fault(19, 1, errors.UnsupportedSchema, "/points", "differently from ROS: without height")
 def another_definition(folder: Path) -> str:
     definition = ros().schema(CLOUDS[0].type).replace(b"uint32 height\n", b"", 1)
     raw_log(folder / "log.mcap", [("/points", CLOUD, "ros2msg", definition, CLOUDS[0].data)])
     return CONVERT
 
 
-@fault(20, 3, None, "1 scans skipped (the message is shorter than its schema)")
+@fault(20, 3, None, "1 scans skipped (the message is no whole sensor_msgs/PointCloud2)")
 def one_message_cut_short(folder: Path) -> str:
     log(folder, changed(lambda i: CLOUDS[i]._replace(data=CLOUDS[i].data[:-50]) if i == 5 else None))
     return CONVERT
 
 
-@fault(20, 1, errors.LogCorrupt, "/points: 4 of 12 scans are unreadable", "shorter than its schema")
+@fault(20, 1, errors.LogCorrupt, "/points: 4 of 12 scans are unreadable", "no whole sensor_msgs/PointCloud2")
 def many_messages_cut_short(folder: Path) -> str:
     log(folder, changed(lambda i: CLOUDS[i]._replace(data=CLOUDS[i].data[:-50]) if i > 7 else None))
     return CONVERT

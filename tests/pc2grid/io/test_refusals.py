@@ -236,9 +236,9 @@ def test_foxglove_topics_that_are_not_read(channel: TopicInfo, words: str) -> No
 @pytest.mark.parametrize(
     ("kind", "data", "words"),
     [
-        ("sensor_msgs/PointCloud2", b"\0\1", "shorter than its encapsulation header"),
-        ("tf2_msgs/TFMessage", b"\0\1\0\0" + struct.pack("<I", 100_001), "Invalid sequence length 100001"),
-        ("sensor_msgs/PointCloud2", b"\0\1\0\0\1\0\0\0", "shorter than its schema"),
+        ("sensor_msgs/PointCloud2", b"\0\1", "no whole sensor_msgs/PointCloud2"),
+        ("tf2_msgs/TFMessage", b"\0\1\0\0" + struct.pack("<I", 100_001), "no whole tf2_msgs/TFMessage"),
+        ("sensor_msgs/PointCloud2", b"\0\1\0\0\1\0\0\0", "no whole sensor_msgs/PointCloud2"),
     ],
 )
 def test_messages_that_are_too_short_or_too_large(kind: str, data: bytes, words: str) -> None:
