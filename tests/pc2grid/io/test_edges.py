@@ -172,6 +172,8 @@ def split(folder: Path) -> Path:
         (folder / f"{part}/{part}.db3").rename(folder / f"all_{part}.db3")
         (folder / f"{part}/metadata.yaml").unlink()
         (folder / f"{part}").rmdir()
+    listed = "rosbag2_bagfile_information: {relative_file_paths: [all_0.db3, all_1.db3]}"
+    (folder / "metadata.yaml").write_text(listed)
     return folder
 
 
