@@ -304,7 +304,7 @@ def bomb(folder: Path) -> str:
     return CONVERT
 
 
-@fault(12, 1, errors.LogCorrupt, "log.mcap", "another length")
+@fault(12, 1, errors.LogTruncated, "log.mcap: chunk", "ends within", "--recover")
 def absurd_length(folder: Path) -> str:
     whole = log(folder)
     at = whole.index(b"\x04\0\0\0zstd") - 37

@@ -518,7 +518,7 @@ def test_definitions_that_swell_or_take_for_ever(tmp_path: Path, encoding: str, 
 def test_a_chunk_above_the_limit_is_not_read_by_the_index_either(tmp_path: Path) -> None:
     cloud = ros().cloud("/points", T0, np.ones((900, 3)))
     path = write_mcap(tmp_path / "a.mcap", [cloud], compression=CompressionType.NONE)
-    with pytest.raises(LimitExceeded, match=r"a record at byte \d+ has \d+ bytes; the limit is 3000"):
+    with pytest.raises(LimitExceeded, match=r"chunk at byte \d+: a record has \d+ bytes; the limit is 3000"):
         read(path, ReadConfig(assume_identity=True, max_record_bytes=3000))
 
 

@@ -9,7 +9,7 @@ import pytest
 from mcap.writer import CompressionType
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import LogCorrupt, PointCloudError, UnsupportedSchema
+from pc2grid.errors import LogCorrupt, NoScans, PointCloudError, UnsupportedSchema
 from pc2grid.io import open_log, scan_stream
 from tests.helpers.recordings import (
     STEP,
@@ -20,6 +20,7 @@ from tests.helpers.recordings import (
     raw_log,
     read,
     ros,
+    write_clouds,
     write_mcap,
 )
 
@@ -296,3 +297,18 @@ def test_a_flip_in_an_unchunked_log_is_seen_by_its_data_checksum(tmp_path: Path)
     path.write_bytes(content)
     with pytest.raises(LogCorrupt, match="checksum"):
         read(path)
+
+
+# --- parts of a recording -----------------------------------------------------------------------------
+
+
+def test_a_part_is_chosen_by_seconds_after_the_first_scan(tmp_path: Path) -> None:
+    with open_log(write_clouds(tmp_path / "a.mcap")) as log:
+        scans = list(log.scans(1.0, 0.5))
+        assert [s.stamp_ns - T0 for s in scans] == [10 * STEP + i * STEP for i in range(5)]
+        assert scans[0].T_base_sensor[:3, 3].tolist() == [0.2, 0.0, 0.5]
+        # Odometry comes 10 ms after each scan: 0.1 m per 0.1 s, so the scan is 0.01 m behind.
+        assert scans[0].T_odom_base is not None
+        assert scans[0].T_odom_base[0, 3] == pytest.approx(0.99)
+        with pytest.raises(NoScans, match=r"lasts 3\.9 s"):
+            list(log.scans(100.0))
