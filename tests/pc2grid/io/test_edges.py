@@ -358,7 +358,7 @@ def test_paths_of_maps(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None
     np.testing.assert_array_equal(load_map(inner).cells, grid.cells)
     for name in ('"a\\0b"', "3", '""', "[a]"):
         inner.write_text(plain.replace("m.pgm", name))
-        with pytest.raises(MapFileError, match=r"inner/m\.yaml: image: expected a file name"):
+        with pytest.raises(MapFileError, match=r"inner/m\.yaml: image: "):
             load_map(inner)
     with pytest.raises(MapFileError, match="mode: 'odd' is not one of"):
         save_map(grid, tmp_path / "n", mode="odd")  # type: ignore[arg-type]

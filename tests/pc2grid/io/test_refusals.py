@@ -19,8 +19,6 @@ from pc2grid.errors import (
     LimitExceeded,
     LogCorrupt,
     LogNotFound,
-    MapFileError,
-    NoScans,
     PointCloudError,
     UnsupportedSchema,
 )
@@ -32,7 +30,6 @@ from pc2grid.io.messages import foxglove
 from pc2grid.io.messages import ros as ros_messages
 from pc2grid.io.messages.cloud_files import parser
 from pc2grid.io.messages.types import Header, PointCloud2
-from pc2grid.io.nav2_map import load_map
 from tests.helpers.cloud_folders import folder_of
 from tests.helpers.recordings import T0, drive, raw_log, read, ros, write_bag, write_mcap, write_rosbag2
 
@@ -325,25 +322,6 @@ def test_a_folder_whose_files_are_all_gone(tmp_path: Path) -> None:
         open_log(folder)
     with pytest.raises(LogNotFound, match="none of the files of the recording is there"):
         open_log(folder, recover=True)
-
-
-def test_a_metadata_file_without_end(tmp_path: Path) -> None:
-    folder = write_rosbag2(tmp_path / "log", drive(), "mcap")
-    with (folder / "metadata.yaml").open("ab") as file:
-        file.truncate(64 << 20)
-    with pytest.raises(LogCorrupt, match=r"metadata\.yaml: not the metadata"):
-        open_log(folder)
-
-
-@pytest.mark.parametrize("top", [0, 256, 65535])
-def test_a_pgm_of_other_depths(tmp_path: Path, top: int) -> None:
-    (tmp_path / "a.pgm").write_bytes(b"P5\n2 2\n%d\n" % top + bytes(8))
-    (tmp_path / "a.yaml").write_text(
-        "image: a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n"
-        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
-    )
-    with pytest.raises(MapFileError, match=f"PGM with maximum {top}"):
-        load_map(tmp_path / "a.yaml")
 
 
 def test_what_others_raise_becomes_ours_but_for_memory() -> None:
