@@ -452,8 +452,7 @@ HEADER = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 30000\nHEIGHT 1\nDATA "
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (HEADER + b"ascii\n" + b"1 2 3\n" * 29_999 + b"1 2 " + b"0" * MIB + b"3\n", "more than 100 digits"),
-        (HEADER + b"ascii\n" + b"1 2 3\n" * 29_999 + b"1 2", "89999 numbers where 90000 are declared"),
+        (HEADER + b"ascii\n" + b"1 2 3\n" * 29_999 + b"1 2", "not a line of numbers"),
         (HEADER + b"binary_compressed\n" + struct.pack("<II", 9, 360_000) + bytes(9), "expand to 360000"),
         (
             HEADER.replace(b"30000", b"30000000") + b"binary_compressed\n"
@@ -463,20 +462,9 @@ HEADER = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 30000\nHEIGHT 1\nDATA "
     ],
 )  # fmt: skip
 def test_clouds_that_swell(content: bytes, words: str) -> None:
-    """One long word among many short ones is as wide a column of text for all of them."""
     with peak_memory() as peak, pytest.raises(PointCloudError, match=words):
         cloud_files.parser("pcd")(content, Header(1, "lidar"))
     assert peak.grown_bytes() < 64 * MIB
-
-
-def test_numbers_of_a_text_are_read_in_blocks() -> None:
-    points = np.random.default_rng(5).normal(size=(70_000, 3))
-    text = "\n".join(" ".join(map(repr, p)) for p in points.tolist()).encode()
-    assert len(text) > 3 * MIB
-    found = cloud_files.parser("pcd")(
-        HEADER.replace(b"30000", b"70000") + b"ascii\n" + text, Header(1, "lidar")
-    )
-    assert np.frombuffer(found.data, "<f8").tolist() == points.ravel().tolist()
 
 
 def nested(levels: int, width: int, leaf: str = "int32 a\n") -> str:
