@@ -34,7 +34,7 @@ from pc2grid.io.messages.ros import decoder_for
 from pc2grid.io.messages.types import Header, Transform
 from pc2grid.io.nav2_map import load_map, save_map
 from pc2grid.io.sensors.png_header import MAGIC
-from pc2grid.io.trajectory import read_tum, stamp_ns_from_text
+from pc2grid.io.trajectory import read_tum
 from pc2grid.model import OccupancyGrid
 from tests.helpers import foxglove_messages as foxglove
 from tests.helpers.memory import peak_memory
@@ -119,8 +119,6 @@ def test_a_flipped_bit_anywhere_in_a_png_changes_no_pixel(tmp_path: Path) -> Non
         ),
         (lying_png(4, 4, bits=16), "a damaged image|16 bits"),
         (lying_png(4, 4, colour=5), "its header makes no sense"),
-        (MAGIC + chunk(b"IHDR", b"short") + chunk(b"IEND", b""), "37 bytes cannot hold"),
-        (MAGIC + chunk(b"IDAT", b"") + chunk(b"IEND", b""), "cut off|makes no sense"),
         (MAGIC + struct.pack(">I", 2**31) + b"IHDR", "it is cut off"),
         (b"\xff\xd8\xff\xe0 a photo", "not the image of a map"),
         (b"BM" + bytes(100), "0 x 0 pixels"),
@@ -438,12 +436,6 @@ def test_files_that_are_too_large_are_not_read(tmp_path: Path) -> None:
         file.truncate(1 << 40)
     with pytest.raises(TrajectoryFileError, match=r"a\.tum: larger than \d+ bytes"):
         read_tum(tmp_path / "a.tum")
-
-
-@pytest.mark.parametrize("word", ["1e999000", "-1e300000", "1e999999999999", "inf", "nan"])
-def test_times_of_a_million_digits(word: str) -> None:
-    with pytest.raises((ValueError, ArithmeticError)):
-        stamp_ns_from_text(word)
 
 
 HEADER = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 30000\nHEIGHT 1\nDATA "

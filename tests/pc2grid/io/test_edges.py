@@ -309,7 +309,7 @@ def test_kitti_poses_without_calibration_and_with_a_broken_one(tmp_path: Path) -
         read(folder)
 
 
-@pytest.mark.parametrize("word", ["", "x", "1..2", "--1", "1e", "nan", "inf", "1e400", "9" * 30])
+@pytest.mark.parametrize("word", ["", "x", "1..2", "--1", "1e", "nan", "inf", "9" * 30, "1e999999999999"])
 def test_words_that_are_no_times(word: str) -> None:
     with pytest.raises((ValueError, ArithmeticError)):
         stamp_ns_from_text(word)

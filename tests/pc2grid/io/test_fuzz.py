@@ -9,7 +9,7 @@ with the time and memory of a small file. What cannot be noticed:
   section. Whole chunks can be missing without a trace in a file that was not closed; the warning that the
   recorder was killed stands for that.
 
-PC2GRID_FUZZ is the number of mutations of each kind: at least hundreds, so that every outcome occurs.
+PC2GRID_FUZZ is the number of mutations of each kind: at least 100, so that every outcome occurs.
 """
 
 from __future__ import annotations

@@ -16,7 +16,6 @@ from pc2grid.config import ReadConfig
 from pc2grid.errors import (
     DatabaseError,
     FrameError,
-    LimitExceeded,
     LogCorrupt,
     LogNotFound,
     PointCloudError,
@@ -31,7 +30,7 @@ from pc2grid.io.messages import ros as ros_messages
 from pc2grid.io.messages.cloud_files import parser
 from pc2grid.io.messages.types import Header, PointCloud2
 from tests.helpers.cloud_folders import folder_of
-from tests.helpers.recordings import T0, drive, raw_log, read, ros, write_bag, write_mcap, write_rosbag2
+from tests.helpers.recordings import T0, drive, write_bag, write_rosbag2
 
 HEADER = Header(T0, "lidar")
 NUMPY = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8"}
@@ -134,47 +133,7 @@ def test_ply_of_every_type_behind_another_element(kind: str) -> None:
         np.testing.assert_array_equal(values.astype("f8"), wanted.astype("f8"))
 
 
-@pytest.mark.parametrize(
-    ("was", "now", "words"),
-    [
-        (b"SIZE 4", b"SIZE 4 4", "makes no sense"),
-        (b"SIZE 4", b"SIZE 3", "makes no sense: 'F3'"),
-        (b"COUNT 1", b"COUNT 1 1", "makes no sense"),
-        (b"COUNT 1", b"COUNT -1", "a negative count"),
-        (b"WIDTH 2", b"WIDTH -2", "a negative count"),
-        (b"WIDTH 2", b"WIDTH", "makes no sense"),
-        (b"FIELDS n0", b"FIELDS", "makes no sense"),
-        (b"DATA binary", b"DATA", "without a DATA line"),
-        (b"DATA binary", b"DATA morse", "a PCD of data 'morse' is not read"),
-    ],
-)
-def test_a_header_of_a_pcd_that_makes_no_sense(was: bytes, now: bytes, words: str) -> None:
-    content = pcd("binary", columns(["f4"], [1]))
-    assert content.count(was + b"\n") == 1
-    with pytest.raises((PointCloudError, UnsupportedSchema), match=words):
-        parser("pcd")(content.replace(was + b"\n", now + b"\n"), HEADER)
-
-
 # --- limits, met exactly ------------------------------------------------------------------------------
-
-
-def record_lengths(bag: bytes) -> tuple[list[int], list[int]]:
-    """Lengths of the headers and of the data of a bag's records."""
-    at, lengths = len(b"#ROSBAG V2.0\n"), []
-    while at < len(bag):
-        lengths.append(int.from_bytes(bag[at : at + 4], "little"))
-        at += 4 + lengths[-1]
-    return lengths[::2], lengths[1::2]
-
-
-def test_a_bag_may_be_as_large_as_the_limits_say(tmp_path: Path) -> None:
-    path = write_bag(tmp_path / "a.bag", drive("ros1"), chunk_bytes=5000)
-    _, data = record_lengths(path.read_bytes())
-    wanted, _ = read(path)
-    scans, _ = read(path, ReadConfig(max_record_bytes=max(data)))
-    assert [s.stamp_ns for s in scans] == [s.stamp_ns for s in wanted]
-    with pytest.raises(LimitExceeded, match=f"the limit is {max(data) - 1}"):
-        read(path, ReadConfig(max_record_bytes=max(data) - 1))
 
 
 def test_a_refused_bag_is_closed(tmp_path: Path) -> None:
@@ -251,17 +210,6 @@ def test_a_camera_matrix_of_other_sizes() -> None:
         decode(json.dumps(message).encode())
 
 
-def test_a_topic_without_messages_is_named(tmp_path: Path) -> None:
-    kind = "sensor_msgs/msg/PointCloud2"
-    text = ros().schema("sensor_msgs/PointCloud2")
-    path = raw_log(tmp_path / "a.mcap", [("/points", kind, "ros2msg", text, b"")])
-    with (
-        open_log(path, ReadConfig(topic="/points")) as log,
-        pytest.raises(NoScans, match="/points: no message"),
-    ):
-        log.choose()
-
-
 def test_frames_that_are_not_connected(tmp_path: Path) -> None:
     tree = FrameTree()
     assert np.array_equal(tree.lookup("a", "a", T0), np.eye(4))
@@ -291,27 +239,6 @@ def test_a_part_of_a_folder_of_clouds(tmp_path: Path) -> None:
         part = [scan.stamp_ns for scan in log.scans(start_s=0.25, duration_s=0.5)]
     begin = whole[0] + 250_000_000
     assert part == [t for t in whole if begin <= t < begin + 500_000_000]
-
-
-def test_a_part_of_a_split_recording(tmp_path: Path) -> None:
-    messages = drive(scans=12)
-    for name, chosen in (("a_0", messages[: len(messages) // 2]), ("a_1", messages[len(messages) // 2 :])):
-        write_mcap(tmp_path / f"{name}.mcap", chosen)
-    folder = tmp_path / "a"
-    folder.mkdir()
-    for name in ("a_0.mcap", "a_1.mcap"):
-        (tmp_path / name).rename(folder / name)
-    (folder / "metadata.yaml").write_text(
-        "rosbag2_bagfile_information: {relative_file_paths: [a_0.mcap, a_1.mcap]}"
-    )
-    with open_log(folder) as log:
-        whole = [scan.stamp_ns for scan in log.scans()]
-        assert whole == sorted(whole) and len(whole) == 12
-        for start_s, duration_s in ((0.0, 0.15), (1.0, None), (0.4, 0.4)):
-            begin = log.info.start_ns + round(start_s * 1e9)
-            end = begin + round((duration_s or 1e6) * 1e9)
-            part = [scan.stamp_ns for scan in log.scans(start_s=start_s, duration_s=duration_s)]
-            assert part == [t for t in whole if begin <= t < end]
 
 
 def test_a_folder_whose_files_are_all_gone(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sqlite3
-import struct
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -210,28 +209,6 @@ def test_a_db3_of_an_old_rosbag2_has_no_definitions(tmp_path: Path) -> None:
             )
     db.close()
     check_drive(read(path)[0])
-
-
-def test_what_is_no_whole_db3(tmp_path: Path) -> None:
-    folder = write_rosbag2(tmp_path / "log", drive())
-    path = folder / "log.db3"
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(LogCorrupt, match=r"log\.db3: a damaged \.db3: .*sqlite3 log\.db3 \.recover"):
-        read(path)
-    path.write_bytes(whole[:50])
-    with pytest.raises(LogCorrupt, match=r"log\.db3: a damaged"):
-        read(path)
-    page = struct.unpack(">H", whole[16:18])[0]
-    path.write_bytes(whole[:page] + b"\x55" * (len(whole) - page))
-    with pytest.raises(LogCorrupt, match=r"log\.db3: .*malformed"):
-        read(path)
-    other = tmp_path / "other.db3"
-    with sqlite3.connect(other) as db:
-        db.execute("CREATE TABLE cookies(x)")
-    db.close()
-    with pytest.raises(NotALog, match=r"not a rosbag2 \.db3"):
-        read(other)
 
 
 def test_a_message_that_unpacks_without_end_is_refused(tmp_path: Path) -> None:
