@@ -1,4 +1,4 @@
-"""Draw the three signatures of a submap: figures 2 to 6 of the paper in one picture.
+"""Draw the three signatures of a submap: figures 2, 3, 4 and 6 of the paper in one picture.
 
 python examples/signature_of_a_submap.py path/to/map.yaml            # the submap nearest the map's middle
 python examples/signature_of_a_submap.py path/to/map.yaml --submap 12 --out submap.png
@@ -20,7 +20,6 @@ from pc2grid.io.nav2_map import load_map
 from pc2grid.model import OccupancyGrid, Submap
 from pc2grid.submaps.junction_graph import junction_graph, map_skeleton
 from pc2grid.submaps.partition import partition
-from pc2grid_lab.experiments.noise import NOISE_LEVELS, add_noise
 from signature.boundary import boundary_edges, boundary_histogram, boundary_points
 from signature.config import SignatureConfig
 from signature.describe import describe
@@ -79,7 +78,7 @@ def draw_boundary(axes: Any, submap: Submap, config: SignatureConfig) -> None:
 
 
 def draw_freespace(axes: Any, submap: Submap, config: SignatureConfig) -> None:
-    """Figures 4 and 5: the free-space graph, its path lengths, and the effect of obstacles."""
+    """Figure 4: the free-space graph and its path lengths."""
     graph = freespace_graph(submap, config)
     show(axes[0], submap.grid, f"Free space: {len(graph)} nodes (III-C)")
     places = {node: data["center_m"] for node, data in graph.nodes(data=True)}
@@ -94,18 +93,6 @@ def draw_freespace(axes: Any, submap: Submap, config: SignatureConfig) -> None:
         GREEN,
         "Lengths of the shortest paths (Eq. 4)",
     )
-    noisy = add_noise(submap, NOISE_LEVELS[1], np.random.default_rng(0))
-    changed = path_histogram(noisy, config)
-    at = (np.arange(len(changed)) + 0.5) * config.freespace_bin_m
-    axes[1].step(
-        at,
-        changed,
-        where="mid",
-        color=WALL,
-        linewidth=1,
-        label="with 10 obstacles (Figure 5)",
-    )
-    axes[1].legend(fontsize=11, frameon=False)
 
 
 def path_histogram(submap: Submap, config: SignatureConfig) -> np.ndarray:

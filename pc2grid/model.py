@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PlainSerializer
+from pydantic import BeforeValidator, PlainSerializer
 
 from pc2grid.arrays import F32, F64, I64, U8, BoolGrid, freeze, hand_over
 from pc2grid.display import html_picture, html_table, map_png, short
@@ -404,7 +404,7 @@ class Loop:
     older: int
     newer: int
     T_older_newer: SE2
-    information: F64
+    information: Annotated[F64, BeforeValidator(np.asarray)]
     accepted: bool = True
 
     def __post_init__(self) -> None:

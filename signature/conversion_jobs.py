@@ -1,4 +1,4 @@
-"""Converts many recordings for one database: a job for each, in this process or on a Dask cluster.
+"""Converts many recordings for one database: a job for each, here, in several processes, or on a cluster.
 
 Recordings are independent of each other, so each is mapped wherever a worker is free. One process stores the
 results, in the order of the jobs. So the database has the same bytes wherever the jobs ran.
@@ -6,20 +6,32 @@ results, in the order of the jobs. So the database has the same bytes wherever t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+import contextlib
+import functools
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
+from pc2grid import extras
 from pc2grid._version import __version__
 from pc2grid.errors import ClusterError, DatabaseError
 from pc2grid.mapping.drawn_map import is_drawn_map
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
-from signature.cluster import connected
 from signature.config import Config
 from signature.database.protocol import Entry, Label, Provenance
 from signature.sessions import build_sessions, describe_all, digest_of, provenance
+
+CONNECT_TIMEOUT_S = 10.0
+"""How long a scheduler may take to answer, and to have its first worker; chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +72,10 @@ class Outcome:
     error: Exception | None = None
 
 
+Submit = Callable[..., Any]
+"""Lets a worker call a function with arguments; what it returns has the `result`."""
+
+
 def convert(job: Job, observer: Observer = Observer()) -> tuple[Entry, ...]:
     """Do a job: everything there is to store of it, nothing if it is stored already.
 
@@ -97,31 +113,101 @@ def here(jobs: Sequence[Job], observer: Observer = Observer()) -> Generator[Outc
         yield _attempt(job, observer)
 
 
-def on_cluster(
-    jobs: Sequence[Job], address: str, processes: int, observer: Observer = Observer()
+def at_once(
+    jobs: Sequence[Job], workers: contextlib.AbstractContextManager[Submit], observer: Observer = Observer()
 ) -> Generator[Outcome, None, None]:
-    """Do jobs on the workers of a Dask scheduler, as many at once as there are workers.
+    """Do as many jobs at once as there are workers; the outcomes are yielded in the order of the jobs.
 
-    The outcomes are yielded in the order of the jobs.
+    workers : `processes_here` or `on_cluster`. They read the recordings themselves: a path must name the same
+        file there. observer : gets the progress.
 
-    address : of the scheduler, or LOCAL for `processes` processes of this machine with one thread each. The
-        workers read `job.path` themselves. Relative paths are made absolute; a path must name the same file
-        there.
-    observer : gets the progress, and a warning when a worker is lost. Its job starts again on another worker.
-
-    Raises ClusterError if the cluster cannot be reached or goes away; the jobs yielded until then are done.
+    Raises ClusterError if the workers cannot be reached or go away; the jobs yielded until then are done.
     """
-    with connected(address, processes) as client:
-        names: dict[str, str] = {}
-        futures = []
-        for number, job in enumerate(jobs):
-            key = f"pc2grid-{number:06d}-{job.name}"
-            names[key] = job.name
-            futures.append(client.submit(_attempt, _absolute(job), key=key, pure=False))
-        client.subscribe_topic("all", _LostWorkers(names, observer.on_warning))
+    with workers as submit:
+        futures = [submit(_attempt, replace(job, path=job.path.absolute())) for job in jobs]
         for done, job in enumerate(jobs, start=1):
             yield _outcome(job, futures.pop(0))
             observer.on_progress(done / len(jobs))
+
+
+@contextlib.contextmanager
+def processes_here(count: int) -> Iterator[Submit]:
+    """Processes of this machine.
+
+    A terminal sends Ctrl-C to all processes, but only this one may react, because it ends the others. So they
+    are started while SIGINT is blocked, and inherit this.
+    """
+    resource_tracker.ensure_running()  # started later, it would unblock the signal
+    others = multiprocessing.active_children()
+    spawn = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=_end_with_parent)
+
+    def submit(action: Callable[..., Any], *values: Any) -> Any:
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return pool.submit(action, *values)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    try:
+        yield submit
+    finally:
+        for process in multiprocessing.active_children():
+            if process not in others:
+                process.terminate()
+        pool.shutdown(cancel_futures=True)
+
+
+@contextlib.contextmanager
+def on_cluster(address: str) -> Iterator[Submit]:
+    """The workers of a Dask scheduler. It starts a job again that a worker died on.
+
+    Raises ClusterError if it does not answer, or if dask is not installed.
+    """
+    extras.require({"cluster": "a cluster"})
+    import distributed
+
+    class Client(distributed.Client):
+        """A client that closes itself if it cannot connect.
+
+        Otherwise the garbage collector would close the incomplete client at an arbitrary time. If another
+        client starts at that time, each waits for a lock that the other one holds.
+        """
+
+        def __init__(self) -> None:
+            try:
+                super().__init__(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)  # type: ignore[no-untyped-call]
+            except BaseException:
+                self.close()  # type: ignore[no-untyped-call]
+                raise
+
+    # The library logs many lines for each lost connection; our error is one line.
+    for name in ("distributed", "tornado", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    with contextlib.ExitStack() as stack:
+        problem = "does not answer"
+        try:
+            client = stack.enter_context(Client())
+            problem = "has no workers"
+            client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
+        except (OSError, ValueError) as error:
+            raise ClusterError(
+                f"the scheduler {address} {problem}",
+                hint="start one with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`",
+            ) from error
+        yield functools.partial(client.submit, pure=False)
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that started it is killed: nobody else would."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _attempt(job: Job, observer: Observer = Observer()) -> Outcome:
@@ -132,45 +218,16 @@ def _attempt(job: Job, observer: Observer = Observer()) -> Outcome:
         return Outcome(job=job, error=error)
 
 
-def _absolute(job: Job) -> Job:
-    return replace(job, path=job.path.absolute())
-
-
 def _outcome(job: Job, future: Any) -> Outcome:
-    from distributed import KilledWorker
-    from distributed.client import FutureCancelledError
+    """What a worker made of a job, whose own error is a part of it.
 
+    Raises ClusterError for every other error: the worker, or the way to it, is gone.
+    """
     try:
         outcome: Outcome = future.result()
-    except KilledWorker as error:
-        many = f"{error.allowed_failures + 1} workers died on it, one after the other"
-        hint = "if memory ran out: fewer workers at once, or a shorter part of it"
-        return Outcome(job=job, error=ClusterError(f"{job.path}: {many}", hint=hint))
-    except (FutureCancelledError, OSError) as error:
+    except Exception as error:
         raise ClusterError(
-            "the scheduler went away",
-            hint="what was stored is whole; the same command continues from there",
+            f"a worker was lost; {job.path} and what follows it is not stored: {type(error).__name__}",
+            hint="the same command continues from there; if memory ran out, with fewer workers",
         ) from error
     return replace(outcome, job=job)
-
-
-class _LostWorkers:
-    """Handles events of the scheduler: reports workers that were lost while they had one of our jobs.
-
-    names : names of our jobs by their keys on the cluster. report : takes a sentence for each lost job.
-    """
-
-    def __init__(self, names: dict[str, str], report: Callable[[str], None]) -> None:
-        self._names = names
-        self._report = report
-
-    def __call__(self, event: tuple[float, Any]) -> None:
-        message = event[1]
-        if not isinstance(message, dict) or message.get("action") != "remove-worker":
-            return
-        lost = [*message.get("processing-tasks", ()), *message.get("lost-computed-tasks", ())]
-        for key in lost:
-            if key in self._names:
-                self._report(
-                    f"worker {message['worker']} was lost; {self._names[key]} starts over on another"
-                )

@@ -3,7 +3,7 @@
 The containers of recordings are mutated in tests/pc2grid/io/test_fuzz.py, where checksums catch most of it.
 Here the container stays sound and its content is wrong, so that decoders behind the checksums are reached.
 Whatever is changed, the result is whole and possible, or a Pc2GridError; never another exception.
-PC2GRID_FUZZ is the number of mutations of each kind: at least hundreds, so that every outcome occurs.
+PC2GRID_FUZZ is the number of mutations of each kind: at least 100, so that every outcome occurs.
 """
 
 from __future__ import annotations

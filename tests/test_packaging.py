@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -39,14 +40,41 @@ def test_the_wheel_holds_the_examples_that_readme_names(wheel: zipfile.ZipFile) 
     assert "nav2.sh" in held
 
 
-def test_the_wheel_holds_the_packages_and_no_tests(wheel: zipfile.ZipFile) -> None:
+def test_the_wheel_holds_the_packages_without_tests_and_laboratory(wheel: zipfile.ZipFile) -> None:
     tops = {name.partition("/")[0] for name in wheel.namelist()}
     version = pc2grid.__version__
-    wanted = {"pc2grid", "signature", "pc2grid_cli", "pc2grid_lab"}
+    wanted = {"pc2grid", "signature", "pc2grid_cli"}
     assert tops == {*wanted, f"pc2grid-{version}.dist-info", f"pc2grid-{version}.data"}
     for package in wanted:
         assert f"{package}/py.typed" in wheel.namelist()
     assert "pc2grid_cli/report.html" in wheel.namelist()
+
+
+def test_the_wheel_alone_simulates_and_says_what_compare_needs(
+    wheel: zipfile.ZipFile, tmp_path: Path
+) -> None:
+    wheel.extractall(tmp_path / "wheel")
+    code = (
+        "import sys, pathlib\n"
+        "sys.path = [sys.argv.pop(1), *(p for p in sys.path if not pathlib.Path(p, 'pc2grid_lab').exists()"
+        " and not pathlib.Path(p, 'pc2grid').exists())]\n"
+        "from pc2grid_cli.main import main; main()"
+    )
+
+    def pc2grid(*words: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-c", code, tmp_path / "wheel", *words]
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        return subprocess.run(
+            command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment
+        )
+
+    made = pc2grid("simulate", "drive.mcap", "--sensor", "laser", "--length", "0.5")
+    assert made.returncode == 0 and (tmp_path / "drive.tum").exists(), made.stderr
+    assert pc2grid("demo", "--help").returncode == 0
+    refused = pc2grid("compare", "recordings", ".")
+    assert refused.returncode == 2 and "Traceback" not in refused.stderr
+    assert "not installed" in refused.stderr and "pip install -e ." in refused.stderr
+    assert "compare-paper" not in pc2grid("config", "schema").stdout
 
 
 def test_readme_has_no_link_that_an_index_cannot_follow(wheel: zipfile.ZipFile) -> None:

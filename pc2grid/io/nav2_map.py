@@ -12,11 +12,13 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from typing_extensions import Self
 
 from pc2grid.arrays import hand_over
 from pc2grid.errors import MapFileError
@@ -64,24 +66,13 @@ def load_map(yaml_path: str | Path, warn: Callable[[str], object] = _log.warning
     """
     yaml_path = Path(yaml_path)
     keys = _read_yaml(yaml_path)
-    image_path = _image_path(yaml_path, keys, warn)
-    mode = keys.get("mode", "trinary")
-    resolution_m = _number(yaml_path, keys, "resolution")
-    if not _RESOLUTION_M[0] <= resolution_m <= _RESOLUTION_M[1]:
-        raise MapFileError(
-            f"{yaml_path}: resolution: expected {_RESOLUTION_M[0]:g} .. {_RESOLUTION_M[1]:g} m per pixel, "
-            f"found {resolution_m:g}"
-        )
-    x_m, y_m, yaw_rad = _origin(yaml_path, keys)
-    negate = _flag(yaml_path, keys, "negate")
-    occupied_thresh, free_thresh = _thresholds(yaml_path, keys)
-    if mode not in ("trinary", "scale", "raw"):
-        raise MapFileError(f"{yaml_path}: mode: {_shown(mode)} is not one of trinary, scale, raw")
-    image = read_image(image_path)
-    table = _cell_of(image, mode, negate, occupied_thresh, free_thresh)
-    if mode == "trinary" and _frees_unknown(image, table):
+    if ".." in Path(keys.image).parts:
+        warn(f"{yaml_path}: image: {keys.image} leaves the folder of the map")
+    image = read_image(yaml_path.parent / keys.image)  # an absolute name stays absolute, as in nav2
+    table = _cell_of(image, keys)
+    if keys.mode == "trinary" and _frees_unknown(image, table):
         warn(
-            f"{yaml_path}: free_thresh {free_thresh:g} would make grey {_UNKNOWN_GREY} free, which map "
+            f"{yaml_path}: free_thresh {keys.free_thresh:g} would make grey {_UNKNOWN_GREY} free, which map "
             f"savers write for unknown: it stays unknown; free_thresh: {_FREE_THRESH} says so in the .yaml"
         )
         table[_UNKNOWN_GREY] = UNKNOWN
@@ -90,7 +81,8 @@ def load_map(yaml_path: str | Path, warn: Callable[[str], object] = _log.warning
         cells[::-1]
     ):  # row by row: the index takes eight times the memory of a pixel
         target[:] = table[image.values[row], 0 if image.alpha is None else image.alpha[row]]
-    grid = OccupancyGrid(cells=hand_over(cells), resolution_m=resolution_m, origin_m=(x_m, y_m))
+    x_m, y_m, yaw_rad = keys.origin
+    grid = OccupancyGrid(cells=hand_over(cells), resolution_m=keys.resolution, origin_m=(x_m, y_m))
     if abs(yaw_rad) <= _LEAST_YAW_RAD:
         return grid
     warn(
@@ -102,7 +94,7 @@ def load_map(yaml_path: str | Path, warn: Callable[[str], object] = _log.warning
 
 def _frees_unknown(image: GreyImage, table: NDArray[np.int8]) -> bool:
     """Whether the thresholds make unknown pixels free, in an image that has lighter ones for free space."""
-    if image.top != 255 or image.alpha is not None or table[_UNKNOWN_GREY] != FREE:
+    if image.alpha is not None or table[_UNKNOWN_GREY] != FREE:
         return False
     return bool((image.values == _UNKNOWN_GREY).any() and image.values.max() > _UNKNOWN_GREY)
 
@@ -137,15 +129,14 @@ def _turned(path: Path, grid: OccupancyGrid, yaw_rad: float) -> OccupancyGrid:
     return OccupancyGrid(cells=cells, resolution_m=grid.resolution_m, origin_m=(float(x_m), float(y_m)))
 
 
-def _cell_of(
-    image: GreyImage, mode: str, negate: bool, occupied_thresh: float, free_thresh: float
-) -> NDArray[np.int8]:
+def _cell_of(image: GreyImage, keys: _Keys) -> NDArray[np.int8]:
     """The cell for every value and opacity that a pixel of the image can have."""
+    mode, occupied_thresh, free_thresh = keys.mode, keys.occupied_thresh, keys.free_thresh
     opacity = np.ones(1) if image.alpha is None else np.arange(256) / 255.0
-    grey, alpha = np.meshgrid(np.arange(image.top + 1) / image.top, opacity, indexing="ij")
+    grey, alpha = np.meshgrid(np.arange(256) / 255.0, opacity, indexing="ij")
     if mode == "trinary" and image.alpha is not None:
         grey = (3.0 * grey + alpha) / 4.0  # nav2 includes the alpha channel in the mean of the colours
-    occupancy = grey if negate else 1.0 - grey
+    occupancy = grey if keys.negate else 1.0 - grey
     cells = np.full(grey.shape, UNKNOWN, dtype=np.int8)
     if mode == "raw":
         value = np.round(grey * 255.0)
@@ -223,8 +214,29 @@ def save_map(
 
 # --- yaml ---------------------------------------------------------------------------------------------
 
+_Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+
+class _Keys(BaseModel):
+    """The keys of a map.yaml. Other programs write further ones into it."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    image: str = Field(pattern=r"^[^\x00]+$")
+    resolution: float = Field(ge=_RESOLUTION_M[0], le=_RESOLUTION_M[1])
+    origin: tuple[_Coordinate, _Coordinate, float]
+    negate: bool
+    occupied_thresh: float = Field(ge=0, le=1)
+    free_thresh: float = Field(ge=0, le=1)
+    mode: MapMode = "trinary"
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.free_thresh > self.occupied_thresh:
+            raise ValueError(f"free_thresh: {self.free_thresh} is above occupied_thresh")
+        return self
+
+
+def _read_yaml(path: Path) -> _Keys:
     try:
         with path.open("rb") as file:
             text = file.read(_MAX_YAML_BYTES + 1)
@@ -235,85 +247,19 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     if len(text) > _MAX_YAML_BYTES:
         raise MapFileError(f"{path}: larger than {_MAX_YAML_BYTES} bytes: not a map.yaml")
     try:
-        keys = yaml.safe_load(text)
+        return _Keys.model_validate(yaml.safe_load(text))
+    except ValidationError as error:
+        raise _wrong_key(path, error) from None
     except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:
         raise MapFileError(f"{path}: not readable as YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(keys, dict):
-        raise MapFileError(f"{path}: not a map.yaml: expected keys like image and resolution")
-    return keys
 
 
-def _shown(value: object) -> str:
-    """A value shortened for a message: with aliases, a few lines of YAML can hold billions of items."""
-    if isinstance(value, int) and abs(value) >= 10**18:
-        return "a huge number"
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join('[...]' if isinstance(v, list) else _shown(v) for v in value[:4])}]"
-    return f"{value!r:.60}" if isinstance(value, (str, int, float)) else f"a {type(value).__name__}"
-
-
-def _value(path: Path, keys: dict[str, Any], key: str) -> Any:
-    if keys.get(key) is None:
-        raise MapFileError(f"{path}: {key}: missing", hint="see nav2's map.yaml format")
-    return keys[key]
-
-
-def _as_float(value: object) -> float:
-    """A number as yaml-cpp reads it: `1e-3` is a number there, but text to PyYAML."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        raise ValueError(value)
-    number = float(value)
-    if not math.isfinite(number):
-        raise ValueError(value)
-    return number
-
-
-def _number(path: Path, keys: dict[str, Any], key: str) -> float:
-    value = _value(path, keys, key)
-    try:
-        return _as_float(value)
-    except (ValueError, OverflowError):
-        raise MapFileError(f"{path}: {key}: expected a finite number, found {_shown(value)}") from None
-
-
-def _thresholds(path: Path, keys: dict[str, Any]) -> tuple[float, float]:
-    """occupied_thresh and free_thresh."""
-    occupied, free = _number(path, keys, "occupied_thresh"), _number(path, keys, "free_thresh")
-    if not 0.0 <= free <= occupied <= 1.0:
-        raise MapFileError(
-            f"{path}: free_thresh: expected 0 <= free_thresh <= occupied_thresh <= 1, "
-            f"found {free} and {occupied}"
-        )
-    return occupied, free
-
-
-def _flag(path: Path, keys: dict[str, Any], key: str) -> bool:
-    value = _value(path, keys, key)
-    named = {"0": False, "1": True, "False": False, "True": True}.get(_shown(value).strip("'").capitalize())
-    if named is None:
-        raise MapFileError(f"{path}: {key}: expected 0 or 1, found {_shown(value)}")
-    return named
-
-
-def _origin(path: Path, keys: dict[str, Any]) -> tuple[float, float, float]:
-    """x and y in metres, and the yaw in radians."""
-    value = _value(path, keys, "origin")
-    try:
-        x, y, yaw = (_as_float(v) for v in value)
-    except (TypeError, ValueError, OverflowError):
-        raise MapFileError(f"{path}: origin: expected [x, y, yaw], found {_shown(value)}") from None
-    if max(abs(x), abs(y)) > FARTHEST_M:
-        raise MapFileError(f"{path}: origin: {x:g}, {y:g} m is nowhere on earth")
-    return x, y, yaw
-
-
-def _image_path(path: Path, keys: dict[str, Any], warn: Callable[[str], object]) -> Path:
-    name = _value(path, keys, "image")
-    if not isinstance(name, str) or not name or "\0" in name:
-        raise MapFileError(f"{path}: image: expected a file name, found {_shown(name)}")
-    if ".." in Path(name).parts:
-        warn(f"{path}: image: {name} leaves the folder of the map")
-    return path.parent / name  # an absolute name stays absolute, as in nav2
+def _wrong_key(path: Path, error: ValidationError) -> MapFileError:
+    first = error.errors()[0]
+    key = "".join(f"{part}: " for part in first["loc"][:1])
+    complaint = first["msg"][:1].lower() + first["msg"][1:]
+    # What was found is not shown: with aliases, a few lines of YAML hold billions of items.
+    return MapFileError(f"{path}: {key}{complaint}", hint="see nav2's map.yaml format")
 
 
 def _yaml_number(value: float) -> str:

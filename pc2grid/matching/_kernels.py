@@ -8,8 +8,8 @@ import numba
 import numpy as np
 
 from pc2grid.arrays import F32, F64, I64, U8, U16, BoolGrid
+from pc2grid.matching.lattice import BLOCK, SQUARE, TILE
 from pc2grid.matching.likelihood_field import LIKELIHOOD
-from pc2grid.matching.window_search import BLOCK, SQUARE, TILE
 
 _ROWS, _COLUMNS = TILE
 _NEUTRAL = LIKELIHOOD.neutral_value

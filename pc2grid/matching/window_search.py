@@ -27,6 +27,7 @@ from itertools import pairwise
 import numpy as np
 
 from pc2grid.arrays import F32, F64, I64, U8, U16
+from pc2grid.matching.lattice import BLOCK, SQUARE, TILE
 from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField
 from pc2grid.matching.walls import Walls
 from pc2grid.model import OccupancyGrid
@@ -39,13 +40,6 @@ MARGIN_M = 2.0
 scores the same if the margin is wider than the last of `REACHES_M`."""
 MOST_POINTS = 256
 """So many likelihoods of 8 bits add up in 16 bits."""
-SQUARE = 4
-"""Side of a square of the lattice, in cells."""
-TILE = 16, 64
-"""Rows and columns of squares that are summed at once. A row of sums of 16 bits fills two of the widest
-vector registers; shorter rows of a fixed length are not compiled to vector instructions (measured)."""
-BLOCK = 4
-"""Of a block of so many by so many squares, the best pose at a heading is reported."""
 BOUND_SLACK = 0.98
 """A pose may exceed the bound of its square, because `levels_for` neglects half a cell. A square is left out
 only if its bound is below this share of the best score found. Chosen by hand."""

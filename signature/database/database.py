@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,9 @@ from pc2grid.model import Loop, OccupancyGrid, PointMap, SessionMap, Submap, Tra
 from pc2grid.submaps.junction_graph import graph_from_arrays
 from pc2grid.submaps.partition import view_at
 from signature.config import Config
-from signature.database import codec, stored, validation
+from signature.database import document, validation
+from signature.database.arrays import DatabaseDamage, explained
+from signature.database.document import PARTS, StoredSession, SubmapArrays, stored_session
 from signature.database.protocol import (
     BuildingFrame,
     Place,
@@ -25,7 +28,6 @@ from signature.database.protocol import (
     none_there,
 )
 from signature.database.rows import Rows, SessionRow, no_session
-from signature.database.stored import PARTS, StoredSession, SubmapArrays, stored_session
 from signature.similarity import SignatureTable
 
 if TYPE_CHECKING:
@@ -136,29 +138,20 @@ class SubmapDatabase(ABC):
 
     def signatures(self, session: str | None = None) -> SignatureTable:
         """All signatures, or those of one session; `session_index` counts in the order of `sessions()`."""
-        config, filled, table = self.config(), 0, dict[str, Any]()
-        capacity = self._rows.count_submaps()
+        config, tables = self.config(), list[SignatureTable]()
         for index, row in enumerate(self._known()):
             if session not in (None, row.name):
                 continue
             part = self._rows.part(row, "submaps", {"info": self._rows.info(row)})
             if not len(part):
                 continue
-            with codec.explained(self.location, f"submaps of session {row.name!r}"):
+            with explained(self.location, f"submaps of session {row.name!r}"):
                 validation.check_bins(part.boundary.shape[1], part.freespace.shape[1], config)
-                arrays = {name: getattr(part, name) for name in codec.fields_of(SubmapArrays)}
-                arrays["session_index"] = np.full(len(part), index, np.int32)
-                # Copied into the table session by session, so that only one is in memory twice.
-                for name, values in arrays.items():
-                    if name not in table:
-                        table[name] = np.empty((capacity, *values.shape[1:]), values.dtype)
-                    table[name][filled : filled + len(part)] = values
-                filled += len(part)
-        if session is not None and not table:
+            columns = {field.name: getattr(part, field.name) for field in fields(SubmapArrays)}
+            tables.append(SignatureTable(session_index=np.full(len(part), index, np.int32), **columns))
+        if session is not None and not tables:
             self._row(session)
-        if not table:
-            return SignatureTable.of((), np.empty((0, 2)))
-        return SignatureTable(**{name: values[:filled] for name, values in table.items()})
+        return SignatureTable.concatenated(tables or [SignatureTable.of((), np.empty((0, 2)))])
 
     def grid(self, session: str) -> OccupancyGrid:
         """Whole occupancy grid of a session."""
@@ -215,14 +208,14 @@ class SubmapDatabase(ABC):
     def stored(self, session: str, *, recover: bool = False) -> StoredSession:
         """Everything that is stored of a session.
 
-        recover : without what is damaged and can be lost (`signature.database.stored.completed`).
+        recover : without what is damaged and can be lost (`signature.database.document.completed`).
         """
         row = self._row(session)
         parts: dict[str, Any] = {"info": self._rows.info(row)}
-        for part in PARTS[1:]:
-            with contextlib.suppress(*[DatabaseCorrupt] if recover and part in stored.RECOVERED else []):
+        for part in PARTS:
+            with contextlib.suppress(*[DatabaseCorrupt] if recover and part in document.RECOVERED else []):
                 parts[part] = self._rows.part(row, part, parts)
-        return stored.completed(parts)
+        return document.completed(parts)
 
     def add(
         self,
@@ -274,13 +267,13 @@ class SubmapDatabase(ABC):
         damaged = {
             row.id: problem
             for row in self._known()
-            for problem in [next(self._rows.problems(row, stored.SEARCHED), None)]
+            for problem in [next(self._rows.problems(row, document.SEARCHED), None)]
             if problem is not None
         }
         self._left_out |= damaged.keys()
         problems = (*damaged.values(), *self._rows.orphans())
         if problems and next(self._known(), None) is None:
-            raise codec.DatabaseDamage(self.location, problems[0].where, problems[0].what)
+            raise DatabaseDamage(self.location, problems[0].where, problems[0].what)
         return problems
 
     # --- rows and parts -------------------------------------------------------------------------------
@@ -289,7 +282,6 @@ class SubmapDatabase(ABC):
         """What is wrong with the rows of all sessions."""
         for row in self._all():
             yield from self._rows.problems(row)
-            yield from self._rows.strays(row)
         yield from self._rows.orphans()
 
     def _all(self, condition: str = "true", *values: Any) -> Iterator[SessionRow]:
@@ -300,7 +292,7 @@ class SubmapDatabase(ABC):
         """The rows of the sessions that are known."""
         with contextlib.suppress(*[DatabaseCorrupt] if self._damaged else []):
             for row in self._all(condition, *values):
-                unreadable = self._damaged and next(self._rows.problems(row, ("info",)), None) is not None
+                unreadable = self._damaged and next(self._rows.problems(row, ()), None) is not None
                 if row.id not in self._left_out and not unreadable:
                     yield row
 

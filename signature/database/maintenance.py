@@ -10,11 +10,11 @@ from pc2grid.errors import DatabaseCorrupt, DatabaseError
 from pc2grid.io.containers.detect import first_bytes, is_submap_database
 from pc2grid.model import is_part_of, part_name
 from signature.database import engine_of, open_database, refuse_existing
-from signature.database.codec import DatabaseDamage, clean
+from signature.database.arrays import DatabaseDamage, clean
+from signature.database.document import StoredSession, stored_session
 from signature.database.postgres.server import is_url, location
 from signature.database.protocol import BuildingFrame, Entry, Place, Problem, SessionInfo
 from signature.database.rows import Rows, no_session, refuse_other_settings
-from signature.database.stored import StoredSession, stored_session
 
 _MOST_PARTS = 100
 """Parts of one recording that are looked for; a recording of 1.9 km without loops falls into 9."""

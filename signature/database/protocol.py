@@ -183,8 +183,8 @@ def refused_version(location: object, version: int) -> DatabaseError:
     """The error for a database of another format."""
     if version < FORMAT:
         return DatabaseVersion(
-            f"{location}: of a format older than {FORMAT}, which this pc2grid does not read",
-            hint="convert the recordings again",
+            f"{location}: of an older format, which this pc2grid does not read",
+            hint="convert the recordings again, with `pc2grid convert`",
         )
     return DatabaseVersion(
         f"{location}: database format {version}; this pc2grid reads format {FORMAT}",
@@ -208,7 +208,7 @@ def none_there(where: str, building: str | None, floor: str | None, labels: Sequ
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One finding of `check`: where (array and session) and what."""
+    """One finding of `check`: where (part and session) and what."""
 
     where: str
     what: str
@@ -220,6 +220,8 @@ APPLICATION_ID = int.from_bytes(SUBMAPS_ID, "big")
 """Marks a file, and the lock of a server, as pc2grid's."""
 OLDER_ID = int.from_bytes(b"pc2g", "big")
 """Marks files that were written before the first format was fixed."""
+OLDER_TABLE = "array"
+"""A table that only databases of older formats have."""
 BUSY_TIMEOUT_S = 30.0
 """How long a writer waits for another one; chosen by hand."""
 Entry = tuple[SessionMap, "Sequence[Signature]", Provenance]

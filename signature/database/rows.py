@@ -1,50 +1,48 @@
 """The two tables of a database, and what SQLite and PostgreSQL share of reading and writing their rows.
 
-`session` has one row a session: its name, its label, its document. `array` has one row for each array of a
+`session` has one row a session: its name, its label, its document. `part` has one row for each part of a
 session. Every row ends with the crc32 of its other columns: no engine notices a flipped bit in a blob.
 """
 
 from __future__ import annotations
 
-import functools
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
 from pc2grid.errors import DatabaseError, DatabaseVersion
-from signature.database import codec, stored, validation
+from signature.database import document
+from signature.database.arrays import DatabaseDamage, explained, row_crc
+from signature.database.document import PARTS, StoredSession
 from signature.database.protocol import BuildingFrame, Problem, SessionInfo
-from signature.database.stored import PARTS, StoredSession
 
 SESSION_COLUMNS = ("building", "id", "floor", "name", "document")
-ARRAY_COLUMNS = ("building", "session_id", "name", "dtype", "shape", "data")
+PART_COLUMNS = ("building", "session_id", "name", "data")
 _SESSIONS = f"SELECT {', '.join(SESSION_COLUMNS)}, crc32 FROM session"
-_ARRAYS = (
-    f'SELECT {", ".join(ARRAY_COLUMNS)}, crc32 FROM "array" WHERE building = ? AND session_id = ?'
-    " AND substr(name, 1, ?) = ?"
+_PART = (
+    f"SELECT {', '.join(PART_COLUMNS)}, crc32 FROM part WHERE building = ? AND session_id = ? AND name = ?"
 )
-_NAMES = 'SELECT name FROM "array" WHERE building = ? AND session_id = ? ORDER BY name'
 _ORPHANS = (
-    'SELECT DISTINCT a.session_id FROM "array" a WHERE NOT EXISTS'
-    " (SELECT 1 FROM session s WHERE s.building = a.building AND s.id = a.session_id) ORDER BY a.session_id"
+    "SELECT DISTINCT p.session_id FROM part p WHERE NOT EXISTS"
+    " (SELECT 1 FROM session s WHERE s.building = p.building AND s.id = p.session_id) ORDER BY p.session_id"
 )
 
 
-def definitions(blob: str, number: str, *, session_key: str = "", array_key: str = "") -> dict[str, str]:
+def definitions(blob: str, number: str, *, session_key: str = "", part_key: str = "") -> dict[str, str]:
     """The statement that creates each table: table -> SQL.
 
-    blob : the engine's type of bytes. number : its column of a session's number. session_key, array_key :
+    blob : the engine's type of bytes. number : its column of a session's number. session_key, part_key :
     what it adds to the two tables.
     """
     return {
         "session": f"CREATE TABLE session (building text NOT NULL, {number}, floor text NOT NULL,"
         f" name text NOT NULL UNIQUE, document text NOT NULL, crc32 bigint NOT NULL{session_key})",
-        "array": 'CREATE TABLE "array" (building text NOT NULL, session_id bigint NOT NULL,'
-        f" name text NOT NULL, dtype text NOT NULL, shape text NOT NULL, data {blob} NOT NULL,"
-        f" crc32 bigint NOT NULL, PRIMARY KEY (building, session_id, name){array_key})",
+        "part": "CREATE TABLE part (building text NOT NULL, session_id bigint NOT NULL, name text NOT NULL,"
+        f" data {blob} NOT NULL, crc32 bigint NOT NULL, PRIMARY KEY (building, session_id, name){part_key})",
     }
 
 
@@ -86,7 +84,7 @@ class Rows(ABC):
     def sessions(self, condition: str = "true", *values: Any, tail: str = "") -> Iterator[SessionRow]:
         """Rows of sessions in the order they were added. tail : what follows that in the statement."""
         for *row, crc in self.select(f"{_SESSIONS} WHERE {condition} ORDER BY id{tail}", *values):
-            yield SessionRow._make((*row, codec.row_crc(row) == crc))
+            yield SessionRow._make((*row, row_crc(row) == crc))
 
     def info(self, row: SessionRow) -> SessionInfo:
         """What the row of a session says.
@@ -95,90 +93,59 @@ class Rows(ABC):
         """
         where = f"session {row.id}"
         if not row.sound:
-            raise codec.DatabaseDamage(self.location, where, "wrong checksum")
-        with codec.explained(self.location, where):
-            filed = tuple(validation.text(getattr(row, name), name) for name in ("name", "building", "floor"))
-            document = validation.text(row.document, "document")
+            raise DatabaseDamage(self.location, where, "wrong checksum")
+        with explained(self.location, where):
             try:
-                info = _info(document)
+                info = document.decode_info(row.document)
             except ValidationError as error:
-                raise self._unknown_setting(row, json.loads(document)["info"], error) from None
-            label = info.provenance.label
+                first = error.errors()[0]["loc"]
+                if first[:2] != ("provenance", "config"):
+                    raise
+                raise self._unknown_setting(row, ".".join(map(str, first[2:]))) from None
+            label, filed = info.provenance.label, (row.name, row.building, row.floor)
             if filed != (info.name, label.building or "", label.floor or ""):
                 raise ValueError(f"filed as {', '.join(map(repr, filed))}, but is {info.name!r} of {label}")
             return info
 
     def part(self, row: SessionRow, part: str, others: Mapping[str, Any]) -> Any:
-        """A part of a session (`signature.database.stored`). others : parts that it is compared with.
+        """A part of a session (`signature.database.document`). others : parts that it is compared with.
 
-        Raises DatabaseCorrupt that names the array, or the part, and the session.
+        Raises DatabaseCorrupt that names the part and the session.
         """
-        arrays = {}
-        for name, array in self._arrays(row, part):
-            if isinstance(array, codec.DatabaseDamage):
-                raise array
-            arrays[name] = array
-        with codec.explained(self.location, f"{part} of session {row.name!r}"):
-            return stored.decode(part, _content(row.document), arrays, others)
+        found = next(self.select(_PART, row.building, row.id, part), None)
+        with explained(self.location, f"{part} of session {row.name!r}"):
+            if found is None:
+                raise ValueError("is missing")
+            *values, crc = found
+            if row_crc(values) != crc:
+                raise ValueError("wrong checksum")
+            return document.decode(part, values[-1], others)
 
     def problems(self, row: SessionRow, parts: Sequence[str] = PARTS) -> Iterator[Problem]:
-        """What is wrong with these parts of a session: each array, and each part that its arrays make."""
+        """What is wrong with a session and these parts of it."""
         known: dict[str, Any] = {}
         try:
             known["info"] = self.info(row)
-        except codec.DatabaseDamage as error:
+            for part in parts:
+                try:
+                    known[part] = self.part(row, part, known)
+                except DatabaseDamage as error:
+                    yield error.problem
+        except DatabaseDamage as error:
             yield error.problem
         except DatabaseVersion as error:
             yield Problem(f"session {row.id}", error.message)
-        for part in parts[1:]:
-            try:
-                damaged = [
-                    a.problem for _, a in self._arrays(row, part) if isinstance(a, codec.DatabaseDamage)
-                ]
-                yield from damaged
-                if not damaged and "info" in known:
-                    known[part] = self.part(row, part, known)
-            except codec.DatabaseDamage as error:
-                yield error.problem
-
-    def strays(self, row: SessionRow) -> Iterator[Problem]:
-        """Arrays that no part of a session has."""
-        for (name,) in self.select(_NAMES, row.building, row.id):
-            if str(name).partition(".")[0] not in PARTS[1:]:
-                yield Problem(f"{name} of session {row.name!r}", "no part of a session")
-
-    def count_submaps(self) -> int:
-        """How many submaps all sessions have at most, by the bytes that are there."""
-        statement = 'SELECT coalesce(sum(length(data)), 0) FROM "array" WHERE name = ?'
-        ((size,),) = self.select(statement, "submaps.symmetry")
-        return int(size) // 8
 
     def orphans(self) -> Iterator[Problem]:
-        """Arrays without a session."""
+        """Parts without a session."""
         for (number,) in self.select(_ORPHANS):
-            yield Problem(f"arrays of session {number}", "belong to no session")
+            yield Problem(f"parts of session {number}", "belong to no session")
 
-    def _arrays(self, row: SessionRow, part: str) -> Iterator[tuple[str, codec.Array | codec.DatabaseDamage]]:
-        """The arrays of a part by their names, or what is wrong with them."""
-        for *values, crc in self.select(_ARRAYS, row.building, row.id, len(part) + 1, f"{part}."):
-            _, _, name, *packed = values
-            found: codec.Array | codec.DatabaseDamage
-            try:
-                with codec.explained(self.location, f"{name} of session {row.name!r}"):
-                    if codec.row_crc(values) != crc:
-                        raise ValueError("wrong checksum")
-                    found = codec.unpack(codec.Packed(*packed))
-            except codec.DatabaseDamage as error:
-                found = error
-            yield name, found
-
-    def _unknown_setting(
-        self, row: SessionRow, content: Mapping[str, Any], error: ValidationError
-    ) -> DatabaseVersion:
-        what = ".".join(map(str, error.errors()[0]["loc"]))
-        made_by = content["provenance"]["versions"].get("pc2grid", "an unknown version")
+    def _unknown_setting(self, row: SessionRow, setting: str) -> DatabaseVersion:
+        versions = json.loads(row.document)["provenance"]["versions"]
         return DatabaseVersion(
-            f"{self.location}: session {row.name!r} was made by pc2grid {made_by} with the setting {what},"
+            f"{self.location}: session {row.name!r} was made by pc2grid"
+            f" {versions.get('pc2grid', 'an unknown version')} with the setting {setting},"
             " which this version does not understand",
             hint="convert the recording again, or use that version",
         )
@@ -194,67 +161,55 @@ class Rows(ABC):
         compared with those of the other sessions.
         """
         for session in sessions:
-            document, arrays = stored.encode(session)
-            info = _info(document)
+            text = document.encode_info(session.info)
+            info = document.decode_info(text)
             other = self.other(info)
             if other is not None:
                 refuse_other_settings(other, info, self.location)
             known = self.find(info.name)
-            if known is not None:
-                # Where it lies in the building is no part of what was recorded.
-                if not force and stored.with_frame(known.document, None) == stored.with_frame(document, None):
+            if known is not None and not force:
+                if known.document == text:
                     continue
-                if not force:
-                    raise DatabaseError(
-                        f"{self.location}: holds another session named {info.name!r} already",
-                        hint="--force replaces it; --name gives this one another name",
-                    )
+                raise DatabaseError(
+                    f"{self.location}: holds another session named {info.name!r} already",
+                    hint="--force replaces it; --name gives this one another name",
+                )
+            if known is not None:
                 self.delete(known)
             label, number = info.provenance.label, self.new_id() if known is None else known.id
             building, floor = label.building or "", label.floor or ""
-            self._insert("session", SESSION_COLUMNS, (building, number, floor, info.name, document))
-            for name, packed in arrays.items():
-                self._insert('"array"', ARRAY_COLUMNS, (building, number, name, *packed))
+            self._insert("session", SESSION_COLUMNS, (building, number, floor, info.name, text))
+            for part in PARTS:
+                data = document.encode(part, getattr(session, part))
+                self._insert("part", PART_COLUMNS, (building, number, part, data))
 
     def remove(self, names: Sequence[str]) -> None:
         """Remove sessions. Raises DatabaseError for a name that no session has."""
-        known = self._some_names()
-        for name in dict.fromkeys(names):
-            row = self.find(name)
-            if row is None:
-                raise no_session(name, known, self.location)
+        for row in [self._found(name) for name in dict.fromkeys(names)]:
             self.delete(row)
 
     def rename(self, old: str, new: str) -> None:
         """Give a session another name. Raises DatabaseError if there is no session `old`, or one `new`."""
-        new, row = stored.stored_name(new), self.find(old)
-        if row is None:
-            raise no_session(old, self._some_names(), self.location)
+        new, row = document.stored_name(new), self._found(old)
         if new != old and self.find(new) is not None:
             raise DatabaseError(
                 f"{self.location}: holds a session {new!r} already", hint="choose another name"
             )
-        self.info(row)
-        content = json.loads(row.document)
-        content["info"]["name"] = new
-        self._update(row, new, codec.to_json(content))
+        text = document.encode_info(replace(self.info(row), name=new))
+        values = (row.building, row.id, row.floor, new, text)
+        self.execute(
+            "UPDATE session SET name = ?, document = ?, crc32 = ? WHERE building = ? AND id = ?",
+            new, text, row_crc(values), row.building, row.id,
+        )  # fmt: skip
 
     def place(self, frames: Mapping[str, BuildingFrame | None]) -> None:
         """Store where sessions lie in their building, by name; None: nowhere. Raises DatabaseError for a name
         that no session has."""
         for name, frame in frames.items():
-            row = self.find(name)
-            if row is None:
-                raise no_session(name, self._some_names(), self.location)
-            self._update(row, row.name, stored.with_frame(row.document, frame))
-
-    def _update(self, row: SessionRow, name: str, document: str) -> None:
-        """Give a session another name and document."""
-        values = (row.building, row.id, row.floor, name, document)
-        self.execute(
-            "UPDATE session SET name = ?, document = ?, crc32 = ? WHERE building = ? AND id = ?",
-            name, document, codec.row_crc(values), row.building, row.id,
-        )  # fmt: skip
+            row = self._found(name)
+            where = row.building, row.id, "frame"
+            self.execute("DELETE FROM part WHERE building = ? AND session_id = ? AND name = ?", *where)
+            self._insert("part", PART_COLUMNS, (*where, document.encode("frame", frame)))
 
     def find(self, name: str) -> SessionRow | None:
         """The session of a name."""
@@ -267,31 +222,22 @@ class Rows(ABC):
 
     def delete(self, row: SessionRow) -> None:
         """Delete all rows of a session."""
-        self.execute('DELETE FROM "array" WHERE building = ? AND session_id = ?', row.building, row.id)
+        self.execute("DELETE FROM part WHERE building = ? AND session_id = ?", row.building, row.id)
         self.execute("DELETE FROM session WHERE building = ? AND id = ?", row.building, row.id)
 
-    def _some_names(self) -> list[str]:
-        """Names of sessions for a message: a fleet has many."""
-        return [name for (name,) in self.select("SELECT name FROM session ORDER BY id LIMIT 20")]
+    def _found(self, name: str) -> SessionRow:
+        """The session of a name. Raises DatabaseError that names some of those that are there."""
+        row = self.find(name)
+        if row is None:
+            known = [name for (name,) in self.select("SELECT name FROM session ORDER BY id LIMIT 20")]
+            raise no_session(name, known, self.location)
+        return row
 
     def _insert(self, table: str, columns: Sequence[str], values: Sequence[Any]) -> None:
         """Add a row with its checksum."""
         marks = ", ".join("?" * (len(columns) + 1))
         statement = f"INSERT INTO {table} ({', '.join(columns)}, crc32) VALUES ({marks})"
-        self.execute(statement, *values, codec.row_crc(values))
-
-
-@functools.lru_cache(maxsize=256)
-def _info(document: str) -> SessionInfo:
-    """The description of a session in its document. Cached: every part that is read is compared with it."""
-    info: SessionInfo = stored.decode("info", _content(document), {}, {})
-    return info
-
-
-@functools.lru_cache(maxsize=256)
-def _content(document: str) -> Any:
-    """A document, which must not be changed."""
-    return json.loads(document)
+        self.execute(statement, *values, row_crc(values))
 
 
 def no_session(name: str, known: Iterable[str], location: str) -> DatabaseError:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import sqlite3
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +31,14 @@ from pc2grid.model import (
     Trajectory,
     UncertainStretch,
 )
-from pc2grid.submaps.junction_graph import graph_to_arrays, junction_graph
+from pc2grid.submaps.junction_graph import graph_to_arrays
 from pc2grid.submaps.partition import view_at
 from signature.boundary import boundary_bins
 from signature.config import Config
 from signature.database import Provenance, SubmapDatabase, open_database
-from signature.database.codec import Packed, pack, row_crc, unpack
+from signature.database.arrays import row_crc, unpack
 from signature.database.protocol import Entry
-from signature.database.rows import ARRAY_COLUMNS, SESSION_COLUMNS
+from signature.database.rows import PART_COLUMNS, SESSION_COLUMNS
 from signature.describe import Signature
 from signature.freespace import freespace_bins
 from tests.helpers import postgresql
@@ -136,11 +137,7 @@ def small_graph(seed: int) -> nx.Graph:
     return graph
 
 
-def with_graph_of_grid(entry: Entry) -> Entry:
-    """The entry with the graph that is made anew where the stored one is damaged."""
-    session_map, signatures, provenance = entry
-    graph = junction_graph(session_map.grid, provenance.config.partition)
-    return replace(session_map, graph=graph), signatures, provenance
+MONDAY, TUESDAY = make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)
 
 
 def assert_holds(database: SubmapDatabase, entry: Entry) -> None:
@@ -201,20 +198,21 @@ def assert_same_graph(found: nx.Graph, wanted: nx.Graph) -> None:
         np.testing.assert_array_equal(getattr(arrays, field), getattr(expected, field))
 
 
-def everything(place: str | Path) -> str:
-    """A digest of all content of a database."""
+def everything(place: str | Path) -> dict[str, str]:
+    """A digest of all content of each session of a database."""
     with open_database(place) as database:
-        return digest_of(database)
+        return digests_of(database)
 
 
-def digest_of(database: SubmapDatabase) -> str:
+def digests_of(database: SubmapDatabase) -> dict[str, str]:
     """The same, of an open database."""
-    digest = hashlib.sha256()
-    for info in database.sessions():
-        digest.update(repr(info).encode())
+    digests = {}
+    for number, info in enumerate(database.sessions()):
+        digest = hashlib.sha256(repr(info).encode())
         digest.update(database.grid(info.name).cells.tobytes())
-        digest.update(database.trajectory(info.name).T_session_base.tobytes())
-        digest.update(repr(database.loops(info.name)).encode())
+        trajectory = database.trajectory(info.name)
+        digest.update(trajectory.stamps_ns.tobytes() + trajectory.T_session_base.tobytes())
+        digest.update(repr((trajectory.health, database.loops(info.name))).encode())
         arrays = graph_to_arrays(database.graph(info.name))
         digest.update(repr([getattr(arrays, field).tolist() for field in arrays.__slots__]).encode())
         seen = database.seen_places(info.name)
@@ -224,10 +222,11 @@ def digest_of(database: SubmapDatabase) -> str:
         for submap in database.submaps(info.name):
             digest.update(repr((submap.submap_id, submap.center_m, submap.radius_m)).encode())
             digest.update(submap.grid.cells.tobytes())
-    table = database.signatures()
-    for field in ("boundary", "freespace", "symmetry", "session_index", "submap_id", "center_m"):
-        digest.update(getattr(table, field).tobytes())
-    return digest.hexdigest()
+        table = database.signatures()
+        for field in ("boundary", "freespace", "symmetry", "submap_id", "center_m"):
+            digest.update(np.ascontiguousarray(getattr(table, field)[table.session_index == number]))
+        digests[info.name] = digest.hexdigest()
+    return digests
 
 
 # --- rows as SQL sees them, of either engine ----------------------------------------------------------
@@ -248,37 +247,37 @@ def sql(place: str | Path, statement: str, *values: object) -> list[tuple[Any, .
 
 @dataclass
 class Content:
-    """What is stored of a session: its own row, its document, its arrays, unpacked or as they are stored."""
+    """What is stored of a session: its own row, its document, and of each part document and arrays, or
+    its bytes."""
 
     row: dict[str, Any]
     document: dict[str, Any]
-    arrays: dict[str, Any]
+    parts: dict[str, Any]
 
 
 def craft(place: str | Path, change: Callable[[Content], None], session_id: int = 1) -> None:
     """Change what is stored of a session, and make the checksums right again."""
     (found,) = sql(place, f"SELECT {', '.join(SESSION_COLUMNS)} FROM session WHERE id = ?", session_id)
     row = dict(zip(SESSION_COLUMNS, found, strict=True))
-    stored = sql(
-        place, 'SELECT name, dtype, shape, data FROM "array" WHERE session_id = ? ORDER BY 1', session_id
-    )
-    before = {name: Packed(*packed) for name, *packed in stored}
-    content = Content(row, json.loads(row["document"]), {n: unpack(packed) for n, packed in before.items()})
+    stored = sql(place, "SELECT name, data FROM part WHERE session_id = ? ORDER BY 1", session_id)
+    content = Content(row, json.loads(row["document"]), {name: unpack(data) for name, data in stored})
     change(content)
     building = row["building"]
     if row["document"] == found[-1]:
         row["document"] = json.dumps(content.document)
     values = [content.row[column] for column in SESSION_COLUMNS]
-    sql(place, 'DELETE FROM "array" WHERE session_id = ?', session_id)
+    sql(place, "DELETE FROM part WHERE session_id = ?", session_id)
     sets = ", ".join(f"{column} = ?" for column in (*SESSION_COLUMNS, "crc32"))
     sql(place, f"UPDATE session SET {sets} WHERE id = ?", *values, row_crc(values), session_id)
-    for name, array in content.arrays.items():
-        packed = array if isinstance(array, Packed) else pack(array)
-        values = [building, session_id, name, *packed]
+    for name, part in content.parts.items():
+        values = [building, session_id, name, part if isinstance(part, bytes) else _packed(*part)]
         marks = ", ".join("?" * (len(values) + 1))
-        sql(
-            place,
-            f'INSERT INTO "array" ({", ".join(ARRAY_COLUMNS)}, crc32) VALUES ({marks})',
-            *values,
-            row_crc(values),
-        )
+        statement = f"INSERT INTO part ({', '.join(PART_COLUMNS)}, crc32) VALUES ({marks})"
+        sql(place, statement, *values, row_crc(values))
+
+
+def _packed(document: Any, arrays: dict[str, Any]) -> bytes:
+    """A part, also with numbers in its document that are not finite."""
+    stream, text = io.BytesIO(), np.frombuffer(json.dumps(document).encode(), np.uint8)
+    np.savez(stream, document=text, **arrays)
+    return stream.getvalue()

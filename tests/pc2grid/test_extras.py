@@ -63,13 +63,13 @@ def test_a_package_that_is_broken_is_missing(tmp_path: Path, monkeypatch: pytest
     [
         ("compare paper --maps {0} -o {0}/new", ("paper",), ConfigError, "pip install mahotas"),
         (
-            "convert a.mcap -o {0}/b.submaps --jobs 2",
+            "convert a.mcap -o {0}/b.submaps --dask tcp://h:1",
             ("cluster",),
             ClusterError,
             "pip install dask distributed",
         ),
         (
-            "convert a.mcap -o postgresql://u:secret@h/d --jobs 2",
+            "convert a.mcap -o postgresql://u:secret@h/d --dask tcp://h:1",
             ("cluster", "postgres"),
             ClusterError,
             "pip install dask distributed 'psycopg[binary]'",

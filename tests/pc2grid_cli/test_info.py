@@ -116,8 +116,10 @@ def test_damage_is_one_line_and_exit_1(log: Path) -> None:
 
 def test_what_is_lost_of_a_damaged_log_shows_in_the_exit_code(log: Path) -> None:
     assert runner.invoke(app, ["info", str(log), "--recover"]).exit_code == 0
-    data = bytearray(log.read_bytes())
-    data[len(data) // 2 : len(data) // 2 + 50] = bytes(50)
+    data = bytearray(write_mcap(log, drive(), chunk_size=1000).read_bytes())
+    mark = b"\x04\0\0\0zstd"  # in the head of each chunk
+    second = data.index(mark, data.index(mark) + 1)
+    data[second + 30 : second + 50] = bytes(20)
     log.write_bytes(data)
     result = runner.invoke(app, ["info", str(log), "--json", "--recover"])
     assert json.loads(result.stdout)["bytes_lost"] > 0

@@ -21,7 +21,7 @@ from pc2grid_cli.console import print_json
 from pc2grid_cli.json_schemas import documents, schema
 from pc2grid_cli.main import app
 from signature.config import Config
-from tests.helpers.json_schema import closed
+from tests.helpers.json_schema import closed, keys
 from tests.helpers.simulated_drives import cut, office
 
 
@@ -79,6 +79,13 @@ def test_documents_are_as_their_schema_says(
     done = CliRunner().invoke(app, [*command.split(), "--json"], catch_exceptions=False)
     assert done.exit_code == code, done.stderr
     jsonschema.validate(json.loads(done.stdout), closed(schema(name)))
+
+
+@pytest.mark.parametrize("name", documents())
+def test_the_keys_of_a_document_stay(name: str) -> None:
+    """Scripts rely on them. What is printed is what the schema says (the test above); more keys may come."""
+    known = json.loads((Path(__file__).parent / "json_keys.json").read_text())
+    assert set(known[name]) - keys(schema(name)) == set()
 
 
 def test_every_document_is_validated_by_a_test() -> None:

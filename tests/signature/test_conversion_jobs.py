@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import multiprocessing
 import os
 import re
 import signal
@@ -19,14 +20,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pc2grid.errors import ClusterError
+from pc2grid.errors import ClusterError, ConfigError
 from pc2grid.io.nav2_map import save_map
 from pc2grid.model import OccupancyGrid, part_name
-from pc2grid.observer import Observer
 from pc2grid_cli.main import app
-from signature import cluster, conversion_jobs
+from signature import conversion_jobs
 from signature.config import Config
-from signature.conversion_jobs import Job, Outcome, on_cluster
+from signature.conversion_jobs import Job, Outcome, at_once, on_cluster, processes_here
 from signature.database import maintenance, open_database
 from signature.sessions import build_sessions
 from tests.helpers import postgresql
@@ -35,16 +35,6 @@ from tests.helpers.interruptible import interruptible
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("kitchen", "hall", "cellar", "attic")
-
-
-class Said(Observer):
-    """Keeps the warnings."""
-
-    def __init__(self, warnings: list[str]) -> None:
-        self.warnings = warnings
-
-    def on_warning(self, text: str) -> None:
-        self.warnings.append(text)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def processes() -> Iterator[Any]:
     """A scheduler with two workers of one thread each."""
-    with cluster.processes_here(2) as made:
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as made:
         yield made
 
 
@@ -186,7 +176,7 @@ def test_one_failure_is_named_and_the_others_go_on(
     folder: Path, processes: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     some = inputs(folder, "kitchen", "ruin", "hall")
-    for number, more in enumerate(([], ["--dask", processes.scheduler_address])):
+    for number, more in enumerate(([], ["--dask", processes.scheduler_address], ["--jobs", "2"])):
         database = tmp_path / f"{number}.submaps"
         assert run("convert", *some, "-o", database, *more, "--json") == 3
         out, err = capsys.readouterr()
@@ -195,23 +185,22 @@ def test_one_failure_is_named_and_the_others_go_on(
         assert "ruin.yaml" in err
         assert "image" in err
         assert "Traceback" not in err
-    assert (tmp_path / "0.submaps").read_bytes() == (tmp_path / "1.submaps").read_bytes()
+    made = {(tmp_path / f"{number}.submaps").read_bytes() for number in range(3)}
+    assert len(made) == 1
     bad = [*inputs(folder, "ruin"), folder / "none.mcap"]
     assert run("convert", *bad, "-o", tmp_path / "none.submaps") == 1
     assert not (tmp_path / "none.submaps").exists()
 
 
-def test_a_killed_worker_costs_only_what_it_had_in_hand(folder: Path, processes: Any) -> None:
+def test_a_killed_worker_of_a_cluster_costs_only_what_it_had_in_hand(folder: Path, processes: Any) -> None:
     """Stopped first, so that it has a job in hand for sure when it is killed."""
     pids = [nanny.pid for nanny in processes.workers.values()]
     os.kill(pids[0], signal.SIGSTOP)
     killer = threading.Timer(1.0, os.kill, (pids[0], signal.SIGKILL))
     killer.start()
-    said: list[str] = []
     try:
-        outcomes = list(
-            on_cluster([job(folder, name) for name in NAMES], processes.scheduler_address, 2, Said(said))
-        )
+        workers = on_cluster(processes.scheduler_address)
+        outcomes = list(at_once([job(folder, name) for name in NAMES], workers))
     finally:
         killer.join()
     assert [outcome.job.name for outcome in outcomes] == list(NAMES)
@@ -220,9 +209,35 @@ def test_a_killed_worker_costs_only_what_it_had_in_hand(folder: Path, processes:
         (entry,) = outcome.entries
         assert entry[0].session == outcome.job.name
         assert len(entry[1]) == len(entry[0].submaps) > 0
-    assert said
-    assert all("was lost" in line and "starts over" in line for line in said)
-    assert {line.split("; ")[1].split()[0] for line in said} < set(NAMES)
+
+
+def test_a_killed_process_ends_all(folder: Path) -> None:
+    others = set(multiprocessing.active_children())
+    outcomes = at_once([job(folder, name) for name in NAMES], processes_here(1))
+    assert next(outcomes).error is None
+    (child,) = set(multiprocessing.active_children()) - others
+    os.kill(child.pid or 0, signal.SIGSTOP)
+    os.kill(child.pid or 0, signal.SIGKILL)
+    with pytest.raises(ClusterError, match="a worker was lost"):
+        list(outcomes)
+    assert set(multiprocessing.active_children()) <= others
+
+
+def test_processes_end_with_the_one_that_started_them() -> None:
+    code = (
+        "from signature.conversion_jobs import processes_here\nimport os, signal\n"
+        "if __name__ == '__main__':\n"
+        "    with processes_here(1) as submit:\n"
+        "        print(submit(os.getpid).result(), flush=True)\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    worker = int(done.stdout)
+    for _ in range(200):
+        if not Path(f"/proc/{worker}").exists():
+            return
+        time.sleep(0.05)
+    raise AssertionError(f"{worker} is still there")
 
 
 def test_a_worker_of_another_version_is_refused(folder: Path) -> None:
@@ -233,11 +248,11 @@ def test_a_worker_of_another_version_is_refused(folder: Path) -> None:
 
 
 def test_no_scheduler_and_no_workers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(conversion_jobs, "CONNECT_TIMEOUT_S", 0.5)
     jobs = [job(folder, "hall")]
     for address in ("tcp://127.0.0.1:1", "nonsense://x", "tcp://nowhere.invalid:8786"):
         with pytest.raises(ClusterError, match="does not answer") as caught:
-            list(on_cluster(jobs, address, 2))
+            list(at_once(jobs, on_cluster(address)))
         assert address in str(caught.value)
         # type(): a dead weak proxy of another library raises when isinstance looks at its class.
         clients = [thing for thing in gc.get_objects() if issubclass(type(thing), distributed.Client)]
@@ -246,14 +261,14 @@ def test_no_scheduler_and_no_workers(folder: Path, monkeypatch: pytest.MonkeyPat
         distributed.LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as empty,
         pytest.raises(ClusterError, match="has no workers"),
     ):
-        list(on_cluster(jobs, empty.scheduler_address, 2))
+        list(at_once(jobs, on_cluster(empty.scheduler_address)))
 
 
 def test_without_the_extra_it_says_what_to_install() -> None:
     code = (
         "import sys; sys.modules['distributed'] = None\n"
-        "from signature.conversion_jobs import on_cluster\n"
-        "list(on_cluster([], 'local', 2))"
+        "from signature.conversion_jobs import at_once, on_cluster\n"
+        "list(at_once([], on_cluster('tcp://h:1')))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "ClusterError" in done.stderr
@@ -328,33 +343,11 @@ def test_convert_export_and_maintain_a_fleets_database(
         assert maintenance.check(tmp_path / "merged.submaps") == ()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "address", "processes"),
-    [
-        (["--dask", "FIRST", "SECOND"], "local", os.cpu_count()),
-        (["FIRST", "SECOND", "--dask"], "local", os.cpu_count()),
-        (["FIRST", "SECOND", "--jobs", "1"], "local", 1),
-        (["--dask", "tcp://scheduler:8786", "FIRST", "SECOND"], "tcp://scheduler:8786", os.cpu_count()),
-    ],
-)
-def test_an_address_may_follow_dask_or_not(
-    folder: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: list[str],
-    address: str,
-    processes: Any,
-) -> None:
-    asked: list[object] = []
-
-    def nobody(jobs: list[Job], address: str, processes: int, observer: Observer) -> Iterator[Outcome]:
-        asked.extend([[job.name for job in jobs], address, processes])
-        yield from ()
-
-    monkeypatch.setattr(conversion_jobs, "on_cluster", nobody)
-    paths = dict(zip(("FIRST", "SECOND"), inputs(folder, "kitchen", "hall"), strict=True))
-    run("convert", *(paths.get(argument, argument) for argument in arguments), "-o", tmp_path / "x.submaps")
-    assert asked == [["kitchen", "hall"], address, min(2, processes)]
+@pytest.mark.parametrize("words", [["--dask", "local"], ["--dask", "tcp://h:1", "--jobs", "2"]])
+def test_dask_is_a_cluster_and_jobs_are_processes(folder: Path, tmp_path: Path, words: list[str]) -> None:
+    with pytest.raises(ConfigError, match="names the scheduler") as refused:
+        run("convert", *inputs(folder, "hall"), "-o", tmp_path / "x.submaps", *words)
+    assert "--jobs N" in str(refused.value.hint)
 
 
 PAGE = (ROOT / "examples" / "buildings.md").read_text()

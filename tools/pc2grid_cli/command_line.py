@@ -1,8 +1,8 @@
 """How the words of a command are read, in addition to what typer does.
 
-Global options are understood behind the command as well, where people put them. `--dask` may stand
-without a value, for which typer has no notation. The module of a command is imported when it is used:
-here alone the program imports late, so that every other import stands at the top of its file.
+Global options are understood behind the command as well, where people put them. The module of a command is
+imported when it is used: here alone the program imports late, so that every other import stands at the top of
+its file.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import gc
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from importlib import import_module
 from typing import Any, ClassVar, Literal
@@ -20,6 +20,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
+from pc2grid.errors import ConfigError
 from pc2grid_cli.console import Console
 from pc2grid_cli.options import DATABASE
 from pc2grid_cli.removed import REMOVED
@@ -29,20 +30,18 @@ _FANCY = sys.stderr.isatty() and sys.stdout.isatty() and not os.environ.get("NO_
 MARKUP: Literal["rich"] | None = "rich" if _FANCY else None
 """How typer prints help."""
 
+LABORATORY = "pc2grid_lab"
+"""The package that a clone of the repository has, and the wheel has not."""
 _NEW_OBJECTS = 100_000
 """After so many new objects the collector looks for cycles, not after 700: the libraries that a command loads
 when it needs them make about as many. `convert` leaves 2,000 objects in cycles in 150 s of a laser."""
-_WITHOUT_VALUE: dict[str, tuple[str, Callable[[str], bool]]] = {
-    "--dask": ("local", lambda word: "://" in word),
-}
-"""By option: the value that it has if none follows, and whether a following word is a value."""
 
 
 class Command(TyperCommand):
     """A command that takes the global options."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Apply the global options, and complete options that stand without a value."""
+        """Apply the global options."""
         words = _read(self.params, ctx, args, until_command=False)
         try:
             return super().parse_args(ctx, list(words))
@@ -66,7 +65,15 @@ class LateCommand(TyperCommand):
     def command(self) -> Any:
         """The command itself."""
         name, _, function = self._function.partition(":")
-        module = import_module(name)
+        try:
+            module = import_module(name)
+        except ModuleNotFoundError as error:
+            if error.name != LABORATORY:
+                raise
+            raise ConfigError(
+                f"pc2grid compare {self.name}: the laboratory is not installed; it is no part of the package",
+                hint="in a clone of pc2grid's repository: pip install -e .",
+            ) from None
         if not gc.isenabled():  # `main` has stopped it. What is imported stays: it need not be walked through
             gc.freeze()
             gc.set_threshold(_NEW_OBJECTS)
@@ -141,13 +148,7 @@ def _read(params: Iterable[Any], ctx: typer.Context, words: list[str], *, until_
         if word == "--" or (until_command and not word.startswith("-")):
             break
         position += 1
-        if word in _WITHOUT_VALUE and word in names:
-            value, is_value = _WITHOUT_VALUE[word]
-            if position < len(words) and is_value(words[position]):
-                value = words[position]
-                position += 1
-            left.append(f"{word}={value}")
-        elif word in names and not names[word].is_flag and not names[word].count:
+        if word in names and not names[word].is_flag and not names[word].count:
             left += [word, *words[position : position + names[word].nargs]]
             position += names[word].nargs
         elif not console.apply(word):

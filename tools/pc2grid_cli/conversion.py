@@ -110,7 +110,7 @@ def convert_all(
     keep: bool,
     force: bool,
     dask: str | None,
-    processes: int,
+    processes: int | None,
     quiet: bool,
     strict: bool,
 ) -> Done:
@@ -140,15 +140,20 @@ def convert_all(
 
 @contextlib.contextmanager
 def _outcomes(
-    jobs: list[Job], dask: str | None, processes: int, observer: Observer
+    jobs: list[Job], dask: str | None, processes: int | None, observer: Observer
 ) -> Iterator[Iterator[conversion_jobs.Outcome]]:
     """The results of the jobs as they come, in their order; leaving the block ends what is not done."""
-    if dask is None:
+    if dask is None and processes is None:
         with contextlib.closing(conversion_jobs.here(jobs, observer)) as outcomes:
             yield outcomes
         return
-    on_cluster = conversion_jobs.on_cluster(jobs, dask, min(processes, len(jobs)), observer)
-    with observer.step(f"convert {len(jobs)} recordings"), contextlib.closing(on_cluster) as outcomes:
+    workers = (
+        conversion_jobs.on_cluster(dask)
+        if dask is not None
+        else conversion_jobs.processes_here(min(processes or 1, len(jobs)))
+    )
+    at_once = conversion_jobs.at_once(jobs, workers, observer)
+    with observer.step(f"convert {len(jobs)} recordings"), contextlib.closing(at_once) as outcomes:
         yield outcomes
 
 

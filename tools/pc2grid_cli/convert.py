@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -10,12 +9,12 @@ from typing import Annotated
 import typer
 
 from pc2grid import extras
+from pc2grid.errors import ConfigError
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, conversion
 from pc2grid_cli import options as options
 from pc2grid_cli.output_files import check_database
 from pc2grid_cli.stored_sessions import stored_sessions
-from signature.cluster import LOCAL
 from signature.database import Label
 
 _Inputs = Annotated[
@@ -94,8 +93,8 @@ def convert_command(
         console.of(context),
         keep=add or bool(stored),
         force=force,
-        dask=LOCAL if dask is None and jobs is not None else dask,
-        processes=jobs or os.cpu_count() or 1,
+        dask=dask,
+        processes=jobs,
         quiet=json,
         strict=strict,
     )
@@ -104,6 +103,9 @@ def convert_command(
 
 
 def _check(output: str, *, dask: str | None, jobs: int | None) -> None:
-    """Raises ConfigError if what the options need is not installed."""
-    parallel = {} if dask is None and jobs is None else {"cluster": "--dask" if jobs is None else "--jobs"}
-    extras.require(parallel | extras.of_addresses(output))
+    """Raises ConfigError if `dask` is no address, or if what the options need is not installed."""
+    if dask is not None and (jobs is not None or "://" not in dask):
+        raise ConfigError(
+            "--dask ADDRESS names the scheduler of a cluster", hint="--jobs N: processes of this machine"
+        )
+    extras.require(({} if dask is None else {"cluster": "--dask"}) | extras.of_addresses(output))

@@ -9,6 +9,7 @@ that it does not know.
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, Literal, TypeVar
 
 from pydantic import TypeAdapter
@@ -378,6 +379,19 @@ class Export(TypedDict):
     written: list[str]
 
 
+class Simulate(TypedDict):
+    """`pc2grid simulate --json`; clutter: objects that could be placed."""
+
+    schema_version: Version
+    recording: str
+    truth: str
+    sensor: str
+    scans: int
+    duration_s: float
+    length_m: float
+    clutter: int
+
+
 DOCUMENTS: dict[str, type] = {
     "convert": Convert,
     "db-check": DbCheck,
@@ -393,6 +407,7 @@ DOCUMENTS: dict[str, type] = {
     "info-map": InfoMap,
     "relocalize": Relocalize,
     "relocalize-check": RelocalizeCheck,
+    "simulate": Simulate,
     "watch": Watch,
     "watch-check": WatchCheck,
 }
@@ -400,7 +415,9 @@ DOCUMENTS: dict[str, type] = {
 
 
 def documents() -> dict[str, type]:
-    """All documents by command: those above, and those of the laboratory."""
+    """All documents by command: those above, and those of the laboratory where it is installed."""
+    if find_spec("pc2grid_lab") is None:
+        return DOCUMENTS
     return {**DOCUMENTS, **import_module("pc2grid_lab.documents").DOCUMENTS}
 
 

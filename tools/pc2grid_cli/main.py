@@ -17,7 +17,7 @@ from pc2grid_cli.command_line import MARKUP, group
 # Name, "package.module:function", and what lists of commands say of it.
 COMMANDS = {
     "demo": ("pc2grid_cli.demo:demo_command", "Map a simulated office, and find another robot in it."),
-    "simulate": ("pc2grid_lab.simulate:simulate_command", "Drive a robot through a building and record it."),
+    "simulate": ("pc2grid_cli.simulate:simulate_command", "Drive a robot through a building and record it."),
     "info": ("pc2grid_cli.info:info_command", "Say what is in a recording, a map or a database."),
     "convert": ("pc2grid_cli.convert:convert_command", "Make a submap database from recordings or maps."),
     "relocalize": ("pc2grid_cli.relocalize:relocalize_command", "Find where a recording was made."),
@@ -96,7 +96,7 @@ def options(
 app.add_typer(
     typer.Typer(
         cls=group(COMPARE),
-        help="Measure: recordings, sensors, peers, the paper's tables.",
+        help="Measure: recordings, sensors, peers, the paper's tables. Only where a clone is installed.",
         no_args_is_help=True,
     ),
     name="compare",

@@ -75,11 +75,10 @@ AssumeIdentity = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="one JSON document on stdout")]
 Force = Annotated[bool, typer.Option("--force", help="replace existing files")]
 Dask = Annotated[
-    str | None,
-    typer.Option("--dask", metavar="[ADDRESS]", help="of a scheduler; none: processes on this machine"),
+    str | None, typer.Option("--dask", metavar="ADDRESS", help="convert on the workers of this scheduler")
 ]
 JobCount = Annotated[
-    int | None, typer.Option("--jobs", min=1, help="how many processes; default: as many as cores")
+    int | None, typer.Option("--jobs", min=1, help="convert in so many processes of this machine")
 ]
 DATABASE = "BUILDING.submaps|postgresql://..."
 Database = Annotated[str, typer.Argument(metavar=DATABASE, help="the database")]

@@ -16,6 +16,14 @@ REMOVED = {
         ("pc2grid simulate --floors", "pc2grid simulate --ride", "pc2grid simulate --slope"),
         "a recording is one floor: `pc2grid simulate` makes one for each `--seed`",
     ),
+    **dict.fromkeys(
+        ("pc2grid simulate --change", "pc2grid simulate --walkers", "pc2grid simulate --relief"),
+        "another `--seed` and `--clutter` place other objects in the same building",
+    ),
+    **dict.fromkeys(
+        ("pc2grid simulate --glass", "pc2grid simulate --mirrors"),
+        "all walls of a simulated building are opaque",
+    ),
     "pc2grid simulate --alike": "a recording is one floor: the same `--seed` places the same objects",
     **dict.fromkeys(
         ("pc2grid compare log", "pc2grid compare maps"),

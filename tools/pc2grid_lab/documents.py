@@ -14,21 +14,6 @@ from pc2grid_lab.peers.outcome import PeerCell, PeerTrial
 from signature.localization.answer_json import Version
 
 
-class Simulate(TypedDict):
-    """`pc2grid simulate --json`; clutter: objects that could be placed. change: what differs from the
-    building as drawn, counts and metres, and the share of its visible walls."""
-
-    schema_version: Version
-    recording: str
-    truth: str
-    sensor: str
-    scans: int
-    duration_s: float
-    length_m: float
-    clutter: int
-    change: dict[str, float]
-
-
 class ComparePaper(TypedDict):
     """`pc2grid compare paper --json`: a cell a map, method and noise level, measured beside published."""
 
@@ -117,6 +102,5 @@ DOCUMENTS: dict[str, type] = {
     "compare-peers": ComparePeers,
     "compare-recordings": CompareRecordings,
     "compare-sensors": CompareSensors,
-    "simulate": Simulate,
 }
 """By command."""

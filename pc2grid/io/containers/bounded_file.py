@@ -1,7 +1,7 @@
-"""A file that refuses to read more at once than is allowed.
+"""A file that refuses to read more at once than is allowed, or than there is.
 
 The readers of `mcap` and `rosbags` read as many bytes as a record says it has, and Python sets the memory
-aside before it reads: a damaged length of 4 GB costs 4 GB.
+aside before it reads: a damaged length of 4 GB costs 4 GB. `mcap` takes fewer bytes than it asked for.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import os
 
-from pc2grid.errors import LimitExceeded, LogCorrupt
+from pc2grid.errors import LimitExceeded, LogCorrupt, LogTruncated
 
 
 class BoundedFile(io.BufferedReader):
@@ -26,11 +26,13 @@ class BoundedFile(io.BufferedReader):
     def read(self, size: int | None = -1, /) -> bytes:
         """See io.BufferedReader.
 
-        Raises LogCorrupt if the file is smaller than `size` (or if `size` is negative: a length was smaller
-        than what it counts), LimitExceeded if `size` is above the limit.
+        Raises LogTruncated if fewer bytes are left, LogCorrupt if `size` is negative (a length was smaller
+        than what it counts), LimitExceeded if it is above the limit.
         """
-        if size is None or size < 0 or size > self._size:
+        if size is None or size < 0:
             raise LogCorrupt(f"a length of {size} bytes where a record should begin")
+        if size > self._size - self.tell():
+            raise LogTruncated(f"the file ends within {size} bytes of a record")
         if size > self._most_bytes:
             raise LimitExceeded(
                 f"a record has {size} bytes; the limit is {self._most_bytes}",

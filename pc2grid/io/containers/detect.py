@@ -9,9 +9,8 @@ from pathlib import Path
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogNotFound, LogTruncated, NotALog
 from pc2grid.io.containers import cloud_folder, rosbag2_folder
-from pc2grid.io.containers.bag import BagSource
-from pc2grid.io.containers.db3 import Db3Source
 from pc2grid.io.containers.mcap import McapSource
+from pc2grid.io.containers.rosbags_file import RosbagsFile
 from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
 from pc2grid.io.message_source import MessageSource
 
@@ -70,13 +69,13 @@ def _open_file(path: Path, head: bytes, config: ReadConfig, recover: bool) -> Me
     if _MCAP.startswith(head):
         raise LogTruncated(f"{path}: an MCAP that ends after {len(head)} bytes", hint="nothing to recover")
     if head.startswith(_BAG):
-        return BagSource(path, config)
+        return RosbagsFile(path, config, is_bag=True)
     if is_submap_database(head):
         raise NotALog(
             f"{path}: a submap database, not a recording", hint=f"`pc2grid info {path}` shows what is in it"
         )
     if head.startswith(_SQLITE):
-        return Db3Source(path, config)
+        return RosbagsFile(path, config, is_bag=False)
     raise NotALog(f"{path}: not a recording; looks like {_looks_like(head)}", hint=_advice(head))
 
 

@@ -1,73 +1,59 @@
-"""MCAP files as a message source, read by `mcap`.
+"""MCAP files as a message source, read by `mcap` with checksums compared.
 
-With a sound summary, chunks are found by the index, so a part of a long log costs what that part costs.
-Without one (a recorder that was killed, a damaged summary, `recover`), the file is surveyed once from its
-start and the index is made from what is there. Either way the messages come from `mcap`'s StreamReader, chunk
-by chunk.
-
-Its SeekingReader would choose and sort the chunks, too. It is not used for that: it does not compare a chunk
-with the index, does not bound a decompression, and holds all chunks that overlap in time in memory.
+By the index in its summary, a part of a long log costs what that part costs. A file whose recorder was
+killed, or whose summary is damaged, is read once up to its end or its first damage, and indexed meanwhile.
 """
 
 from __future__ import annotations
 
 import bisect
 import io
+import itertools
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
-from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message
-from mcap.stream_reader import StreamReader
+from mcap.records import Chunk, ChunkIndex, Message
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import LogCorrupt, LogTruncated
-from pc2grid.io.containers import mcap_records as rec
+from pc2grid.errors import LogCorrupt, LogError
 from pc2grid.io.containers.bounded_file import BoundedFile
-from pc2grid.io.containers.mcap_index import McapIndex, read_index
-from pc2grid.io.containers.mcap_records import Damage
-from pc2grid.io.containers.mcap_survey import crc_of, survey
-from pc2grid.io.error_translation import RECOVER_HINT
+from pc2grid.io.containers.mcap_index import (
+    McapIndex,
+    Survey,
+    named,
+    open_chunk,
+    read_summary,
+    records_of,
+)
 from pc2grid.io.message_source import LogInfo, RawMessage, Tally, TopicInfo
 
-# Messages of chunks that overlap in time wait to be merged in this much memory (chosen by hand); in a file
-# whose chunks overlap more, they come less well sorted.
-_MAX_PENDING_BYTES = 128 << 20
-
-
-class _TimeRange(NamedTuple):
-    """Log times from start_ns up to, not including, end_ns."""
-
-    start_ns: int
-    end_ns: int
-
-    def __contains__(self, time_ns: object) -> bool:
-        return isinstance(time_ns, int) and self.start_ns <= time_ns < self.end_ns
+_LAST_NS = 1 << 64
+_UNCHECKED = "parts of the log carry no checksum: damage would not be seen"
 
 
 class McapSource:
     """One MCAP file, open.
 
-    Raises LogTruncated, LogCorrupt or LimitExceeded when it is opened or read; with `recover`, what is whole
-    is read and the rest is counted in `tally`.
+    Raises LogTruncated, LogCorrupt, LimitExceeded or UnsupportedSchema when it is opened or read. With
+    `recover`, damaged chunks are left out and counted in `tally`; without an index, all behind the damage is.
     """
 
     def __init__(self, path: Path, config: ReadConfig, *, recover: bool = False) -> None:
         self.files: tuple[Path, ...] = (path,)
         self.tally = Tally()
-        self._path = path
-        self._limits = rec.Limits(config.max_chunk_bytes, config.max_record_bytes)
-        self._recover = recover
-        self._stream = BoundedFile(io.FileIO(path), config.max_record_bytes)
+        self._path, self._config = path, config
+        self._stream = self._opened()
         try:
-            self._index = self._find_index()
+            self._index = self._indexed(recover) or self._surveyed(recover)
+            if not self._index.checked:
+                self.tally.warn(_UNCHECKED)
+            self._topic_of = self._topics()
             self.info = self._describe()
         except BaseException:
-            self._stream.close()
+            self.close()
             raise
-        self._loose_checked = False
 
     def close(self) -> None:
         """Close the file."""
@@ -75,62 +61,67 @@ class McapSource:
 
     # --- opening --------------------------------------------------------------------------------------
 
-    def _find_index(self) -> McapIndex:
-        """The index of the file: its own if it is sound, else one made by reading the whole file."""
-        own: McapIndex | None = None
+    def _opened(self) -> BoundedFile:
+        return BoundedFile(io.FileIO(self._path), self._config.max_record_bytes)
+
+    def _indexed(self, recover: bool) -> McapIndex | None:
+        """The index in the summary; None if there is none, it is damaged, or it lists no chunks."""
         try:
-            found = read_index(self._stream, self._path.stat().st_size, self._limits)
-        except Damage as damage:
-            self.tally.warn(f"the index is not usable ({damage.what}); the log was read in full instead")
-        else:
-            if isinstance(found, str):
-                self.tally.warn(f"the log has no index ({found}); it was read in full instead")
-            elif not self._recover:
-                return found
-            else:
-                own = found
-        return self._surveyed(own)
+            index = read_summary(self._stream)
+        except MemoryError:
+            raise
+        except Exception as error:
+            why = named(error, "the index is not usable")
+            self.tally.warn(f"{why.message}; the log was read in full instead")
+            return None
+        for chunk in list(index.chunks) if recover else ():
+            try:
+                self._load(chunk, index)
+            except LogError as error:
+                index.chunks.remove(chunk)
+                index.counted = False
+                self.tally.warn(f"{error.message}: the chunk was left out")
+                self.tally.bytes_lost += chunk.chunk_length
+        is_empty = index.counted and not any(index.counts.values())
+        return index if index.chunks or is_empty else None
 
-    def _surveyed(self, own: McapIndex | None) -> McapIndex:
-        """An index made by reading the whole file; `own` is the one in its summary."""
+    def _surveyed(self, recover: bool) -> McapIndex:
+        """An index made by reading the file. Raises LogError for damage, unless `recover`."""
+        found = Survey(self._stream, self._config.max_chunk_bytes)
         size = self._path.stat().st_size
-        # A chunk may rest on definitions in an earlier one that is lost; the summary repeats them.
-        known = own.definitions if own else None
-        with self._path.open("rb") as stream:
-            found = survey(stream, size, self._limits, resync=self._recover, known=known)
-        index, tally = found.index, self.tally
-        if own is not None:
-            found.compare(own.chunks)
-        for sentence in found.warnings:
-            tally.warn(sentence)
-        tally.bytes_lost += found.bytes_lost
-        unexplained = found.missing > 0 and not found.bytes_lost
-        tally.topics_lost = (found.holes and own is None) or unexplained
-        if found.damage is not None and not self._recover:
-            raise self._damaged(found.damage, index, size)
-        return index
+        if found.damage is not None:
+            where = f"{self._path}: at byte {found.at} of {size}"
+            behind = (
+                f"; {sum(found.index.counts.values())} messages ({found.scans_s():.1f} s of scans) before it "
+                "are readable"
+            )
+            error = named(found.damage, where, behind)
+            if not recover:
+                raise error from found.damage
+            self.tally.warn(f"{error.message}; the rest was left out")
+            self.tally.bytes_lost += size - found.at
+            self.tally.topics_lost = True
+        elif not found.closed:
+            self.tally.warn("the recording was not closed (was the recorder killed?); what is there is whole")
+        elif found.missing > 0:
+            self.tally.warn(f"{found.missing} messages that the log counts are not there")
+            self.tally.topics_lost = True
+        return found.index
 
-    def _damaged(self, damage: Damage, index: McapIndex, size: int) -> LogCorrupt | LogTruncated:
-        seconds = (index.end_ns - index.start_ns) * 1e-9
-        count = sum(index.counts.values())
-        kind = LogTruncated if damage.truncated else LogCorrupt
-        return kind(
-            f"{self._path}: {damage.what}, at byte {damage.offset} of {size}; "
-            f"{count} messages ({seconds:.1f} s) before it are readable",
-            hint=RECOVER_HINT,
-        )
+    def _topics(self) -> dict[int, TopicInfo]:
+        """The topic of each channel; one that several programs publish may have several channels."""
+        index = self._index
+        of_channel = {key: index.topic(channel) for key, channel in index.channels.items()}
+        groups: dict[tuple[str, str, str], list[int]] = {}
+        for key, topic in of_channel.items():
+            groups.setdefault((topic.topic, topic.type, topic.encoding), []).append(key)
+        for group in groups.values():
+            total = sum(index.counts.get(key, 0) for key in group) if index.counted else None
+            of_channel.update(dict.fromkeys(group, replace(of_channel[group[0]], message_count=total)))
+        return of_channel
 
     def _describe(self) -> LogInfo:
         index = self._index
-        groups: dict[tuple[str, str, str], list[Channel]] = {}
-        for channel in index.definitions.channels.values():
-            topic = index.definitions.topic(channel)
-            groups.setdefault((topic.topic, topic.type, topic.encoding), []).append(channel)
-        self._topic_of: dict[int, TopicInfo] = {}
-        for group in groups.values():
-            count = sum(index.counts.get(c.id, 0) for c in group) if index.counted else None
-            info = replace(index.definitions.topic(group[0]), message_count=count)
-            self._topic_of.update((channel.id, info) for channel in group)
         topics = sorted(set(self._topic_of.values()), key=lambda t: (t.topic, t.type))
         encodings = Counter(t.encoding for t in topics)
         dialect = encodings.most_common(1)[0][0] if encodings else "empty"
@@ -150,134 +141,61 @@ class McapSource:
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """See MessageSource.messages. Chunks that overlap in time are merged, up to a bound in memory."""
-        wanted = frozenset(key for key, topic in self._topic_of.items() if topic.topic in topics)
-        times = _TimeRange(-1 if start_ns is None else start_ns, 1 << 64 if end_ns is None else end_ns)
-        try:
-            yield from self._loose_messages(wanted, times)
-            yield from self._chunk_messages(wanted, times)
-        except Damage as damage:
-            raise LogCorrupt(
-                f"{self._path}: {damage.what}, at byte {damage.offset}", hint=RECOVER_HINT
-            ) from damage
+        """See MessageSource.messages. Those that stand outside of chunks come in the order of the file."""
+        wanted = {key for key, topic in self._topic_of.items() if topic.topic in topics}
+        low_ns, high_ns = start_ns or 0, _LAST_NS if end_ns is None else end_ns
 
-    def _chunk_messages(self, wanted: frozenset[int], times: _TimeRange) -> Iterator[RawMessage]:
-        chunks = sorted(self._index.chunks, key=lambda c: (c.message_start_time, c.chunk_start_offset))
-        pending: list[RawMessage] = []
-        for chunk in chunks:
-            if not _is_wanted(chunk, wanted, times):
-                continue
-            ready = _ready(pending, chunk.message_start_time)
+        def fitting(messages: Iterable[Message]) -> Iterator[RawMessage]:
+            for m in messages:
+                if m.channel_id in wanted and low_ns <= m.log_time < high_ns:
+                    yield RawMessage(self._topic_of[m.channel_id], m.log_time, m.data)
+
+        if not self._index.chunks:
+            yield from fitting(self._outside_chunks())
+        pending: list[RawMessage] = []  # of chunks that overlap in time
+        for chunk in _wanted(self._index.chunks, wanted, low_ns, high_ns):
+            ready = bisect.bisect_left(pending, chunk.message_start_time, key=lambda m: m.log_time_ns)
             yield from pending[:ready]
             del pending[:ready]
-            pending += (
-                RawMessage(self._topic_of[message.channel_id], message.log_time, message.data)
-                for message in self._load(chunk)
-                if message.channel_id in wanted and message.log_time in times
-            )
-            pending.sort(key=lambda m: m.log_time_ns)  # stable: equal times stay in file order
+            pending += fitting(self._load(chunk, self._index))
+            pending.sort(key=lambda m: m.log_time_ns)  # stable: equal times stay in the order of the file
         yield from pending
 
-    def _load(self, listed: ChunkIndex) -> list[Message]:
-        """The messages of a chunk that the index lists. Raises Damage if it is not what the index says."""
-        offset = listed.chunk_start_offset
+    def _load(self, listed: ChunkIndex, index: McapIndex) -> list[Message]:
+        """The messages of a chunk that the index lists. Raises LogError if it is damaged."""
+        place, size = listed.chunk_start_offset, listed.chunk_length
         try:
-            chunk = self._read_chunk(listed)
-            if chunk.uncompressed_crc == 0 and chunk.uncompressed_size:
-                self.tally.warn("chunks of the log carry no checksum: damage would not be seen")
-            records = rec.chunk_records(chunk, offset, self._limits)
-            messages = []
-            for record in records:
-                if isinstance(record, Message):
-                    if record.channel_id not in self._topic_of:
-                        raise Damage(offset, f"a message names channel {record.channel_id}, which is missing")
-                    messages.append(record)
-                else:
-                    self._index.definitions.take(record, offset)
-        except Damage as damage:
-            number = self._index.chunks.index(listed) + 1
-            first_s, last_s = (
-                (time_ns - self.info.start_ns) * 1e-9
-                for time_ns in (listed.message_start_time, listed.message_end_time)
-            )
-            where = f"chunk {number} ({first_s:.1f} s to {last_s:.1f} s)"
-            raise Damage(damage.offset, f"{where}: {damage.what}", truncated=damage.truncated) from damage
+            self._stream.seek(place)
+            chunk = next(records_of(self._stream, whole_file=False).records)
+            if not isinstance(chunk, Chunk) or self._stream.tell() != place + size:
+                raise LogCorrupt("the index points to something else")
+            if not chunk.uncompressed_crc and chunk.data:
+                self.tally.warn(_UNCHECKED)
+            records = open_chunk(chunk, self._config.max_chunk_bytes)
+            messages = [record for record in records if isinstance(record, Message)]
+            if any(message.channel_id not in index.channels for message in messages):
+                raise LogCorrupt("a message of a channel that is missing")
+        except MemoryError:
+            raise
+        except Exception as error:
+            raise named(error, f"{self._path}: chunk at byte {place}") from error
         return messages
 
-    def _read_chunk(self, listed: ChunkIndex) -> Chunk:
-        offset, size = listed.chunk_start_offset, listed.chunk_length
-        self._stream.seek(offset)
-        head = self._stream.read(rec.HEAD_BYTES)
-        if head[:1] != rec.CHUNK_KIND:
-            raise Damage(offset, "the index points to something else")
-        length = int.from_bytes(head[1:], "little")
-        if length + rec.HEAD_BYTES != size:
-            raise Damage(offset, "the index gives another length")
-        if length > self._limits.record_bytes:
-            raise rec.too_large(offset, length, self._limits)
-        self._stream.seek(offset)
-        with rec.mcap_errors_as_damage(offset):
-            chunk = next(self._records())
-        assert isinstance(chunk, Chunk)
-        fields_bytes = rec.HEAD_BYTES + rec.CHUNK_FIELDS_BYTES + len(chunk.compression.encode())
-        if fields_bytes + len(chunk.data) != size or self._stream.tell() != offset + size:
-            raise Damage(offset, "a chunk's lengths contradict each other")
-        if (chunk.message_start_time, chunk.message_end_time) != (
-            listed.message_start_time,
-            listed.message_end_time,
-        ):
-            raise Damage(offset, "the index gives other times")
-        return chunk
-
-    def _loose_messages(self, wanted: frozenset[int], times: _TimeRange) -> Iterator[RawMessage]:
-        """Messages outside of chunks, in file order; only the data section's checksum protects them."""
-        spans = self._index.outside_chunks
-        if spans and not self._loose_checked:
-            self._check_data_section()
-        for start, end in spans:
-            self._stream.seek(start)
-            records = self._records()
-            at = start
-            while at < end:
-                self._stream.seek(at)  # another pass over the file may have moved it
-                with rec.mcap_errors_as_damage(at):
-                    record = next(records)
-                at = self._stream.tell()
-                if isinstance(record, Message) and record.channel_id in wanted and record.log_time in times:
-                    yield RawMessage(self._topic_of[record.channel_id], record.log_time, record.data)
-
-    def _records(self) -> Iterator[McapRecord]:
-        """The records from where the file stands on, chunks as they are stored."""
-        limit = self._limits.record_bytes
-        return StreamReader(self._stream, skip_magic=True, emit_chunks=True, record_size_limit=limit).records
-
-    def _check_data_section(self) -> None:
-        """Compare the checksum of everything up to the end of the data; `mcap` would do so too late."""
-        index = self._index
-        self._loose_checked = True
-        if not index.data_crc:
-            self.tally.warn("messages of the log carry no checksum: damage would not be seen")
-            return
-        with self._path.open("rb") as stream:
-            if crc_of(stream, index.data_end) == index.data_crc:
-                return
-        if not self._recover:
-            raise Damage(index.data_end, "the checksum (CRC) of the data section is wrong")
-        doubtful = sum(end - start for start, end in index.outside_chunks)
-        self.tally.bytes_lost += doubtful
-        self.tally.warn(f"{doubtful} bytes of messages fail their checksum and may be wrong")
+    def _outside_chunks(self) -> Iterator[Message]:
+        with self._opened() as stream:
+            records = records_of(stream, whole_file=True).records
+            found = (record for record in records if isinstance(record, Message))
+            yield from itertools.islice(found, sum(self._index.counts.values()))
 
 
-def _is_wanted(chunk: ChunkIndex, channels: frozenset[int], times: _TimeRange) -> bool:
-    """Whether a chunk may hold messages of these channels and times."""
-    if chunk.message_end_time < times.start_ns or chunk.message_start_time >= times.end_ns:
-        return False
-    # Without message indexes, only its records say which topics are in a chunk.
-    return not chunk.message_index_offsets or bool(chunk.message_index_offsets.keys() & channels)
-
-
-def _ready(pending: list[RawMessage], start_ns: int) -> int:
-    """How many of the sorted messages need not wait for those of a chunk that begins at `start_ns`."""
-    if sum(len(m.data) for m in pending) > _MAX_PENDING_BYTES:
-        return len(pending)
-    return bisect.bisect_left(pending, start_ns, key=lambda m: m.log_time_ns)
+def _wanted(chunks: list[ChunkIndex], channels: set[int], low_ns: int, high_ns: int) -> list[ChunkIndex]:
+    """The chunks that may hold messages of these channels and times, by their first times."""
+    found = [
+        chunk
+        for chunk in chunks
+        if chunk.message_end_time >= low_ns
+        and chunk.message_start_time < high_ns
+        # Without message indexes, only its records say which channels are in a chunk.
+        and (not chunk.message_index_offsets or chunk.message_index_offsets.keys() & channels)
+    ]
+    return sorted(found, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))

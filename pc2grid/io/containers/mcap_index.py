@@ -1,160 +1,230 @@
-"""What is where in an MCAP file, as its summary says; used only as far as it agrees with the file.
+"""What is where in an MCAP: as its summary says, or by reading it up to its end or its first damage.
 
-`mcap` parses the summary. It does not compare the summary's checksum, nor its parts with each other, and it
-reads no message that stands outside of the chunks if there are any; that is done here.
+`mcap` parses the records. It takes whatever memory a chunk claims, does not compare the checksum of the
+summary, and raises many unrelated errors for damage; that is done here.
 """
 
 from __future__ import annotations
 
+import io
+import struct
 import zlib
-from dataclasses import dataclass, field
-from typing import BinaryIO
+from dataclasses import dataclass, field, replace
 
-from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import ChunkIndex, DataEnd
-from mcap.summary import Summary
+from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, McapRecord, Message, Schema, Statistics
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
-from pc2grid.io.containers import mcap_records as rec
-from pc2grid.io.containers.mcap_records import Damage, Definitions
+from pc2grid.errors import LimitExceeded, LogCorrupt, LogError, LogTruncated, UnsupportedSchema
+from pc2grid.io import topics
+from pc2grid.io.containers.bounded_file import BoundedFile
+from pc2grid.io.containers.decompress import expand
+from pc2grid.io.error_translation import RECOVER_HINT
+from pc2grid.io.message_source import TopicInfo
+from pc2grid.io.messages.ros_definitions import short_name
+
+_MAGIC = b"\x89MCAP0\r\n"
+_FOOTER = struct.Struct("<9xQQI8s")  # offsets of the summary and of its parts, checksum, magic
+_CHUNK_BYTES = 49  # of a chunk's record, without the name of the compression and the data
 
 
 @dataclass(slots=True)
 class McapIndex:
     """What is where in an MCAP file.
 
-    chunks : whole chunks, by offset. outside_chunks : byte spans that hold messages outside of chunks.
-    counts : messages per channel id, complete if `counted`. start_ns, end_ns : first and last log time.
-    data_end, data_crc : end and checksum of the data section (0: none).
+    chunks : none if the messages stand outside of chunks. counts : of messages, by channel; complete if
+    `counted`. start_ns, end_ns : first and last log time. checked : whether there is a checksum on it.
     """
 
-    definitions: Definitions = field(default_factory=Definitions)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
-    outside_chunks: list[tuple[int, int]] = field(default_factory=list)
     counts: dict[int, int] = field(default_factory=dict)
     counted: bool = True
     start_ns: int = 0
     end_ns: int = 0
-    data_end: int = 0
-    data_crc: int = 0
+    checked: bool = True
+
+    def topic(self, channel: Channel) -> TopicInfo:
+        """The topic of a channel."""
+        schema = self.schemas.get(channel.schema_id)
+        return TopicInfo(
+            topic=channel.topic,
+            type=short_name(schema.name) if schema else "",
+            encoding=channel.message_encoding,
+            schema_encoding=schema.encoding if schema else "",
+            schema=schema.data if schema else b"",
+        )
 
 
-def read_index(stream: BinaryIO, size: int, limits: rec.Limits) -> McapIndex | str:
-    """The index in the summary section of a file of `size` bytes; a string says why there is none.
+def records_of(stream: BoundedFile, *, whole_file: bool) -> StreamReader:
+    """A reader of the records of a stream, chunks as they are stored; `stream` bounds what it reads at once.
 
-    stream : a file that bounds what is read at once (BoundedFile).
-
-    Raises Damage if there is one that contradicts the file or itself, LimitExceeded.
+    whole_file : from the start of the file, the checksum of its data compared; else from where it stands.
     """
-    found = _read_summary(stream, size, limits)
-    if isinstance(found, str):
-        return found
-    summary, summary_at = found
-    statistics, chunks = summary.statistics, summary.chunk_indexes
-    if statistics is None:
-        return "it has no statistics"
-    if statistics.chunk_count != len(chunks):
-        return "it does not list the chunks"
-    needed = max(statistics.channel_count, int(statistics.message_count > 0 and not chunks))
-    if needed > len(summary.channels):
-        return "it does not list the channels"
-    definitions = Definitions()
-    for definition in (*summary.schemas.values(), *summary.channels.values()):
-        definitions.take(definition, summary_at)
-    for chunk in chunks:
-        _check(chunk, summary, summary_at)
-    chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
-    outside_chunks, data_end, data_crc = _between_chunks(stream, chunks, summary_at, limits)
-    counts = statistics.channel_message_counts
-    return McapIndex(
-        definitions=definitions,
-        chunks=chunks,
-        outside_chunks=outside_chunks,
-        counts=counts,
-        counted=sum(counts.values()) == statistics.message_count,
-        start_ns=statistics.message_start_time,
-        end_ns=statistics.message_end_time,
-        data_end=data_end,
-        data_crc=data_crc,
+    return StreamReader(
+        stream,
+        skip_magic=not whole_file,
+        emit_chunks=True,
+        validate_crcs=whole_file,
+        record_size_limit=None,
     )
 
 
-def _check(chunk: ChunkIndex, summary: Summary, summary_at: int) -> None:
-    """Raises Damage if a chunk cannot be where the summary says."""
-    if not chunk.message_index_offsets.keys() <= summary.channels.keys():
-        raise Damage(summary_at, "it names channels that are missing")
-    first, behind = chunk.chunk_start_offset, _behind(chunk)
-    if first < len(rec.MAGIC) or chunk.chunk_length < rec.HEAD_BYTES or behind > summary_at:
-        raise Damage(summary_at, "it places a chunk outside of the data")
+def open_chunk(chunk: Chunk, most_bytes: int) -> list[McapRecord]:
+    """The schemas, channels and messages in a chunk.
 
-
-def _behind(chunk: ChunkIndex) -> int:
-    """The offset behind a chunk and its message indexes."""
-    return chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
-
-
-def _read_summary(stream: BinaryIO, size: int, limits: rec.Limits) -> tuple[Summary, int] | str:
-    """The summary and its offset; a string says why there is none."""
-    foot = size - len(rec.MAGIC) - rec.FOOTER_BYTES
-    if foot < len(rec.MAGIC):
-        return "the recording was not finished"
-    stream.seek(foot)
-    tail = stream.read(rec.FOOTER_BYTES + len(rec.MAGIC))
-    if tail[-8:] != rec.MAGIC or tail[0] != Opcode.FOOTER or int.from_bytes(tail[1:9], "little") != 20:
-        return "the recording was not finished"
-    summary_at = int.from_bytes(tail[9:17], "little")
-    crc = int.from_bytes(tail[25:29], "little")
-    if summary_at == 0:
-        return "its writer made none"
-    if not len(rec.MAGIC) <= summary_at <= foot:
-        raise Damage(foot, "the footer points outside of the file")
-    if foot - summary_at > limits.record_bytes:
-        raise Damage(foot, "the summary is larger than the limit")
-    stream.seek(summary_at)
-    section = stream.read(foot - summary_at)
-    if crc and zlib.crc32(tail[:25], zlib.crc32(section)) != crc:
-        raise Damage(summary_at, "its checksum (CRC) is wrong")
-    stream.seek(0)
-    with rec.mcap_errors_as_damage(summary_at):
-        summary = SeekingReader(stream, record_size_limit=limits.record_bytes).get_summary()
-    assert summary is not None  # its offset is not 0
-    return summary, summary_at
-
-
-def _between_chunks(
-    stream: BinaryIO, chunks: list[ChunkIndex], data_end: int, limits: rec.Limits
-) -> tuple[list[tuple[int, int]], int, int]:
-    """Spans of the data section that hold messages outside of chunks, its end, and its checksum.
-
-    A chunk that the summary does not list, or whose kind was changed by damage, is noticed here: it leaves a
-    gap that is no sequence of records, or its statistics do not add up.
+    Raises LimitExceeded for one that would expand to more than `most_bytes`, UnsupportedSchema for a
+    compression that pc2grid does not read, and other errors for damage.
     """
-    if not chunks:  # everything is one span; following its records would mean to read all of them
-        end_of_data, crc = _data_end(stream, data_end)
-        return [(len(rec.MAGIC), end_of_data)], end_of_data, crc
-    outside_chunks: list[tuple[int, int]] = []
-    at, end_of_data, crc = len(rec.MAGIC), data_end, 0
-    for stop, behind in [*((c.chunk_start_offset, _behind(c)) for c in chunks), (data_end, data_end)]:
-        if stop < at:
-            raise Damage(stop, "it lists chunks that overlap")
-        for record in rec.read_records(stream, at, stop, limits, wanted=frozenset({Opcode.DATA_END})):
-            if record.opcode == Opcode.DATA_END:
-                end_of_data, crc = record.offset, rec.parsed(DataEnd.read, record).data_section_crc
-            elif record.opcode == Opcode.MESSAGE and (not outside_chunks or outside_chunks[-1] != (at, stop)):
-                outside_chunks.append((at, stop))
-        at = behind
-    return outside_chunks, end_of_data, crc
+    if chunk.uncompressed_size > most_bytes:
+        raise LimitExceeded(
+            f"a chunk would expand to {chunk.uncompressed_size} bytes; the limit is {most_bytes}",
+            hint="--set read.max_chunk_bytes=N raises it",
+        )
+    if chunk.compression not in ("", "zstd", "lz4"):
+        raise UnsupportedSchema(
+            f"a chunk is compressed with {chunk.compression!r:.40}",
+            hint="pc2grid reads zstd, lz4 and uncompressed chunks; `mcap convert` can change it",
+        )
+    # One byte more than declared, so that a longer content is noticed.
+    content = expand(chunk.compression or "none", chunk.data, chunk.uncompressed_size + 1)
+    if len(content) != chunk.uncompressed_size:
+        raise LogCorrupt(f"a chunk does not hold {chunk.uncompressed_size} bytes, as it says")
+    return breakup_chunk(replace(chunk, compression="", data=content), validate_crc=True)
 
 
-def _data_end(stream: BinaryIO, summary_at: int) -> tuple[int, int]:
-    """Offset and checksum of the DataEnd record, which stands right before the summary."""
-    offset = summary_at - rec.HEAD_BYTES - 4
-    stream.seek(max(offset, 0))
-    head = stream.read(rec.HEAD_BYTES + 4)
-    if (
-        offset < len(rec.MAGIC)
-        or head[0] != Opcode.DATA_END
-        or int.from_bytes(head[1 : rec.HEAD_BYTES], "little") != 4
-    ):
-        raise Damage(offset, "the data section has no end")
-    return offset, int.from_bytes(head[rec.HEAD_BYTES :], "little")
+def named(error: Exception, where: str, behind: str = "") -> LogError:
+    """The error to show for one that was raised while a place was read."""
+    if isinstance(error, CRCValidationError):
+        what = "the checksum (CRC) is wrong"
+    elif isinstance(error, LogError):
+        what = error.message
+    else:
+        what = f"damaged ({type(error).__name__}: {' '.join(str(error).split())[:120]})"
+    kind = type(error) if isinstance(error, LogError) else LogCorrupt
+    return kind(f"{where}: {what}{behind}", hint=getattr(error, "hint", None) or RECOVER_HINT)
+
+
+def read_summary(stream: BoundedFile) -> McapIndex:
+    """The index in the summary at the end of a file. Raises LogError if there is none, or it is damaged."""
+    size = stream.seek(0, io.SEEK_END)
+    stream.seek(max(size - _FOOTER.size, 0))
+    start, _, crc, magic = _FOOTER.unpack(stream.read(_FOOTER.size))
+    if magic != _MAGIC:
+        raise LogTruncated("the recording was not finished")
+    stream.seek(start)
+    if start and crc and zlib.crc32(stream.read(size - start - len(_MAGIC) - 4)) != crc:
+        raise LogCorrupt("its checksum (CRC) is wrong")
+    stream.seek(0)
+    summary = SeekingReader(stream, record_size_limit=None).get_summary()
+    if summary is None or summary.statistics is None:
+        raise LogCorrupt("its writer made none")
+    statistics, chunks, channels = summary.statistics, summary.chunk_indexes, summary.channels
+    counts = statistics.channel_message_counts
+    used = {key for chunk in chunks for key in chunk.message_index_offsets}
+    complete = len(chunks) == statistics.chunk_count and len(channels) >= statistics.channel_count
+    if not complete or used - channels.keys():
+        raise LogCorrupt("it does not list all chunks and channels")
+    return McapIndex(
+        summary.schemas,
+        channels,
+        chunks,
+        counts,
+        sum(counts.values()) == statistics.message_count,
+        statistics.message_start_time,
+        statistics.message_end_time,
+        checked=bool(crc),
+    )
+
+
+class Survey:
+    """The index of a file, made by reading it up to its end or its first damage.
+
+    damage : what ended the reading, or None. at : the offset up to which the file is whole. closed : whether
+    the recorder wrote the end of the data. missing : how many of the messages that it counted are not there:
+    chunks that were cut out completely leave no other trace.
+    """
+
+    def __init__(self, stream: BoundedFile, most_chunk_bytes: int) -> None:
+        self.index = McapIndex(checked=False)
+        self.damage: Exception | None = None
+        self.closed = False
+        self.missing = 0
+        self.at = 0
+        self._most_bytes = most_chunk_bytes
+        self._spans: dict[int, tuple[int, int]] = {}  # first and last log time, by channel
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(0)
+        try:
+            self._read(stream)
+        except MemoryError:
+            raise
+        except Exception as error:  # behind the end of the data, only the summary can be wrong
+            self.damage = error if self.at < size and not self.closed else None
+        index, spans = self.index, self._spans.values()
+        index.checked |= bool(index.chunks)  # they have their own
+        index.start_ns = min((first for first, _ in spans), default=0)
+        index.end_ns = max((last for _, last in spans), default=0)
+
+    def _read(self, stream: BoundedFile) -> None:
+        for record in records_of(stream, whole_file=True).records:
+            self._take(record, stream.tell())
+            self.at = stream.tell()
+            if isinstance(record, DataEnd):
+                self.closed = True
+                self.index.checked = bool(record.data_section_crc)
+            elif isinstance(record, Statistics):
+                self.missing = record.message_count - sum(self.index.counts.values())
+
+    def _take(self, record: McapRecord, end: int) -> None:
+        """Take up a record that ends at an offset; raises whatever is wrong with it."""
+        chunks = self.index.chunks
+        if not isinstance(record, Chunk):
+            if isinstance(record, Message) and chunks:
+                raise LogCorrupt("a message outside of the chunks")
+            self._take_content(record)
+            return
+        if self._spans and not chunks:
+            raise LogCorrupt("a chunk in a file with messages outside of chunks")
+        items = open_chunk(record, self._most_bytes)
+        for item in items:
+            self._take_content(item)
+        there = {item.channel_id for item in items if isinstance(item, Message)}
+        chunks.append(_indexed(record, end, there))
+
+    def _take_content(self, item: McapRecord) -> None:
+        index = self.index
+        if isinstance(item, Schema):
+            index.schemas[item.id] = item
+        elif isinstance(item, Channel):
+            index.channels[item.id] = item
+        elif isinstance(item, Message):
+            if item.channel_id not in index.channels:
+                raise LogCorrupt(f"a message of channel {item.channel_id}, which is missing")
+            first, last = self._spans.get(item.channel_id, (item.log_time, item.log_time))
+            self._spans[item.channel_id] = min(first, item.log_time), max(last, item.log_time)
+            index.counts[item.channel_id] = index.counts.get(item.channel_id, 0) + 1
+
+    def scans_s(self) -> float:
+        """The time from the first to the last message on topics of scans, in seconds."""
+        scans = {key for key, c in self.index.channels.items() if self.index.topic(c).type in topics.SENSORS}
+        spans = [span for key, span in self._spans.items() if key in scans]
+        times = [time_ns for span in spans for time_ns in span]
+        return (max(times) - min(times)) * 1e-9 if times else 0.0
+
+
+def _indexed(chunk: Chunk, end: int, channels: set[int]) -> ChunkIndex:
+    """The place of a chunk that ends at an offset, and what is in it."""
+    size = _CHUNK_BYTES + len(chunk.compression.encode()) + len(chunk.data)
+    return ChunkIndex(
+        chunk_length=size,
+        chunk_start_offset=end - size,
+        compression=chunk.compression,
+        compressed_size=len(chunk.data),
+        message_end_time=chunk.message_end_time,
+        message_index_length=0,
+        message_index_offsets=dict.fromkeys(channels, 0),
+        message_start_time=chunk.message_start_time,
+        uncompressed_size=chunk.uncompressed_size,
+    )

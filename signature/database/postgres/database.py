@@ -62,7 +62,7 @@ class PostgresRows(Rows):
         return super().other(info)
 
     def orphans(self) -> Iterator[Problem]:
-        """None: the server keeps no array without its session."""
+        """None: the server keeps no part without its session."""
         return iter(())
 
 
@@ -110,7 +110,7 @@ class PostgresDatabase(SubmapDatabase):
                     with served(rows.location), rows.connection.transaction():
                         if not keep:
                             rows.execute("SELECT 1 FROM about FOR UPDATE")
-                            rows.execute('DELETE FROM "array"')
+                            rows.execute("DELETE FROM part")
                             rows.execute("DELETE FROM session")
                         action(rows)
                     return

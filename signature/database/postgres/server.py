@@ -21,7 +21,14 @@ from pc2grid.errors import (
     OutputError,
     Pc2GridError,
 )
-from signature.database.protocol import APPLICATION_ID, BUSY_TIMEOUT_S, FORMAT, no_utf8, refused_version
+from signature.database.protocol import (
+    APPLICATION_ID,
+    BUSY_TIMEOUT_S,
+    FORMAT,
+    OLDER_TABLE,
+    no_utf8,
+    refused_version,
+)
 from signature.database.rows import definitions
 
 if TYPE_CHECKING:
@@ -31,7 +38,7 @@ TABLES = definitions(
     "bytea",
     "id bigint NOT NULL",
     session_key=", PRIMARY KEY (building, id)",
-    array_key=", FOREIGN KEY (building, session_id) REFERENCES session (building, id)",
+    part_key=", FOREIGN KEY (building, session_id) REFERENCES session (building, id)",
 )
 """The statement that creates each table: table -> SQL. The keys begin with the building, so that a cluster
 can keep a whole building on one node (examples/buildings.md)."""
@@ -112,7 +119,7 @@ def inspect(connection: Connection[Any], where: str) -> None:
         if len(found) != 1:
             raise DatabaseCorrupt(f"{where}: damaged: pc2grid.about has {len(found)} rows instead of one")
         version = int(found[0][0])
-        if _has(connection, "pc2grid.signature"):  # as before the first format was fixed
+        if _has(connection, f"pc2grid.{OLDER_TABLE}"):
             raise refused_version(where, 0)
         if version < 1:
             raise DatabaseCorrupt(f"{where}: damaged: database format {version} never existed")

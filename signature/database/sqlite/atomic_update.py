@@ -20,7 +20,7 @@ from pathlib import Path
 
 from pc2grid.errors import DatabaseBusy, OutputError
 from pc2grid.io.atomic import is_at, replace_file
-from signature.database.codec import DatabaseDamage
+from signature.database.arrays import DatabaseDamage
 from signature.database.protocol import BUSY_TIMEOUT_S
 from signature.database.sqlite import schema
 from signature.database.sqlite.connection import BoundedConnection

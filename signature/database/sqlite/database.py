@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError
-from signature.database.codec import DatabaseDamage
+from signature.database.arrays import DatabaseDamage
 from signature.database.database import SubmapDatabase
 from signature.database.protocol import Place, Problem, no_utf8
 from signature.database.rows import Rows

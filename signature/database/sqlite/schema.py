@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pc2grid.errors import DatabaseCorrupt, NotADatabase
 from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
-from signature.database.codec import SALVAGE
-from signature.database.protocol import APPLICATION_ID, FORMAT, OLDER_ID, refused_version
+from signature.database.arrays import SALVAGE
+from signature.database.protocol import APPLICATION_ID, FORMAT, OLDER_ID, OLDER_TABLE, refused_version
 from signature.database.rows import definitions
 
 _CONVERTED = (".mcap", ".bag", ".db3", ".yaml", ".yml", ".pcd", ".ply", ".obj", ".stl")
@@ -93,12 +93,14 @@ def _check_format(path: Path, application_id: int, version: int) -> None:
 def inspect_tables(connection: sqlite3.Connection, path: Path) -> None:
     """Compare the tables with those of the format: no views or triggers of others, no damage.
 
-    Raises DatabaseCorrupt.
+    Raises DatabaseVersion, DatabaseCorrupt.
     """
     found = {
         str(name): str(sql)
         for name, sql in connection.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL")
     }
+    if OLDER_TABLE in found:
+        raise refused_version(path, 0)
     if found != TABLES:
         odd = sorted(name for name in found.keys() | TABLES if found.get(name) != TABLES.get(name))
         raise DatabaseCorrupt(

@@ -6,8 +6,6 @@ import dataclasses
 import logging
 import math
 import os
-import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,9 +18,7 @@ from pc2grid.errors import (
     ConfigError,
     FrameError,
     LimitExceeded,
-    LogCorrupt,
     LogNotFound,
-    LogTruncated,
     MapFileError,
     NotALog,
     PointCloudError,
@@ -89,78 +85,6 @@ def test_names_in_a_file_break_no_line(tmp_path: Path) -> None:
     assert caught.value.message.count("a\\nb.mcap") == 1
 
 
-# --- structure of an MCAP -----------------------------------------------------------------------------
-
-
-def record(opcode: int, body: bytes) -> bytes:
-    return bytes([opcode]) + struct.pack("<Q", len(body)) + body
-
-
-def text(value: bytes) -> bytes:
-    return struct.pack("<I", len(value)) + value
-
-
-def channel(key: int, schema: int, topic: bytes) -> bytes:
-    return record(4, struct.pack("<HH", key, schema) + text(topic) + text(b"cdr") + struct.pack("<I", 0))
-
-
-MAGIC = b"\x89MCAP0\r\n"
-HEADER = record(1, text(b"ros2") + text(b"me"))
-END = record(15, struct.pack("<I", 0)) + record(2, bytes(20)) + MAGIC
-
-
-def chunk(content: bytes, *, size: int | None = None, start: int = T0, end: int = T0) -> bytes:
-    crc = zlib.crc32(content)
-    head = struct.pack("<QQQI", start, end, len(content) if size is None else size, crc)
-    return record(6, head + text(b"") + struct.pack("<Q", len(content)) + content)
-
-
-def message(key: int, stamp: int = T0) -> bytes:
-    return record(5, struct.pack("<HIQQ", key, 0, stamp, stamp) + b"\0\1\0\0")
-
-
-@pytest.mark.parametrize(
-    ("body", "error", "words"),
-    [
-        (channel(1, 0, b"/a") + channel(1, 0, b"/b") + END, LogCorrupt, "channel 1 is defined twice"),
-        (record(4, b"\1\0") + END, LogCorrupt, "a record is shorter than its fields"),
-        (chunk(channel(1, 0, b"/a") + message(2)) + END, LogCorrupt, "channel 2, which is missing"),
-        (chunk(channel(1, 0, b"/a") + message(1)[:-3]) + END, LogCorrupt, "a chunk ends within a record"),
-        (chunk(channel(1, 0, b"/a") + b"\5\0") + END, LogCorrupt, "a chunk ends within a record"),
-        (chunk(channel(1, 0, b"/a") + record(5, b"\1\0\0")) + END, LogCorrupt, "a message is shorter"),
-        (chunk(message(1)[:9], size=99) + END, LogCorrupt, "9 bytes instead of 99"),
-        (record(6, bytes(28) + text(b"") + struct.pack("<Q", 999)) + END, LogCorrupt, "lengths contradict"),
-        (record(0, b"") + END, LogCorrupt, "not a record"),
-        (record(0x7E, b"new") + END, LogCorrupt, "a record of unknown kind 0x7e"),
-        (chunk(channel(1, 0, b"/a") + message(1, T0 + 5)) + END, LogCorrupt, "times contradict"),
-        (record(15, bytes(4)) + record(2, bytes(20)) + MAGIC[:5], LogTruncated, "the end mark is missing"),
-        (END + b"more", LogCorrupt, "4 bytes follow the end of the log"),
-    ],
-)  # fmt: skip
-def test_records_that_contradict_themselves(
-    tmp_path: Path, body: bytes, error: type[Exception], words: str
-) -> None:
-    path = tmp_path / "a.mcap"
-    path.write_bytes(MAGIC + HEADER + body)
-    with pytest.raises(error, match=words) as caught:
-        read(path)
-    assert "a.mcap" in str(caught.value)
-
-
-def test_a_record_larger_than_the_limit(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", drive(), use_chunking=False)
-    with pytest.raises(LimitExceeded, match=r"a\.mcap.*max_record_bytes"):
-        read(path, ReadConfig(max_record_bytes=100))
-
-
-def test_records_of_users_are_passed_over(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", drive(), chunk_size=2000)
-    whole = path.read_bytes()
-    at = 8 + len(record(1, whole[17 : 17 + int.from_bytes(whole[9:17], "little")]))
-    path.write_bytes(whole[:at] + record(0x90, b"ours") + whole[at:])
-    check_drive(read(path)[0])
-
-
 # --- parts, times, odometry ---------------------------------------------------------------------------
 
 
@@ -172,6 +96,8 @@ def split(folder: Path) -> Path:
         (folder / f"{part}/{part}.db3").rename(folder / f"all_{part}.db3")
         (folder / f"{part}/metadata.yaml").unlink()
         (folder / f"{part}").rmdir()
+    listed = "rosbag2_bagfile_information: {relative_file_paths: [all_0.db3, all_1.db3]}"
+    (folder / "metadata.yaml").write_text(listed)
     return folder
 
 
@@ -383,7 +309,7 @@ def test_kitti_poses_without_calibration_and_with_a_broken_one(tmp_path: Path) -
         read(folder)
 
 
-@pytest.mark.parametrize("word", ["", "x", "1..2", "--1", "1e", "nan", "inf", "1e400", "9" * 30])
+@pytest.mark.parametrize("word", ["", "x", "1..2", "--1", "1e", "nan", "inf", "9" * 30, "1e999999999999"])
 def test_words_that_are_no_times(word: str) -> None:
     with pytest.raises((ValueError, ArithmeticError)):
         stamp_ns_from_text(word)
@@ -432,7 +358,7 @@ def test_paths_of_maps(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None
     np.testing.assert_array_equal(load_map(inner).cells, grid.cells)
     for name in ('"a\\0b"', "3", '""', "[a]"):
         inner.write_text(plain.replace("m.pgm", name))
-        with pytest.raises(MapFileError, match=r"inner/m\.yaml: image: expected a file name"):
+        with pytest.raises(MapFileError, match=r"inner/m\.yaml: image: "):
             load_map(inner)
     with pytest.raises(MapFileError, match="mode: 'odd' is not one of"):
         save_map(grid, tmp_path / "n", mode="odd")  # type: ignore[arg-type]

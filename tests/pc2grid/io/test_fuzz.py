@@ -3,13 +3,13 @@
 Whatever happens to a file, reading it gives the clean result, a Pc2GridError, or a report of what was lost,
 with the time and memory of a small file. What cannot be noticed:
 
-- ROS 1 bags (except bz2, whose blocks have checksums), .db3 and clouds in files carry no checksum. Their
-  reader always warns of it; a changed coordinate, stamp or frame name is read as it stands.
+- ROS 1 bags, .db3 and clouds in files carry no checksum (but for the blocks of bz2). Their reader always
+  warns of it; a changed coordinate, stamp, or name of a frame or topic is read as it stands.
 - In an MCAP, everything that is used of a message stands under the checksum of its chunk, or of the data
   section. Whole chunks can be missing without a trace in a file that was not closed; the warning that the
   recorder was killed stands for that.
 
-PC2GRID_FUZZ is the number of mutations of each kind: at least hundreds, so that every outcome occurs.
+PC2GRID_FUZZ is the number of mutations of each kind: at least 100, so that every outcome occurs.
 """
 
 from __future__ import annotations
@@ -54,7 +54,6 @@ UNCHECKED = [
     "bag", "bag bz2", "bag lz4", "db3", "rosbag2 db3",
     "pcd ascii", "pcd binary", "pcd compressed", "ply ascii", "ply binary", "bin",
 ]  # fmt: skip
-WARNED = [kind for kind in UNCHECKED if kind != "bag bz2"]
 KINDS = [*CHECKED, *UNCHECKED]
 # With fewer scans, a single lost one would exceed the tenth that a reader accepts; where every chunk has a
 # checksum, whole chunks are lost instead of single scans.
@@ -127,7 +126,7 @@ def test_fuzz_recordings(tmp_path: Path, kind: str, part: int) -> None:
     scans, usual = read(path)
     clean = essence(scans)
     assert not usual.lossy
-    assert any("no checksum" in warning for warning in usual.warnings) == (kind in WARNED)
+    assert any("no checksum" in warning for warning in usual.warnings) == (kind in UNCHECKED)
     rng = np.random.default_rng([KINDS.index(kind), part])
     outcomes = {"clean": 0, "refused": 0, "said": 0}
     for number in patiently():
@@ -158,8 +157,6 @@ def test_fuzz_recordings(tmp_path: Path, kind: str, part: int) -> None:
                 assert {f[:2] for f in found} <= {c[:2] for c in clean}, f"{what}: other points"
             if kind.endswith("db3"):
                 assert news(report, usual) or len(found) == len(clean), f"{what}: silent"
-            if kind == "bag bz2":
-                assert {f[1] for f in found} <= {c[1] for c in clean}, f"{what}: other points"
         if len(files) > 1:
             put(files[victim], whole[victim])
     assert outcomes["clean"] and outcomes["refused"], outcomes

@@ -117,7 +117,7 @@ def test_bad_keys_are_named(tmp_path: Path, key: str, value: object) -> None:
 
 @pytest.mark.parametrize("key", list(GOOD))
 def test_missing_keys_are_named(tmp_path: Path, key: str) -> None:
-    with pytest.raises(MapFileError, match=f"{key}: missing"):
+    with pytest.raises(MapFileError, match=f"{key}: field required"):
         load_map(write_map(tmp_path, {k: v for k, v in GOOD.items() if k != key}))
 
 
@@ -139,7 +139,7 @@ def test_values_up_to_their_limits(tmp_path: Path, key: str, good: list[object],
     for value in good:
         load_map(write_map(tmp_path, {**GOOD, key: value}))
     for value in bad:
-        with pytest.raises(MapFileError, match=r"m\.yaml: (free_thresh|" + key + "): "):
+        with pytest.raises(MapFileError, match=r"m\.yaml: .*" + key):
             load_map(write_map(tmp_path, {**GOOD, key: value}))
 
 
@@ -210,7 +210,7 @@ def test_things_are_obstacles_unless_walls_alone_are_wanted(tmp_path: Path, imag
 
 
 def test_a_short_image_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(MapFileError, match="3 x 2 pixels declared, 5 found"):
+    with pytest.raises(MapFileError, match=r"m\.pgm: a damaged image"):
         load_map(write_map(tmp_path, GOOD, bytes(5)))
 
 

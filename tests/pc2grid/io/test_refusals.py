@@ -16,16 +16,12 @@ from pc2grid.config import ReadConfig
 from pc2grid.errors import (
     DatabaseError,
     FrameError,
-    LimitExceeded,
     LogCorrupt,
     LogNotFound,
-    MapFileError,
-    NoScans,
     PointCloudError,
     UnsupportedSchema,
 )
 from pc2grid.io import open_log
-from pc2grid.io.containers.bag import MAGIC
 from pc2grid.io.error_translation import guarded, guarded_stream
 from pc2grid.io.frames import FrameTree
 from pc2grid.io.message_source import TopicInfo
@@ -33,9 +29,8 @@ from pc2grid.io.messages import foxglove
 from pc2grid.io.messages import ros as ros_messages
 from pc2grid.io.messages.cloud_files import parser
 from pc2grid.io.messages.types import Header, PointCloud2
-from pc2grid.io.nav2_map import load_map
 from tests.helpers.cloud_folders import folder_of
-from tests.helpers.recordings import T0, drive, raw_log, read, ros, write_bag, write_mcap, write_rosbag2
+from tests.helpers.recordings import T0, drive, write_bag, write_rosbag2
 
 HEADER = Header(T0, "lidar")
 NUMPY = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8"}
@@ -138,55 +133,14 @@ def test_ply_of_every_type_behind_another_element(kind: str) -> None:
         np.testing.assert_array_equal(values.astype("f8"), wanted.astype("f8"))
 
 
-@pytest.mark.parametrize(
-    ("was", "now", "words"),
-    [
-        (b"SIZE 4", b"SIZE 4 4", "makes no sense"),
-        (b"SIZE 4", b"SIZE 3", "makes no sense: 'F3'"),
-        (b"COUNT 1", b"COUNT 1 1", "makes no sense"),
-        (b"COUNT 1", b"COUNT -1", "a negative count"),
-        (b"WIDTH 2", b"WIDTH -2", "a negative count"),
-        (b"WIDTH 2", b"WIDTH", "makes no sense"),
-        (b"FIELDS n0", b"FIELDS", "makes no sense"),
-        (b"DATA binary", b"DATA", "without a DATA line"),
-        (b"DATA binary", b"DATA morse", "a PCD of data 'morse' is not read"),
-    ],
-)
-def test_a_header_of_a_pcd_that_makes_no_sense(was: bytes, now: bytes, words: str) -> None:
-    content = pcd("binary", columns(["f4"], [1]))
-    assert content.count(was + b"\n") == 1
-    with pytest.raises((PointCloudError, UnsupportedSchema), match=words):
-        parser("pcd")(content.replace(was + b"\n", now + b"\n"), HEADER)
-
-
 # --- limits, met exactly ------------------------------------------------------------------------------
-
-
-def record_lengths(bag: bytes) -> tuple[list[int], list[int]]:
-    """Lengths of the headers and of the data of a bag's records."""
-    at, lengths = len(MAGIC), []
-    while at < len(bag):
-        lengths.append(int.from_bytes(bag[at : at + 4], "little"))
-        at += 4 + lengths[-1]
-    return lengths[::2], lengths[1::2]
-
-
-def test_a_bag_may_be_as_large_as_the_limits_say(tmp_path: Path) -> None:
-    path = write_bag(tmp_path / "a.bag", drive("ros1"), chunk_bytes=5000)
-    _, data = record_lengths(path.read_bytes())
-    wanted, _ = read(path)
-    scans, _ = read(path, ReadConfig(max_record_bytes=max(data)))
-    assert [s.stamp_ns for s in scans] == [s.stamp_ns for s in wanted]
-    with pytest.raises(LimitExceeded, match=f"the limit is {max(data) - 1}"):
-        read(path, ReadConfig(max_record_bytes=max(data) - 1))
 
 
 def test_a_refused_bag_is_closed(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "a.bag", drive("ros1"))
     content = path.read_bytes()
-    # What the index says of a topic, and no chunk does; the record says it once more in its data.
-    at = content.rindex(b"topic=/", 0, content.rindex(b"topic=/"))
-    path.write_bytes(content[: at + 7] + b"x" + content[at + 8 :])
+    at = content.index(b"conn=", content.index(b"op=\x04")) + 5  # an index of messages, of another topic
+    path.write_bytes(content[:at] + b"\0\x10" + content[at + 2 :])
     with pytest.raises(LogCorrupt):
         open_log(path)
     there = [file.path for file in psutil.Process().open_files()]
@@ -236,9 +190,9 @@ def test_foxglove_topics_that_are_not_read(channel: TopicInfo, words: str) -> No
 @pytest.mark.parametrize(
     ("kind", "data", "words"),
     [
-        ("sensor_msgs/PointCloud2", b"\0\1", "shorter than its encapsulation header"),
-        ("tf2_msgs/TFMessage", b"\0\1\0\0" + struct.pack("<I", 100_001), "Invalid sequence length 100001"),
-        ("sensor_msgs/PointCloud2", b"\0\1\0\0\1\0\0\0", "shorter than its schema"),
+        ("sensor_msgs/PointCloud2", b"\0\1", "no whole sensor_msgs/PointCloud2"),
+        ("tf2_msgs/TFMessage", b"\0\1\0\0" + struct.pack("<I", 100_001), "no whole tf2_msgs/TFMessage"),
+        ("sensor_msgs/PointCloud2", b"\0\1\0\0\1\0\0\0", "no whole sensor_msgs/PointCloud2"),
     ],
 )
 def test_messages_that_are_too_short_or_too_large(kind: str, data: bytes, words: str) -> None:
@@ -254,17 +208,6 @@ def test_a_camera_matrix_of_other_sizes() -> None:
     }  # fmt: skip
     with pytest.raises(PointCloudError, match="a camera matrix K of 8 numbers"):
         decode(json.dumps(message).encode())
-
-
-def test_a_topic_without_messages_is_named(tmp_path: Path) -> None:
-    kind = "sensor_msgs/msg/PointCloud2"
-    text = ros().schema("sensor_msgs/PointCloud2")
-    path = raw_log(tmp_path / "a.mcap", [("/points", kind, "ros2msg", text, b"")])
-    with (
-        open_log(path, ReadConfig(topic="/points")) as log,
-        pytest.raises(NoScans, match="/points: no message"),
-    ):
-        log.choose()
 
 
 def test_frames_that_are_not_connected(tmp_path: Path) -> None:
@@ -298,24 +241,6 @@ def test_a_part_of_a_folder_of_clouds(tmp_path: Path) -> None:
     assert part == [t for t in whole if begin <= t < begin + 500_000_000]
 
 
-def test_a_part_of_a_split_recording(tmp_path: Path) -> None:
-    messages = drive(scans=12)
-    for name, chosen in (("a_0", messages[: len(messages) // 2]), ("a_1", messages[len(messages) // 2 :])):
-        write_mcap(tmp_path / f"{name}.mcap", chosen)
-    folder = tmp_path / "a"
-    folder.mkdir()
-    for name in ("a_0.mcap", "a_1.mcap"):
-        (tmp_path / name).rename(folder / name)
-    with open_log(folder) as log:
-        whole = [scan.stamp_ns for scan in log.scans()]
-        assert whole == sorted(whole) and len(whole) == 12
-        for start_s, duration_s in ((0.0, 0.15), (1.0, None), (0.4, 0.4)):
-            begin = log.info.start_ns + round(start_s * 1e9)
-            end = begin + round((duration_s or 1e6) * 1e9)
-            part = [scan.stamp_ns for scan in log.scans(start_s=start_s, duration_s=duration_s)]
-            assert part == [t for t in whole if begin <= t < end]
-
-
 def test_a_folder_whose_files_are_all_gone(tmp_path: Path) -> None:
     folder = write_rosbag2(tmp_path / "log", drive(), "mcap")
     for file in folder.glob("*.mcap"):
@@ -324,25 +249,6 @@ def test_a_folder_whose_files_are_all_gone(tmp_path: Path) -> None:
         open_log(folder)
     with pytest.raises(LogNotFound, match="none of the files of the recording is there"):
         open_log(folder, recover=True)
-
-
-def test_a_metadata_file_without_end(tmp_path: Path) -> None:
-    folder = write_rosbag2(tmp_path / "log", drive(), "mcap")
-    with (folder / "metadata.yaml").open("ab") as file:
-        file.truncate(64 << 20)
-    with pytest.raises(LogCorrupt, match=r"metadata\.yaml: larger than \d+ bytes"):
-        open_log(folder)
-
-
-@pytest.mark.parametrize("top", [0, 256, 65535])
-def test_a_pgm_of_other_depths(tmp_path: Path, top: int) -> None:
-    (tmp_path / "a.pgm").write_bytes(b"P5\n2 2\n%d\n" % top + bytes(8))
-    (tmp_path / "a.yaml").write_text(
-        "image: a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n"
-        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
-    )
-    with pytest.raises(MapFileError, match=f"PGM with maximum {top}"):
-        load_map(tmp_path / "a.yaml")
 
 
 def test_what_others_raise_becomes_ours_but_for_memory() -> None:

@@ -9,7 +9,7 @@ import pytest
 from mcap.writer import CompressionType
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import LogCorrupt, PointCloudError, UnsupportedSchema
+from pc2grid.errors import LogCorrupt, NoScans, PointCloudError, UnsupportedSchema
 from pc2grid.io import open_log, scan_stream
 from tests.helpers.recordings import (
     STEP,
@@ -20,6 +20,7 @@ from tests.helpers.recordings import (
     raw_log,
     read,
     ros,
+    write_clouds,
     write_mcap,
 )
 
@@ -170,9 +171,9 @@ def test_a_few_short_messages_are_counted_and_more_than_a_tenth_refused(tmp_path
 
     scans, report = read(log(2))
     assert len(scans) == 18
-    assert report.scans_skipped == {"the message is shorter than its schema": 2}
+    assert report.scans_skipped == {"the message is no whole sensor_msgs/PointCloud2": 2}
     assert report.lossy
-    with pytest.raises(LogCorrupt, match=r"/points: 3 of 20 scans are unreadable: .* than its schema"):
+    with pytest.raises(LogCorrupt, match=r"/points: 3 of 20 scans are unreadable: .*no whole"):
         read(log(3))
 
 
@@ -246,7 +247,7 @@ def test_a_schema_in_idl(tmp_path: Path) -> None:
     (scan,), _ = read(raw_log(tmp_path / "a.mcap", [("/scan", name, "ros2idl", IDL, payload)]))
     assert len(scan.points_m) == 2
     wrong = IDL.replace(b"sequence<float> ranges", b"sequence<double> ranges")
-    with pytest.raises(UnsupportedSchema, match=r"differently from ROS: .*float64 ranges\[\]"):
+    with pytest.raises(PointCloudError, match=r"the message is no whole sensor_msgs/LaserScan"):
         read(raw_log(tmp_path / "b.mcap", [("/scan", name, "ros2idl", wrong, payload)]))
     with pytest.raises(UnsupportedSchema, match="not readable: std_msgs/Header: definition missing"):
         missing = IDL.split(b"=" * 80)[1]
@@ -296,3 +297,18 @@ def test_a_flip_in_an_unchunked_log_is_seen_by_its_data_checksum(tmp_path: Path)
     path.write_bytes(content)
     with pytest.raises(LogCorrupt, match="checksum"):
         read(path)
+
+
+# --- parts of a recording -----------------------------------------------------------------------------
+
+
+def test_a_part_is_chosen_by_seconds_after_the_first_scan(tmp_path: Path) -> None:
+    with open_log(write_clouds(tmp_path / "a.mcap")) as log:
+        scans = list(log.scans(1.0, 0.5))
+        assert [s.stamp_ns - T0 for s in scans] == [10 * STEP + i * STEP for i in range(5)]
+        assert scans[0].T_base_sensor[:3, 3].tolist() == [0.2, 0.0, 0.5]
+        # Odometry comes 10 ms after each scan: 0.1 m per 0.1 s, so the scan is 0.01 m behind.
+        assert scans[0].T_odom_base is not None
+        assert scans[0].T_odom_base[0, 3] == pytest.approx(0.99)
+        with pytest.raises(NoScans, match=r"lasts 3\.9 s"):
+            list(log.scans(100.0))

@@ -289,7 +289,7 @@ def test_command_line(tmp_path: Path) -> None:
     from typer.testing import CliRunner
 
     from pc2grid.io.nav2_map import save_map
-    from pc2grid_lab.simulate import simulate_command
+    from pc2grid_cli.simulate import simulate_command
 
     cells = np.full((120, 160), 100, np.int8)
     cells[20:100, 20:140] = 0

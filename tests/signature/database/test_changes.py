@@ -10,18 +10,7 @@ import pytest
 from pc2grid.errors import DatabaseError, NotADatabase, OutputError
 from signature.database import maintenance, open_database
 from signature.database.sqlite.database import SqliteRows
-from tests.helpers import postgresql
-from tests.helpers.databases import assert_holds, everything, make_entry
-
-MONDAY, TUESDAY = make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)
-
-
-@pytest.fixture(params=["sqlite", "postgres"])
-def place(request: pytest.FixtureRequest, tmp_path: Path) -> str | Path:
-    """A database of two sessions, on each engine."""
-    target = tmp_path / "x.submaps" if request.param == "sqlite" else postgresql.new_database()
-    maintenance.store(target, [MONDAY, TUESDAY], keep=False)
-    return target
+from tests.helpers.databases import MONDAY, TUESDAY, assert_holds, everything, make_entry
 
 
 def names(place: str | Path) -> list[str]:
@@ -90,9 +79,7 @@ def test_what_is_refused_changes_nothing(place: str | Path, tmp_path: Path) -> N
     assert not (tmp_path / "no.submaps").exists()
 
 
-def test_a_file_is_changed_as_a_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "x.submaps"
-    maintenance.store(path, [MONDAY, TUESDAY], keep=False)
+def test_a_file_is_changed_as_a_whole_or_not_at_all(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = path.read_bytes()
     with pytest.raises(DatabaseError, match="named twice"):
         maintenance.split(path, ["monday"], path, force=True)
@@ -107,7 +94,7 @@ def test_a_file_is_changed_as_a_whole_or_not_at_all(tmp_path: Path, monkeypatch:
     ):
         with pytest.raises(KeyboardInterrupt):
             act()
-    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("x.submaps", before)]
+    assert [(file.name, file.read_bytes()) for file in path.parent.iterdir()] == [(path.name, before)]
 
 
 def test_what_is_no_database_is_not_changed(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pc2grid.errors import DatabaseError, LogNotFound, MapFileError, NotADatabase, OutputError
+from pc2grid.errors import LogNotFound, MapFileError, NotADatabase, OutputError
 from pc2grid.io import open_log
 from pc2grid.io.export.mcap import LogWriter
 from pc2grid.io.nav2_map import load_map, save_map
@@ -33,8 +33,8 @@ from pc2grid.io.trajectory import write_kitti, write_tum
 from pc2grid.model import Trajectory
 from pc2grid.simulate import SimulationConfig, simulate_session
 from signature.database import open_database
-from signature.database.maintenance import check, copy, store
-from tests.helpers.databases import assert_holds, make_entry
+from signature.database.maintenance import store
+from tests.helpers.databases import MONDAY, assert_holds, make_entry
 from tests.helpers.rooms import small_house
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -196,7 +196,7 @@ def test_kill_at_random_moments_of_adding(inputs: Path, tmp_path: Path) -> None:
 def test_fuzz_kill_at_every_line_of_the_writer(tmp_path: Path) -> None:
     """Exact where the clock is not: a forked writer kills itself before the N-th line it would run."""
     path = tmp_path / "x.submaps"
-    store(path, [make_entry("monday", 0)], keep=False)
+    store(path, [MONDAY], keep=False)
     old = path.read_bytes()
     added = make_entry("tuesday", 1)
     store(path, [added], keep=True)
@@ -292,7 +292,7 @@ def test_reader_that_has_seen_enough_is_no_error(inputs: Path, arguments: str) -
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO, errno.EDQUOT, errno.EACCES])
 def test_fail_the_nth_call_of_a_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     path = tmp_path / "x.submaps"
-    store(path, [make_entry("monday", 0)], keep=False)
+    store(path, [MONDAY], keep=False)
     old = path.read_bytes()
     store(path, [make_entry("tuesday", 1)], keep=True)
     new = path.read_bytes()
@@ -340,7 +340,7 @@ def test_fail_the_nth_call_of_a_write(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_disk_full_at_every_page_of_a_write(tmp_path: Path) -> None:
     """A limit on the size of files stops SQLite's own writing, from the first page to the last."""
     path = tmp_path / "x.submaps"
-    store(path, [make_entry("monday", 0)], keep=False)
+    store(path, [MONDAY], keep=False)
     old = path.read_bytes()
     added = make_entry("tuesday", 1)
     store(path, [added], keep=True)
@@ -436,13 +436,13 @@ import subprocess, sys
 from pathlib import Path
 from pc2grid.errors import OutputError
 from signature.database.maintenance import store
-from tests.helpers.databases import make_entry
+from tests.helpers.databases import MONDAY, make_entry
 
 disk, path = Path(sys.argv[1]), Path(sys.argv[1]) / "x.submaps"
 mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", disk]
 if subprocess.run(mount, capture_output=True).returncode:
     sys.exit(77)
-store(path, [make_entry("monday", 0)], keep=False)
+store(path, [MONDAY], keep=False)
 old, outcomes = path.read_bytes(), []
 for pages in range(len(old) // 4096, 4 * len(old) // 4096):
     path.write_bytes(old)
@@ -517,7 +517,7 @@ def test_log_that_may_not_be_read(open_folder: Path) -> None:
 @pytest.mark.fault(39)
 def test_folder_that_refuses(open_folder: Path) -> None:
     path, file = open_folder / "x.submaps", open_folder / "file"
-    store(path, [make_entry("monday", 0)], keep=False)
+    store(path, [MONDAY], keep=False)
     file.write_text("mine")
     before = path.read_bytes()
 
@@ -528,7 +528,7 @@ def test_folder_that_refuses(open_folder: Path) -> None:
         with pytest.raises(OutputError, match=r"x\.submaps: cannot write: Permission denied"):
             store(path, [make_entry("tuesday", 1)], keep=True)
         with open_database(path) as database:
-            assert_holds(database, make_entry("monday", 0))
+            assert_holds(database, MONDAY)
 
     open_folder.chmod(0o555)
     as_nobody(body)
@@ -541,22 +541,10 @@ def test_folder_that_refuses(open_folder: Path) -> None:
     assert sorted(open_folder.iterdir()) == [file, path]
 
 
-def test_reader_keeps_what_it_opened(tmp_path: Path) -> None:
-    path = tmp_path / "x.submaps"
-    store(path, [make_entry("monday", 0)], keep=False)
-    with open_database(path) as database:
-        store(path, [make_entry("tuesday", 1)], keep=False)
-        assert_holds(database, make_entry("monday", 0))
-    with open_database(path) as database:
-        assert_holds(database, make_entry("tuesday", 1))
-    copy(path, tmp_path / "y.submaps")
-    assert check(tmp_path / "y.submaps") == ()
-
-
 def test_symbolic_link_is_followed(tmp_path: Path) -> None:
     path, link = tmp_path / "x.submaps", tmp_path / "link.submaps"
     link.symlink_to(path.name)
-    store(link, [make_entry("monday", 0)], keep=False)
+    store(link, [MONDAY], keep=False)
     store(link, [make_entry("tuesday", 1)], keep=True)
     assert link.is_symlink()
     with open_database(path) as database:
@@ -590,13 +578,3 @@ def test_another_run_onto_the_same_file_is_refused_with_the_difference(
     assert "--force" in said.splitlines()[1]
     assert (inputs / "drive.submaps").read_bytes() == before
     assert sorted(inputs.iterdir()) == folder
-
-
-def test_adding_another_session_of_the_name_is_refused(inputs: Path, tmp_path: Path) -> None:
-    path = tmp_path / "x.submaps"
-    store(path, [make_entry("monday", 0)], keep=False)
-    before = path.read_bytes()
-    with pytest.raises(DatabaseError, match="another session named 'monday'"):
-        store(path, [make_entry("monday", 1)], keep=True)
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]

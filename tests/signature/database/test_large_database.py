@@ -155,7 +155,7 @@ def test_places_are_selected_by_what_is_stored_and_computed_where_it_is_not(tmp_
     store_maps(file, MAPS)
     settings = ALL.made_with.relocalize.model_copy(update={"shortlist": 16, "shortlist_share": 0.0})
     config = ALL.made_with.model_copy(update={"relocalize": settings})
-    sql(file, "DELETE FROM \"array\" WHERE name LIKE 'seen.%'")
+    sql(file, "DELETE FROM part WHERE name = 'seen'")
     maintenance.copy(file, copied, recover=True)
     answers, news = {}, {}
     for path in (file, copied):
@@ -174,7 +174,7 @@ def test_places_are_selected_by_what_is_stored_and_computed_where_it_is_not(tmp_
 def test_damage_to_what_is_seen_costs_no_answer(tmp_path: Path) -> None:
     file = tmp_path / "x.submaps"
     store_maps(file, {"office": MAPS["office"]})
-    sql(file, "UPDATE \"array\" SET crc32 = crc32 + 1 WHERE name LIKE 'seen.%'")
+    sql(file, "UPDATE part SET crc32 = crc32 + 1 WHERE name = 'seen'")
     with open_database(file) as database:
         assert database.leave_out_damaged() == ()
         with pytest.raises(DatabaseCorrupt, match="wrong checksum"):

@@ -20,6 +20,7 @@ from pc2grid.errors import (
     DatabaseUnreachable,
     DatabaseVersion,
     NotADatabase,
+    OutputError,
     Pc2GridError,
 )
 from signature.config import Config
@@ -27,20 +28,8 @@ from signature.database import create_database, maintenance, open_database
 from signature.database.maintenance import store
 from signature.database.postgres import server
 from tests.helpers import postgresql
-from tests.helpers.databases import assert_holds, digest_of, everything, make_entry, sql
+from tests.helpers.databases import MONDAY, assert_holds, everything, make_entry, sql
 from tests.helpers.postgresql import with_user
-
-
-@pytest.fixture
-def url() -> str:
-    return postgresql.new_database()
-
-
-@pytest.fixture
-def filled(url: str) -> str:
-    store(url, [make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)], keep=False)
-    return url
-
 
 # --- who may come in ----------------------------------------------------------------------------------
 
@@ -67,28 +56,28 @@ def test_wrong_urls_are_one_line_without_the_password(bad: str, error: type, wor
             assert part not in str(caught.value)
 
 
-def test_location_is_a_url_without_secrets(filled: str) -> None:
+def test_location_is_a_url_without_secrets(url: str) -> None:
     shown = server.location("postgresql://robot:pa%40ss@host:5433/db?sslpassword=x&options=-cx%3D1")
     assert shown == "postgresql://robot@host:5433/db"
-    with open_database(filled) as database, open_database(database.location) as again:
+    with open_database(url) as database, open_database(database.location) as again:
         assert again.sessions() == database.sessions()
 
 
-def test_wrong_password_user_and_database(filled: str) -> None:
+def test_wrong_password_user_and_database(url: str) -> None:
     running = postgresql.server()
-    with postgresql.connect(filled) as connection:
+    with postgresql.connect(url) as connection:
         connection.execute("CREATE ROLE robot LOGIN PASSWORD 'right'")
         rules = running.data / "pg_hba.conf"
         rules.write_text("local all robot scram-sha-256\n" + rules.read_text())
         connection.execute("SELECT pg_reload_conf()")
     with pytest.raises(DatabaseUnreachable, match="user or password is not accepted") as caught:
-        _eventually(lambda: open_database(with_user(filled, "robot", "wr0ng")))
+        _eventually(lambda: open_database(with_user(url, "robot", "wr0ng")))
     assert "wr0ng" not in str(caught.value)
     assert "PGPASSWORD" in str(caught.value)
     with pytest.raises(DatabaseError, match="permission denied") as caught:
-        open_database(with_user(filled, "robot", "right"))
+        open_database(with_user(url, "robot", "right"))
     with pytest.raises(DatabaseUnreachable, match="ghost"):
-        open_database(with_user(filled, "ghost", ""))
+        open_database(with_user(url, "ghost", ""))
     with pytest.raises(NotADatabase, match="does not exist") as caught:
         open_database(running.url("none"))
     assert "createdb none" in str(caught.value)
@@ -106,29 +95,53 @@ def _eventually(attempt) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.fault(44)
 @pytest.mark.parametrize(
-    ("number", "error", "words"),
+    ("change", "error", "words"),
     [
-        (99, DatabaseVersion, r"format 99; this pc2grid reads format 1 \(use a newer"),
-        (0, DatabaseCorrupt, "never existed"),
+        (
+            "UPDATE about SET format = 99",
+            DatabaseVersion,
+            r"format 99; this pc2grid reads format 1 \(use a newer",
+        ),
+        ("UPDATE about SET format = 0", DatabaseCorrupt, "never existed"),
+        ("DELETE FROM about", DatabaseCorrupt, r"pc2grid\.about has 0 rows instead of one"),
+        ('ALTER TABLE part RENAME TO "array"', DatabaseVersion, r"older format, .* \(convert the recordings"),
     ],
 )
-def test_schema_of_another_version(filled: str, number: int, error: type[DatabaseError], words: str) -> None:
-    with postgresql.connect(filled) as connection:
-        connection.execute("UPDATE pc2grid.about SET format = %s", [number])
-    for attempt in (open_database, lambda u: store(u, [make_entry("friday", 5)], keep=True)):
+def test_schema_of_another_version(url: str, change: str, error: type[DatabaseError], words: str) -> None:
+    sql(url, change)
+    for attempt in (
+        open_database,
+        maintenance.check,
+        lambda u: store(u, [make_entry("friday", 5)], keep=True),
+    ):
         with pytest.raises(error, match=words):
-            attempt(filled)
+            attempt(url)
 
 
-@pytest.mark.fault(44)
-def test_a_database_of_before_the_first_format_is_refused(filled: str) -> None:
-    with postgresql.connect(filled) as connection:
-        connection.execute("UPDATE pc2grid.about SET format = 5")
-        connection.execute("CREATE TABLE pc2grid.signature (building text)")
-    for attempt in (open_database, maintenance.check, lambda u: store(u, [make_entry()], keep=True)):
-        with pytest.raises(DatabaseVersion, match=r"older than 1, .* \(convert the recordings again"):
-            attempt(filled)
+def test_tables_that_are_not_ours(url: str) -> None:
+    sql(url, "ALTER TABLE part RENAME COLUMN data TO content")
+    with open_database(url) as database, pytest.raises(DatabaseCorrupt, match="not those of format 1"):
+        database.loops("monday")
+
+
+def test_a_server_that_takes_no_changes(url: str) -> None:
+    """A replica, or one whose administrator has set it so."""
+    name = url.rpartition("/fleet")[2].partition("?")[0]
+    sql(url, f"ALTER DATABASE fleet{name} SET default_transaction_read_only = on")
+    with pytest.raises(OutputError, match=r"cannot write: cannot execute .* in a read-only transaction"):
+        store(url, [make_entry("friday", 5)], keep=True)
+    with open_database(url) as database:
+        assert_holds(database, MONDAY)
+
+
+def test_a_user_who_may_not_make_tables() -> None:
+    url = postgresql.new_database()
+    sql(url, "CREATE ROLE guest LOGIN")
+    with pytest.raises(DatabaseError, match="permission denied for database") as caught:
+        create_database(with_user(url, "guest", ""))
+    assert "ask an administrator" in str(caught.value)
 
 
 def test_without_the_extra_it_says_what_to_install() -> None:
@@ -142,16 +155,16 @@ def test_without_the_extra_it_says_what_to_install() -> None:
     assert "pip install 'psycopg[binary]'" in done.stderr
 
 
-def test_rights_that_a_robot_needs(filled: str) -> None:
+def test_rights_that_a_robot_needs(url: str) -> None:
     """Those that examples/buildings.md names, and no others."""
-    with postgresql.connect(filled) as connection:
+    with postgresql.connect(url) as connection:
         for role, tables in (("writer", "SELECT, INSERT, DELETE"), ("viewer", "SELECT")):
             connection.execute(f"CREATE ROLE {role} LOGIN")
             connection.execute(f"GRANT USAGE ON SCHEMA pc2grid TO {role}")
             connection.execute(f"GRANT {tables} ON ALL TABLES IN SCHEMA pc2grid TO {role}")
         connection.execute("GRANT UPDATE ON pc2grid.about, pc2grid.session TO writer")
         connection.execute("GRANT USAGE ON SEQUENCE pc2grid.session_id TO writer")
-    writer, viewer = (with_user(filled, role, "") for role in ("writer", "viewer"))
+    writer, viewer = (with_user(url, role, "") for role in ("writer", "viewer"))
     store(writer, [make_entry("friday", 5)], keep=True)
     store(writer, [make_entry("friday", 6)], keep=True, force=True)
     with open_database(viewer, writable=True) as database:
@@ -164,9 +177,9 @@ def test_rights_that_a_robot_needs(filled: str) -> None:
 # --- many at once -------------------------------------------------------------------------------------
 
 
-def test_robots_that_write_and_read_at_once(url: str) -> None:
+def test_robots_that_write_and_read_at_once() -> None:
     """The tables do not exist at first. All writers store one common session; the other sessions differ."""
-    wrong: list[str] = []
+    url, wrong = postgresql.new_database(), list[str]()
 
     def robot(number: int) -> None:
         try:
@@ -192,7 +205,8 @@ def test_robots_that_write_and_read_at_once(url: str) -> None:
         assert database.check() == ()
 
 
-def test_first_two_with_different_settings_do_not_both_win(url: str) -> None:
+def test_first_two_with_different_settings_do_not_both_win() -> None:
+    url = postgresql.new_database()
     entries = [
         make_entry(f"s{bin_m}", 1, config=Config.model_validate({"signature": {"boundary_bin_m": bin_m}}))
         for bin_m in (0.2, 0.3, 0.4)
@@ -215,63 +229,23 @@ def test_first_two_with_different_settings_do_not_both_win(url: str) -> None:
     assert sum("cannot be compared" in str(result) for result in results) == 2, results
 
 
-def test_writer_that_waits_too_long_is_told(filled: str, monkeypatch) -> None:
+def test_writer_that_waits_too_long_is_told(url: str, monkeypatch) -> None:
     monkeypatch.setattr(server, "BUSY_TIMEOUT_S", 1.0)
-    with postgresql.connect(filled) as other, other.transaction():
+    with postgresql.connect(url) as other, other.transaction():
         other.execute("SELECT 1 FROM pc2grid.about FOR UPDATE")
         with pytest.raises(DatabaseBusy, match="lock timeout"):
-            store(filled, [make_entry("friday", 5)], keep=True)
-
-
-# --- damage -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("where", "change"),
-    [
-        ("session 1", "UPDATE session SET document = document || ' ' WHERE id = 1"),
-        ("session 1", "UPDATE session SET floor = 'cellar' WHERE id = 1"),
-        *(
-            (
-                f"{name} of session 'monday'",
-                f"UPDATE \"array\" SET {change} WHERE session_id = 1 AND name = '{name}'",
-            )
-            for name, change in [
-                ("grid.cells", "data = set_byte(data, 9, get_byte(data, 9) # 1)"),
-                ("trajectory.stamps_ns", "shape = '[8]'"),
-                ("loops.information", "dtype = 'float32'"),
-                ("graph.length_m", "data = data || data"),
-                ("submaps.boundary", "data = set_byte(data, 9, get_byte(data, 9) # 128)"),
-            ]
-        ),
-    ],
-)
-def test_changed_rows_are_found(filled: str, where: str, change: str) -> None:
-    sql(filled, change)
-    (problem,) = maintenance.check(filled)
-    assert (problem.where, problem.what) == (where, "wrong checksum")
-    with pytest.raises(DatabaseCorrupt, match="checksum"), open_database(filled) as database:
-        digest_of(database)
-
-
-def test_search_goes_on_without_what_is_damaged(filled: str) -> None:
-    sql(filled, "UPDATE \"array\" SET shape = '[60,40]' WHERE session_id = 1 AND name = 'grid.cells'")
-    with open_database(filled) as database:
-        (problem,) = database.leave_out_damaged()
-        assert problem.where == "grid.cells of session 'monday'"
-        assert [info.name for info in database.sessions()] == ["tuesday"]
-        assert len(database.signatures()) == 5
+            store(url, [make_entry("friday", 5)], keep=True)
 
 
 # --- a server that goes away --------------------------------------------------------------------------
 
 
-def test_connection_cut_in_the_middle_of_storing_leaves_what_was_there(filled: str) -> None:
-    before = everything(filled)
+def test_connection_cut_in_the_middle_of_storing_leaves_what_was_there(url: str) -> None:
+    before = everything(url)
 
     def entries():
         yield make_entry("wednesday", 2)
-        with postgresql.connect(filled) as connection:
+        with postgresql.connect(url) as connection:
             connection.execute(
                 "SELECT pg_terminate_backend(pid) FROM pg_stat_activity"
                 " WHERE datname = current_database() AND pid <> pg_backend_pid()"
@@ -279,9 +253,9 @@ def test_connection_cut_in_the_middle_of_storing_leaves_what_was_there(filled: s
         yield make_entry("thursday", 3)
 
     with pytest.raises(DatabaseUnreachable, match="server went away") as caught:
-        store(filled, entries(), keep=True)
+        store(url, entries(), keep=True)
     assert "try again" in str(caught.value)
-    assert everything(filled) == before
+    assert everything(url) == before
 
 
 def _write_for_ever(url: str, queue) -> None:
@@ -294,25 +268,25 @@ def _write_for_ever(url: str, queue) -> None:
         queue.put(i)
 
 
-def test_killed_server_loses_nothing_that_was_stored(filled: str) -> None:
+def test_killed_server_loses_nothing_that_was_stored(url: str) -> None:
     running = postgresql.server()
     context = multiprocessing.get_context("spawn")
     queue = context.Queue()
-    writer = context.Process(target=_write_for_ever, args=(filled, queue))
+    writer = context.Process(target=_write_for_ever, args=(url, queue))
     writer.start()
     stored = [queue.get(timeout=60) for _ in range(4)]
-    with open_database(filled) as reader:
+    with open_database(url) as reader:
         running.kill()
         with pytest.raises(DatabaseUnreachable, match="server went away"):
             reader.sessions()
     with pytest.raises(DatabaseUnreachable):
-        open_database(filled)
+        open_database(url)
     running.start()
     writer.join(60)
     while not isinstance(stored[-1], str):
         stored.append(queue.get(timeout=10))
     assert stored.pop() == "DatabaseUnreachable"
-    with open_database(filled) as database:
+    with open_database(url) as database:
         names = [info.name for info in database.sessions()]
         # One more than it was told of may have been stored: the answer got lost, not the session.
         assert names[: 2 + len(stored)] == ["monday", "tuesday", *(f"day {i}" for i in stored)]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pc2grid.errors import LimitExceeded, LogCorrupt
+from pc2grid.errors import LimitExceeded, LogCorrupt, LogTruncated
 from pc2grid.io.containers.bounded_file import BoundedFile
 from tests.helpers.memory import bounded_memory
 
@@ -22,8 +22,7 @@ def file(tmp_path: Path) -> BoundedFile:
 def test_what_is_allowed_is_read(file: BoundedFile) -> None:
     assert file.read(40) == bytes(range(40))
     file.seek(95)
-    assert file.read(10) == bytes(range(95, 100))  # the end, as with every file
-    assert file.read(1) == b""
+    assert file.read(5) == bytes(range(95, 100))
 
 
 def test_more_than_the_limit_is_refused(file: BoundedFile) -> None:
@@ -31,7 +30,14 @@ def test_more_than_the_limit_is_refused(file: BoundedFile) -> None:
         file.read(41)
 
 
-@pytest.mark.parametrize("size", [101, 1 << 62, -1, -5, None])
-def test_more_than_there_is_is_damage(file: BoundedFile, size: int | None) -> None:
-    with bounded_memory(100 << 20), pytest.raises(LogCorrupt, match="where a record should begin"):
+def test_the_end_of_the_file_is_the_end_of_no_record(file: BoundedFile) -> None:
+    file.seek(95)
+    for size in (6, 101, 1 << 62):
+        with bounded_memory(100 << 20), pytest.raises(LogTruncated, match="ends within"):
+            file.read(size)
+
+
+@pytest.mark.parametrize("size", [-1, -5, None])
+def test_a_length_that_is_none_is_damage(file: BoundedFile, size: int | None) -> None:
+    with pytest.raises(LogCorrupt, match="where a record should begin"):
         file.read(size)

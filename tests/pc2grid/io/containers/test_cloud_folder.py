@@ -150,8 +150,8 @@ HEAD = b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 2
     [
         ("1.pcd", b"", PointCloudError, "without a DATA line"),
         ("1.pcd", HEAD + b"DATA binary\n" + bytes(20), PointCloudError, "20 bytes of data where 24"),
-        ("1.pcd", HEAD + b"DATA ascii\n1 2 3 4 5\n", PointCloudError, "5 numbers where 6 are declared"),
-        ("1.pcd", HEAD + b"DATA ascii\n1 2 3 4 5 six\n", PointCloudError, "not a number"),
+        ("1.pcd", HEAD + b"DATA ascii\n1 2 3 4 5\n", PointCloudError, "1 x 5 numbers as text where 2 x 3"),
+        ("1.pcd", HEAD + b"DATA ascii\n1 2 3 4 5 six\n", PointCloudError, "not a line of numbers"),
         ("1.pcd", HEAD + b"DATA zipped\n", UnsupportedSchema, "'zipped'"),
         ("1.pcd", HEAD.replace(b"WIDTH 2", b"WIDTH x") + b"DATA ascii\n", PointCloudError, "makes no sense"),
         ("1.pcd", HEAD.replace(b"WIDTH 2", b"WIDTH -2") + b"DATA binary\n", PointCloudError, "negative"),

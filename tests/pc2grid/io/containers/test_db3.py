@@ -1,13 +1,8 @@
-"""rosbag2 .db3 files: damage is named with the command that mends it; what a killed recorder left is read."""
+"""rosbag2 .db3 files: damage, and what a killed recorder left, is named with the command that mends it."""
 
 from __future__ import annotations
 
-import os
-import shutil
 import sqlite3
-import stat
-import struct
-import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -81,7 +76,7 @@ def test_a_db3_that_ends_too_early(tmp_path: Path) -> None:
     for size in range(len(whole) - 1, 12 * PAGE, -len(whole) // 7):
         path.write_bytes(whole[:size])
         for recover in (False, True):
-            with pytest.raises(LogTruncated, match=rf"log\.db3: ends after \d+ of \d+ bytes .*{MENDS}"):
+            with pytest.raises(LogCorrupt, match=rf"log\.db3: a damaged \.db3: .*{MENDS}"):
                 read(path, CONFIG, recover=recover)
 
 
@@ -118,7 +113,7 @@ def test_an_index_that_misses_messages_is_noticed(tmp_path: Path) -> None:
     assert content[at + 4] == 25
     content[at + 4] = 20
     path.write_bytes(content)
-    with pytest.raises(LogCorrupt, match=r"index of times disagree .*sqlite3"):
+    with pytest.raises(LogCorrupt, match=r"a damaged \.db3: .*sqlite3"):
         read(path)
 
 
@@ -131,7 +126,7 @@ def test_a_topic_that_is_lost(tmp_path: Path) -> None:
     content[cell + 1] = 40  # topic 2 is now 40
     path.write_bytes(content)
     before = psutil.Process().num_fds()
-    with pytest.raises(LogCorrupt, match=r"messages, topics and index .*sqlite3") as caught:
+    with pytest.raises(LogCorrupt, match=r"messages whose topic is missing .*sqlite3") as caught:
         read(path)
     assert psutil.Process().num_fds() == before, caught
 
@@ -139,7 +134,7 @@ def test_a_topic_that_is_lost(tmp_path: Path) -> None:
 def test_a_message_above_the_limit_is_refused(tmp_path: Path) -> None:
     path = db3(tmp_path)
     with pytest.raises(
-        LimitExceeded, match=r"log\.db3: a message has more than 5000 bytes .*max_record_bytes"
+        LimitExceeded, match=r"log\.db3: a message has \d+ bytes; the limit is 5000 .*max_record_bytes"
     ):
         read(path, ReadConfig(assume_identity=True, max_record_bytes=5000))
 
@@ -157,114 +152,19 @@ def test_a_header_that_is_damaged(tmp_path: Path) -> None:
 # --- recorders that were killed -----------------------------------------------------------------------
 
 
-def killed(folder: Path, commits: int) -> Path:
-    """A .db3 whose last messages are in its write-ahead log, committed in so many steps."""
-    source = write_rosbag2(folder / "log", drive()) / "log.db3"
-    with closing(sqlite3.connect(source)) as db:
+@pytest.mark.fault(6)
+def test_what_the_recorder_left_in_the_log_is_not_passed_over(tmp_path: Path) -> None:
+    path = write_rosbag2(tmp_path / "log", drive()) / "log.db3"
+    with closing(sqlite3.connect(path)) as db:
         db.execute("PRAGMA journal_mode=WAL")
-        rows = db.execute("SELECT * FROM messages WHERE id > 5").fetchall()
         db.execute("DELETE FROM messages WHERE id > 5")
         db.commit()
+        for recover in (False, True):
+            with pytest.raises(LogTruncated, match=r"log\.db3: its recorder was killed.*wal_checkpoint"):
+                read(path, recover=recover)
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        db.execute("PRAGMA wal_autocheckpoint=0")
-        size = -(-len(rows) // commits)
-        for first in range(0, len(rows), size):
-            db.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows[first : first + size])
-            db.commit()
-        for name in ("log.db3", "log.db3-wal"):
-            shutil.copy(source.with_name(name), folder / name)
-    assert (folder / "log.db3-wal").stat().st_size > PAGE
-    return folder / "log.db3"
-
-
-@pytest.mark.fault(6)
-def test_what_the_recorder_left_in_the_log_is_read(tmp_path: Path) -> None:
-    path = killed(tmp_path, 1)
-    before = {file.name: file.read_bytes() for file in tmp_path.iterdir() if file.is_file()}
-    for recover in (False, True):
-        scans, report = read(path, recover=recover)
-        check_drive(scans)
-        assert not report.lossy
-        assert any("did not close the file" in w for w in report.warnings)
-    assert {file.name: file.read_bytes() for file in tmp_path.iterdir() if file.is_file()} == before
-
-
-@pytest.mark.fault(6)
-def test_of_the_log_only_what_was_committed_counts(tmp_path: Path) -> None:
-    path = killed(tmp_path, 4)
-    wal = path.with_name("log.db3-wal")
-    content = bytearray(wal.read_bytes())
-    content[-100] ^= 1  # in the last commit
-    path = killed(tmp_path / "again", 4)
-    for damaged in (content, content[:-100]):
-        wal.write_bytes(damaged)
-        with closing(sqlite3.connect(wal.with_name("log.db3"))) as db:  # SQLite's own recovery, which writes
-            expected = db.execute("SELECT timestamp FROM messages ORDER BY timestamp, id").fetchall()
-        assert 5 < len(expected) < 25
-        path.with_name("log.db3-wal").write_bytes(damaged)
         with open_log(path) as log:
-            assert log.info.message_count == len(expected)
-            assert any("did not close the file" in w for w in log.report().warnings)
-
-
-def test_a_log_of_another_file_is_not_read(tmp_path: Path) -> None:
-    path = write_rosbag2(tmp_path / "log", drive()) / "log.db3"
-    for content in (b"junk", bytes(5000), b"\x37\x7f\x06\x82" + bytes(5000)):
-        path.with_name("log.db3-wal").write_bytes(content)
-        scans, report = read(path)
-        check_drive(scans)
-        assert any("did not close the file" in w for w in report.warnings)
-
-
-@pytest.mark.parametrize("at", [5, 14, 17, 25])
-def test_a_log_whose_beginning_is_damaged_is_not_read(tmp_path: Path, at: int) -> None:
-    path = killed(tmp_path, 1)
-    wal = path.with_name("log.db3-wal")
-    content = bytearray(wal.read_bytes())
-    content[at] ^= 4
-    wal.write_bytes(content)
-    with open_log(path) as log:
-        assert log.info.message_count == 5
-        assert any("did not close the file" in w for w in log.report().warnings)
-
-
-def test_damage_beside_a_log_is_not_passed_over(tmp_path: Path) -> None:
-    path = killed(tmp_path, 1)
-    content = bytearray(path.read_bytes())
-    content[3 * PAGE : 4 * PAGE] = b"\x55" * PAGE  # the topics, of which the log holds nothing newer
-    path.write_bytes(content)
-    with pytest.raises(LogCorrupt, match=rf"log\.db3: a damaged .*{MENDS}"):
-        read(path)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_log_beside_a_file_that_may_not_be_written(tmp_path: Path) -> None:
-    path = killed(tmp_path, 1)
-    path.chmod(stat.S_IRUSR)
-    with pytest.raises(LogCorrupt, match="copy it and the -wal file beside it to a folder"):
-        read(path)
-
-
-def test_a_file_that_is_being_recorded_is_not_disturbed(tmp_path: Path) -> None:
-    path = write_rosbag2(tmp_path / "log", drive()) / "log.db3"
-    with closing(sqlite3.connect(path)) as recorder:
-        recorder.execute("PRAGMA journal_mode=WAL")
-        recorder.execute("DELETE FROM messages WHERE id > 20")
-        recorder.commit()
-        # In a process of its own: locks of one process do not exclude each other.
-        code = "import sys; from pc2grid.io import open_log; open_log(sys.argv[1])"
-        command = [sys.executable, "-c", code, str(path)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert "log.db3: cannot be read: " in done.stderr
-        assert "copy it and the -wal file beside it" in done.stderr
-        recorder.execute("DELETE FROM messages WHERE id > 10")
-        recorder.commit()
-        copy = tmp_path / "copy"
-        copy.mkdir()
-        for name in ("log.db3", "log.db3-wal"):
-            shutil.copy(path.with_name(name), copy / name)
-    with open_log(copy / "log.db3") as log:
-        assert log.info.message_count == 10
+            assert log.info.message_count == 5
 
 
 def test_junk_behind_the_magic_is_refused(tmp_path: Path) -> None:
@@ -309,30 +209,6 @@ def test_a_db3_of_an_old_rosbag2_has_no_definitions(tmp_path: Path) -> None:
             )
     db.close()
     check_drive(read(path)[0])
-
-
-def test_what_is_no_whole_db3(tmp_path: Path) -> None:
-    folder = write_rosbag2(tmp_path / "log", drive())
-    path = folder / "log.db3"
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(
-        LogTruncated, match=r"log\.db3: ends after \d+ of \d+ bytes.*sqlite3 log\.db3 \.recover"
-    ):
-        read(path)
-    path.write_bytes(whole[:50])
-    with pytest.raises(LogTruncated, match="ends after 50 bytes"):
-        read(path)
-    page = struct.unpack(">H", whole[16:18])[0]
-    path.write_bytes(whole[:page] + b"\x55" * (len(whole) - page))
-    with pytest.raises(LogCorrupt, match=r"log\.db3: .*malformed"):
-        read(path)
-    other = tmp_path / "other.db3"
-    with sqlite3.connect(other) as db:
-        db.execute("CREATE TABLE cookies(x)")
-    db.close()
-    with pytest.raises(NotALog, match=r"not a rosbag2 \.db3"):
-        read(other)
 
 
 def test_a_message_that_unpacks_without_end_is_refused(tmp_path: Path) -> None:

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from pc2grid.config import ReadConfig
-from pc2grid.io.containers.bag import BagSource
-from pc2grid.io.containers.db3 import Db3Source
 from pc2grid.io.containers.mcap import McapSource
+from pc2grid.io.containers.rosbags_file import RosbagsFile
 from pc2grid.io.message_source import MessageSource
 from tests.helpers.recordings import (
     STEP,
@@ -83,8 +82,8 @@ def check(messages: list[Message], *sources: MessageSource) -> None:
 def test_a_bag(tmp_path: Path, compression: str, order: Callable[[list[Message]], list[Message]]) -> None:
     messages = order(at_odd_times("ros1"))
     path = write_bag(tmp_path / "a.bag", messages, compression, chunk_bytes=3000)
-    check(messages, BagSource(path, CONFIG))
-    found = everything(BagSource(path, CONFIG), {m.topic for m in messages}, (None, None))
+    check(messages, RosbagsFile(path, CONFIG, is_bag=True))
+    found = everything(RosbagsFile(path, CONFIG, is_bag=True), {m.topic for m in messages}, (None, None))
     assert [m[2] for m in found] == sorted(m.log_time_ns for m in messages)
 
 
@@ -99,7 +98,7 @@ def test_a_topic_of_a_bag_that_has_no_messages(tmp_path: Path) -> None:
         out.add_connection("/silent", "sensor_msgs/msg/LaserScan", typestore=ros("ros1").store)
         for topic, _, log_time_ns, data in messages:
             out.write(of[topic], log_time_ns, data)
-    source = BagSource(tmp_path / "a.bag", CONFIG)
+    source = RosbagsFile(tmp_path / "a.bag", CONFIG, is_bag=True)
     assert {t.topic: t.message_count for t in source.info.topics}["/silent"] == 0
     check(messages, source)
 
@@ -108,8 +107,8 @@ def test_a_topic_of_a_bag_that_has_no_messages(tmp_path: Path) -> None:
 def test_a_db3(tmp_path: Path, order: Callable[[list[Message]], list[Message]]) -> None:
     messages = order(at_odd_times())
     (path,) = write_rosbag2(tmp_path / "log", messages).glob("*.db3")
-    check(messages, Db3Source(path, CONFIG))
-    found = everything(Db3Source(path, CONFIG), {m.topic for m in messages}, (None, None))
+    check(messages, RosbagsFile(path, CONFIG, is_bag=False))
+    found = everything(RosbagsFile(path, CONFIG, is_bag=False), {m.topic for m in messages}, (None, None))
     assert [m[2] for m in found] == sorted(m.log_time_ns for m in messages)
 
 

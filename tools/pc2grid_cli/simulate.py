@@ -11,12 +11,11 @@ from pydantic import ValidationError
 from pc2grid.errors import ConfigError
 from pc2grid.io.atomic import require_writable
 from pc2grid.model import OccupancyGrid
-from pc2grid.simulate import Building, SimulatedSession, load_building
+from pc2grid.simulate import Building, SimulatedSession, SimulationConfig, load_building, simulate_session
+from pc2grid.simulate.config import OdometryConfig
 from pc2grid_cli import console
+from pc2grid_cli.json_schemas import Simulate
 from pc2grid_cli.options import AsJson, Force, SensorName
-from pc2grid_lab.documents import Simulate
-from pc2grid_lab.worlds import ChangeConfig, WorldConfig, simulate_session
-from pc2grid_lab.worlds.change import Change
 
 
 def simulate_command(
@@ -33,13 +32,6 @@ def simulate_command(
     length: Annotated[float, typer.Option(min=0.1, metavar="M", help="metres to drive")] = 40.0,
     seed: Annotated[int, typer.Option(min=0, help="route, clutter, noise and odometry")] = 0,
     clutter: Annotated[int, typer.Option(min=0, help="movable objects in the way")] = 30,
-    walkers: Annotated[int, typer.Option(min=0, help="people who walk about meanwhile")] = 0,
-    change: Annotated[
-        float, typer.Option(min=0, max=1, help="share of doors and furniture that differ from the building")
-    ] = 0.0,
-    relief: Annotated[float, typer.Option(min=0, max=2, help="things on a metre of wall")] = 0.0,
-    glass: Annotated[float, typer.Option(min=0, max=1, help="share of the walls that is glass")] = 0.0,
-    mirrors: Annotated[float, typer.Option(min=0, max=0.5, help="share of the walls that is mirror")] = 0.0,
     start: Annotated[
         tuple[float, float] | None,
         typer.Option(metavar="X Y", help="where to start in the map; default: anywhere"),
@@ -57,39 +49,24 @@ def simulate_command(
     Example: pc2grid simulate map.yaml drive.mcap --sensor depth --length 20
     """
     grid = _building(files, force)
-    config = _world(
+    config = _config(
         length_m=length,
         seed=seed,
         clutter=clutter,
-        walkers=walkers,
         start_m=start,
-        change={
-            "doors": change,
-            "furniture": change,
-            "relief_per_m": relief,
-            "glass": glass,
-            "mirrors": mirrors,
-        },
         building_seed=building_seed,
-        odometry={"enabled": not no_odometry},
+        odometry=OdometryConfig(enabled=not no_odometry),
     )
     with console.of(context).progress(f"simulate {sensor.value}") as update:
-        made, differs = simulate_session(
-            files[-1],
-            sensor=sensor.value,
-            grid=grid,
-            config=config,
-            progress=update,
-            force=force,
+        made = simulate_session(
+            files[-1], sensor=sensor.value, grid=grid, config=config, progress=update, force=force
         )
     if made.clutter < clutter:
         console.warn(f"only {made.clutter} of {clutter} pieces of clutter could be placed")
     if json:
-        console.print_json(_document(made, differs))
+        console.print_json(_document(made))
         return
     print(f"{made.path}: {made.scans} {made.sensor} scans, {made.length_m:.1f} m in {made.duration_s:.1f} s")
-    if change or relief or glass or mirrors:
-        print(f"against the building as drawn: {differs.describe()}")
     print(f"{made.truth_path}: {made.scans} true poses of base_link in the map frame")
 
 
@@ -104,16 +81,16 @@ def _building(files: list[Path], force: bool) -> OccupancyGrid | Building | None
     return load_building(files[0]) if len(files) == 2 else None
 
 
-def _world(change: dict[str, float], **given: Any) -> WorldConfig:
+def _config(**given: Any) -> SimulationConfig:
     """Raises ConfigError for a value that does not fit."""
     try:
-        return WorldConfig.model_validate({**given, "change": ChangeConfig(**change)})
+        return SimulationConfig(**given)
     except ValidationError as error:
         first = error.errors()[0]
         raise ConfigError(f"{first['loc'][0]}: {first['msg']}, got {first['input']}") from error
 
 
-def _document(made: SimulatedSession, differs: Change) -> Simulate:
+def _document(made: SimulatedSession) -> Simulate:
     return {
         "schema_version": 1,
         "recording": str(made.path),
@@ -123,5 +100,4 @@ def _document(made: SimulatedSession, differs: Change) -> Simulate:
         "duration_s": made.duration_s,
         "length_m": made.length_m,
         "clutter": made.clutter,
-        "change": differs.counts(),
     }

@@ -1,24 +1,26 @@
 """What a database stores of a session, as one frozen type: the session map, its submaps and signatures.
 
-`StoredSession` is all there is to say about the content of a database: `signature.database.codec` turns it
-into a document and arrays by its fields. A field of one of its types is stored without another line.
+`StoredSession` is all there is to say about the content of a database: pydantic turns its parts into plain
+values and back, by the types of their fields. A field of one of its types is stored without another line.
 """
 
 from __future__ import annotations
 
-import json
+import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Optional, get_type_hints
 
 import numpy as np
+from pydantic import ConfigDict, TypeAdapter
 
 from pc2grid.arrays import F32, F64, freeze
 from pc2grid.errors import DatabaseError
 from pc2grid.model import Loop, OccupancyGrid, PointMap, Trajectory
 from pc2grid.submaps.junction_graph import GraphArrays, graph_from_arrays, graph_to_arrays, junction_graph
 from pc2grid.submaps.partition import divide
-from signature.database import codec, validation
+from signature.database import validation
+from signature.database.arrays import clean, pack, to_json, unpack
 from signature.database.protocol import BuildingFrame, Entry, SessionInfo
 from signature.describe import describe
 from signature.seen_places import SeenPlaces
@@ -74,7 +76,7 @@ class SubmapArrays:
             np.array([submap.center_m for submap in submaps]),
             submap_id=[submap.submap_id for submap in submaps],
         )
-        return SubmapArrays(**{name: getattr(table, name) for name in codec.fields_of(SubmapArrays)})
+        return SubmapArrays(**{field.name: getattr(table, field.name) for field in fields(SubmapArrays)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,19 +93,32 @@ class StoredSession:
     loops: tuple[Loop, ...]
     graph: GraphArrays
     points: PointMap | None
-    submaps: SubmapArrays = field(metadata=codec.UNCOMPRESSED)
+    submaps: SubmapArrays
     seen: SeenPlaces
     frame: BuildingFrame | None = None
 
 
-PARTS = tuple(codec.fields_of(StoredSession))
-"""The parts of a session; all but the first are read only when they are asked for."""
-SEARCHED = ("info", "grid", "submaps")
+PARTS = tuple(field.name for field in fields(StoredSession))[1:]
+"""The parts of a session beside its info; each is read only when it is asked for."""
+SEARCHED = ("grid", "submaps")
 """The parts that every search reads."""
 RECOVERED = ("graph", "points", "submaps", "seen", "frame")
 """The parts that a session can lose: see `completed`."""
-ADDED = ("frame",)
-"""The parts that a session gets after it was stored; without them, nothing in its document tells of them."""
+_UNCOMPRESSED = ("submaps",)
+"""Stored as they are, because a search reads all of them."""
+_CONFIG = ConfigDict(arbitrary_types_allowed=True, extra="forbid", allow_inf_nan=False)
+
+
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    """pydantic takes a configuration for a type that may be None, and none for a dataclass alone."""
+    optional: Any = Optional[kind]  # noqa: UP045 - a type that is made here
+    return TypeAdapter(optional, config=_CONFIG)
+
+
+_ADAPTERS = {
+    name: _adapter(kind) for name, kind in get_type_hints(StoredSession, include_extras=True).items()
+}
+"""What turns a part into plain values and back, by the types of its fields."""
 
 
 def stored_session(entry: Entry) -> StoredSession:
@@ -171,46 +186,41 @@ def stored_name(name: str) -> str:
     """The name of a session as it is stored. Raises DatabaseError if it is empty."""
     if not name.strip():
         raise DatabaseError("the name of a session is empty", hint="give it a name")
-    return codec.clean(name)
+    return clean(name)
 
 
-def encode(session: StoredSession) -> tuple[str, dict[str, codec.Packed]]:
-    """The document and the arrays of a session."""
-    content: dict[str, Any] = {}
-    packed: dict[str, codec.Packed] = {}
-    for part in fields(StoredSession):
-        arrays: dict[str, codec.Array] = {}
-        value = getattr(session, part.name)
-        if part.name in ADDED and value is None:
-            continue
-        content[part.name] = codec.encode(codec.fields_of(StoredSession)[part.name], value, part.name, arrays)
-        compress = part.metadata.get("compress", True)
-        packed |= {name: codec.pack(array, compress=compress) for name, array in arrays.items()}
-    return codec.to_json(content), packed
+def encode_info(info: SessionInfo) -> str:
+    """The document of a session."""
+    return to_json(_ADAPTERS["info"].dump_python(info))
 
 
-def with_frame(document: str, frame: BuildingFrame | None) -> str:
-    """The document of a session with another place in its building; None: with none."""
-    content = json.loads(document)
-    content.pop("frame", None)
-    if frame is not None:
-        content["frame"] = codec.encode(BuildingFrame, frame, "frame", {})
-    return codec.to_json(content)
+@functools.lru_cache(maxsize=256)
+def decode_info(document: str) -> SessionInfo:
+    """The inverse of `encode_info`. Raises ValidationError. Cached: each part is compared with it."""
+    info: SessionInfo | None = _ADAPTERS["info"].validate_json(document)
+    if info is None:
+        raise ValueError("a document without content")
+    return info
 
 
-def decode(part: str, content: Any, arrays: dict[str, codec.Array], others: Mapping[str, Any]) -> Any:
-    """A part of a session. Raises ValueError for implausible content, and many others for damaged content.
+def encode(part: str, value: Any) -> bytes:
+    """A part of a session as it is stored."""
+    content, arrays = _ADAPTERS[part].dump_python(value), {}
+    if isinstance(content, dict):
+        arrays = {name: field for name, field in content.items() if isinstance(field, np.ndarray)}
+        content = {name: field for name, field in content.items() if name not in arrays}
+    return pack(content, arrays, compress=part not in _UNCOMPRESSED)
 
-    content : the document. arrays : those of the part, by their path. others : the parts that it is compared
-    with: always the info, and the grid if that is known.
+
+def decode(part: str, data: bytes, others: Mapping[str, Any]) -> Any:
+    """The inverse of `encode`. Raises ValueError for implausible content, and others for damaged content.
+
+    others : the parts that it is compared with: always the info, and the grid if that is known.
     """
-    if isinstance(content, dict) and part in ADDED and part not in content:
-        return None
-    if not isinstance(content, dict) or part not in content:
-        raise ValueError(f"the document has no {part}")
-    value = codec.decode(codec.fields_of(StoredSession)[part], content[part], part, arrays)
-    if arrays:
-        raise ValueError(f"{min(arrays)} is not one of its arrays")
+    content, arrays = unpack(data)
+    value = _ADAPTERS[part].validate_python({**content, **arrays} if isinstance(content, dict) else content)
+    if value is None and part not in ("points", "frame"):
+        raise ValueError("is not there")
     if part in _CHECKS:
         _CHECKS[part](value, others["info"], others.get("grid"))
     return value
@@ -228,14 +238,14 @@ def _check_trajectory(trajectory: Trajectory, info: SessionInfo, _: object) -> N
 
 
 def _check_graph(graph: GraphArrays, _: SessionInfo, grid: OccupancyGrid | None) -> None:
-    validation.check_graph(graph, grid)
     graph_from_arrays(graph)
+    if grid is not None:
+        validation.check_on_map(graph.center_m, grid, "node")
 
 
 def _check_submaps(submaps: SubmapArrays, info: SessionInfo, grid: OccupancyGrid | None) -> None:
     _expect(len(submaps), info.submaps, "submaps")
     validation.check_ids(submaps.submap_id)
-    validation.check_near(submaps.center_m, "submap")
     if grid is not None:
         validation.check_on_map(submaps.center_m, grid, "submap")
     if len(submaps):
@@ -243,18 +253,6 @@ def _check_submaps(submaps: SubmapArrays, info: SessionInfo, grid: OccupancyGrid
         validation.check_bins(*bins, info.provenance.config)
     for name in ("boundary", "freespace"):
         validation.check_histograms(getattr(submaps, name), name)
-    if (submaps.symmetry < 0).any():
-        row = int((submaps.symmetry < 0).any(axis=1).argmax())
-        raise ValueError(f"submap {submaps.submap_id[row]} has a symmetry score below 0")
-
-
-def _check_seen(seen: SeenPlaces, info: SessionInfo, _: object) -> None:
-    validation.check_seen(seen, info.submaps)
-
-
-def _check_frame(frame: BuildingFrame | None, _: SessionInfo, __: object) -> None:
-    if frame is not None:
-        validation.check_covariance(frame.covariance)
 
 
 def _expect(found: int, stored: int, what: str) -> None:
@@ -269,7 +267,6 @@ _CHECKS: dict[str, Callable[[Any, SessionInfo, OccupancyGrid | None], None]] = {
     "graph": _check_graph,
     "points": lambda points, info, grid: validation.check_points(points),
     "submaps": _check_submaps,
-    "seen": _check_seen,
-    "frame": _check_frame,
+    "seen": lambda seen, info, grid: validation.check_seen(seen, info.submaps),
 }
 """What must be true of a part, beside the types of its fields."""
