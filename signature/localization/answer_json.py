@@ -26,6 +26,13 @@ class Pose(TypedDict):
     yaw: float
 
 
+class Labelled(TypedDict):
+    """Where a session was recorded, in the user's words; null: not known."""
+
+    building: str | None
+    floor: str | None
+
+
 class StampedPose(Pose):
     """The base in the map frame at the query's last scan; covariance (3, 3) of x, y, yaw."""
 
@@ -33,15 +40,13 @@ class StampedPose(Pose):
     covariance: list[list[float]]
 
 
-class Hypothesis(Pose):
+class Hypothesis(Pose, Labelled):
     """A place that fits. Equal `place`: the same place in the maps of different sessions. frame: of the
     building, in which the pose is; null: the map frame of the session. submap_id is null if the whole map was
     searched. score and overlap: shares of what both sides see, 0..1."""
 
     session: str
     frame: str | None
-    building: str | None
-    floor: str | None
     submap_id: int | None
     place: int
     score: float
@@ -113,7 +118,7 @@ class PoseInSpace(TypedDict):
     before: float
 
 
-class Result(TypedDict):
+class Result(Labelled):
     """What is found. frame: of the building, in which the poses are if the session was joined with others;
     null: the map frame of the session. T_map_odom puts the query's own frame into it. confidence: the
     probability that the best hypothesis is right. hypotheses: best first. prior: null if nothing was known
@@ -123,8 +128,6 @@ class Result(TypedDict):
     status: Status
     session: str | None
     frame: str | None
-    building: str | None
-    floor: str | None
     pose: StampedPose | None
     T_map_odom: Pose | None
     confidence: float

@@ -21,6 +21,7 @@ from pc2grid.model import Consistency, OdometryCheck, ThreeDigits, UncertainStre
 from signature.config import Config
 from signature.database.protocol import Problem
 from signature.localization.answer_json import (
+    Labelled,
     Pose,
     PoseInSpace,
     Result,
@@ -34,6 +35,38 @@ from signature.localization.belief import State
 
 Document = TypeVar("Document")
 CheckStatus = Literal["fine", "lost", "unsure"]
+
+
+class Printed(TypedDict):
+    """What every document says."""
+
+    schema_version: Version
+
+
+class OfDatabase(Printed):
+    """A document about a database: its path, or its URL without a password."""
+
+    database: str
+
+
+class OfFile(Printed):
+    """A document about a file."""
+
+    path: str
+    format: str
+    warnings: list[str]
+
+
+class Live(TypedDict):
+    """How a running robot is followed. scans: used so far. dropped: left out because the computer is too
+    slow. reconnected: lost connections made again. lag_s, elapsed_s: seconds from a scan's arrival to its
+    use, and for this look."""
+
+    scans: int
+    dropped: int
+    reconnected: int
+    lag_s: float
+    elapsed_s: float
 
 
 class QueryRecording(Travel):
@@ -69,12 +102,10 @@ class CheckedPose(Pose):
     stamp_ns: int
 
 
-class BetterPlace(TypedDict):
+class BetterPlace(Labelled):
     """Where the query is instead, with certainty."""
 
     session: str | None
-    building: str | None
-    floor: str | None
     pose: StampedPose | None
     confidence: float
 
@@ -85,7 +116,7 @@ class CheckedAgainst(TypedDict):
     path: str
 
 
-class CheckedPoseJudgement(TypedDict):
+class CheckedPoseJudgement(Printed):
     """What is said of a pose that the robot believes in.
 
     status: fine, lost, or unsure. probability: that the pose is right; an upper bound unless it is fine.
@@ -93,7 +124,6 @@ class CheckedPoseJudgement(TypedDict):
     registration was lost after the time of the pose. better: null unless another place is certain.
     """
 
-    schema_version: Version
     status: CheckStatus
     probability: float
     session: str
@@ -111,39 +141,28 @@ class RelocalizeCheck(CheckedPoseJudgement):
     query: QueryRecording
 
 
-class WatchCheck(CheckedPoseJudgement):
-    """A line of `pc2grid watch --check-topic --json`. path_m: travel that the judgement rests on. scans,
-    dropped, reconnected, lag_s, elapsed_s: as in those of `watch`."""
+class WatchCheck(CheckedPoseJudgement, Live):
+    """A line of `pc2grid watch --check-topic --json`. path_m: travel that the judgement rests on."""
 
     path_m: float
-    scans: int
-    dropped: int
-    reconnected: int
-    lag_s: float
-    elapsed_s: float
 
 
-class WatchedMap(TypedDict):
+class WatchedMap(Labelled):
     """The map that a pose is in: its session, and the sha256 of what the session was made from, hex."""
 
     database: str
     session: str
-    building: str | None
-    floor: str | None
     digest: str
 
 
-class Watch(TypedDict):
+class Watch(Printed, Live):
     """A line of `pc2grid watch --json`: what one look at the database said. state: searching (not located
     yet), located, doubtful (certain neither where it was nor elsewhere), lost, recovered (located elsewhere
     or again). pose: of the base at `stamp_ns`; null unless the status is `located`. T_map_odom: of
     the robot's own odometry frame. frame: of the building, in which the pose is; null: the map frame of the
     session. in_space: null if the map or the scans have no points. confidence: the probability that the best
-    place is right. published: topics on which it was said. lag_s, elapsed_s: seconds from a scan's arrival to
-    its use, and for this look. scans: used so far, dropped: left out because the computer is too slow,
-    reconnected: lost connections made again."""
+    place is right. published: topics on which it was said."""
 
-    schema_version: Version
     state: State
     status: Status
     stamp_ns: int
@@ -155,11 +174,6 @@ class Watch(TypedDict):
     in_space: PoseInSpace | None
     confidence: float
     published: list[str]
-    scans: int
-    dropped: int
-    reconnected: int
-    lag_s: float
-    elapsed_s: float
 
 
 class Topic(TypedDict):
@@ -184,12 +198,9 @@ class ChosenTopics(TypedDict):
     reason: str
 
 
-class Info(TypedDict):
+class Info(OfFile):
     """`pc2grid info --json`. choice is null, and problem says why, if `convert` could not use the log."""
 
-    schema_version: Version
-    path: str
-    format: str
     size_bytes: int
     start_ns: int
     end_ns: int
@@ -199,17 +210,13 @@ class Info(TypedDict):
     choice: ChosenTopics | None
     problem: str | None
     bytes_lost: int
-    warnings: list[str]
 
 
-class InfoMap(TypedDict):
+class InfoMap(OfFile):
     """`pc2grid info MAP --json`. origin_m: x, y of the lower left corner; free_m2, occupied_m2: areas.
     Of a cloud or mesh, voxels: points of which it was drawn, one a voxel, floor_z_m, tilt_deg: height and
     tilt of the floor in the file; 0 for a nav2 map."""
 
-    schema_version: Version
-    path: str
-    format: str
     width: int
     height: int
     resolution_m: float
@@ -219,7 +226,6 @@ class InfoMap(TypedDict):
     voxels: int
     floor_z_m: float
     tilt_deg: float
-    warnings: list[str]
 
 
 class Report(TypedDict):
@@ -243,13 +249,10 @@ class PrecisionSummary(TypedDict):
     loose: list[UncertainStretch]
 
 
-class Converted(TypedDict):
-    """What became of one input. digest: sha256 of it, hex. area_m2: free space. consistency, odometry,
+class Mapped(Labelled):
+    """A session. digest: sha256 of what it was made from, hex. area_m2: free space. consistency, odometry,
     precision: null for an imported map."""
 
-    session: str
-    building: str | None
-    floor: str | None
     source: str
     digest: str
     sensor: str
@@ -261,6 +264,12 @@ class Converted(TypedDict):
     consistency: Consistency | None
     odometry: OdometryCheck | None
     precision: PrecisionSummary | None
+
+
+class Converted(Mapped):
+    """What became of one input."""
+
+    session: str
     report: Report
 
 
@@ -275,12 +284,10 @@ class JoinedSession(TypedDict):
     bent_m: float
 
 
-class Convert(TypedDict):
+class Convert(OfDatabase):
     """`pc2grid convert --json`. unchanged: sessions that were stored already; failed: inputs left out.
     joined: where those of the new sessions lie in a building that were joined with others."""
 
-    schema_version: Version
-    database: str
     lossy: bool
     sessions: list[Converted]
     unchanged: list[str]
@@ -288,53 +295,33 @@ class Convert(TypedDict):
     joined: list[JoinedSession]
 
 
-class StoredInfo(TypedDict):
-    """A session of a database, with the versions and settings that made it. consistency: null for an imported
-    map, and for a session that was stored before it was measured."""
+class StoredInfo(Mapped):
+    """A session of a database, with the versions and settings that made it."""
 
     name: str
-    sensor: str
-    building: str | None
-    floor: str | None
-    source: str
-    digest: str
-    submaps: int
     resolution_m: float
-    area_m2: float
-    path_m: float
-    duration_s: float
-    scans: int
     lossy: bool
-    consistency: Consistency | None
-    odometry: OdometryCheck | None
-    precision: PrecisionSummary | None
     warnings: list[str]
     versions: dict[str, str]
     config: dict[str, Any]
 
 
-class DbInfo(TypedDict):
+class DbInfo(OfDatabase):
     """`pc2grid db info --json`."""
 
-    schema_version: Version
-    database: str
     sessions: list[StoredInfo]
 
 
-class DbCheck(TypedDict):
+class DbCheck(OfDatabase):
     """`pc2grid db check --json`; no problems: sound."""
 
-    schema_version: Version
-    database: str
     problems: list[Problem]
 
 
-class DbWrite(TypedDict):
+class DbWrite(OfDatabase):
     """`pc2grid db merge`, `copy`, `split`, `rename` and `remove` with `--json`. sessions: how many are in
     the database now; left_out: damage that was not copied."""
 
-    schema_version: Version
-    database: str
     sessions: int
     left_out: list[Problem]
 
@@ -358,31 +345,26 @@ class ComparedSessions(TypedDict):
     nodes: int
 
 
-class DbJoin(TypedDict):
+class DbJoin(OfDatabase):
     """`pc2grid db join --json`. stored: false with --dry-run. sessions: those that were joined. alone: the
     names of the others."""
 
-    schema_version: Version
-    database: str
     stored: bool
     pairs: list[ComparedSessions]
     sessions: list[JoinedSession]
     alone: list[str]
 
 
-class Export(TypedDict):
+class Export(OfDatabase):
     """`pc2grid export --json`; session is null if only a report was written."""
 
-    schema_version: Version
-    database: str
     session: str | None
     written: list[str]
 
 
-class Simulate(TypedDict):
+class Simulate(Printed):
     """`pc2grid simulate --json`; clutter: objects that could be placed."""
 
-    schema_version: Version
     recording: str
     truth: str
     sensor: str

@@ -7,31 +7,29 @@ from typing import Any
 # Before Python 3.12 pydantic, which makes the schemas, does not take the TypedDict of typing.
 from typing_extensions import TypedDict
 
+from pc2grid_cli.json_schemas import Printed
 from pc2grid_lab.experiments.metrics import ConfidenceError, MatrixCell
 from pc2grid_lab.experiments.recordings.changes import RowChange
 from pc2grid_lab.experiments.recordings.rows import FollowedRow, MapRow, PairRow
 from pc2grid_lab.peers.outcome import PeerCell, PeerTrial
-from signature.localization.answer_json import Version
 
 
-class ComparePaper(TypedDict):
+class ComparePaper(Printed):
     """`pc2grid compare paper --json`: a cell a map, method and noise level, measured beside published."""
 
-    schema_version: Version
     version: str
     queries: int
     seed: int
     cells: list[dict[str, Any]]
 
 
-class ComparePeers(TypedDict):
+class ComparePeers(Printed):
     """`pc2grid compare peers --json`, and its peers.json.
 
     setting: the options, the seed of the intervals, and by name the seconds that `--mapped` gives.
     not_installed: by peer, the command that installs it.
     """
 
-    schema_version: Version
     recordings: list[str]
     setting: dict[str, float]
     not_installed: dict[str, str]
@@ -39,13 +37,12 @@ class ComparePeers(TypedDict):
     trials: list[PeerTrial]
 
 
-class CompareRecordings(TypedDict):
+class CompareRecordings(Printed):
     """`pc2grid compare recordings --json`; without `changes` its real.json. program: changes with any source
     file of the product and with the catalogue; cpu_s: of all commands together. changes: against the table
     of the run before; empty if there is none.
     """
 
-    schema_version: Version
     program: str
     commit: str
     quick: bool
@@ -80,11 +77,10 @@ class Ablation(TypedDict):
     recall: dict[str, dict[str, dict[str, float | None]]]
 
 
-class CompareSensors(TypedDict):
+class CompareSensors(Printed):
     """`pc2grid compare sensors --json`, and its matrix.json. outside_the_map: trials where the map has not
     been. change: by plan, what differs in a session from the plan, mean of some sessions."""
 
-    schema_version: Version
     plans: list[str]
     queries: int
     setting: dict[str, float]
