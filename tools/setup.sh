@@ -2,7 +2,8 @@
 # Make .venv and install pc2grid with its tools for developers into it. Called by the Makefile.
 #
 # open3d needs five libraries of the system, even without a screen. Where they are missing, root gets
-# them from apt; anyone else is told the one line to type.
+# them from apt; anyone else is told the one line to type. The same holds for chromium, in which tests look at
+# pages; without it they are skipped.
 set -eu
 
 fail() {
@@ -33,10 +34,15 @@ apt_install() { # why, then package names
     has_apt || fail "$why; install what your system calls: $*"
     is_root || fail "$why; install with:" "sudo apt-get update && sudo apt-get install -y $*"
     echo "setup: $why; installing $*"
-    apt-get update -q >&2 || echo "setup: apt-get update failed, trying with the lists that are there" >&2
-    DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends "$@" >&2 ||
-        fail "apt-get could not install $*"
+    apt_get "$@" || fail "apt-get could not install $*"
 }
+
+apt_get() { # package names
+    apt-get update -q >&2 || echo "setup: apt-get update failed, trying with the lists that are there" >&2
+    DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends "$@" >&2
+}
+
+has_browser() { command -v chromium >/dev/null 2>&1 || command -v chromium-browser >/dev/null 2>&1; }
 
 missing_libraries() { # prints the packages that hold what cannot be loaded
     "$1" - <<'END'
@@ -89,6 +95,12 @@ watched() { # command and arguments
 packages=$(missing_libraries "$python")
 # shellcheck disable=SC2086  # one word per package
 [ -z "$packages" ] || apt_install "open3d needs libraries that are missing here" $packages
+
+if ! has_browser && has_apt && is_root; then
+    echo "setup: tests look at pages in chromium; installing it"
+    apt_get chromium || :
+fi
+has_browser || echo "setup: no chromium, so tests of pages are skipped; on Debian: sudo apt-get install chromium" >&2
 
 .venv/bin/python -c 'import pip' >/dev/null 2>&1 || "$python" -m venv --clear .venv
 echo "setup: installing into .venv with $(.venv/bin/python --version) (the first time takes some minutes)"
