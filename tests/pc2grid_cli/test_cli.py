@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import signal
@@ -10,19 +12,37 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from pc2grid.io.nav2_map import save_map
 from pc2grid.model import OccupancyGrid
+from pc2grid_cli.console import Console
+from pc2grid_cli.main import app
 from tests.helpers.interruptible import interruptible
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def pc2grid(*arguments: object, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    return python("from pc2grid_cli.main import main; main()", *arguments, cwd=cwd, **environment)
+    """The program as its entry point runs it, but in this process: starting one takes a second."""
+    out, err, before, terminal = io.StringIO(), io.StringIO(), Path.cwd(), Console()
+    words = [*map(str, arguments)]
+    os.chdir(cwd)
+    try:
+        with (
+            mock.patch.dict(os.environ, {"PC2GRID_CONFIG": "", "COLUMNS": "200", **environment}),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
+            code = terminal.run(lambda: app(words, prog_name="pc2grid", standalone_mode=False, obj=terminal))
+    except SystemExit as end:
+        code = int(end.code or 0)
+    finally:
+        os.chdir(before)
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
 
 
 def python(code: str, *arguments: object, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -52,20 +72,8 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cells[88:91, :100], cells[88:91, 120:], cells[:60, 150:153], cells[120:, 80:83] = 100, 100, 100, 100
     cells[30:40, 30:50], cells[140:150, 180:186] = 100, 100
     save_map(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-2.0, -3.0)), folder / "house")
-    made = pc2grid(
-        "simulate",
-        "house.yaml",
-        "drive.mcap",
-        "--sensor",
-        "laser",
-        "--length",
-        "8",
-        "--seed",
-        "5",
-        "--clutter",
-        "0",
-        cwd=folder,
-    )
+    words = "simulate house.yaml drive.mcap --sensor laser --length 8 --seed 5 --clutter 0"
+    made = pc2grid(*words.split(), cwd=folder)
     assert made.returncode == 0, made.stderr
     return folder
 
@@ -173,19 +181,8 @@ def test_convert_export_add_and_check(house: Path, tmp_path: Path) -> None:
     assert pc2grid("db", "check", "d.submaps", cwd=tmp_path).stdout == "d.submaps: sound\n"
     info = json.loads(pc2grid("db", "info", "d.submaps", "--json", cwd=tmp_path).stdout)
     assert info["sessions"][0]["sensor"] == "laser"
-    out = pc2grid(
-        "export",
-        "d.submaps",
-        "--map",
-        "m",
-        "--trajectory",
-        "t.tum",
-        "--mcap",
-        "o.mcap",
-        "--plot",
-        "p.png",
-        cwd=tmp_path,
-    )
+    words = "export d.submaps --map m --trajectory t.tum --mcap o.mcap --plot p.png"
+    out = pc2grid(*words.split(), cwd=tmp_path)
     assert out.returncode == 0, out.stderr
     assert {p.name for p in tmp_path.iterdir()} >= {"m.yaml", "m.pgm", "t.tum", "o.mcap", "p.png"}
     assert len(np.loadtxt(tmp_path / "t.tum")) == info["sessions"][0]["scans"]
