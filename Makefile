@@ -10,12 +10,13 @@ ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 BYTE_CODE = PYTHONDONTWRITEBYTECODE=
 PYTEST_ARGS ?=
 
-.PHONY: help demo test check bench real fuzz picture docs clean
+.PHONY: help demo test nightly check bench real fuzz picture docs clean
 .DEFAULT_GOAL = help
 
 help:
 	@echo 'make demo    simulate two robots, map with one, find the other; leaves a picture in demo_out/'
 	@echo 'make test    run the tests (PYTEST_ARGS="-k name" for some of them)'
+	@echo 'make nightly what `make test` leaves out: README pasted whole, the site, kill -9, recordings; 1,000 rounds of fuzz'
 	@echo 'make check   lint, format, types, import order'
 	@echo 'make bench   time and memory of describe, look up and convert'
 	@echo 'make real    every real recording, against examples/real.md (QUICK=1: some of them); data: PC2GRID_DATA'
@@ -35,6 +36,10 @@ demo: $(READY)
 test: $(READY)
 	$(BYTE_CODE) $(ONE_THREAD) $(BIN)/python -m pytest -q -n auto --dist loadfile $(PYTEST_ARGS)
 
+nightly: $(READY)
+	$(BYTE_CODE) $(ONE_THREAD) $(BIN)/python -m pytest -q -n auto --dist loadfile -m nightly $(PYTEST_ARGS)
+	$(ONE_THREAD) PC2GRID_FUZZ=1000 $(BIN)/python -m pytest -q -n auto --dist worksteal $(FUZZED) $(PYTEST_ARGS)
+
 check: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -53,10 +58,11 @@ real: $(READY)
 
 # Half a million small files: in memory, where there is a place for that.
 FUZZ_FOLDER = $(shell test -w /dev/shm && echo --basetemp=/dev/shm/pc2grid-fuzz -o tmp_path_retention_policy=failed)
-FUZZ = $(ONE_THREAD) PC2GRID_FUZZ=20000 $(BIN)/python -m pytest -q -n auto --dist worksteal --timeout 1200 $(PYTEST_ARGS)
+FUZZED = tests/pc2grid/io/test_fuzz.py tests/test_fuzz_inputs.py
+FUZZ = $(ONE_THREAD) PC2GRID_FUZZ=20000 $(BIN)/python -m pytest -q -n auto --dist worksteal --timeout 1200 -m "" $(PYTEST_ARGS)
 
 fuzz: $(READY)
-	$(FUZZ) $(FUZZ_FOLDER) tests/pc2grid/io/test_fuzz.py tests/test_fuzz_inputs.py
+	$(FUZZ) $(FUZZ_FOLDER) $(FUZZED)
 	$(FUZZ) tests/signature/database/test_faults.py tests/signature/database/test_durability.py \
 		tests/pc2grid_cli/test_view.py -k fuzz
 

@@ -183,7 +183,7 @@ def demonstrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(900)  # half a minute of work; on a busy machine many times as long
 def test_the_readme_can_be_pasted_from_top_to_bottom(
     demonstrated: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -206,6 +206,7 @@ def test_the_readme_can_be_pasted_from_top_to_bottom(
         assert Path(file).exists(), f"README names {file}, which its commands do not make"
 
 
+@pytest.mark.nightly
 def test_the_cells_of_the_notebook_run(
     demonstrated: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

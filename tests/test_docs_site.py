@@ -39,12 +39,14 @@ def text_of(page: Path) -> str:
     return html.unescape(re.sub(r"<[^>]+>", "", page.read_text("utf-8")))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("command", ["", "convert", "relocalize", "db merge", "compare sensors"])
 def test_commands_are_described_as_by_help(site: Path, command: str) -> None:
     said = CliRunner().invoke(app, [*command.split(), "--help"], prog_name="pc2grid").stdout
     assert said.strip() in text_of(site / "reference" / "commands.html")
 
 
+@pytest.mark.nightly
 def test_every_setting_and_every_public_name_has_its_place(site: Path) -> None:
     settings = text_of(site / "reference" / "settings.html")
     assert "radius_m = 5.0" in settings and "[relocalize]" in settings
@@ -56,6 +58,7 @@ def test_every_setting_and_every_public_name_has_its_place(site: Path) -> None:
                 assert f"{thing.__module__}.{thing.__qualname__}" in page, name
 
 
+@pytest.mark.nightly
 def test_docstrings_are_set_as_text_lists_and_code(site: Path) -> None:
     page = text_of(site / "reference" / "pc2grid.html")
     assert "stamp_ns: when the scan was taken" in page and "stamp_ns : when" not in page
@@ -64,18 +67,21 @@ def test_docstrings_are_set_as_text_lists_and_code(site: Path) -> None:
     assert "&gt;&gt;&gt; " not in re.sub(r"<pre.*?</pre>", "", raw, flags=re.DOTALL)
 
 
+@pytest.mark.nightly
 def test_the_notebook_and_the_pictures_are_there(site: Path) -> None:
     notebook = (site / "examples" / "from_log_to_answer.html").read_text("utf-8")
     assert notebook.count("data:image/png;base64,") > 4 and "session lidar" in notebook
     assert (site / "docs" / "signatures.png").is_file() and (site / "examples" / "demo.png").is_file()
 
 
+@pytest.mark.nightly
 def test_nothing_is_loaded_from_elsewhere(site: Path) -> None:
     for page in site.rglob("*.html"):
         tags = re.findall(r"<(?:script|link|img)\b[^>]*>", page.read_text("utf-8"))
         assert [tag for tag in tags if re.search(r"(?:src|href)=\"?https?:", tag)] == [], page.name
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
 def test_the_site_can_be_searched_without_a_server(site: Path, tmp_path: Path) -> None:
     page = (site / "docs" / "method.html").read_text("utf-8")

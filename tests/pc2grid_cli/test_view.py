@@ -573,7 +573,6 @@ def test_the_command_prints_its_address_and_stops_with_ctrl_c(desk: Path, tmp_pa
         view.wait()
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(600)  # some seconds of work; on a busy machine many times as long
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
 @pytest.mark.parametrize("end", [None, "located", "ambiguous", "error"])

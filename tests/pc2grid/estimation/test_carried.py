@@ -311,7 +311,6 @@ def level(T: F64) -> F64:
     return turn
 
 
-@pytest.mark.slow
 def test_sixteen_rings_in_the_hand_of_somebody_who_walks_need_the_gyroscope(tmp_path: Path) -> None:
     """Steps turn the lidar by up to 8 degrees more from scan to scan than the motion before says.
 
@@ -340,7 +339,7 @@ def test_sixteen_rings_in_the_hand_of_somebody_who_walks_need_the_gyroscope(tmp_
     assert worst_deg[1] > 6.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(not ROOMS.is_dir(), reason="no recording of a phone: set PC2GRID_DATA")
 @pytest.mark.parametrize(
     ("name", "with_odometry", "limit_m"),

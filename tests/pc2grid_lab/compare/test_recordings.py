@@ -103,7 +103,6 @@ def compare(data: Path, out: Path, *options: str) -> Any:
     return done
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_a_small_run(data: Path, tmp_path: Path) -> None:
     document = json.loads(compare(data, tmp_path, "--json").stdout)
@@ -160,7 +159,6 @@ def test_a_small_run(data: Path, tmp_path: Path) -> None:
     assert drive.stat().st_mtime_ns == made_ns
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_ones_own_recordings_need_no_catalogue(data: Path, tmp_path: Path) -> None:
     """Later parts of a drive are located in the map of its beginning, and judged by the poses beside it."""

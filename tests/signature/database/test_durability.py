@@ -139,6 +139,7 @@ def in_child(body: Callable[[], object]) -> tuple[int, str]:
 
 
 @pytest.mark.fault(40)
+@pytest.mark.nightly
 @pytest.mark.parametrize("part", range(4 if FUZZ else 1))
 def test_fuzz_kill_at_random_moments_of_convert(inputs: Path, tmp_path: Path, part: int) -> None:
     """Every second one while the temporary file is there, the others anywhere from the start."""
@@ -172,6 +173,7 @@ def test_fuzz_kill_at_random_moments_of_convert(inputs: Path, tmp_path: Path, pa
 
 
 @pytest.mark.fault(40)
+@pytest.mark.nightly
 def test_kill_at_random_moments_of_adding(inputs: Path, tmp_path: Path) -> None:
     """The database is the old one or the new one, whole, and what was left over is swept by the next run."""
     rng = np.random.default_rng(41)
