@@ -169,7 +169,8 @@ class Survey:
 
     def _read(self, stream: BoundedFile) -> None:
         for record in records_of(stream, whole_file=True).records:
-            self._take(record, stream.tell())
+            if not self.closed:  # what the summary repeats may be damaged
+                self._take(record, stream.tell())
             self.at = stream.tell()
             if isinstance(record, DataEnd):
                 self.closed = True

@@ -128,6 +128,16 @@ def test_a_footer_that_points_elsewhere_costs_nothing(tmp_path: Path, start: int
     assert any("the index is not usable" in warning for warning in report.warnings)
 
 
+def test_a_damaged_summary_renames_no_topic(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", drive(), chunk_size=2000)
+    whole = bytearray(path.read_bytes())
+    whole[whole.rindex(b"/tf_static") + 1] ^= 4
+    path.write_bytes(whole)
+    scans, report = read(path)
+    check_drive(scans)
+    assert any("the index is not usable" in warning for warning in report.warnings)
+
+
 @pytest.mark.parametrize("place", [3, 2000, 1 << 60])
 def test_an_index_that_points_elsewhere_is_damage(tmp_path: Path, place: int) -> None:
     path = write_mcap(tmp_path / "a.mcap", drive(), chunk_size=2000)
