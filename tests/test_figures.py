@@ -58,17 +58,18 @@ def test_elsewhere_is_what_the_page_counts() -> None:
 def test_robots_that_are_carried_away_are_those_of_the_page() -> None:
     page = " ".join((ROOT / "examples" / "real.md").read_text("utf-8").split())
     (found,) = re.findall(
-        r"Of (\d+) kidnaps of a robot that knew where it was, (\d+) are noticed, (\S+) s and (\S+) m after it was put "
-        r"down, in the median. In (\d+) of them the map shows what it sees there; it is located again (\d+) times, "
-        r"(\S+) s and (\S+) m after, in the median;.*? what it sees: (\d+) in (\d+) rows. "
+        r"Of (\d+) kidnaps of a robot that knew where it was, (\d+) are noticed, (\S+) s and (\S+) m after "
+        r"it was put down, in the median. In (\d+) of them the map shows what it sees there; it is located "
+        r"again (\d+) times, (\S+) s and (\S+) m after, in the median;.*? what it sees: (\d+) in (\d+) rows. "
         r"Of (\d+) places that can be judged, (\d+) are wrong.",
         page,
     )
     kidnaps, noticed, s, m, shown, again, again_s, again_m, alarms, rows, judged, wrong = found
     said = (
-        f"Of {kidnaps} robots that were carried away, {noticed} noticed it, after {s} s and {m} m in the median; where the "
-        f"map shows what they saw there, {again} of {shown} were located again, after {again_s} s and {again_m} m. "
-        f"{wrong} of {judged} places that they told were wrong, and in {rows} drives there were {alarms} false alarms."
+        f"Of {kidnaps} robots that were carried away, {noticed} noticed it, after {s} s and {m} m in the "
+        f"median; where the map shows what they saw there, {again} of {shown} were located again, after "
+        f"{again_s} s and {again_m} m. {wrong} of {judged} places that they told were wrong, and in {rows} "
+        f"drives there were {alarms} false alarms."
     )
     assert said in FLAT
 
