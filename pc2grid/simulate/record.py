@@ -71,28 +71,11 @@ def simulate_session(
     >>> made.truth_path.name, made.scans > 10
     ('drive.tum', True)
     """
-    refuse_existing_recording(out, force)
-    session = prepare_session(sensor=sensor, grid=grid, config=config)
-    return record_session(out, session, progress=progress, force=force)
-
-
-def refuse_existing_recording(out: str | Path, force: bool) -> None:
-    """Raises OutputError if the recording or its truth exists, unless `force`."""
-    for path in (Path(out), Path(out).with_suffix(".tum")):
-        refuse_existing(path, force)
-
-
-def record_session(
-    out: str | Path,
-    session: Session,
-    *,
-    progress: Callable[[float], None] | None = None,
-    force: bool = False,
-) -> SimulatedSession:
-    """Record a prepared session; see `simulate_session`."""
     out = Path(out)
     truth_path = out.with_suffix(".tum")
-    refuse_existing_recording(out, force)
+    for path in (out, truth_path):
+        refuse_existing(path, force)
+    session = prepare_session(sensor=sensor, grid=grid, config=config)
     count = session.scan_count
     stamps, poses = [], []
     with LogWriter(out, force=force) as log:

@@ -116,8 +116,3 @@ class Scene:
         first hit, inf without one."""
         hits: F32 = self._scene.cast_rays(self._tensor.from_numpy(rays))["t_hit"].numpy()
         return hits
-
-    def cast_with_normals(self, rays: F32) -> tuple[F32, F32]:
-        """The same, and the unit normals (N, 3) of the surfaces that were hit, on either side."""
-        found = self._scene.cast_rays(self._tensor.from_numpy(rays))
-        return found["t_hit"].numpy(), found["primitive_normals"].numpy()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,10 +29,6 @@ RAYS_PER_CAST = 300_000  # bounds the memory of one call of the ray caster
 
 # Each purpose has its own stream of random numbers, so that more clutter does not change the noise.
 _CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE, _HAND, _IMU = range(7)
-
-Cast = Callable[[F32, F64, F64, int], F32]
-"""Ranges (S, R) of rays (S, R, 6) that are cast at times (S, R) from base poses (S, R, 3); the last argument
-is the number of the first of these scans."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,19 +87,10 @@ class Session:
         shell = extrude(self.grid, self.config.wall_height_m) if self.shell is None else self.shell
         return Mesh.join([shell, *(furniture.mesh() for furniture in self.objects)])
 
-    def caster(self) -> Cast:
-        """What casts the rays of this session."""
-        scene = Scene(self.mesh())
-
-        def cast(rays: F32, times_s: F64, poses: F64, first: int) -> F32:
-            return scene.cast(rays.reshape(-1, 6)).reshape(times_s.shape)
-
-        return cast
-
     def readings(self) -> Iterator[Reading]:
         """Cast all scans, several in a call; each ray starts at the robot's pose at the time of the ray."""
         sensor = self.sensor
-        cast = self.caster()
+        scene = Scene(self.mesh())
         T = sensor.T_base_sensor
         directions = sensor.directions @ T[:3, :3].T
         batch = max(RAYS_PER_CAST // len(directions), 1)
@@ -115,7 +102,7 @@ class Session:
                 rays = _rays(poses, T[:3, 3], directions)
             else:
                 rays = np.stack([self._carried_rays(of_scan) for of_scan in times_s])
-            true_m = cast(rays, times_s, poses, first)
+            true_m = scene.cast(rays.reshape(-1, 6)).reshape(times_s.shape)
             for index, ranges in zip(indices, true_m, strict=True):
                 rng = np.random.default_rng([self.config.seed, _NOISE, int(index)])
                 yield Reading(int(index), float(index) / sensor.rate_hz, sensor.measure(ranges, rng))

@@ -30,8 +30,9 @@
 `located` means that one place has at least the mass `RelocalizeConfig.accept`; `ambiguous`, that the best
 place is at least as likely as "nowhere", z + ln prior >= 0; `not_found` all else.
 
-`pc2grid_lab.experiments.calibration` fits b, c and d to queries whose truth is known, and judges them
-on buildings that were left out.
+`pc2grid_lab.fit.posterior` fits b, c and d to queries whose truth is known, and judges them on buildings that
+were left out. They are fitted to fr079, intel, csail, aces, killian, wean, kidnap, workshop, birmingham, the
+hall, jarvis, the room and the kitchen of the catalogue of recordings.
 """
 
 from __future__ import annotations
@@ -47,25 +48,6 @@ from pc2grid.arrays import F64
 from pc2grid.matching.two_way_score import Fit
 from pc2grid.matching.walls import Walls
 from signature.localization.query import QueryMap
-
-FITTED_ON = frozenset(
-    {
-        "fr079",
-        "intel",
-        "csail",
-        "aces",
-        "killian",
-        "wean",
-        "kidnap",
-        "workshop",
-        "birmingham",
-        "hall",
-        "jarvis",
-        "room",
-        "kitchen",
-    }
-)
-"""Buildings that `POSTERIOR` was fitted on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

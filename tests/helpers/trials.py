@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from pc2grid_lab.experiments.ablation import COMBINATIONS
 from pc2grid_lab.experiments.trial import Trial
 
 
@@ -22,12 +21,7 @@ def trial(**changes: Any) -> Trial:
         "confidence": 0.95,
         "right": True,
         "error_m": 0.05,
-        "error_rad": 0.01,
         "rank": 0,
-        "alone": dict.fromkeys(COMBINATIONS, 0),
-        "agreement": 0.9,
-        "walls": 500.0,
-        "lead": 0.2,
         "look_up_ms": 10.0,
     }
     return Trial(**{**fields, **changes})

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from pc2grid.io.nav2_map import save_map
 from pc2grid.settings import dump_settings
 from pc2grid_cli.console import print_json
-from pc2grid_cli.json_schemas import documents, schema
+from pc2grid_cli.json_schemas import DOCUMENTS, schema
 from pc2grid_cli.main import app
 from signature.config import Config
 from tests.helpers.json_schema import closed, keys
@@ -81,7 +81,7 @@ def test_documents_are_as_their_schema_says(
     jsonschema.validate(json.loads(done.stdout), closed(schema(name)))
 
 
-@pytest.mark.parametrize("name", documents())
+@pytest.mark.parametrize("name", DOCUMENTS)
 def test_the_keys_of_a_document_stay(name: str) -> None:
     """Scripts rely on them. What is printed is what the schema says (the test above); more keys may come."""
     known = json.loads((Path(__file__).parent / "json_keys.json").read_text())
@@ -90,19 +90,15 @@ def test_the_keys_of_a_document_stay(name: str) -> None:
 
 def test_every_document_is_validated_by_a_test() -> None:
     elsewhere = {
-        "compare-paper": "pc2grid_lab/compare/test_paper.py",
-        "compare-peers": "pc2grid_lab/experiments/test_peers.py",
-        "compare-recordings": "pc2grid_lab/compare/test_recordings.py",
-        "compare-sensors": "pc2grid_lab/experiments/test_sensor_matrix.py",
         "watch": "pc2grid_cli/test_watch.py",
         "watch-check": "pc2grid_cli/test_known_pose.py",
     }
     for name, file in elsewhere.items():
         assert f'schema("{name}")' in (Path(__file__).parents[1] / file).read_text()
-    assert {name for name, _, _ in COMMANDS} | set(elsewhere) == set(documents())
+    assert {name for name, _, _ in COMMANDS} | set(elsewhere) == set(DOCUMENTS)
 
 
-@pytest.mark.parametrize("name", ["settings", *documents()])
+@pytest.mark.parametrize("name", ["settings", *DOCUMENTS])
 def test_schemas_are_sound_and_explained(name: str) -> None:
     done = CliRunner().invoke(app, ["config", "schema", name], catch_exceptions=False)
     document = json.loads(done.stdout)
@@ -143,7 +139,7 @@ def test_every_command_shows_an_example_that_parses(name: str, command: Any) -> 
 def test_json_is_offered_where_there_is_a_schema_and_only_there() -> None:
     for name, command in commands(get_command(app)):
         has_json = any("--json" in option.opts for option in command.params)
-        assert has_json == (name.replace(" ", "-") in documents()), name
+        assert has_json == (name.replace(" ", "-") in DOCUMENTS), name
 
 
 def test_what_is_not_known_is_null(capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,7 @@ import typer
 from pc2grid.errors import ConfigError
 from pc2grid.settings import dump_settings
 from pc2grid_cli import console
-from pc2grid_cli.json_schemas import documents, schema
+from pc2grid_cli.json_schemas import DOCUMENTS, schema
 from pc2grid_cli.options import Assignments, ConfigFile, Preset, PresetName, make_config
 
 
@@ -32,7 +32,7 @@ def config_schema_command(
 
     Example: pc2grid config schema relocalize
     """
-    names = ["settings", *documents()]
+    names = ["settings", *DOCUMENTS]
     if name is None:
         print("\n".join(names))
     elif name in names:

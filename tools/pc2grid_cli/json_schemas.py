@@ -8,8 +8,6 @@ that it does not know.
 
 from __future__ import annotations
 
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any, Literal, TypeVar
 
 from pydantic import TypeAdapter
@@ -396,13 +394,6 @@ DOCUMENTS: dict[str, type] = {
 """By command."""
 
 
-def documents() -> dict[str, type]:
-    """All documents by command: those above, and those of the laboratory where it is installed."""
-    if find_spec("pc2grid_lab") is None:
-        return DOCUMENTS
-    return {**DOCUMENTS, **import_module("pc2grid_lab.documents").DOCUMENTS}
-
-
 def plain(kind: type[Document], document: Document) -> Any:
     """A document of plain types: the frozen types in it become objects, with the digits that they declare."""
     return TypeAdapter(kind).dump_python(document, mode="json")
@@ -410,6 +401,6 @@ def plain(kind: type[Document], document: Document) -> Any:
 
 def schema(name: str) -> dict[str, Any]:
     """JSON Schema of a command's document, or of all `settings` as TOML holds them. Raises KeyError."""
-    kind = Config if name == "settings" else documents()[name]
+    kind = Config if name == "settings" else DOCUMENTS[name]
     about = TypeAdapter(kind).json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **about}

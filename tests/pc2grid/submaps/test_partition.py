@@ -136,7 +136,7 @@ def test_number_of_submaps_is_near_table_1_with_one_set_of_parameters() -> None:
     from pc2grid_lab.experiments.paper_task import read_map
 
     for name, published in SUBMAPS.items():
-        found = len(partition(read_map(DATA / "maps" / f"{name}.yaml", "paper"), PAPER))
+        found = len(partition(read_map(DATA / "maps" / f"{name}.yaml"), PAPER))
         assert abs(found / published - 1) <= 0.25, name
 
 

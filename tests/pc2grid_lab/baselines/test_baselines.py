@@ -5,15 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
-from pc2grid.errors import ConfigError
 from pc2grid.model import Submap
 from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES, Matcher, Method, make_methods
-from pc2grid_lab.baselines.opencv_shape_context import OpenCvShapeContext
-from pc2grid_lab.baselines.point_contexts import PointContexts, _mean_best_costs
 from pc2grid_lab.baselines.sdf import (
     DistanceFeatures,
     _consensus,
@@ -28,28 +24,7 @@ from pc2grid_lab.baselines.words import Words, sift, submap_image, surf
 from pc2grid_lab.experiments.paper_experiment import rotated_submap
 from tests.helpers.rooms import cross, degenerate, disc, l_shape, polygon, random_rooms, rectangle, submap_of
 
-HAS_OPENCV_SHAPES = hasattr(cv2, "createShapeContextDistanceExtractor")
-ALL = tuple(
-    name for name in METHOD_NAMES + EXTRA_METHOD_NAMES if HAS_OPENCV_SHAPES or name != "opencv_shape_context"
-)
-
-
-@pytest.mark.skipif(HAS_OPENCV_SHAPES, reason="this OpenCV has the module shape")
-def test_a_missing_module_of_opencv_is_named() -> None:
-    with pytest.raises(ConfigError, match="no Shape Context") as caught:
-        make_methods(["opencv_shape_context"])["opencv_shape_context"].fit(rooms())
-    assert caught.value.hint is not None and "opencv-contrib" in caught.value.hint
-
-
-@pytest.mark.parametrize("turned_rad", [0.0, 0.7])
-def test_opencv_gets_the_same_shape_turned(turned_rad: float) -> None:
-    """Without OpenCV's module: what is handed to it are boundary points, as (column, row)."""
-    submap = rooms()[0]
-    turned = rotated_submap(submap.grid, submap.center_m, 8.0, turned_rad)
-    points = OpenCvShapeContext().sample(turned)
-    assert points.shape[1:] == (1, 2) and 3 <= len(points) <= 100 and points.dtype == np.float32
-    column, row = points[:, 0].T.astype(int)
-    assert turned.grid.occupied[row, column].all()
+ALL = METHOD_NAMES + EXTRA_METHOD_NAMES
 
 
 def rooms() -> list[Submap]:
@@ -79,7 +54,7 @@ def test_every_method_finds_a_submap_itself(name: str, matchers: dict[str, Match
 
 
 # Bags of words are not asked: the stairs of turned walls are the only features of rooms as bare as these.
-ON_GEOMETRY = ["shape_context", "shape_rings", "point_contexts", "proposed", "sdf"]
+ON_GEOMETRY = ["shape_context", "proposed", "sdf"]
 
 
 @pytest.mark.parametrize("name", ON_GEOMETRY)
@@ -107,9 +82,7 @@ def test_degenerate_submaps_have_finite_scores(name: str, matchers: dict[str, Ma
         assert np.isfinite(matchers[name].similarities(query)).all(), query_name
 
 
-@pytest.mark.parametrize(
-    "name", ["shape_context", "point_contexts", "sdf", "sift_bow", "sift_tfidf", "proposed"]
-)
+@pytest.mark.parametrize("name", ["shape_context", "sdf", "sift_bow", "sift_tfidf", "proposed"])
 def test_a_map_of_empty_submaps_can_be_fitted(name: str) -> None:
     empty = [degenerate()["unknown"], degenerate()["free"]]
     scores = make_methods([name])[name].fit(empty).similarities(rooms()[0])
@@ -178,16 +151,6 @@ def test_shape_context_of_one_wall_by_hand() -> None:
     ring = int(np.searchsorted(rings, 4.0))
     assert np.argwhere(context > 0).tolist() == [[ring, 0], [ring, 6]]
     assert context.sum() == pytest.approx(1.0)
-    rings = ShapeContext(turns=False).context(submap_of(cells))
-    assert rings.shape == (12, 1) and rings[ring, 0] == pytest.approx(1.0)
-
-
-def test_chi_square_cost_by_hand() -> None:
-    wanted = np.array([[0.5, 0.5, 0.0]], np.float32)
-    table = np.array([[0.5, 0.5, 0.0], [0.5, 0.0, 0.5], [0.0, 0.0, 1.0]], np.float32)
-    costs = _mean_best_costs(wanted, table, np.array([0, 1, 2, 3, 3]))
-    assert costs == pytest.approx([0.0, 0.5, 1.0, 1.0], abs=1e-5)
-    assert PointContexts().contexts(degenerate()["unknown"], 10).shape == (0, 288)
 
 
 def test_distance_keypoints_sit_where_the_room_is_special() -> None:

@@ -1,30 +1,21 @@
-"""The sensor matrix: its measures over given trials, its JSON document, and one small run."""
+"""The sensor matrix: its measures over given trials, and one small run."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
-import jsonschema
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from pc2grid.simulate import SimulationConfig, office_floorplan
-from pc2grid_cli.console import json_text
-from pc2grid_cli.json_schemas import schema
-from pc2grid_lab.compare import matrix_report
-from pc2grid_lab.compare.sensors import _document
-from pc2grid_lab.experiments.ablation import Independence
-from pc2grid_lab.experiments.metrics import matrix, reliability
-from pc2grid_lab.experiments.registered_session import RegisteredSession, simulate_and_register
-from pc2grid_lab.experiments.sensor_map import SensorMap
-from pc2grid_lab.experiments.sensor_matrix import map_building, query_trials
-from signature.config import Config
-from signature.describe import describe
-from signature.localization.localizer import MapIndex
-from signature.similarity import SignatureTable
-from tests.helpers.json_schema import closed
+from pc2grid.io.nav2_map import save_map
+from pc2grid_cli.main import app
+from pc2grid_lab.compare import sensors
+from pc2grid_lab.experiments import sensor_matrix
+from pc2grid_lab.experiments.trial import matrix, reliability
+from tests.helpers.simulated_drives import office, plan
 from tests.helpers.trials import trial
 
 
@@ -34,10 +25,10 @@ def test_a_trial_consists_of_plain_json_types() -> None:
 
 
 def test_all_nine_cells_of_the_matrix_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
-    matrix_report.tables([], [])
+    sensors.print_tables([])
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
-    sensors = ("lidar", "laser", "depth")
-    assert [row[:2] for row in rows if row[-1:] == ["0"]] == [[m, q] for m in sensors for q in sensors]
+    kinds = ("lidar", "laser", "depth")
+    assert [row[:2] for row in rows if row[-1:] == ["0"]] == [[m, q] for m in kinds for q in kinds]
 
 
 def test_a_cell_counts_the_trials_in_the_map_of_their_own_building() -> None:
@@ -55,28 +46,10 @@ def test_a_cell_counts_the_trials_in_the_map_of_their_own_building() -> None:
     assert cell.located_right == pytest.approx(2 / 5)
     assert cell.wrong == pytest.approx(1 / 3)
     assert cell.ambiguous == cell.not_found == pytest.approx(1 / 5)
-    assert cell.recall == {1: pytest.approx(1 / 5), 5: pytest.approx(2 / 5), 20: pytest.approx(3 / 5)}
+    assert cell.recall == pytest.approx((1 / 5, 2 / 5, 3 / 5))
     assert cell.median_error_m == pytest.approx(0.10)
-
-
-def test_unknown_numbers_are_null_in_the_document() -> None:
-    """No trial is located rightly, no plan was used for tuning, and no signatures are compared."""
-    trials = [
-        trial(status="not_found", right=False, error_m=None, rank=-1),
-        trial(building="b", in_building=False, mapped=0.0, status="not_found", right=False),
-    ]
-    nothing = Independence(combination="boundary", same=np.empty(0), other=np.empty(0))
-    about = {"plans": ["a", "b"], "queries": 1, "setting": {"rate": 10.0, "seed": 1}, "change": {}}
-    text = json_text({**_document(trials, {"boundary": nothing}, 8.0), **about})
-    document = json.loads(text, parse_constant=pytest.fail)
-    jsonschema.validate(document, closed(schema("compare-sensors")))
-    (cell,) = document["cells"]
-    assert (cell["trials"], cell["median_error_m"], cell["recall"]["20"]) == (1, None, 0.0)
-    assert document["confidence"]["tuned on"]["brier"] is None
-    assert document["confidence"]["other plans"]["reliability"] == [[0.95, 0.0, 2]]
-    assert document["elsewhere"] == {"trials": 1, "not_found": 1, "located": 0}
-    assert document["independence"]["boundary"] == {"auc": None, "same": 0, "other": 0}
-    assert document["ablation"]["recall"]["all"]["with isovists"]["1"] is None  # nobody drove 8 m
+    (nothing,) = matrix([trial(status="not_found", right=False, error_m=None)])
+    assert nothing.median_error_m is None and nothing.wrong == 0.0
 
 
 def test_reliability_compares_confidence_with_truth() -> None:
@@ -84,25 +57,29 @@ def test_reliability_compares_confidence_with_truth() -> None:
     assert rows == [(pytest.approx((0.95 + 0.91 + 1.0) / 3), pytest.approx(2 / 3), 3)]
 
 
-def test_a_laser_finds_itself_in_a_map_made_by_another_session(tmp_path: Path) -> None:
-    plan = office_floorplan(3, 22.0, 20.0)
-    config = Config()
-    session, T_plan_map = map_building(
-        "office", plan, "laser", SimulationConfig(length_m=40, seed=1000, clutter=8), config
-    )
-    table = SignatureTable.of(
-        [describe(s, config.signature) for s in session.submaps], [s.center_m for s in session.submaps]
-    )
-    index = MapIndex({session.session: session.grid}, table, config, config)
-    sensor_map = SensorMap(name="office", sensor="laser", T_plan_map=T_plan_map, index=index)
-    queries = SimulationConfig(length_m=8, seed=4, clutter=8)
-    query = simulate_and_register(plan, "laser", queries, config, until_m=6.0)
-    query.save(tmp_path / "query.npz")
-    loaded = RegisteredSession.load(tmp_path / "query.npz")
-    trials = query_trials("office", 4, loaded, [sensor_map], (2.0, 6.0))
-    assert [t.travel_m for t in trials] == [2.0, 6.0]
-    assert trials[-1].status == "located" and trials[-1].right
-    assert trials[-1].error_m is not None and trials[-1].error_m < 0.15
-    elsewhere = replace(sensor_map, name="another building")
-    (last,) = query_trials("office", 4, loaded, [elsewhere], (2.0, 6.0))
-    assert last.travel_m == 6.0 and not last.in_building and not last.right and last.mapped == 0.0
+def test_a_laser_finds_itself_in_its_own_building_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sensor_matrix, "SENSORS", ("laser",))
+    monkeypatch.setattr(sensors, "SENSORS", ("laser",))
+    save_map(office(), tmp_path / "office")
+    save_map(plan(12.0, 9.0, [(0, 4, 7, 4), (7, 6, 7, 9), (3, 6, 3, 9)]), tmp_path / "hall")
+    words = [
+        "compare",
+        "sensors",
+        tmp_path / "office.yaml",
+        tmp_path / "hall.yaml",
+        "--out",
+        tmp_path / "out",
+    ]
+    words += ["--queries", 1, "--map-length", 30, "--clutter", 0, "--rate", 5, "--travel", 5, "--jobs", 1]
+    done = CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
+    assert done.exit_code == 0 and "queries from another building: " in done.stdout
+    assert (tmp_path / "out" / "matrix.png").read_bytes().startswith(b"\x89PNG")
+    document = json.loads((tmp_path / "out" / "matrix.json").read_text())
+    assert sum(document["elsewhere"].values()) == 2 and "located" not in document["elsewhere"]
+    last = next(cell for cell in document["cells"] if cell["travel_m"] == 5.0)
+    assert last["trials"] == 2 and last["located_right"] > 0.0 and last["median_error_m"] < 0.15
+    trials = [json.loads(file.read_text()) for file in (tmp_path / "out" / "trials").iterdir()]
+    assert all(not t["right"] and t["mapped"] == 0.0 for rows in trials for t in rows if not t["in_building"])
+    assert np.isfinite([t["look_up_ms"] for rows in trials for t in rows]).all()

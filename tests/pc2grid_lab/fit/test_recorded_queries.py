@@ -4,7 +4,7 @@ import math
 
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue
-from pc2grid_lab.fit.posterior import of_rows
+from pc2grid_lab.fit.posterior import known_of
 from pc2grid_lab.fit.recorded_queries import Window, rows
 from signature.config import Config
 from signature.localization.query import Query
@@ -37,7 +37,7 @@ def test_each_question_says_what_tells_for_its_places() -> None:
     assert len(inside["evidence"][0]["tail"]) >= 40  # of the last 8 m, a scan every 0.2 m
     assert all(error_m == math.inf for error_m, _ in elsewhere["errors"])
     assert all(error_m > 0.5 for error_m, _ in blanked["errors"])
-    known = {answered.kind: answered.known for answered in of_rows([inside, elsewhere])}
-    assert known["laser log in its own building"].first == 0
-    assert known["laser log in another building"].first is None
-    assert known["laser log in another building"].buildings == {"wean", "fr079"}
+    known = {one.kind: one for one in known_of([inside, elsewhere])}
+    assert known["in its own building"].first == 0
+    assert known["in another building"].first is None
+    assert known["in another building"].buildings == {"wean", "fr079"}

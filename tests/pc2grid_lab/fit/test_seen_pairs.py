@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pc2grid.geometry import SE2
-from pc2grid_lab.experiments.sensor_map import SensorMap
+from pc2grid_lab.experiments.sensor_matrix import SensorMap
 from pc2grid_lab.fit.queries import office_floor
 from pc2grid_lab.fit.seen_pairs import pairs_of
 from signature.config import Config

@@ -10,13 +10,10 @@ from collections.abc import Collection, Iterable
 from pc2grid import extras
 from pc2grid_lab.baselines.method import Matcher as Matcher
 from pc2grid_lab.baselines.method import Method as Method
-from pc2grid_lab.baselines.opencv_shape_context import OpenCvShapeContext, require_shapes
-from pc2grid_lab.baselines.point_contexts import PointContexts
 from pc2grid_lab.baselines.proposed import Proposed
 from pc2grid_lab.baselines.sdf import DistanceFeatures
 from pc2grid_lab.baselines.several_centres import SeveralCentres
 from pc2grid_lab.baselines.shape_context import ShapeContext
-from pc2grid_lab.baselines.verified import Verified
 from pc2grid_lab.baselines.words import FEATURES, Vocabulary, Words
 from signature.config import SignatureConfig
 
@@ -31,17 +28,9 @@ METHOD_NAMES = (
 )
 """In the order of Table III."""
 
-EXTRA_METHOD_NAMES = (
-    "point_contexts",
-    "shape_rings",
-    "opencv_shape_context",
-    "verified",
-    "proposed_centres",
-    "boundary_centres",
-    "shape_context_centres",
-)
-"""Beyond the paper: three other readings of the shape context, its own method with alignment, and places
-described from several centres: by Eq. 6, by its boundary alone, and by the shape context."""
+EXTRA_METHOD_NAMES = ("proposed_centres", "boundary_centres", "shape_context_centres")
+"""Beyond the paper: places described from several centres, by Eq. 6, by its boundary alone, and by the shape
+context."""
 
 
 def require_packages(names: Collection[str]) -> None:
@@ -49,8 +38,6 @@ def require_packages(names: Collection[str]) -> None:
     wanted = [name for name in names if name.startswith("surf")]
     if wanted:
         extras.require({"paper": ", ".join(wanted)})
-    if "opencv_shape_context" in names:
-        require_shapes()
 
 
 def make_methods(names: Iterable[str]) -> dict[str, Method]:
@@ -71,14 +58,8 @@ def _make(name: str, vocabularies: dict[str, Vocabulary]) -> Method:
         return SeveralCentres(method=_make(name.removesuffix("_centres"), vocabularies))
     if name == "proposed":
         return Proposed()
-    if name in ("shape_context", "shape_rings"):
-        return ShapeContext(turns=name == "shape_context")
-    if name == "point_contexts":
-        return PointContexts()
-    if name == "opencv_shape_context":
-        return OpenCvShapeContext()
-    if name == "verified":
-        return Verified()
+    if name == "shape_context":
+        return ShapeContext()
     if name == "sdf":
         return DistanceFeatures()
     feature, _, weighting = name.partition("_")

@@ -1,8 +1,8 @@
 """Shape Context of a whole submap: 24 angular, 12 radial bins (paper IV-A, "describes global shapes").
 
 One log-polar histogram of the boundary around the submap's centre (the descriptor of Belongie et al. 2002),
-compared by the chi-square statistic in every of the 24 turns. The paper does not describe
-how it treats rotation; `turns=False`, which adds up each ring, gives the figures nearest to the paper's.
+compared by the chi-square statistic in every of the 24 turns. The paper does not describe how it treats
+rotation.
 """
 
 from __future__ import annotations
@@ -19,26 +19,20 @@ from pc2grid.submaps.skeleton import thin
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShapeContext:
-    """Bins as in the paper; rings grow by a constant factor from a radius of `inner_m` to the submap's.
-
-    turns : compare in every turn. False: compare only the share of each ring, which does not change by
-    turning.
-    inner_m : chosen by hand.
-    """
+    """Bins as in the paper; rings grow by a constant factor from `inner_m`, chosen by hand, to the radius."""
 
     angular_bins: int = 24
     radial_bins: int = 12
     inner_m: float = 0.5
-    turns: bool = True
 
     def fit(self, submaps: Sequence[Submap]) -> _Shapes:
         """Describe every submap."""
-        bins = (self.radial_bins, self.angular_bins if self.turns else 1)
+        bins = (self.radial_bins, self.angular_bins)
         shapes = [self.context(submap) for submap in submaps]
         return _Shapes(self, np.stack(shapes) if shapes else np.empty((0, *bins), np.float32))
 
     def context(self, submap: Submap) -> F32:
-        """Shares of the boundary pixels, (radial, angular; 1 without turns); sum 1, or all 0 without any."""
+        """Shares of the boundary pixels, (radial, angular); sum 1, or all 0 without any."""
         edges = thin(submap.grid.occupied)
         y, x = ((cells_of(edges) - (np.array(edges.shape) - 1) / 2) * submap.grid.resolution_m).T
         rings = np.geomspace(self.inner_m, submap.radius_m, self.radial_bins)
@@ -49,8 +43,6 @@ class ShapeContext:
             ring * self.angular_bins + sector, minlength=self.radial_bins * self.angular_bins
         )
         shares = counts.reshape(self.radial_bins, self.angular_bins) / max(len(x), 1)
-        if not self.turns:
-            shares = shares.sum(axis=1, keepdims=True)
         return np.asarray(shares, np.float32)
 
 

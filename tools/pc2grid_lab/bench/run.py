@@ -12,6 +12,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 from pc2grid.io import open_log
@@ -55,7 +56,7 @@ def _converting(folder: Path) -> Iterator[Figure]:
 def _describing(database: SubmapDatabase) -> Iterator[Figure]:
     (info,) = database.sessions()
     config = database.config().signature
-    taken = [_cpu_ms(lambda one=submap: describe(one, config)) for submap in database.submaps(info.name)]
+    taken = [_cpu_ms(partial(describe, submap, config)) for submap in database.submaps(info.name)]
     yield f"describe a submap, median of {len(taken)}", statistics.median(taken), "ms"
 
 

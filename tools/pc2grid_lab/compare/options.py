@@ -11,4 +11,3 @@ from pc2grid_cli.options import OUTPUT_FOLDER
 
 OutputFolder = Annotated[Path, typer.Option(*OUTPUT_FOLDER, help="folder for results; run again to go on")]
 Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="processes [one a core]")]
-AsJson = Annotated[bool, typer.Option("--json", help="print one JSON document, not a table")]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-import sys
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -13,16 +12,21 @@ import typer
 
 from pc2grid.errors import ConfigError, LogNotFound
 from pc2grid.io.building_file import is_building_file
-from pc2grid_cli.console import json_text, of, print_json, warn
+from pc2grid_cli.console import json_text, of, warn
 from pc2grid_cli.output_files import make_folder
+from pc2grid_cli.picture import BLUE, GREEN, VERMILLION
+from pc2grid_cli.tables import show, table
 from pc2grid_lab.compare import options as options
-from pc2grid_lab.compare.peers_report import draw, print_table
-from pc2grid_lab.experiments.stored import in_processes, write_text
-from pc2grid_lab.peers.environment import PEERS, PeerEnvironment
-from pc2grid_lab.peers.experiment import run, tasks
-from pc2grid_lab.peers.outcome import OUTCOME, PeerCell, PeerTrial, counted
-from pc2grid_lab.peers.site import Site, recorded_site, simulated_site, site_name
+from pc2grid_lab.compare.picture import picture
+from pc2grid_lab.experiments.program import BACK, FRONT, LABORATORY, digest_of_sources
+from pc2grid_lab.experiments.stored import write_text
+from pc2grid_lab.peers.outcome import PeerCell, PeerTrial, counted
+from pc2grid_lab.peers.programs import PEERS, PINS, answers, missing
+from pc2grid_lab.peers.site import Site, recorded_site, simulated_site, truth_file
 from signature.config import Config
+from signature.sessions import digest_of
+
+TITLES = {kind.name: kind.title for kind in PEERS}
 
 
 def compare_peers_command(
@@ -45,14 +49,6 @@ def compare_peers_command(
     of_base: Annotated[
         bool, typer.Option("--of-base", help="the true poses are of the base, not of the sensor")
     ] = False,
-    environment: Annotated[
-        Path | None,
-        typer.Option("--environment", help="virtual environment of the peers [peers/ in that of pc2grid]"),
-    ] = None,
-    install: Annotated[
-        bool, typer.Option("--install", help="make that environment if it does not exist: 100 MB")
-    ] = False,
-    as_json: options.AsJson = False,
 ) -> None:
     """Other programs and pc2grid locate later parts of real recordings in maps of earlier parts.
 
@@ -61,76 +57,69 @@ def compare_peers_command(
 
     Example: pc2grid compare peers intel.mcap fr079.mcap hall.mcap --mapped intel=900 --mapped fr079=600
     """
-    seconds = _seconds(mapped or [], recordings)
-    where, terminal = _environment(environment, install), of(context)
-    missing = _missing(where)
-    for folder in ("sites", "trials"):
-        make_folder(out / folder)
-    with terminal.progress("prepare") as advance:
-        prepare = [(r, out / "sites", queries, travel, seconds.get(r.stem), of_base) for r in recordings]
-        sites = in_processes(_site, prepare, jobs=1, advance=advance)
-    with terminal.progress("locate") as advance:
-        waiting = [(task, where, out / "trials") for task in tasks(sites, where)]
-        found = in_processes(run, waiting, jobs=1, advance=advance)
-    trials = list(itertools.chain.from_iterable(found))
-    document = {
-        "schema_version": 1,
-        "recordings": [recording.name for recording in recordings],
-        "setting": {"queries": queries, "travel": travel, "seed": OUTCOME.seed, **seconds},
-        "not_installed": missing,
-    }
-    sensors = {site.name: site.sensor for site in sites}
-    _finish(out, counted(trials), trials, sensors, document, as_json)
-
-
-def _missing(environment: PeerEnvironment) -> dict[str, str]:
-    """The peers that are not installed, and how they are; each is warned of."""
-    missing = {kind.name: command for kind in PEERS if (command := environment.missing(kind)) is not None}
-    for name, command in missing.items():
+    seconds, terminal = _seconds(mapped or [], recordings), of(context)
+    not_installed = {kind.name: command for kind in PEERS if (command := missing(kind)) is not None}
+    for name, command in not_installed.items():
         warn(f"{name} is not installed: {command}")
-    return missing
-
-
-def _finish(
-    out: Path,
-    cells: Sequence[PeerCell],
-    trials: Sequence[PeerTrial],
-    sensors: Mapping[str, str],
-    about: Mapping[str, Any],
-    as_json: bool,
-) -> None:
-    """Write and print the results. sensors : of the sites. about : the rest of the document."""
-    document = {**about, "cells": list(map(asdict, cells)), "trials": list(map(asdict, trials))}
+    work = out / digest_of_sources((FRONT, BACK, LABORATORY))
+    make_folder(out)
+    sites, trials = [], []
+    with terminal.progress("prepare") as advance:
+        for recording in recordings:
+            sites.append(_site(recording, work, queries, travel, seconds.get(recording.stem), of_base))
+            advance(len(sites) / len(recordings))
+    tasks = _tasks(sites, not_installed)
+    with terminal.progress("locate") as advance:
+        for done, (name, site, map_site) in enumerate(tasks, start=1):
+            trials += _asked(name, site, map_site, work)
+            advance(done / len(tasks))
+    cells = counted(trials)
+    setting = {"queries": queries, "travel": travel, "pins": PINS, "not_installed": not_installed, **seconds}
+    document = {"setting": setting, "cells": list(map(asdict, cells)), "trials": list(map(asdict, trials))}
     write_text(out / "peers.json", json_text(document) + "\n")
-    draw(out / "peers.png", cells, sensors)
-    if as_json:
-        print_json(document)
-        return
-    print_table(cells, sensors, about["not_installed"])
-    print("\n".join(str(out / name) for name in ("peers.json", "peers.png")))
+    draw(out / "peers.png", cells)
+    print_table(cells)
+    print(out / "peers.json", out / "peers.png", sep="\n")
+
+
+def _tasks(sites: Sequence[Site], not_installed: Mapping[str, str]) -> list[tuple[str, Site, Site]]:
+    """What is run: each installed program with the sites of its sensors, each in its own map and another."""
+    tasks = []
+    for kind in PEERS:
+        for sensor in kind.sensors if kind.name not in not_installed else ():
+            of_sensor = [site for site in sites if site.sensor == sensor]
+            for k, site in enumerate(of_sensor):
+                tasks += [(kind.name, site, other) for other in dict.fromkeys((site, of_sensor[k - 1]))]
+    return tasks
+
+
+def _asked(name: str, site: Site, map_site: Site, work: Path) -> list[PeerTrial]:
+    """The judged answers of a program; those of an earlier run of the same sources are used again."""
+    (kind,) = (kind for kind in PEERS if kind.name == name)
+    queries = site.queries()
+    kept = work / f"{name}.{site.folder.name}.in.{map_site.folder.name}.json"
+    found = answers(kind, map_site.map_stem, [site.stem(number) for number in queries], kept)
+    return [
+        PeerTrial.of(name, site.name, map_site.name, query, answer)
+        for query, answer in zip(queries.values(), found, strict=True)
+    ]
 
 
 def _site(
-    recording: Path, folder: Path, queries: int, travel_m: float, mapped_s: float | None, of_base: bool
+    recording: Path, work: Path, queries: int, travel_m: float, mapped_s: float | None, of_base: bool
 ) -> Site:
     """The building of a recording, or of a 3D scan; what was prepared from the same before is used again."""
     if not recording.exists():
         raise LogNotFound(f"{recording}: no such file")
-    config = Config()
-    setting: dict[str, Any] = {"queries": queries, "travel_m": travel_m}
-    known: dict[str, Any] = {"mapped_s": mapped_s, "of_base": of_base}
-    made = folder / site_name(recording, config, **setting, **known)
-    if is_building_file(recording):
-        return simulated_site(recording, made, config, **setting)
-    return recorded_site(recording, made, config, **setting, **known)
-
-
-def _environment(folder: Path | None, install: bool) -> PeerEnvironment:
-
-    environment = PeerEnvironment(folder=(folder or Path(sys.prefix) / "peers").absolute())
-    if install and any("pip install" in (environment.missing(kind) or "") for kind in PEERS):
-        environment.install()
-    return environment
+    config, is_building = Config(), is_building_file(recording)
+    truth = b"" if is_building else truth_file(recording).read_bytes()
+    made_of = (digest_of(recording, config), truth, queries, travel_m, mapped_s, of_base)
+    folder = work / f"{recording.stem}.{hashlib.sha256(repr(made_of).encode()).hexdigest()[:12]}"
+    if is_building:
+        return simulated_site(recording, folder, config, queries=queries, travel_m=travel_m)
+    return recorded_site(
+        recording, folder, config, queries=queries, travel_m=travel_m, mapped_s=mapped_s, of_base=of_base
+    )
 
 
 def _seconds(mapped: Sequence[str], recordings: Sequence[Path]) -> dict[str, float]:
@@ -149,3 +138,66 @@ def _seconds(mapped: Sequence[str], recordings: Sequence[Path]) -> dict[str, flo
                 f"--mapped {text}: not seconds of one of the recordings", hint=f"for example {names[0]}=600"
             )
     return seconds
+
+
+def print_table(cells: Sequence[PeerCell]) -> None:
+    """Print a row for each building and program."""
+    title = "later parts of recordings in a map of an earlier part; of the queries that the map covers:"
+    figures = ("covered", "right", "5-95 %", "wrong", "none", "uncovered\nwrong", "elsewhere\nwrong")
+    shown = table(title, ("building", "program"), (*figures, "off by", "CPU", "CPU\nelsewhere", "memory"))
+    for cell in cells:
+        shown.add_row(cell.site, TITLES[cell.peer], *_figures(cell))
+    show(
+        shown,
+        "uncovered wrong, elsewhere wrong: answers to queries that have no right one. pc2grid decides itself;"
+        " the others have the threshold with the most right answers less wrong ones in this very table",
+    )
+
+
+def _figures(cell: PeerCell) -> tuple[str, ...]:
+    return (
+        str(cell.covered),
+        str(cell.right),
+        "" if cell.interval is None else "{:.2f}-{:.2f}".format(*cell.interval),
+        str(cell.wrong),
+        str(cell.covered - cell.right - cell.wrong),
+        f"{cell.uncovered_wrong} of {cell.uncovered}",
+        f"{cell.elsewhere_wrong} of {cell.elsewhere}",
+        "" if cell.median_error_m is None else f"{cell.median_error_m:.2f} m",
+        *("" if cpu_s is None else f"{cpu_s:.2f} s" for cpu_s in (cell.cpu_s, cell.elsewhere_cpu_s)),
+        f"{cell.peak_mb:.0f} MB",
+    )
+
+
+def draw(path: Path, cells: Sequence[PeerCell]) -> None:
+    """A bar for each building and program: right, none and wrong of all queries, elsewhere included.
+
+    In the building, queries that the map does not cover are rightly left without an answer, as those
+    elsewhere are.
+    """
+    order = sorted(cells, key=lambda cell: cell.site)
+    with picture(path, 9.0, 0.9 + 0.3 * max(len(order), 1)) as figure:
+        inside, outside = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
+        for y, cell in enumerate(order):
+            rest, elsewhere = cell.covered - cell.right - cell.wrong, cell.uncovered + cell.elsewhere
+            wrong = cell.uncovered_wrong + cell.elsewhere_wrong
+            _draw_bar(inside, y, ((cell.right, GREEN), (rest, "0.85"), (cell.wrong, VERMILLION)))
+            _draw_bar(outside, y, ((elsewhere - wrong, BLUE), (wrong, VERMILLION)))
+        names = [f"{cell.site}: {TITLES[cell.peer]}" for cell in order]
+        inside.set_yticks(range(len(order)), names, fontsize=8)
+        inside.invert_yaxis()
+        inside.set_title("covered by the map: right, none, wrong", fontsize=9)
+        outside.set_title("not in the map: refused, wrong", fontsize=9)
+        for axes in (inside, outside):
+            axes.set_xlim(0, 1)
+            axes.set_xlabel("share of the queries", fontsize=8)
+
+
+def _draw_bar(axes: Any, y: int, parts: Sequence[tuple[int, str]]) -> None:
+    """Counts and their colours, as shares of their sum."""
+    left, total = 0.0, max(sum(count for count, _ in parts), 1)
+    for count, colour in parts:
+        axes.barh(y, count / total, left=left, color=colour, height=0.75)
+        if count:
+            axes.text(left + count / total / 2, y, str(count), ha="center", va="center", fontsize=7)
+        left += count / total

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +11,6 @@ import typer
 
 from pc2grid.errors import ConfigError
 from pc2grid_cli import console
-from pc2grid_cli import options as options
 from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
@@ -58,7 +56,6 @@ def compare_recordings_command(
     ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="a small part of all, always the same")] = False,
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="processes at a time")] = 2,
-    as_json: options.AsJson = False,
 ) -> None:
     """Map every real recording, locate parts of it in other maps, and tell what changed since the last time.
 
@@ -96,9 +93,6 @@ def compare_recordings_command(
     if only is None and not quick:
         write_text(kept, found.to_text())
         write_text(kept.with_suffix(".md"), page(found, changed))
-    if as_json:
-        console.print_json({**found.to_json(), "changes": [asdict(change) for change in changed]})
-        return
     print(page(found))
     if before is None:
         print(f"nothing to compare with: there is no {kept}")

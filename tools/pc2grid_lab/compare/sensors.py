@@ -6,27 +6,24 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from pc2grid.errors import ConfigError, MapFileError
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import SensorKind
-from pc2grid_cli.console import Console, json_text, of, print_json
+from pc2grid_cli.console import Console, json_text, of
 from pc2grid_cli.output_files import make_folder
+from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
+from pc2grid_cli.tables import show, table
 from pc2grid_lab.compare import options as options
-from pc2grid_lab.compare.matrix_report import contribution_table, draw, draw_signatures, tables
-from pc2grid_lab.experiments.ablation import COMBINATIONS, Independence, independence, recall_by_combination
-from pc2grid_lab.experiments.metrics import ConfidenceError, matrix, reliability
-from pc2grid_lab.experiments.plan_drives import PlanDrives
-from pc2grid_lab.experiments.sensor_map import SensorMap
-from pc2grid_lab.experiments.sensor_matrix import SENSORS, TRAVELS_M, query_trials
+from pc2grid_lab.compare.picture import picture
+from pc2grid_lab.experiments.sensor_matrix import SENSORS, PlanDrives, query_trials
 from pc2grid_lab.experiments.stored import in_processes, write_text
-from pc2grid_lab.experiments.trial import Trial
-from pc2grid_lab.worlds import prepare_session
-from signature.localization.posterior import FITTED_ON
+from pc2grid_lab.experiments.trial import MatrixCell, Trial, matrix, reliability
 
 
 def compare_sensors_command(
@@ -41,17 +38,12 @@ def compare_sensors_command(
     clutter: Annotated[
         int, typer.Option("--clutter", help="things in the way, different in each session")
     ] = 30,
-    change: Annotated[
-        float,
-        typer.Option("--change", min=0, max=1, help="share of doors and furniture that differ, by session"),
-    ] = 0.0,
     rate: Annotated[float, typer.Option("--rate", help="scans a second, of every sensor")] = 10.0,
     travel: Annotated[
         float, typer.Option("--travel", min=1.0, help="Metres that a query drives at most.")
     ] = 15.0,
     seed: Annotated[int, typer.Option("--seed", help="of the first query session")] = 1,
     jobs: options.Jobs = None,
-    as_json: options.AsJson = False,
 ) -> None:
     """Map plans with lidar, laser and depth camera, locate sessions of each in each: nine cells.
 
@@ -61,27 +53,24 @@ def compare_sensors_command(
     for folder in ("", "maps", "drives", "trials"):
         make_folder(out / folder)
     setting: dict[str, float] = {"map_length": map_length, "clutter": clutter, "rate": rate, "travel": travel}
-    if change:  # without it the results of earlier runs stay valid
-        setting["change"] = change
     drives = PlanDrives(out=out, setting=tuple(setting.items()), until_m=travel, length_m=travel + 3.0)
     trials = _asked(drives, plans, range(seed, seed + queries), of(context), jobs)
-    independent = _independent([[drives.read_map(plan.stem, sensor) for sensor in SENSORS] for plan in plans])
+    cells, elsewhere = matrix(trials), [t.status for t in trials if not t.in_building]
     document = {
-        **_document(trials, independent, max(d for d in TRAVELS_M if d <= min(travel, 8.0))),
         "plans": [plan.stem for plan in plans],
         "queries": queries,
         "setting": {**setting, "seed": seed},
-        "change": {plan.stem: _mean_change(plan, drives, seed, min(queries, 5)) for plan in plans},
+        "cells": list(map(asdict, cells)),
+        "outside_the_map": sum(t.in_building and not t.in_map for t in trials),
+        "elsewhere": {status: elsewhere.count(status) for status in sorted(set(elsewhere))},
     }
     write_text(out / "matrix.json", json_text(document) + "\n")
-    _, others = _by_tuning(trials)
-    draw(out / "matrix.png", matrix(trials), reliability(others or trials), fitted_on=not others)
-    draw_signatures(out / "signatures.png", independent, document["ablation"]["recall"])
-    if as_json:
-        print_json(document)
-    else:
-        _print(document, trials, independent)
-        print("\n".join(str(out / name) for name in ("matrix.json", "matrix.png", "signatures.png")))
+    draw(out / "matrix.png", cells, reliability(trials))
+    print_tables(cells)
+    if elsewhere:
+        right = elsewhere.count("not_found")
+        show(f"queries from another building: {right} of {len(elsewhere)} answered not_found")
+    print(out / "matrix.json", out / "matrix.png", sep="\n")
 
 
 def _asked(
@@ -109,87 +98,6 @@ def _refuse(plans: Sequence[Path]) -> None:
             raise MapFileError(f"{plan}: no such file", hint="give the path of a map.yaml")
 
 
-def _independent(buildings: Sequence[Sequence[SensorMap]]) -> dict[str, Independence]:
-    """Of all buildings together, by combination of signatures."""
-    measured = zip(*(independence(maps) for maps in buildings), strict=True)
-    return dict(zip(COMBINATIONS, map(Independence.together, measured), strict=True))
-
-
-def _print(
-    document: Mapping[str, Any], trials: Sequence[Trial], independent: Mapping[str, Independence]
-) -> None:
-    tables(matrix(trials), _elsewhere(trials))
-    for name, counts in document["change"].items():
-        print(f"{name}: between sessions {_change_text(counts)}")
-    ablation = document["ablation"]
-    contribution_table(independent, ablation["recall"], ablation["travel_m"])
-    for name, some in zip(("plans it was fitted on", "other plans"), _by_tuning(trials), strict=True):
-        if some:
-            errors = ConfidenceError.of(some)
-            print(
-                f"confidence, {name}: Brier {errors.brier:.3f},"
-                f" expected error {errors.expected_error:.3f} ({errors.trials} answers)"
-            )
-
-
-def _document(
-    trials: Sequence[Trial], independent: Mapping[str, Independence], described_m: float
-) -> dict[str, Any]:
-    """The document of all trials. described_m : metres driven after which the signatures are compared."""
-    elsewhere = _elsewhere(trials)
-    return {
-        "schema_version": 1,
-        "cells": [asdict(cell) for cell in matrix(trials)],
-        "confidence": {
-            name: asdict(ConfidenceError.of(some))
-            for name, some in zip(("tuned on", "other plans"), _by_tuning(trials), strict=True)
-        },
-        "outside_the_map": sum(t.in_building and not t.in_map for t in trials),
-        "elsewhere": {
-            "trials": len(elsewhere),
-            "not_found": sum(t.status == "not_found" for t in elsewhere),
-            "located": sum(t.status == "located" for t in elsewhere),
-        },
-        "independence": {
-            name: {"auc": one.auc, "same": len(one.same), "other": len(one.other)}
-            for name, one in independent.items()
-        },
-        "ablation": {"travel_m": described_m, "recall": recall_by_combination(trials, described_m)},
-    }
-
-
-def _mean_change(plan: Path, drives: PlanDrives, seed: int, sessions: int) -> dict[str, float]:
-    """What differs in a session from the plan, and its clutter: mean of the first sessions."""
-    grid = load_map(plan)
-    configs = [drives.simulation(drives.until_m, seed + k) for k in range(sessions)]
-    prepared = [prepare_session(sensor="laser", grid=grid, config=config) for config in configs]
-    counts = [{**p.change.counts(), "clutter": float(len(p.clutter))} for p in prepared]
-    return {key: sum(c[key] for c in counts) / len(counts) for key in counts[0]}
-
-
-def _change_text(counts: Mapping[str, float]) -> str:
-    text = f"{counts['clutter']:.0f} objects stand elsewhere"
-    if counts["doorways"]:
-        text += (
-            f", {counts['closed']:.1f} of {counts['doorways']:.0f} doors are shut, {counts['ajar']:.1f} ajar"
-        )
-    if counts["pieces"]:
-        moved = counts["moved"] + counts["exchanged"]
-        text += f", {moved:.1f} of {counts['pieces']:.0f} pieces of furniture are moved or exchanged"
-    return text + f"; {100 * counts['walls_changed']:.0f} % of the visible walls differ from the plan"
-
-
-def _elsewhere(trials: Sequence[Trial]) -> list[Trial]:
-    """The trials whose query comes from another building than the map."""
-    return [t for t in trials if not t.in_building]
-
-
-def _by_tuning(trials: Sequence[Trial]) -> tuple[list[Trial], list[Trial]]:
-    """The trials in plans that the confidence was fitted on, and the other ones."""
-    tuned = [t for t in trials if FITTED_ON.intersection(t.buildings)]
-    return tuned, [t for t in trials if not FITTED_ON.intersection(t.buildings)]
-
-
 def _map(drives: PlanDrives, plan: Path, sensor: SensorKind) -> None:
     drives.make_map(plan.stem, partial(load_map, plan), sensor)
 
@@ -213,3 +121,60 @@ def _locate(
         session = drives.drive(plan.stem, partial(load_map, plan), sensor, seed)
         write_text(file, json.dumps([asdict(t) for t in query_trials(plan.stem, seed, session, maps)]))
     return [Trial(**row) for row in json.loads(file.read_text())]
+
+
+def print_tables(cells: Sequence[MatrixCell]) -> None:
+    """Print the share located and right by metres driven, and the other figures of each cell."""
+    distances = sorted({cell.travel_m for cell in cells})
+    last = distances[-1] if distances else 0.0
+    who = ("map", "query")
+    shares = table("located and right, by metres driven", who, (*(f"{d:g} m" for d in distances), "n"))
+    figures = ("wrong", "ambiguous", "not found", "recall 1/5/20", "median", "95 %", "ms")
+    detail = table(f"after {last:g} m", who, figures)
+    for pair in product(SENSORS, SENSORS):
+        row = {c.travel_m: c for c in cells if (c.map_sensor, c.query_sensor) == pair}
+        shares.add_row(*pair, *_shares(row, distances))
+        if last in row:
+            detail.add_row(*pair, *_figures(row[last]))
+    show(shares, detail)
+
+
+def _shares(row: Mapping[float, MatrixCell], distances: Sequence[float]) -> list[str]:
+    """Of a pair of sensors; without a row no query drove where the map is."""
+    shown = [f"{row[d].located_right:.2f}" if d in row else "" if row else "-" for d in distances]
+    return [*shown, str(max((cell.trials for cell in row.values()), default=0))]
+
+
+def _figures(cell: MatrixCell) -> tuple[str, ...]:
+    return (
+        f"{cell.wrong:.3f}",
+        f"{cell.ambiguous:.2f}",
+        f"{cell.not_found:.2f}",
+        "/".join(f"{share:.2f}" for share in cell.recall),
+        *("-" if m is None else f"{m:.3f} m" for m in (cell.median_error_m, cell.p95_error_m)),
+        f"{cell.look_up_ms:.0f}",
+    )
+
+
+def draw(path: Path, cells: Sequence[MatrixCell], reliable: Sequence[tuple[float, float, int]]) -> None:
+    """One picture: share located and right by metres for each map sensor; confidence against truth."""
+    colours = dict(zip(SENSORS, (BLUE, ORANGE, VERMILLION), strict=False))
+    farthest_m = max((c.travel_m for c in cells), default=1.0)
+    with picture(path, 15.0, 3.8, dpi=130) as figure:
+        *axes, last = figure.subplots(1, 4)
+        for ax, map_sensor in zip(axes, SENSORS, strict=False):
+            for query_sensor, marker in zip(SENSORS, "os^", strict=False):
+                row = [c for c in cells if (c.map_sensor, c.query_sensor) == (map_sensor, query_sensor)]
+                at, right = [c.travel_m for c in row], [c.located_right for c in row]
+                label = f"{query_sensor} query"
+                ax.plot(at, right, marker=marker, color=colours[query_sensor], label=label)
+            ax.set(title=f"{map_sensor} map", xlabel="driven, m", xlim=(0, 1.05 * farthest_m), ylim=(0, 1.03))
+            ax.grid(alpha=0.3)
+        axes[0].set_ylabel("located and right")
+        axes[0].legend(loc="lower right")
+        last.plot([0, 1], [0, 1], color="0.6", lw=1)
+        if reliable:
+            confidence, share, count = zip(*reliable, strict=True)
+            last.scatter(confidence, share, s=[20 + 2 * min(n, 200) for n in count], color=BLUE, alpha=0.7)
+        last.set(title="all answers", xlabel="confidence", ylabel="share that was right")
+        last.grid(alpha=0.3)

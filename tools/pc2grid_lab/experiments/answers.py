@@ -14,10 +14,14 @@ from pc2grid.arrays import BoolGrid
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
 from pc2grid.model import UNKNOWN, OccupancyGrid, RegisteredScan
+from pc2grid.submaps.partition import partition
+from signature.config import Config
+from signature.describe import describe
 from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
+from signature.similarity import SignatureTable
 
 _WALL_M = 0.4
 """What a query has seen is widened by this: the far side of a wall does not count as unseen. By hand."""
@@ -73,13 +77,11 @@ def localize(
         yield answers(count)
 
 
-def share_known(grid: OccupancyGrid, seen: OccupancyGrid, T_map_query: SE2) -> float:
-    """The share of what a query has seen that a map knows, if the query lies at a pose."""
-    cells = np.argwhere(seen.cells != UNKNOWN)
-    at = grid.to_cell(T_map_query.apply(seen.to_point(cells)))
-    inside: BoolGrid = np.all((at >= 0) & (at < grid.cells.shape), axis=1)
-    inside[inside] = grid.cells[at[inside, 0], at[inside, 1]] != UNKNOWN
-    return float(inside.mean()) if len(inside) else 0.0
+def index_of(name: str, grid: OccupancyGrid, config: Config) -> MapIndex:
+    """A database of one map."""
+    submaps = partition(grid, config.partition)
+    table = SignatureTable.of([describe(s, config.signature) for s in submaps], [s.center_m for s in submaps])
+    return MapIndex({name: grid}, table, config, config)
 
 
 def unseen_by(query: QueryMap, grid: OccupancyGrid, T_map_query: SE2) -> OccupancyGrid:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,7 +23,8 @@ class Experiment:
 
     queries : number of queries per map (paper IV-B: 2000).
     offset_m : largest distance of a query's centre from the nearest submap's centre. The paper does not give
-        it, and the results depend on it. Its F1 rules out 0.5 (`largest_right_share`); 1.0 fits best.
+        it, and the results depend on it. Its F1 rules out 0.5: if a share p of the best matches is right, F1
+        is at least 2 p / (1 + p). 1.0 fits best.
     correct_m : a match is true if the matched submap's centre is this near (paper IV-B).
     seed : of everything random. Query i of a seed does not depend on the number of queries, and lies at the
         same place at every noise level.
@@ -77,18 +78,6 @@ class MatchMeasures(NamedTuple):
     rp9: float
     f1: float
     r_at_1: float
-
-
-def largest_right_share(f1: float) -> float:
-    """The largest share of true best matches with which F1 can come out as given.
-
-    Of all queries a share p is matched right. With every match accepted precision is p and recall 1, so that
-    the best F1 is at least 2 p / (1 + p); therefore p <= F1 / (2 - F1).
-
-    >>> round(largest_right_share(0.943), 3)
-    0.892
-    """
-    return f1 / (2.0 - f1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,12 +193,10 @@ def evaluate(
     submaps: Sequence[Submap],
     experiment: Experiment,
     noise: Noise,
-    progress: Callable[[float], None] | None = None,
 ) -> dict[str, BestMatches]:
     """Cells of Table III: the methods on one map at one noise level, all on the same queries.
 
-    submaps : the map's partition, all of one radius. progress : called with the share that is done, 0..1.
-    Raises ValueError if there are no submaps.
+    submaps : the map's partition, all of one radius. Raises ValueError if there are no submaps.
     """
     if not submaps:
         raise ValueError("a map without submaps cannot be evaluated")
@@ -223,6 +210,4 @@ def evaluate(
             best = int(np.argmax(scores))
             similarity[name][i] = scores[best]
             correct[name][i] = math.dist(centers_m[best], query.center_m) <= experiment.correct_m
-        if progress is not None:
-            progress((i + 1) / experiment.queries)
     return {name: BestMatches(similarity=similarity[name], correct=correct[name]) for name in methods}

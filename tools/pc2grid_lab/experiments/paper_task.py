@@ -4,31 +4,26 @@ own.
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-import json
-import time
-from collections.abc import Callable, Iterator, Sequence
+import pickle
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from pc2grid._version import __version__
 from pc2grid.config import PartitionConfig
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid.submaps.partition import partition
-from pc2grid_lab.baselines import METHOD_NAMES, Method, make_methods
+from pc2grid_lab.baselines import METHOD_NAMES, make_methods
 from pc2grid_lab.baselines.proposed import Proposed
-from pc2grid_lab.experiments.noise import NOISE_LEVELS, Noise
+from pc2grid_lab.experiments.noise import NOISE_LEVELS
 from pc2grid_lab.experiments.paper_experiment import BestMatches, Experiment, MatchMeasures, evaluate
 from pc2grid_lab.experiments.paper_tables import MAPS, SIZE_PX
 from signature.config import SignatureConfig
-
-Reading = Literal["paper", "true"]
 
 RADII_M = (6.0, 8.0, 10.0)
 """Table IV."""
@@ -39,10 +34,6 @@ TOGETHER = (
     ("sift_bow", "sift_tfidf"),
     ("surf_bow", "surf_tfidf"),
     ("shape_context",),
-    ("shape_rings",),
-    ("point_contexts",),
-    ("opencv_shape_context",),
-    ("verified",),
     ("proposed_centres",),
     ("boundary_centres",),
     ("shape_context_centres",),
@@ -162,24 +153,16 @@ OPEN_CHOICES = (
 )
 """Where the default departs from the paper, and other values of what the paper leaves open."""
 
-_BY_SIGNATURES = ("proposed", "verified", "proposed_centres", "boundary_centres")
-"""Methods whose results depend on SignatureConfig."""
-
-_FORMAT = 2  # of the result files; a change of the meaning of their numbers changes it too
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperTask:
     """Methods on one map at one noise level; one result file for each method.
 
-    reading : the image of killian has 0.10 m a pixel, while the paper says 0.05. "paper" reads it as the
-        paper does, half as large; "true" reads it in its true size. For all other maps both are the same.
     overrides : fields of SignatureConfig that differ from their defaults, for the proposed method.
     speckle_sigma_m : spread of the boundary noise, which the paper leaves open.
     """
 
     map_path: Path
-    reading: Reading
     methods: tuple[str, ...]
     level: int
     radius_m: float
@@ -187,12 +170,7 @@ class PaperTask:
     queries: int
     seed: int
     overrides: tuple[tuple[str, Any], ...] = ()
-    speckle_sigma_m: float = Noise(boundary=0, freespace=0).speckle_sigma_m
-
-    @property
-    def noise(self) -> Noise:
-        """The noise of the level, with the spread of this task."""
-        return replace(NOISE_LEVELS[self.level], speckle_sigma_m=self.speckle_sigma_m)
+    speckle_sigma_m: float = NOISE_LEVELS[0].speckle_sigma_m
 
     @property
     def map_name(self) -> str:
@@ -202,11 +180,9 @@ class PaperTask:
     def result_path(self, folder: Path, method: str) -> Path:
         """The file of one method's result."""
         changed = "".join(f".{key}={value}" for key, value in self.overrides)
-        if self.speckle_sigma_m != NOISE_LEVELS[self.level].speckle_sigma_m:
-            changed += f".speckles{self.speckle_sigma_m:g}"
         return folder / (
-            f"{self.map_name}-{self.reading}.{method}.noise{self.level}.r{self.radius_m:g}"
-            f".offset{self.offset_m:g}.q{self.queries}.seed{self.seed}{changed}.json"
+            f"{self.map_name}.{method}.noise{self.level}.r{self.radius_m:g}.offset{self.offset_m:g}"
+            f".q{self.queries}.seed{self.seed}.speckles{self.speckle_sigma_m:g}{changed}.pickle"
         )
 
 
@@ -215,50 +191,27 @@ def paper_tasks(
     *,
     methods: Sequence[str] = METHOD_NAMES,
     offsets_m: Sequence[float] = (1.0, 0.5),
-    queries: int = 2000,
-    seed: int = 1,
     choices: Sequence[SettingChoice] = (),
-    speckle_sigma_m: float = NOISE_LEVELS[0].speckle_sigma_m,
+    **setting: Any,
 ) -> Iterator[PaperTask]:
-    """Every task of Tables III and IV, and those that measure other `choices`.
-
-    In its true size killian is given to the proposed method only, because it has five times as many submaps.
-    """
+    """Every task of Tables III and IV, and those that measure other `choices`. setting : of all tasks."""
     groups = [tuple(name for name in together if name in methods) for together in TOGETHER]
     for offset_m, group, path in itertools.product(offsets_m, filter(None, groups), maps):
-        for facts in _cells_of(path, group, choices):
-            yield PaperTask(
-                map_path=path,
-                methods=group,
-                offset_m=offset_m,
-                queries=queries,
-                seed=seed,
-                speckle_sigma_m=speckle_sigma_m,
-                **facts,
-            )
+        task = PaperTask(map_path=path, methods=group, level=0, radius_m=8.0, offset_m=offset_m, **setting)
+        yield from (replace(task, level=level) for level in range(len(NOISE_LEVELS)))
+        if group == ("proposed",):
+            yield from (replace(task, level=1, radius_m=r) for r in RADII_M if r != task.radius_m)
+            for choice, level in itertools.product(choices, (0, 2)):
+                yield replace(task, level=level, overrides=choice.overrides)
 
 
-def _cells_of(
-    path: Path, group: tuple[str, ...], choices: Sequence[SettingChoice]
-) -> Iterator[dict[str, Any]]:
-    """Reading, level, radius and overrides of the tasks of some methods on a map."""
-    plain: dict[str, Any] = {"reading": "paper", "radius_m": 8.0}
-    for level in range(len(NOISE_LEVELS)):
-        yield {**plain, "level": level}
-        if group == ("proposed",) and path.stem == "killian":
-            yield {**plain, "level": level, "reading": "true"}
-    if group == ("proposed",):
-        for radius_m in (r for r in RADII_M if r != 8.0):
-            yield {**plain, "level": 1, "radius_m": radius_m}
-        for choice, level in itertools.product(choices, (0, 2)):
-            yield {**plain, "level": level, "overrides": choice.overrides}
+def read_map(path: Path) -> OccupancyGrid:
+    """A map in the size that the paper has it. Raises MapFileError.
 
-
-def read_map(path: Path, reading: Reading) -> OccupancyGrid:
-    """A map in the size that `reading` names. Raises MapFileError."""
-    grid = load_map(path)
-    published = SIZE_PX.get(path.stem)
-    if reading == "paper" and published is not None and grid.cells.shape[1] > 1.5 * published[0]:
+    The image of killian has 0.10 m a pixel, while the paper says 0.05: it is read half as large.
+    """
+    grid, published = load_map(path), SIZE_PX.get(path.stem)
+    if published is not None and grid.cells.shape[1] > 1.5 * published[0]:
         return halved(grid)
     return grid
 
@@ -279,130 +232,61 @@ def halved(grid: OccupancyGrid) -> OccupancyGrid:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperCell:
-    """One cell of a table: the facts of its task, its measures, and the best match of every query.
+    """One cell of a table: its task, the best match of every query, and the measures of these.
 
     half_widths : half of the interval from 5 to 95 % of each measure, by bootstrap over the queries.
     """
 
-    map_name: str
-    reading: Reading
+    task: PaperTask
     method: str
-    level: int
-    radius_m: float
-    offset_m: float
-    queries: int
-    seed: int
-    overrides: tuple[tuple[str, Any], ...]
     submaps: int
-    seconds: float
-    auc: float
-    rp9: float
-    f1: float
-    true_share: float
     matches: BestMatches
-    speckle_sigma_m: float
+    measures: MatchMeasures
     half_widths: MatchMeasures
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether the method has its own settings."""
+        return not self.task.overrides
+
     def summary(self) -> dict[str, Any]:
-        """Everything except the single queries, for JSON and CSV."""
-        rest = ("matches", "overrides", "half_widths")
-        return (
-            {key: getattr(self, key) for key in self.__slots__ if key not in rest}
-            | {f"{measure}_half_width": value for measure, value in self.half_widths._asdict().items()}
-            | {"overrides": dict(self.overrides)}
-        )
+        """Everything except the single queries, for JSON."""
+        task = {**asdict(self.task), "map_path": self.task.map_name, "overrides": dict(self.task.overrides)}
+        half = {f"{name}_half_width": value for name, value in self.half_widths._asdict().items()}
+        return {**task, "method": self.method, "submaps": self.submaps, **self.measures._asdict(), **half}
 
 
-def fingerprint(task: PaperTask, method: str) -> str:
-    """A hash of what a result depends on; a stored result with another hash is not used."""
-    signature = SignatureConfig(**dict(task.overrides))
-    facts = {
-        "format": _FORMAT,
-        "version": __version__,
-        "map": hashlib.sha256(task.map_path.read_bytes() + _image_bytes(task.map_path)).hexdigest(),
-        "noise": asdict(task.noise),
-        "partition": PartitionConfig.paper(task.radius_m).model_dump(),
-        "signature": signature.model_dump() if method in _BY_SIGNATURES else None,
-    }
-    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
+def load_results(task: PaperTask, folder: Path) -> list[PaperCell]:
+    """The results of a task that are in a folder."""
+    files = [task.result_path(folder, method) for method in task.methods]
+    return [pickle.loads(file.read_bytes()) for file in files if file.exists()]
 
 
-def _image_bytes(map_path: Path) -> bytes:
-    for suffix in (".png", ".pgm"):
-        if map_path.with_suffix(suffix).exists():
-            return map_path.with_suffix(suffix).read_bytes()
-    return b""
-
-
-def load_result(task: PaperTask, method: str, folder: Path) -> PaperCell | None:
-    """The result of an earlier run; None if there is none or its `fingerprint` differs."""
-    path = task.result_path(folder, method)
-    try:
-        stored = json.loads(path.read_text())
-        if stored.pop("fingerprint") != fingerprint(task, method):
-            return None
-        matches = BestMatches(
-            similarity=np.array(stored.pop("similarity"), np.float64),
-            correct=np.array(stored.pop("correct"), np.bool_),
-        )
-        half_widths = MatchMeasures(*(stored.pop(f"{key}_half_width") for key in MatchMeasures._fields))
-        stored["overrides"] = tuple((key, value) for key, value in stored["overrides"].items())
-        return PaperCell(matches=matches, half_widths=half_widths, **stored)
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-def run_task(task: PaperTask, folder: Path, progress: Callable[[float], None] | None = None) -> None:
+def run_task(task: PaperTask, folder: Path) -> None:
     """Run the methods of a task that have no result yet. Each file is written completely or not at all.
 
-    progress : called with the share that is done, 0..1. Raises MapFileError, OutputError.
+    Raises MapFileError, OutputError.
     """
-    missing = [name for name in task.methods if load_result(task, name, folder) is None]
-    if not missing:
-        return
-    started = time.perf_counter()
-    grid = read_map(task.map_path, task.reading)
+    missing = [name for name in task.methods if not task.result_path(folder, name).exists()]
+    grid = read_map(task.map_path)
     submaps = partition(grid, PartitionConfig.paper(task.radius_m))
     experiment = Experiment(queries=task.queries, offset_m=task.offset_m, seed=task.seed)
-    found = evaluate(_methods(missing, task), grid, submaps, experiment, task.noise, progress)
-    seconds = round((time.perf_counter() - started) / len(missing), 2)
-    for method, matches in found.items():
-        measures = matches.measures()
+    noise = replace(NOISE_LEVELS[task.level], speckle_sigma_m=task.speckle_sigma_m)
+    methods = make_methods(missing)
+    if "proposed" in methods:
+        methods["proposed"] = Proposed(SignatureConfig(**dict(task.overrides)))
+    for method, matches in evaluate(methods, grid, submaps, experiment, noise).items():
         low, high = matches.intervals()
-        result = PaperCell(
-            map_name=task.map_name,
-            reading=task.reading,
+        cell = PaperCell(
+            task=task,
             method=method,
-            level=task.level,
-            radius_m=task.radius_m,
-            offset_m=task.offset_m,
-            queries=task.queries,
-            seed=task.seed,
-            overrides=task.overrides,
             submaps=len(submaps),
-            seconds=seconds,
-            auc=measures.auc,
-            rp9=measures.rp9,
-            f1=measures.f1,
-            true_share=measures.r_at_1,
             matches=matches,
-            speckle_sigma_m=task.speckle_sigma_m,
+            measures=matches.measures(),
             half_widths=MatchMeasures(*((b - a) / 2 for a, b in zip(low, high, strict=True))),
         )
-        document = result.summary() | {
-            "fingerprint": fingerprint(task, method),
-            "similarity": matches.similarity.tolist(),
-            "correct": matches.correct.astype(int).tolist(),
-        }
-        with replace_file(task.result_path(folder, method)) as temporary:
-            temporary.write_text(json.dumps(document))
-
-
-def _methods(names: Sequence[str], task: PaperTask) -> dict[str, Method]:
-    methods = make_methods(names)
-    if "proposed" in methods and task.overrides:
-        methods["proposed"] = Proposed(SignatureConfig(**dict(task.overrides)))
-    return methods
+        with replace_file(task.result_path(folder, method)) as draft:
+            draft.write_bytes(pickle.dumps(cell))
 
 
 def known_maps(path: Path) -> list[Path]:

@@ -8,29 +8,23 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from functools import cache
 from pathlib import Path
 
 import pc2grid
 import signature
 
 FRONT, BACK = Path(pc2grid.__file__).parent, Path(signature.__file__).parent
-EXPERIMENTS = Path(__file__).parent
+LABORATORY = Path(__file__).parents[1]
+LABORATORY = Path(__file__).parents[1]
 """Folders of sources."""
 
 
-@cache
-def program_digest() -> str:
-    """Twelve hexadecimal digits that change with any source file of these packages and experiments.
+def digest_of_sources(paths: Iterable[Path]) -> str:
+    """Twelve hexadecimal digits that change with any of these files, and the Python files in these folders.
 
-    >>> len(program_digest())
+    >>> len(digest_of_sources([FRONT]))
     12
     """
-    return digest_of_sources((FRONT, BACK, EXPERIMENTS))
-
-
-def digest_of_sources(paths: Iterable[Path]) -> str:
-    """The same of these files, and of the Python files in these folders."""
     found = hashlib.sha256()
     for path in paths:
         for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:

@@ -7,8 +7,9 @@ many maps it is located in and however many methods are compared on it.
 from __future__ import annotations
 
 import math
+import pickle
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,9 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import Config
 from pc2grid.geometry import SE2
 from pc2grid.io.atomic import replace_file
-from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, SensorKind
+from pc2grid.model import Health, RegisteredScan, Scan, SensorKind
 from pc2grid.pipeline import follow
-from pc2grid.simulate import Building
 from pc2grid_lab.experiments.frames import fit_frame
-from pc2grid_lab.worlds import WorldConfig, iter_session
 
 _FITTED_M = 3.0  # length of the path that the true frame is fitted over; chosen by hand
 
@@ -96,54 +95,15 @@ class RegisteredSession:
             )
 
     def save(self, path: Path) -> None:
-        """Write the session to one .npz file, completely or not at all."""
-        empty = np.empty((0, 2), np.float32)
-        with replace_file(path) as draft, draft.open("wb") as file:
-            np.savez_compressed(
-                file,
-                sensor=np.array(self.sensor),
-                stamps_ns=np.array([s.stamp_ns for s in self.planar_scans], np.int64),
-                T_odom_base=self.T_odom_base,
-                lost=self.lost,
-                T_world_base=self.T_world_base,
-                hit_count=np.array([len(s.hits_m) for s in self.planar_scans], np.int64),
-                hits_m=np.concatenate([empty, *(s.hits_m for s in self.planar_scans)]),
-                origin_m=np.array([s.origin_m for s in self.planar_scans]).reshape(-1, 2),
-                free_m=np.array([s.free_m for s in self.planar_scans], np.float32),
-                height_m=np.array([s.height_m for s in self.planar_scans], np.float64),
-                heights=np.concatenate([empty[:, 0], *(s.heights for s in self.planar_scans)]),
-                heights_count=np.array([len(s.heights) for s in self.planar_scans], np.int64),
-            )
+        """Write the session to a file, completely or not at all."""
+        with replace_file(path) as draft:
+            draft.write_bytes(pickle.dumps(self))
 
     @staticmethod
     def load(path: Path) -> RegisteredSession:
         """Read a file that `save` has written."""
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-        hits = np.split(arrays["hits_m"], np.cumsum(arrays["hit_count"])[:-1])
-        heights = np.split(arrays["heights"].astype(np.uint8), np.cumsum(arrays["heights_count"])[:-1])
-        return RegisteredSession(
-            sensor=str(arrays["sensor"]),  # type: ignore[arg-type]
-            planar_scans=tuple(
-                replace(
-                    PlanarScan.of_hits(stamp_ns=int(stamp), hits_m=points, origin_m=origin, free_m=free),
-                    height_m=None if np.isnan(height_m) else float(height_m),
-                    heights=seen_at,
-                )
-                for stamp, points, origin, free, height_m, seen_at in zip(
-                    arrays["stamps_ns"],
-                    hits,
-                    arrays["origin_m"],
-                    arrays["free_m"],
-                    arrays["height_m"],
-                    heights,
-                    strict=True,
-                )
-            ),
-            T_odom_base=arrays["T_odom_base"],
-            lost=arrays["lost"],
-            T_world_base=arrays["T_world_base"],
-        )
+        session: RegisteredSession = pickle.loads(path.read_bytes())
+        return session
 
 
 def register(
@@ -187,19 +147,6 @@ def register(
         lost=np.array(lost, bool),
         T_world_base=_array(truths[: len(planar_scans)]),
     )
-
-
-def simulate_and_register(
-    plan: OccupancyGrid | Building,
-    sensor: SensorKind,
-    simulation: WorldConfig,
-    config: Config,
-    *,
-    until_m: float = math.inf,
-) -> RegisteredSession:
-    """Simulate a session in a floor plan and register it."""
-    scans = iter_session(sensor=sensor, grid=plan, config=simulation)
-    return register(scans, config, sensor=sensor, until_m=until_m)
 
 
 def _pose(row: F64) -> SE2:

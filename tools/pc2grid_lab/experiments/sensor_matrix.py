@@ -7,34 +7,125 @@ metres of travel. The sessions are registered as a user would do it; true poses 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from pc2grid.geometry import SE2
+from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import OccupancyGrid, Scan, SensorKind, SessionMap
 from pc2grid.pipeline import map_scans
-from pc2grid.simulate import Building
 from pc2grid.submaps.partition import partition
 from pc2grid_lab.experiments.answers import Answers, localize
-from pc2grid_lab.experiments.judgement import judge
-from pc2grid_lab.experiments.registered_session import RegisteredSession
-from pc2grid_lab.experiments.sensor_map import SensorMap
-from pc2grid_lab.experiments.trial import Trial
-from pc2grid_lab.worlds import WorldConfig, iter_session, prepare_session
+from pc2grid_lab.experiments.frames import apart
+from pc2grid_lab.experiments.registered_session import RegisteredSession, register
+from pc2grid_lab.experiments.stored import write_text
+from pc2grid_lab.experiments.trial import JUDGEMENT, Trial
+from pc2grid_lab.worlds import WorldConfig, prepare_session
 from signature.config import Config
+from signature.database import open_database
+from signature.localization.map_index import MapIndex
+from signature.localization.query import QueryMap
+from signature.retrieval.vote import retrieve
+from signature.sessions import add_session, provenance
 
 SENSORS: tuple[SensorKind, ...] = ("lidar", "laser", "depth")
 TRAVELS_M = (1.0, 3.0, 5.0, 8.0, 10.0, 15.0)
 """Metres of travel after which a query is answered."""
+MAP_SEED = 1000
+"""Map sessions and query sessions never share a seed: other clutter, start, direction and noise."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorMap:
+    """The map of a building by one sensor. T_plan_map : its frame in the floor plan."""
+
+    name: str
+    sensor: SensorKind
+    T_plan_map: SE2
+    index: MapIndex
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanDrives:
+    """Maps and drives that are made unless they exist.
+
+    setting : what their files are named after: map_length (metres driven to make a map), clutter, rate (scans
+        a second), change (share of doors and furniture that differ, 0 if left out). until_m, length_m : a
+        query is registered so far, of a simulated drive that long.
+    """
+
+    out: Path
+    setting: tuple[tuple[str, float], ...]
+    until_m: float
+    length_m: float
+
+    def file(self, kind: str, *names: object, suffix: str) -> Path:
+        """A file of the folder `kind`, named after its building, sensor and so on, and the setting."""
+        tag = (f"{key}{value:g}" for key, value in sorted(self.setting))
+        return self.out / kind / ".".join([*map(str, names), *tag, suffix])
+
+    def simulation(
+        self, length_m: float, seed: int, start_m: tuple[float, float] | None = None
+    ) -> WorldConfig:
+        """Of one drive."""
+        setting = dict(self.setting)
+        return WorldConfig.model_validate(
+            {
+                "length_m": length_m,
+                "seed": seed,
+                "clutter": int(setting["clutter"]),
+                "start_m": start_m,
+                "change": setting.get("change", 0.0),
+                **{sensor: {"rate_hz": setting["rate"]} for sensor in SENSORS},
+            }
+        )
+
+    @property
+    def mapping(self) -> WorldConfig:
+        """Of the drive that makes a map."""
+        return self.simulation(dict(self.setting)["map_length"], MAP_SEED)
+
+    def make_map(self, name: str, plan: Callable[[], OccupancyGrid], sensor: SensorKind) -> None:
+        """Make the map of a plan by one sensor: a database, and beside it its frame in the plan."""
+        path, config = self.file("maps", name, sensor, suffix="submaps"), Config()
+        if not path.with_suffix(".json").exists():
+            session_map, T_plan_map = map_building(name, plan(), sensor, self.mapping, config)
+            path.unlink(missing_ok=True)
+            add_session(path, session_map, config, provenance(f"{name}.plan", "0" * 64, config))
+            write_text(path.with_suffix(".json"), json.dumps((T_plan_map.x, T_plan_map.y, T_plan_map.yaw)))
+
+    def read_map(self, name: str, sensor: SensorKind) -> SensorMap:
+        """What `make_map` has made."""
+        path = self.file("maps", name, sensor, suffix="submaps")
+        with open_database(path) as database:
+            index = MapIndex.of(database, Config())
+        T_plan_map = SE2(*json.loads(path.with_suffix(".json").read_text()))
+        return SensorMap(name=name, sensor=sensor, T_plan_map=T_plan_map, index=index)
+
+    def drive(
+        self, name: str, plan: Callable[[], OccupancyGrid], sensor: SensorKind, seed: int
+    ) -> RegisteredSession:
+        """A registered query session, which starts somewhere on the path of the mapping one: a query from
+        where the mapping robot has never been has no right answer."""
+        path = self.file("drives", name, sensor, seed, suffix="pickle")
+        if not path.exists():
+            grid = plan()
+            way = prepare_session(sensor="laser", grid=grid, config=self.mapping).drive
+            at_s = np.random.default_rng([seed, MAP_SEED]).uniform(0.0, way.duration_s)
+            x, y, _ = way.at(np.array([at_s]))[0].tolist()
+            config = self.simulation(self.length_m, seed, (x, y))
+            scans = prepare_session(sensor=sensor, grid=grid, config=config).scans()
+            register(scans, Config(), sensor=sensor, until_m=self.until_m).save(path)
+        return RegisteredSession.load(path)
 
 
 def map_building(
-    name: str,
-    plan: OccupancyGrid | Building,
-    sensor: SensorKind,
-    simulation: WorldConfig,
-    config: Config,
+    name: str, plan: OccupancyGrid, sensor: SensorKind, simulation: WorldConfig, config: Config
 ) -> tuple[SessionMap, SE2]:
     """The map of a simulated session in a floor plan, and T_plan_map, the frame of the map in the plan.
 
@@ -44,7 +135,7 @@ def map_building(
     true_m: list[tuple[float, float]] = []
 
     def scans() -> Iterator[Scan]:
-        for scan, truth in iter_session(sensor=sensor, grid=plan, config=simulation):
+        for scan, truth in prepare_session(sensor=sensor, grid=plan, config=simulation).scans():
             true_m.append((truth.x, truth.y))
             yield scan
 
@@ -60,17 +151,6 @@ def map_building(
     return session_map, SE2.fit(trajectory.planar()[:, :2], np.array(true_m))
 
 
-def query_start(plan: OccupancyGrid | Building, mapping: WorldConfig, seed: int) -> tuple[float, float]:
-    """(x, y) in the plan where query session `seed` starts, drawn from the path of the mapping session.
-
-    A query from where the mapping robot has never been has no right answer.
-    """
-    path = prepare_session(sensor="laser", grid=plan, config=mapping).drive
-    rng = np.random.default_rng([seed, mapping.seed])
-    x, y, _ = path.at(np.array([rng.uniform(0.0, path.duration_s)]))[0]
-    return float(x), float(y)
-
-
 def query_trials(
     name: str,
     seed: int,
@@ -83,8 +163,6 @@ def query_trials(
     name : the building of the session. In maps of other buildings there is no right answer; they are located
     for the longest travel only.
     """
-    own = [m for m in maps if m.name == name]
-    others = [m for m in maps if m.name != name]
     path_m = session.path_m()
     travels_m = sorted(d for d in travels_m if d <= path_m[-1])
     # The number of scans after which each distance is reached, made distinct.
@@ -92,32 +170,74 @@ def query_trials(
     after = np.maximum.accumulate(after) + np.arange(len(travels_m))
     truths = [truth for _, _, truth in session.scans()]
     trials: list[Trial] = []
-    for searched_maps, first in ((own, 0), (others, len(travels_m) - 1)):
-        if not searched_maps or not travels_m:
+    for searched, first in (
+        ([m for m in maps if m.name == name], 0),
+        ([m for m in maps if m.name != name], len(travels_m) - 1),
+    ):
+        if not searched or not travels_m:
             continue
-        answers = _localize(session, searched_maps, set(after[first:].tolist()))
+        scans = ((registered, planar_scan) for registered, planar_scan, _ in session.scans())
+        answers = localize(scans, [m.index for m in searched], after=set(after[first:].tolist()))
         for travel_m, found in zip(travels_m[first:], answers, strict=True):
-            for sensor_map, answer, elapsed_ms in zip(
-                searched_maps, found.answers, found.elapsed_ms, strict=True
-            ):
-                trials.append(
-                    judge(
-                        sensor_map,
-                        found.query,
-                        answer,
-                        truths[found.scans - 1],
-                        building=name,
-                        query_sensor=session.sensor,
-                        seed=seed,
-                        travel_m=travel_m,
-                        look_up_ms=elapsed_ms,
-                    )
-                )
+            about = (name, session.sensor, seed, travel_m)
+            trials += [
+                _judged(sensor_map, found, k, truths[found.scans - 1], *about)
+                for k, sensor_map in enumerate(searched)
+            ]
     return trials
 
 
-def _localize(
-    session: RegisteredSession, maps: Sequence[SensorMap], after: Collection[int]
-) -> Iterator[Answers]:
-    scans = ((registered, planar_scan) for registered, planar_scan, _ in session.scans())
-    return localize(scans, [m.index for m in maps], after=after)
+def _judged(
+    sensor_map: SensorMap,
+    found: Answers,
+    k: int,
+    T_plan_base: SE2,
+    building: str,
+    query_sensor: SensorKind,
+    seed: int,
+    travel_m: float,
+) -> Trial:
+    """The kth of the answers to a query, compared with the true pose of the base at its last scan."""
+    query, answer = found.query, found.answers[k]
+    in_building = sensor_map.name == building
+    T_map_base = sensor_map.T_plan_map.inverse() @ T_plan_base
+    T_map_query = T_map_base @ answer.T_odom_base.inverse()
+    mapped = score_fit(sensor_map.index.maps[0].walls, query.walls, T_map_query, np.eye(3)).overlap
+    error_m, right = None, False
+    if answer.hypotheses:
+        error_m, error_rad = apart(T_map_base, answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base)
+        right = in_building and error_m <= JUDGEMENT.right_m and error_rad <= JUDGEMENT.right_rad
+    return Trial(
+        building=sensor_map.name,
+        map_sensor=sensor_map.sensor,
+        query_sensor=query_sensor,
+        seed=seed,
+        travel_m=travel_m,
+        in_building=in_building,
+        mapped=mapped if in_building else 0.0,
+        status=answer.status,
+        confidence=answer.confidence,
+        right=right,
+        error_m=error_m,
+        rank=_retrieved_rank(sensor_map.index, query, T_map_query) if in_building else -1,
+        look_up_ms=found.elapsed_ms[k],
+    )
+
+
+def _retrieved_rank(index: MapIndex, query: QueryMap, T_map_query: SE2) -> int:
+    """Rank of the first place, retrieved by signatures and isovists, at the true position of one of the
+    views.
+    """
+    proposals = retrieve(
+        query.views,
+        (query.T_odom_base.x, query.T_odom_base.y),
+        index.places,
+        signature=index.made_with.signature,
+        config=index.config,
+        top_k=50,
+    )
+    for rank, proposal in enumerate(proposals):
+        true_m = T_map_query.apply(np.array([query.views[proposal.view].center_m]))[0]
+        if math.dist(true_m, index.places.table.center_m[proposal.row]) <= JUDGEMENT.retrieved_m:
+            return rank
+    return -1

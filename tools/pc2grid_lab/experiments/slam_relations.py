@@ -6,6 +6,7 @@ of a trajectory between chosen pairs of times are compared with relative poses t
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,15 +32,13 @@ class Relations:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelationError:
-    """Mean and standard deviation of the absolute errors over the relations, metres and degrees.
+    """Mean absolute errors over the relations, metres and degrees; NaN without any.
 
     used : number of relations, of `total`, for which the trajectory has poses at both times.
     """
 
     translation_m: float
-    translation_std_m: float
     rotation_deg: float
-    rotation_std_deg: float
     used: int
     total: int
 
@@ -82,45 +81,6 @@ def relation_error(
         are those of the laser, not of the base). tolerance_s : a relation is left out if no pose is this
         close to one of its times, which may differ by a millisecond from the stamps.
     """
-    _, _, wanted, measured = compared_poses(
-        trajectory, relations, base_to_reference_m=base_to_reference_m, tolerance_s=tolerance_s
-    )
-    total = len(relations.first_ns)
-    if not len(measured):
-        nan = float("nan")
-        return RelationError(
-            translation_m=nan,
-            translation_std_m=nan,
-            rotation_deg=nan,
-            rotation_std_deg=nan,
-            used=0,
-            total=total,
-        )
-    error = _relative(wanted, measured)
-    distance = np.hypot(error[:, 0], error[:, 1])
-    angle = np.degrees(np.abs(wrap_angle(error[:, 2])))
-    return RelationError(
-        translation_m=float(distance.mean()),
-        translation_std_m=float(distance.std()),
-        rotation_deg=float(angle.mean()),
-        rotation_std_deg=float(angle.std()),
-        used=len(measured),
-        total=total,
-    )
-
-
-def compared_poses(
-    trajectory: Trajectory,
-    relations: Relations,
-    *,
-    base_to_reference_m: tuple[float, float] = (0.0, 0.0),
-    tolerance_s: float = 0.005,
-) -> tuple[I64, I64, F64, F64]:
-    """The relations for which the trajectory has poses at both times; the parameters are those above.
-
-    Returns the numbers of the two poses (U,) each, and the relative pose (U, 3) x, y, yaw by the relation and
-    by the trajectory.
-    """
     poses = trajectory.planar()
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     dx, dy = base_to_reference_m
@@ -129,8 +89,14 @@ def compared_poses(
     i, near_i = _nearest(trajectory.stamps_ns, relations.first_ns, tolerance_s)
     j, near_j = _nearest(trajectory.stamps_ns, relations.second_ns, tolerance_s)
     used = near_i & near_j
-    i, j = i[used], j[used]
-    return i, j, relations.T_first_second[used], _relative(poses[i], poses[j])
+    error = _relative(relations.T_first_second[used], _relative(poses[i[used]], poses[j[used]]))
+    off_m, off_deg = np.hypot(error[:, 0], error[:, 1]), np.degrees(np.abs(wrap_angle(error[:, 2])))
+    return RelationError(
+        translation_m=float(off_m.mean()) if len(error) else math.nan,
+        rotation_deg=float(off_deg.mean()) if len(error) else math.nan,
+        used=len(error),
+        total=len(used),
+    )
 
 
 def _nearest(stamps_ns: I64, wanted_ns: I64, tolerance_s: float) -> tuple[I64, np.ndarray]:

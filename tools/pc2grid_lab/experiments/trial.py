@@ -1,11 +1,18 @@
-"""One answer together with the truth: the type that all measurements of relocalization are made of."""
+"""One answer together with the truth, and what many of them say: the cells of the sensor matrix."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from signature.localization.answer_json import Status
+
+RECALL_AT = (1, 5, 20)
+"""Numbers of retrieved places for which the recall is given."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,13 +43,9 @@ class Trial:
 
     building: of the map. in_building: the query comes from that building; if not, nothing is right. mapped:
     share of the query's walls, placed as they truly are, that lie on ground that the map knows, 0..1. status,
-    confidence, error_m, error_rad: of the best hypothesis; the errors are null if there is none. right: the
-    error of the best hypothesis is small enough. rank: of the first right place among those retrieved, -1 if
-    there is none; alone: the same by each combination of signatures, without isovists. forward, walls,
-    backward, looked_at, lead, likeness: the evidence of the decision, see
-    `signature.localization.posterior`; agreement: the better one of forward and backward. In the results
-    of earlier versions, forward, backward, looked_at and likeness are null. query_building: of
-    the query; null in the results of earlier versions.
+    confidence, error_m: of the best hypothesis; the error is null if there is none. right: the error of the
+    best hypothesis is small enough. rank: of the first right place among those retrieved, -1 if there is
+    none.
     """
 
     building: str
@@ -56,25 +59,75 @@ class Trial:
     confidence: float
     right: bool
     error_m: float | None
-    error_rad: float | None
     rank: int
-    alone: dict[str, int]
-    agreement: float
-    walls: float
-    lead: float
     look_up_ms: float
-    forward: float | None = None
-    backward: float | None = None
-    looked_at: float | None = None
-    likeness: float | None = None
-    query_building: str | None = None
-
-    @property
-    def buildings(self) -> frozenset[str]:
-        """The buildings of the map and of the query, as far as they are known."""
-        return frozenset({self.building, self.query_building or self.building})
 
     @property
     def in_map(self) -> bool:
         """Whether the query lies where the map has been made, so that there is a right answer."""
         return self.in_building and self.mapped >= JUDGEMENT.mapped
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatrixCell:
+    """Queries of one sensor in maps made by another, after some metres of travel.
+
+    Shares are 0..1 of its trials. located_right: located, and right. wrong: share of the located ones that
+    are not right. recall: of the first right place among the first `RECALL_AT` retrieved ones. Errors are of
+    the answers that are located and right, in metres; null if there are none.
+    """
+
+    map_sensor: str
+    query_sensor: str
+    travel_m: float
+    trials: int
+    located_right: float
+    wrong: float
+    ambiguous: float
+    not_found: float
+    recall: tuple[float, ...]
+    median_error_m: float | None
+    p95_error_m: float | None
+    look_up_ms: float
+
+
+def matrix(trials: Sequence[Trial]) -> list[MatrixCell]:
+    """The trials that lie in the map of their own building, by map sensor, query sensor and travel."""
+    groups: dict[tuple[str, str, float], list[Trial]] = {}
+    for trial in trials:
+        if trial.in_map:
+            groups.setdefault((trial.map_sensor, trial.query_sensor, trial.travel_m), []).append(trial)
+    return [_cell(*key, members) for key, members in sorted(groups.items())]
+
+
+def _cell(map_sensor: str, query_sensor: str, travel_m: float, trials: Sequence[Trial]) -> MatrixCell:
+    located = [t for t in trials if t.status == "located"]
+    right = [t for t in located if t.right]
+    statuses, count = Counter(t.status for t in trials), len(trials)
+    errors_m = [t.error_m for t in right if t.error_m is not None]
+    median_m, p95_m = np.percentile(errors_m, (50, 95)).tolist() if errors_m else (None, None)
+    return MatrixCell(
+        map_sensor=map_sensor,
+        query_sensor=query_sensor,
+        travel_m=travel_m,
+        trials=count,
+        located_right=len(right) / count,
+        wrong=(len(located) - len(right)) / max(len(located), 1),
+        ambiguous=statuses["ambiguous"] / count,
+        not_found=statuses["not_found"] / count,
+        recall=tuple(sum(0 <= t.rank < k for t in trials) / count for k in RECALL_AT),
+        median_error_m=median_m,
+        p95_error_m=p95_m,
+        look_up_ms=float(np.median([t.look_up_ms for t in trials])),
+    )
+
+
+def reliability(trials: Sequence[Trial], bands: int = 10) -> list[tuple[float, float, int]]:
+    """For each band of confidence that has trials: mean confidence, share that was right, how many."""
+    members: dict[int, list[Trial]] = {}
+    for trial in trials:
+        members.setdefault(min(int(trial.confidence * bands), bands - 1), []).append(trial)
+    return [
+        (float(np.mean([t.confidence for t in band])), sum(t.right for t in band) / len(band), len(band))
+        for _, band in sorted(members.items())
+    ]

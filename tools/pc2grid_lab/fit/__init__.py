@@ -1,6 +1,5 @@
 """What the weights and numbers that come with the program were learned from, and by what they are judged.
 
 The weights of the signatures: `simulated`, then `signatures`; `retrieval` judges them. The numbers of the
-posterior: `real_queries` and `recorded_queries` collect evidence, `posterior` fits and judges; `real_answers`
-counts what is answered.
+posterior: `recorded_queries` collects evidence, `posterior` fits and judges.
 """

@@ -2,14 +2,13 @@
 
     python -m pc2grid_lab.fit.posterior EVIDENCE.json ...
 
-Each file is one that `real_queries` or `recorded_queries` has written, or one of the folder trials/ of
-`pc2grid compare sensors`. An answer is judged by a fit without all answers whose query or map is of one of
-its buildings. Prints the parameters for `signature.localization.posterior`, the log loss, by kind of pair
-and distance how many answers are right, and how many would be located by the parameters in use and by those
-fitted without the building, rightly and wrongly; the risk at several coverages; and what would be located
-if the least mass to answer were chosen without the building, too.
+Each file is one that `recorded_queries` has written. An answer is judged by a fit without all answers whose
+query or map is of one of its buildings. Prints by kind of query how many answers are right, and how many
+would be located by the parameters in use and by those fitted without the building, rightly and wrongly; the
+log loss; and the parameters for `signature.localization.posterior`.
 
-Queries whose place was found and all others weigh the same in the fit, however many of each there are.
+Queries whose place was found and all others weigh the same in the fit, however many of each there are. So the
+probability holds for queries half of which lie in the map.
 """
 
 from __future__ import annotations
@@ -17,203 +16,207 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.stats import mannwhitneyu
 
 from pc2grid.arrays import F64
-from pc2grid_lab.experiments.calibration import (
-    MOST_WRONG,
-    Known,
-    accepted,
-    clopper_pearson,
-    fit,
-    left_out,
-    log_loss,
-    roc_area,
-    share_by_building,
-)
+from pc2grid_lab.experiments.recordings.chance import clopper_pearson
 from signature.config import Config
-from signature.localization.posterior import POSTERIOR, Evidence
+from signature.localization.posterior import POSTERIOR, Evidence, PosteriorParameters, masses
 
 RIGHT_M, RIGHT_RAD = 0.5, math.radians(5.0)
 """Errors of answers to real logs at the right place. How precise they are is not the question here; the poses
 that count as true are good to some centimetres."""
 NEAR_M = 1.0
 """Answers so near to the place of a query that is not in the map are left out: neither right nor wrong."""
-SHARE_FOUND = 0.5
-"""Weight of the queries whose place was found. So the probability holds for queries half of which lie in the
-map."""
-COVERAGES = (0.5, 0.6, 0.7, 0.8, 0.9)
-"""At which the risk is printed."""
 PARTS_OF = {"fr079_floor": "fr079"}
 """Physical building of what the data call otherwise: the 3D scan is one floor of fr079."""
+_LAPSE = 0.1
+"""Share of the truths that are taken to be none: a query whose map is wrong, or whose place no equation would
+find, does not decide the fit."""
+_PENALTY = 1e-3
+"""Weight of the squared bias, fit and lead in the loss: keeps them finite where the answers can be told apart
+without error. By hand; with a tenth of it, what is judged on buildings that were left out is too sure."""
 
 
-@dataclass(frozen=True, slots=True)
-class Answered:
-    """An answer of a kind of pair of sensors, after some metres."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Known:
+    """A query whose truth is known, asked in one map.
+
+    kind : of query and map. buildings : of both. session : the drive it belongs to; answers of one drive
+    depend on each other. places : what tells for each place that was found, best first. first : number of the
+    place that was truly the query's, None if it was none of them.
+    """
 
     kind: str
-    travel_m: float
-    known: Known
+    buildings: frozenset[str]
+    session: str
+    places: tuple[Evidence, ...]
+    first: int | None
+
+    @property
+    def right(self) -> bool:
+        """Whether the best place is where the query truly was."""
+        return self.first == 0
+
+    def probability(self, p: PosteriorParameters) -> float:
+        """Mass of the best place."""
+        return float(masses(self.places, p=p)[0]) if self.places else 0.0
 
 
-def physical(*names: str) -> frozenset[str]:
-    """The buildings that the logs, scans and plans of these names are of."""
-    return frozenset(PARTS_OF.get(name, name) for name in names)
-
-
-def of_rows(rows: list[dict[str, Any]]) -> Iterator[Answered]:
+def known_of(rows: Sequence[dict[str, Any]]) -> Iterator[Known]:
     """Answers to real logs, without those to queries whose true pose is not known."""
     for row in rows:
         own, blanked = row["log"] == row["map"], row["place"] == "blanked"
         if not row["errors"] or (own and not math.isfinite(row["errors"][0][0])):
             continue
-        errors_m = [error_m for error_m, _ in row["errors"]]
-        if blanked and min(errors_m) < NEAR_M:
+        if blanked and min(error_m for error_m, _ in row["errors"]) < NEAR_M:
             continue
         right = [
             k
             for k, (error_m, error_rad) in enumerate(row["errors"])
             if own and not blanked and error_m <= RIGHT_M and error_rad <= RIGHT_RAD
         ]
-        where = "its own building" if own else "another building"
-        yield Answered(
-            f"laser log in {where}{', place blanked' if blanked else ''}",
-            row["travel_m"],
-            Known(
-                buildings=physical(row["log"], row["map"]),
-                session=f"{row['log']} {row['start']}",
-                places=tuple(Evidence(**evidence) for evidence in row["evidence"]),
-                first=right[0] if right else None,
-            ),
+        yield Known(
+            kind="place blanked" if blanked else "in its own building" if own else "in another building",
+            buildings=frozenset(PARTS_OF.get(row[name], row[name]) for name in ("log", "map")),
+            session=f"{row['log']} {row['start']}",
+            places=tuple(Evidence(**evidence) for evidence in row["evidence"]),
+            first=right[0] if right else None,
         )
 
 
-def of_trials(trials: list[dict[str, Any]]) -> Iterator[Answered]:
-    """Answers of `compare sensors`."""
-    names = ("forward", "walls", "backward", "looked_at", "lead", "likeness")
-    for trial in trials:
-        if trial.get("likeness") is None or trial.get("query_building") is None:
-            raise SystemExit("results of an earlier version, without all evidence; measure them again")
-        where = "" if trial["in_building"] else " in another building"
-        yield Answered(
-            f"{trial['query_sensor']} in a map by {trial['map_sensor']}{where}",
-            trial["travel_m"],
-            Known(
-                buildings=physical(trial["building"], trial["query_building"]),
-                session=f"{trial['query_building']} {trial['query_sensor']} {trial['seed']}",
-                places=(Evidence(**{name: trial[name] for name in names}),),
-                first=0 if trial["right"] else None,
-            ),
+def fit(answers: Sequence[Known]) -> PosteriorParameters:
+    """The parameters bias, fit and lead under which the truth is likeliest; only the bias may be negative.
+
+    The rate of slips stays as it is in use: queries in which tracking slips are too rare to tell it.
+    Raises ValueError unless there are both queries whose place was found and others.
+    """
+    found = np.array([answer.first is not None for answer in answers])
+    if found.all() or not found.any():
+        raise ValueError("a fit needs queries whose place was found and others")
+    weights = 0.5 * np.where(found, 1.0 / found.sum(), 1.0 / (~found).sum())
+    likelihood = _Likelihood.of(answers)
+
+    def loss(x: F64) -> float:
+        p = (1.0 - _LAPSE) * likelihood.of_truth(x) + _LAPSE
+        return float(-weights @ np.log(p) + 0.5 * _PENALTY * x @ x)
+
+    start = np.array([POSTERIOR.bias, POSTERIOR.fit, POSTERIOR.lead])
+    bounds = [(None, None), (0.0, None), (0.0, None)]
+    bias, fit_, lead = minimize(loss, start, bounds=bounds, method="L-BFGS-B").x.tolist()
+    return replace(POSTERIOR, bias=bias, fit=fit_, lead=lead)
+
+
+@dataclass(frozen=True, slots=True)
+class _Likelihood:
+    """Of N answers with up to K places: terms (N, K, 3), tails (N, T) of the best place, and the number of
+    the true place (N,), K for none.
+
+    Places that are missing or without walls have terms (inf, 0, 0); missing tails are inf.
+    """
+
+    terms: F64
+    tails: F64
+    first: NDArray[np.intp]
+
+    @staticmethod
+    def of(answers: Sequence[Known]) -> _Likelihood:
+        most = max((len(a.places) for a in answers), default=0)
+        longest = max((len(e.tail) for a in answers for e in a.places), default=0)
+        terms = np.tile((np.inf, 0.0, 0.0), (len(answers), most, 1))
+        tails = np.full((len(answers), longest), np.inf)
+        for n, answer in enumerate(answers):
+            for k, evidence in enumerate(answer.places):
+                if evidence.walls:
+                    terms[n, k] = evidence.terms
+                tails[n, : len(evidence.tail)] = evidence.tail
+        first = np.array([most if a.first is None else a.first for a in answers])
+        return _Likelihood(terms, tails, first)
+
+    def of_truth(self, x: F64) -> F64:
+        """(N,) probability of what is true, by bias, fit and lead."""
+        given = np.isfinite(self.terms[:, :, 0])
+        z = np.where(given, np.nan_to_num(self.terms, posinf=0.0) @ x, -700.0)
+        odds = np.exp(np.clip(z, -700.0, 300.0))
+        lost = (
+            POSTERIOR.slip
+            * np.exp(-x[1] * np.minimum(self.tails, 700.0)).sum(axis=1)
+            * odds[:, :1].sum(axis=1)
         )
+        every = np.column_stack((odds, np.ones(len(odds))))
+        lost_or_nowhere = np.where(self.first == odds.shape[1], lost, 0.0)
+        truth = every[np.arange(len(odds)), self.first] + lost_or_nowhere
+        return np.asarray(truth / (every.sum(axis=1) + lost))
 
 
-def read(file: Path) -> list[Answered]:
-    """The answers of one file. Raises SystemExit for results of an earlier version."""
-    document = json.loads(file.read_text())
-    if document and "in_building" in document[0]:
-        return list(of_trials(document))
-    # Before equal places shared their mass, each was compared with them.
-    if any("place" not in row or any("apart" in one for one in row["evidence"]) for row in document):
-        raise SystemExit(f"{file}: evidence of an earlier version; collect it again by real_queries.py")
-    return list(of_rows(document))
+def left_out(answers: Sequence[Known]) -> F64:
+    """(N,) mass of the best place of each answer by the parameters fitted to the answers in which neither
+    query nor map is of one of its buildings."""
+    models = {
+        buildings: fit([a for a in answers if not a.buildings & buildings])
+        for buildings in {answer.buildings for answer in answers}
+    }
+    return np.array([answer.probability(models[answer.buildings]) for answer in answers])
 
 
-@dataclass(slots=True)
-class Count:
-    """Answers, right ones, and those located [in use, refitted], rightly and wrongly."""
+def log_loss(answers: Sequence[Known], probabilities: F64) -> float:
+    """Mean negative logarithm of the probability (N,) of what is true."""
+    right = np.array([answer.right for answer in answers])
+    return float(-np.log(np.clip(np.where(right, probabilities, 1.0 - probabilities), 1e-4, 1.0)).mean())
 
-    answers: int = 0
-    right: int = 0
-    located_right: list[int] = field(default_factory=lambda: [0, 0])
-    located_wrong: list[int] = field(default_factory=lambda: [0, 0])
+
+def roc_area(answers: Sequence[Known], probabilities: F64) -> float:
+    """Area under the ROC curve: how often a right answer is surer than a wrong one; 0.5 is chance."""
+    right = np.array([answer.right for answer in answers])
+    statistic = mannwhitneyu(probabilities[right], probabilities[~right], method="asymptotic").statistic
+    return float(statistic / (right.sum() * (~right).sum()))
 
 
 def main() -> None:
     """Fit, judge and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("files", type=Path, nargs="+")
-    answered = [a for file in parser.parse_args().files for a in read(file)]
-    known = [a.known for a in answered]
-    refuse(known)
-    in_use = np.array([k.probability(POSTERIOR) for k in known])
-    refitted = left_out(known, SHARE_FOUND)
-    print_counts(answered, in_use, refitted)
-    accept = Config().relocalize.accept
-    print_sums(known, "in use", in_use, in_use >= accept)
-    print_sums(known, "fitted without the building", refitted, refitted >= accept)
-    given = accepted(known, SHARE_FOUND)
-    print_sums(known, f"and the least mass for {MOST_WRONG:.0%} wrong chosen without it", refitted, given)
-    print_risk(known, refitted)
-    print(fit(known, SHARE_FOUND))
-
-
-def refuse(known: list[Known]) -> None:
-    """Raises SystemExit if a building cannot be left out."""
+    known = [k for file in parser.parse_args().files for k in known_of(json.loads(file.read_text()))]
     for buildings in {k.buildings for k in known}:
         if len({k.first is None for k in known if not k.buildings & buildings}) < 2:
             raise SystemExit(
                 "the fit is judged by leaving buildings out, and without"
                 f" {' and '.join(sorted(buildings))} not both kinds of queries are left: found and not"
             )
+    in_use = np.array([k.probability(POSTERIOR) for k in known])
+    for name, probabilities in (("in use", in_use), ("fitted without the building", left_out(known))):
+        print_judged(known, name, probabilities)
+    print(fit(known))
 
 
-def print_counts(answered: list[Answered], *probabilities: F64) -> None:
-    """Print a row for each kind of query and metres driven. probabilities : (N,) in use, and refitted."""
-    counts: dict[tuple[str, int], Count] = {}
-    for a, *each in zip(answered, *probabilities, strict=True):
-        count = counts.setdefault((a.kind, math.floor(a.travel_m)), Count())
-        count.answers += 1
-        count.right += a.known.right
-        for i, probability in enumerate(each):
-            if probability >= Config().relocalize.accept:
-                (count.located_right if a.known.right else count.located_wrong)[i] += 1
-    print(f"{'kind':50} {'m':>3} answers right | in use: right wrong | left out: right wrong")
-    for (kind, metres), c in sorted(counts.items()):
-        print(
-            f"{kind:50} {metres:3d} {c.answers:7d} {c.right:5d}"
-            f" | {c.located_right[0]:13d} {c.located_wrong[0]:5d} |"
-            f" {c.located_right[1]:15d} {c.located_wrong[1]:5d}"
-        )
-
-
-def print_sums(known: list[Known], name: str, probabilities: F64, located: NDArray[np.bool_]) -> None:
-    """Print how good the probabilities (N,) are, and what is located (N,) by them."""
-    right = np.array([k.right for k in known])
-    buildings, drives = [k.buildings for k in known], [k.session for k in known]
-    _, low, high = share_by_building(buildings, drives, located & ~right)
+def print_judged(known: Sequence[Known], name: str, probabilities: F64) -> None:
+    """Print how good the probabilities (N,) are, and what is located by them, by kind of query."""
+    accept = Config().relocalize.accept
+    counts = Counter((k.kind, k.right, bool(p >= accept)) for k, p in zip(known, probabilities, strict=True))
+    for kind in sorted({k.kind for k in known}):
+        right, wrong = (counts[kind, is_right, True] for is_right in (True, False))
+        all_right = right + counts[kind, True, False]
+        answers = all_right + wrong + counts[kind, False, False]
+        print(f"{name}, {kind}: of {answers} located {right} of {all_right} right ones, {wrong} wrong ones")
     # Windows of one drive depend on each other: a drive with a wrong answer counts once.
-    in_drives = {drive for drive, is_located in zip(drives, located, strict=True) if is_located}
-    wrong_drives = {drive for drive, is_wrong in zip(drives, located & ~right, strict=True) if is_wrong}
-    least, most = clopper_pearson(len(wrong_drives), len(in_drives))
+    located = {k.session for k, p in zip(known, probabilities, strict=True) if p >= accept}
+    wrong_in = {k.session for k, p in zip(known, probabilities, strict=True) if p >= accept and not k.right}
+    least, most = clopper_pearson(len(wrong_in), len(located), 0.1) if located else (0.0, 1.0)
     print(
-        f"{name}: log loss {log_loss(known, probabilities):.4f},"
-        f" area under the ROC curve {roc_area(known, probabilities):.4f}, located"
-        f" {np.count_nonzero(located & right)} of {np.count_nonzero(right)} right ones,"
-        f" {np.count_nonzero(located & ~right)} of {np.count_nonzero(~right)} wrong ones"
-        f" ({np.mean(located & ~right):.2%} of all answers; 5 to 95 %, by building and drive: {low:.2%} to"
-        f" {high:.2%}); wrong in {len(wrong_drives)} of {len(in_drives)} queries that are located"
-        f" (Clopper-Pearson 90 %: {least:.2%} to {most:.2%})"
+        f"{name}: log loss {log_loss(known, probabilities):.4f}, area under the ROC curve"
+        f" {roc_area(known, probabilities):.4f}, wrong in {len(wrong_in)} of {len(located)} drives"
+        f" (90 %: {least:.2%} to {most:.2%})"
     )
-
-
-def print_risk(known: list[Known], probabilities: F64) -> None:
-    """Print which share of the answers that are given is wrong (the risk), if the surest share of those whose
-    place comes first is given (the coverage)."""
-    right = np.array([k.right for k in known])
-    order = np.argsort(-probabilities, kind="stable")
-    found, wrong = np.cumsum(right[order]), np.cumsum(~right[order])
-    for coverage in COVERAGES:
-        k = int(np.searchsorted(found, coverage * found[-1]))
-        print(f"coverage {coverage:.2f}: mass {probabilities[order][k]:.3f}, wrong {wrong[k]} of {k + 1}")
 
 
 if __name__ == "__main__":

@@ -1,17 +1,25 @@
-"""Queries of which the true place is known, and floors of other buildings."""
+"""Queries of which the true place is known, and floors of other buildings.
+
+The map of a real log is drawn at the poses of the ground truth, so that mapping has no part in it; the
+queries are its later parts, registered as a user's would be. DATA holds `laser/NAME.mcap` and
+`laser/NAME_corrected.tum`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from pc2grid.geometry import SE2
+from pc2grid.io.nav2_map import load_map
 from pc2grid.model import OCCUPIED, OccupancyGrid
 from pc2grid.simulate import office_floorplan
 from pc2grid.simulate.clutter import covered, place_clutter
 from pc2grid_lab.experiments.registered_session import RegisteredSession
+from pc2grid_lab.peers.site import recorded_site
 from signature.config import Config
 from signature.localization.query import Query, QueryMap
 
@@ -32,7 +40,10 @@ def office_floor(seed: int, clutter: int = 30) -> OccupancyGrid:
 def queries_of(
     session: RegisteredSession, config: Config, travels_m: Sequence[float] = TRAVELS_M
 ) -> Iterator[tuple[float, QueryMap, SE2]]:
-    """The query after each of `travels_m`: metres, what has been seen, and its true frame in the plan."""
+    """The query after each of `travels_m`: metres, what has been seen, and its true frame in the plan.
+
+    Without those whose true pose is not known.
+    """
     query = Query(config, config.relocalize)
     path_m = session.path_m()
     due = sorted(d for d in travels_m if len(path_m) and d <= path_m[-1])
@@ -40,13 +51,30 @@ def queries_of(
         if not session.lost[number]:
             query.add(registered, planar_scan)
         while due and path_m[number] >= due[0]:
-            if not np.all(session.lost[: number + 1]):
+            truth = session.T_world_base[: number + 1]
+            if not np.all(session.lost[: number + 1]) and not np.isnan(truth).all():
                 so_far = replace(
                     session,
                     planar_scans=session.planar_scans[: number + 1],
                     T_odom_base=session.T_odom_base[: number + 1],
                     lost=session.lost[: number + 1],
-                    T_world_base=session.T_world_base[: number + 1],
+                    T_world_base=truth,
                 )
                 yield due[0], query.map(), so_far.T_world_odom()
             del due[0]
+
+
+MAPPED_S = {"fr079": 600.0, "intel": 900.0, "csail": 250.0, "killian": 900.0}
+"""Seconds of each log that become the map."""
+
+Drawn = tuple[OccupancyGrid, list[RegisteredSession]]
+"""The map of the first part of a log, and its later parts as registered queries."""
+
+
+def read(data: Path, name: str, queries: int, kept: Path, config: Config) -> Drawn:
+    """The map of the first part of a log, and its later parts as registered queries; `kept` has them."""
+    log = data / "laser" / f"{name}.mcap"
+    travel_m, mapped_s = TRAVELS_M[-1] + 2.0, MAPPED_S[name]
+    site = recorded_site(log, kept / name, config, queries=queries, travel_m=travel_m, mapped_s=mapped_s)
+    sessions = [RegisteredSession.load(site.stem(number).with_suffix(".pickle")) for number in site.queries()]
+    return load_map(site.map_stem.with_suffix(".yaml")), sessions

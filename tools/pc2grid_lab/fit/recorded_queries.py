@@ -5,7 +5,7 @@
 DATA is the folder of recordings, WORK the one in which `compare recordings` has kept its maps and answers.
 Each window is asked in its map and in that of another building, with --everywhere in those of seven or eight;
 where the map knows its place, also with all that it sees there made unknown ("blanked"), and standing, by its
-last scan alone. `posterior` fits the posterior to them; the rows are those of `real_queries`.
+last scan alone. `posterior` fits the posterior to them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import argparse
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +30,11 @@ from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair
 from pc2grid_lab.experiments.recordings.drive import config_of
 from pc2grid_lab.experiments.recordings.judging import Judge
 from pc2grid_lab.experiments.recordings.run import Folder
-from pc2grid_lab.fit.real_queries import evidence_list
 from signature.config import Config
 from signature.database import SubmapDatabase, open_database
+from signature.localization.hypotheses import Hypothesis
 from signature.localization.map_index import MapIndex
+from signature.localization.posterior import evidence_of, tail_of
 from signature.localization.query import Query, QueryMap
 
 OTHERS = ("fr079", "wean 2", "kidnap dec13 before", "workshop_1", "birmingham", "csail", "jarvis nav", "hall")
@@ -82,9 +83,6 @@ def rows(
         "map": building[window.pair.map],
         "start": f"{window.pair.query} {window.span.start_s:.1f}",
         "travel_m": window.whole.path_m,
-        "window_m": index.config.window_m,
-        "stage": "everywhere",
-        "covered": float(window.covered),
         "place": "in the map" if window.truth else "elsewhere",
     }
     yield row | _asked(index, window.whole, window.truth)
@@ -103,6 +101,16 @@ def _asked(index: MapIndex, query: QueryMap, truth: dict[str, SE2]) -> dict[str,
         at = h.fit.T_map_query @ query.T_odom_base
         errors.append((math.inf, math.pi) if expected is None else apart(expected, at))
     return {"evidence": evidence_list(index, query, found), "errors": errors}
+
+
+def evidence_list(index: MapIndex, query: QueryMap, found: tuple[Hypothesis, ...]) -> list[dict[str, Any]]:
+    """What tells for each hypothesis, and for the best one, what its last scans tell."""
+    evidence = list(evidence_of([h.fit for h in found], query))
+    if found:
+        walls = index.maps[found[0].session_index].walls
+        tail = tail_of(query, found[0].fit, walls, index.config.step_m)
+        evidence[0] = replace(evidence[0], tail=tail)
+    return [asdict(one) for one in evidence]
 
 
 def _blanked(index: MapIndex, window: Window) -> MapIndex:

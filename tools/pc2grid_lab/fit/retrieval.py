@@ -1,22 +1,17 @@
-"""Do the signatures find the place? Real logs, beside a shortlist drawn at random and none at all.
+"""Do the signatures find the place? Real logs, beside a shortlist drawn at random.
 
-    python -m pc2grid_lab.fit.retrieval DATA FOLDER [--logs csail,...] [--floors 24] [--locate]
+    python -m pc2grid_lab.fit.retrieval DATA FOLDER [--logs csail,...] [--floors 24]
 
 The map of a building is that of the first part of its log at true poses, the queries are later parts after
 1, 3 and 8 m. The other places are of office floors. FOLDER holds `without_NAME.npz` and
 `without_NAME.places.npz` for each log: statistics that `signatures` has learned without this building.
 For each selector, printed is the share of queries of which a right place is selected among 0.64 % and 5 % (at
 least 50) of the places.
-
---locate : prints instead what is located, and rightly, with the selected 5 %, and the processor time of the
-look-up with the decision on what it found; "none": the maps are searched as a whole. To be compared with few
-floors.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -26,13 +21,11 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from pc2grid.arrays import I64
-from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.geometry import SE2
+from pc2grid_lab.experiments.answers import index_of
 from pc2grid_lab.experiments.trial import JUDGEMENT
-from pc2grid_lab.fit.queries import TRAVELS_M, office_floor
-from pc2grid_lab.fit.real_queries import MAPPED_S, Drawn, index_of, read
-from pc2grid_lab.fit.signatures import queries_with_truth
+from pc2grid_lab.fit.queries import MAPPED_S, TRAVELS_M, Drawn, office_floor, queries_of, read
 from signature.config import Config
-from signature.localization.decision import judge
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
 from signature.retrieval.place_index import PlaceIndex
@@ -43,7 +36,7 @@ from signature.similarity import SignatureTable
 
 _FIRST_FLOOR = 1000
 _ALL = "+".join(COMBINATIONS[-1])
-RANDOM, SHUFFLED, NONE, EVERY = "random", "shuffled", "none", "all places"
+RANDOM, SHUFFLED = "random", "shuffled"
 NO_LOOK, ANY_LOOK = "no first look", "first look at random"
 """All viewpoints are compared; those of places drawn at random are."""
 _NAMES = tuple("+".join(names) for names in COMBINATIONS)
@@ -51,8 +44,8 @@ _FEW = 0.0064
 """102 of 16,000 places, as in earlier measurements."""
 
 
-Row = tuple[str, float, int, bool, bool, float, str]
-"""Selector, metres of travel, which size of shortlist, located, right, processor time in ms, and log."""
+Row = tuple[str, float, int, bool, float]
+"""Selector, metres of travel, which size of shortlist, whether a right place is in it, and time in ms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +91,8 @@ class Building:
     def rows(self, selector: str, query: QueryMap, most: int, rng: np.random.Generator) -> I64:
         """The places that are selected, likeliest first."""
         count = len(self.index.places.table)
-        if selector in (RANDOM, EVERY):
-            return rng.permutation(count)[: count if selector == EVERY else most]
+        if selector == RANDOM:
+            return rng.permutation(count)[:most]
         among = None
         if selector != NO_LOOK:
             among = self.first_looks.get(selector, self.first_looks[_ALL]).likely(query.views, most)
@@ -127,16 +120,14 @@ def asked_of(
 ) -> Iterator[tuple[float, QueryMap, SE2, I64]]:
     """The queries on the map: metres of travel, what was seen, its true frame, and the right places."""
     for session in drawn[1]:
-        for travel_m, query, T_map_query in queries_with_truth(session, config):
+        for travel_m, query, T_map_query in queries_of(session, config):
             right = right_places(query, T_map_query, places) if query.views else np.empty(0, np.int64)
             if len(right):
                 yield travel_m, query, T_map_query, right
 
 
-def recalls(
-    building: Building, drawn: Drawn, config: Config
-) -> Iterator[tuple[str, float, int, bool, float]]:
-    """Selector, metres of travel, places selected, whether a right one is, processor time in ms."""
+def recalls(building: Building, drawn: Drawn, config: Config) -> Iterator[Row]:
+    """What each selector finds for each query."""
     places, rng = building.index.places.table, np.random.default_rng(0)
     sizes = (round(_FEW * len(places)), shortlist_size(len(places), config.relocalize))
     for travel_m, query, _, right in asked_of(drawn, places, config):
@@ -144,40 +135,8 @@ def recalls(
             begin = time.process_time()
             rows = building.rows(selector, query, max(sizes), rng)
             took_ms = 1000.0 * (time.process_time() - begin)
-            for size in sizes:
-                yield selector, travel_m, size, bool(np.isin(rows[:size], right).any()), took_ms
-
-
-def answers(
-    building: Building, drawn: Drawn, config: Config
-) -> Iterator[tuple[str, float, bool, bool, float]]:
-    """Selector, metres of travel, located, rightly, processor time in ms."""
-    index, rng = building.index, np.random.default_rng(0)
-    index.maps[0], index.places.around(np.arange(len(index.places.table)))
-    most = shortlist_size(len(index.places.table), config.relocalize)
-    for travel_m, query, T_map_query, _ in asked_of(drawn, index.places.table, config):
-        for selector in (_ALL, RANDOM, EVERY, NONE):
-            begin = time.process_time()
-            if selector == NONE:
-                found = index.search_whole_maps(query, ())
-            else:
-                found = index.look_up(query, rows=np.sort(building.rows(selector, query, most, rng)))
-            verdict = judge(index, query, found)
-            took_ms = 1000.0 * (time.process_time() - begin)
-            located = verdict.status == "located"
-            well = False
-            if located:
-                best, base = verdict.hypotheses[0], query.T_odom_base
-                error = (T_map_query @ base).inverse() @ (best.fit.T_map_query @ base)
-                near = math.hypot(error.x, error.y) <= JUDGEMENT.right_m
-                turned = abs(float(wrap_angle(error.yaw)))
-                well = best.session_index == 0 and near and turned <= JUDGEMENT.right_rad
-            yield selector, travel_m, located, well, took_ms
-
-
-def _mean(found: Sequence[Row], selector: str, rank: int, name: str) -> float:
-    """The share of right ones of a log."""
-    return float(np.mean([r[4] for r in found if (r[0], r[2], r[6]) == (selector, rank, name)]))
+            for rank, size in enumerate(sizes):
+                yield selector, travel_m, rank, bool(np.isin(rows[:size], right).any()), took_ms
 
 
 def main() -> None:
@@ -190,7 +149,6 @@ def main() -> None:
     parser.add_argument("--logs", default=",".join(MAPPED_S))
     parser.add_argument("--queries", type=int, default=24)
     parser.add_argument("--floors", type=int, default=24)
-    parser.add_argument("--locate", action="store_true")
     options = parser.parse_args()
     config, kept = Config(), options.folder / "drives"
     kept.mkdir(parents=True, exist_ok=True)
@@ -205,33 +163,21 @@ def main() -> None:
         own = index_of(name, drawn[0], config)
         building = Building.of(name, [own, *floors], options.folder / f"without_{name}.npz", config)
         places.append(len(building.index.places.table))
-        if options.locate:
-            found += [
-                (s, t, 0, hit, well, ms, name) for s, t, hit, well, ms in answers(building, drawn, config)
-            ]
-        else:
-            sizes: dict[int, int] = {}
-            for s, t, size, hit, ms in recalls(building, drawn, config):
-                rank = sizes.setdefault(size, len(sizes))
-                found.append((s, t, rank, hit, hit, ms, name))
-    _print_tables(found, places, options.logs.split(","), options.locate)
+        found += recalls(building, drawn, config)
+    _print_tables(found, places)
 
 
-def _print_tables(found: Sequence[Row], places: Sequence[int], logs: Sequence[str], locate: bool) -> None:
-    """A table for each number of places that are selected, or one of what was located."""
-    for rank in sorted({row[2] for row in found}):
-        what = "located, rightly" if locate else ("0.64 %", "5 %, at least 50")[rank]
-        print(f"\n{what} of {min(places):,} to {max(places):,} places, {', '.join(logs)}")
+def _print_tables(found: Sequence[Row], places: Sequence[int]) -> None:
+    """A table for each number of places that are selected."""
+    for rank, what in enumerate(("0.64 %", "5 %, at least 50")):
+        print(f"\n{what} of {min(places):,} to {max(places):,} places")
         for selector in dict.fromkeys(row[0] for row in found):
+            rows = [r for r in found if (r[0], r[2]) == (selector, rank)]
             cells = []
             for travel_m in TRAVELS_M:
-                rows = [r for r in found if r[0] == selector and r[1] == travel_m and r[2] == rank]
-                wrong = sum(r[3] and not r[4] for r in rows)
-                said = f" ({wrong} wrong)" if locate else ""
-                cells.append(f"{np.mean([r[4] for r in rows]):.2f}{said} of {len(rows)}")
-            took = np.median([r[5] for r in found if r[0] == selector])
-            by_log = [f"{name} {_mean(found, selector, rank, name):.2f}" for name in logs]
-            print(f"| {selector} | {' | '.join(cells)} | {took:.0f} ms | {', '.join(by_log)} |", flush=True)
+                hits = [r[3] for r in rows if r[1] == travel_m]
+                cells.append(f"{np.mean(hits):.2f} of {len(hits)}")
+            print(f"| {selector} | {' | '.join(cells)} | {np.median([r[4] for r in rows]):.0f} ms |")
 
 
 if __name__ == "__main__":

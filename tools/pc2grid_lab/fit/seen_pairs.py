@@ -11,7 +11,7 @@ from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.isovist import look_around
 from pc2grid.submaps.partition import submap_centers
-from pc2grid_lab.experiments.sensor_map import SensorMap
+from pc2grid_lab.experiments.sensor_matrix import SensorMap
 from signature.config import Config
 from signature.localization.query import QueryMap, best_observed
 from signature.seen import seen_signatures

@@ -11,7 +11,7 @@ places are those of the other logs' maps, of drawn maps, and of office floors.
 The weights of the signatures of places, by which the first look is taken, are learned from the same logs, and
 from the place of the map that is nearest to each view; they are written to OUT.places.npz.
 
-DATA is as of `real_queries`; with `maps/NAME.yaml`, maps of buildings without queries. The building that is
+DATA is as of `queries`; with `maps/NAME.yaml`, maps of buildings without queries. The building that is
 to be judged is left out by --without; `retrieval` judges.
 """
 
@@ -28,11 +28,10 @@ from scipy.spatial import cKDTree
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import OccupancyGrid
-from pc2grid_lab.experiments.registered_session import RegisteredSession
-from pc2grid_lab.experiments.sensor_map import SensorMap
+from pc2grid_lab.experiments.answers import index_of
+from pc2grid_lab.experiments.sensor_matrix import SensorMap
 from pc2grid_lab.experiments.trial import JUDGEMENT
-from pc2grid_lab.fit.queries import TRAVELS_M, office_floor, queries_of
-from pc2grid_lab.fit.real_queries import MAPPED_S, Drawn, index_of, read
+from pc2grid_lab.fit.queries import MAPPED_S, Drawn, office_floor, queries_of, read
 from pc2grid_lab.fit.seen_pairs import pairs_of
 from signature.boundary import boundary_bins
 from signature.config import Config
@@ -48,17 +47,6 @@ _FIRST_FLOOR, _FLOORS = 30_010, 10
 """Office floors that are other places, besides the maps of other buildings."""
 
 
-def queries_with_truth(
-    driven: RegisteredSession, config: Config, travels_m: Sequence[float] = TRAVELS_M
-) -> Iterator[tuple[float, QueryMap, SE2]]:
-    """`queries_of` a session, without those whose true pose is not known."""
-    for travel_m in travels_m:
-        try:
-            yield from queries_of(driven, config, (travel_m,))
-        except IndexError:  # the truth of this part of the log has no pose
-            continue
-
-
 def pairs_of_logs(logs: dict[str, Drawn], floors: Sequence[OccupancyGrid], config: Config) -> Pairs:
     """Pairs of the logs; `floors` and the maps of the logs are the other places."""
 
@@ -66,7 +54,7 @@ def pairs_of_logs(logs: dict[str, Drawn], floors: Sequence[OccupancyGrid], confi
         for name, (grid, driven) in logs.items():
             own = SensorMap(name=name, sensor="laser", index=index_of(name, grid, config), T_plan_map=SE2())
             for session in driven:
-                for _, query, T_map_query in queries_with_truth(session, config):
+                for _, query, T_map_query in queries_of(session, config):
                     yield query, T_map_query, [own]
 
     return pairs_of(asked(), [*floors, *(grid for grid, _ in logs.values())], config)
@@ -80,7 +68,7 @@ def place_pairs_of_logs(logs: dict[str, Drawn], floors: Sequence[OccupancyGrid],
     for name, (_, driven) in logs.items():
         tree, rows = cKDTree(maps[name].center_m), table_rows(maps[name])
         for session in driven:
-            for _, query, T_map_query in queries_with_truth(session, config):
+            for _, query, T_map_query in queries_of(session, config):
                 if query.views:
                     views_m = T_map_query.apply(np.array([view.center_m for view in query.views]))
                     distance_m, nearest = tree.query(views_m)

@@ -20,9 +20,7 @@ from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import OccupancyGrid
 from pc2grid.simulate import office_floorplan
-from pc2grid_lab.experiments.plan_drives import PlanDrives
-from pc2grid_lab.experiments.sensor_map import SensorMap
-from pc2grid_lab.experiments.sensor_matrix import SENSORS
+from pc2grid_lab.experiments.sensor_matrix import SENSORS, PlanDrives, SensorMap
 from pc2grid_lab.fit.queries import TRAVELS_M, office_floor, queries_of
 from pc2grid_lab.fit.seen_pairs import pairs_of
 from signature.config import Config

@@ -1,8 +1,8 @@
-"""What the peers' answers are worth: right, wrong or none, each peer with the threshold that is best for it.
+"""What the answers are worth: right, wrong or none, each program with the threshold that is best for it.
 
 pc2grid decides by itself whether it answers. The others give an answer and a score. Their threshold is chosen
 on these very answers, which is more than a user could do: it is the one with the most right answers less the
-wrong ones, in the own building and in another one. So the comparison is in favour of the peers.
+wrong ones, in the own building and in another one. So the comparison is in favour of the others.
 """
 
 from __future__ import annotations
@@ -11,14 +11,12 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import median
 from typing import Literal
 
-import numpy as np
-
 from pc2grid.geometry import SE2
-from pc2grid_lab.experiments.calibration import share_by_session
 from pc2grid_lab.experiments.frames import apart
-from pc2grid_lab.peers.peer_process import PeerAnswer
+from pc2grid_lab.experiments.recordings.chance import clopper_pearson
 from pc2grid_lab.peers.site import SiteQuery
 
 Place = Literal["covered", "uncovered", "elsewhere"]
@@ -26,84 +24,64 @@ Place = Literal["covered", "uncovered", "elsewhere"]
 building."""
 
 DECIDES = "pc2grid"
-"""The peer whose answers need no threshold."""
+"""The program whose answers need no threshold."""
+RIGHT_M, RIGHT_RAD = 0.3, math.radians(5.0)
+"""The truth is another program's map, good to some centimetres. By hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OutcomeParameters:
-    """When an answer is right, and how intervals are made. All chosen by hand.
+class PeerAnswer:
+    """What a program says to one query.
 
-    right_m, right_rad : the truth is another program's map, good to some centimetres.
-    resamples, seed, low, high : of the bootstrap over queries, and its percentiles.
+    pose : x, y, yaw of the base in the map, None without an answer. score : how sure it is, larger is surer,
+        in a unit of its own. cpu_s : processor time from the registered query to the pose. peak_mb : largest
+        memory of the process so far, with the map and the libraries.
     """
 
-    right_m: float = 0.3
-    right_rad: float = math.radians(5.0)
-    resamples: int = 2000
-    seed: int = 0
-    low: float = 5.0
-    high: float = 95.0
-
-
-OUTCOME = OutcomeParameters()
+    pose: tuple[float, float, float] | None
+    score: float
+    cpu_s: float
+    peak_mb: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PeerTrial:
     """One answer with its truth.
 
-    site: the building of the query. map: that of the map. right: near the true pose; false without a pose
-    and elsewhere. error_m: null without a pose and elsewhere.
+    site : the building of the query. right : near the true pose; false without a pose and elsewhere.
+    error_m : None without a pose and elsewhere.
     """
 
     peer: str
     site: str
-    map: str
-    query: int
     place: Place
-    pose: tuple[float, float, float] | None
-    score: float
+    answer: PeerAnswer
     right: bool
     error_m: float | None
-    cpu_s: float
-    peak_mb: float
 
     @staticmethod
-    def of(peer: str, site: str, map_: str, number: int, query: SiteQuery, answer: PeerAnswer) -> PeerTrial:
-        """The answer to a query, judged."""
+    def of(peer: str, site: str, map_: str, query: SiteQuery, answer: PeerAnswer) -> PeerTrial:
+        """The answer to a query, judged. map_ : the building of the map."""
         place: Place = "elsewhere" if map_ != site else "covered" if query.covered else "uncovered"
         right, error_m = False, None
         if answer.pose is not None and place != "elsewhere":
-            error_m, error_rad = apart(query.T_map_base, SE2(*answer.pose))
-            right = error_m <= OUTCOME.right_m and error_rad <= OUTCOME.right_rad
-        return PeerTrial(
-            peer=peer,
-            site=site,
-            map=map_,
-            query=number,
-            place=place,
-            pose=answer.pose,
-            score=answer.score,
-            right=right,
-            error_m=error_m,
-            cpu_s=answer.cpu_s,
-            peak_mb=answer.peak_mb,
-        )
+            error_m, error_rad = apart(SE2(*query.pose), SE2(*answer.pose))
+            right = error_m <= RIGHT_M and error_rad <= RIGHT_RAD
+        return PeerTrial(peer=peer, site=site, place=place, answer=answer, right=right, error_m=error_m)
 
     def answered(self, threshold: float) -> bool:
         """Whether there is an answer at this threshold of the score."""
-        return self.pose is not None and self.score >= threshold
+        return self.answer.pose is not None and self.answer.score >= threshold
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PeerCell:
-    """One peer in the queries of one building.
+    """One program in the queries of one building.
 
-    threshold: of its score; null if the peer decides by itself. right, wrong, unanswered: of the covered
-    queries; right_low, right_high: 5 and 95 % of the share that is right. uncovered_wrong: of the uncovered
-    ones. elsewhere_wrong: answers in another building's map, all wrong. median_error_m: of the right answers,
-    null if there are none. cpu_s, elsewhere_cpu_s: median of an answer in the own and in another building's
-    map; null without queries there. peak_mb: largest of its process.
+    threshold: of its score; null if it decides by itself, or never answers. right, wrong: of the covered
+    queries; interval: 5 and 95 % of the share that is right, null without such queries. The others are wrong
+    answers to the queries that have no right one. cpu_s, elsewhere_cpu_s: median of an answer in the own and
+    in another building's map.
     """
 
     peer: str
@@ -112,9 +90,7 @@ class PeerCell:
     covered: int
     right: int
     wrong: int
-    unanswered: int
-    right_low: float | None
-    right_high: float | None
+    interval: tuple[float, float] | None
     uncovered: int
     uncovered_wrong: int
     elsewhere: int
@@ -130,66 +106,47 @@ def best_threshold(trials: Sequence[PeerTrial]) -> float:
 
     Infinite, which is never to answer, if wrong answers outnumber the right ones at every threshold.
     """
-    scored = [t for t in trials if t.pose is not None]
 
     def gain(threshold: float) -> int:
-        return sum(1 if t.right else -1 for t in scored if t.answered(threshold))
+        return sum(1 if t.right else -1 for t in trials if t.answered(threshold))
 
-    return max([math.inf, *sorted({t.score for t in scored}, reverse=True)], key=gain)
+    scores = {t.answer.score for t in trials if t.answer.pose is not None}
+    return max([math.inf, *sorted(scores, reverse=True)], key=gain)
 
 
 def counted(trials: Sequence[PeerTrial]) -> list[PeerCell]:
-    """A cell for each site and peer, in the order of the trials. A peer has one threshold for all sites."""
+    """A cell for each site and program, in the order of the trials. A program has one threshold for all."""
     thresholds = {
-        name: best_threshold([t for t in trials if t.peer == name])
+        name: -math.inf if name == DECIDES else best_threshold([t for t in trials if t.peer == name])
         for name in dict.fromkeys(t.peer for t in trials)
-        if name != DECIDES
     }
     pairs = dict.fromkeys((t.site, t.peer) for t in trials)
-    return [_cell([t for t in trials if (t.site, t.peer) == pair], thresholds.get(pair[1])) for pair in pairs]
+    return [_cell([t for t in trials if (t.site, t.peer) == pair], thresholds[pair[1]]) for pair in pairs]
 
 
-def _cell(trials: Sequence[PeerTrial], threshold: float | None) -> PeerCell:
-    lowest = -math.inf if threshold is None else threshold
+def _cell(trials: Sequence[PeerTrial], threshold: float) -> PeerCell:
     of_place = Counter(trial.place for trial in trials)
-    wrong = Counter(t.place for t in trials if t.answered(lowest) and not t.right)
-    right = [t for t in trials if t.answered(lowest) and t.right and t.place == "covered"]
-    low, high = _interval([t in right for t in trials if t.place == "covered"])
+    wrong = Counter(t.place for t in trials if t.answered(threshold) and not t.right)
+    right = [t for t in trials if t.answered(threshold) and t.right and t.place == "covered"]
+    covered = of_place["covered"]
     return PeerCell(
         peer=trials[0].peer,
         site=trials[0].site,
-        threshold=threshold if math.isfinite(lowest) else None,
-        covered=of_place["covered"],
+        threshold=threshold if math.isfinite(threshold) else None,
+        covered=covered,
         right=len(right),
         wrong=wrong["covered"],
-        unanswered=of_place["covered"] - len(right) - wrong["covered"],
-        right_low=low,
-        right_high=high,
+        interval=clopper_pearson(len(right), covered, 0.1) if covered else None,
         uncovered=of_place["uncovered"],
         uncovered_wrong=wrong["uncovered"],
         elsewhere=of_place["elsewhere"],
         elsewhere_wrong=wrong["elsewhere"],
-        median_error_m=_median([t.error_m for t in right]),
-        cpu_s=_median_cpu_s(trials, elsewhere=False),
-        elsewhere_cpu_s=_median_cpu_s(trials, elsewhere=True),
-        peak_mb=max(t.peak_mb for t in trials),
+        median_error_m=_median([t.error_m for t in right if t.error_m is not None]),
+        cpu_s=_median([t.answer.cpu_s for t in trials if t.place != "elsewhere"]),
+        elsewhere_cpu_s=_median([t.answer.cpu_s for t in trials if t.place == "elsewhere"]),
+        peak_mb=max(t.answer.peak_mb for t in trials),
     )
 
 
-def _median_cpu_s(trials: Sequence[PeerTrial], *, elsewhere: bool) -> float | None:
-    return _median([t.cpu_s for t in trials if (t.place == "elsewhere") == elsewhere])
-
-
-def _median(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None
-
-
-def _interval(right: Sequence[bool]) -> tuple[float | None, float | None]:
-    """Percentiles of the share, by resampling the queries."""
-    if not right:
-        return None, None
-    bounds = (OUTCOME.low, OUTCOME.high)
-    return share_by_session(
-        range(len(right)), np.array(right), draws=OUTCOME.resamples, seed=OUTCOME.seed, percentiles=bounds
-    )[1:]
+def _median(values: Sequence[float]) -> float | None:
+    return median(values) if values else None

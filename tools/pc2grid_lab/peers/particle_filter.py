@@ -14,14 +14,16 @@ import subprocess
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pc2grid.arrays import F32, F64
+from pc2grid.errors import Pc2GridError
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import load_map
+from pc2grid_lab.experiments.frames import apart
 from pc2grid_lab.experiments.registered_session import RegisteredSession
-from pc2grid_lab.peers.peer_process import PeerAnswer, PeerFailed
 
 PROGRAMS = ("pf-localization", "carmen2rawlog", "ros-map-yaml2mrpt")
 
@@ -119,17 +121,17 @@ class ParticleFilter:
         self._map = Path(self._folder.name) / "map.gridmap.gz"
         _run(["ros-map-yaml2mrpt", "-q", "-w", "-i", map_stem.with_suffix(".yaml"), "-d", self._folder.name])
 
-    def locate(self, query: Path) -> PeerAnswer:
-        """The mean of the particles at the last scan.
+    def locate(self, query: Path) -> dict[str, Any]:
+        """The mean of the particles at the last scan, as the fields of `PeerAnswer`.
 
         The score is minus the root of the trace of their covariance, metres and radians: particles in
         several places are far from each other.
 
-        Raises PeerFailed if one of the programs fails.
+        Raises Pc2GridError if one of the programs fails.
         """
         folder = Path(self._folder.name)
         log, rawlog, config = folder / "query.log", folder / "query.rawlog", folder / "query.ini"
-        session = RegisteredSession.load(query.with_suffix(".npz"))
+        session = RegisteredSession.load(query.with_suffix(".pickle"))
         with np.load(query.with_suffix(".ranges.npz")) as file:
             ranges_m, fov_rad, T_base_middle = file["ranges_m"], float(file["fov_rad"]), file["T_base_middle"]
         log.write_text(carmen_log(session, ranges_m, fov_rad, SE2.from_matrix(T_base_middle)))
@@ -154,13 +156,10 @@ class ParticleFilter:
         output, cpu_s, peak_mb = _run(["pf-localization", config])
         found = _ESTIMATE.findall(output)
         if not found:
-            raise PeerFailed(f"pf-localization: no estimate for {query}", hint=output[-300:])
+            raise Pc2GridError(f"pf-localization: no estimate for {query}", hint=output[-300:])
         x, y, yaw_deg, spread = (float(value) for value in found[-1])
-        return PeerAnswer(pose=(x, y, math.radians(yaw_deg)), score=-spread, cpu_s=cpu_s, peak_mb=peak_mb)
-
-    def close(self) -> None:
-        """Remove the temporary files."""
-        self._folder.cleanup()
+        pose = (x, y, math.radians(yaw_deg))
+        return {"pose": pose, "score": -spread, "cpu_s": cpu_s, "peak_mb": peak_mb}
 
 
 def carmen_log(session: RegisteredSession, ranges_m: F32, fov_rad: float, T_base_middle: SE2) -> str:
@@ -190,13 +189,11 @@ def carmen_log(session: RegisteredSession, ranges_m: F32, fov_rad: float, T_base
 
 def _after_motion(T_odom_base: F64) -> list[int]:
     """The first scan, those after each step of motion, and the last."""
+    poses, p = [SE2(*row) for row in T_odom_base.tolist()], PARTICLE_FILTER
     kept = [0]
-    for k in range(1, len(T_odom_base)):
-        step = SE2(*T_odom_base[kept[-1]].tolist()).inverse() @ SE2(*T_odom_base[k].tolist())
-        moved = (
-            math.hypot(step.x, step.y) >= PARTICLE_FILTER.step_m or abs(step.yaw) >= PARTICLE_FILTER.step_rad
-        )
-        if moved or k == len(T_odom_base) - 1:
+    for k, pose in enumerate(poses):
+        step_m, step_rad = apart(poses[kept[-1]], pose)
+        if step_m >= p.step_m or step_rad >= p.step_rad or k == len(poses) - 1 > 0:
             kept.append(k)
     return kept
 
@@ -204,7 +201,7 @@ def _after_motion(T_odom_base: F64) -> list[int]:
 def _run(command: list[str | Path]) -> tuple[str, float, float]:
     """Run a program to its end: its output, processor seconds, and peak of memory in megabytes.
 
-    Raises PeerFailed if it fails.
+    Raises Pc2GridError if it fails.
     """
     with tempfile.TemporaryFile("w+") as output:
         process = subprocess.Popen(
@@ -215,5 +212,5 @@ def _run(command: list[str | Path]) -> tuple[str, float, float]:
         output.seek(0)
         text = output.read()
     if process.returncode:
-        raise PeerFailed(f"{command[0]} ended with {process.returncode}", hint=text[-300:])
+        raise Pc2GridError(f"{command[0]} ended with {process.returncode}", hint=text[-300:])
     return text, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1000.0

@@ -5,13 +5,12 @@ registered as a user's would be; every peer gets the registered poses as its odo
 that of wheels.
 
 A site is a folder: `map.yaml` and `map.png` (nav2), `map.npz` (clouds along the path, of a lidar only) and
-`queries/NN.*`: `.json` (the truth), `.npz` (registered planar scans), `.ranges.npz` (the beams of a laser) or
-`.cloud.npz` (the points of a lidar).
+`queries/NN.*`: `.json` (the truth), `.pickle` (registered planar scans), `.ranges.npz` (the beams of a laser)
+or `.cloud.npz` (the points of a lidar).
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Iterable, Iterator
@@ -26,24 +25,19 @@ from pc2grid.errors import ConfigError, LogNotFound
 from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2, transform_points
 from pc2grid.io import Log, open_log
-from pc2grid.io.building_file import is_building_file
 from pc2grid.io.nav2_map import load_map, save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
-from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind, Trajectory
+from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind
 from pc2grid.sensor_model import SENSOR_MODELS
-from pc2grid.simulate import load_building
+from pc2grid.simulate import Session, SimulationConfig, load_building, prepare_session
+from pc2grid.simulate.config import LidarConfig
 from pc2grid_lab.experiments.frames import apart, number_at
-from pc2grid_lab.experiments.plan_drives import MAP_SEED
-from pc2grid_lab.experiments.program import digest_of_sources
 from pc2grid_lab.experiments.registered_session import register
-from pc2grid_lab.experiments.sensor_matrix import query_start
+from pc2grid_lab.experiments.sensor_matrix import MAP_SEED
 from pc2grid_lab.experiments.stored import write_arrays, write_text
 from pc2grid_lab.experiments.trial import JUDGEMENT
-from pc2grid_lab.peers.request_digest import PREPARES, digest
-from pc2grid_lab.worlds import WorldConfig, iter_session
 from signature.config import Config
-from signature.sessions import digest_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,11 +86,6 @@ class SiteQuery:
     covered: bool
     travel_m: float
 
-    @property
-    def T_map_base(self) -> SE2:
-        """The true pose."""
-        return SE2(*self.pose)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
@@ -121,25 +110,6 @@ class Site:
         return {int(file.stem): SiteQuery(**json.loads(file.read_text())) for file in files}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TruePoses:
-    """Poses that another program has computed, of the sensor or, with `of_base`, of the base.
-
-    Not every scan needs to have one.
-    """
-
-    trajectory: Trajectory
-    of_base: bool = False
-
-    def at(self, scan: Scan) -> F64 | None:
-        """T_world_base (4, 4) at a scan; None where it is not known."""
-        i = number_at(self.trajectory.stamps_ns, scan.stamp_ns)
-        if i is None:
-            return None
-        T_world: F64 = self.trajectory.T_session_base[i]
-        return T_world if self.of_base else T_world @ np.linalg.inv(scan.T_base_sensor)
-
-
 PosedScan = tuple[Scan, F64 | None]
 """A scan with its true pose T_world_base (4, 4)."""
 
@@ -155,20 +125,6 @@ def truth_file(log: Path) -> Path:
     raise LogNotFound(
         f"{log}: no true poses beside it", hint=f"put them into {log.stem}.tum, stamped as the scans"
     )
-
-
-def site_name(
-    source: Path, config: Config, *, queries: int, travel_m: float, mapped_s: float | None, of_base: bool
-) -> str:
-    """A name for the folder of a site, that differs where anything differs that the site is made from.
-
-    source : a recording with true poses beside it, or a 3D scan of a building. Raises what `digest_of` and
-    `truth_file` do.
-    """
-    truth = "" if is_building_file(source) else hashlib.sha256(truth_file(source).read_bytes()).hexdigest()
-    settings = (queries, travel_m, mapped_s, of_base, config.model_dump(mode="json"))
-    made = digest(digest_of(source, config), truth, settings, digest_of_sources(PREPARES))
-    return f"{source.stem}.{made}"
 
 
 def recorded_site(
@@ -190,7 +146,6 @@ def recorded_site(
     Raises ConfigError if nothing is left to locate, and what `open_log` and `read_tum` do.
     """
     with open_log(log, config.read) as opened:
-        truth = TruePoses(trajectory=read_tum(truth_file(log)), of_base=of_base)
         end_s = (opened.info.end_ns - opened.info.start_ns) * 1e-9
         mapped_s = mapped_s if mapped_s is not None else SITE.mapped * end_s
         longest_s = min(SITE.query_s, SITE.query_share * (end_s - mapped_s))
@@ -200,11 +155,18 @@ def recorded_site(
                 hint=f"for example --mapped {log.stem}={end_s / 2:.0f}",
             )
         site = Site(name=log.stem, sensor=opened.choose().sensor, folder=folder)
-        if not _has_map(site):
-            _save_map(site, _posed(opened, truth, 0.0, mapped_s), config)
+        truth = read_tum(truth_file(log))
+
+        def posed(start_s: float, duration_s: float) -> Iterator[PosedScan]:
+            for scan in opened.scans(start_s, duration_s):
+                i = number_at(truth.stamps_ns, scan.stamp_ns)
+                T = None if i is None else truth.T_session_base[i]
+                yield scan, T if T is None or of_base else T @ np.linalg.inv(scan.T_base_sensor)
+
+        _save_map(site, posed(0.0, mapped_s), config)
         starts_s = np.linspace(mapped_s + SITE.gap * longest_s, end_s - longest_s, queries)
         for number, start_s in enumerate(_distinct(opened, starts_s)):
-            _save_query(site, number, _posed(opened, truth, start_s, longest_s), config, travel_m)
+            _save_query(site, number, posed(start_s, longest_s), config, travel_m)
     return site
 
 
@@ -214,32 +176,27 @@ def simulated_site(
     """The site of a lidar that is simulated in a real 3D scan of a building (PLY, PCD or a mesh)."""
     building = load_building(building_file)
     site = Site(name=building_file.stem, sensor="lidar", folder=folder)
-    mapping = _simulation(SITE.map_length_m, MAP_SEED)
 
-    def drive(simulation: WorldConfig) -> Iterator[PosedScan]:
-        for scan, truth in iter_session(sensor="lidar", grid=building, config=simulation):
-            yield scan, truth.lift()
+    def drive(length_m: float, seed: int, start_m: tuple[float, float] | None = None) -> Session:
+        config = SimulationConfig(
+            length_m=length_m,
+            seed=seed,
+            clutter=SITE.clutter,
+            start_m=start_m,
+            lidar=LidarConfig(rate_hz=SITE.rate_hz, columns=SITE.columns),
+        )
+        return prepare_session(sensor="lidar", grid=building, config=config)
 
-    if not _has_map(site):
-        _save_map(site, drive(mapping), config)
+    def posed(session: Session) -> Iterator[PosedScan]:
+        return ((scan, truth.lift()) for scan, truth in session.scans())
+
+    mapping = drive(SITE.map_length_m, MAP_SEED)
+    _save_map(site, posed(mapping), config)
     for number in range(queries):
-        if not site.stem(number).with_suffix(".json").exists():
-            start_m = query_start(building, mapping, number + 1)
-            simulation = _simulation(travel_m + 3.0, number + 1, start_m)
-            _save_query(site, number, drive(simulation), config, travel_m)
+        at_s = np.random.default_rng([number + 1, MAP_SEED]).uniform(0.0, mapping.drive.duration_s)
+        x, y, _ = mapping.drive.at(np.array([at_s]))[0].tolist()
+        _save_query(site, number, posed(drive(travel_m + 3.0, number + 1, (x, y))), config, travel_m)
     return site
-
-
-def _simulation(length_m: float, seed: int, start_m: tuple[float, float] | None = None) -> WorldConfig:
-    lidar = {"rate_hz": SITE.rate_hz, "columns": SITE.columns}
-    return WorldConfig.model_validate(
-        {"length_m": length_m, "seed": seed, "clutter": SITE.clutter, "start_m": start_m, "lidar": lidar}
-    )
-
-
-def _posed(log: Log, truth: TruePoses, start_s: float, duration_s: float) -> Iterator[PosedScan]:
-    for scan in log.scans(start_s, duration_s):
-        yield scan, truth.at(scan)
 
 
 def _distinct(log: Log, starts_s: F64) -> list[float]:
@@ -250,12 +207,10 @@ def _distinct(log: Log, starts_s: F64) -> list[float]:
     ]
 
 
-def _has_map(site: Site) -> bool:
-    return site.map_stem.with_suffix(".yaml").exists()
-
-
 def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
-    """Draw the grid at the true poses and, of a lidar, keep the clouds."""
+    """Draw the grid at the true poses and, of a lidar, keep the clouds; unless there is a map."""
+    if site.map_stem.with_suffix(".yaml").exists():
+        return
     builder = GridBuilder(config.projection)
     path, clouds = [], []
     for scan, T_world_base in _keyframes(site, scans):
@@ -307,7 +262,7 @@ def _save_query(
     if np.isnan(session.T_world_base[:, 0]).all():
         return
     truth = session.T_world_odom() @ SE2(*session.T_odom_base[-1].tolist())
-    session.save(stem.with_suffix(".npz"))
+    session.save(stem.with_suffix(".pickle"))
     if SENSOR_MODELS[site.sensor].planar:
         save_beams(stem.with_suffix(".ranges.npz"), [registered.scan for registered in seen])
     else:
