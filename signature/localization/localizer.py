@@ -160,22 +160,23 @@ class Localizer:
         self._last = query.part, query.path_m, hypotheses
 
     def answer(self, known: tuple[Hypothesis, ...] = (), prior_of: PriorOf | None = None) -> Answer:
-        """Where the query is by all that it has seen. The search goes on as if it had not been asked.
+        """Where the query is by all that it has seen; if it was likely carried away, by what it has seen
+        since. The search goes on as if it had not been asked.
 
         known : hypotheses to be compared, too. prior_of : of each place; None: by the looks before the last
         metres. Raises NoScans if no scan could be used.
         """
         if prior_of is not None:
             return self._answer(self.query, known, prior_of)
-        return self._since_slip()[1]
+        return self._since_slip(known)[1]
 
-    def _since_slip(self) -> tuple[Query, Answer]:
-        """The answer; by the scans since the robot was carried away or tracking slipped, if that is more
-        likely than not."""
-        query, answer = self.query, self._answer(self.query)
+    def _since_slip(self, known: tuple[Hypothesis, ...] = ()) -> tuple[Query, Answer]:
+        """The answer, and the query that it is about: the scans since the robot was carried away or tracking
+        slipped, if that is more likely than not."""
+        query, answer = self.query, self._answer(self.query, known)
         while answer.slipped >= POSTERIOR.likely:
             query = query.since(answer.evidence.scans_since)
-            answer = self._answer(query)
+            answer = self._answer(query, known)
         return query, answer
 
     def _answer(

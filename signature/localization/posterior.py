@@ -89,9 +89,8 @@ class Evidence:
     `pc2grid.matching.walls.steadiness`. backward, looked_at : the other way round, from whichever side.
     lead : score less that of the best place that does not fit equally well, at most `longest_lead` of it.
     likeness : `pc2grid.matching.self_likeness` of the query.
-    tail : r_k, log-likelihood of the scans from the k-th one on, the last one first, up to the second one
-    of the query. since : A, what they can
-    be elsewhere, as a multiple of "nowhere".
+    tail : r_k, log-likelihood of the scans from the k-th one on, the last one first, without the first scan
+    of the query. since : A, what the scans since the likeliest slip can be, as a multiple of "nowhere".
     """
 
     forward: float
