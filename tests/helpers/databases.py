@@ -138,6 +138,15 @@ def small_graph(seed: int) -> nx.Graph:
 
 
 MONDAY, TUESDAY = make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)
+READ_PART: dict[str, Callable[[Any], object]] = {
+    "grid": lambda database: database.grid("monday"),
+    "trajectory": lambda database: database.trajectory("monday"),
+    "loops": lambda database: database.loops("monday"),
+    "graph": lambda database: database.graph("monday"),
+    "points": lambda database: database.points("monday"),
+    "seen": lambda database: database.seen_places("monday"),
+}
+"""What reads a part of the session "monday"."""
 
 
 def assert_holds(database: SubmapDatabase, entry: Entry) -> None:

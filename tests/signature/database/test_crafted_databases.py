@@ -17,7 +17,7 @@ from signature.boundary import boundary_bins
 from signature.config import Config
 from signature.database import maintenance, open_database, validation
 from signature.database.rows import SESSION_COLUMNS
-from tests.helpers.databases import TUESDAY, Content, assert_holds, craft, make_entry, sql
+from tests.helpers.databases import READ_PART, TUESDAY, Content, assert_holds, craft, make_entry, sql
 
 FUZZ = int(os.environ.get("PC2GRID_FUZZ", "0"))
 Change = Callable[[Content], Any]
@@ -72,12 +72,7 @@ def row(**values: Any) -> Change:
 NAN, INF = float("nan"), float("inf")
 READ: dict[str, Callable[[Any], object]] = {
     "info": lambda database: database.sessions(),
-    "grid": lambda database: database.grid("monday"),
-    "trajectory": lambda database: database.trajectory("monday"),
-    "loops": lambda database: database.loops("monday"),
-    "graph": lambda database: database.graph("monday"),
-    "points": lambda database: database.points("monday"),
-    "seen": lambda database: database.seen_places("monday"),
+    **READ_PART,
     "submaps": lambda database: (database.signatures(), list(database.submaps("monday"))),
     "frame": lambda database: database.frames(),
 }

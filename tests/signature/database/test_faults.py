@@ -47,7 +47,7 @@ from signature.database.sqlite.atomic_update import hold, rewrite
 from signature.describe import describe
 from signature.sessions import add_session, provenance
 from tests.helpers import postgresql
-from tests.helpers.databases import MONDAY, TUESDAY, assert_holds, everything, make_entry, sql
+from tests.helpers.databases import MONDAY, READ_PART, TUESDAY, assert_holds, everything, make_entry, sql
 from tests.helpers.memory import bounded_memory
 from tests.helpers.rooms import small_house
 
@@ -444,12 +444,7 @@ def test_table_definitions_that_are_no_text(path: Path, before: bytes, after: by
 
 
 GONE: dict[str, Callable[[Any], object]] = {
-    "grid": lambda database: database.grid("monday"),
-    "trajectory": lambda database: database.trajectory("monday"),
-    "loops": lambda database: database.loops("monday"),
-    "graph": lambda database: database.graph("monday"),
-    "points": lambda database: database.points("monday"),
-    "seen": lambda database: database.seen_places("monday"),
+    **READ_PART,
     "submaps": lambda database: list(database.submaps("monday")),
 }
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from itertools import permutations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -126,7 +127,7 @@ def task(catalogue: Catalogue, folder: Folder, one: Followed) -> Task:
     return Task(_result(folder, one), do, 0.0)
 
 
-def _result(folder: Folder, one: Followed) -> Any:
+def _result(folder: Folder, one: Followed) -> Path:
     return folder.work / "followed" / f"{plain(one.name)}.in.{plain(one.map)}.json"
 
 
@@ -184,25 +185,29 @@ class FollowedJudge:
 
     def _shows(self, name: str, map_: str, stamp_ns: int) -> bool | None:
         """Whether the map knows what the robot sees; None if nobody knows where that is."""
-        frame, own = self._frame(name, map_), self._drive(name).own_pose(stamp_ns)
-        if frame is None or own is None:
+        expected = self._expected(name, map_, stamp_ns)
+        if expected is None:
             return None
         hits_m = hits_at(self._folder, self._catalogue.recordings[name], stamp_ns)
         with open_database(self._folder.map(map_)) as database:
             grid = database.grid(_SESSION)
-        return known_share(grid, frame.place(own[1])[0].apply(hits_m)) >= JUDGEMENT.mapped
+        return known_share(grid, expected[0].apply(hits_m)) >= JUDGEMENT.mapped
+
+    def _is_right(self, name: str, map_: str, stamp_ns: int, T_map_base: SE2) -> bool | None:
+        """Whether the robot is there; None if nobody knows where it is."""
+        expected = self._expected(name, map_, stamp_ns)
+        return None if expected is None else is_right(T_map_base, *expected)[0]
+
+    def _expected(self, name: str, map_: str, stamp_ns: int) -> tuple[SE2, float] | None:
+        """T_map_base at a scan of a recording, and how far a right answer may be from there, metres; None if
+        nobody knows how the recording lies in the map."""
+        frame, own = self._frame(name, map_), self._drive(name).own_pose(stamp_ns)
+        return None if frame is None or own is None else frame.place(own[1])
 
     def _travel_m(self, name: str, begin_ns: int, end_ns: int) -> float:
         """How far the robot has driven between two scans of a recording."""
         parts = self._drive(name).parts
         return float(sum(np.ptp(np.interp((begin_ns, end_ns), p.stamps_ns, p.path_m())) for p in parts))
-
-    def _is_right(self, name: str, map_: str, stamp_ns: int, T_map_base: SE2) -> bool | None:
-        """Whether the robot is there; None if nobody knows how the recording lies in the map."""
-        frame, own = self._frame(name, map_), self._drive(name).own_pose(stamp_ns)
-        if frame is None or own is None:
-            return None
-        return is_right(T_map_base, *frame.place(own[1]))[0]
 
     def _frame(self, name: str, map_: str) -> Frame | None:
         """How a recording lies in a map, by the looks at the recording as it is."""
