@@ -15,6 +15,7 @@ from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli.known_pose import KnownPose, end_s
+from pc2grid_cli.locate import about_log
 from signature.files import query_config
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import check_pose
@@ -60,7 +61,8 @@ def check_log(
                 session=known.session,
                 watch=see,
             )
-        return checked, _document(checked, log, path, database.location, scans)
+        about = about_log(path, log, checked, scans=scans, span=span)
+        return checked, {**_judgement(checked, database.location), "query": about}
 
 
 def _believed(log: Log, known: KnownPose, span: TimeSpan) -> tuple[SE2, int | None]:
@@ -71,22 +73,6 @@ def _believed(log: Log, known: KnownPose, span: TimeSpan) -> tuple[SE2, int | No
     assert known.check is not None
     x_m, y_m, yaw_deg = known.check
     return SE2(x_m, y_m, math.radians(yaw_deg)), None
-
-
-def _document(checked: PoseCheck, log: Log, path: Path, where: str, scans: int) -> RelocalizeCheck:
-    report = log.report()
-    return {
-        **_judgement(checked, where),
-        "query": {
-            "path_m": checked.path_m,
-            "stamp_ns": checked.stamp_ns,
-            "source": path.name,
-            "scans": scans,
-            "sensor": log.choose().sensor,
-            "lossy": report.lossy,
-            "warnings": list(report.warnings),
-        },
-    }
 
 
 def live_document(look: PoseLook, drive: Followed, where: str) -> WatchCheck:

@@ -68,9 +68,12 @@ class Live(TypedDict):
 
 
 class QueryRecording(Travel):
-    """What was looked for. sensor: lidar, laser, depth, or map. lossy: data was lost while reading."""
+    """What was looked for. start_s, duration_s: the part of the recording that was read; null: to its end.
+    sensor: lidar, laser, depth, or map. lossy: data was lost while reading."""
 
     source: str
+    start_s: float
+    duration_s: float | None
     scans: int
     sensor: str
     lossy: bool

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from signature.database import SubmapDatabase
     from signature.localization.answer import Moment
     from signature.localization.localizer import Answer, Watch
+    from signature.localization.pose_check import PoseCheck
     from signature.localization.prior import Prior
 
 
@@ -114,18 +115,22 @@ def find_log(
             on_the_way=on_the_way,
             index=index,
         )
-        about = about_log(path, query, answer, scans=len(poses))
+        about = about_log(path, query, answer, scans=len(poses), span=span)
         report = query.report()
         return Found(answer=answer, poses=poses, about=about, report=report, on_the_way=tuple(moments))
 
 
-def about_log(path: Path, query: Log, answer: Answer, *, scans: int) -> QueryRecording:
-    """The description of a recording in the JSON document of the answer."""
+def about_log(
+    path: Path, query: Log, answer: Answer | PoseCheck, *, scans: int, span: TimeSpan = TimeSpan()
+) -> QueryRecording:
+    """The description of a recording, or of a part of it, in the JSON document of the answer."""
     report = query.report()
     return {
         "path_m": answer.path_m,
         "stamp_ns": answer.stamp_ns,
         "source": path.name,
+        "start_s": span.start_s,
+        "duration_s": span.duration_s,
         "scans": scans,
         "sensor": query.choose().sensor,
         "lossy": report.lossy,
@@ -133,17 +138,19 @@ def about_log(path: Path, query: Log, answer: Answer, *, scans: int) -> QueryRec
     }
 
 
-def find_map(path: Path, database: SubmapDatabase, config: Config) -> Found:
-    """Locate a map: of nav2, or a cloud or mesh."""
+def find_map(path: Path, database: SubmapDatabase, config: Config, index: MapIndex | None = None) -> Found:
+    """Locate a map: of nav2, or a cloud or mesh. index : of the database, if it is prepared."""
 
     made_with = database.config().model_copy(update={"read": config.read})
     drawn = load_drawn_map(path, made_with)
-    answer = locate_map(drawn.grid, MapIndex.of(database, config))
+    answer = locate_map(drawn.grid, index or MapIndex.of(database, config))
     poses = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
     about: QueryRecording = {
         "path_m": answer.path_m,
         "stamp_ns": answer.stamp_ns,
         "source": path.name,
+        "start_s": 0.0,
+        "duration_s": None,
         "scans": 0,
         "sensor": "map",
         "lossy": False,

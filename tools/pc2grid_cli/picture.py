@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from pc2grid.arrays import F64, U8
     from pc2grid.geometry import SE2
     from pc2grid.model import OccupancyGrid, Trajectory
+    from pc2grid_cli.locate import Found
     from signature.database import SubmapDatabase
     from signature.database.protocol import BuildingFrame
     from signature.localization.answer import Answer
@@ -110,7 +112,7 @@ def shades(grid: OccupancyGrid) -> U8:
 def draw_session(path: Path, database: SubmapDatabase, session: str) -> None:
     """The map of a session with its submaps and the path of the robot."""
     grid = database.grid(session)
-    figure, (axes,) = _panels(_known(grid), None)
+    figure, (axes,) = _panels(_known(grid))
     _draw_map(axes, grid)
     _draw_submaps(axes, database, session)
     poses = database.trajectory(session).planar()
@@ -130,7 +132,7 @@ def draw_building(path: Path, name: str, maps: Mapping[str, tuple[OccupancyGrid,
     }
     boxes = [_Box.around(points_m, _CLOSE_MARGIN_M) for points_m in walls.values() if len(points_m)]
     whole = reduce(_Box.united, boxes or [_Box(0.0, 1.0, 0.0, 1.0)])
-    figure, (axes,) = _panels(whole, None)
+    figure, (axes,) = _panels(whole)
     axes.set_facecolor(_grey("free"))
     colours = itertools.cycle((BLUE, VERMILLION, GREEN, PURPLE, ORANGE, GREY, YELLOW))
     for (session, points_m), colour in zip(walls.items(), colours, strict=False):
@@ -163,7 +165,7 @@ def draw_answer(
         whole = whole.united(close)
         if max(close.width_m, close.height_m) > _CLOSE_SHARE * max(whole.width_m, whole.height_m):
             close = None
-    figure, panels = _panels(whole, close)
+    figure, panels = _panels(whole, *(() if close is None else (close,)))
     for axes in panels:
         _draw_map(axes, grid)
         _draw_way(axes, database, session)
@@ -176,6 +178,30 @@ def draw_answer(
     if close is not None:
         _outline(panels[0], panels[1])
     panels[0].set_title(_title(answer, session, compared), loc="left")
+    _finish(figure, panels[0], path)
+
+
+def draw_answers(path: Path, database: SubmapDatabase, found: Sequence[Found]) -> None:
+    """The maps in which queries were located, each with their paths, and arrows where these end.
+
+    Each recording has a colour. If none was located there is only the first map.
+    """
+    located = Counter(one.answer.session for one in found if one.answer.session is not None)
+    sessions = [session for session, _ in located.most_common()] or [database.sessions()[0].name]
+    sources = dict.fromkeys(one.about["source"] for one in found)
+    colours = dict(zip(sources, itertools.cycle((PURPLE, BLUE, VERMILLION, GREEN, ORANGE)), strict=False))
+    grids = [database.grid(session) for session in sessions]
+    figure, panels = _panels(*(_known(grid) for grid in grids))
+    for axes, session, grid in zip(panels, sessions, grids, strict=True):
+        _draw_map(axes, grid)
+        _draw_way(axes, database, session)
+        title = f"located in {session}: {located[session]} of {len(found)} queries"
+        axes.set_title(title, loc="left", fontsize=10)
+        for answer, poses, source in ((one.answer, one.poses, one.about["source"]) for one in found):
+            if answer.session == session and answer.T_map_odom and answer.T_map_base:
+                path_m = answer.T_map_odom.apply(poses.planar()[:, :2])
+                axes.plot(*path_m.T, color=colours[source], lw=1.8, label=f"{source}: path as located")
+                _draw_arrow(axes, answer.T_map_base, colours[source])
     _finish(figure, panels[0], path)
 
 
@@ -205,20 +231,20 @@ def _known(grid: OccupancyGrid) -> _Box:
     return _Box.around(corners_m, _MARGIN * float(np.ptp(corners_m, axis=0).max()))
 
 
-def _panels(whole: _Box, close: _Box | None) -> tuple[Any, list[Any]]:
-    """A figure with a panel for the whole map and, if wanted, one for a close-up beside or below it."""
+def _panels(whole: _Box, *more: _Box) -> tuple[Any, list[Any]]:
+    """A figure with a panel for a map and one for each other box, such as a close-up, beside or below it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     ratio = float(np.clip(whole.height_m / whole.width_m, 0.1, 2.5))
     boxes, sizes_in = [whole.with_ratio(ratio)], [(_WIDTH_IN, _WIDTH_IN * ratio)]
     beside = ratio > 0.8
-    if close is not None:
+    if more:
         if beside:
-            sizes_in = [(_WIDTH_IN * 0.6, _WIDTH_IN * 0.6 * ratio)] * 2
+            sizes_in = [(_WIDTH_IN * 0.6, _WIDTH_IN * 0.6 * ratio)] * (1 + len(more))
         else:
-            sizes_in.append((_WIDTH_IN, _WIDTH_IN * 0.55))
-        boxes.append(close.with_ratio(sizes_in[1][1] / sizes_in[1][0]))
+            sizes_in += [(_WIDTH_IN, _WIDTH_IN * 0.55)] * len(more)
+        boxes += [box.with_ratio(sizes_in[1][1] / sizes_in[1][0]) for box in more]
     step = (1, 0) if beside else (0, 1)
     total_in = [
         sum(size[k] for size in sizes_in) + _GAP_IN * (len(boxes) - 1) if step[k] else sizes_in[0][k]
@@ -307,18 +333,23 @@ def _draw_robot(axes: Any, best: Hypothesis, answer: Answer, poses: Trajectory) 
     pose = best.fit.T_map_query @ answer.T_odom_base
     if pose not in _Box(*axes.get_xlim(), *axes.get_ylim()):
         return
+    _draw_arrow(axes, pose, PURPLE)
+    label = "robot at the last scan" if answer.status == "located" else "robot, if it were here"
+    if not len(poses):
+        label = "frame of the query"
+    axes.plot(pose.x, pose.y, "o", color=PURPLE, mec="white", ms=9, zorder=7, label=label)
+
+
+def _draw_arrow(axes: Any, pose: SE2, colour: str) -> None:
+    """An arrow from where a robot is to where it looks."""
     length = 0.035 * max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
     axes.annotate(
         "",
         xy=(pose.x + length * np.cos(pose.yaw), pose.y + length * np.sin(pose.yaw)),
         xytext=(pose.x, pose.y),
-        arrowprops={"arrowstyle": "-|>", "color": PURPLE, "lw": 2.5, "mutation_scale": 18},
+        arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 2.5, "mutation_scale": 18},
         zorder=6,
     )
-    label = "robot at the last scan" if answer.status == "located" else "robot, if it were here"
-    if not len(poses):
-        label = "frame of the query"
-    axes.plot(pose.x, pose.y, "o", color=PURPLE, mec="white", ms=9, zorder=7, label=label)
 
 
 def _draw_rivals(axes: Any, answer: Answer, session: str) -> None:

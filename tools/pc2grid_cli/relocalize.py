@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -28,8 +30,9 @@ from pc2grid_cli.known_pose import KnownPose
 from pc2grid_cli.locate import ON_THE_WAY, Found, find_log, find_map, in_map, searched
 from pc2grid_cli.nav2_pose import write_initialpose
 from pc2grid_cli.output_files import check_file
-from pc2grid_cli.picture import draw_answer
+from pc2grid_cli.picture import draw_answer, draw_answers
 from pc2grid_cli.report import write_report
+from pc2grid_cli.windows import Window, find_all, show, windows_of
 from signature.database.maintenance import is_database
 from signature.localization.in_building import answer_in_building
 
@@ -38,6 +41,7 @@ if TYPE_CHECKING:
     from pc2grid_cli.json_schemas import Relocalize
     from signature.config import Config
     from signature.database import SubmapDatabase
+    from signature.database.protocol import BuildingFrame
     from signature.localization.hypotheses import Hypothesis
     from signature.localization.localizer import Answer
 
@@ -67,19 +71,19 @@ class _Outputs:
         always = [path for path in (self.plot, self.report) if path is not None]
         return [*self.of_answer(), *always] if located else always
 
-    def refuse(self, reason: str) -> None:
-        """Raises ConfigError if there is any."""
+    def refuse(self, reason: str, hint: str, *, but: tuple[str, ...] = ()) -> None:
+        """Raises ConfigError if there is any file, but for these."""
         files = ("trajectory", "initialpose", "output", "plot", "report")
-        given = [f"--{option}" for option in files if getattr(self, option) is not None]
+        given = [f"--{option}" for option in files if option not in but and getattr(self, option) is not None]
         if given:
-            raise ConfigError(f"{given[0]}: {reason}", hint="leave it out, or ask without --check")
+            raise ConfigError(f"{given[0]}: {reason}", hint=hint)
 
 
 def relocalize_command(
     context: typer.Context,
-    log: Annotated[
-        Path,
-        typer.Argument(metavar="LOG|MAP", help="the recording or map to locate: .yaml, .pcd, .ply, a mesh"),
+    logs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG|MAP...", help="recordings or maps to locate: .yaml, .pcd, .ply, a mesh"),
     ],
     database: options.SearchedDatabase,
     building: options.Building = None,
@@ -115,6 +119,15 @@ def relocalize_command(
     imu: options.ImuTopic = None,
     start: options.Start = 0.0,
     duration: options.Duration = None,
+    every: Annotated[
+        float | None,
+        typer.Option(
+            "--every",
+            metavar="S",
+            min=0.1,
+            help="locate a window every S seconds, as long as --duration, else S",
+        ),
+    ] = None,
     top_k: Annotated[int | None, typer.Option("--top-k", min=1, help="candidates to align with")] = None,
     trajectory: Annotated[
         Path | None, typer.Option("--trajectory", metavar="OUT.tum", help="the query's poses in the map")
@@ -144,6 +157,8 @@ def relocalize_command(
 ) -> None:
     """Find where a recording was made. Exit code 4: there is no confident single answer.
 
+    Of several recordings, and with --every, each query has a line: of a table, or with --json a document.
+
     With --near or --near-pose, places elsewhere are no answers. With --check or --check-topic, no place is
     found, but a pose is judged: fine, lost, or unsure; exit code 4 unless it is fine.
 
@@ -158,12 +173,18 @@ def relocalize_command(
         force=force,
     )
     known = KnownPose(near=near, near_pose=near_pose, check=check, check_topic=check_topic, session=session)
-    _check_options(log, database, outputs, known)
+    several = every is not None or len(logs) > 1
+    _check_options(logs, database, outputs, known, several=several)
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity, top_k=top_k
     )
+    span, terminal = TimeSpan(start, duration), console.of(context)
+    windows = windows_of(logs, every, span, settings, recover=recover)
+    log, observer = logs[0], terminal.observer()
     with searched(database, building, floor) as (opened, left_out):
         where = opened.location
+        for damage in left_out:
+            console.warn(f"{where}: damaged and left out: {damage}")
         frames = opened.frames() if frame is options.FrameName.building else {}
         if known.is_check:
             checked, document = check_log(
@@ -171,18 +192,24 @@ def relocalize_command(
                 opened,
                 settings,
                 known,
-                span=TimeSpan(start, duration),
+                span=span,
                 recover=recover,
-                observer=console.of(context).observer(),
+                observer=observer,
             )
             raise typer.Exit(report_check(checked, document, as_json=json))
+        if several:
+            found_in_turn = find_all(windows, opened, settings, known, recover=recover, observer=observer)
+            code = _tell_all(found_in_turn, opened, frames, left_out, plot=plot, strict=strict, as_json=json)
+            if plot is not None:
+                terminal.note(f"wrote {plot}")
+            raise typer.Exit(code)
         found, located = _find(
             log,
             opened,
             settings,
-            span=TimeSpan(start, duration),
+            span=span,
             recover=recover,
-            observer=console.of(context).observer(),
+            observer=observer,
             known=known,
             # Only the page shows it, and it takes time.
             on_the_way=ON_THE_WAY if report is not None else 0,
@@ -192,7 +219,7 @@ def relocalize_command(
         _print(found, stated, where, left_out, map_sigma_m(found.answer, opened), as_json=json)
         _write(outputs, opened, found, stated, located, settings)
         for path in outputs.written(located=located is not None):
-            console.of(context).note(f"wrote {path}")
+            terminal.note(f"wrote {path}")
         _warn_of_missing_points(found, opened)
         _warn_of_unjoined(found.answer, opened)
     if located is None:
@@ -201,8 +228,6 @@ def relocalize_command(
     for warning in found.about["warnings"]:
         console.warn(warning)
     _warn_of_prior(stated)
-    for damage in left_out:
-        console.warn(f"{where}: damaged and left out: {damage}")
     lossy = _warn_of_losses(log, found.report, strict) or bool(left_out)
     if found.answer.status != "located":
         raise typer.Exit(console.UNSURE)
@@ -210,15 +235,22 @@ def relocalize_command(
         raise typer.Exit(console.LOSSY)
 
 
-def _check_options(log: Path, database: str, outputs: _Outputs, known: KnownPose) -> None:
-    """Raises what is wrong with the options before any work is done."""
+def _check_options(
+    logs: Sequence[Path], database: str, outputs: _Outputs, known: KnownPose, *, several: bool
+) -> None:
+    """Raises what is wrong with the options before any work is done. several : queries at once."""
     extras.require(extras.of_addresses(database))
     outputs.check()
-    _check_options_for_maps(log, outputs)
-    known.validate(is_map=is_map_file(log))
+    if several:
+        outputs.refuse("is of one query", "leave it out, or give one recording and no --every", but=("plot",))
+    for log in logs:
+        _check_options_for_maps(log, outputs)
+        known.validate(is_map=is_map_file(log))
+        _check_not_swapped(log, database)
     if known.is_check:
-        outputs.refuse("--check judges a pose and finds none")
-    _check_not_swapped(log, database)
+        outputs.refuse("--check judges a pose and finds none", "leave it out, or ask without --check")
+        if several:
+            raise ConfigError("--check: judges one pose", hint="give one recording, and no --every")
 
 
 def _warn_of_losses(log: Path, report: ReadReport | None, strict: bool) -> bool:
@@ -346,17 +378,62 @@ def _print(
 ) -> None:
     """The answer on stdout. stated : as it is given. sigma_m : of the map where the query is."""
     if as_json:
-        answer = stated.to_json()
-        document: Relocalize = {
-            **answer,
-            "query": found.about,
-            "database": {**answer["database"], "path": where, "left_out": left_out},
-            "map_sigma_m": None if sigma_m is None else round(sigma_m, 3),
-        }
-        console.print_json(document)
+        console.print_json(_document(found, stated, where, left_out, sigma_m))
     else:
         text = as_text(stated, is_map=found.drawn is not None)
         print(text + _about_map(sigma_m), flush=True)
+
+
+def _document(
+    found: Found, stated: Answer, where: str, left_out: list[str], sigma_m: float | None
+) -> Relocalize:
+    """What `--json` prints; see `_print`."""
+    answer = stated.to_json()
+    return {
+        **answer,
+        "query": found.about,
+        "database": {**answer["database"], "path": where, "left_out": left_out},
+        "map_sigma_m": None if sigma_m is None else round(sigma_m, 3),
+    }
+
+
+def _tell_all(
+    found_in_turn: Generator[tuple[Window, Found | None]],
+    database: SubmapDatabase,
+    frames: Mapping[str, BuildingFrame],
+    left_out: list[str],
+    *,
+    plot: Path | None,
+    strict: bool,
+    as_json: bool,
+) -> int:
+    """Print the answers to several queries, and draw them; returns the exit code.
+
+    The documents are printed one by one, the table at the end, also if the work is interrupted."""
+    told: list[tuple[Window, Answer | None]] = []
+    all_found: list[Found] = []
+    with contextlib.ExitStack() as stack:
+        if not as_json:
+            stack.callback(show, told)
+        for window, found in stack.enter_context(contextlib.closing(found_in_turn)):
+            stated = None if found is None else answer_in_building(found.answer, frames)
+            told.append((window, stated))
+            if found is not None and stated is not None:
+                all_found.append(found)
+                if as_json:
+                    sigma_m = map_sigma_m(found.answer, database)
+                    document = _document(found, stated, database.location, left_out, sigma_m)
+                    console.print_json_line(document)
+    if plot is not None:
+        draw_answers(plot, database, all_found)
+    for warning in dict.fromkeys(f"{f.about['source']}: {w}" for f in all_found for w in f.about["warnings"]):
+        console.warn(warning)
+    losses = [_warn_of_losses(Path(f.about["source"]), f.report, strict) for f in all_found]
+    if not all_found:
+        return console.FAILED
+    if all(found.answer.status != "located" for found in all_found):
+        return console.UNSURE
+    return console.LOSSY if any(losses) or left_out or len(all_found) < len(told) else console.OK
 
 
 def _warn_of_prior(answer: Answer) -> None:

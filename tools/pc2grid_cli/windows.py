@@ -1,0 +1,129 @@
+"""Several queries at once: recordings, or windows along them, each with a line of its own."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pc2grid.display import probability
+from pc2grid.errors import ConfigError, LogError, one_line
+from pc2grid.io import open_log
+from pc2grid.mapping.drawn_map import is_drawn_map
+from pc2grid.observer import Observer
+from pc2grid.time_span import TimeSpan
+from pc2grid_cli import console, tables
+from pc2grid_cli.known_pose import KnownPose
+from pc2grid_cli.locate import Found, find_log, find_map
+from signature.files import query_config
+from signature.localization.map_index import MapIndex
+
+if TYPE_CHECKING:
+    from signature.config import Config
+    from signature.database import SubmapDatabase
+    from signature.localization.answer import Answer
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A query: a part of a recording, or a map."""
+
+    path: Path
+    span: TimeSpan
+
+    def __str__(self) -> str:
+        return one_line(f"{self.path.name} from {self.span.start_s:g} s")
+
+
+def windows_of(
+    paths: Sequence[Path], every_s: float | None, span: TimeSpan, config: Config, *, recover: bool
+) -> list[Window]:
+    """The queries: of each path one, or one every `every_s` seconds, from the start of `span` on.
+
+    A window is as long as `span`, by default `every_s`. It ends within its recording, unless it is the first.
+
+    Raises ConfigError for a map with `every_s`, and the errors of `open_log`.
+    """
+    if every_s is None:
+        return [Window(path, span) for path in paths]
+    length_s = span.duration_s or every_s
+    windows = []
+    for path in paths:
+        if is_drawn_map(path):
+            raise ConfigError(f"--every: {path} is a map, and no time passes in it", hint="leave it out")
+        with open_log(path, config.read, recover=recover) as log:
+            left_s = (log.info.end_ns - log.info.start_ns) * 1e-9 - span.start_s - length_s
+        starts_s = span.start_s + every_s * np.arange(max(math.floor(left_s / every_s), 0) + 1)
+        windows += [Window(path, TimeSpan(float(start_s), length_s)) for start_s in starts_s]
+    return windows
+
+
+class _Part(Observer):
+    """The news of one query of several: its progress is a part of that of all."""
+
+    def __init__(self, all_: Observer, done: int, count: int) -> None:
+        self._all, self._done, self._count = all_, done, count
+        self.on_note, self.on_warning = all_.on_note, all_.on_warning  # type: ignore[method-assign]
+
+    def on_progress(self, share: float) -> None:
+        """Moves the bar of all."""
+        self._all.on_progress((self._done + share) / self._count)
+
+
+def find_all(
+    windows: Sequence[Window],
+    database: SubmapDatabase,
+    config: Config,
+    known: KnownPose,
+    *,
+    recover: bool,
+    observer: Observer,
+) -> Generator[tuple[Window, Found | None]]:
+    """Locate each query, by one index of the database. One that cannot be read is warned of, and is None."""
+    index = MapIndex.of(database, query_config(database, config), observer)
+    with observer.step(f"locate {len(windows)} queries"):
+        for number, window in enumerate(windows):
+            found = None
+            try:
+                if is_drawn_map(window.path):
+                    found = find_map(window.path, database, config, index)
+                else:
+                    found = find_log(
+                        window.path,
+                        database,
+                        config,
+                        span=window.span,
+                        recover=recover,
+                        observer=_Part(observer, number, len(windows)),
+                        known=known,
+                        index=index,
+                    )
+            except LogError as error:
+                console.warn(f"{window}: {error.message}")
+            observer.on_progress((number + 1) / len(windows))
+            yield window, found
+
+
+def show(answers: Sequence[tuple[Window, Answer | None]]) -> None:
+    """Print a table with a line for each query."""
+    counts = Counter("failed" if answer is None else answer.status for _, answer in answers)
+    title = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.most_common())
+    texts = ("recording", "answer", "in")
+    numbers = ("from, s", "x, m", "y, m", "yaw, deg", "confidence", "travel, m")
+    table = tables.table(f"{len(answers)} queries: {title}", texts, numbers)
+    for window, answer in answers:
+        name, start_s = one_line(window.path.name), f"{window.span.start_s:g}"
+        if answer is None:
+            table.add_row(name, "failed", "", start_s)
+            continue
+        pose = answer.T_map_base
+        at = (f"{pose.x:.2f}", f"{pose.y:.2f}", f"{math.degrees(pose.yaw):.1f}") if pose else ("", "", "")
+        sure = probability(answer.confidence), f"{answer.path_m:.1f}"
+        where = one_line(answer.frame or answer.session or "")
+        table.add_row(name, answer.status.replace("_", " "), where, start_s, *at, *sure)
+    tables.show(table)
