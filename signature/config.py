@@ -10,8 +10,8 @@ from typing_extensions import Self
 import pc2grid.config
 from pc2grid.config import PartitionConfig, Section
 
-SelectBy = Literal["seen", "paper"]
-"""Signatures of what was seen, or those of the paper."""
+ShortlistBy = Literal["signatures", "shuffled", "random"]
+"""By the signatures; as a control, by those of another place, or by chance."""
 
 
 class SignatureConfig(Section):
@@ -136,15 +136,15 @@ class RelocalizeConfig(Section):
     step_m: float = Field(1.0, gt=0, description="metres of travel between two searches of the database")
     views: int = Field(8, gt=0, description="number of views that describe a query, along its path")
     view_spacing_m: float = Field(1.2, gt=0, description="least distance of two views")
-    shortlist: int = Field(
-        50, gt=0, description="at least so many places are selected for a query, by their signatures"
-    )
+    shortlist: int = Field(50, gt=0, description="at least so many places are selected for a query")
     shortlist_share: float = Field(
         0.05, ge=0, le=1, description="of many places, this share is selected; only these are verified"
     )
     shortlist_most: int = Field(3200, gt=0, description="but no more than so many")
-    select_by: SelectBy = Field(
-        "seen", description="signatures of what was seen, hidden rays left out; paper: Eq. 6"
+    shortlist_by: ShortlistBy = Field(
+        "signatures",
+        description="what selects them; two controls show what signatures are worth: shuffled, by those of"
+        " another place; random",
     )
     top_k: int = Field(50, gt=0, description="placements that retrieval passes to alignment")
     coarse_floor: float = Field(

@@ -130,17 +130,14 @@ class MapIndex:
             lacking.append(name)
             return None
 
-        table, by_paper = database.signatures(), config.relocalize.select_by == "paper"
-        made_with = database.config()
+        table, made_with = database.signatures(), database.config()
         frames: Mapping[str, BuildingFrame] = {}
         with contextlib.suppress(DatabaseCorrupt):  # without them a search takes longer, and finds the same
             frames = database.frames()
         index = MapIndex(grids, table, made_with, config, labels, areas_m2, stored, frames)
-        if is_large and not by_paper:
+        if is_large:
             index.places.without_histograms()
         index.points_of = points_reader(database)
-        if by_paper:
-            return index
         with observer.step("prepare places"):
             index.places.index(observer.on_progress)
         if lacking:
@@ -199,7 +196,6 @@ class MapIndex:
             query.views,
             base_m,
             self.places,
-            signature=self.made_with.signature,
             config=self.config,
             rows=rows,
         )
@@ -236,7 +232,7 @@ class MapIndex:
             if len(free) * HYPOTHESES.square_m**2 <= self.config.exhaustive_m2:
                 yield index, free
             return
-        for index in self.places.sessions(query.views, self.made_with.signature, self.config):
+        for index in self.places.sessions(query.views, self.config):
             if self._areas_m2[index] <= self.config.exhaustive_m2:
                 yield index, self._free[index]
 

@@ -102,9 +102,7 @@ class SessionRecognizer:
         return found
 
     def _look_up(self, query: QueryMap, places: Places) -> list[Recognition]:
-        proposals = retrieve(
-            query.views, query.center_m, places, signature=self._made_with.signature, config=self._config
-        )
+        proposals = retrieve(query.views, query.center_m, places, config=self._config)
         maps = LazySequence(self._map, len(self._stored), most=0)
         return [
             Recognition(

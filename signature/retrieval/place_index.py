@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -135,6 +135,11 @@ class PlaceIndex:
             weights=weights,
             spread=spread,
         )
+
+    def shuffled(self, rng: np.random.Generator) -> PlaceIndex:
+        """The same viewpoints, each with the signatures of another one."""
+        order = rng.permutation(len(self))
+        return replace(self, vectors=self.vectors[order], hidden=self.hidden[order])
 
     def __len__(self) -> int:
         return len(self.vectors)

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from pc2grid.arrays import F32, F64, I64, BoolGrid
 from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.isovist import HIDDEN, look_around
-from signature.config import RelocalizeConfig, SignatureConfig
+from signature.config import RelocalizeConfig
 from signature.retrieval.place_index import PlaceBlock, PlaceIndex
 from signature.retrieval.place_signatures import PlaceSignatures
-from signature.retrieval.signature_index import Nearest, SignatureIndex, sessions_by_likeness
 from signature.retrieval.view import View
 from signature.seen_places import LATTICE_M, PROFILE_BEARINGS, SeenPlaces
 from signature.similarity import SignatureTable
@@ -117,8 +116,8 @@ class Places:
         self.table = table
         self.sight_m = sight_m
         self._grids, self._stored = grids, stored
-        self._paper: SignatureIndex | None = None
         self._index: PlaceIndex | None = None
+        self._chance = np.random.default_rng(0)
         self._described: dict[int, SeenPlaces] = {} if fewer is None else dict(fewer._described)
         self._areas_m2 = np.asarray(areas_m2, np.float64)
         self._known: dict[int, tuple[F64, F32, NDArray[np.bool_]]] = (
@@ -132,26 +131,24 @@ class Places:
         """Whether there is more free floor than is searched at once."""
         return bool(self._areas_m2.sum() > AT_ONCE_M2)
 
-    def select(self, views: Sequence[View], signature: SignatureConfig, config: RelocalizeConfig) -> Selected:
+    def select(self, views: Sequence[View], config: RelocalizeConfig) -> Selected:
         """The places to compare with a query, `shortlist_size` of them, by `PlaceSignatures.likely` and then
-        `PlaceIndex.select`; by Eq. 6 alone where `config.select_by` says so. The sessions are those of the
+        `PlaceIndex.select`, or by a control (`RelocalizeConfig.shortlist_by`). The sessions are those of the
         places, in a large database up to `AT_ONCE_M2`.
         """
         if self._selected is None or self._selected[0] is not views or self._selected[1] is not config:
-            self._selected = views, config, self._select(views, signature, config)
+            self._selected = views, config, self._select(views, config)
         return self._selected[2]
 
-    def _select(
-        self, views: Sequence[View], signature: SignatureConfig, config: RelocalizeConfig
-    ) -> Selected:
+    def _select(self, views: Sequence[View], config: RelocalizeConfig) -> Selected:
         session_index, most = self.table.session_index, shortlist_size(len(self.table), config)
-        if config.select_by == "paper":
-            near = self.nearest_by_paper(views, max(1, most // max(1, len(views))), signature)
-            rows = np.unique(np.concatenate([found.rows for found in near]))
-            sessions = sessions_by_likeness(near, session_index)
+        if config.shortlist_by == "random":
+            best = self._chance.permutation(len(self.table))[:most]
         else:
-            best = self.index().select(views, most, self.likely(views, most))
-            rows, sessions = np.sort(best), _in_order(session_index[best])
+            shuffled = config.shortlist_by == "shuffled"
+            likely = None if shuffled else self.likely(views, most)
+            best = (self._shuffled if shuffled else self.index()).select(views, most, likely)
+        rows, sessions = np.sort(best), _in_order(session_index[best])
         if not self.is_large or not len(sessions):
             return Selected(rows, sessions)
         areas_m2 = self._areas_m2[sessions]
@@ -173,14 +170,6 @@ class Places:
         assert self._first_look is None or len(self._first_look.vectors) == len(self.table)
         self.table = self.table.without_histograms()
 
-    def nearest_by_paper(
-        self, views: Sequence[View], k: int, signature: SignatureConfig
-    ) -> tuple[Nearest, ...]:
-        """For each view the `k` places that are nearest by Eq. 6."""
-        if self._paper is None:
-            self._paper = SignatureIndex.of(self.table)
-        return self._paper.nearest_to_each([view.signature for view in views], k, signature)
-
     def index(self, on_progress: Callable[[float], None] = lambda share: None) -> PlaceIndex:
         """The viewpoints of all places with their signatures; made when first asked for.
 
@@ -189,6 +178,11 @@ class Places:
         if self._index is None:
             self._index = PlaceIndex.of(self.blocks(on_progress))
         return self._index
+
+    @cached_property
+    def _shuffled(self) -> PlaceIndex:
+        """The same viewpoints, each with the signatures of another one: a control."""
+        return self.index().shuffled(self._chance)
 
     def blocks(self, on_progress: Callable[[float], None] = lambda share: None) -> Iterator[PlaceBlock]:
         """What is seen from the places of each session: as stored, or else computed from the map."""
@@ -215,13 +209,11 @@ class Places:
         first, end = np.searchsorted(self.table.session_index, (session, session + 1))
         return slice(int(first), int(end))
 
-    def sessions(
-        self, views: Sequence[View], signature: SignatureConfig, config: RelocalizeConfig
-    ) -> list[int]:
+    def sessions(self, views: Sequence[View], config: RelocalizeConfig) -> list[int]:
         """Indices of the sessions to be searched as a whole: all, or those of the selected places."""
         if not self.is_large:
             return list(range(len(self._areas_m2)))
-        return self.select(views, signature, config).sessions.tolist() if views else []
+        return self.select(views, config).sessions.tolist() if views else []
 
     def around(self, rows: I64) -> Viewpoints:
         """The viewpoints at the places `rows` (R,) of the table, with their isovists."""

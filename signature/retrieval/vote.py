@@ -15,7 +15,7 @@ import numpy as np
 
 from pc2grid.arrays import F32, F64, I64
 from pc2grid.submaps.isovist import HIDDEN
-from signature.config import RelocalizeConfig, SignatureConfig
+from signature.config import RelocalizeConfig
 from signature.retrieval.likeness import peaks, rotate_and_compare
 from signature.retrieval.view import View
 from signature.retrieval.viewpoints import Places, Viewpoints
@@ -63,7 +63,6 @@ def retrieve(
     base_m: tuple[float, float],
     places: Places,
     *,
-    signature: SignatureConfig,
     config: RelocalizeConfig,
     top_k: int | None = None,
     rows: I64 | None = None,
@@ -79,7 +78,7 @@ def retrieve(
     if not views or not len(places.table) or (rows is not None and not len(rows)):
         return ()
     if rows is None:
-        rows = places.select(views, signature, config).rows
+        rows = places.select(views, config).rows
     stand = places.around(rows)
     ranges = np.stack([v.profile.ranges_m for v in views])
     seen = np.stack([v.profile.ends != HIDDEN for v in views])

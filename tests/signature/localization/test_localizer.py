@@ -244,11 +244,9 @@ def test_a_query_is_drawn_from_the_newest_scans_alone() -> None:
     assert 0 < last.walls.weight < 0.7 * whole.walls.weight
 
 
-@pytest.mark.parametrize(
-    ("select_by", "shortlist", "uses_them"), [("seen", 40, True), ("seen", 1000, False), ("paper", 40, True)]
-)
+@pytest.mark.parametrize(("shortlist", "uses_them"), [(40, True), (1000, False)])
 def test_views_are_described_by_the_papers_signatures_only_where_these_leave_places_out(
-    select_by: str, shortlist: int, uses_them: bool, monkeypatch: pytest.MonkeyPatch
+    shortlist: int, uses_them: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a map with fewer places than are looked for, none can be left out at a first look."""
     described = []
@@ -259,7 +257,7 @@ def test_views_are_described_by_the_papers_signatures_only_where_these_leave_pla
 
     monkeypatch.setattr(query_module, "describe", counted)
     config = Config()
-    few = {"shortlist": shortlist, "shortlist_share": 0.0, "select_by": select_by}
+    few = {"shortlist": shortlist, "shortlist_share": 0.0}
     settings = config.model_copy(update={"relocalize": config.relocalize.model_copy(update=few)})
     index = MapIndex({"office": office()}, OFFICE.places.table, config, settings)
     answer, _ = ask(index, office(), ROUTE)

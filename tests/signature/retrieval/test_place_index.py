@@ -100,11 +100,7 @@ def test_a_random_shortlist_of_the_same_size_finds_fewer_places(field_deg: float
     # one or two, of views into one direction that have seen little.
     assert np.mean(found) >= 0.9
     assert np.mean(found) >= np.mean(drawn) + 0.2
-    order = rng.permutation(len(index))
-    shuffled = PlaceIndex(
-        **{name: getattr(index, name) for name in PlaceIndex.__slots__}
-        | {"vectors": index.vectors[order], "hidden": index.hidden[order]}
-    )
+    shuffled = index.shuffled(rng)
     lost = [np.isin(shuffled.select(q.views, most), right(q, T)).any() for q, T in asked]
     assert np.mean(found) >= np.mean(lost) + 0.2
 
@@ -123,6 +119,18 @@ def test_at_least_fifty_of_few_and_a_share_of_many_places_are_selected() -> None
     config = RelocalizeConfig()
     sizes = {count: shortlist_size(count, config) for count in (10, 1000, 10_000, 500_000)}
     assert sizes == {10: 50, 1000: 50, 10_000: 500, 500_000: config.shortlist_most}
+
+
+def test_the_controls_select_as_many_places_and_find_fewer() -> None:
+    """As by `relocalize --set relocalize.shortlist_by=shuffled`."""
+    asked, found = queries(), {}
+    for by in ("signatures", "shuffled", "random"):
+        config = RelocalizeConfig.model_validate({"shortlist": 5, "shortlist_share": 0.0, "shortlist_by": by})
+        places = building({"office": office()}).places
+        rows = [places.select(query.views, config).rows for query, _ in asked]
+        assert {len(chosen) for chosen in rows} == {5}
+        found[by] = np.mean([np.isin(r, right(*each)).any() for r, each in zip(rows, asked, strict=True)])
+    assert found["signatures"] >= max(found["shuffled"], found["random"]) + 0.2
 
 
 def test_maps_do_not_mix() -> None:

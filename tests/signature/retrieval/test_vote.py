@@ -52,13 +52,11 @@ def window(corners: list[tuple[float, float]], field_deg: float = 360.0) -> tupl
 @pytest.mark.parametrize("field_deg", [360.0, 270.0, 90.0])
 def test_the_right_place_is_among_the_first_twenty(field_deg: float) -> None:
     seen, T_map_query = window([(1.5, 7.0), (9.5, 7.0)], field_deg)
-    made_with = OFFICE.made_with
     query = seen.map()
     found = retrieve(
         query.views,
         (query.T_odom_base.x, query.T_odom_base.y),
         OFFICE.places,
-        signature=made_with.signature,
         config=OFFICE.config,
         top_k=20,
     )
@@ -90,10 +88,8 @@ def test_isovists_are_compared_only_at_the_places_that_the_signatures_select() -
     for shortlist in (5, 20):
         config = OFFICE.config.model_copy(update={"shortlist": shortlist, "shortlist_share": 0.0})
         base_m = (query.T_odom_base.x, query.T_odom_base.y)
-        found = retrieve(
-            query.views, base_m, OFFICE.places, signature=OFFICE.made_with.signature, config=config
-        )
-        selected = OFFICE.places.select(query.views, OFFICE.made_with.signature, config).rows
+        found = retrieve(query.views, base_m, OFFICE.places, config=config)
+        selected = OFFICE.places.select(query.views, config).rows
         assert len(selected) == shortlist
         assert OFFICE.places._last is not None
         assert np.array_equal(OFFICE.places._last[0], selected)

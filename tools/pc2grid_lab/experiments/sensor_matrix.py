@@ -232,7 +232,6 @@ def _retrieved_rank(index: MapIndex, query: QueryMap, T_map_query: SE2) -> int:
         query.views,
         (query.T_odom_base.x, query.T_odom_base.y),
         index.places,
-        signature=index.made_with.signature,
         config=index.config,
         top_k=50,
     )

@@ -78,7 +78,7 @@ class Building:
             if len(names) in (1, 3)
         }
         indexes |= dict.fromkeys((NO_LOOK, ANY_LOOK), indexes[_ALL])
-        indexes[SHUFFLED] = shuffled(indexes[_ALL], np.random.default_rng(0))
+        indexes[SHUFFLED] = indexes[_ALL].shuffled(np.random.default_rng(0))
         looks = {
             names: PlaceSignatures.of(table, of_places, names.split("+"))
             for names in indexes
@@ -99,12 +99,6 @@ class Building:
         if among is not None and selector in (SHUFFLED, ANY_LOOK):
             among = rng.permutation(among)
         return self.indexes[selector].select(query.views, most, among)
-
-
-def shuffled(index: PlaceIndex, rng: np.random.Generator) -> PlaceIndex:
-    """The same viewpoints, each with the signatures of another one: all but they is the same."""
-    order = rng.permutation(len(index))
-    return replace(index, vectors=index.vectors[order], hidden=index.hidden[order])
 
 
 def right_places(query: QueryMap, T_map_query: SE2, places: SignatureTable) -> I64:
