@@ -20,11 +20,11 @@ def main(recording: str, database: str) -> None:
         config = opened.config()
         localizer = pc2grid.Localizer(pc2grid.MapIndex.of(opened, config))
         for registered, planar_scan in pc2grid.follow(log.scans(), config):
-            moment = localizer.add(registered, planar_scan)
-            if moment is None:  # the database is asked after every metre of travel
+            estimate = localizer.add(registered, planar_scan)
+            if estimate is None:  # the database is searched after every metre of travel
                 continue
-            answer = localizer.answer()
-            print(f"after {moment.path_m:.1f} m: {answer.status}, confidence {answer.confidence:.3f}")
+            answer = estimate.answer
+            print(f"after {answer.path_m:.1f} m: {answer.status}, confidence {answer.confidence:.3f}")
             if answer.T_map_base is not None:
                 x, y, yaw_deg = answer.T_map_base.x, answer.T_map_base.y, math.degrees(answer.T_map_base.yaw)
                 print(f"in {answer.session} at x {x:.2f} m, y {y:.2f} m, {yaw_deg:.0f} deg")

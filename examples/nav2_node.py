@@ -24,7 +24,8 @@ from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.io.message_source import RawMessage, TopicInfo
 from signature.database import open_database
 from signature.localization.follower import Follower
-from signature.localization.localizer import Localizer, Look, MapIndex
+from signature.localization.localizer import Estimate, Localizer
+from signature.localization.map_index import MapIndex
 
 try:
     import rclpy
@@ -120,21 +121,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 follower.restart()
 
 
-def tell(node: Any, live: LiveLog, publisher: Nav2Publisher, looks: Sequence[Look]) -> bool:
+def tell(node: Any, live: LiveLog, publisher: Nav2Publisher, estimates: Sequence[Estimate]) -> bool:
     """Log what there is to say; publish the pose and return true once the robot is located."""
     for sentence in live.feed.news.take():
         node.get_logger().warning(sentence)
-    for look in looks:
-        node.get_logger().info(f"{look.state} after {look.answer.path_m:.1f} m")
-        if look.T_map_base is None or look.answer.covariance is None:
+    for estimate in estimates:
+        answer = estimate.answer
+        node.get_logger().info(f"{estimate.state} after {answer.path_m:.1f} m")
+        if answer.T_map_base is None or answer.covariance is None:
             continue
-        # The look is about a scan some tenths of a second ago: apply it to the newest odometry.
-        stamp_ns, pose = look.registered.scan.stamp_ns, look.T_map_base
+        # The answer is about a scan some tenths of a second ago: apply it to the newest odometry.
+        stamp_ns, pose = answer.stamp_ns, answer.T_map_base
         newest = live.newest_odometry()
-        if newest is not None and look.T_map_odom is not None:
-            stamp_ns, pose = newest[0], look.T_map_odom @ pc2grid.SE2.from_matrix(newest[1])
-        publisher.initialpose(stamp_ns, pose, look.answer.covariance)
-        node.get_logger().info(f"in {look.session} at {pose}")
+        if newest is not None and estimate.T_map_odom is not None:
+            stamp_ns, pose = newest[0], estimate.T_map_odom @ pc2grid.SE2.from_matrix(newest[1])
+        publisher.initialpose(stamp_ns, pose, answer.covariance)
+        node.get_logger().info(f"in {answer.session} at {pose}")
         return True
     return False
 

@@ -26,8 +26,7 @@ Recordings to maps
 
 Databases and answers
     open_database       a SubmapDatabase; Label: building and floor of a session
-    locate              where registered scans were taken: an Answer
-    Localizer           the same while the robot drives, in a MapIndex
+    Localizer           where registered scans were taken, in a MapIndex, while the robot drives: an Answer
     Prior               where the robot is known to be, roughly
 
 Types
@@ -84,7 +83,6 @@ if TYPE_CHECKING:
     from signature.files import relocalize as relocalize
     from signature.localization.answer import Answer as Answer
     from signature.localization.localizer import Localizer as Localizer
-    from signature.localization.localizer import locate as locate
     from signature.localization.map_index import MapIndex as MapIndex
     from signature.localization.prior import Prior as Prior
 
@@ -126,7 +124,6 @@ _HOMES = {
     "MapIndex": "signature.localization.map_index",
     "Prior": "signature.localization.prior",
     "Localizer": "signature.localization.localizer",
-    "locate": "signature.localization.localizer",
 }
 __all__ = ["__version__", *_HOMES]
 

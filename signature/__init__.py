@@ -2,12 +2,15 @@
 
 The back of pc2grid: one file for each section of the paper (`boundary`, `freespace`, `symmetry`,
 `similarity`), the database behind one protocol, and localization. Importing this package loads no library:
-each name loads its module when it is first used. `help(signature.locate)` and so on explain them.
+each name loads its module when it is first used. `help(signature.relocalize)` and so on explain them.
 
 >>> import pc2grid, signature
 >>> with signature.open_database("building.submaps") as database, pc2grid.open_log("tuesday.mcap") as log:
 ...     config = database.config()
-...     answer = signature.locate(pc2grid.follow(log.scans(), config), database, config)
+...     localizer = signature.Localizer(signature.MapIndex.of(database, config))
+...     for registered, planar_scan in pc2grid.follow(log.scans(), config):
+...         estimate = localizer.add(registered, planar_scan)  # None but after every metre
+>>> answer = localizer.answer()
 >>> answer.status, answer.session
 ('located', 'monday')
 
@@ -24,8 +27,8 @@ Databases
 
 Answers
     relocalize          where in a database a recording was made: an Answer
-    locate              where registered scans were taken; locate_map: where a drawn map lies
-    Localizer           the same while the robot drives, in a MapIndex
+    Localizer           where registered scans were taken, in a MapIndex: an Estimate after every metre
+    locate_map          where a drawn map lies
     Prior               where the robot is known to be, roughly
     check_pose          whether a pose that is believed agrees with the map: a PoseCheck
     Config              settings
@@ -47,9 +50,9 @@ if TYPE_CHECKING:
     from signature.files import convert as convert
     from signature.files import relocalize as relocalize
     from signature.localization.answer import Answer as Answer
+    from signature.localization.answering import locate_map as locate_map
+    from signature.localization.localizer import Estimate as Estimate
     from signature.localization.localizer import Localizer as Localizer
-    from signature.localization.localizer import locate as locate
-    from signature.localization.localizer import locate_map as locate_map
     from signature.localization.map_index import MapIndex as MapIndex
     from signature.localization.pose_check import PoseCheck as PoseCheck
     from signature.localization.pose_check import check_pose as check_pose
@@ -77,9 +80,9 @@ _HOMES = {
     "PoseCheck": "signature.localization.pose_check",
     "check_pose": "signature.localization.pose_check",
     "Prior": "signature.localization.prior",
+    "Estimate": "signature.localization.localizer",
     "Localizer": "signature.localization.localizer",
-    "locate": "signature.localization.localizer",
-    "locate_map": "signature.localization.localizer",
+    "locate_map": "signature.localization.answering",
     "add_session": "signature.sessions",
     "build_session": "signature.sessions",
     "build_sessions": "signature.sessions",

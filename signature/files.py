@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,16 +20,16 @@ from signature.config import Config
 from signature.database import Label, open_database
 from signature.database.maintenance import exists
 from signature.database.postgres.server import is_url
-from signature.localization.localizer import MapIndex, locate_in, locate_map
+from signature.localization.answering import locate_map
+from signature.localization.localizer import Estimate, Localizer
+from signature.localization.map_index import MapIndex
 from signature.sessions import add_sessions, build_sessions
 
 if TYPE_CHECKING:
     from pc2grid.io.recording import Log
     from pc2grid.model import RegisteredScan
     from signature.database import SubmapDatabase
-    from signature.localization.answer import Answer, Moment
-    from signature.localization.localizer import Watch
-    from signature.localization.map_index import MapIndex
+    from signature.localization.answer import Answer
     from signature.localization.prior import Prior
 
 
@@ -103,8 +102,8 @@ def relocalize(
     config : its sections `read`, `registration` and `relocalize` are used; see `query_config`.
     span : the part of the recording to use. recover : use what is whole of a damaged recording.
     prior : what is known of the robot's pose beforehand; other places are no answers.
-    until_located : ask after every metre of travel, and stop at the first answer that is `located`; otherwise
-        the recording is read to its end, and the answer is about its last metres.
+    until_located : stop at the first estimate that is `located`; otherwise the recording is read to its end,
+        and the answer is about its last metres.
     observer : gets the progress, and each scan with its tracked pose; None: a progress bar on a terminal
         or in a notebook.
 
@@ -162,41 +161,27 @@ def locate_log(
     *,
     span: TimeSpan = TimeSpan(),
     until_located: bool = False,
-    watch: Watch | None = None,
-    on_the_way: int = 0,
+    see: Callable[[RegisteredScan, Estimate | None], None] = lambda registered, estimate: None,
     observer: Observer = Observer(),
 ) -> Answer:
     """Find where an open recording, or the part of it that `span` names, was made.
 
-    config : see `query_config`. until_located, watch : as in
-    `signature.localization.localizer.locate_in`. observer : as in `relocalize`.
-    on_the_way : at so many moments at most, spread evenly over the time of the recording, `watch` gets what
-        the answer would have been there, and nothing at others; 0: what each look says.
+    config : see `query_config`. until_located, observer : as in `relocalize`.
+    see : called with each scan, and with what `Localizer.add` returned for it.
 
     Raises NoScans if no scan can be used.
     """
     ends_ns = log.info.start_ns, log.info.end_ns
-    answered = 0
-
-    def due(registered: RegisteredScan) -> bool:
-        nonlocal answered
-        part = math.floor(on_the_way * span.share_done(registered.scan.stamp_ns, *ends_ns))
-        if part < answered:
-            return False
-        answered = part + 1
-        return part < on_the_way
-
-    def see(registered: RegisteredScan, moment: Moment | None) -> None:
-        observer.on_scan(registered)
-        observer.on_progress(span.share_done(registered.scan.stamp_ns, *ends_ns))
-        if watch is not None:
-            watch(registered, moment)
-
+    localizer = Localizer(index)
     with observer.step("locate", span.length_ns(*ends_ns) * 1e-9):
-        scans = follow(log.scans(span.start_s, span.duration_s), config, observer)
-        return locate_in(
-            scans, index, until_located=until_located, watch=see, answer_at=due if on_the_way else None
-        )
+        for registered, planar_scan in follow(log.scans(span.start_s, span.duration_s), config, observer):
+            estimate = localizer.add(registered, planar_scan)
+            observer.on_scan(registered)
+            observer.on_progress(span.share_done(registered.scan.stamp_ns, *ends_ns))
+            see(registered, estimate)
+            if until_located and estimate is not None and estimate.answer.status == "located":
+                break
+        return localizer.answer()
 
 
 def query_config(database: SubmapDatabase, config: Config) -> Config:

@@ -17,7 +17,7 @@ from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from signature.localization.answer import Answer, Moment, Verdict
 from signature.localization.belief import Masses
-from signature.localization.decision import PriorOf, anywhere, decide, judge, with_slip
+from signature.localization.decision import PriorOf, decide, judge, with_slip
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.in_space import settle_in_space
 from signature.localization.map_index import MapIndex
@@ -44,19 +44,20 @@ def answer_query(
     seen: QueryMap,
     found: tuple[Hypothesis, ...],
     *,
-    prior_of: PriorOf = anywhere,
-    history: tuple[Moment, ...] = (),
-    clock: Clock | None = None,
+    prior_of: PriorOf,
+    session_index: int | None,
+    history: tuple[Moment, ...],
+    clock: Clock,
 ) -> Answer:
     """Where a query is.
 
     seen : `query` drawn. found : hypotheses for it. prior_of : what was known before it, of each place.
+    session_index : of the map that is preferred among several that show the place.
     """
-    clock = clock or Clock()
     verdict = decide(index, seen, found, prior_of)
     clock.lap("decide")
     verdict, prior, excluded = _with_prior(index, seen, verdict, prior_of)
-    verdict = _with_slip(index, query, verdict)
+    verdict = _in_map(_with_slip(index, query, verdict), session_index)
     clock.lap("decide")
     in_space = None
     if query.in_space is not None:
@@ -97,6 +98,15 @@ def _with_slip(index: MapIndex, query: Query, verdict: Verdict) -> Verdict:
     found = alone.confidence and math.exp(alone.evidence.log_odds()) / alone.confidence
     elsewhere = 1.0 + found * (sum(alone.masses) - here)
     return with_slip(verdict, elsewhere, index.config.accept)
+
+
+def _in_map(verdict: Verdict, session_index: int | None) -> Verdict:
+    """The verdict in which, of each place, the hypothesis in the map of one session comes first."""
+    ordered = sorted(
+        zip(verdict.places, verdict.hypotheses, strict=True),
+        key=lambda each: (each[0], each[1].session_index != session_index),
+    )
+    return replace(verdict, hypotheses=tuple(h for _, h in ordered))
 
 
 def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:

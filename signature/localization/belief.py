@@ -3,10 +3,10 @@
     prior_t(h)  =  1 + (1 - k) mass_s(h) / (1 - (1 - k) sum_g mass_s(g)),    k = 1 - (1 - slip)^n
     mass_t(h)   =  prior_t(h) exp(z_h) / N        (`signature.localization.posterior`)
 
-The scans of a look are those of the last metres, so the looks overlap. The prior of look t follows from the
-latest look s that lies before all scans of t. Then each scan counts once, however far the robot has driven,
-and a look costs the same after 80 m as after 15 m. The odometry carries the places on: the pose of a query in
-the map is that of its odometry frame, which does not move.
+The scans of a search are those of the last metres, so the searches overlap. The prior of search t follows
+from the latest search s that lies before all scans of t. Then each scan counts once, however far the robot
+has driven, and a search costs the same after 80 m as after 15 m. The odometry carries the places on: the pose
+of a query in the map is that of its odometry frame, which does not move.
 
 At each of the n scans of t, odometry may fail or the robot may be carried away, at the rate `slip`. This
 share of the mass joins "anywhere", of which each place has the mass of "nowhere" again, as at the beginning.
@@ -84,12 +84,12 @@ def kept(query: QueryMap) -> float:
 
 
 class Belief:
-    """The masses of the looks since the start of the last window, and what they say of a running robot."""
+    """The masses of the searches since the start of the last window, and what they say of a running robot."""
 
     def __init__(self, accept: float) -> None:
         """accept : least mass to say where the robot is, and to say that it is not where it was."""
         self._accept = accept
-        self._looks: list[Masses] = []
+        self._searches: list[Masses] = []
         self._place: tuple[int, tuple[Hypothesis, ...]] | None = None  # part and place of the last "located"
         self._was_located = False
 
@@ -105,38 +105,36 @@ class Belief:
 
     def restart(self) -> None:
         """The scans do not go on from those before. It is remembered that the robot was located once."""
-        self._looks.clear()
+        self._searches.clear()
         self._place = None
 
     def prior(self, query: QueryMap, place: Sequence[Hypothesis]) -> float:
-        """Prior of a place, relative to that of "nowhere", by the looks before the scans of a query."""
+        """Prior of a place, relative to that of "nowhere", by the searches before the scans of a query."""
         before = self._before(query)
         return before[-1].prior(query, place) if before else 1.0
 
     def add(self, query: QueryMap, found: Verdict | Answer) -> Masses:
-        """Keep the masses of a look; those that no later query follows from are forgotten."""
-        look = Masses.of(query, found)
+        """Keep the masses of a search; those that no later query follows from are forgotten."""
+        now = Masses.of(query, found)
         forgotten = max(len(self._before(query)) - 1, 0)
-        here = [known for known in self._looks if known.part == query.part]
-        self._looks = [*here[forgotten:], look]
-        return look
+        here = [known for known in self._searches if known.part == query.part]
+        self._searches = [*here[forgotten:], now]
+        return now
 
     def _before(self, query: QueryMap) -> list[Masses]:
-        """The looks that lie before all scans of a query."""
+        """The searches that lie before all scans of a query."""
         first_m = query.keyframes[0].path_m if query.keyframes else 0.0
-        return [look for look in self._looks if look.part == query.part and look.path_m < first_m]
+        return [past for past in self._searches if past.part == query.part and past.path_m < first_m]
 
-    def follow(self, look: Masses, best: Hypothesis | None) -> State:
-        """The state of a running robot after a look. best : the hypothesis that it is located at."""
+    def follow(self, now: Masses, *, located: bool) -> State:
+        """The state of a running robot after a search. located : at the first place."""
         here = 0.0
-        if self._place is not None and self._place[0] == look.part:
-            here = look.mass(self._place[1])
-        if best is not None:
-            place = look.places[0]
+        if self._place is not None and self._place[0] == now.part:
+            here = now.mass(self._place[1])
+        if located:
             goes_on = not self._was_located or here >= POSTERIOR.likely
             self._was_located = True
-            all_of = (h for h, number in zip(look.hypotheses, look.places, strict=True) if number == place)
-            self._place = look.part, (best, *(h for h in all_of if h is not best))
+            self._place = now.part, now.hypotheses[: now.places.count(0)]
             return "located" if goes_on else "recovered"
         if here > 1.0 - self._accept:
             return "doubtful"

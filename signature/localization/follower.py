@@ -1,6 +1,6 @@
-"""Looks at the database beside the tracking of a robot.
+"""Searches of the database beside the tracking of a robot.
 
-A look takes up to seconds in a large building, and a robot sends 40 scans in one. So it is made in a thread
+A search takes up to seconds in a large building, and a robot sends 40 scans in one. So it is made in a thread
 of its own, while tracking goes on: its parts that cost most are compiled and run beside Python.
 """
 
@@ -21,11 +21,11 @@ from pc2grid.geometry import SE2
 from pc2grid.model import RegisteredScan
 from signature.localization.query import ViewSpacing
 
-LookT = TypeVar("LookT")
-LookT_co = TypeVar("LookT_co", covariant=True)
+EstimateT = TypeVar("EstimateT")
+EstimateT_co = TypeVar("EstimateT_co", covariant=True)
 
 
-class Follows(Protocol[LookT_co]):
+class Follows(Protocol[EstimateT_co]):
     """What follows a robot: a `Localizer` or a `PoseWatch`.
 
     uses_points : whether the scans that `ViewSpacing` takes are needed with their points.
@@ -36,10 +36,10 @@ class Follows(Protocol[LookT_co]):
         """See above."""
         ...
 
-    def follow(
-        self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_look: bool = True
-    ) -> LookT_co | None:
-        """Take in the next scan; returns what a look said if there was one after it."""
+    def add(
+        self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_search: bool = True
+    ) -> EstimateT_co | None:
+        """Take in the next scan; returns an estimate if there is one after it."""
         ...
 
     def restart(self) -> None:
@@ -48,21 +48,21 @@ class Follows(Protocol[LookT_co]):
 
 
 _MOST_WAITING = 2000
-"""Scans that wait for a look to end; beyond, the oldest are left out. Chosen by hand: some 20 MB,
+"""Scans that wait for a search to end; beyond, the oldest are left out. Chosen by hand: some 20 MB,
 and the points of a scan every 0.2 m where they are used."""
 
 
-class Follower(Generic[LookT]):
+class Follower(Generic[EstimateT]):
     """Feeds a `Localizer` or a `PoseWatch` with scans, here or in a thread. Use as a context manager.
 
     lock : is held while the database is read; hold it to read the database in between.
     """
 
-    def __init__(self, localizer: Follows[LookT], *, beside: bool, step_m: float = 1.0) -> None:
-        """beside : in a thread; otherwise each look is made before `add` returns, always after the same
+    def __init__(self, localizer: Follows[EstimateT], *, beside: bool, step_m: float = 1.0) -> None:
+        """beside : in a thread; otherwise each search is made before `add` returns, always after the same
         scans.
 
-        step_m : travel after which a look is due. A look is left out if so much travel waits behind it.
+        step_m : travel after which a search is due. It is left out if so much travel waits behind it.
         """
         self.lock = threading.Lock()
         self._localizer, self._step_m = localizer, step_m
@@ -70,16 +70,16 @@ class Follower(Generic[LookT]):
         self._last: SE2 | None = None
         self._spacing = ViewSpacing()
         self._waiting: deque[tuple[RegisteredScan, PlanarScan, float] | None] = deque(maxlen=_MOST_WAITING)
-        self._looks: deque[Future[LookT | None]] = deque()
-        self._thread = ThreadPoolExecutor(1, "looks") if beside else None
+        self._estimates: deque[Future[EstimateT | None]] = deque()
+        self._thread = ThreadPoolExecutor(1, "searches") if beside else None
 
-    def __enter__(self) -> Follower[LookT]:
+    def __enter__(self) -> Follower[EstimateT]:
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the thread, when it has finished its look."""
+        """End the thread, when it has finished its search."""
         self._waiting.clear()
         if self._thread is not None:
             self._thread.shutdown(cancel_futures=True)
@@ -101,28 +101,28 @@ class Follower(Generic[LookT]):
         self._last, self._spacing = None, ViewSpacing()
         self._hand_over(None)
 
-    def take(self) -> list[LookT]:
-        """The looks that are done. Raises what the thread raised."""
+    def take(self) -> list[EstimateT]:
+        """The estimates that are done. Raises what the thread raised."""
         taken = []
-        while self._looks and self._looks[0].done():
-            look = self._looks.popleft().result()
-            taken += [] if look is None else [look]
+        while self._estimates and self._estimates[0].done():
+            estimate = self._estimates.popleft().result()
+            taken += [] if estimate is None else [estimate]
         return taken
 
     def finish(self) -> None:
         """Wait until the scans that were handed over are used."""
-        wait(self._looks)
+        wait(self._estimates)
 
     def _hand_over(self, item: tuple[RegisteredScan, PlanarScan, float] | None) -> None:
         self._waiting.append(item)
         if self._thread is not None:
-            self._looks.append(self._thread.submit(self._use_next))
+            self._estimates.append(self._thread.submit(self._use_next))
             return
-        done: Future[LookT | None] = Future()
+        done: Future[EstimateT | None] = Future()
         done.set_result(self._use_next())
-        self._looks.append(done)
+        self._estimates.append(done)
 
-    def _use_next(self) -> LookT | None:
+    def _use_next(self) -> EstimateT | None:
         try:
             item = self._waiting.popleft()
         except IndexError:  # left out
@@ -132,5 +132,5 @@ class Follower(Generic[LookT]):
             return None
         registered, planar_scan, path_m = item
         with self.lock:
-            may_look = self._path_m - path_m < self._step_m
-            return self._localizer.follow(registered, planar_scan, may_look=may_look)
+            may_search = self._path_m - path_m < self._step_m
+            return self._localizer.add(registered, planar_scan, may_search=may_search)

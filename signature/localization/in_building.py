@@ -12,7 +12,6 @@ from pc2grid.geometry import SE2
 from signature.database.protocol import BuildingFrame
 from signature.localization.answer import Answer, Moment, PoseInSpace
 from signature.localization.hypotheses import Hypothesis
-from signature.localization.localizer import Look
 
 _APART = BuildingFrame(name="", T_building_session=SE2(), covariance=((0.0,) * 3,) * 3)
 """Of a session that is not joined: its poses stay as they are."""
@@ -45,13 +44,6 @@ def answer_in_building(answer: Answer, frames: Mapping[str, BuildingFrame]) -> A
         covariance=fit.covariance,
         in_space=answer.in_space and _in_space(answer.in_space, frame_of[hypotheses[0].session_index]),
     )
-
-
-def look_in_building(look: Look, frames: Mapping[str, BuildingFrame]) -> Look:
-    """A look at a running robot with all poses in the frames of the buildings."""
-    frame = frames.get(look.session or "", _APART)
-    T_map_base = look.T_map_base and frame.placed(look.T_map_base)
-    return replace(look, answer=answer_in_building(look.answer, frames), T_map_base=T_map_base)
 
 
 def covariance_in_building(covariance: F64, T_session_base: SE2, frame: BuildingFrame) -> F64:

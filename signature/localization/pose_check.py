@@ -18,8 +18,8 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -36,9 +36,6 @@ from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import log_likelihood
 from signature.localization.prior import Prior
-
-if TYPE_CHECKING:
-    from signature.localization.localizer import Watch
 
 CheckStatus = Literal["fine", "lost", "unsure"]
 
@@ -73,6 +70,7 @@ class PoseCheck:
     off_m, off_rad : what it differs by from the best place near it; None if nothing fits there.
     better : the answer that contradicts the pose, if it is lost and the right place is certain.
     lapsed : registration was lost after the time of the pose, so it could not be compared.
+    elapsed_s : time that a check of a running robot took.
     """
 
     status: CheckStatus
@@ -85,6 +83,7 @@ class PoseCheck:
     off_rad: float | None = None
     better: Answer | None = None
     lapsed: bool = False
+    elapsed_s: float = 0.0
 
 
 def check_pose(
@@ -94,14 +93,12 @@ def check_pose(
     *,
     stamp_ns: int | None = None,
     session: str | None = None,
-    watch: Watch | None = None,
 ) -> PoseCheck:
     """Whether a pose is right, by the last metres of a registered recording.
 
     scans : with their planar scans, from `pc2grid.pipeline.follow`, in any frame of their own.
     stamp_ns : time of the pose, of which the nearest scan is meant; None: the last scan.
     session : whose map frame the pose is in; may be None if there is only one.
-    watch : called with each scan.
 
     Raises ConfigError for a missing or unknown session, NoScans for a query without a usable scan.
 
@@ -109,7 +106,7 @@ def check_pose(
     >>> with signature.open_database("plan.submaps") as database, pc2grid.open_log("tuesday.mcap") as log:
     ...     config = database.config()
     ...     index = MapIndex.of(database, config)
-    ...     found = signature.locate(pc2grid.follow(log.scans(), config), database, config)
+    ...     found = signature.relocalize("tuesday.mcap", "plan.submaps")
     ...     checked = check_pose(pc2grid.follow(log.scans(), config), index, found.T_map_base)
     >>> checked.status, checked.off_m < 0.1
     ('fine', True)
@@ -118,8 +115,6 @@ def check_pose(
     localizer = Localizer(index, prior_ns=stamp_ns)
     for registered, planar_scan in scans:
         localizer.take(registered, planar_scan)
-        if watch is not None:
-            watch(registered, None)
     seen = localizer.query.map()
     if stamp_ns is not None:
         if seen.T_odom_prior is None:
@@ -147,7 +142,8 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
     fit = score_fit(walls, seen.walls, T_map_query, np.zeros((3, 3)))
     believed = Hypothesis(session_index=number, row=-1, fit=fit)
     # All mass was near the pose before what was seen lately. So of two equal rooms it is in the nearer one.
-    answer = localizer.answer(
+    answer = localizer.search(
+        localizer.query,
         near.search_whole_maps(seen, (believed,)),
         lambda place: 1.0 / (1.0 - kept(seen)) if any(near.allows(seen, h) for h in place) else 1.0,
     )
@@ -160,8 +156,7 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
     mass_here = sum(answer.masses[place] for place in here)
     # Where the map knows too little to contradict the pose, "at no place of this map" does not exclude it.
     at_most = mass_here if log_likelihood(fit) < 0.0 else 1.0 - sum(answer.masses) + mass_here
-    status: CheckStatus = "lost" if at_most <= 1.0 - index.config.accept else "unsure"
-    status = "fine" if mass_here >= index.config.accept else status
+    status = _status(mass_here, at_most, index.config.accept)
     _, off_m, off_rad = apart[0] if apart else (None, None, None)
     return PoseCheck(
         status=status,
@@ -174,6 +169,13 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
         off_rad=off_rad,
         better=answer if status == "lost" and answer.status == "located" else None,
     )
+
+
+def _status(mass_here: float, at_most: float, accept: float) -> CheckStatus:
+    """at_most : upper bound of the probability that the pose is right. accept : least mass to be certain."""
+    if mass_here >= accept:
+        return "fine"
+    return "lost" if at_most <= 1.0 - accept else "unsure"
 
 
 def _around(T_map_base: SE2, session: str | None) -> Prior:
@@ -193,15 +195,6 @@ def _apart(a: SE2, b: SE2) -> tuple[float, float]:
 
 def _within_tolerance(off_m: float, off_rad: float) -> bool:
     return off_m <= CHECK.tolerance_m and off_rad <= CHECK.tolerance_rad
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PoseLook:
-    """What one look said of the pose. registered : the scan of the look. elapsed_s : time of the look."""
-
-    checked: PoseCheck
-    registered: RegisteredScan
-    elapsed_s: float
 
 
 class PoseWatch:
@@ -231,13 +224,13 @@ class PoseWatch:
         self._T_map_session: SE2 | None = None
         self._judged: SE2 | None = None
 
-    def follow(
-        self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_look: bool = True
-    ) -> PoseLook | None:
-        """Take in the next scan; returns what a look said if there was one after it.
+    def add(
+        self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_search: bool = True
+    ) -> PoseCheck | None:
+        """Take in the next scan; returns the judgement if there was one after it.
 
-        may_look : if not, a look that is due is put off until it is true. Raises ConfigError for a missing or
-        unknown session.
+        may_search : if not, a judgement that is due is put off until it is true. Raises ConfigError for a
+        missing or unknown session.
         """
         begin = time.perf_counter()
         T_session_base = SE2.from_matrix(registered.T_session_base)
@@ -247,9 +240,9 @@ class PoseWatch:
         self._driven.append((registered.scan.stamp_ns, T_session_base))
         self._update()
         T_map_session = self._T_map_session
-        may_look = may_look and T_map_session is not None
-        is_time = self._localizer.take(registered, planar_scan, may_look=may_look)
-        if T_map_session is None or not may_look:
+        may_search = may_search and T_map_session is not None
+        is_time = self._localizer.take(registered, planar_scan, may_search=may_search)
+        if T_map_session is None or not may_search:
             return None
         T_map_base = T_map_session @ T_session_base
         judged = T_map_session if self._judged is None else self._judged
@@ -260,10 +253,8 @@ class PoseWatch:
             checked = judge_pose(self._localizer, T_map_base, self._session)
         except NoScans:  # the scans since registration was lost show nothing
             return None
-        if self._localizer.due:
-            self._localizer.looked()
         self._judged = T_map_session
-        return PoseLook(checked=checked, registered=registered, elapsed_s=time.perf_counter() - begin)
+        return replace(checked, elapsed_s=time.perf_counter() - begin)
 
     def _update(self) -> None:
         """Find out where the frame of the registered scans lies in the map, as the robot believes.

@@ -220,27 +220,35 @@ class Query:
         if self._keyframes and self._newest is not None:
             step = self._newest.T_odom_base.inverse() @ pose
             path_m = self._newest.path_m + math.hypot(step.x, step.y)
-        self._newest = newest = Keyframe(planar_scan, pose, path_m)
+        self._newest = Keyframe(planar_scan, pose, path_m)
         if self._prior_ns is not None and abs(planar_scan.stamp_ns - self._prior_ns) < self._at_prior[0]:
-            self._at_prior = abs(planar_scan.stamp_ns - self._prior_ns), newest
+            self._at_prior = abs(planar_scan.stamp_ns - self._prior_ns), self._newest
+        self._keep(self._newest)
+
+    def _keep(self, newest: Keyframe) -> None:
+        """Keep a scan if the robot has moved since the last one that was kept."""
         if self._keyframes:
-            last = self._keyframes[-1].T_odom_base.inverse() @ pose
+            last = self._keyframes[-1].T_odom_base.inverse() @ newest.T_odom_base
             if math.hypot(last.x, last.y) < QUERY.keyframe_m and abs(last.yaw) < QUERY.keyframe_rad:
                 return
         self._keyframes.append(newest)
-        while path_m - self._keyframes[0].path_m > self._config.window_m:
+        while newest.path_m - self._keyframes[0].path_m > self._config.window_m:
             self._keyframes.popleft()
 
     def since(self, scans: int) -> Query:
         """The query that begins with the last so many `QueryMap.keyframes`: a part of its own."""
         keyframes = self.map().keyframes[-scans:]
         begin_m = keyframes[0].path_m
-        later = Query(self._made_with, self._config, prior_ns=self._prior_ns)
+        later = Query(self._made_with, self._config)
         later.in_space = None if self.in_space is None else self.in_space.since(self.path_m - begin_m)
         later.part, later.first_ns = self.part + 1, keyframes[0].planar_scan.stamp_ns
         later._keyframes.extend(replace(k, path_m=k.path_m - begin_m) for k in keyframes)
         later._newest = later._keyframes[-1]
         return later
+
+    def forget_prior(self) -> None:
+        """The motion since the time of the prior is not known any more."""
+        self._prior_ns, self._at_prior, self._drawn = None, (math.inf, None), None
 
     def map(self) -> QueryMap:
         """What has been seen over the last metres, described as the database is.

@@ -1,10 +1,9 @@
-"""`pc2grid relocalize` of a drive whose tracking drifts: where it was on the way, and what the page asks."""
+"""`pc2grid relocalize` of a drive whose tracking drifts: where it was on the way."""
 
 from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +19,7 @@ from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
-from pc2grid_cli.locate import ON_THE_WAY
 from pc2grid_cli.main import app
-from signature.localization.localizer import Localizer
 from tests.helpers.simulated_drives import office
 
 DRIFT_RAD_PER_M = math.radians(1.0)
@@ -85,21 +82,13 @@ def scans_and_config(folder: Path) -> tuple[Any, Any]:
         return iter(list(log.scans())), pc2grid.Config()
 
 
-def test_a_page_asks_a_bounded_number_of_times(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    looked_up_at = []
-    answer = Localizer.answer
-
-    def counted(localizer: Localizer) -> Any:
-        looked_up_at.append(localizer.path_m)
-        return answer(localizer)
-
-    monkeypatch.setattr(Localizer, "answer", counted)
-    page = tmp_path / "page.html"
-    run("relocalize", folder / "drive.mcap", "-d", folder / "plan.submaps", "--report", page)
-    assert len(looked_up_at) <= ON_THE_WAY + 1
-    assert max(np.diff(looked_up_at)) < 2.5 * max(looked_up_at) / ON_THE_WAY
-    found = re.search(r'"moments": ?(\d+)', page.read_text())
-    assert found is not None and int(found[1]) == len(looked_up_at) - 1
-    assert "moments spread evenly over the time of the recording" in page.read_text()
+def test_a_recording_is_followed_as_a_robot_is(folder: Path) -> None:
+    """What `watch` says on the way is the history of the answer of `relocalize`."""
+    words = (folder / "drive.mcap", "-d", folder / "plan.submaps", "--json")
+    said = [json.loads(line) for line in run("watch", *words, "--keep").splitlines()]
+    history = json.loads(run("relocalize", *words))["history"]
+    assert len(said) >= 10
+    for told, moment in zip(said, history, strict=False):
+        assert [told[key] for key in ("stamp_ns", "path_m", "status", "confidence")] == [
+            moment[key] for key in ("stamp_ns", "path_m", "status", "confidence")
+        ]

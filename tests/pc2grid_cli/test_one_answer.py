@@ -79,14 +79,9 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Expected]:
 
 
 def assert_same(document: Any, expected: Expected) -> None:
-    """Equal numbers but for the rounding of sums, whose order in Open3D and BLAS depends on the machine.
-
-    Looks at a running robot are whole answers, those on the way of a recording are quick, and what was known
-    before the last metres follows from them: the confidence may differ, but less than what one reads.
-    """
-    for key in ("status", "pose", "in_space"):
+    """Equal numbers but for the rounding of sums, whose order in Open3D and BLAS depends on the machine."""
+    for key in ("status", "pose", "in_space", "confidence"):
         assert document[key] == rounded(expected[key]), key
-    assert document["confidence"] == pytest.approx(expected["confidence"], abs=1e-3)
 
 
 def rounded(value: Any) -> Any:
@@ -118,17 +113,6 @@ def test_relocalize(expected: tuple[Path, Expected]) -> None:
 def test_relocalize_of_the_library(expected: tuple[Path, Expected]) -> None:
     folder, last = expected
     answer = pc2grid.relocalize(folder / "tuesday.mcap", folder / "monday.submaps")
-    assert_same(answer.to_json(), last)
-
-
-def test_locate_of_the_library(expected: tuple[Path, Expected]) -> None:
-    folder, last = expected
-    with (
-        open_database(folder / "monday.submaps") as database,
-        pc2grid.open_log(folder / "tuesday.mcap") as log,
-    ):
-        config = database.config()
-        answer = pc2grid.locate(pc2grid.follow(log.scans(), config), database, config)
     assert_same(answer.to_json(), last)
 
 
@@ -165,7 +149,7 @@ def test_localizer_of_the_library(expected: tuple[Path, Expected]) -> None:
 
 
 def test_laboratory(expected: tuple[Path, Expected]) -> None:
-    """Several maps are compared with one query, which is drawn once."""
+    """Several maps are compared with one query."""
     folder, last = expected
     with (
         open_database(folder / "monday.submaps") as database,

@@ -203,13 +203,11 @@ def test_the_answer_on_the_page_is_the_answer(database: SubmapDatabase, found: F
     assert len(shown["hypotheses"]) == len(found.answer.hypotheses)
 
 
-def test_the_curve_is_what_asking_would_have_said(database: SubmapDatabase, found: Found) -> None:
-    quiet = contents(database, found=found)["answer"]
-    assert not quiet["moments"] and len(quiet["history"]) == 1
+def test_the_curve_is_the_history_of_the_answer(database: SubmapDatabase, found: Found) -> None:
     last = found.answer.history[-1]
-    asked = tuple(replace(last, path_m=float(m), confidence=0.1 * m, status="ambiguous") for m in (1, 2))
-    shown = contents(database, found=replace(found, on_the_way=asked))["answer"]
-    assert shown["moments"] == 2
+    before = tuple(replace(last, path_m=float(m), confidence=0.1 * m, status="ambiguous") for m in (1, 2))
+    answer = replace(found.answer, history=(*before, last))
+    shown = contents(database, found=replace(found, answer=answer))["answer"]
     assert [m["path_m"] for m in shown["history"]] == [1.0, 2.0, last.path_m]
     assert [m["status"] for m in shown["history"]] == ["ambiguous", "ambiguous", "located"]
     assert shown["history"][-1]["confidence"] == last.confidence

@@ -10,7 +10,8 @@ import pytest
 from pc2grid.model import SessionMap
 from signature.config import Config
 from signature.database import Label, Provenance, open_database
-from signature.localization.localizer import MapIndex, locate_map
+from signature.localization.answering import locate_map
+from signature.localization.map_index import MapIndex
 from signature.sessions import add_sessions, provenance
 from tests.helpers.session_maps import session, way
 from tests.helpers.simulated_drives import cut, office

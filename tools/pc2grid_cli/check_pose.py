@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,13 +22,14 @@ from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import check_pose
 
 if TYPE_CHECKING:
+    from pc2grid.clouds.planar_scan import PlanarScan
     from pc2grid.io import Log
     from pc2grid.model import RegisteredScan
     from pc2grid_cli.followed import Followed
     from pc2grid_cli.json_schemas import CheckedPoseJudgement, RelocalizeCheck, WatchCheck
     from signature.config import Config
     from signature.database import SubmapDatabase
-    from signature.localization.pose_check import PoseCheck, PoseLook
+    from signature.localization.pose_check import PoseCheck
 
 
 def check_log(
@@ -47,20 +49,16 @@ def check_log(
         ends_ns = log.info.start_ns, log.info.end_ns
         scans = 0
 
-        def see(registered: RegisteredScan, moment: object) -> None:
+        def counted() -> Iterator[tuple[RegisteredScan, PlanarScan]]:
             nonlocal scans
-            scans += 1
-            observer.on_progress(span.share_done(registered.scan.stamp_ns, *ends_ns))
+            for registered, planar_scan in follow(log.scans(span.start_s, span.duration_s), config, observer):
+                scans += 1
+                observer.on_progress(span.share_done(registered.scan.stamp_ns, *ends_ns))
+                yield registered, planar_scan
 
         with observer.step("check", span.length_ns(*ends_ns) * 1e-9):
-            checked = check_pose(
-                follow(log.scans(span.start_s, span.duration_s), config, observer),
-                MapIndex.of(database, config),
-                T_map_base,
-                stamp_ns=stamp_ns,
-                session=known.session,
-                watch=see,
-            )
+            index = MapIndex.of(database, config)
+            checked = check_pose(counted(), index, T_map_base, stamp_ns=stamp_ns, session=known.session)
         about = about_log(path, log, checked, scans=scans, span=span)
         return checked, {**_judgement(checked, database.location), "query": about}
 
@@ -75,16 +73,16 @@ def _believed(log: Log, known: KnownPose, span: TimeSpan) -> tuple[SE2, int | No
     return SE2(x_m, y_m, math.radians(yaw_deg)), None
 
 
-def live_document(look: PoseLook, drive: Followed, where: str) -> WatchCheck:
+def live_document(checked: PoseCheck, drive: Followed, where: str) -> WatchCheck:
     """The document of one check of a running robot's own pose."""
     return {
-        **_judgement(look.checked, where),
-        "path_m": look.checked.path_m,
+        **_judgement(checked, where),
+        "path_m": checked.path_m,
         "scans": drive.report().scans_read,
         "dropped": drive.counts.dropped,
         "reconnected": drive.counts.reconnected,
         "lag_s": drive.lag_s,
-        "elapsed_s": look.elapsed_s,
+        "elapsed_s": checked.elapsed_s,
     }
 
 

@@ -5,20 +5,19 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import typer
 
 from pc2grid.display import counted
 from pc2grid.geometry import wrap_angle
-from pc2grid.io import open_log
 from pc2grid.io.atomic import require_writable
 from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid.simulate.config import LidarConfig
 from pc2grid_cli import console
-from pc2grid_cli.locate import ON_THE_WAY, Found, about_log, locate
+from pc2grid_cli.locate import find_log
 from pc2grid_cli.options import OUTPUT_FOLDER, Force
 from pc2grid_cli.output_files import make_folder
 from pc2grid_cli.picture import draw_answer
@@ -27,10 +26,6 @@ from pc2grid_cli.report import write_report
 from signature.config import Config
 from signature.database import open_database
 from signature.sessions import add_sessions, build_session
-
-if TYPE_CHECKING:
-    from pc2grid.model import RegisteredScan
-    from signature.localization.answer import Moment
 
 BUILDING_SEED = 3
 MAP_LENGTH_M = 60.0
@@ -80,25 +75,16 @@ def demo_command(
 
     terminal.note("3/4 relocalize the depth camera's recording in it")
     truth_map, truth_query = read_tum(lidar.with_suffix(".tum")), read_tum(depth.with_suffix(".tum"))
-    with open_database(database) as opened, open_log(depth, config.read) as query:
-        moments: list[Moment] = []
-
-        def watch(_: RegisteredScan, moment: Moment | None) -> None:
-            if moment is not None:
-                moments.append(moment)
-
-        answer, poses = locate(
-            query, opened, config, observer=terminal.observer(), watch=watch, on_the_way=ON_THE_WAY
-        )
+    with open_database(database) as opened:
+        found = find_log(depth, opened, config, observer=terminal.observer())
+        answer = found.answer
         # The frame of the database is the first pose of the lidar robot; the truth is in that of the plan.
         T_map_plan = next(truth_map.poses()).inverse()
         true_poses = [T_map_plan @ pose for pose in truth_query.poses()]
         terminal.note("4/4 draw it")
 
         truth_m = np.array([(p.x, p.y) for p in true_poses])
-        draw_answer(picture, opened, answer, poses, truth_m)
-        about = about_log(depth, query, answer, scans=len(poses))
-        found = Found(answer=answer, poses=poses, about=about, on_the_way=tuple(moments))
+        draw_answer(picture, opened, answer, found.poses, truth_m)
         write_report(page, opened, found=found, accept=config.relocalize.accept, truth_m=truth_m)
     scans, submaps = counted(len(session.trajectory), "lidar scan"), counted(len(session.submaps), "submap")
     print(f"map: {scans}, {submaps}: {database}")

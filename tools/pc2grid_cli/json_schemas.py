@@ -58,7 +58,7 @@ class OfFile(Printed):
 class Live(TypedDict):
     """How a running robot is followed. scans: used so far. dropped: left out because the computer is too
     slow. reconnected: lost connections made again. lag_s, elapsed_s: seconds from a scan's arrival to its
-    use, and for this look."""
+    use, and for this estimate."""
 
     scans: int
     dropped: int
@@ -157,7 +157,7 @@ class WatchedMap(Labelled):
 
 
 class Watch(Printed, Live):
-    """A line of `pc2grid watch --json`: what one look at the database said. state: searching (not located
+    """A line of `pc2grid watch --json`: what one search of the database said. state: searching (not located
     yet), located, doubtful (certain neither where it was nor elsewhere), lost, recovered (located elsewhere
     or again). pose: of the base at `stamp_ns`; null unless the status is `located`. T_map_odom: of
     the robot's own odometry frame. frame: of the building, in which the pose is; null: the map frame of the

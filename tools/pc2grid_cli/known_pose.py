@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,6 +65,11 @@ class KnownPose:
             return None
         x_m, y_m, radius_m = self.near
         return Prior.around(x_m, y_m, radius_m, session=self.session)
+
+    def at_start(self) -> Prior | None:
+        """The region of `--near` as one in which the first scan was taken."""
+        region = self.region()
+        return None if region is None else replace(region, stamp_ns=0)
 
     def prior(self, log: Log, span: TimeSpan) -> Prior | None:
         """The region that the pose is in; None if none is given.

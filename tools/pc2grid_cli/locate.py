@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,8 +20,8 @@ from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli.known_pose import KnownPose
 from signature.files import locate_log, open_places, query_config
+from signature.localization.answering import locate_map
 from signature.localization.hypotheses import HYPOTHESES
-from signature.localization.localizer import locate_map
 from signature.localization.map_index import MapIndex
 from signature.localization.prior import PRIOR
 
@@ -32,15 +32,9 @@ if TYPE_CHECKING:
     from pc2grid_cli.json_schemas import QueryRecording
     from signature.config import Config
     from signature.database import SubmapDatabase
-    from signature.localization.answer import Moment
-    from signature.localization.localizer import Answer, Watch
+    from signature.localization.answer import Answer
+    from signature.localization.localizer import Estimate
     from signature.localization.pose_check import PoseCheck
-    from signature.localization.prior import Prior
-
-
-ON_THE_WAY = 8
-"""At so many moments on the way the page says what the answer would have been. Chosen by hand: each takes as
-long as the answer, so that a page takes a few times as long as the answer alone."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +44,6 @@ class Found:
     poses : the query in its own frame, see `followed`; empty for a map. drawn : the query if it is a map.
     about : the description of the query in the JSON document.
     report : what was read of a recording, and what was lost; None for a map.
-    on_the_way : what the answer would have been on the way; empty if this was not wanted.
     """
 
     answer: Answer
@@ -58,7 +51,6 @@ class Found:
     about: QueryRecording
     drawn: OccupancyGrid | None = None
     report: ReadReport | None = None
-    on_the_way: tuple[Moment, ...] = ()
 
 
 @contextlib.contextmanager
@@ -80,48 +72,40 @@ def find_log(
     database: SubmapDatabase,
     config: Config,
     *,
-    span: TimeSpan,
-    recover: bool,
+    span: TimeSpan = TimeSpan(),
+    recover: bool = False,
     observer: Observer = Observer(),
-    watch: Watch | None = None,
+    see: Callable[[RegisteredScan, Estimate | None], None] = lambda registered, estimate: None,
     known: KnownPose = KnownPose(),
-    on_the_way: int = 0,
     index: MapIndex | None = None,
 ) -> Found:
     """Locate a recording, or the part of it that `span` names.
 
-    on_the_way : find out, too, what the answer would have been at so many moments (`Found.on_the_way`, and
-        what `watch` gets), see `signature.files.locate_log`.
-    index : of the database, if it is prepared.
+    see : see `signature.files.locate_log`. index : of the database, if it is prepared.
     """
-    moments: list[Moment] = []
+    config = query_config(database, config)
+    seen: list[RegisteredScan] = []
 
-    def see(registered: RegisteredScan, moment: Moment | None) -> None:
-        if on_the_way and moment is not None:
-            moments.append(moment)
-        if watch is not None:
-            watch(registered, moment)
+    def keep(registered: RegisteredScan, estimate: Estimate | None) -> None:
+        seen.append(_without_points(registered))
+        see(registered, estimate)
 
-    with open_log(path, config.read, recover=recover) as query:
-        prior = known.prior(query, span)
-        answer, poses = locate(
-            query,
-            database,
-            config,
-            span=span,
-            observer=observer,
-            watch=see,
-            prior=prior,
-            on_the_way=on_the_way,
-            index=index,
+    with open_log(path, config.read, recover=recover) as log:
+        prior = known.prior(log, span)
+        index = index or MapIndex.of(database, config, observer)
+        index = index if prior is None else index.within(prior)
+        answer = locate_log(log, index, config, span=span, see=keep, observer=observer)
+        poses = Trajectory(
+            stamps_ns=np.array([s.scan.stamp_ns for s in seen], np.int64),
+            T_session_base=np.array([s.T_session_base for s in seen]).reshape(-1, 4, 4),
+            health=tuple(s.health for s in seen),
         )
-        about = about_log(path, query, answer, scans=len(poses), span=span)
-        report = query.report()
-        return Found(answer=answer, poses=poses, about=about, report=report, on_the_way=tuple(moments))
+        about = about_log(path, log, answer, scans=len(poses), span=span)
+        return Found(answer=answer, poses=followed(poses, answer), about=about, report=log.report())
 
 
 def about_log(
-    path: Path, query: Log, answer: Answer | PoseCheck, *, scans: int, span: TimeSpan = TimeSpan()
+    path: Path, query: Log, answer: Answer | PoseCheck, *, scans: int, span: TimeSpan
 ) -> QueryRecording:
     """The description of a recording, or of a part of it, in the JSON document of the answer."""
     report = query.report()
@@ -157,53 +141,6 @@ def find_map(path: Path, database: SubmapDatabase, config: Config, index: MapInd
         "warnings": list(drawn.warnings),
     }
     return Found(answer=answer, poses=poses, about=about, drawn=drawn.grid)
-
-
-def locate(
-    query: Log,
-    database: SubmapDatabase,
-    config: Config,
-    *,
-    span: TimeSpan = TimeSpan(),
-    observer: Observer = Observer(),
-    watch: Watch | None = None,
-    prior: Prior | None = None,
-    on_the_way: int = 0,
-    index: MapIndex | None = None,
-) -> tuple[Answer, Trajectory]:
-    """The answer for a recording, and its poses in its own odometry frame, as `followed` corrects them.
-
-    watch : called with each scan, and with the state of the answer if the database was searched after it.
-    prior : what is known of the pose beforehand. on_the_way : see `signature.files.locate_log`.
-    index : of the database, if it is prepared.
-
-    config : see `query_config`.
-    """
-
-    config = query_config(database, config)
-    index = index or MapIndex.of(database, config, observer)
-    seen: list[RegisteredScan] = []
-
-    def see(registered: RegisteredScan, moment: Moment | None) -> None:
-        seen.append(_without_points(registered))
-        if watch is not None:
-            watch(registered, moment)
-
-    answer = locate_log(
-        query,
-        index if prior is None else index.within(prior),
-        config,
-        span=span,
-        watch=see,
-        on_the_way=on_the_way,
-        observer=observer,
-    )
-    poses = Trajectory(
-        stamps_ns=np.array([s.scan.stamp_ns for s in seen], np.int64),
-        T_session_base=np.array([s.T_session_base for s in seen]).reshape(-1, 4, 4),
-        health=tuple(s.health for s in seen),
-    )
-    return answer, followed(poses, answer)
 
 
 def in_map(poses: Trajectory, answer: Answer) -> Trajectory | None:

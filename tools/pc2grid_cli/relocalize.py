@@ -27,7 +27,7 @@ from pc2grid_cli import options as options
 from pc2grid_cli.check_pose import check_log, report_check
 from pc2grid_cli.foxglove import write_answer, write_located_map
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import ON_THE_WAY, Found, find_log, find_map, in_map, searched
+from pc2grid_cli.locate import Found, find_log, find_map, in_map, searched
 from pc2grid_cli.nav2_pose import write_initialpose
 from pc2grid_cli.output_files import check_file
 from pc2grid_cli.picture import draw_answer, draw_answers
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.database.protocol import BuildingFrame
+    from signature.localization.answer import Answer
     from signature.localization.hypotheses import Hypothesis
-    from signature.localization.localizer import Answer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -211,8 +211,6 @@ def relocalize_command(
             recover=recover,
             observer=observer,
             known=known,
-            # Only the page shows it, and it takes time.
-            on_the_way=ON_THE_WAY if report is not None else 0,
         )
         # Printed first: a file that cannot be written must not cost the answer.
         stated = answer_in_building(found.answer, frames)
@@ -290,12 +288,8 @@ def _find(
     recover: bool,
     observer: Observer,
     known: KnownPose,
-    on_the_way: int,
 ) -> tuple[Found, Trajectory | None]:
-    """The answer, and the query's poses in the map.
-
-    on_the_way : find out, too, what the answer would have been at so many moments on the way.
-    """
+    """The answer, and the query's poses in the map."""
     if is_drawn_map(log):
         found = find_map(log, database, settings)
         return found, in_map(found.poses, found.answer)
@@ -307,7 +301,6 @@ def _find(
         recover=recover,
         observer=observer,
         known=known,
-        on_the_way=on_the_way,
     )
     return found, in_map(found.poses, found.answer)
 

@@ -261,11 +261,9 @@ def _answer(found: Found, database: SubmapDatabase, accept: float, truth_m: F64 
             for shown, h, points in zip(document["hypotheses"], answer.hypotheses, compared, strict=True)
         ],
         "history": [
-            {"path_m": m.path_m, "status": m.status, "confidence": m.confidence}
-            for m in (*(found.on_the_way or answer.history[:-1]), answer.history[-1])
+            {"path_m": m.path_m, "status": m.status, "confidence": m.confidence} for m in answer.history
         ],
         "why": why_here(answer, database),
-        "moments": len(found.on_the_way),
         "path": runs(found.poses),
         "truth": [] if truth_m is None else _short(np.ravel(truth_m), 2),
     }

@@ -19,7 +19,6 @@ from pc2grid.errors import ConfigError, OutputError, Pc2GridError
 from pc2grid.io.live.targets import open_live
 from pc2grid.observer import Observer
 from pc2grid.pipeline import follow
-from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.known_pose import KnownPose
@@ -33,9 +32,10 @@ from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 
 if TYPE_CHECKING:
+    from pc2grid.model import RegisteredScan
     from signature.config import Config
     from signature.database import SubmapDatabase
-    from signature.localization.localizer import Look
+    from signature.localization.localizer import Estimate
 
 _MOST_GB = 4.0
 _SHARES_EVERY_S = 0.2
@@ -134,9 +134,11 @@ class Locator:
         events, progress = self.events, Progress(self.events)
         events.publish("begin", {"source": path.name})
 
-        def see(registered: Any, moment: Any) -> None:
+        def see(registered: RegisteredScan, estimate: Estimate | None) -> None:
             check()
-            progress.see(registered, moment)
+            progress.add(registered)
+            if estimate is not None:
+                progress.tell(estimate)
 
         try:
             known = KnownPose(near=_near(options.get("near")), session=options.get("session"))
@@ -144,10 +146,8 @@ class Locator:
                 path,
                 self._database,
                 self._settings,
-                span=TimeSpan(),
-                recover=False,
                 observer=_Shares(events),
-                watch=see,
+                see=see,
                 known=known,
                 index=self._prepared(),
             )
@@ -194,8 +194,8 @@ class Locator:
             def poll() -> bool:
                 for sentence in live.news.take():
                     console.warn(sentence)
-                for look in follower.take():
-                    _tell(progress, look)
+                for estimate in follower.take():
+                    progress.tell(estimate)
                 return False
 
             live.on_poll = poll
@@ -243,19 +243,6 @@ def live_page(database: SubmapDatabase, **answer: Any) -> bytes:
     script = html.rindex("</body>")
     panel, _, code = live.partition("<!-- behind the page -->")
     return (html[:main] + panel + html[main:script] + code + html[script:]).encode()
-
-
-def _tell(progress: Progress, look: Look) -> None:
-    """Publish what a look said; without an answer, the best place all the same."""
-    answer, best = look.answer, look.answer.history[-1]
-    progress.tell(
-        answer.path_m,
-        answer.status,
-        look.session or best.session,
-        answer.confidence,
-        look.T_map_base or best.pose,
-        look.registered,
-    )
 
 
 def _near(text: str | None) -> tuple[float, float, float] | None:

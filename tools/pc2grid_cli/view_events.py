@@ -16,7 +16,7 @@ from pc2grid.model import Health
 
 if TYPE_CHECKING:
     from pc2grid.model import RegisteredScan
-    from signature.localization.answer import Moment
+    from signature.localization.localizer import Estimate
 
 _MOST_WAITING = 1000
 """Events that wait for a page that does not read them; older ones are dropped."""
@@ -120,14 +120,6 @@ class Progress:
     _sent_s: float = 0.0
     _base: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def see(self, registered: RegisteredScan, moment: Moment | None) -> None:
-        """The next scan, and the state of the answer if the database was searched after it."""
-        self.add(registered)
-        if moment is not None:
-            self.tell(
-                moment.path_m, moment.status, moment.session, moment.confidence, moment.pose, registered
-            )
-
     def add(self, registered: RegisteredScan | None) -> None:
         """The next scan; None: what follows does not go on from what was before."""
         if registered is None:
@@ -138,26 +130,19 @@ class Progress:
         if time.monotonic() - self._sent_s >= _SCANS_EVERY_S:
             self.flush()
 
-    def tell(
-        self,
-        path_m: float,
-        status: str,
-        session: str | None,
-        confidence: float,
-        pose: SE2 | None,
-        registered: RegisteredScan,
-    ) -> None:
-        """The state of the answer after a scan. pose : of the base then in the map of `session`."""
+    def tell(self, estimate: Estimate) -> None:
+        """An estimate; without an answer, the best place all the same."""
+        moment = estimate.answer.history[-1]
         self.flush()
         self.events.publish(
             "moment",
             {
-                "path_m": path_m,
-                "status": status,
-                "session": session,
-                "confidence": confidence,
-                "pose": pose and [pose.x, pose.y, pose.yaw],
-                "base": _planar(registered),
+                "path_m": moment.path_m,
+                "status": moment.status,
+                "session": moment.session,
+                "confidence": moment.confidence,
+                "pose": moment.pose and [moment.pose.x, moment.pose.y, moment.pose.yaw],
+                "base": _planar(estimate.registered),
             },
         )
 

@@ -8,7 +8,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, TypeVar, cast
 
 import typer
@@ -30,11 +30,11 @@ from pc2grid_cli.known_pose import KnownPose
 from pc2grid_cli.locate import searched
 from signature.localization.answer_json import in_space_document
 from signature.localization.follower import Follower
-from signature.localization.in_building import look_in_building
+from signature.localization.in_building import answer_in_building
 from signature.localization.joining.building_map import map_of
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
-from signature.localization.pose_check import PoseLook, PoseWatch
+from signature.localization.pose_check import PoseCheck, PoseWatch
 
 if TYPE_CHECKING:
     from pc2grid.io.live.nav2 import Outlet
@@ -43,11 +43,11 @@ if TYPE_CHECKING:
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.database.protocol import BuildingFrame, SessionInfo
-    from signature.localization.localizer import Look
+    from signature.localization.localizer import Estimate
     from signature.localization.prior import Prior
 
 
-LookT = TypeVar("LookT")
+EstimateT = TypeVar("EstimateT")
 
 
 class Publish(str, enum.Enum):
@@ -122,7 +122,7 @@ def watch_command(
     config: options.ConfigFile = None,
     set_: options.Assignments = None,
     assume_identity: options.AssumeIdentity = False,
-    json: Annotated[bool, typer.Option("--json", help="a JSON document on each line, one a look")] = False,
+    json: Annotated[bool, typer.Option("--json", help="a JSON document on each line, one a search")] = False,
 ) -> None:
     """Find where a running robot is, while it drives, or was while it was recorded. Exit code 4: it was not
     located.
@@ -137,7 +137,7 @@ def watch_command(
         config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity
     )
     known = KnownPose(near=near, check_topic=check_topic, session=session)
-    prior = known.region()
+    prior = known.at_start()
     publishes = publish is not Publish.none or publish_map
     if publishes and check_topic is not None:
         raise ConfigError("--check-topic and --publish do not go together", hint="run `watch` twice")
@@ -179,16 +179,16 @@ class _Following:
         own = {name: getattr(self.settings, name) for name in ("read", "relocalize", "registration")}
         return self.database.config().model_copy(update=own)
 
-    def run(self, follower: Follower[LookT], use: Callable[[LookT], bool]) -> None:
-        """Feed `follower` with scans. use : what to do with each look; true if that was enough."""
+    def run(self, follower: Follower[EstimateT], use: Callable[[EstimateT], bool]) -> None:
+        """Feed `follower` with scans. use : what to do with each estimate; true if that was enough."""
         drive, config = self.drive, self.config
         over = False
 
         def poll() -> bool:
             nonlocal over
             _tell_news(drive)
-            for look in follower.take():
-                over = over or use(look)
+            for estimate in follower.take():
+                over = over or use(estimate)
             over = over or time.monotonic() > self.end_s
             return over
 
@@ -223,11 +223,11 @@ def _search(
     located = False
     with Follower(localizer, beside=drive.realtime, step_m=config.relocalize.step_m) as follower:
 
-        def use(look: Look) -> bool:
+        def use(estimate: Estimate) -> bool:
             nonlocal located
-            look = look_in_building(look, robot.frames)
-            _print(look, drive, robot, robot.tell(look, follower.lock), as_json=as_json)
-            located = look.state in ("located", "recovered")
+            estimate = replace(estimate, answer=answer_in_building(estimate.answer, robot.frames))
+            _print(estimate, drive, robot, robot.tell(estimate, follower.lock), as_json=as_json)
+            located = estimate.answer.status == "located"
             return located and not forever
 
         following.run(follower, use)
@@ -243,13 +243,13 @@ def _check(following: _Following, topic: str, session: str | None, *, as_json: b
     fine = False
     with Follower(watch, beside=drive.realtime, step_m=config.relocalize.step_m) as follower:
 
-        def use(look: PoseLook) -> bool:
+        def use(checked: PoseCheck) -> bool:
             nonlocal fine
-            fine = look.checked.status == "fine"
+            fine = checked.status == "fine"
             if as_json:
-                console.print_json_line(live_document(look, drive, following.database.location))
+                console.print_json_line(live_document(checked, drive, following.database.location))
             else:
-                print(check_as_text(look.checked), flush=True)
+                print(check_as_text(checked), flush=True)
             return False
 
         following.run(follower, use)
@@ -293,7 +293,7 @@ class _Robot:
 
     publisher : None if it is not told anything. pose_is_due : whether it is to be told its pose.
     map_session : the session whose map was published. sessions : of the database, by name. frames : of the
-    buildings that looks are in, by session.
+    buildings that answers are in, by session.
     """
 
     live: LiveLog | None
@@ -338,32 +338,32 @@ class _Robot:
             robot.publisher.announce(*topics)
             yield robot
 
-    def tell(self, look: Look, lock: threading.Lock) -> list[str]:
-        """Publish what follows from a look; returns the topics. lock : is held to read the database."""
-        publisher, live = self.publisher, self.live
+    def tell(self, estimate: Estimate, lock: threading.Lock) -> list[str]:
+        """Publish what follows from an estimate; returns the topics. lock : is held to read the database."""
+        publisher, live, session = self.publisher, self.live, estimate.answer.session
         if publisher is None or live is None:
             return []
-        if look.state == "lost":
+        if estimate.state == "lost":
             self.pose_is_due = True
             publisher.stop_tf()
-        if look.state not in ("located", "recovered") or look.session is None:
+        if session is None:
             return []
         told = []
-        if self.publish_map and look.session != self.map_session:
-            self.map_session = look.session
+        if self.publish_map and session != self.map_session:
+            self.map_session = session
             with lock:
-                grid = map_of(self.database, look.session, self.frames)
-            publisher.map(look.registered.scan.stamp_ns, grid)
+                grid = map_of(self.database, session, self.frames)
+            publisher.map(estimate.registered.scan.stamp_ns, grid)
             told.append("/map")
-        self.pose_is_due = self.pose_is_due or look.state == "recovered"
+        self.pose_is_due = self.pose_is_due or estimate.state == "recovered"
         if self.publish is Publish.initialpose and self.pose_is_due and self.resets.allows():
             self.pose_is_due = False
-            assert look.answer.covariance is not None
-            stamp_ns, T_map_base = _now(look, live)
-            publisher.initialpose(stamp_ns, T_map_base, look.answer.covariance)
+            assert estimate.answer.covariance is not None
+            stamp_ns, T_map_base = _now(estimate, live)
+            publisher.initialpose(stamp_ns, T_map_base, estimate.answer.covariance)
             told.append("/initialpose")
         elif self.publish is Publish.tf:
-            T_map_odom, odom_frame = look.T_map_odom, live.odometry_frame
+            T_map_odom, odom_frame = estimate.T_map_odom, live.odometry_frame
             if T_map_odom is None or odom_frame is None:
                 console.warn("--publish tf: the robot has no odometry; nothing is published")
                 return told
@@ -372,12 +372,12 @@ class _Robot:
         return told
 
 
-def _now(look: Look, live: LiveLog) -> tuple[int, SE2]:
-    """The stamp of the newest odometry and the pose of the base there: the look is about an earlier scan."""
-    T_map_odom, newest = look.T_map_odom, live.newest_odometry()
+def _now(estimate: Estimate, live: LiveLog) -> tuple[int, SE2]:
+    """The newest odometry: its stamp, and the pose of the base there: the estimate is older."""
+    T_map_odom, newest = estimate.T_map_odom, live.newest_odometry()
     if T_map_odom is None or newest is None:
-        assert look.T_map_base is not None
-        return look.registered.scan.stamp_ns, look.T_map_base
+        assert estimate.answer.T_map_base is not None
+        return estimate.registered.scan.stamp_ns, estimate.answer.T_map_base
     stamp_ns, T_odom_base = newest
     return stamp_ns, T_map_odom @ SE2.from_matrix(T_odom_base)
 
@@ -402,35 +402,38 @@ def _summarize(drive: Followed, terminal: console.Console) -> None:
         )
 
 
-def _print(look: Look, drive: Followed, robot: _Robot, published: list[str], *, as_json: bool) -> None:
-    """What one look said, on stdout."""
+def _print(
+    estimate: Estimate, drive: Followed, robot: _Robot, published: list[str], *, as_json: bool
+) -> None:
+    """An estimate on stdout."""
     if as_json:
-        console.print_json_line(_document(look, drive, robot, published))
+        console.print_json_line(_document(estimate, drive, robot, published))
     else:
-        print(as_text(look, published), flush=True)
+        print(as_text(estimate, published), flush=True)
 
 
-def as_text(look: Look, published: list[str]) -> str:
-    """A look in one line."""
-    answer = look.answer
-    begin = f"after {answer.path_m:.1f} m: {look.state}"
-    if look.T_map_base is None:
+def as_text(estimate: Estimate, published: list[str]) -> str:
+    """An estimate in one line."""
+    answer = estimate.answer
+    begin = f"after {answer.path_m:.1f} m: {estimate.state}"
+    if answer.T_map_base is None:
         places = len(set(answer.places))
         return f"{begin}, {places} places fit" if answer.status == "ambiguous" else f"{begin}, no place fits"
-    pose = look.T_map_base
+    pose = answer.T_map_base
     told = f", published {' and '.join(published)}" if published else ""
     yaw_deg = math.degrees(pose.yaw)
     return one_line(
-        f"{begin} in {look.session}: x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {yaw_deg:.1f} deg,"
+        f"{begin} in {answer.session}: x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {yaw_deg:.1f} deg,"
         f" confidence {probability(answer.confidence)}{told}"
     )
 
 
-def _document(look: Look, drive: Followed, robot: _Robot, published: list[str]) -> Watch:
-    answer, pose, T_map_odom, counts = look.answer, look.T_map_base, look.T_map_odom, drive.counts
+def _document(estimate: Estimate, drive: Followed, robot: _Robot, published: list[str]) -> Watch:
+    answer, T_map_odom, counts = estimate.answer, estimate.T_map_odom, drive.counts
+    session, pose = answer.session, answer.T_map_base
     document: Watch = {
         "schema_version": 1,
-        "state": look.state,
+        "state": estimate.state,
         "status": answer.status,
         "stamp_ns": answer.stamp_ns,
         "path_m": answer.path_m,
@@ -445,15 +448,15 @@ def _document(look: Look, drive: Followed, robot: _Robot, published: list[str]) 
         "dropped": counts.dropped,
         "reconnected": counts.reconnected,
         "lag_s": drive.lag_s,
-        "elapsed_s": look.elapsed_s,
+        "elapsed_s": estimate.elapsed_s,
     }
-    if look.session is not None and pose is not None and answer.covariance is not None:
-        info = robot.sessions[look.session]
+    if session is not None and pose is not None and answer.covariance is not None:
+        info = robot.sessions[session]
         label = info.provenance.label
-        document["frame"] = robot.frames[look.session].name if look.session in robot.frames else None
+        document["frame"] = robot.frames[session].name if session in robot.frames else None
         document["map"] = {
             "database": robot.database.location,
-            "session": look.session,
+            "session": session,
             "building": label.building,
             "floor": label.floor,
             "digest": info.digest,

@@ -15,7 +15,8 @@ from pc2grid_cli.main import app
 from pc2grid_cli.relocalize import as_text
 from signature.config import Config
 from signature.database import Label, open_database
-from signature.localization.localizer import MapIndex, locate_map
+from signature.localization.answering import locate_map
+from signature.localization.map_index import MapIndex
 from signature.sessions import add_session, provenance
 from tests.helpers.simulated_drives import plan
 

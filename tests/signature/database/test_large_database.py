@@ -15,7 +15,8 @@ from pc2grid.submaps.partition import partition
 from signature.config import Config, RelocalizeConfig
 from signature.database import maintenance, open_database
 from signature.localization import map_index as building_file
-from signature.localization.localizer import MapIndex, locate_map
+from signature.localization.answering import locate_map
+from signature.localization.map_index import MapIndex
 from signature.localization.query import query_of
 from signature.retrieval import viewpoints
 from signature.retrieval.view import View

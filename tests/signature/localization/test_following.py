@@ -14,7 +14,7 @@ from pc2grid.geometry import SE2
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from signature.config import Config, RelocalizeConfig
 from signature.localization.belief import Belief, Masses
-from signature.localization.localizer import Localizer, Look
+from signature.localization.localizer import Estimate, Localizer
 from signature.localization.prior import Prior
 from tests.helpers.simulated_drives import building, drive, office, plan
 
@@ -45,35 +45,35 @@ def stretch(
         yield moved, planar_scan, truth
 
 
-def looks_of(localizer: Localizer, steps: list[Step]) -> list[tuple[Look, SE2]]:
+def estimates_of(localizer: Localizer, steps: list[Step]) -> list[tuple[Estimate, SE2]]:
     found = []
     for registered, planar_scan, truth in steps:
-        look = localizer.follow(registered, planar_scan)
-        if look is not None:
-            found.append((look, truth))
+        estimate = localizer.add(registered, planar_scan)
+        if estimate is not None:
+            found.append((estimate, truth))
     return found
 
 
-def check_poses(looks: list[tuple[Look, SE2]]) -> None:
-    for look, truth in looks:
-        if look.state in ("located", "recovered"):
-            assert look.T_map_base is not None
-            assert math.dist((look.T_map_base.x, look.T_map_base.y), (truth.x, truth.y)) < 0.15
+def check_poses(estimates: list[tuple[Estimate, SE2]]) -> None:
+    for estimate, truth in estimates:
+        pose = estimate.answer.T_map_base
+        assert (pose is not None) == (estimate.state in ("located", "recovered"))
+        assert pose is None or math.dist((pose.x, pose.y), (truth.x, truth.y)) < 0.15
 
 
 def test_a_robot_that_drives_on_stays_located() -> None:
-    looks = looks_of(Localizer(OFFICE), list(stretch(FIRST)))
-    states = [look.state for look, _ in looks]
+    estimates = estimates_of(Localizer(OFFICE), list(stretch(FIRST)))
+    states = [estimate.state for estimate, _ in estimates]
     at = states.index("located")
     assert set(states[:at]) <= {"searching"}
     assert set(states[at:]) == {"located"}
-    assert len(looks) >= 5
-    check_poses(looks)
+    assert len(estimates) >= 5
+    check_poses(estimates)
 
 
 def test_the_odometry_frame_in_the_map_does_not_change_while_the_robot_drives() -> None:
-    looks = looks_of(Localizer(OFFICE), list(stretch(FIRST)))
-    frames = [look.T_map_odom for look, _ in looks if look.state == "located"]
+    estimates = estimates_of(Localizer(OFFICE), list(stretch(FIRST)))
+    frames = [estimate.T_map_odom for estimate, _ in estimates if estimate.state == "located"]
     poses = np.array([(f.x, f.y) for f in frames if f is not None])
     assert len(poses) > 2
     assert np.ptp(poses, axis=0).max() < 0.2
@@ -89,13 +89,13 @@ def test_a_robot_that_is_seen_being_carried_away_is_lost_and_then_recovered() ->
     steps = list(stretch(FIRST))
     end = SE2.from_matrix(steps[-1][0].T_session_base)
     steps += list(stretch([(2.0, 2.0), (2.0, 9.0)], end, Health.LOST, grid=OTHER))[:25]
-    looks = looks_of(Localizer(OFFICE), [*steps, *stretch(SECOND, end)])
-    states = [look.state for look, _ in looks]
+    estimates = estimates_of(Localizer(OFFICE), [*steps, *stretch(SECOND, end)])
+    states = [estimate.state for estimate, _ in estimates]
     at = states.index("lost")
     assert set(states[:at]) == {"located"}
     assert states[at + 1 : at + 3] == ["recovered", "located"]
     assert set(states[at + 3 :]) == {"located"}
-    check_poses(looks)
+    check_poses(estimates)
 
 
 @pytest.mark.parametrize("corners", [[FIRST[0], (3.6, 7.0)], FIRST])
@@ -107,32 +107,34 @@ def test_a_robot_that_is_carried_away_unseen_is_recovered_all_the_same(
     steps = list(stretch(corners))
     end = SE2.from_matrix(steps[-1][0].T_session_base)
     localizer = Localizer(OFFICE)
-    before = looks_of(localizer, steps)
-    looks = looks_of(localizer, list(stretch(SECOND, end)))
-    states = [look.state for look, _ in looks]
+    before = estimates_of(localizer, steps)
+    estimates = estimates_of(localizer, list(stretch(SECOND, end)))
+    states = [estimate.state for estimate, _ in estimates]
     at = states.index("recovered")
     assert before[-1][0].state == "located" and at <= 2
     assert set(states[at + 1 :]) == {"located"}
-    assert all(look.answer.path_m < 3.0 + n for n, (look, _) in enumerate(looks[at:]))
-    check_poses([*before, *looks[at:]])
+    assert all(estimate.answer.path_m < 3.0 + n for n, (estimate, _) in enumerate(estimates[at:]))
+    check_poses([*before, *estimates[at:]])
 
 
 def test_a_place_is_given_up_when_it_is_as_certain_that_the_robot_is_not_there() -> None:
     localizer = Localizer(OFFICE)
-    looks_of(localizer, list(stretch(FIRST)))
+    estimates_of(localizer, list(stretch(FIRST)))
     found = Masses.of(localizer.query.map(), localizer.answer())
     belief = Belief(accept=0.75)
     states = [
-        belief.follow(replace(found, masses=(mass, *found.masses[1:])), found.hypotheses[0] if sure else None)
+        belief.follow(replace(found, masses=(mass, *found.masses[1:])), located=sure)
         for mass, sure in ((0.9, True), (0.5, False), (0.3, False), (0.8, True), (0.2, False), (0.5, False))
     ]
     assert states == ["located", "doubtful", "doubtful", "located", "lost", "lost"]
 
 
 def test_a_robot_elsewhere_is_never_located() -> None:
-    looks = looks_of(Localizer(OFFICE), list(stretch([(2, 2), (2, 4.5)], grid=OTHER)))
-    assert {look.state for look, _ in looks} == {"searching"}
-    assert all(look.T_map_base is None and look.T_map_odom is None for look, _ in looks)
+    estimates = estimates_of(Localizer(OFFICE), list(stretch([(2, 2), (2, 4.5)], grid=OTHER)))
+    assert {estimate.state for estimate, _ in estimates} == {"searching"}
+    assert all(
+        estimate.answer.T_map_base is None and estimate.T_map_odom is None for estimate, _ in estimates
+    )
 
 
 def test_a_robot_that_stands_is_looked_for_once() -> None:
@@ -141,34 +143,33 @@ def test_a_robot_that_stands_is_looked_for_once() -> None:
     for number in range(60):
         scan = replace(first[0].scan, stamp_ns=number * 10**8)
         steps.append((replace(first[0], scan=scan), first[1], first[2]))
-    looks = looks_of(Localizer(OFFICE), steps)
-    assert len(looks) == 1
-    assert looks[0][0].answer.path_m == 0.0
-    check_poses(looks)
+    estimates = estimates_of(Localizer(OFFICE), steps)
+    assert len(estimates) == 1
+    assert estimates[0][0].answer.path_m == 0.0
+    check_poses(estimates)
 
 
 def test_after_a_restart_a_located_robot_is_recovered() -> None:
     localizer = Localizer(OFFICE)
-    assert looks_of(localizer, list(stretch(FIRST)))[-1][0].state == "located"
+    assert estimates_of(localizer, list(stretch(FIRST)))[-1][0].state == "located"
     localizer.restart()
-    assert not localizer.located
-    looks = looks_of(localizer, list(stretch(FIRST, SE2(40.0, 2.0, 1.0))))
-    states = [look.state for look, _ in looks if look.answer.status == "located"]
+    estimates = estimates_of(localizer, list(stretch(FIRST, SE2(40.0, 2.0, 1.0))))
+    states = [estimate.state for estimate, _ in estimates if estimate.answer.status == "located"]
     assert states[0] == "recovered" and set(states[1:]) == {"located"}
-    check_poses(looks)
+    check_poses(estimates)
 
 
 def test_one_place_in_two_sessions_is_one_if_they_are_joined() -> None:
     """A database of two maps of one floor: the pose stays in the map in which it was found first."""
     both = building({"monday": office(), "tuesday": office()})
-    looks = looks_of(Localizer(both), list(stretch(FIRST)))
-    assert {look.state for look, _ in looks} == {"searching"}
-    last = looks[-1][0].answer
+    estimates = estimates_of(Localizer(both), list(stretch(FIRST)))
+    assert {estimate.state for estimate, _ in estimates} == {"searching"}
+    last = estimates[-1][0].answer
     assert last.status == "ambiguous" and last.masses[:2] == (last.masses[0],) * 2
     both = building({"monday": office(), "tuesday": office()}, joined={"monday": HERE, "tuesday": HERE})
-    looks = looks_of(Localizer(both), list(stretch(FIRST)))
-    assert len({look.session for look, _ in looks if look.state == "located"}) == 1
-    assert "doubtful" not in {look.state for look, _ in looks}
+    estimates = estimates_of(Localizer(both), list(stretch(FIRST)))
+    assert len({estimate.answer.session for estimate, _ in estimates if estimate.state == "located"}) == 1
+    assert "doubtful" not in {estimate.state for estimate, _ in estimates}
 
 
 def test_a_prior_is_about_the_beginning_and_is_forgotten_when_the_search_begins_again() -> None:
@@ -178,14 +179,28 @@ def test_a_prior_is_about_the_beginning_and_is_forgotten_when_the_search_begins_
     # The rooms are not quite equal: their outer walls are cut off at the edge of the plan.
     index = building({"twins": twins}, Config(relocalize=RelocalizeConfig(accept=0.95)))
     steps = list(stretch([(1.0, 1.0), (5.0, 1.0)], grid=twins))
-    for where, index_of in (("unknown", index), ("left", index.within(Prior.around(1.0, 1.0, 1.0)))):
+    for where, index_of in (
+        ("unknown", index),
+        ("left", index.within(replace(Prior.around(1.0, 1.0, 1.0), stamp_ns=0))),
+    ):
         localizer = Localizer(index_of)
-        looks = looks_of(localizer, steps)
-        states = {look.state for look, _ in looks}
+        estimates = estimates_of(localizer, steps)
+        states = {estimate.state for estimate, _ in estimates}
         if where == "unknown":
             assert states == {"searching"}
             continue
         assert "located" in states  # although it has left the disc in which it began
-        check_poses(looks)
+        check_poses(estimates)
         localizer.restart()
-        assert {look.state for look, _ in looks_of(localizer, steps)} == {"lost"}
+        assert {estimate.state for estimate, _ in estimates_of(localizer, steps)} == {"lost"}
+
+
+def test_a_prior_says_nothing_of_a_robot_that_was_carried_away_unseen() -> None:
+    index = OFFICE.within(replace(Prior.around(*FIRST[0], 1.0), stamp_ns=0))
+    localizer, steps = Localizer(index), list(stretch([FIRST[0], (3.6, 7.0)]))
+    assert estimates_of(localizer, steps)[-1][0].state == "located"
+    end = SE2.from_matrix(steps[-1][0].T_session_base)
+    estimates = estimates_of(localizer, list(stretch(SECOND, end)))
+    at = [estimate.state for estimate, _ in estimates].index("recovered")
+    assert {estimate.state for estimate, _ in estimates[at + 1 :]} == {"located"}
+    check_poses(estimates[at:])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,10 +17,11 @@ from signature.config import Config, SignatureConfig
 from signature.database import Label
 from signature.describe import Signature, describe
 from signature.localization import query as query_module
-from signature.localization.answer import Moment
+from signature.localization.answer import Answer
 from signature.localization.decision import decide, judge
 from signature.localization.hypotheses import Hypothesis
-from signature.localization.localizer import Answer, Localizer, MapIndex, locate_in
+from signature.localization.localizer import Localizer
+from signature.localization.map_index import MapIndex
 from signature.localization.prior import Prior
 from signature.localization.query import Query, QueryMap
 from tests.helpers.simulated_drives import building, drive, office, plan
@@ -84,24 +86,25 @@ def test_certainty_grows_with_travel_and_history_tells_it() -> None:
     assert answer.history[-1].confidence >= answer.history[0].confidence
 
 
-def test_asking_on_the_way_says_what_the_answer_would_be_and_changes_nothing() -> None:
-    scans = list(drive(office(), ROUTE, field_rad=math.radians(90)))
-    asked: list[Moment] = []
+def test_an_answer_is_one_search_and_asking_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An estimate is the answer at its scan; at others the database is searched when it is asked."""
+    searched, look_up = [], MapIndex.look_up
 
-    def watch(_: RegisteredScan, moment: Moment | None) -> None:
-        asked.extend([] if moment is None else [moment])
+    def counted(index: MapIndex, query: QueryMap, *arguments: Any) -> Any:
+        searched.append(query.path_m)
+        return look_up(index, query, *arguments)
 
-    registered = [(scan, planar_scan) for scan, planar_scan, _ in scans]
-    quiet = locate_in(registered, OFFICE)
-    told = locate_in(registered, OFFICE, watch=watch, answer_at=lambda _: True)
-    assert told.to_json()["history"] == quiet.to_json()["history"]
-    assert told.confidence == quiet.confidence
-    assert len(asked) == len(quiet.history) - 1
-    for moment in asked[::3]:
-        before = [pair for pair in registered if pair[0].scan.stamp_ns <= moment.stamp_ns]
-        answer = locate_in(before, OFFICE)
-        assert (moment.status, moment.confidence) == (answer.status, answer.confidence)
-        assert moment.path_m == answer.path_m
+    monkeypatch.setattr(MapIndex, "look_up", counted)
+    quiet, asked = Localizer(OFFICE), Localizer(OFFICE)
+    for number, (registered, planar_scan, _) in enumerate(drive(office(), ROUTE)):
+        told = quiet.add(registered, planar_scan)
+        estimate = asked.add(registered, planar_scan)
+        searched.clear()
+        answer = asked.answer() if estimate or number % 20 == 10 else None
+        assert len(searched) == (answer is not None and estimate is None)
+        if estimate and told and answer:
+            assert (answer.confidence, answer.T_map_base) == (told.answer.confidence, told.answer.T_map_base)
+            assert answer.history[-1].stamp_ns == registered.scan.stamp_ns
 
 
 def test_another_building_is_not_found() -> None:
@@ -213,7 +216,6 @@ def test_lost_scans_end_a_part_and_the_last_one_alone_is_a_query() -> None:
             scan=registered.scan, T_session_base=registered.T_session_base, health=Health.LOST
         )
         localizer.add(lost, planar_scan)
-    assert localizer.path_m == 0.0
     assert localizer.answer().path_m == 0.0
     with pytest.raises(NoScans):
         Localizer(OFFICE).answer()
@@ -282,5 +284,3 @@ def test_a_query_whose_last_scans_contradict_the_others_is_located_by_these_alon
     T_map_base = scans[-1][2]
     assert math.dist((answer.T_map_base.x, answer.T_map_base.y), (T_map_base.x, T_map_base.y)) < 0.1
     assert (answer.path_m < 3.0) == (slip_deg != 0.0)
-    # The search goes on as if it had not been asked.
-    assert localizer.path_m > 5.0

@@ -165,6 +165,6 @@ def test_a_robot_that_stands_is_judged_once_after_each_loss() -> None:
         scan = replace(registered.scan, stamp_ns=number * 10**8)
         moved = replace(registered, scan=scan, health=Health.LOST if number == 50 else Health.FINE)
         newest = replace(newest, stamp_ns=number * 10**8)
-        if watch.follow(moved, planar_scan) is not None:
+        if watch.add(moved, planar_scan) is not None:
             judged.append(number)
     assert judged == [21, 72]

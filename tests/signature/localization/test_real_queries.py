@@ -21,7 +21,8 @@ from pc2grid.model import RegisteredScan, Scan, Trajectory
 from pc2grid.pipeline import follow
 from signature.config import Config
 from signature.localization.answer import Answer
-from signature.localization.localizer import MapIndex, locate_in
+from signature.localization.localizer import Localizer
+from signature.localization.map_index import MapIndex
 from tests.helpers.simulated_drives import building
 
 CONFIG = Config()
@@ -56,7 +57,10 @@ def map_of(scans: Iterator[Scan], truth: Trajectory) -> MapIndex:
 
 
 def ask(scans: list[tuple[RegisteredScan, PlanarScan]], index: MapIndex) -> Answer:
-    return locate_in(scans, index)
+    localizer = Localizer(index)
+    for registered, planar_scan in scans:
+        localizer.add(registered, planar_scan)
+    return localizer.answer()
 
 
 def test_a_place_that_the_proposals_lack_is_found_before_the_answer_is_certain() -> None:

@@ -1,11 +1,13 @@
-"""The answers to one query in several maps, each by a `Localizer` of its own; the query is drawn once."""
+"""The answers to one query in several maps, each by a `Localizer` of its own."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -18,11 +20,12 @@ from pc2grid.submaps.partition import partition
 from signature.config import Config
 from signature.describe import describe
 from signature.localization.answer import Answer
-from signature.localization.localizer import Localizer
+from signature.localization.localizer import Estimate, Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
 from signature.similarity import SignatureTable
 
+T = TypeVar("T")
 _WALL_M = 0.4
 """What a query has seen is widened by this: the far side of a wall does not count as unseen. By hand."""
 
@@ -51,30 +54,33 @@ def localize(
 
     Raises NoScans if an answer is due and no scan could be used.
     """
-    first = Localizer(indexes[0])
-    localizers = [first, *(Localizer(index, query=first.query) for index in indexes[1:])]
+    localizers = [Localizer(index) for index in indexes]
 
-    def answers(count: int) -> Answers:
-        begin = time.perf_counter()
-        query = first.query.map()
-        describe_ms = 1000.0 * (time.perf_counter() - begin)
-        found, elapsed_ms = [], []
-        for localizer in localizers:
-            begin = time.perf_counter()
-            found.append(localizer.answer())
-            elapsed_ms.append(describe_ms + 1000.0 * (time.perf_counter() - begin))
-        return Answers(scans=count, query=query, answers=tuple(found), elapsed_ms=tuple(elapsed_ms))
+    def answers(count: int, added: Sequence[tuple[object, float]]) -> Answers:
+        found = [_timed(localizer.answer) for localizer in localizers]
+        return Answers(
+            scans=count,
+            query=localizers[0].query.map(),
+            answers=tuple(answer for answer, _ in found),
+            elapsed_ms=tuple(ms + add_ms for (_, ms), (_, add_ms) in zip(found, added, strict=True)),
+        )
 
     count = 0
+    added: list[tuple[Estimate | None, float]] = [(None, 0.0)] * len(localizers)
     for count, (registered, planar_scan) in enumerate(scans, start=1):
-        first.add(registered, planar_scan)
-        for localizer in localizers[1:]:
-            if localizer.due:
-                localizer.look()
+        # After every metre this is a search, which is then the answer.
+        added = [_timed(partial(localizer.add, registered, planar_scan)) for localizer in localizers]
         if after is not None and count in after:
-            yield answers(count)
+            yield answers(count, added)
     if after is None:
-        yield answers(count)
+        yield answers(count, added)
+
+
+def _timed(action: Callable[[], T]) -> tuple[T, float]:
+    """What an action returns, and its time in milliseconds."""
+    begin = time.perf_counter()
+    done = action()
+    return done, 1000.0 * (time.perf_counter() - begin)
 
 
 def index_of(name: str, grid: OccupancyGrid, config: Config) -> MapIndex:
