@@ -136,7 +136,12 @@ class RelocalizeConfig(Section):
     step_m: float = Field(1.0, gt=0, description="metres of travel between two searches of the database")
     views: int = Field(8, gt=0, description="number of views that describe a query, along its path")
     view_spacing_m: float = Field(1.2, gt=0, description="least distance of two views")
-    shortlist: int = Field(50, gt=0, description="at least so many places are selected for a query")
+    shortlist: int = Field(
+        100,
+        gt=0,
+        description="at least so many places where the robot may stand are selected for a query, by their"
+        " signatures",
+    )
     shortlist_share: float = Field(
         0.05, ge=0, le=1, description="of many places, this share is selected; only these are verified"
     )
@@ -144,9 +149,8 @@ class RelocalizeConfig(Section):
     shortlist_by: ShortlistBy = Field(
         "signatures",
         description="what selects them; two controls show what signatures are worth: shuffled, by those of"
-        " another place; random",
+        " another viewpoint; random",
     )
-    top_k: int = Field(50, gt=0, description="placements that retrieval passes to alignment")
     coarse_floor: float = Field(
         0.4, ge=0, le=1, description="placements with a lower coarse score are dropped"
     )
@@ -157,7 +161,7 @@ class RelocalizeConfig(Section):
     exhaustive_m2: float = Field(
         20_000.0,
         ge=0,
-        description="without a clear answer by signatures, maps up to this free area are searched as a whole",
+        description="maps up to this free area are searched as a whole, for a drawn map or with a prior",
     )
     accept: float = Field(0.75, gt=0, lt=1, description="least confidence to answer located")
 

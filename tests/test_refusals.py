@@ -21,7 +21,7 @@ from pc2grid.settings import load_settings
 from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
 from signature.config import Config
 from signature.describe import Signature
-from signature.localization.lazy_maps import LazySequence
+from signature.retrieval.lazy_maps import LazySequence
 from signature.similarity import SignatureTable
 
 GRID = OccupancyGrid(cells=np.zeros((2, 2)), resolution_m=0.05, origin_m=(0.0, 0.0))

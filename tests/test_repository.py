@@ -96,12 +96,12 @@ def test_one_setting_leaves_the_others_of_its_section_alone() -> None:
 
 def test_order_of_precedence(tmp_path: Path) -> None:
     low, high = tmp_path / "low.toml", tmp_path / "high.toml"
-    low.write_text("[partition]\nradius_m = 3.0\n[relocalize]\ntop_k = 3\n")
+    low.write_text("[partition]\nradius_m = 3.0\n[relocalize]\nviews = 3\n")
     high.write_text("[partition]\nradius_m = 4.0\n")
     environment = {"PC2GRID_CONFIG": str(low)}
     assert load_settings(Config, None, (), environment).partition.radius_m == 3.0
     assert load_settings(Config, high, (), environment).partition.radius_m == 4.0
-    assert load_settings(Config, high, (), environment).relocalize.top_k == Config().relocalize.top_k
+    assert load_settings(Config, high, (), environment).relocalize.views == Config().relocalize.views
     assert load_settings(Config, high, ["partition.radius_m=5"], environment).partition.radius_m == 5.0
     assert load_settings(Config, None, ["read.topic=null"], {}).read.topic is None
 

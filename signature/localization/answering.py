@@ -73,14 +73,14 @@ def _with_prior(
 ) -> tuple[Verdict, Literal["used", "lapsed"] | None, Moment | None]:
     """The verdict, what became of the prior, and the best place that it excludes.
 
-    Where nothing that the prior allows is certain, all places are searched: those that fit better outside
-    tell what wrong places score.
+    Where nothing that the prior allows is certain, all places are asked: those that fit better outside tell
+    what wrong places score.
     """
     if index.whole is None or not index.prior_applies(query):
         return verdict, None if index.whole is None else "lapsed", None
     if verdict.status == "located":
         return verdict, "used", None
-    everywhere = index.whole.search_whole_maps(query, index.whole.look_up(query, verdict.hypotheses))
+    everywhere = index.whole.look_up(query, verdict.hypotheses)
     best = judge(index.whole, query, everywhere)
     excluded = best.hypotheses and not index.allows(query, best.hypotheses[0])
     verdict = judge(index, query, everywhere, prior_of)
@@ -133,7 +133,7 @@ def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
     clock.lap("describe")
     found = index.look_up(query)
     clock.lap("look_up")
-    verdict = decide(index, query, found)
+    verdict = judge(index, query, index.search_whole_maps(query, found))
     clock.lap("decide")
     at_origin = tuple(_at_origin(h, query.T_odom_base) for h in verdict.hypotheses)
     verdict = replace(verdict, hypotheses=at_origin)

@@ -42,9 +42,11 @@ def anywhere(place: Place) -> float:
 def decide(
     index: MapIndex, query: QueryMap, hypotheses: tuple[Hypothesis, ...], prior_of: PriorOf = anywhere
 ) -> Verdict:
-    """The verdict after all maps were searched as a whole, so that neither the right place nor a rival is
-    left out: a wrong place among few proposals may lead by far, if the right one was not proposed."""
-    return judge(index, query, index.search_whole_maps(query, hypotheses), prior_of)
+    """The verdict on what the signatures propose; where there is nothing to describe, or a prior names a
+    small region, on whatever fits there."""
+    if not query.views or index.prior_applies(query):
+        hypotheses = index.search_whole_maps(query, hypotheses)
+    return judge(index, query, hypotheses, prior_of)
 
 
 def judge(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,17 +21,13 @@ from pc2grid.matching.window_search import (
 )
 from signature.config import RelocalizeConfig
 from signature.localization.query import QueryMap
-from signature.retrieval.viewpoints import Places
-from signature.retrieval.vote import Proposal
+from signature.retrieval.viewpoints import SQUARE_M, Area, Places
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HypothesisParameters:
     """How places are verified. All chosen by hand, checked on fr079 and intel.
 
-    square_m : side of the squares of free ground that a whole map is searched in, and of those around a
-        proposal: a lattice of viewpoints, with some reserve.
-    half_a_rad : headings are searched so far around a proposal, half a ray of its isovist with some reserve.
     few_points : near wall points in the coarse search, and as many far ones; enough to rank poses.
     few_spacing_m : they are at least about so far apart.
     near_m : near are walls up to so far from the centre of rotation. A small error of yaw moves those beyond
@@ -46,8 +42,6 @@ class HypothesisParameters:
         stated (median), with them 1.0.
     """
 
-    half_a_rad: float = math.radians(8.0)
-    square_m: float = 0.8
     few_points: int = 128
     few_spacing_m: float = 0.25
     near_m: float = 8.0
@@ -75,76 +69,43 @@ class Hypothesis:
     fit: Fit
 
 
-def verify(
+def align(
     query: QueryMap,
-    proposals: Sequence[Proposal],
+    areas: Iterable[Area],
     places: Places,
     maps: Sequence[SearchMap],
     config: RelocalizeConfig,
 ) -> tuple[Hypothesis, ...]:
-    """Align the query at every proposed place; returns what fits, best first, no two alike.
+    """Align the query with any heading wherever the robot may stand; returns what fits, best first, no two
+    alike.
 
+    areas : likeliest first; what is clearly less than the best so far is not looked for in the next.
     maps : prepared map of each session, by session_index.
     """
     coarse: list[tuple[float, int, int, SE2]] = []
     best = 0.0
-    groups: dict[tuple[int, int], list[Proposal]] = {}
-    for proposal in proposals:
-        session = int(places.table.session_index[proposal.row])
-        groups.setdefault((proposal.view, session), []).append(proposal)
-    for (view, session), members in groups.items():
-        center = query.views[view].center_m
-        rows = np.array([p.row for p in members])
+    for session, squares_m in areas:
+        target = maps[session]
         poses = search_windows(
-            maps[session],
-            coarse_points(query.walls.facing(maps[session].walls).points_m, center),
-            np.array([(*p.at_m, p.yaw_rad) for p in members]),
-            half_t_m=0.5 * HYPOTHESES.square_m,
-            half_a_rad=HYPOTHESES.half_a_rad,
+            target,
+            coarse_points(query.walls.facing(target.walls).points_m, query.center_m),
+            np.insert(squares_m, 2, 0.0, axis=1),
+            half_t_m=0.5 * SQUARE_M,
+            half_a_rad=math.pi,
             parameters=SearchParameters(
                 floor=max(config.coarse_floor, config.coarse_keep * best),
                 keep=config.coarse_keep,
                 most=config.hypotheses,
             ),
         )
-        for x, y, yaw, score in poses.tolist():
+        _, rows = places.nearest(session, poses[:, :2])
+        for (x, y, yaw, score), row in zip(poses.tolist(), rows.tolist(), strict=True):
             best = max(best, score)
-            nearest = int(rows[np.argmin(np.hypot(*(places.table.center_m[rows] - (x, y)).T))])
-            coarse.append((score, session, nearest, _about(center, SE2(x, y, yaw))))
+            coarse.append((score, session, row, _about(query.center_m, SE2(x, y, yaw))))
     coarse.sort(key=lambda c: -c[0])
     found = [
         fitted(query, session, row, maps[session], T_map_query)
         for _, session, row, T_map_query in coarse[: HYPOTHESES.refined * config.hypotheses]
-    ]
-    return distinct(found, query.T_odom_base)
-
-
-def search_whole_map(
-    query: QueryMap,
-    session_index: int,
-    target: SearchMap,
-    free_xy_m: F64,
-    config: RelocalizeConfig,
-) -> tuple[Hypothesis, ...]:
-    """Align the query on the whole map of a session: slower than at proposals, but nothing is left out.
-
-    free_xy_m : (K, 2) centres of the squares of `HYPOTHESES.square_m` that hold free space; the base is in
-    one of them.
-    """
-    center = (query.T_odom_base.x, query.T_odom_base.y)
-    poses = search_windows(
-        target,
-        coarse_points(query.walls.facing(target.walls).points_m, center),
-        np.insert(free_xy_m, 2, 0.0, axis=1),
-        half_t_m=0.5 * HYPOTHESES.square_m,
-        half_a_rad=math.pi,
-        parameters=SearchParameters(
-            floor=config.coarse_floor, keep=config.coarse_keep, most=config.hypotheses
-        ),
-    )
-    found = [
-        fitted(query, session_index, -1, target, _about(center, SE2(x, y, yaw)))
-        for x, y, yaw, _ in poses.tolist()
     ]
     return distinct(found, query.T_odom_base)
 

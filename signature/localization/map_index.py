@@ -5,33 +5,22 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from pc2grid.arrays import F64, I64
 from pc2grid.errors import DatabaseCorrupt
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid, PointMap
 from pc2grid.observer import Observer
 from signature.config import Config
 from signature.database.protocol import BuildingFrame, Label
-from signature.localization.hypotheses import (
-    HYPOTHESES,
-    Hypothesis,
-    distinct,
-    fitted,
-    search_whole_map,
-    verify,
-)
+from signature.localization.hypotheses import Hypothesis, align, distinct, fitted
 from signature.localization.in_space import PointsOf, points_reader
-from signature.localization.lazy_maps import DatabaseGrids, LazySequence
 from signature.localization.posterior import POSTERIOR
 from signature.localization.prior import Prior, Region
 from signature.localization.query import QueryMap
-from signature.retrieval.viewpoints import AT_ONCE_M2, Places
-from signature.retrieval.vote import retrieve
+from signature.retrieval.lazy_maps import DatabaseGrids, LazySequence
+from signature.retrieval.viewpoints import AT_ONCE_M2, SQUARE_M, Area, Places
 from signature.seen_places import SeenPlaces
 from signature.similarity import SignatureTable
 
@@ -87,7 +76,7 @@ class MapIndex:
         most = most_prepared = None
         if area_m2 > AT_ONCE_M2:
             most = math.ceil(count * AT_ONCE_M2 / area_m2)
-            most_prepared = self.config.top_k + self.config.hypotheses
+            most_prepared = self.config.shortlist + self.config.hypotheses
         self.grids: LazySequence[OccupancyGrid] = LazySequence(lambda i: grids[self.sessions[i]], count, most)
         self.maps: LazySequence[SearchMap] = LazySequence(
             lambda i: SearchMap.of(self.grids[i]), count, most_prepared
@@ -95,7 +84,6 @@ class MapIndex:
         self._from_above: LazySequence[SearchMap] = LazySequence(
             lambda i: SearchMap.of(self.grids[i], from_below=True), count, most_prepared
         )
-        self._free: LazySequence[F64] = LazySequence(lambda i: free_squares(self.grids[i]), count)
         self.places = Places(
             table,
             self.grids,
@@ -180,39 +168,26 @@ class MapIndex:
             h.session_index == region.session_index and region.allows(query, h.fit.T_map_query)
         )
 
-    def look_up(
-        self, query: QueryMap, carried: tuple[Hypothesis, ...] = (), *, rows: I64 | None = None
-    ) -> tuple[Hypothesis, ...]:
-        """Hypotheses for the query, best first: the carried ones, refined, and what retrieval proposes.
-
-        rows : places that retrieval compares, instead of those it selects.
-        """
+    def look_up(self, query: QueryMap, carried: tuple[Hypothesis, ...] = ()) -> tuple[Hypothesis, ...]:
+        """Hypotheses for the query, best first: those carried, refined, and what the signatures propose."""
+        maps = self.maps_for(query)
         old = [
-            fitted(query, h.session_index, h.row, self.maps_for(query)[h.session_index], h.fit.T_map_query)
-            for h in carried
+            fitted(query, h.session_index, h.row, maps[h.session_index], h.fit.T_map_query) for h in carried
         ]
-        base_m = (query.T_odom_base.x, query.T_odom_base.y)
-        proposals = retrieve(
-            query.views,
-            base_m,
-            self.places,
-            config=self.config,
-            rows=rows,
-        )
-        found = (*old, *verify(query, proposals, self.places, self.maps_for(query), self.config))
-        return self._worth_keeping(query, found)
+        rows = self.places.select(query.views, query.center_m, self.config)
+        return self._worth_keeping(query, (*old, *self._aligned(query, self.places.areas(rows))))
 
     def search_whole_maps(self, query: QueryMap, known: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
-        """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole; in
-        a large database, on those that look most like the query. With a prior: anywhere in its region.
+        """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole,
+        those first that look most like the query; in a large database, on these alone. With a prior: anywhere
+        in its region.
 
         What has less than the share `RelocalizeConfig.coarse_keep` of the best coarse score is left out.
         """
-        found = list(known)
-        maps = self.maps_for(query)
-        for index, free in self._searched(query):
-            found.extend(search_whole_map(query, index, maps[index], free, self.config))
-        return self._worth_keeping(query, found)
+        return self._worth_keeping(query, (*known, *self._aligned(query, self._whole_maps(query))))
+
+    def _aligned(self, query: QueryMap, areas: Iterable[Area]) -> tuple[Hypothesis, ...]:
+        return align(query, areas, self.places, self.maps_for(query), self.config)
 
     def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
         """The maps as they are searched for a query: to one in a lower plane, their free space is unknown."""
@@ -223,18 +198,18 @@ class MapIndex:
 
         return LazySequence(facing, len(self.maps), 0)
 
-    def _searched(self, query: QueryMap) -> Iterator[tuple[int, F64]]:
-        """The maps that are searched as a whole, and the free squares (K, 2) there that may hold the base."""
+    def _whole_maps(self, query: QueryMap) -> Iterator[Area]:
+        """The maps that are searched as a whole."""
         region = self._region_for(query)
         if region is not None:
             index = region.session_index
-            free = region.squares(query, self._free[index], HYPOTHESES.square_m)
-            if len(free) * HYPOTHESES.square_m**2 <= self.config.exhaustive_m2:
-                yield index, free
+            squares_m = region.squares(query, self.places.ground[index][0], SQUARE_M)
+            if len(squares_m) * SQUARE_M**2 <= self.config.exhaustive_m2:
+                yield Area(index, squares_m)
             return
-        for index in self.places.sessions(query.views, self.config):
+        for index in self.places.sessions(query.views, query.center_m, self.config):
             if self._areas_m2[index] <= self.config.exhaustive_m2:
-                yield index, self._free[index]
+                yield Area(index, self.places.ground[index][0])
 
     def _worth_keeping(self, query: QueryMap, found: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         """Best first, what scores enough beside the best one to tell of it
@@ -253,15 +228,3 @@ class MapIndex:
         if frame is None or other is None or frame.name != other.name:
             return None
         return frame, other
-
-
-def free_squares(grid: OccupancyGrid, side_m: float = HYPOTHESES.square_m) -> F64:
-    """Centres (K, 2) of the squares of `side_m` of a grid that hold any free space, map frame."""
-    n = max(1, round(side_m / grid.resolution_m))
-    height, width = grid.cells.shape
-    if not height or not width:
-        return np.empty((0, 2))
-    rows, columns = np.arange(0, height, n), np.arange(0, width, n)
-    free = np.add.reduceat(np.add.reduceat(grid.free.astype(np.int32), rows, axis=0), columns, axis=1)
-    corners = np.argwhere(free > 0)[:, ::-1] * (n * grid.resolution_m)
-    return np.asarray(corners + 0.5 * n * grid.resolution_m + np.asarray(grid.origin_m))

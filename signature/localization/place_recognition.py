@@ -2,7 +2,7 @@
 
 The session is its own database: each stretch of some metres of travel becomes a small map with a few
 described places, and every new stretch is looked up among those before it with the parts of a `MapIndex`.
-Signatures and isovists propose, the alignment of walls in both directions verifies, and a calibrated
+Signatures propose, the alignment of walls in both directions verifies, and a calibrated
 probability says how sure it is that the two maps show the same place. Which of several such places is the
 right one is decided by loop closure (`pc2grid.mapping.loop_candidates`), which knows the travel between them.
 """
@@ -22,12 +22,11 @@ from pc2grid.matching.two_way_score import Fit
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
-from signature.localization.hypotheses import verify
-from signature.localization.lazy_maps import LazySequence
+from signature.localization.hypotheses import align
 from signature.localization.posterior import log_likelihood_ratio
 from signature.localization.query import QueryMap, query_of
+from signature.retrieval.lazy_maps import LazySequence
 from signature.retrieval.viewpoints import Places
-from signature.retrieval.vote import retrieve
 from signature.similarity import SignatureTable
 
 
@@ -37,7 +36,6 @@ class RecognitionParameters:
 
     views : places of a stretch that are described. They are both what is asked and what is asked for.
     shortlist : so many earlier places are compared with it, those that are likeliest by their signatures.
-    placements : placements that are aligned.
     maps : prepared maps of earlier stretches that stay in memory, about 4 MB each.
     least : hypotheses that are less probable are not reported.
     neutral, sharpness : s_0 and k of `probability`, fitted to simulated sessions in the plans of fr079 and
@@ -46,7 +44,6 @@ class RecognitionParameters:
 
     views: int = 12
     shortlist: int = 10
-    placements: int = 30
     maps: int = 16
     least: float = 0.3
     neutral: float = 0.627
@@ -85,7 +82,6 @@ class SessionRecognizer:
                 "views": parameters.views,
                 "shortlist": parameters.shortlist,
                 "shortlist_share": 0.0,
-                "top_k": parameters.placements,
             }
         )
         self._parameters = parameters
@@ -102,7 +98,7 @@ class SessionRecognizer:
         return found
 
     def _look_up(self, query: QueryMap, places: Places) -> list[Recognition]:
-        proposals = retrieve(query.views, query.center_m, places, config=self._config)
+        areas = places.areas(places.select(query.views, query.center_m, self._config))
         maps = LazySequence(self._map, len(self._stored), most=0)
         return [
             Recognition(
@@ -110,7 +106,7 @@ class SessionRecognizer:
                 T_older_newest=found.fit.T_map_query,
                 probability=probability,
             )
-            for found in verify(query, proposals, places, maps, self._config)
+            for found in align(query, areas, places, maps, self._config)
             if (probability := self._parameters.probability(found.fit)) >= self._parameters.least
         ]
 

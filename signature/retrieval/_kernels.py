@@ -71,8 +71,10 @@ def best_headings(
     view: I64,
     steps: F64,
     out: F32,
+    at_best: I64,
 ) -> None:
-    """The sum of the `scores` (K, V) of all views at the best heading, into `out` (P,).
+    """The sum of the `scores` (K, V) of all views at the best heading, into `out` (P,), and the number of
+    that heading, into `at_best` (P,).
 
     squares : (K, 2) viewpoints in units of the lattice. block, low, shape, first, at : as in
     `place_index.Raster`. viewpoint, view : (P,) which view is put on which viewpoint. steps :
@@ -95,5 +97,6 @@ def best_headings(
                     beside = at[first[number] + x * columns + y]
                     if beside >= 0:
                         total += scores[beside, other]
-            best = max(best, total)
+            if total > best:
+                best, at_best[pose] = total, heading
         out[pose] = best

@@ -7,7 +7,8 @@ direction. The positions of a query's views relative to each other do contain on
    those of places that a first look leaves out (`signature.retrieval.place_signatures`) are not compared;
 2. each of these, at each of some headings, is a pose of the whole query: it says at which viewpoints the
    other views stand. The log-likelihoods of all views there are added up;
-3. the places with the best poses are selected. They alone are verified.
+3. the best heading of each pose says where the robot stands: the places that it stands next to in the best
+   poses are selected. Only there are its walls aligned, with any heading, as signatures say little about it.
 """
 
 from __future__ import annotations
@@ -86,6 +87,18 @@ class Raster(NamedTuple):
         return Raster(low, shape, first, at)
 
 
+class Poses(NamedTuple):
+    """P poses of a query.
+
+    likelihood (P,) : sum of the log-likelihood ratios of its views. base_m (P, 2) : where the robot stands in
+    the map of a block (P,).
+    """
+
+    likelihood: F32
+    base_m: F64
+    block: NDArray[np.int32]
+
+
 @dataclass(frozen=True, slots=True)
 class PlaceIndex:
     """K viewpoints of N places.
@@ -150,27 +163,6 @@ class PlaceIndex:
         columns = (self.vectors, self.hidden, self.at_m, self.block, self.row, self.raster.at)
         return sum(column.nbytes for column in columns)
 
-    def select(self, views: Sequence[View], most: int, among: BoolGrid | None = None) -> I64:
-        """Rows of the at most `most` places where the query most likely lies, best first.
-
-        among : (N,) the places that are compared, by default all.
-
-        Equal inputs give equal places. Fewer are returned only if there are fewer.
-        """
-        if not views or not len(self) or most < 1:
-            return np.empty(0, np.int64)
-        compared = np.arange(len(self)) if among is None else np.flatnonzero(among[self.row])
-        if not len(compared):
-            return np.empty(0, np.int64)
-        scores = self.scores(views, compared)
-        likelihood, viewpoint = self.poses(views, scores, compared)
-        best = viewpoint[np.argsort(-likelihood, kind="stable")]
-        rows = _first_unique(self.row[best], most)
-        if len(rows) < most:
-            others = compared[np.argsort(-scores[compared].max(axis=1), kind="stable")]
-            rows = _first_unique(np.concatenate((rows, self.row[others])), most)
-        return rows.astype(np.int64)
-
     def scores(self, views: Sequence[View], compared: I64 | None = None) -> F32:
         """(K, V) log-likelihood ratio of each viewpoint and each view showing one place, by signatures.
 
@@ -194,30 +186,36 @@ class PlaceIndex:
             found[part] = self.spread.log_ratio(squared, hidden + self.hidden[part, None])
         return found
 
-    def poses(self, views: Sequence[View], scores: F32, compared: I64) -> tuple[F32, I64]:
-        """The log-likelihood (P,) of the best heading of each pose that the viewpoints `compared` propose,
-        and the viewpoint that proposed it (P,)."""
+    def poses(
+        self, views: Sequence[View], base_m: tuple[float, float], among: BoolGrid | None = None
+    ) -> Poses:
+        """Poses of the query that its views propose.
+
+        base_m : (x, y) of the robot in the query's frame. among : (N,) the places that are compared, by
+        default all.
+        """
         from signature.retrieval._kernels import best_headings
 
+        compared = np.arange(len(self)) if among is None else np.flatnonzero(among[self.row])
+        if not views or not len(compared):
+            return Poses(np.empty(0, np.float32), np.empty((0, 2)), np.empty(0, np.int32))
         most = min(POSES.proposed, len(compared))
+        scores = self.scores(views, compared)
         likeliest = [compared[np.argpartition(-column, most - 1)[:most]] for column in scores[compared].T]
         viewpoint, view = np.concatenate(likeliest), np.repeat(np.arange(len(views)), most)
-        found = np.empty(len(viewpoint), np.float32)
+        found, heading = np.empty(len(viewpoint), np.float32), np.empty(len(viewpoint), np.int64)
         floored = np.maximum(scores, np.float32(POSES.least))
         squares = self.at_m / np.float32(LATTICE_M)
-        steps = steps_between(views) / LATTICE_M
-        best_headings(floored, squares, self.block, *self.raster, viewpoint, view, steps, found)
-        return found, viewpoint
+        points_m = np.array([one.center_m for one in views])
+        steps = turned(points_m[None] - points_m[:, None]) / LATTICE_M
+        on = floored, squares, self.block, *self.raster
+        best_headings(*on, viewpoint, view, steps, found, heading)
+        to_base = turned(np.asarray(base_m) - points_m)[heading, view]
+        return Poses(found, self.at_m[viewpoint] + to_base, self.block[viewpoint])
 
 
-def steps_between(views: Sequence[View]) -> F64:
-    """(H, V, V, 2) the way in metres from one view to another, at each heading of the query."""
+def turned(steps_m: F64) -> F64:
+    """(H, ..., 2) steps (..., 2) at each heading of the query."""
     turns = 2.0 * math.pi * np.arange(POSES.headings) / POSES.headings
     turn = np.stack((np.cos(turns), -np.sin(turns), np.sin(turns), np.cos(turns)), axis=1).reshape(-1, 2, 2)
-    points_m = np.array([view.center_m for view in views])
-    return np.asarray(np.einsum("hij,abj->habi", turn, points_m[None] - points_m[:, None]), np.float64)
-
-
-def _first_unique(rows: NDArray[np.int32], most: int) -> NDArray[np.int32]:
-    """The first `most` different ones, in their order."""
-    return rows[np.sort(np.unique(rows, return_index=True)[1])[:most]]
+    return np.asarray(np.einsum("hij,...j->h...i", turn, steps_m), np.float64)

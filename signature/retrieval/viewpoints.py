@@ -1,102 +1,56 @@
-"""The places of a database: which of them a query is compared with, and what is seen around those.
+"""The places of a database: which of them a robot may stand next to, and the free ground there.
 
 A first look at the signatures of all places leaves out most, the signatures of viewpoints select from the
-rest. Only around the selected places are isovists compared at every rotation, which says how the query lies
-there; they are computed when a place is first selected.
+rest. Walls are aligned on the free ground next to the selected places alone.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from typing import TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64, BoolGrid
+from pc2grid.arrays import F64, I64, BoolGrid
 from pc2grid.model import OccupancyGrid
-from pc2grid.submaps.isovist import HIDDEN, look_around
 from signature.config import RelocalizeConfig
-from signature.retrieval.place_index import PlaceBlock, PlaceIndex
+from signature.retrieval.lazy_maps import LazySequence
+from signature.retrieval.place_index import PlaceBlock, PlaceIndex, Poses
 from signature.retrieval.place_signatures import PlaceSignatures
 from signature.retrieval.view import View
-from signature.seen_places import LATTICE_M, PROFILE_BEARINGS, SeenPlaces
+from signature.seen_places import SeenPlaces
 from signature.similarity import SignatureTable
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 T = TypeVar("T")
 
 AT_ONCE_M2 = 200_000.0
 """So much free floor is searched at once; of a larger database, the sessions that look likeliest. Chosen by
 the time of a look-up."""
-_KEPT_PLACES, _KEPT_SESSIONS = 50_000, 1000
-"""Places whose isovists are kept, and sessions whose viewpoints are: 0.5 MB each, of floors of 40 x 60 m."""
+SQUARE_M = 0.8
+"""Side of the squares of free ground that are searched. By hand."""
+_KEPT_SESSIONS = 1000
+"""Sessions whose viewpoints are kept: 0.5 MB each, of floors of 40 x 60 m."""
+_APART_M = 1e6
+"""Puts the places of different sessions far apart in one KD-tree."""
 
 
-@dataclass(frozen=True, slots=True)
-class Viewpoints:
-    """K viewpoints at some places of the database.
+class Area(NamedTuple):
+    """Where the robot may stand in one session: squares of `SQUARE_M` with the centres (K, 2), map frame."""
 
-    place : (K,) index into the places asked for. at_m : (K, 2) in the map of `session` (K,).
-    ranges_m : (K, B) float32, length of each ray of the isovist. seen : (K, B) whether its end is known.
-    rasters : by session, the index of the viewpoint in each square of the lattice, K where there is none,
-    and the (column, row) of its first square.
-    """
-
-    place: I64
-    at_m: F64
-    session: I64
-    ranges_m: F32
-    seen: NDArray[np.bool_]
-    rasters: Mapping[int, tuple[I64, I64]]
-
-    @staticmethod
-    def of(place: I64, at_m: F64, session: I64, ranges_m: F32, seen: NDArray[np.bool_]) -> Viewpoints:
-        """Viewpoints with their rasters; a square with several viewpoints holds the one next to its
-        centre."""
-        squares = np.rint(at_m / LATTICE_M)
-        off = np.abs(squares * LATTICE_M - at_m).max(axis=1)
-        rasters = {}
-        for number in np.unique(session).tolist():
-            members = np.flatnonzero(session == number)
-            members = members[np.argsort(-off[members], kind="stable")]
-            inside = squares[members].astype(np.int64)
-            low = inside.min(axis=0)
-            raster = np.full(inside.max(axis=0) - low + 1, len(at_m), np.int64)
-            raster[tuple((inside - low).T)] = members
-            rasters[number] = raster, low
-        return Viewpoints(place, at_m, session, ranges_m, seen, rasters)
-
-    def beside(self, at_m: F64, session: I64) -> I64:
-        """Index (...) of the viewpoint in the square of each of the points (..., 2), which lie in the maps
-        of `session` (...); K where there is none."""
-        found = np.full(session.shape, len(self.at_m), np.int64)
-        squares = np.rint(at_m / LATTICE_M).astype(np.int64)
-        for number, (raster, low) in self.rasters.items():
-            index = squares - low
-            inside = (session == number) & ((index >= 0) & (index < raster.shape)).all(axis=-1)
-            found[inside] = raster[tuple(index[inside].T)]
-        return found
-
-
-@dataclass(frozen=True, slots=True)
-class Selected:
-    """The places, ascending, that are compared with a query, and the sessions that are searched, likeliest
-    first."""
-
-    rows: I64
-    sessions: I64
+    session: int
+    squares_m: F64
 
 
 class Places:
     """All places of a database, ready for retrieval.
 
-    table : their signatures. sight_m : length of the rays of their isovists.
-
-    The isovists around a place are computed when it is first selected, so that a large database answers its
-    first question soon and places that are not asked for take no memory.
+    table : their signatures. sight_m : length of the rays by which they are described.
     """
 
     def __init__(
@@ -120,40 +74,56 @@ class Places:
         self._chance = np.random.default_rng(0)
         self._described: dict[int, SeenPlaces] = {} if fewer is None else dict(fewer._described)
         self._areas_m2 = np.asarray(areas_m2, np.float64)
-        self._known: dict[int, tuple[F64, F32, NDArray[np.bool_]]] = (
-            {} if fewer is None else dict(fewer._known)
-        )
-        self._last: tuple[I64, Viewpoints] | None = None
-        self._selected: tuple[Sequence[View], RelocalizeConfig, Selected] | None = None
+        self._session_of_block = np.unique(table.session_index)
+        self.ground: LazySequence[tuple[F64, I64]] = LazySequence(self._ground, len(grids), _KEPT_SESSIONS)
+        """By session, the squares (K, 2) that hold free ground, and the places next to them (K,)."""
+        self._selected: tuple[Sequence[View], RelocalizeConfig, I64] | None = None
 
     @property
     def is_large(self) -> bool:
         """Whether there is more free floor than is searched at once."""
         return bool(self._areas_m2.sum() > AT_ONCE_M2)
 
-    def select(self, views: Sequence[View], config: RelocalizeConfig) -> Selected:
-        """The places to compare with a query, `shortlist_size` of them, by `PlaceSignatures.likely` and then
-        `PlaceIndex.select`, or by a control (`RelocalizeConfig.shortlist_by`). The sessions are those of the
-        places, in a large database up to `AT_ONCE_M2`.
+    def select(self, views: Sequence[View], base_m: tuple[float, float], config: RelocalizeConfig) -> I64:
+        """The places (R,) that the robot at `base_m` most likely stands next to, likeliest first,
+        `shortlist_size` of them: by `PlaceSignatures.likely` and then `PlaceIndex.poses`, or by a control
+        (`RelocalizeConfig.shortlist_by`). In a large database those in the likeliest maps, up to
+        `AT_ONCE_M2`.
         """
         if self._selected is None or self._selected[0] is not views or self._selected[1] is not config:
-            self._selected = views, config, self._select(views, config)
+            self._selected = views, config, self._select(views, base_m, config)
         return self._selected[2]
 
-    def _select(self, views: Sequence[View], config: RelocalizeConfig) -> Selected:
-        session_index, most = self.table.session_index, shortlist_size(len(self.table), config)
+    def _select(self, views: Sequence[View], base_m: tuple[float, float], config: RelocalizeConfig) -> I64:
+        most = shortlist_size(len(self.table), config)
+        every = np.arange(len(self.table))
+        if not views or not len(every):
+            return every[:0]
         if config.shortlist_by == "random":
-            best = self._chance.permutation(len(self.table))[:most]
-        else:
-            shuffled = config.shortlist_by == "shuffled"
-            likely = None if shuffled else self.likely(views, most)
-            best = (self._shuffled if shuffled else self.index()).select(views, most, likely)
-        rows, sessions = np.sort(best), _in_order(session_index[best])
-        if not self.is_large or not len(sessions):
-            return Selected(rows, sessions)
+            return self._at_once(self._chance.permutation(every)[:most])
+        shuffled = config.shortlist_by == "shuffled"
+        index = self._shuffled if shuffled else self.index()
+        found = index.poses(views, base_m, None if shuffled else self.likely(views, most))
+        return self._at_once(self.next_to(found, most))
+
+    def next_to(self, poses: Poses, most: int) -> I64:
+        """The `most` places (R,) that the robot stands next to in the likeliest poses, likeliest first; if
+        these are too few, others, too."""
+        away_m, row = self.nearest(self._session_of_block[poses.block], poses.base_m)
+        order = np.argsort(-poses.likelihood, kind="stable")
+        near = row[order[away_m[order] <= self.sight_m]]
+        ordered = np.concatenate((near, np.arange(len(self.table))))
+        return ordered[np.sort(np.unique(ordered, return_index=True)[1])[:most]]
+
+    def _at_once(self, rows: I64) -> I64:
+        """Those of the places that are in the maps that are searched at once."""
+        if not self.is_large:
+            return rows
+        of = self.table.session_index[rows]
+        sessions = np.array(list(dict.fromkeys(of.tolist())))
         areas_m2 = self._areas_m2[sessions]
-        sessions = sessions[np.cumsum(areas_m2) <= max(AT_ONCE_M2, areas_m2[0])]
-        return Selected(rows[np.isin(session_index[rows], sessions)], sessions)
+        kept: I64 = rows[np.isin(of, sessions[np.cumsum(areas_m2) <= max(AT_ONCE_M2, areas_m2[0])])]
+        return kept
 
     def likely(self, views: Sequence[View], most: int) -> BoolGrid | None:
         """The places (N,) that a first look by the signatures of the places leaves; None if it cannot be
@@ -209,51 +179,57 @@ class Places:
         first, end = np.searchsorted(self.table.session_index, (session, session + 1))
         return slice(int(first), int(end))
 
-    def sessions(self, views: Sequence[View], config: RelocalizeConfig) -> list[int]:
-        """Indices of the sessions to be searched as a whole: all, or those of the selected places."""
-        if not self.is_large:
-            return list(range(len(self._areas_m2)))
-        return self.select(views, config).sessions.tolist() if views else []
+    def sessions(
+        self, views: Sequence[View], base_m: tuple[float, float], config: RelocalizeConfig
+    ) -> list[int]:
+        """Indices of the sessions to be searched as a whole, likeliest first: all, or of a large database
+        those of the selected places."""
+        rows = self.select(views, base_m, config)
+        first: list[int] = self.table.session_index[rows].tolist()
+        every = () if self.is_large else range(len(self._areas_m2))
+        return list(dict.fromkeys((*first, *every)))
 
-    def around(self, rows: I64) -> Viewpoints:
-        """The viewpoints at the places `rows` (R,) of the table, with their isovists."""
-        if self._last is not None and np.array_equal(self._last[0], rows):
-            return self._last[1]
-        self._look_around(np.array([row for row in rows.tolist() if row not in self._known], np.int64))
-        found = [self._known[row] for row in rows.tolist()]
-        counts = np.array([len(at) for at, _, _ in found], np.int64)
-        at_m, ranges_m, seen = (np.concatenate(part) for part in zip(*found, strict=True))
-        session = np.repeat(self.table.session_index[rows].astype(np.int64), counts)
-        place = np.repeat(np.arange(len(rows)), counts)
-        viewpoints = Viewpoints.of(place, at_m, session, ranges_m, seen)
-        self._last = rows.copy(), viewpoints
-        _forget(self._known, _KEPT_PLACES)
-        return viewpoints
+    def areas(self, rows: I64) -> Iterator[Area]:
+        """The free ground next to the places `rows`, in the order of their sessions."""
+        chosen = np.zeros(len(self.table), bool)
+        chosen[rows] = True
+        for session in dict.fromkeys(self.table.session_index[rows].tolist()):
+            squares_m, nearest = self.ground[session]
+            yield Area(session, squares_m[chosen[nearest]])
 
-    def _look_around(self, rows: I64) -> None:
-        """Cast the rays at the viewpoints of places: positions (K, 2), ranges (K, B) and whether the ends of
-        the rays are known (K, B), for each."""
-        for session in np.unique(self.table.session_index[rows]).tolist():
-            seen, first = self._seen(session), self._rows(session).start
-            asked = np.sort(rows[self.table.session_index[rows] == session])
-            chosen = np.flatnonzero(np.isin(seen.place, asked - first))
-            at_m = seen.at_m[chosen].astype(np.float64)
-            ranges_m, ends = look_around(self._grids[session], at_m, self.sight_m, bearings=PROFILE_BEARINGS)
-            known = ends != HIDDEN
-            bounds = np.searchsorted(seen.place[chosen] + first, asked, side="left").tolist()
-            for row, begin, end in zip(asked.tolist(), bounds, [*bounds[1:], len(chosen)], strict=True):
-                self._known[row] = at_m[begin:end], ranges_m[begin:end], known[begin:end]
+    def nearest(self, session: int | NDArray[np.integer], at_m: NDArray[np.floating]) -> tuple[F64, I64]:
+        """The distance (K,) of the place of a session that is next to points (K, 2), and its row (K,), -1 if
+        the session has no places."""
+        apart_m = np.broadcast_to(np.asarray(session, np.float64) * _APART_M, len(at_m))
+        away_m, row = self._tree.query(np.column_stack((at_m, apart_m)))
+        return away_m, np.where(away_m < 0.5 * _APART_M, row, -1)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(np.column_stack((self.table.center_m, self.table.session_index * _APART_M)))
+
+    def _ground(self, session: int) -> tuple[F64, I64]:
+        squares_m = free_squares(self._grids[session])
+        return squares_m, self.nearest(session, squares_m)[1]
+
+
+def free_squares(grid: OccupancyGrid) -> F64:
+    """Centres (K, 2) of the squares of `SQUARE_M` of a grid that hold any free space, map frame."""
+    n = max(1, round(SQUARE_M / grid.resolution_m))
+    height, width = grid.cells.shape
+    if not height or not width:
+        return np.empty((0, 2))
+    rows, columns = np.arange(0, height, n), np.arange(0, width, n)
+    free = np.add.reduceat(np.add.reduceat(grid.free.astype(np.int32), rows, axis=0), columns, axis=1)
+    corners = np.argwhere(free > 0)[:, ::-1] * (n * grid.resolution_m)
+    return np.asarray(corners + 0.5 * n * grid.resolution_m + np.asarray(grid.origin_m))
 
 
 def shortlist_size(places: int, config: RelocalizeConfig) -> int:
-    """How many places are compared with a query."""
+    """How many places a query is aligned at."""
     return max(config.shortlist, min(math.ceil(config.shortlist_share * places), config.shortlist_most))
-
-
-def _in_order(sessions: NDArray[np.int32]) -> I64:
-    """The different sessions, in the order in which they come first."""
-    unique, first = np.unique(sessions, return_index=True)
-    return unique[np.argsort(first)].astype(np.int64)
 
 
 def _forget(kept: dict[int, T], most: int) -> None:

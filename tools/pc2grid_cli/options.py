@@ -102,7 +102,6 @@ def make_config(
     odometry: str | None = None,
     imu: str | None = None,
     assume_identity: bool = False,
-    top_k: int | None = None,
     points_voxel_m: float | None = None,
     preset: PresetName = PresetName.default,
 ) -> Config:
@@ -114,7 +113,7 @@ def make_config(
     config = load_settings(Config, file, assignments or (), preset=base)
     read = {"topic": topic, "odometry": odometry, "imu": imu, "assume_identity": assume_identity or None}
     kept = {"points_voxel_m": points_voxel_m}
-    return _changed(config, {"read": read, "relocalize": {"top_k": top_k}, "projection": kept})
+    return _changed(config, {"read": read, "projection": kept})
 
 
 def _changed(config: Config, flags: Mapping[str, Mapping[str, object]]) -> Config:

@@ -128,7 +128,6 @@ def relocalize_command(
             help="locate a window every S seconds, as long as --duration, else S",
         ),
     ] = None,
-    top_k: Annotated[int | None, typer.Option("--top-k", min=1, help="candidates to align with")] = None,
     trajectory: Annotated[
         Path | None, typer.Option("--trajectory", metavar="OUT.tum", help="the query's poses in the map")
     ] = None,
@@ -176,7 +175,7 @@ def relocalize_command(
     several = every is not None or len(logs) > 1
     _check_options(logs, database, outputs, known, several=several)
     settings = options.make_config(
-        config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity, top_k=top_k
+        config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity
     )
     span, terminal = TimeSpan(start, duration), console.of(context)
     windows = windows_of(logs, every, span, settings, recover=recover)

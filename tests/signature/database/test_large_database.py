@@ -87,7 +87,7 @@ def test_a_map_larger_than_what_is_searched_at_once_is_still_searched(
         _Counted(), ALL.places.table, ALL.made_with, Config(), areas_m2=areas_m2, stored=SEEN.get
     )
     assert locate_map(PART, index).session == "office"
-    assert index.places.sessions(query_views(), index.config) == [list(MAPS).index("office")]
+    assert index.places.sessions(query_views(), (0.0, 0.0), index.config) == [list(MAPS).index("office")]
 
 
 def test_the_maps_that_were_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,7 +162,7 @@ def test_places_are_selected_by_what_is_stored_and_computed_where_it_is_not(tmp_
         news[path] = News()
         with open_database(path) as database:
             index = MapIndex.of(database, config, news[path])
-            assert len(index.places.select(query_views(), index.config).rows) < 20
+            assert len(index.places.select(query_views(), (0.0, 0.0), index.config)) < 20
             answers[path] = locate_map(PART, index)
     assert answers[file].session == answers[copied].session == "office"
     assert answers[file].T_map_base == answers[copied].T_map_base

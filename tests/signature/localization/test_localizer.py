@@ -18,11 +18,8 @@ from signature.database import Label
 from signature.describe import Signature, describe
 from signature.localization import query as query_module
 from signature.localization.answer import Answer
-from signature.localization.decision import decide, judge
-from signature.localization.hypotheses import Hypothesis
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
-from signature.localization.prior import Prior
 from signature.localization.query import Query, QueryMap
 from tests.helpers.simulated_drives import building, drive, office, plan
 
@@ -50,33 +47,6 @@ def test_a_drive_through_a_known_building_is_located(field_deg: float) -> None:
     assert answer.confidence >= 0.9
     whole = answer.T_map_odom @ answer.T_odom_base if answer.T_map_odom else None
     assert whole is not None and math.dist((whole.x, whole.y), (pose.x, pose.y)) < 1e-9
-
-
-def test_a_better_place_that_was_not_proposed_takes_a_certain_answer_away() -> None:
-    """Proposals may lack the right place; what leads among them is not certain before the map is searched."""
-    config = Config()
-    daring = config.model_copy(update={"relocalize": config.relocalize.model_copy(update={"accept": 0.001})})
-    index = MapIndex({"office": office()}, OFFICE.places.table, config, daring)
-    query = Query(index.made_with, index.config)
-    for registered, planar_scan, end in drive(office(), ROUTE, field_rad=math.radians(90)):
-        query.add(registered, planar_scan)
-        truth = end
-    seen = query.map()
-    proposed = index.look_up(seen)
-    wrong = index.within(Prior.around(4.0, 3.0, radius_m=3.0)).search_whole_maps(seen, ())
-    assert math.dist(position(wrong[0], seen), (truth.x, truth.y)) > 1.0
-    alone = judge(index, seen, wrong[:1])
-    assert alone.status == "located"
-    verdict = decide(index, seen, wrong[:1])
-    assert math.dist(position(verdict.hypotheses[0], seen), (truth.x, truth.y)) < 0.1
-    # Nothing is found that would shake a right answer.
-    right = decide(index, seen, proposed)
-    assert right.hypotheses[0] == proposed[0] and right.confidence == judge(index, seen, proposed).confidence
-
-
-def position(hypothesis: Hypothesis, query: QueryMap) -> tuple[float, float]:
-    base = hypothesis.fit.T_map_query @ query.T_odom_base
-    return base.x, base.y
 
 
 def test_certainty_grows_with_travel_and_history_tells_it() -> None:

@@ -79,7 +79,7 @@ def test_tables_that_were_seen_over_and_under_do_not_hide_an_earlier_place() -> 
     for earlier in (tables, replace(tables, heights=None)):
         recognizer = SessionRecognizer(Config())
         recognizer.recognize(stretch(0, earlier))
-        (found,) = recognizer.recognize(stretch(1, rooms(1)))
+        found, *_ = recognizer.recognize(stretch(1, rooms(1)))
         probable.append(found.probability)
     assert probable[0] > 0.99 > 0.9 > probable[1]
 

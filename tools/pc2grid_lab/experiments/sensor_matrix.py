@@ -8,7 +8,6 @@ metres of travel. The sessions are registered as a user would do it; true poses 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,6 @@ from signature.config import Config
 from signature.database import open_database
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
-from signature.retrieval.vote import retrieve
 from signature.sessions import add_session, provenance
 
 SENSORS: tuple[SensorKind, ...] = ("lidar", "laser", "depth")
@@ -225,18 +223,8 @@ def _judged(
 
 
 def _retrieved_rank(index: MapIndex, query: QueryMap, T_map_query: SE2) -> int:
-    """Rank of the first place, retrieved by signatures and isovists, at the true position of one of the
-    views.
-    """
-    proposals = retrieve(
-        query.views,
-        (query.T_odom_base.x, query.T_odom_base.y),
-        index.places,
-        config=index.config,
-        top_k=50,
-    )
-    for rank, proposal in enumerate(proposals):
-        true_m = T_map_query.apply(np.array([query.views[proposal.view].center_m]))[0]
-        if math.dist(true_m, index.places.table.center_m[proposal.row]) <= JUDGEMENT.retrieved_m:
-            return rank
-    return -1
+    """Rank of the first place, selected by the signatures, that the robot truly stood next to."""
+    rows = index.places.select(query.views, query.center_m, index.config)
+    off_m = index.places.table.center_m[rows] - T_map_query.apply(np.array([query.center_m]))
+    right = np.flatnonzero(np.hypot(*off_m.T) <= JUDGEMENT.retrieved_m)
+    return int(right[0]) if len(right) else -1

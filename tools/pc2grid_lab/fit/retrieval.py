@@ -98,15 +98,18 @@ class Building:
             among = self.first_looks.get(selector, self.first_looks[_ALL]).likely(query.views, most)
         if among is not None and selector in (SHUFFLED, ANY_LOOK):
             among = rng.permutation(among)
-        return self.indexes[selector].select(query.views, most, among)
+        poses = self.indexes[selector].poses(query.views, query.center_m, among)
+        return self.index.places.next_to(poses, most)
 
 
 def right_places(query: QueryMap, T_map_query: SE2, places: SignatureTable) -> I64:
-    """The places where a view of the query truly lies; none if half of the views lie at none."""
+    """The places that the robot truly stands next to; none if half of the views of the query lie at none."""
     views_m = T_map_query.apply(np.array([view.center_m for view in query.views]).reshape(-1, 2))
     own = np.flatnonzero(places.session_index == 0)
-    near = cdist(views_m, places.center_m[own]) <= JUDGEMENT.retrieved_m
-    return own[near.any(axis=0)] if near.any(axis=1).mean() >= 0.5 else own[:0]
+    known = (cdist(views_m, places.center_m[own]) <= JUDGEMENT.retrieved_m).any(axis=1)
+    base_m = T_map_query.apply(np.array([query.center_m]))
+    near = cdist(base_m, places.center_m[own])[0] <= JUDGEMENT.retrieved_m
+    return own[near] if known.mean() >= 0.5 else own[:0]
 
 
 def asked_of(
