@@ -18,10 +18,9 @@ from pc2grid.submaps.isovist import look_around
 from signature.seen import parts, seen_signatures
 
 PROFILE_BEARINGS = 48
-"""Rays of the isovists: one every 7.5 degrees, the window of headings that the coarse search covers around
-each proposal. Chosen on fr079 and intel."""
+"""Rays of the isovists: one every 7.5 degrees. Chosen on fr079 and intel."""
 LATTICE_M = 0.4
-"""Distance of viewpoints: a view is at most 0.28 m from one of them, about the scale of `LIKENESS`. With
+"""Distance of viewpoints: a view is at most 0.28 m from one of them. With
 0.8 m a tenth fewer queries find their place after 1 m."""
 AROUND_M = 1.2
 """A viewpoint farther than this from every place is left out: places are 1 m apart by default."""

@@ -1,7 +1,7 @@
 """What a robot has seen over its last metres, made ready to be looked up.
 
 A robot rarely stands where it has seen most. So the query is described not where the robot is but at
-those places of its own path whose surroundings it has observed best; each is a view, and all views vote.
+those places of its own path whose surroundings it has observed best; each is a view.
 """
 
 from __future__ import annotations

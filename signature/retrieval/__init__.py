@@ -1,1 +1,1 @@
-"""Which places may a query lie at? Views in, proposals out: signature index, viewpoints, votes."""
+"""Where may the robot stand? Views of a query in, places out: by the signatures, and by nothing else."""

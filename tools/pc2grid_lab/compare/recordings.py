@@ -23,6 +23,7 @@ from pc2grid_lab.experiments.recordings.program import commit, digest
 from pc2grid_lab.experiments.recordings.rows import Table
 from pc2grid_lab.experiments.recordings.run import Folder, run_all
 from pc2grid_lab.experiments.stored import write_text
+from signature.config import ShortlistBy
 
 
 def compare_recordings_command(
@@ -55,6 +56,10 @@ def compare_recordings_command(
         ),
     ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="a small part of all, always the same")] = False,
+    shortlist: Annotated[
+        ShortlistBy,
+        typer.Option("--shortlist", help="what selects places; a control is not written to the table"),
+    ] = "signatures",
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="processes at a time")] = 2,
 ) -> None:
     """Map every real recording, locate parts of it in other maps, and tell what changed since the last time.
@@ -71,8 +76,9 @@ def compare_recordings_command(
     work = out / "work" / (digest() + state_of(data, own[0]))
     make_folder(work)
     _remove_others(work)
-    folder = Folder(data.absolute(), work.absolute())
-    followed = followed_in(catalogue, folder, only)
+    folder = Folder(data.absolute(), work.absolute(), shortlist)
+    is_control = shortlist != "signatures"
+    followed = () if is_control else followed_in(catalogue, folder, only)
     if not (catalogue.mapped or catalogue.pairs or followed):
         raise ConfigError(f"--only {only}: no recording, building, sensor or kind is named so")
     terminal = console.of(context)
@@ -90,7 +96,7 @@ def compare_recordings_command(
     kept = table or out / "real.json"
     before = _read(kept)
     changed = [] if before is None else changes(before, found)
-    if only is None and not quick:
+    if only is None and not quick and not is_control:
         write_text(kept, found.to_text())
         write_text(kept.with_suffix(".md"), page(found, changed))
     print(page(found))

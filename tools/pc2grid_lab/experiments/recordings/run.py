@@ -19,6 +19,7 @@ from pc2grid_lab.experiments.recordings.children import Finished, keep, kept, pc
 from pc2grid_lab.experiments.recordings.driven import digest_of_drive, write_drive
 from pc2grid_lab.experiments.recordings.thinned import write_thinned
 from pc2grid_lab.experiments.stored import in_processes
+from signature.config import ShortlistBy
 
 _RESULTS = ("maps", "bare", "answers", "followed")
 """Folders of results."""
@@ -30,11 +31,12 @@ class Folder:
     """Where the maps and answers of one run are.
 
     data : the folder of recordings. work : of everything that is made. Both are absolute, as the commands
-        run in another folder.
+        run in another folder. shortlist : `signature.config.RelocalizeConfig.shortlist_by` of the answers.
     """
 
     data: Path
     work: Path
+    shortlist: ShortlistBy = "signatures"
 
     def source(self, recording: Recording) -> Path:
         """The file that the commands read; if it is thinned or driven, `_make` makes it.
@@ -77,7 +79,8 @@ class Folder:
     def answer(self, pair: Pair, window: TimeSpan) -> Path:
         """The result of `relocalize` for a window."""
         named = f"{plain(pair.query)}.in.{plain(pair.map_name)}"
-        return self.work / "answers" / f"{named}.{window.start_s:.2f}s.{window.duration_s:g}s.json"
+        answers = "answers" if self.shortlist == "signatures" else f"answers_{self.shortlist}"
+        return self.work / answers / f"{named}.{window.start_s:.2f}s.{window.duration_s:g}s.json"
 
     def missing(self, recording: Recording) -> bool:
         """Whether the data folder lacks the recording, so that it is a gap of the page."""
@@ -244,5 +247,7 @@ def _locate(folder: Folder, recording: Recording, pair: Pair, window: TimeSpan) 
         folder.map(pair.map_name),
         *recording.options,
         *span,
+        "--set",
+        f"relocalize.shortlist_by={folder.shortlist}",
     )
     return Task(folder.answer(pair, window), lambda: pc2grid("-q", "relocalize", *arguments, "--json"), 0.0)
