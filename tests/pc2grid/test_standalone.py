@@ -34,5 +34,5 @@ def test_what_is_passed_on_is_the_same_thing() -> None:
     import pc2grid
     import signature
 
-    for name in ("Answer", "Config", "convert", "locate", "open_database", "relocalize"):
+    for name in ("Answer", "Config", "convert", "Localizer", "open_database", "relocalize"):
         assert getattr(pc2grid, name) is getattr(signature, name)

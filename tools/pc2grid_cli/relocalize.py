@@ -460,7 +460,7 @@ def _warn_of_unjoined(answer: Answer, database: SubmapDatabase) -> None:
     """Say what may make one place of two, where the best of them are in sessions that are not joined."""
     if answer.status != "ambiguous" or 1 not in answer.places:
         return
-    a, b = (answer.hypotheses[answer.places.index(place)].session_index for place in (0, 1))
+    a, b = sorted(answer.hypotheses[answer.places.index(place)].session_index for place in (0, 1))
     one, other = answer.sessions[a], answer.sessions[b]
     frames = database.frames()
     joined = one in frames and other in frames and frames[one].name == frames[other].name

@@ -17,7 +17,7 @@ from pc2grid.io import open_log
 from pc2grid.mapping.drawn_map import is_drawn_map
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
-from pc2grid_cli import console, tables
+from pc2grid_cli import console
 from pc2grid_cli.known_pose import KnownPose
 from pc2grid_cli.locate import Found, find_log, find_map
 from signature.files import query_config
@@ -111,6 +111,8 @@ def find_all(
 
 def show(answers: Sequence[tuple[Window, Answer | None]]) -> None:
     """Print a table with a line for each query."""
+    from pc2grid_cli import tables
+
     counts = Counter("failed" if answer is None else answer.status for _, answer in answers)
     title = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.most_common())
     texts = ("recording", "answer", "in")
