@@ -1,10 +1,50 @@
 """Every error that pc2grid raises on purpose, as one tree.
 
 The library raises; only the command line prints and exits. A message is one line that says what is
-wrong and where; `hint` says what to type next.
+wrong and where; `hint` says what to type next: the command line prints it as it is, `str` in terms of Python.
 """
 
 from __future__ import annotations
+
+import re
+
+
+def _setting(found: re.Match[str]) -> str:
+    """A setting of the command line as an argument in Python."""
+    section, key, value = found.groups()
+    known = {"true": "True", "false": "False"}.get(value)
+    plain = value if re.fullmatch(r"-?[\d.]+|N", value) else repr(value)
+    return f"config=Config({section}={{'{key}': {known or plain}}})"
+
+
+_IN_PYTHON = (
+    (r"--set (\w+)\.(\w+)=([^\s,;()]+)", _setting),
+    (r"--(topic|odometry|imu) ([^\s,;()]+(?:,/[^\s,;()]+)*)", r"config=Config(read={'\1': '\2'})"),
+    (r"--(topic|odometry|imu)", r"config=Config(read={'\1': ...})"),
+    (r"--start and --duration", "span=TimeSpan(start_s, duration_s)"),
+    (r"--start\b", "start_m"),
+    (r"--near X Y RADIUS", "prior=Prior.around(x_m, y_m, radius_m)"),
+    (r"--force", "overwrite=True"),
+    (r"--(recover|add)", r"\1=True"),
+    (r"--(name|session|floor)\b( NAME)?", r"\1=..."),
+    (r"`?pc2grid convert (\S+) -o ([^\s`]+)`?", r'pc2grid.convert("\1", "\2")'),
+    (r"`pc2grid info ([^`]+)`", r'pc2grid.open_log("\1").info'),
+)
+"""What stands for options of the command line in Python, in this order."""
+
+
+def in_python(hint: str) -> str:
+    """A hint for the command line as one for Python.
+
+    >>> print(in_python("choose one, e.g. --topic /front"))
+    choose one, e.g. config=Config(read={'topic': '/front'})
+    >>> print(in_python("--set read.max_points=1000 raises it"))
+    config=Config(read={'max_points': 1000}) raises it
+    """
+    parts = re.split(r"(`pc2grid db .*?`)", hint)  # these have no function that is as short
+    for option, argument in _IN_PYTHON:
+        parts[::2] = [re.sub(option, argument, part) for part in parts[::2]]
+    return "".join(parts)
 
 
 def one_line(text: str) -> str:
@@ -29,6 +69,11 @@ class Pc2GridError(Exception):
         super().__init__(self.message)
 
     def __str__(self) -> str:
+        return self.message if self.hint is None else f"{self.message} ({in_python(self.hint)})"
+
+    @property
+    def in_short(self) -> str:
+        """Message and hint in one line, as the command line says them."""
         return self.message if self.hint is None else f"{self.message} ({self.hint})"
 
 

@@ -43,7 +43,7 @@ def convert(
     recover: bool = False,
     label: Label | None = None,
     add: bool = False,
-    force: bool = False,
+    overwrite: bool = False,
     observer: Observer | None = None,
 ) -> SessionMap:
     """Make a session of a recording or a map, and store it in a database.
@@ -55,11 +55,11 @@ def convert(
     database : the file to make, such as `building.submaps`, or a postgresql:// URL.
     name : of the session; by default that of the file.
     span, recover, label : as in `signature.build_session`.
-    add : add the session to an existing database. force : replace an existing database or, with `add`, a
+    add : add the session to an existing database. overwrite : replace an existing database or, with `add`, a
         session of the same name.
     observer : gets the news; None: a progress bar on a terminal or in a notebook.
 
-    Raises OutputError, before any work, for an existing database without `add` and `force` and for one that
+    Raises OutputError, before any work, for an existing database without `add` and `overwrite` and for one that
     cannot be written; else as `signature.build_session` and `signature.add_session`.
 
     >>> import pc2grid
@@ -67,10 +67,10 @@ def convert(
     >>> monday.session, monday.sensor
     ('monday', 'laser')
     """
-    if not (add or force) and exists(database):
-        raise OutputError(f"{database}: exists already", hint="force=True replaces it, add=True adds to it")
+    if not (add or overwrite) and exists(database):
+        raise OutputError(f"{database}: exists already", hint="overwrite=True replaces it, add=True adds to it")
     if not is_url(database):
-        require_writable(Path(database), force=True)
+        require_writable(Path(database), overwrite=True)
     maps, origin = build_sessions(
         source,
         name or Path(source).stem,
@@ -80,7 +80,7 @@ def convert(
         label=label,
         observer=observer or ProgressBars(),
     )
-    add_sessions(database, [(made, origin) for made in maps], config, keep=add, force=force)
+    add_sessions(database, [(made, origin) for made in maps], config, keep=add, overwrite=overwrite)
     return max(maps, key=lambda part: part.trajectory.length_m)
 
 

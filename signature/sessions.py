@@ -206,11 +206,11 @@ def add_session(
     config: Config,
     provenance: Provenance,
     *,
-    force: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Describe a session and add it to a database file, which is created if it does not exist.
 
-    force : replace a session of the same name.
+    overwrite : replace a session of the same name.
 
     Raises the errors of `SubmapDatabase.add`.
 
@@ -223,7 +223,7 @@ def add_session(
     ...     [session.name for session in database.sessions()]
     ['monday']
     """
-    add_sessions(database, [(session_map, provenance)], config, keep=True, force=force)
+    add_sessions(database, [(session_map, provenance)], config, keep=True, overwrite=overwrite)
 
 
 def add_sessions(
@@ -232,7 +232,7 @@ def add_sessions(
     config: Config,
     *,
     keep: bool = True,
-    force: bool = False,
+    overwrite: bool = False,
     observer: Observer = Observer(),
 ) -> None:
     """Describe several sessions and store them in one transaction.
@@ -240,4 +240,4 @@ def add_sessions(
     keep : add them to the sessions of the file; otherwise they replace them.
     """
     entries = [(m, describe_all(m, config, observer), origin) for m, origin in sessions]
-    store(database, entries, keep=keep, force=force)
+    store(database, entries, keep=keep, overwrite=overwrite)

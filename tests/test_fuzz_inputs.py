@@ -232,7 +232,7 @@ def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: i
         try:
             if number % 5 == 0:  # costs more than all the rest
                 problems = check(path)
-                copy(path, saved, recover=True, force=True)
+                copy(path, saved, recover=True, overwrite=True)
                 assert check(saved) == ()
                 with open_database(saved) as database:
                     found = sessions_of(database)

@@ -62,26 +62,26 @@ def replace_file(path: str | Path, *, alone: bool = False) -> Iterator[Path]:
         os.close(descriptor)
 
 
-def refuse_existing(path: str | Path, force: bool) -> None:
-    """Raise OutputError if `path` exists and `force` is not set."""
-    if not force and Path(path).exists():
+def refuse_existing(path: str | Path, overwrite: bool) -> None:
+    """Raise OutputError if `path` exists and `overwrite` is not set."""
+    if not overwrite and Path(path).exists():
         raise OutputError(f"{path}: exists already", hint="--force replaces it")
 
 
-def require_writable(path: str | Path, force: bool) -> None:
+def require_writable(path: str | Path, overwrite: bool) -> None:
     """Refuse a target that cannot be written, before the work for it begins.
 
     A temporary file is made in the folder of the target and removed: permissions alone do not tell, for
     example on a read-only disk.
 
-    Raises OutputError if `path` exists and `force` is not set, if it is a folder, or if its folder is missing
-    or not writable.
+    Raises OutputError if `path` exists and `overwrite` is not set, if it is a folder, or if its folder is
+    missing or not writable.
     """
     path = Path(path)
     try:
         if path.is_dir():
             raise OutputError(f"{path}: is a folder", hint="name a file to write to")
-        refuse_existing(path, force)
+        refuse_existing(path, overwrite)
         target = Path(os.path.realpath(path))
         temporary, descriptor = _create(target, lock=True)
         os.close(descriptor)

@@ -269,7 +269,7 @@ def map_cloud(
         raise MapFileError(
             "the floor of the cloud is seen nowhere without something on it",
             hint=f"obstacles are what is {projection.band_min_m:g} to {projection.band_max_m:g} m above the"
-            " floor (--set projection.band_min_m, band_max_m)",
+            " floor (settings projection.band_min_m and band_max_m)",
         )
     _draw(builder, points, origin_m, projection, p)
     return builder.grid()

@@ -53,12 +53,12 @@ def simulate_session(
     grid: OccupancyGrid | Building | None = None,
     config: SimulationConfig | None = None,
     progress: Callable[[float], None] | None = None,
-    force: bool = False,
+    overwrite: bool = False,
 ) -> SimulatedSession:
     """Drive through a building and record it.
 
     out : MCAP to write; the ground truth is written beside it as `.tum`. Existing files are refused without
-        `force`.
+        `overwrite`.
     grid : the floor plan, or a real building; None for the procedural office of `config.building_seed`.
     progress : called with the share that is done, 0..1.
 
@@ -74,11 +74,11 @@ def simulate_session(
     out = Path(out)
     truth_path = out.with_suffix(".tum")
     for path in (out, truth_path):
-        refuse_existing(path, force)
+        refuse_existing(path, overwrite)
     session = prepare_session(sensor=sensor, grid=grid, config=config)
     count = session.scan_count
     stamps, poses = [], []
-    with LogWriter(out, force=force) as log:
+    with LogWriter(out, overwrite=overwrite) as log:
         about = {"sensor": session.sensor.kind, "config": session.config.model_dump_json()}
         log.metadata("pc2grid.simulation", about)
         log.tf_static(EPOCH_NS, BASE_FRAME, session.sensor.frame, session.sensor.T_base_sensor)

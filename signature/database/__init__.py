@@ -38,8 +38,8 @@ def open_database(path_or_url: Place, *, writable: bool = False) -> SubmapDataba
     return engine_of(path_or_url).open(path_or_url, writable=writable)
 
 
-def create_database(path_or_url: Place, *, force: bool = False) -> SubmapDatabase:
-    """Make an empty database and open it for writing; an existing one is replaced only with `force`.
+def create_database(path_or_url: Place, *, overwrite: bool = False) -> SubmapDatabase:
+    """Make an empty database and open it for writing; an existing one is replaced only with `overwrite`.
 
     Raises OutputError if the file is there already or cannot be written, DatabaseBusy if another
     process is writing it.
@@ -48,14 +48,14 @@ def create_database(path_or_url: Place, *, force: bool = False) -> SubmapDatabas
     ...     database.sessions()
     ()
     """
-    refuse_existing(path_or_url, force)
+    refuse_existing(path_or_url, overwrite)
     engine_of(path_or_url).change(path_or_url, lambda rows: None, keep=False, create=True)
     return open_database(path_or_url, writable=True)
 
 
-def refuse_existing(place: Place, force: bool) -> None:
-    """Raise OutputError if there is something already, and `force` is not set."""
-    if not force and engine_of(place).exists(place):
+def refuse_existing(place: Place, overwrite: bool) -> None:
+    """Raise OutputError if there is something already, and `overwrite` is not set."""
+    if not overwrite and engine_of(place).exists(place):
         where = location(str(place)) if is_url(place) else str(place)
         raise OutputError(f"{where}: exists already", hint="--force replaces it")
 

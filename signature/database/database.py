@@ -223,10 +223,10 @@ class SubmapDatabase(ABC):
         signatures: Sequence[Signature],
         provenance: Provenance,
         *,
-        force: bool = False,
+        overwrite: bool = False,
     ) -> None:
         """Store a session in one transaction. The same session again changes nothing; another one of the
-        same name is refused with DatabaseError, or replaced with `force`.
+        same name is refused with DatabaseError, or replaced with `overwrite`.
 
         Of the submaps their centres are stored: they are cut from the map again, with the settings of
         `provenance`. Raises ValueError for submaps and signatures of other sizes than these settings make.
@@ -235,7 +235,7 @@ class SubmapDatabase(ABC):
             raise DatabaseError(f"{self.location}: opened for reading only")
         session = stored_session((session_map, signatures, provenance))
         try:
-            self.change(self._place, lambda rows: rows.store([session], force=force))
+            self.change(self._place, lambda rows: rows.store([session], overwrite=overwrite))
         finally:
             self._renew()
 

@@ -20,22 +20,22 @@ _MOST_PARTS = 100
 """Parts of one recording that are looked for; a recording of 1.9 km without loops falls into 9."""
 
 
-def store(target: Place, entries: Iterable[Entry], *, keep: bool, force: bool = False) -> None:
+def store(target: Place, entries: Iterable[Entry], *, keep: bool, overwrite: bool = False) -> None:
     """Write sessions in one transaction, all or none; the database is made if there is none.
 
     entries : may be iterated over more than once.
     keep : add them to the sessions of the database; otherwise they become its whole content.
-    force : replace a session of the same name instead of refusing the new one, and with it the other parts of
-        the recording that it was made from.
+    overwrite : replace a session of the same name instead of refusing the new one, and with it the other
+        parts of the recording that it was made from.
 
     Raises as `SubmapDatabase.add`.
     """
-    names = [clean(session_map.session) for session_map, _, _ in entries] if keep and force else []
+    names = [clean(session_map.session) for session_map, _, _ in entries] if keep and overwrite else []
     drop = _other_parts(target, names) if names and exists(target) else []
 
     def write(rows: Rows) -> None:
         rows.remove([name for name in drop if rows.find(name) is not None])
-        rows.store(map(stored_session, entries), force=force)
+        rows.store(map(stored_session, entries), overwrite=overwrite)
 
     engine_of(target).change(target, write, keep=keep, create=True)
 
@@ -106,15 +106,17 @@ def check(source: Place) -> tuple[Problem, ...]:
     return engine_of(source).problems_of(source)
 
 
-def copy(source: Place, target: Place, *, recover: bool = False, force: bool = False) -> tuple[Problem, ...]:
+def copy(
+    source: Place, target: Place, *, recover: bool = False, overwrite: bool = False
+) -> tuple[Problem, ...]:
     """Write a compact copy, on the same or another engine.
 
     With `recover`, what follows from the map of a session (junction graph, submaps and their signatures, what
     is seen) is computed again where it is damaged; damaged points, and sessions of which another part is
     damaged, are left out. Returns all damage. Raises DatabaseCorrupt for damage without `recover`,
-    OutputError if `target` exists without `force`.
+    OutputError if `target` exists without `overwrite`.
     """
-    refuse_existing(target, force)
+    refuse_existing(target, overwrite)
     problems = check(source)
     if problems and not recover:
         more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
@@ -123,13 +125,13 @@ def copy(source: Place, target: Place, *, recover: bool = False, force: bool = F
     return problems
 
 
-def merge(sources: Sequence[Place], target: Place, *, force: bool = False) -> int:
+def merge(sources: Sequence[Place], target: Place, *, overwrite: bool = False) -> int:
     """Put the sessions of several databases into a new one; returns how many.
 
     A session that several of them hold is taken once. Raises DatabaseError if a database is named twice, if
     two different sessions share a name, or were made with settings whose submaps cannot be compared.
     """
-    refuse_existing(target, force)
+    refuse_existing(target, overwrite)
     _refuse_repeated(sources)
     chosen: dict[str, tuple[SessionInfo, Place]] = {}
     for source in sources:
@@ -148,13 +150,13 @@ def merge(sources: Sequence[Place], target: Place, *, force: bool = False) -> in
     return len(chosen)
 
 
-def split(source: Place, names: Sequence[str], target: Place, *, force: bool = False) -> int:
+def split(source: Place, names: Sequence[str], target: Place, *, overwrite: bool = False) -> int:
     """Copy sessions of a database into a new one; returns how many. `source` stays as it is.
 
     Raises DatabaseError for a name that no session has, or for a `target` that is `source`; OutputError if
-    `target` exists without `force`.
+    `target` exists without `overwrite`.
     """
-    refuse_existing(target, force)
+    refuse_existing(target, overwrite)
     _refuse_repeated([source, target])
     with open_database(source) as database:
         known = [info.name for info in database.sessions(names)]
@@ -182,7 +184,7 @@ def _write(
                         yield database.stored(info.name, recover=recover)
 
     engine_of(target).change(
-        target, lambda rows: rows.store(sessions(), force=False), keep=False, create=True
+        target, lambda rows: rows.store(sessions(), overwrite=False), keep=False, create=True
     )
 
 

@@ -152,10 +152,10 @@ class Rows(ABC):
 
     # --- writing: within a transaction ----------------------------------------------------------------
 
-    def store(self, sessions: Iterable[StoredSession], *, force: bool) -> None:
+    def store(self, sessions: Iterable[StoredSession], *, overwrite: bool) -> None:
         """Add sessions. One that is stored already is passed over.
 
-        force : replace a session of the same name.
+        overwrite : replace a session of the same name.
 
         Raises DatabaseError for a session of that name with other content, or with signatures that cannot be
         compared with those of the other sessions.
@@ -167,7 +167,7 @@ class Rows(ABC):
             if other is not None:
                 refuse_other_settings(other, info, self.location)
             known = self.find(info.name)
-            if known is not None and not force:
+            if known is not None and not overwrite:
                 if known.document == text:
                     continue
                 raise DatabaseError(

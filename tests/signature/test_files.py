@@ -60,14 +60,14 @@ def test_what_exists_is_kept_unless_one_says_so(building: Path, tmp_path: Path) 
     plan, target = building / "plan.yaml", tmp_path / "all.submaps"
     target.write_bytes((building / "plan.submaps").read_bytes())
     before = target.read_bytes()
-    with pytest.raises(OutputError, match=r"exists already.*force=True"):
+    with pytest.raises(OutputError, match=r"exists already.*overwrite=True"):
         convert(tmp_path / "never looked at", target)
     with pytest.raises(DatabaseError, match="plan"):  # another session of that name: it has no label
         convert(plan, target, add=True)
     assert target.read_bytes() == before
     convert(plan, target, name="again", add=True)
     assert names(target) == ["plan", "again"]
-    convert(plan, target, name="alone", force=True)
+    convert(plan, target, name="alone", overwrite=True)
     assert names(target) == ["alone"]
 
 

@@ -162,7 +162,7 @@ def _store(outcome: conversion_jobs.Outcome, output: str, *, keep: bool, force: 
     if not outcome.entries:
         return outcome.error
     try:
-        maintenance.store(output, outcome.entries, keep=keep, force=force)
+        maintenance.store(output, outcome.entries, keep=keep, overwrite=force)
     except DatabaseError as refusal:
         if type(refusal) is not DatabaseError:  # a subclass: the database itself cannot be used
             raise

@@ -111,7 +111,7 @@ def db_merge_command(
 
     Example: pc2grid db merge monday.submaps tuesday.submaps -o week.submaps
     """
-    count = merge(databases, output, force=force)
+    count = merge(databases, output, overwrite=force)
     if json:
         console.print_json(plain(DbWrite, written(output)))
     else:
@@ -129,7 +129,7 @@ def db_copy_command(
 
     Example: pc2grid db copy --recover damaged.submaps -o good.submaps
     """
-    problems = copy(database, output, recover=recover, force=force)
+    problems = copy(database, output, recover=recover, overwrite=force)
     for problem in problems:
         console.warn(f"left out: {problem.where}: {problem.what}")
     if json:
@@ -160,7 +160,7 @@ def db_split_command(
 
     Example: pc2grid db split building.submaps monday -o monday.submaps
     """
-    count = split(database, sessions, output, force=force)
+    count = split(database, sessions, output, overwrite=force)
     if json:
         console.print_json(plain(DbWrite, written(output)))
     else:

@@ -61,12 +61,12 @@ def demo_command(
             building_seed=BUILDING_SEED,
             lidar=LidarConfig(rate_hz=5.0, columns=450),
         )
-        simulate_session(lidar, sensor="lidar", grid=None, config=mapper, progress=update, force=force)
+        simulate_session(lidar, sensor="lidar", grid=None, config=mapper, progress=update, overwrite=force)
     with terminal.progress("simulate depth") as update:
         visitor = SimulationConfig(
             length_m=QUERY_LENGTH_M, seed=12, start_m=QUERY_START_M, building_seed=BUILDING_SEED
         )
-        simulate_session(depth, sensor="depth", grid=None, config=visitor, progress=update, force=force)
+        simulate_session(depth, sensor="depth", grid=None, config=visitor, progress=update, overwrite=force)
 
     terminal.note("2/4 convert the lidar's recording into a database")
     config = Config()

@@ -29,7 +29,7 @@ def write_session(
 ) -> None:
     """A session's map, path and submaps, and the poses of its robot over time. of : what the map shows."""
     poses = database.trajectory(session)
-    with LogWriter(path, force=force) as writer:
+    with LogWriter(path, overwrite=force) as writer:
         _write_map(writer, database, session, int(poses.stamps_ns[0]) if len(poses) else 0, of)
         if len(poses):
             writer.path("/path", poses)
@@ -46,7 +46,7 @@ def write_answer(
     assert answer.T_map_odom is not None
     assert answer.covariance is not None
     first, last = int(located.stamps_ns[0]), int(located.stamps_ns[-1])
-    with LogWriter(path, force=force) as writer:
+    with LogWriter(path, overwrite=force) as writer:
         _write_map(writer, database, answer.session, first)
         way = database.trajectory(answer.session)
         if len(way):
@@ -69,7 +69,7 @@ def write_located_map(
     assert answer.session is not None
     assert answer.T_map_odom is not None
     assert answer.covariance is not None
-    with LogWriter(path, force=force) as writer:
+    with LogWriter(path, overwrite=force) as writer:
         _write_map(writer, database, answer.session, 0)
         writer.occupancy_grid("/query_map", 0, query, frame="query_map")
         writer.tf_static(0, "map", "query_map", answer.T_map_odom.lift())

@@ -141,7 +141,7 @@ def describe(
             for _ in itertools.islice(log.scans(), _TRIED_SCANS):
                 pass
         except Pc2GridError as error:
-            problem = str(error)
+            problem = error.in_short
         else:
             choice = {
                 "topic": chosen.topic,

@@ -74,7 +74,7 @@ def check_database_name(output: str) -> None:
 def check_database(output: str) -> None:
     """Raises OutputError if the file of a database cannot be written; a server is asked later."""
     if not is_url(output):
-        require_writable(output, force=True)
+        require_writable(output, overwrite=True)
 
 
 def make_folder(path: Path) -> None:
@@ -85,4 +85,4 @@ def make_folder(path: Path) -> None:
         raise OutputError(
             f"{path}: cannot make this folder: {error.strerror}", hint="choose another one with --output"
         ) from error
-    require_writable(path / "results", force=True)
+    require_writable(path / "results", overwrite=True)

@@ -59,7 +59,7 @@ def simulate_command(
     )
     with console.of(context).progress(f"simulate {sensor.value}") as update:
         made = simulate_session(
-            files[-1], sensor=sensor.value, grid=grid, config=config, progress=update, force=force
+            files[-1], sensor=sensor.value, grid=grid, config=config, progress=update, overwrite=force
         )
     if made.clutter < clutter:
         console.warn(f"only {made.clutter} of {clutter} pieces of clutter could be placed")

@@ -202,7 +202,7 @@ class _Following:
                     if poll():
                         break
             except TrackingLost as error:
-                console.warn(str(error))
+                console.warn(error.in_short)
             if over:
                 return
             follower.restart()

@@ -47,14 +47,14 @@ class Marker:
 class LogWriter:
     """Write one MCAP. The file gets its name only when the `with` block ends without an error.
 
-    path : file to write; an existing one is refused with OutputError unless `force` is set.
+    path : file to write; an existing one is refused with OutputError unless `overwrite` is set.
 
     Log time and publish time of every message are its stamp. Messages may be written in any order of time.
     """
 
-    def __init__(self, path: Path, *, force: bool = False) -> None:
+    def __init__(self, path: Path, *, overwrite: bool = False) -> None:
         self._target = Path(path)
-        refuse_existing(self._target, force)
+        refuse_existing(self._target, overwrite)
         self._stack = contextlib.ExitStack()
         self._writer: Writer | None = None
         self._channels: dict[tuple[str, str], int] = {}

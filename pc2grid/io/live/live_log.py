@@ -296,7 +296,7 @@ class LiveLog:
     def _tell_late(self, error: Pc2GridError) -> None:
         """Report what is still missing, after `silent_s` or at the end of the feed."""
         if self._clock() - self._begun_s > self._parameters.silent_s or self.feed.ended:
-            self.news.tell(str(error))
+            self.news.tell(error.in_short)
 
     # --- odometry, now --------------------------------------------------------------------------------
 

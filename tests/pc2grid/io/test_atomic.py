@@ -22,7 +22,7 @@ import os, sys
 os.getpid = lambda: 1
 from pc2grid.io.atomic import replace_file, require_writable
 path, content = sys.argv[1:]
-require_writable(path, force=True)
+require_writable(path, overwrite=True)
 with replace_file(path) as temporary, temporary.open("w") as file:
     file.write(content[:3])
     file.flush()
@@ -81,7 +81,7 @@ def test_two_processes_of_the_same_number_write_the_same_file(tmp_path: Path) ->
     assert first.says() == "half"
     second = Container(WRITER, target, "second writer")
     assert second.says() == "half"
-    require_writable(target, force=True)  # a third one looks only
+    require_writable(target, overwrite=True)  # a third one looks only
     assert second.ends() == (0, "")
     assert target.read_text() == "second writer"
     assert first.ends() == (0, "")
@@ -129,7 +129,7 @@ def test_looking_whether_a_file_can_be_written_removes_nothing(
     mine.write_text("precious")
     (tmp_path / "elsewhere").write_text("as well")
     link.symlink_to("elsewhere")
-    require_writable(tmp_path / "a", force=False)
+    require_writable(tmp_path / "a", overwrite=False)
     assert mine.read_text() == "precious" and link.is_symlink()
     assert (tmp_path / "elsewhere").read_text() == "as well"
     assert sorted(tmp_path.iterdir()) == sorted([mine, link, tmp_path / "elsewhere"])
@@ -179,7 +179,7 @@ def test_threads_write_the_same_file(tmp_path: Path) -> None:
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc here")
 def test_a_folder_that_exists_is_not_to_be_created() -> None:
     for check in (
-        lambda path: require_writable(path, force=False),
+        lambda path: require_writable(path, overwrite=False),
         lambda path: replace_file(path).__enter__(),
     ):
         with pytest.raises(OutputError, match=r"/proc/x\.submaps: cannot write") as caught:

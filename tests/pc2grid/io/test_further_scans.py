@@ -114,4 +114,4 @@ def test_mistakes(
         read(write_mcap(tmp_path / "a.mcap", messages), ReadConfig(topic=topic))
     assert getattr(error.value, "hint", None)
     if topic is None:
-        assert "--topic /front,/rear" in str(error.value)
+        assert "--topic /front,/rear" in error.value.in_short

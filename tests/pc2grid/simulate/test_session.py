@@ -280,7 +280,7 @@ def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="exists"):
         simulate_session(tmp_path / "out.mcap", sensor="laser", config=config)
     assert [path.name for path in tmp_path.iterdir()] == ["out.tum"]
-    made = simulate_session(tmp_path / "out.mcap", sensor="laser", config=config, force=True)
+    made = simulate_session(tmp_path / "out.mcap", sensor="laser", config=config, overwrite=True)
     assert len(read_tum(made.truth_path)) == made.scans
 
 

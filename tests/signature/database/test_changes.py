@@ -57,7 +57,7 @@ def test_a_session_split_off_is_as_it_was(place: str | Path, tmp_path: Path) -> 
     assert everything(place) == before
     with pytest.raises(OutputError, match="exists already"):
         maintenance.split(place, ["monday"], alone)
-    assert maintenance.split(place, ["monday", "tuesday"], alone, force=True) == 2
+    assert maintenance.split(place, ["monday", "tuesday"], alone, overwrite=True) == 2
     assert everything(alone) == before
 
 
@@ -82,7 +82,7 @@ def test_what_is_refused_changes_nothing(place: str | Path, tmp_path: Path) -> N
 def test_a_file_is_changed_as_a_whole_or_not_at_all(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = path.read_bytes()
     with pytest.raises(DatabaseError, match="named twice"):
-        maintenance.split(path, ["monday"], path, force=True)
+        maintenance.split(path, ["monday"], path, overwrite=True)
 
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
@@ -113,6 +113,6 @@ def test_a_recording_that_is_replaced_takes_its_other_parts_along(place: str | P
     unrelated = (replace(TUESDAY[0], session="monday#4"), *TUESDAY[1:])
     maintenance.store(place, [*parts, unrelated], keep=True)
     assert names(place) == ["monday", "tuesday", "monday#2", "monday#3", "monday#4"]
-    maintenance.store(place, [make_entry("monday", 5), parts[0]], keep=True, force=True)
+    maintenance.store(place, [make_entry("monday", 5), parts[0]], keep=True, overwrite=True)
     assert sorted(names(place)) == ["monday", "monday#2", "monday#4", "tuesday"]
     assert maintenance.check(place) == ()

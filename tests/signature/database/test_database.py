@@ -74,7 +74,7 @@ def test_sessions_without_submaps_or_poses(place: str | Path) -> None:
 def test_nothing_there_is_no_database(empty: str | Path) -> None:
     with pytest.raises(NotADatabase, match=r"no such database|no submap database yet") as caught:
         open_database(empty)
-    assert "pc2grid convert" in str(caught.value)
+    assert "pc2grid.convert(" in str(caught.value)
 
 
 def test_a_handle_sees_what_was_there_when_it_was_opened(empty: str | Path) -> None:
@@ -149,7 +149,7 @@ def test_copy_and_merge_between_engines(place: str | Path, other: str, tmp_path:
         assert_holds(database, make_entry("friday", 5))
     store(third, [make_entry("monday", 9)], keep=False)
     with pytest.raises(DatabaseError, match="'monday'"):
-        maintenance.merge([place, third], targets[1], force=True)
+        maintenance.merge([place, third], targets[1], overwrite=True)
     with open_database(targets[1]) as database:
         assert len(database.sessions()) == 3
 
@@ -207,9 +207,9 @@ def test_adding_again_changes_nothing_and_another_of_the_name_needs_force(place:
         assert len(database.sessions()) == 2
         with pytest.raises(DatabaseError, match="another session named 'monday'") as caught:
             database.add(*make_entry("monday", 7))
-        assert "--force" in str(caught.value)
+        assert "overwrite=True" in str(caught.value)
         assert_holds(database, MONDAY)
-        database.add(*make_entry("monday", 7), force=True)
+        database.add(*make_entry("monday", 7), overwrite=True)
         assert_holds(database, make_entry("monday", 7))
         assert_holds(database, TUESDAY)
         assert [info.name for info in database.sessions()] == ["monday", "tuesday"]
@@ -221,7 +221,7 @@ def test_create_refuses_to_overwrite_and_leaves_what_is_there(place: str | Path)
     with pytest.raises(OutputError, match="exists"):
         create_database(place)
     assert everything(place) == before
-    with create_database(place, force=True) as database:
+    with create_database(place, overwrite=True) as database:
         assert database.sessions() == ()
         assert len(database.signatures()) == 0
 

@@ -311,7 +311,7 @@ def _write(place: maintenance.Place, mine: str, until: float, results: Any) -> N
         number += 1
         name = "both" if number % 5 == 0 else f"{mine}{number % 4}"
         try:
-            store(place, [make_entry(name, 100 + number % 3)], keep=True, force=True)
+            store(place, [make_entry(name, 100 + number % 3)], keep=True, overwrite=True)
             done += 1
         except DatabaseBusy:
             busy += 1
@@ -409,7 +409,7 @@ def test_adding_to_a_damaged_database_names_the_damage(path: Path) -> None:
         broken = data[:page] + b"\xa5" * 64 + data[page + 64 :]
         path.write_bytes(broken)
         try:
-            store(path, [make_entry("tuesday", 9, submaps=5)], keep=True, force=True)
+            store(path, [make_entry("tuesday", 9, submaps=5)], keep=True, overwrite=True)
         except (DatabaseCorrupt, OutputError) as error:
             assert str(path) in error.message
             assert path.read_bytes() == broken

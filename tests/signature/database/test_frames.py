@@ -56,7 +56,7 @@ def test_a_session_that_is_taken_apart_again_is_stored_as_before(path: Path) -> 
 def test_the_same_session_again_changes_nothing_and_another_one_has_no_frame(joined: str | Path) -> None:
     maintenance.store(joined, [TUESDAY], keep=True)
     assert frames(joined) == FRAMES
-    maintenance.store(joined, [make_entry("tuesday", 7)], keep=True, force=True)
+    maintenance.store(joined, [make_entry("tuesday", 7)], keep=True, overwrite=True)
     assert frames(joined) == {"monday": HERE}
 
 

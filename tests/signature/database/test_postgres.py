@@ -166,7 +166,7 @@ def test_rights_that_a_robot_needs(url: str) -> None:
         connection.execute("GRANT USAGE ON SEQUENCE pc2grid.session_id TO writer")
     writer, viewer = (with_user(url, role, "") for role in ("writer", "viewer"))
     store(writer, [make_entry("friday", 5)], keep=True)
-    store(writer, [make_entry("friday", 6)], keep=True, force=True)
+    store(writer, [make_entry("friday", 6)], keep=True, overwrite=True)
     with open_database(viewer, writable=True) as database:
         assert_holds(database, make_entry("friday", 6))
         with pytest.raises(DatabaseError, match="permission denied"):

@@ -117,7 +117,7 @@ def test_the_same_calls_give_the_same_bytes(tmp_path: Path) -> None:
 def test_an_existing_file_is_refused_and_kept(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     path.write_bytes(b"precious")
-    with pytest.raises(OutputError, match=r"exists already.*--force"), LogWriter(path):
+    with pytest.raises(OutputError, match=r"exists already.*overwrite=True"), LogWriter(path):
         pass
     assert path.read_bytes() == b"precious"
 
@@ -125,7 +125,7 @@ def test_an_existing_file_is_refused_and_kept(tmp_path: Path) -> None:
 def test_an_exception_leaves_the_old_file_and_no_temporary(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     path.write_bytes(b"precious")
-    with pytest.raises(ZeroDivisionError), LogWriter(path, force=True) as out:
+    with pytest.raises(ZeroDivisionError), LogWriter(path, overwrite=True) as out:
         out.tf_static(STAMP, "a", "b", np.eye(4))
         _ = 1 / 0
     assert path.read_bytes() == b"precious"

@@ -39,7 +39,7 @@ def write_drive(scan: Path, target: Path, drive: Drive) -> None:
         }
     )
     target.parent.mkdir(parents=True, exist_ok=True)
-    simulate_session(target, sensor=drive.sensor, grid=building, config=config, force=True)
+    simulate_session(target, sensor=drive.sensor, grid=building, config=config, overwrite=True)
 
 
 @cache
