@@ -1,10 +1,10 @@
-"""Map a sensor that pc2grid does not know: your reader makes Scans, the rest does not change.
+"""Map a sensor that pc2grid does not know, and locate it: your reader makes Scans, the rest does not change.
 
 Here the sensor is a text file with one scan in each line: a time in seconds, then distances in metres at
 equally spaced bearings from -135 to 135 degrees, from a scanner 0.2 m in front of the robot's base. `nan`: no
 return.
 
-python examples/own_sensor.py scans.txt own.submaps
+python examples/own_sensor.py monday.txt tuesday.txt own.submaps
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def read_scans(path: Path) -> Iterator[pc2grid.Scan]:
             )
 
 
-def main(recording: str, database: str) -> None:
-    """Map the scans of the reader, and store the map."""
+def main(recording: str, query: str, database: str) -> None:
+    """Map the scans of a recording, store the map, and find in it where another recording was made."""
     config = signature.Config()
     path = Path(recording)
     grid, trajectory, loops = pc2grid.map_scans(read_scans(path), config)
@@ -58,6 +58,11 @@ def main(recording: str, database: str) -> None:
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     signature.add_session(database, session, config, signature.provenance(path, digest, config))
     print(f"{len(trajectory)} scans, {len(session.submaps)} submaps, {len(loops)} loops closed")
+    with pc2grid.open_database(database) as opened:
+        localizer = pc2grid.Localizer(pc2grid.MapIndex.of(opened, config))
+        for registered, planar_scan in pc2grid.follow(read_scans(Path(query)), config):
+            localizer.add(registered, planar_scan)
+        print(localizer.answer())
 
 
 if __name__ == "__main__":

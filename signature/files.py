@@ -5,14 +5,17 @@ from __future__ import annotations
 import contextlib
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from pc2grid.errors import ConfigError, OutputError
 from pc2grid.io.atomic import require_writable
 from pc2grid.io.recording import open_log
 from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
-from pc2grid.model import SessionMap
+from pc2grid.model import SessionMap, Trajectory
 from pc2grid.observer import Observer, ProgressBars
 from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
@@ -20,16 +23,21 @@ from signature.config import Config
 from signature.database import Label, open_database
 from signature.database.maintenance import exists
 from signature.database.postgres.server import is_url
+from signature.localization.answer import NO_POSES, Asked
 from signature.localization.answering import locate_map
 from signature.localization.localizer import Estimate, Localizer
+from signature.localization.located_path import followed
 from signature.localization.map_index import MapIndex
 from signature.sessions import add_sessions, build_sessions
 
 if TYPE_CHECKING:
     from pc2grid.io.recording import Log
+    from pc2grid.mapping.drawn_map import DrawnMap
     from pc2grid.model import RegisteredScan
     from signature.database import SubmapDatabase
     from signature.localization.answer import Answer
+    from signature.localization.answer_json import QueryRecording
+    from signature.localization.pose_check import PoseCheck
     from signature.localization.prior import Prior
 
 
@@ -59,8 +67,8 @@ def convert(
         session of the same name.
     observer : gets the news; None: a progress bar on a terminal or in a notebook.
 
-    Raises OutputError, before any work, for an existing database without `add` and `overwrite` and for one that
-    cannot be written; else as `signature.build_session` and `signature.add_session`.
+    Raises OutputError, before any work, for an existing database without `add` and `overwrite` and for one
+    that cannot be written; else as `signature.build_session` and `signature.add_session`.
 
     >>> import pc2grid
     >>> monday = pc2grid.convert("monday.mcap", "new.submaps", span=pc2grid.TimeSpan(0.0, 2.0))
@@ -68,7 +76,7 @@ def convert(
     ('monday', 'laser')
     """
     if not (add or overwrite) and exists(database):
-        raise OutputError(f"{database}: exists already", hint="overwrite=True replaces it, add=True adds to it")
+        raise OutputError(f"{database}: exists already", hint="--force replaces it, --add adds to it")
     if not is_url(database):
         require_writable(Path(database), overwrite=True)
     maps, origin = build_sessions(
@@ -108,7 +116,7 @@ def relocalize(
         or in a notebook.
 
     Raises the errors of `pc2grid.open_log` and `signature.open_database`, MapFileError for a map, and NoScans
-    if no scan can be used.
+    if no scan can be used. `Answer.plot`, `report` and `save` show the answer.
 
     >>> import pc2grid
     >>> answer = pc2grid.relocalize("tuesday.mcap", "building.submaps", until_located=True)
@@ -118,18 +126,29 @@ def relocalize(
     >>> pc2grid.relocalize("tuesday.mcap", "building.submaps", prior=elsewhere).status
     'not_found'
     """
-    observer = observer or ProgressBars()
+    observer, path = observer or ProgressBars(), Path(query)
     with open_places(database, config) as opened:
         settings = query_config(opened, config)
         index = MapIndex.of(opened, settings, observer)
-        if is_drawn_map(Path(query)):
+        if is_drawn_map(path):
             if prior is not None:
                 raise ConfigError("prior: there is no robot in a map")
-            return locate_map(load_drawn_map(query, settings).grid, index)
-        if prior is not None:
-            index = index.within(prior)
-        with open_log(query, settings.read, recover=recover) as log:
-            return locate_log(log, index, settings, span=span, until_located=until_located, observer=observer)
+            drawn, poses = load_drawn_map(query, settings), NO_POSES
+            answer = locate_map(drawn.grid, index)
+            about = about_map(path, drawn, answer)
+        else:
+            with open_log(query, settings.read, recover=recover) as log:
+                answer, poses = locate_log(
+                    log,
+                    index if prior is None else index.within(prior),
+                    settings,
+                    span=span,
+                    until_located=until_located,
+                    observer=observer,
+                )
+                about = about_log(path, log, answer, scans=len(poses), span=span)
+    asked = Asked(poses=poses, about=about, database=str(database), accept=settings.relocalize.accept)
+    return replace(answer, asked=asked)
 
 
 @contextlib.contextmanager
@@ -163,8 +182,9 @@ def locate_log(
     until_located: bool = False,
     see: Callable[[RegisteredScan, Estimate | None], None] = lambda registered, estimate: None,
     observer: Observer = Observer(),
-) -> Answer:
-    """Find where an open recording, or the part of it that `span` names, was made.
+) -> tuple[Answer, Trajectory]:
+    """Find where an open recording, or the part of it that `span` names, was made; with its poses in its own
+    odometry frame, as `followed` corrects them.
 
     config : see `query_config`. until_located, observer : as in `relocalize`.
     see : called with each scan, and with what `Localizer.add` returned for it.
@@ -172,16 +192,53 @@ def locate_log(
     Raises NoScans if no scan can be used.
     """
     ends_ns = log.info.start_ns, log.info.end_ns
-    localizer = Localizer(index)
+    localizer, seen = Localizer(index), []
     with observer.step("locate", span.length_ns(*ends_ns) * 1e-9):
         for registered, planar_scan in follow(log.scans(span.start_s, span.duration_s), config, observer):
             estimate = localizer.add(registered, planar_scan)
             observer.on_scan(registered)
             observer.on_progress(span.share_done(registered.scan.stamp_ns, *ends_ns))
             see(registered, estimate)
+            seen.append((registered.scan.stamp_ns, registered.T_session_base, registered.health))
             if until_located and estimate is not None and estimate.answer.status == "located":
                 break
-        return localizer.answer()
+        answer = localizer.answer()
+    stamps_ns, poses, health = zip(*seen, strict=True)
+    way = Trajectory(stamps_ns=np.array(stamps_ns), T_session_base=np.array(poses), health=health)
+    return answer, followed(way, answer)
+
+
+def about_log(
+    path: Path, query: Log, answer: Answer | PoseCheck, *, scans: int, span: TimeSpan = TimeSpan()
+) -> QueryRecording:
+    """The description of a recording, or of a part of it, in the JSON document of the answer."""
+    report = query.report()
+    return {
+        "path_m": answer.path_m,
+        "stamp_ns": answer.stamp_ns,
+        "source": path.name,
+        "start_s": span.start_s,
+        "duration_s": span.duration_s,
+        "scans": scans,
+        "sensor": query.choose().sensor,
+        "lossy": report.lossy,
+        "warnings": list(report.warnings),
+    }
+
+
+def about_map(path: Path, drawn: DrawnMap, answer: Answer) -> QueryRecording:
+    """The same of a map."""
+    return {
+        "path_m": answer.path_m,
+        "stamp_ns": answer.stamp_ns,
+        "source": path.name,
+        "start_s": 0.0,
+        "duration_s": None,
+        "scans": 0,
+        "sensor": "map",
+        "lossy": False,
+        "warnings": list(drawn.warnings),
+    }
 
 
 def query_config(database: SubmapDatabase, config: Config) -> Config:

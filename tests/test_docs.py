@@ -348,24 +348,29 @@ def test_example_locate_a_robot(run: Run) -> None:
 
 
 def test_example_own_sensor(run: Run) -> None:
-    with pc2grid.open_log("tuesday.mcap") as log, Path("scans.txt").open("w") as out:
-        for scan in log.scans(0.0, 4.0):
-            x, y = (scan.points_m[:, :2] - [0.2, 0.0]).T
-            ranges = np.full(541, np.nan)
-            steps = np.rint((np.degrees(np.arctan2(y, x)) + 135.0) * 2).astype(int)
-            inside = (steps >= 0) & (steps <= 540)
-            ranges[steps[inside]] = np.hypot(x, y)[inside]
-            words = " ".join(f"{value:.4f}" for value in ranges)
-            out.write(f"{scan.stamp_ns * 1e-9:.4f} {words}\n")
-    (said,) = run("own_sensor.py", "scans.txt", "own.submaps")
+    def write(path: str, span: pc2grid.TimeSpan) -> None:
+        with pc2grid.open_log("tuesday.mcap") as log, Path(path).open("w") as out:
+            for scan in log.scans(span.start_s, span.duration_s):
+                x, y = (scan.points_m[:, :2] - [0.2, 0.0]).T
+                ranges = np.full(541, np.nan)
+                steps = np.rint((np.degrees(np.arctan2(y, x)) + 135.0) * 2).astype(int)
+                inside = (steps >= 0) & (steps <= 540)
+                ranges[steps[inside]] = np.hypot(x, y)[inside]
+                words = " ".join(f"{value:.4f}" for value in ranges)
+                out.write(f"{scan.stamp_ns * 1e-9:.4f} {words}\n")
+
+    whole = pc2grid.TimeSpan()
+    write("scans.txt", whole)
+    write("later.txt", pc2grid.TimeSpan(2.0))
+    mapped, located = run("own_sensor.py", "scans.txt", "later.txt", "own.submaps")
     with pc2grid.open_log("tuesday.mcap") as log:
-        wanted = pc2grid.build_map(
-            log, signature.Config(), session="tuesday", span=pc2grid.TimeSpan(0.0, 4.0)
-        )
+        wanted = pc2grid.build_map(log, signature.Config(), session="tuesday", span=whole)
     with signature.open_database("own.submaps") as database:
         way = database.trajectory("scans").planar()
-    assert said.startswith(f"{len(wanted.trajectory)} scans, ")
+    assert mapped.startswith(f"{len(wanted.trajectory)} scans, ")
     assert np.allclose(way, wanted.trajectory.planar(), atol=0.05)
+    (x, y) = (float(word) for word in re.findall(r"[xy] (-?[\d.]+) m", located))
+    assert located.startswith("Answer(located in 'scans'") and math.dist((x, y), way[-1, :2]) < 0.1
 
 
 def test_example_own_descriptor(run: Run) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import html
+import inspect
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -50,8 +52,8 @@ def test_commands_are_described_as_by_help(site: Path, command: str) -> None:
 def test_every_setting_and_every_public_name_has_its_place(site: Path) -> None:
     settings = text_of(site / "reference" / "settings.html")
     assert "radius_m = 5.0" in settings and "[relocalize]" in settings
-    for package in (pc2grid, signature):
-        page = (site / "reference" / f"{package.__name__}.html").read_text("utf-8")
+    for package, file in ((pc2grid, "pc2grid_more"), (signature, "signature")):
+        page = (site / "reference" / f"{file}.html").read_text("utf-8")
         for name in package.__all__:
             thing = getattr(package, name)
             if name[0] != "_":
@@ -60,11 +62,28 @@ def test_every_setting_and_every_public_name_has_its_place(site: Path) -> None:
 
 @pytest.mark.nightly
 def test_docstrings_are_set_as_text_lists_and_code(site: Path) -> None:
-    page = text_of(site / "reference" / "pc2grid.html")
+    page = text_of(site / "reference" / "pc2grid_more.html")
     assert "stamp_ns: when the scan was taken" in page and "stamp_ns : when" not in page
     assert ">>> monday = pc2grid.convert(" in page
-    raw = (site / "reference" / "pc2grid.html").read_text("utf-8")
+    raw = (site / "reference" / "pc2grid_more.html").read_text("utf-8")
     assert "&gt;&gt;&gt; " not in re.sub(r"<pre.*?</pre>", "", raw, flags=re.DOTALL)
+
+
+def test_what_people_need_has_a_short_example() -> None:
+    """That it runs, test_docs.py shows."""
+    pytest.importorskip("mkdocs", reason="needs the extra docs (mkdocs-material)")
+    needed = runpy.run_path(str(ROOT / "tools" / "docs_site.py"))["NEEDED"]
+    assert len(needed) == 12
+    for name in needed:
+        text = inspect.getdoc(getattr(pc2grid, name)) or ""
+        assert 1 <= len(re.findall(r"^(?:>>>|\.\.\.)", text, re.MULTILINE)) <= 10, name
+
+
+@pytest.mark.nightly
+def test_what_people_need_is_on_the_first_page_of_the_reference(site: Path) -> None:
+    page = text_of(site / "reference" / "pc2grid.html")
+    for words in ("pc2grid.convert(", "pc2grid.relocalize(", "answer.plot()", "overwrite : ", "Localizer("):
+        assert words.replace(" : ", ": ") in page
 
 
 @pytest.mark.nightly

@@ -50,8 +50,9 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     add(f"{NOTEBOOK}.md", notebook_page(ROOT / f"{NOTEBOOK}.ipynb"))
     add("reference/commands.md", commands_page())
     add("reference/settings.md", settings_page())
-    for package in ("pc2grid", "signature"):
-        add(f"reference/{package}.md", python_page(package))
+    add("reference/pc2grid.md", needed_page())
+    add("reference/pc2grid_more.md", python_page("pc2grid"))
+    add("reference/signature.md", python_page("signature"))
     return files
 
 
@@ -90,27 +91,43 @@ def settings_page() -> str:
     return f"# Settings\n\n{about}\n\n```toml\n{dump_settings(Config())}\n```\n"
 
 
+NEEDED = (
+    "convert", "relocalize", "Answer", "Prior", "TimeSpan", "Config",
+    "open_log", "follow", "build_map", "map_scans", "open_database", "Localizer",
+)  # fmt: skip
+"""The names of `pc2grid` that people need, in the order in which they meet them."""
+
+
+def needed_page() -> str:
+    """The twelve names that people need, for mkdocstrings to fill in."""
+    about = (
+        "Twelve names are enough for most programs. Each has an example that runs: `monday.mcap` and"
+        " `tuesday.mcap` are recordings, `building.submaps` is the database of the first. [All other"
+        " names](pc2grid_more.md) are on the next page."
+    )
+    entries = (_entry(f"pc2grid.{name}", getattr(import_module("pc2grid"), name)) for name in NEEDED)
+    return "\n\n".join(("# pc2grid", about, *entries)) + "\n"
+
+
 def python_page(package: str) -> str:
-    """The docstring of a package, and its public names for mkdocstrings to fill in."""
+    """The docstring of a package, and its public names: those on other pages as links."""
     module = import_module(package)
-    names = [name for name in module.__all__ if not name.startswith("_")]
-    homes = {name: getattr(module, name) for name in names}
-    passed_on = [name for name, thing in homes.items() if thing.__module__.split(".")[0] != package]
-    parts = [f"# {package}", as_markdown(module.__doc__ or "")]
-    if passed_on:
-        links = ", ".join(
-            f"[`{name}`][{thing.__module__}.{thing.__qualname__}]"
-            for name, thing in homes.items()
-            if name in passed_on
-        )
-        parts.append(f"Passed on from `signature`: {links}.")
-    for name, thing in homes.items():
-        if name not in passed_on:
-            path = f"{thing.__module__}.{thing.__qualname__}"
-            parts.append(
-                f"::: {path}\n    options:\n      heading: {package}.{name}\n      toc_label: {name}"
-            )
-    return "\n\n".join(parts) + "\n"
+    own, links = [], []
+    for name in (name for name in module.__all__ if not name.startswith("_")):
+        thing = getattr(module, name)
+        if name in NEEDED or thing.__module__.split(".")[0] != package:
+            links.append(f"[`{name}`][{thing.__module__}.{thing.__qualname__}]")
+        else:
+            own.append(_entry(f"{package}.{name}", thing))
+    parts = [f"# {package}", as_markdown(module.__doc__ or ""), f"On other pages: {', '.join(links)}."]
+    return "\n\n".join((*parts, *own)) + "\n"
+
+
+def _entry(name: str, thing: Any) -> str:
+    """A public name, for mkdocstrings to fill in."""
+    label = name.partition(".")[2]
+    path = f"{thing.__module__}.{thing.__qualname__}"
+    return f"::: {path}\n    options:\n      heading: {name}\n      toc_label: {label}"
 
 
 def notebook_page(path: Path) -> str:

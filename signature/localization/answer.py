@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from pc2grid.arrays import F64, freeze
 from pc2grid.display import html_picture, html_table, map_png, probability, short
+from pc2grid.errors import ConfigError, OutputError
 from pc2grid.geometry import SE2
-from pc2grid.model import OccupancyGrid
+from pc2grid.io.atomic import replace_file, require_writable
+from pc2grid.model import OccupancyGrid, Trajectory
+from signature.database import open_database
 from signature.database.protocol import Label
 from signature.localization.answer_json import AnswerDocument, document
 from signature.localization.answer_json import Status as Status
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.posterior import Evidence
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from signature.localization.answer_json import QueryRecording
 
 SpaceStatus = Literal["agrees", "unsure", "contradicts"]
 
@@ -85,6 +96,24 @@ class Moment:
     confidence: float
 
 
+NO_POSES = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
+"""Of a query that is a map."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """What an answer of `pc2grid.relocalize` is about, for its picture and its page.
+
+    poses : the query in its own frame, empty for a map. about : the description of the query in the JSON
+    document. database : where was looked. accept : the confidence that `located` needed.
+    """
+
+    poses: Trajectory
+    about: QueryRecording
+    database: str
+    accept: float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
     """Where the query was.
@@ -107,6 +136,15 @@ class Answer:
     are in the map frames of their sessions (`signature.localization.in_building`).
     in_space : the pose with six degrees of freedom, and whether the points agree; None if either side has
     none. Of a place that was turned down because they contradict it, the pose there.
+    asked : the question; None unless `pc2grid.relocalize` has answered.
+
+    >>> import pc2grid
+    >>> answer = pc2grid.relocalize("tuesday.mcap", "building.submaps")
+    >>> answer.status, answer.session, answer.confidence > 0.9
+    ('located', 'monday', True)
+    >>> figure = answer.plot()
+    >>> answer.report("answer.html")
+    >>> answer.save("answer.json")
     """
 
     status: Status
@@ -134,6 +172,7 @@ class Answer:
     views_m: tuple[tuple[float, float], ...] = ()
     map: OccupancyGrid | None = None
     frames: tuple[str | None, ...] = ()
+    asked: Asked | None = None
 
     def __repr__(self) -> str:
         sure = f"confidence {probability(self.confidence)}, after {self.path_m:.1f} m"
@@ -167,6 +206,55 @@ class Answer:
         walls_m = self.local_map.to_point(np.argwhere(self.local_map.occupied))
         there_m = self.hypotheses[0].fit.T_map_query.apply(walls_m)
         return map_png(self.map.cells, self.map.resolution_m, self.map.origin_m, centers_m=there_m)
+
+    def plot(self) -> Figure:
+        """The map with the best hypothesis, and what supports and contradicts it, as a figure of matplotlib.
+
+        A notebook shows it; `figure.savefig` and `save` write it.
+        """
+        # What draws answers knows them.
+        from signature.localization.shown.picture import answer_figure, figure_png
+
+        poses = NO_POSES if self.asked is None else self.asked.poses
+        figure = answer_figure(self, self.map or self.local_map, poses)
+        figure._repr_png_ = partial(figure_png, figure)  # type: ignore[attr-defined]
+        return figure
+
+    def report(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the page of `pc2grid relocalize --report`, which needs no network.
+
+        The database is read again: it must be there still, and be no map.
+
+        Raises ConfigError unless `pc2grid.relocalize` has answered, OutputError if the page cannot be
+        written, and the errors of `pc2grid.open_database`.
+        """
+        from signature.localization.shown.report import Found, write_report
+
+        if self.asked is None:
+            raise ConfigError(
+                "report: the answer does not know its recording", hint="pc2grid.relocalize's does"
+            )
+        require_writable(path, overwrite)
+        with open_database(self.asked.database) as database:
+            found = Found(answer=self, poses=self.asked.poses, about=self.asked.about)
+            write_report(Path(path), database, found=found, accept=self.asked.accept)
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the answer: as the document of `to_json` to a .json, as the picture of `plot` to a .png.
+
+        Raises OutputError for another suffix, and for a file that exists without `overwrite`.
+        """
+        from signature.localization.shown.picture import write_figure
+
+        path = Path(path)
+        if path.suffix not in (".json", ".png"):
+            raise OutputError(f"{path}: an answer is saved as .json or .png", hint="end its name so")
+        require_writable(path, overwrite)
+        if path.suffix == ".png":
+            write_figure(self.plot(), path)
+            return
+        with replace_file(path) as temporary:
+            temporary.write_text(json.dumps(self.to_json(), indent=1), encoding="utf-8")
 
     @property
     def slipped(self) -> float:

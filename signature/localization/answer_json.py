@@ -72,6 +72,19 @@ class Travel(TypedDict):
     stamp_ns: int
 
 
+class QueryRecording(Travel):
+    """What was looked for. start_s, duration_s: the part of the recording that was read; null: to its end.
+    sensor: lidar, laser, depth, or map. lossy: data was lost while reading."""
+
+    source: str
+    start_s: float
+    duration_s: float | None
+    scans: int
+    sensor: str
+    lossy: bool
+    warnings: list[str]
+
+
 class Sessions(TypedDict):
     """The sessions of the database."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -50,6 +52,29 @@ def test_a_map_is_found_in_a_map(building: Path) -> None:
     assert 0.3 < np.ptp(green[:, 0]) / height < 0.8 and 0.3 < np.ptp(green[:, 1]) / width < 0.8
 
 
+def test_an_answer_is_drawn_saved_and_shown_as_a_page(building: Path, tmp_path: Path) -> None:
+    answer = relocalize(building / "part.yaml", building / "plan.submaps")
+    figure = answer.plot()
+    assert "located in plan" in figure.axes[0].get_title(loc="left")
+    formatters = pytest.importorskip("IPython.core.formatters", reason="open3d brings it")
+    shown, _ = formatters.DisplayFormatter().format(figure)
+    assert shown["image/png"].startswith(b"\x89PNG")
+    answer.save(tmp_path / "answer.png")
+    answer.save(tmp_path / "answer.json")
+    answer.report(tmp_path / "answer.html")
+    assert cv2.imread(str(tmp_path / "answer.png")) is not None
+    assert json.loads((tmp_path / "answer.json").read_text())["status"] == "located"
+    assert '"part.yaml"' in (tmp_path / "answer.html").read_text()
+    for write, name in ((answer.save, "answer.png"), (answer.report, "answer.html")):
+        with pytest.raises(OutputError, match=r"exists already \(overwrite=True"):
+            write(tmp_path / name)
+    answer.save(tmp_path / "answer.png", overwrite=True)
+    with pytest.raises(OutputError, match=r"\.json or \.png"):
+        answer.save(tmp_path / "answer.txt")
+    with pytest.raises(ConfigError, match="does not know its recording"):
+        replace(answer, asked=None).report(tmp_path / "other.html")
+
+
 def test_a_map_has_no_robot_whose_pose_could_be_known(building: Path) -> None:
     near = pc2grid.Prior.around(4.0, 3.0, radius_m=2.0)
     with pytest.raises(ConfigError, match="no robot in a map"):
@@ -60,7 +85,7 @@ def test_what_exists_is_kept_unless_one_says_so(building: Path, tmp_path: Path) 
     plan, target = building / "plan.yaml", tmp_path / "all.submaps"
     target.write_bytes((building / "plan.submaps").read_bytes())
     before = target.read_bytes()
-    with pytest.raises(OutputError, match=r"exists already.*overwrite=True"):
+    with pytest.raises(OutputError, match=r"exists already.*overwrite=True.*add=True"):
         convert(tmp_path / "never looked at", target)
     with pytest.raises(DatabaseError, match="plan"):  # another session of that name: it has no label
         convert(plan, target, add=True)

@@ -16,8 +16,7 @@ from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli.known_pose import KnownPose, end_s
-from pc2grid_cli.locate import about_log
-from signature.files import query_config
+from signature.files import about_log, query_config
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import check_pose
 

@@ -20,11 +20,11 @@ from pc2grid_cli import console
 from pc2grid_cli.locate import find_log
 from pc2grid_cli.options import OUTPUT_FOLDER, Force
 from pc2grid_cli.output_files import make_folder
-from pc2grid_cli.picture import draw_answer
 from pc2grid_cli.relocalize import as_text
-from pc2grid_cli.report import write_report
 from signature.config import Config
 from signature.database import open_database
+from signature.localization.shown.picture import draw_answer
+from signature.localization.shown.report import write_report
 from signature.sessions import add_sessions, build_session
 
 BUILDING_SEED = 3

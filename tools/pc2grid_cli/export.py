@@ -24,10 +24,10 @@ from pc2grid_cli import console
 from pc2grid_cli.foxglove import write_session
 from pc2grid_cli.options import AsJson, Building, Database, Floor, Force, Frame, FrameName
 from pc2grid_cli.output_files import check_file, map_stem
-from pc2grid_cli.picture import draw_session
-from pc2grid_cli.report import write_report
 from signature.database import open_database
 from signature.localization.joining.building_map import floors_of, map_of
+from signature.localization.shown.picture import draw_session
+from signature.localization.shown.report import write_report
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory

@@ -16,13 +16,13 @@ from pc2grid_cli import console
 from pc2grid_cli.json_schemas import ComparedSessions, DbJoin, plain
 from pc2grid_cli.options import AsJson, Database, Force
 from pc2grid_cli.output_files import check_file
-from pc2grid_cli.picture import draw_building
 from pc2grid_cli.session_documents import joined_document
 from pc2grid_cli.tables import show, table
 from signature.bend import largest_m
 from signature.database import SubmapDatabase, maintenance, open_database
 from signature.localization.joining.building import Joined, join_sessions
 from signature.localization.joining.pairing import SessionPair
+from signature.localization.shown.picture import draw_building
 
 if TYPE_CHECKING:
     from pc2grid.geometry import SE2

@@ -22,11 +22,11 @@ from signature.localization.answer_json import (
     Labelled,
     Pose,
     PoseInSpace,
+    QueryRecording,
     Result,
     Sessions,
     StampedPose,
     Status,
-    Travel,
     Version,
 )
 from signature.localization.belief import State
@@ -65,19 +65,6 @@ class Live(TypedDict):
     reconnected: int
     lag_s: float
     elapsed_s: float
-
-
-class QueryRecording(Travel):
-    """What was looked for. start_s, duration_s: the part of the recording that was read; null: to its end.
-    sensor: lidar, laser, depth, or map. lossy: data was lost while reading."""
-
-    source: str
-    start_s: float
-    duration_s: float | None
-    scans: int
-    sensor: str
-    lossy: bool
-    warnings: list[str]
 
 
 class Searched(Sessions):

@@ -27,14 +27,14 @@ from pc2grid_cli import options as options
 from pc2grid_cli.check_pose import check_log, report_check
 from pc2grid_cli.foxglove import write_answer, write_located_map
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import Found, find_log, find_map, in_map, searched
+from pc2grid_cli.locate import find_log, find_map, in_map, searched
 from pc2grid_cli.nav2_pose import write_initialpose
 from pc2grid_cli.output_files import check_file
-from pc2grid_cli.picture import draw_answer, draw_answers
-from pc2grid_cli.report import write_report
 from pc2grid_cli.windows import Window, find_all, show, windows_of
 from signature.database.maintenance import is_database
 from signature.localization.in_building import answer_in_building
+from signature.localization.shown.picture import draw_answer, draw_answers
+from signature.localization.shown.report import Found, write_report
 
 if TYPE_CHECKING:
     from pc2grid.model import ReadReport, Trajectory

@@ -23,13 +23,13 @@ from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.known_pose import KnownPose
 from pc2grid_cli.locate import find_log, searched
-from pc2grid_cli.report import page
 from pc2grid_cli.view_events import Events, Progress
 from pc2grid_cli.view_server import Cancelled, Options, ViewServer
 from signature.files import query_config
 from signature.localization.follower import Follower
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
+from signature.localization.shown.report import page
 
 if TYPE_CHECKING:
     from pc2grid.model import RegisteredScan

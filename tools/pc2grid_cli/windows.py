@@ -19,9 +19,10 @@ from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import Found, find_log, find_map
+from pc2grid_cli.locate import find_log, find_map
 from signature.files import query_config
 from signature.localization.map_index import MapIndex
+from signature.localization.shown.report import Found
 
 if TYPE_CHECKING:
     from signature.config import Config

@@ -14,7 +14,6 @@ from pc2grid.errors import ConfigError, LogNotFound
 from pc2grid.io.building_file import is_building_file
 from pc2grid_cli.console import json_text, of, warn
 from pc2grid_cli.output_files import make_folder
-from pc2grid_cli.picture import BLUE, GREEN, VERMILLION
 from pc2grid_cli.tables import show, table
 from pc2grid_lab.compare import options as options
 from pc2grid_lab.compare.picture import picture
@@ -24,6 +23,7 @@ from pc2grid_lab.peers.outcome import PeerCell, PeerTrial, counted
 from pc2grid_lab.peers.programs import PEERS, PINS, answers, missing
 from pc2grid_lab.peers.site import Site, recorded_site, simulated_site, truth_file
 from signature.config import Config
+from signature.localization.shown.picture import BLUE, GREEN, VERMILLION
 from signature.sessions import digest_of
 
 TITLES = {kind.name: kind.title for kind in PEERS}

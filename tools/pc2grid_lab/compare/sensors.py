@@ -17,13 +17,13 @@ from pc2grid.io.nav2_map import load_map
 from pc2grid.model import SensorKind
 from pc2grid_cli.console import Console, json_text, of
 from pc2grid_cli.output_files import make_folder
-from pc2grid_cli.picture import BLUE, ORANGE, VERMILLION
 from pc2grid_cli.tables import show, table
 from pc2grid_lab.compare import options as options
 from pc2grid_lab.compare.picture import picture
 from pc2grid_lab.experiments.sensor_matrix import SENSORS, PlanDrives, query_trials
 from pc2grid_lab.experiments.stored import in_processes, write_text
 from pc2grid_lab.experiments.trial import MatrixCell, Trial, matrix, reliability
+from signature.localization.shown.picture import BLUE, ORANGE, VERMILLION
 
 
 def compare_sensors_command(

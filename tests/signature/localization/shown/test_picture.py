@@ -12,10 +12,19 @@ from matplotlib.figure import Figure
 
 from pc2grid.io.nav2_map import save_map
 from pc2grid.model import OccupancyGrid
-from pc2grid_cli.locate import Found, find_map
-from pc2grid_cli.picture import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, draw_answer, draw_session
+from pc2grid_cli.locate import find_map
 from signature.config import Config
 from signature.database import SubmapDatabase, open_database
+from signature.localization.shown.picture import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    VERMILLION,
+    draw_answer,
+    draw_session,
+)
+from signature.localization.shown.report import Found
 from signature.sessions import add_sessions, provenance
 from tests.helpers.session_maps import session, way
 from tests.helpers.simulated_drives import cut, office, plan

@@ -10,6 +10,7 @@ import base64
 import itertools
 import json
 import math
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib.resources import files
 from pathlib import Path
@@ -21,18 +22,18 @@ import numpy as np
 from pc2grid._version import __version__
 from pc2grid.io.atomic import replace_file
 from pc2grid.matching.agreement import Support
-from pc2grid_cli.picture import agreements, shades
-from pc2grid_cli.signatures_compared import why_here
-from pc2grid_cli.submap_sources import similar_places, sources
+from signature.localization.shown.picture import agreements, shades
+from signature.localization.shown.signatures_compared import why_here
+from signature.localization.shown.submap_sources import similar_places, sources
 
 if TYPE_CHECKING:
     import networkx as nx
 
     from pc2grid.arrays import F64
-    from pc2grid.model import Consistency, Loop, OccupancyGrid, Precision, Trajectory
-    from pc2grid_cli.locate import Found
+    from pc2grid.model import Consistency, Loop, OccupancyGrid, Precision, ReadReport, Trajectory
     from signature.database import SessionInfo, SubmapDatabase
     from signature.localization.answer import Answer
+    from signature.localization.answer_json import QueryRecording
     from signature.similarity import SignatureTable
 
 _LARGEST_PIXELS = 3000
@@ -44,6 +45,22 @@ _STEP_M = 0.05
 """Poses nearer than this to the last one drawn are left out: they would not be visible."""
 _BAND_FROM_M = 0.1
 """Positions with a smaller standard deviation have no band: two cells of the default resolution."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Found:
+    """An answer and the query it is about.
+
+    poses : the query in its own frame, see `followed`; empty for a map. drawn : the query if it is a map.
+    about : the description of the query in the JSON document.
+    report : what was read of a recording, and what was lost; None for a map.
+    """
+
+    answer: Answer
+    poses: Trajectory
+    about: QueryRecording
+    drawn: OccupancyGrid | None = None
+    report: ReadReport | None = None
 
 
 def write_report(
@@ -72,7 +89,7 @@ def page(
     truth_m: F64 | None = None,
 ) -> str:
     """The page as text; parameters as for `write_report`."""
-    template = files("pc2grid_cli").joinpath("report.html").read_text(encoding="utf-8")
+    template = files("signature.localization.shown").joinpath("report.html").read_text(encoding="utf-8")
     document = contents(database, found=found, accept=accept, truth_m=truth_m)
     # "<" is the only character that could end the script element.
     data = json.dumps(document, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
@@ -248,7 +265,7 @@ def _answer(found: Found, database: SubmapDatabase, accept: float, truth_m: F64 
         "deviation": None if pose is None else _short(_deviation(answer, database), 4),
         "confidence": round(answer.confidence, 4),
         "accept": accept,
-        "query": {**found.about, "is_map": found.drawn is not None},
+        "query": {**found.about, "is_map": found.about["sensor"] == "map"},
         "walls": _short(np.ravel(walls_m), 2),
         "hypotheses": [
             {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -18,14 +19,16 @@ from pc2grid.matching.agreement import Agreement, Support, agreement
 from pc2grid.matching.walls import Walls
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from pc2grid.arrays import F64, U8
     from pc2grid.geometry import SE2
     from pc2grid.model import OccupancyGrid, Trajectory
-    from pc2grid_cli.locate import Found
     from signature.database import SubmapDatabase
     from signature.database.protocol import BuildingFrame
     from signature.localization.answer import Answer
     from signature.localization.hypotheses import Hypothesis
+    from signature.localization.shown.report import Found
 
 BLUE, ORANGE, GREEN, VERMILLION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
 YELLOW = "#F0E442"
@@ -119,7 +122,7 @@ def draw_session(path: Path, database: SubmapDatabase, session: str) -> None:
     if len(poses):
         axes.plot(poses[:, 0], poses[:, 1], color=BLUE, lw=1.2, label="path of the map's robot")
     axes.set_title(session, loc="left")
-    _finish(figure, axes, path)
+    write_figure(_with_legend(figure, axes), path)
 
 
 def draw_building(path: Path, name: str, maps: Mapping[str, tuple[OccupancyGrid, BuildingFrame]]) -> None:
@@ -138,7 +141,7 @@ def draw_building(path: Path, name: str, maps: Mapping[str, tuple[OccupancyGrid,
     for (session, points_m), colour in zip(walls.items(), colours, strict=False):
         axes.plot(*points_m.T, ".", color=colour, ms=2.5, mew=0, alpha=0.7, label=session)
     axes.set_title(f"walls of the sessions in the frame of {name}", loc="left")
-    _finish(figure, axes, path)
+    write_figure(_with_legend(figure, axes), path)
 
 
 def draw_answer(
@@ -148,17 +151,33 @@ def draw_answer(
     poses: Trajectory,
     truth_m: F64 | None = None,
 ) -> None:
+    """Write the picture of `answer_figure`.
+
+    truth_m : (N, 2) the query's true path in the map frame, if known.
+    """
+    best = answer.hypotheses[0] if answer.hypotheses else None
+    session = answer.sessions[best.session_index if best else 0]
+    way = database.trajectory(session)
+    write_figure(answer_figure(answer, database.grid(session), poses, way=way, truth_m=truth_m), path)
+
+
+def answer_figure(
+    answer: Answer,
+    grid: OccupancyGrid,
+    poses: Trajectory,
+    *,
+    way: Trajectory | None = None,
+    truth_m: F64 | None = None,
+) -> Figure:
     """The map with the best hypothesis: the query's walls, coloured by what the map says about them.
 
     In a large map a second panel shows the place from near. Without any hypothesis there is only the map.
 
-    poses : the query in its own frame, empty for a map. truth_m : (N, 2) its true path in the map frame, if
-    known.
+    grid : the map. poses : the query in its own frame, empty for a map. way : path of the map's robot.
     """
     best = answer.hypotheses[0] if answer.hypotheses else None
     session = answer.sessions[best.session_index if best else 0]
-    grid = database.grid(session)
-    compared = agreements(answer, database)[0] if best else None
+    compared = agreement(Walls.of(grid), Walls.of(answer.local_map), best.fit.T_map_query) if best else None
     whole, close = _known(grid), None
     if best is not None and compared is not None and len(compared.points_m):
         close = _Box.around(best.fit.T_map_query.apply(compared.points_m), _CLOSE_MARGIN_M)
@@ -168,7 +187,7 @@ def draw_answer(
     figure, panels = _panels(whole, *(() if close is None else (close,)))
     for axes in panels:
         _draw_map(axes, grid)
-        _draw_way(axes, database, session)
+        _draw_way(axes, way)
         if truth_m is not None:
             axes.plot(truth_m[:, 0], truth_m[:, 1], color="black", lw=3.5, alpha=0.3, label="query: truth")
         if best is not None and compared is not None:
@@ -178,7 +197,8 @@ def draw_answer(
     if close is not None:
         _outline(panels[0], panels[1])
     panels[0].set_title(_title(answer, session, compared), loc="left")
-    _finish(figure, panels[0], path)
+    made: Figure = _with_legend(figure, panels[0])
+    return made
 
 
 def draw_answers(path: Path, database: SubmapDatabase, found: Sequence[Found]) -> None:
@@ -194,7 +214,7 @@ def draw_answers(path: Path, database: SubmapDatabase, found: Sequence[Found]) -
     figure, panels = _panels(*(_known(grid) for grid in grids))
     for axes, session, grid in zip(panels, sessions, grids, strict=True):
         _draw_map(axes, grid)
-        _draw_way(axes, database, session)
+        _draw_way(axes, database.trajectory(session))
         title = f"located in {session}: {located[session]} of {len(found)} queries"
         axes.set_title(title, loc="left", fontsize=10)
         for answer, poses, source in ((one.answer, one.poses, one.about["source"]) for one in found):
@@ -202,7 +222,7 @@ def draw_answers(path: Path, database: SubmapDatabase, found: Sequence[Found]) -
                 path_m = answer.T_map_odom.apply(poses.planar()[:, :2])
                 axes.plot(*path_m.T, color=colours[source], lw=1.8, label=f"{source}: path as located")
                 _draw_arrow(axes, answer.T_map_base, colours[source])
-    _finish(figure, panels[0], path)
+    write_figure(_with_legend(figure, panels[0]), path)
 
 
 def _title(answer: Answer, session: str, compared: Agreement | None) -> str:
@@ -297,10 +317,9 @@ def _draw_submaps(axes: Any, database: SubmapDatabase, session: str) -> None:
     axes.plot(centers[:, 0], centers[:, 1], ".", color=GREEN, ms=4, label=label)
 
 
-def _draw_way(axes: Any, database: SubmapDatabase, session: str) -> None:
-    way = database.trajectory(session).planar()
-    if len(way):
-        axes.plot(way[:, 0], way[:, 1], color=GREY, lw=0.7, label="path of the map's robot")
+def _draw_way(axes: Any, way: Trajectory | None) -> None:
+    if way is not None and len(way):
+        axes.plot(*way.planar()[:, :2].T, color=GREY, lw=0.7, label="path of the map's robot")
 
 
 def _draw_agreement(axes: Any, best: Hypothesis, compared: Agreement, *, point_size: float) -> None:
@@ -375,8 +394,8 @@ def _outline(whole: Any, close: Any) -> None:
     whole.add_patch(frame)
 
 
-def _finish(figure: Any, axes: Any, path: Path) -> None:
-    """Add the legend of what the figure shows, and write it without empty bands."""
+def _with_legend(figure: Any, axes: Any) -> Any:
+    """The figure with the legend of what it shows."""
     entries: dict[str, Any] = {}
     for panel in figure.axes:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
@@ -396,11 +415,17 @@ def _finish(figure: Any, axes: Any, path: Path) -> None:
         for handle in legend.legend_handles:
             if handle.get_marker() in (".", "x"):  # the dots of the figure are too small to tell colours
                 handle.set_markersize(9 if handle.get_marker() == "." else 6)
+    return figure
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG."""
     with replace_file(path) as temporary:
-        figure.savefig(
-            temporary,
-            format="png",
-            bbox_inches="tight",
-            pad_inches=0.12,
-            metadata={"Software": "pc2grid"},
-        )
+        temporary.write_bytes(figure_png(figure))
+
+
+def figure_png(figure: Figure) -> bytes:
+    """A figure as PNG, without empty bands."""
+    png = io.BytesIO()
+    figure.savefig(png, format="png", bbox_inches="tight", pad_inches=0.12, metadata={"Software": "pc2grid"})
+    return png.getvalue()

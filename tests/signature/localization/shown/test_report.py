@@ -20,17 +20,17 @@ import pytest
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
 from pc2grid.model import Consistency, Contradiction, Health, OccupancyGrid, Precision, Trajectory
-from pc2grid_cli import report
-from pc2grid_cli.locate import Found, find_map
+from pc2grid_cli.locate import find_map
 from pc2grid_cli.nav2_pose import initialpose
 from pc2grid_cli.relocalize import map_sigma_m
-from pc2grid_cli.report import contents, deviation, runs, write_report
-from pc2grid_cli.signatures_compared import why_here
 from signature.boundary import boundary_histogram
 from signature.config import Config
 from signature.database import SubmapDatabase, open_database
 from signature.describe import Signature
 from signature.freespace import freespace_histogram, shortest_paths
+from signature.localization.shown import report
+from signature.localization.shown.report import Found, contents, deviation, runs, write_report
+from signature.localization.shown.signatures_compared import why_here
 from signature.sessions import add_sessions, provenance
 from signature.similarity import distances
 from tests.helpers.session_maps import LOOPS, session, way

@@ -1,0 +1,1 @@
+"""Answers and databases as pictures, and as one page."""
