@@ -1,0 +1,1 @@
+"""pc2grid as a node of ROS 2."""
