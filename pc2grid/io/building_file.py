@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -51,7 +52,7 @@ Kind = Literal["cloud", "mesh"]
 def is_building_file(path: Path) -> bool:
     """Whether an input is a cloud, a mesh or a folder of KISS-SLAM, rather than a recording."""
     if path.is_dir():
-        return (path / _LOCAL_MAPS).is_dir()
+        return os.path.isdir(path / _LOCAL_MAPS)  # noqa: PTH112 - no error for a folder that is locked
     return path.suffix.lower() in (*CLOUD_SUFFIXES, *MESH_SUFFIXES)
 
 

@@ -196,6 +196,14 @@ def test_compiling_is_noted_once(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err.count("compiling what") == 1
 
 
+def test_who_interrupts_is_told_what_is_kept(capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    assert console.Console().run(interrupted) == 130
+    assert "interrupted: each file is complete, or as it was before" in capsys.readouterr().err
+
+
 def test_the_version_needs_no_command(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from pc2grid.errors import LogNotFound
 from pc2grid.io import open_log
 from pc2grid.io.export.cloud import write_cloud
 from pc2grid.io.nav2_map import save_map
@@ -149,3 +151,10 @@ def test_cloud_of_a_building(tmp_path: Path) -> None:
     assert refused.exit_code == 1 and "too high for a building in metres" in str(refused.exception)
     scaled = runner.invoke(app, ["info", str(path), "--set", "read.unit_m=0.001", "--json"])
     assert scaled.exit_code == 0 and json.loads(scaled.stdout)["free_m2"] > 38
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="nothing is locked for root")
+def test_a_locked_folder_is_named_itself(tmp_path: Path) -> None:
+    (tmp_path / "locked").mkdir(mode=0o000)
+    with pytest.raises(LogNotFound, match=r"locked: Permission denied$"):
+        runner.invoke(app, ["info", str(tmp_path / "locked")], catch_exceptions=False)

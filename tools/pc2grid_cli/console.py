@@ -29,6 +29,7 @@ _LINE_EVERY_S = 10.0
 _SENT_AGAIN_S = 0.05
 """How long after a signal whose exception was dropped it is sent again; chosen by hand."""
 _COMPILING = "compiling what runs for the first time here; later runs do not wait for it"
+_INTERRUPTED = "pc2grid: interrupted: each file is complete, or as it was before"
 
 
 class Console:
@@ -136,7 +137,7 @@ class Console:
             sys.stdout.flush()
             return result if isinstance(result, int) else OK
         except KeyboardInterrupt:
-            print("pc2grid: interrupted", file=sys.stderr)
+            print(_INTERRUPTED, file=sys.stderr)
             return INTERRUPTED
         except BrokenPipeError:
             return _pipe_closed()
@@ -146,7 +147,7 @@ class Console:
             raise
         except Exception as error:
             if stop.number == signal.SIGINT:
-                print("pc2grid: interrupted", file=sys.stderr)
+                print(_INTERRUPTED, file=sys.stderr)
                 return INTERRUPTED
             if stop.number is not None:
                 return 128 + stop.number

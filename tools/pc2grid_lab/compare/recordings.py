@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -82,7 +84,7 @@ def compare_recordings_command(
     if not (catalogue.mapped or catalogue.pairs or followed):
         raise ConfigError(f"--only {only}: no recording, building, sensor or kind is named so")
     terminal = console.of(context)
-    with terminal.progress("recordings") as advance:
+    with terminal.progress("recordings") as advance, _note_kept(terminal, out):
         run_all(
             catalogue,
             folder,
@@ -104,6 +106,16 @@ def compare_recordings_command(
         print(f"nothing to compare with: there is no {kept}")
     else:
         print(f"changed since {before.commit} ({kept}):", *(change_lines(changed) or ["- nothing"]), sep="\n")
+
+
+@contextlib.contextmanager
+def _note_kept(terminal: console.Console, out: Path) -> Iterator[None]:
+    """If the block is interrupted, print where its results are: they stay."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        terminal.note(f"what is done is kept in {out}; the same command goes on from there")
+        raise
 
 
 def _catalogue(
