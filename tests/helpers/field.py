@@ -15,6 +15,7 @@ from mcap.reader import make_reader
 from typer.testing import CliRunner
 
 from pc2grid.arrays import F64
+from pc2grid.errors import Pc2GridError
 from pc2grid_cli.main import app
 from signature.database import open_database
 from tests.helpers.recordings import Message, ros, write_mcap
@@ -75,7 +76,8 @@ def convert(path: Path, folder: Path, *options: str) -> Outcome:
     arguments = ["convert", str(path), "-o", str(database), "--json", "--force", *options]
     result = CliRunner().invoke(app, arguments)
     if not database.exists():
-        error = "" if result.exception is None else str(result.exception)
+        failure = result.exception
+        error = failure.in_short if isinstance(failure, Pc2GridError) else str(failure or "")
         return Outcome(result.exit_code, f"{error}\n{result.output}", [])
     session = json.loads(result.stdout)["sessions"][0]
     with open_database(database) as opened:

@@ -1,0 +1,28 @@
+"""Windows asked with the shortlist of the signatures, and with the controls."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+from pc2grid.simulate import office_floorplan
+from pc2grid_lab.fit.shortlists import asked, together
+from signature.localization.query import Query
+from tests.helpers.simulated_drives import building, drive, office
+
+
+def test_a_window_is_asked_once_by_each_shortlist() -> None:
+    own, other = building({"map": office()}), building({"map": office_floorplan(1)})
+    every = together({"office": own, "floor": other})
+    assert every.sessions == ("office", "floor")
+    assert len(every.places.table) == len(own.places.table) + len(other.places.table)
+    query = Query(own.made_with, own.config)
+    for registered, planar_scan, end in drive(office(), [(1.5, 7.0), (9.5, 7.0), (9.5, 4.0)]):
+        query.add(registered, planar_scan)
+        truth = end
+    window = cast(Any, SimpleNamespace(whole=query.map()))
+    rows = list(asked("all maps", every, window, {"office": truth}))
+    assert [row.by for row in rows] == ["signatures", "shuffled", "random"]
+    assert rows[0].located and rows[0].right
+    (elsewhere, *_) = asked("all maps", every, window, {"floor": truth})
+    assert elsewhere.located and not elsewhere.right
