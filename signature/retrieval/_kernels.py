@@ -1,4 +1,4 @@
-"""The comparisons of viewpoints and isovists, compiled. The tests compare them with plain forms in numpy."""
+"""Likeness of isovists, and the headings of poses, compiled. The tests compare both with plain forms."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ import argparse
 import functools
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -79,6 +79,37 @@ def together(maps: dict[str, MapIndex]) -> MapIndex:
     return MapIndex(grids, SignatureTable.concatenated(tables), config, config)
 
 
+def answers(catalogue: Catalogue, folder: Folder, opened: ExitStack) -> Iterator[Asked]:
+    """The answers to every window of the catalogue whose place is known. opened : closes the databases."""
+
+    @functools.cache
+    def index_of(name: str) -> MapIndex:
+        database = opened.enter_context(open_database(folder.map(name)))
+        return MapIndex.of(database, database.config())
+
+    maps = {name: index_of(name) for name in one_each(folder)}
+    every = together(maps)
+    print(f"all maps: {len(maps)}, {len(every.places.table)} places", flush=True)
+    for window in windows(catalogue, folder):
+        name = window.pair.map_name
+        if not window.truth:
+            continue
+        if len(index_of(name).places.table) >= _ENOUGH:
+            yield from asked("its map", index_of(name), window, window.truth)
+        if name in maps:
+            yield from asked("all maps", every, window, {name: next(iter(window.truth.values()))})
+        print(name, f"{window.span.start_s:.1f} s", flush=True)
+
+
+def one_each(folder: Folder) -> Iterable[str]:
+    """The name of one map of each building."""
+    catalogue, found = Catalogue.of(), dict[str, str]()
+    for pair in catalogue.pairs:
+        if pair.kind != "elsewhere" and folder.map(pair.map_name).exists():
+            found.setdefault(catalogue.recordings[pair.map].building, pair.map_name)
+    return found.values()
+
+
 def main() -> None:
     """Print the table."""
     raw = argparse.RawDescriptionHelpFormatter
@@ -87,31 +118,9 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("--only", help="of these recordings, buildings or kinds of pairs only, a pattern")
     options = parser.parse_args()
-    folder, catalogue = Folder(options.data.resolve(), options.work.resolve()), Catalogue.of()
+    folder = Folder(options.data.resolve(), options.work.resolve())
     with ExitStack() as opened:
-
-        @functools.cache
-        def index_of(name: str) -> MapIndex:
-            database = opened.enter_context(open_database(folder.map(name)))
-            return MapIndex.of(database, database.config())
-
-        one_each: dict[str, str] = {}
-        for pair in catalogue.pairs:
-            if pair.kind != "elsewhere" and folder.map(pair.map_name).exists():
-                one_each.setdefault(catalogue.recordings[pair.map].building, pair.map_name)
-        maps = {name: index_of(name) for name in one_each.values()}
-        every = together(maps)
-        found: list[Asked] = []
-        for window in windows(Catalogue.of(only=options.only), folder):
-            name = window.pair.map_name
-            if not window.truth:
-                continue
-            if len(index_of(name).places.table) >= _ENOUGH:
-                found += asked("its map", index_of(name), window, window.truth)
-            if name in maps:
-                found += asked("all maps", every, window, {name: next(iter(window.truth.values()))})
-            print(name, f"{window.span.start_s:.1f} s", flush=True)
-    print(f"all maps: {len(maps)}, {len(every.places.table)} places")
+        found = list(answers(Catalogue.of(only=options.only), folder, opened))
     for where, by in dict.fromkeys((one.where, one.by) for one in found):
         rows = [one for one in found if (one.where, one.by) == (where, by)]
         located = [one.right for one in rows if one.located]
