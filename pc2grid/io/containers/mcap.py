@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import bisect
 import io
-import itertools
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from mcap.records import Chunk, ChunkIndex, Message
+from mcap.records import Chunk, ChunkIndex, McapRecord, Message
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogCorrupt, LogError
 from pc2grid.io.containers.bounded_file import BoundedFile
 from pc2grid.io.containers.mcap_index import (
     McapIndex,
+    Run,
     Survey,
     named,
     open_chunk,
@@ -44,7 +44,7 @@ class McapSource:
         self.files: tuple[Path, ...] = (path,)
         self.tally = Tally()
         self._path, self._config = path, config
-        self._stream = self._opened()
+        self._stream = BoundedFile(io.FileIO(path), config.max_record_bytes)
         try:
             self._index = self._indexed(recover) or self._surveyed(recover)
             if not self._index.checked:
@@ -60,9 +60,6 @@ class McapSource:
         self._stream.close()
 
     # --- opening --------------------------------------------------------------------------------------
-
-    def _opened(self) -> BoundedFile:
-        return BoundedFile(io.FileIO(self._path), self._config.max_record_bytes)
 
     def _indexed(self, recover: bool) -> McapIndex | None:
         """The index in the summary; None if there is none, it is damaged, or it lists no chunks."""
@@ -141,7 +138,7 @@ class McapSource:
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """See MessageSource.messages. Those that stand outside of chunks come in the order of the file."""
+        """See MessageSource.messages."""
         wanted = {key for key, topic in self._topic_of.items() if topic.topic in topics}
         low_ns, high_ns = start_ns or 0, _LAST_NS if end_ns is None else end_ns
 
@@ -150,8 +147,6 @@ class McapSource:
                 if m.channel_id in wanted and low_ns <= m.log_time < high_ns:
                     yield RawMessage(self._topic_of[m.channel_id], m.log_time, m.data)
 
-        if not self._index.chunks:
-            yield from fitting(self._outside_chunks())
         pending: list[RawMessage] = []  # of chunks that overlap in time
         for chunk in _wanted(self._index.chunks, wanted, low_ns, high_ns):
             ready = bisect.bisect_left(pending, chunk.message_start_time, key=lambda m: m.log_time_ns)
@@ -163,15 +158,17 @@ class McapSource:
 
     def _load(self, listed: ChunkIndex, index: McapIndex) -> list[Message]:
         """The messages of a chunk that the index lists. Raises LogError if it is damaged."""
-        place, size = listed.chunk_start_offset, listed.chunk_length
+        place, end = listed.chunk_start_offset, listed.chunk_start_offset + listed.chunk_length
         try:
             self._stream.seek(place)
-            chunk = next(records_of(self._stream, whole_file=False).records)
-            if not isinstance(chunk, Chunk) or self._stream.tell() != place + size:
+            reader = records_of(self._stream, whole_file=False).records
+            records = [next(reader)]
+            while isinstance(listed, Run) and self._stream.tell() < end:
+                records.append(next(reader))
+            if self._stream.tell() != end or isinstance(records[0], Chunk) is isinstance(listed, Run):
                 raise LogCorrupt("the index points to something else")
-            if not chunk.uncompressed_crc and chunk.data:
-                self.tally.warn(_UNCHECKED)
-            records = open_chunk(chunk, self._config.max_chunk_bytes)
+            if isinstance(records[0], Chunk):
+                records = self._content(records[0])
             messages = [record for record in records if isinstance(record, Message)]
             if any(message.channel_id not in index.channels for message in messages):
                 raise LogCorrupt("a message of a channel that is missing")
@@ -181,11 +178,10 @@ class McapSource:
             raise named(error, f"{self._path}: chunk at byte {place}") from error
         return messages
 
-    def _outside_chunks(self) -> Iterator[Message]:
-        with self._opened() as stream:
-            records = records_of(stream, whole_file=True).records
-            found = (record for record in records if isinstance(record, Message))
-            yield from itertools.islice(found, sum(self._index.counts.values()))
+    def _content(self, chunk: Chunk) -> list[McapRecord]:
+        if not chunk.uncompressed_crc and chunk.data:
+            self.tally.warn(_UNCHECKED)
+        return open_chunk(chunk, self._config.max_chunk_bytes)
 
 
 def _wanted(chunks: list[ChunkIndex], channels: set[int], low_ns: int, high_ns: int) -> list[ChunkIndex]:

@@ -11,6 +11,7 @@ import struct
 import zlib
 from dataclasses import dataclass, field, replace
 
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, McapRecord, Message, Schema, Statistics
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
@@ -25,15 +26,23 @@ from pc2grid.io.messages.ros_definitions import short_name
 
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER = struct.Struct("<9xQQI8s")  # offsets of the summary and of its parts, checksum, magic
+_RECORD = struct.Struct("<BQ")  # kind, length
 _CHUNK_BYTES = 49  # of a chunk's record, without the name of the compression and the data
+_MESSAGE_BYTES = 31  # of a message's record, without the data
+_RUN_BYTES = 1 << 20
+"""Length of the runs in which messages outside of chunks are listed; by hand, as long as usual chunks."""
+
+
+class Run(ChunkIndex):
+    """The place of messages that stand one after another outside of chunks."""
 
 
 @dataclass(slots=True)
 class McapIndex:
     """What is where in an MCAP file.
 
-    chunks : none if the messages stand outside of chunks. counts : of messages, by channel; complete if
-    `counted`. start_ns, end_ns : first and last log time. checked : whether there is a checksum on it.
+    chunks : and runs of messages outside of them. counts : of messages, by channel; complete if `counted`.
+    start_ns, end_ns : first and last log time. checked : whether there is a checksum on it.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -126,6 +135,8 @@ def read_summary(stream: BoundedFile) -> McapIndex:
     complete = len(chunks) == statistics.chunk_count and len(channels) >= statistics.channel_count
     if not complete or used - channels.keys():
         raise LogCorrupt("it does not list all chunks and channels")
+    if _has_messages_outside(stream, chunks):
+        raise LogCorrupt("it does not list the messages outside of the chunks")
     return McapIndex(
         summary.schemas,
         channels,
@@ -136,6 +147,23 @@ def read_summary(stream: BoundedFile) -> McapIndex:
         statistics.message_end_time,
         checked=bool(crc),
     )
+
+
+def _has_messages_outside(stream: BoundedFile, chunks: list[ChunkIndex]) -> bool:
+    """Whether messages stand between the chunks, as far as the records there can be told apart."""
+    listed = {c.chunk_start_offset: c.chunk_length + c.message_index_length for c in chunks}
+    at, kind = len(_MAGIC), 0
+    while kind not in (Opcode.MESSAGE, Opcode.DATA_END):
+        length = listed.pop(at, 0)
+        if not length:
+            stream.seek(at)
+            try:
+                kind, behind = _RECORD.unpack(stream.read(_RECORD.size))
+            except LogError:
+                return False
+            length = _RECORD.size + behind
+        at += length
+    return kind == Opcode.MESSAGE
 
 
 class Survey:
@@ -163,7 +191,8 @@ class Survey:
         except Exception as error:  # behind the end of the data, only the summary can be wrong
             self.damage = error if self.at < size and not self.closed else None
         index, spans = self.index, self._spans.values()
-        index.checked |= bool(index.chunks)  # they have their own
+        kinds = {type(chunk) for chunk in index.chunks}
+        index.checked |= kinds == {ChunkIndex}  # chunks have their own
         index.start_ns = min((first for first, _ in spans), default=0)
         index.end_ns = max((last for _, last in spans), default=0)
 
@@ -180,19 +209,28 @@ class Survey:
 
     def _take(self, record: McapRecord, end: int) -> None:
         """Take up a record that ends at an offset; raises whatever is wrong with it."""
-        chunks = self.index.chunks
         if not isinstance(record, Chunk):
-            if isinstance(record, Message) and chunks:
-                raise LogCorrupt("a message outside of the chunks")
             self._take_content(record)
+            if isinstance(record, Message):
+                self._list(_as_run(record, end))
             return
-        if self._spans and not chunks:
-            raise LogCorrupt("a chunk in a file with messages outside of chunks")
         items = open_chunk(record, self._most_bytes)
         for item in items:
             self._take_content(item)
         there = {item.channel_id for item in items if isinstance(item, Message)}
-        chunks.append(_indexed(record, end, there))
+        self.index.chunks.append(_indexed(record, end, there))
+
+    def _list(self, run: Run) -> None:
+        """Add a run of messages to the index, to the one before if it goes on there."""
+        last = self.index.chunks[-1] if self.index.chunks else run
+        goes_on = last.chunk_start_offset + last.chunk_length == run.chunk_start_offset
+        if not isinstance(last, Run) or not goes_on or last.chunk_length > _RUN_BYTES:
+            self.index.chunks.append(run)
+            return
+        last.chunk_length += run.chunk_length
+        last.message_start_time = min(last.message_start_time, run.message_start_time)
+        last.message_end_time = max(last.message_end_time, run.message_end_time)
+        last.message_index_offsets.update(run.message_index_offsets)
 
     def _take_content(self, item: McapRecord) -> None:
         index = self.index
@@ -228,4 +266,20 @@ def _indexed(chunk: Chunk, end: int, channels: set[int]) -> ChunkIndex:
         message_index_offsets=dict.fromkeys(channels, 0),
         message_start_time=chunk.message_start_time,
         uncompressed_size=chunk.uncompressed_size,
+    )
+
+
+def _as_run(message: Message, end: int) -> Run:
+    """The place of a message outside of chunks that ends at an offset."""
+    size = _MESSAGE_BYTES + len(message.data)
+    return Run(
+        chunk_length=size,
+        chunk_start_offset=end - size,
+        compression="",
+        compressed_size=size,
+        message_end_time=message.log_time,
+        message_index_length=0,
+        message_index_offsets={message.channel_id: 0},
+        message_start_time=message.log_time,
+        uncompressed_size=size,
     )

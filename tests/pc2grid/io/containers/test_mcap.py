@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
 
 from pc2grid.config import ReadConfig
@@ -36,9 +37,12 @@ def unfinished(whole: bytes) -> bytes:
 
 
 def with_summary(
-    whole: bytes, change: Callable[[int, bytes], bytes | None], *, checked: bool = True
+    whole: bytes, change: Callable[[int, bytes], bytes | None], *, checked: bool = True, behind: bytes = b""
 ) -> bytes:
-    """The file with records of its summary changed or left out, with a right checksum or without one."""
+    """The file with records of its summary changed or left out, with a right checksum or without one.
+
+    behind : records to put behind the last chunk.
+    """
     at = start = summary_of(whole)
     section = b""
     while at < len(whole) - FOOTER:
@@ -47,9 +51,10 @@ def with_summary(
         if new is not None and opcode != 0x0E:  # offsets would be wrong, and are not needed
             section += bytes([opcode]) + struct.pack("<Q", len(new)) + new
         at += 9 + length
-    head = b"\x02" + struct.pack("<QQQ", 20, start, 0)
+    head = b"\x02" + struct.pack("<QQQ", 20, start + len(behind), 0)
     crc = zlib.crc32(section + head) if checked else 0
-    return whole[:start] + section + head + struct.pack("<I", crc) + whole[-8:]
+    data = whole[: start - 13] + behind + whole[start - 13 : start]
+    return data + section + head + struct.pack("<I", crc) + whole[-8:]
 
 
 def without(opcode: int) -> Callable[[int, bytes], bytes | None]:
@@ -342,8 +347,6 @@ def chunk_of(content: bytes, size: int | None = None) -> bytes:
         (chunk_of(A + ONE[:-3]) + chunk_of(ONE + ONE[:5]), "damaged"),
         (chunk_of(ONE[:9], size=99), "does not hold 99 bytes"),
         (record(CHUNK, bytes(28) + text(b"") + struct.pack("<Q", 999)), "ends within 999 bytes"),
-        (chunk_of(A + ONE) + ONE, "a message outside of the chunks"),
-        (A + ONE + chunk_of(A + ONE), "a chunk in a file with messages outside of chunks"),
     ],
 )
 def test_records_that_contradict_themselves(tmp_path: Path, body: bytes, words: str) -> None:
@@ -352,6 +355,26 @@ def test_records_that_contradict_themselves(tmp_path: Path, body: bytes, words: 
     with pytest.raises(LogError, match=words) as caught:
         read(path)
     assert "a.mcap: at byte" in str(caught.value)
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_messages_outside_of_the_chunks_are_read(tmp_path: Path, indexed: bool) -> None:
+    """They stand behind the last chunk; the index in the summary lists the chunks alone."""
+    *messages, last = drive()
+    path = write_mcap(tmp_path / "a.mcap", messages, chunk_size=2000)
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    (key,) = (channel.id for channel in summary.channels.values() if channel.topic == last.topic)
+    times = last.log_time_ns, last.log_time_ns
+    loose = record(MESSAGE, struct.pack("<HIQQ", key, 0, *times) + last.data)
+    whole = with_summary(path.read_bytes(), lambda kind, body: body, behind=loose)
+    path.write_bytes(whole if indexed else unfinished(whole))
+    scans, report = read(path)
+    check_drive(scans)
+    assert not report.lossy
+    said = "does not list the messages outside of the chunks" if indexed else "was not closed"
+    assert any(said in warning for warning in report.warnings)
 
 
 @pytest.mark.parametrize("options", [{"use_chunking": False}, {"compression": CompressionType.NONE}])
