@@ -140,7 +140,7 @@ class MapFileError(Pc2GridError):
 
 
 class TrajectoryFileError(Pc2GridError):
-    """A TUM or KITTI trajectory file is malformed."""
+    """A TUM file, or a file of times, is malformed."""
 
 
 # --- configuration, database, output ------------------------------------------------------------------

@@ -13,10 +13,13 @@ from typing import NamedTuple, Protocol
 
 from pc2grid.model import ReadReport, SensorKind
 
+GAP_NS = 5_000_000_000
+"""A longer time without messages, and clocks that differ by more, are reported; chosen by hand."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TopicInfo:
-    """One topic of one type.
+    """One topic of one type; two are equal if these and the encoding are.
 
     type : such as `sensor_msgs/PointCloud2`, without the `msg` in the middle.
     encoding : of the messages: `cdr`, `ros1`, `protobuf`, `json`, or a format of files such as `ply`.
@@ -28,9 +31,9 @@ class TopicInfo:
     topic: str
     type: str
     encoding: str
-    schema_encoding: str = ""
-    schema: bytes = field(default=b"", repr=False)
-    message_count: int | None = None
+    schema_encoding: str = field(default="", compare=False)
+    schema: bytes = field(default=b"", repr=False, compare=False)
+    message_count: int | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -97,42 +97,13 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
             out.write(" ".join((stamp_text(int(stamp_ns)), *(f"{v:.9f}" for v in values))) + "\n")
 
 
-def read_kitti(path: str | Path) -> F64:
-    """Read a KITTI pose file; returns (N, 4, 4), metres.
-
-    Raises TrajectoryFileError with the line that is wrong.
-    """
-    poses: list[F64] = []
-    for number, line in enumerate(lines_of(path), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            if len(words) != 12:
-                raise ValueError(f"expected 12 numbers (a 3x4 pose), found {len(words)}")
-            pose = np.eye(4)
-            pose[:3] = np.array([float(word) for word in words]).reshape(3, 4)
-            if not is_rigid(pose):
-                raise ValueError("not a rigid pose")
-        except ValueError as error:
-            raise TrajectoryFileError(f"{path}, line {number}: {error}") from error
-        poses.append(pose)
-    return np.array(poses).reshape(-1, 4, 4)
-
-
-def is_rigid(T: F64) -> bool:
-    """Whether a (4, 4) pose is rigid, within the rounding of numbers in a text file."""
-    R = T[:3, :3]
-    return bool(np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-2 and np.linalg.det(R) > 0)
-
-
 def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     """Write a KITTI pose file: 12 numbers per line, the upper (3, 4) of each pose, row by row, metres.
 
     Raises OutputError if it cannot be written; an existing file is replaced.
 
     >>> write_kitti("poses.txt", read_tum("tuesday.tum"))
-    >>> len(read_kitti("poses.txt")) == len(read_tum("tuesday.tum"))
+    >>> len(lines_of("poses.txt")) == len(read_tum("tuesday.tum"))
     True
     """
     with replace_file(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
@@ -144,8 +115,8 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, kind: TrajectoryF
     """Write a file of the given kind; without one KITTI for the suffix `.kitti`, else TUM, which has times.
 
     >>> write_trajectory("way.kitti", read_tum("tuesday.tum"))
-    >>> read_kitti("way.kitti").shape[1:]
-    (4, 4)
+    >>> len(lines_of("way.kitti")[0].split())
+    12
     """
     if kind is None:
         kind = "kitti" if Path(path).suffix.lower() == ".kitti" else "tum"

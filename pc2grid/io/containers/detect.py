@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
@@ -19,6 +18,23 @@ _BAG = b"#ROSBAG V2.0\n"
 _SQLITE = b"SQLite format 3\0"
 SUBMAPS_ID = b"pcsm"
 """The application id in the header of a submap database."""
+_READ = "pc2grid reads MCAP, ROS 1 bags, rosbag2 folders and .db3"
+_OTHERS = (
+    (
+        b"#ROSBAG V",
+        "a ROS 1 bag of an old format",
+        "`rosbag migrate` or `rosbag fix` makes it one of format 2.0",
+    ),
+    (b"\x89PNG", "a PNG image", "of a map, give the .yaml that names this image"),
+    (b"P5", "a PGM image", "of a map, give the .yaml that names this image"),
+    (b"\x1f\x8b", "a gzip archive", "unpack it first"),
+    (b"PK\x03\x04", "a zip archive", "unpack it first"),
+    (b"\x28\xb5\x2f\xfd", "a zstd-compressed file", "unpack it first"),
+    (b"\x04\x22\x4d\x18", "an lz4-compressed file", "unpack it first"),
+    (b"# .PCD", "a PCD cloud", "name the folder of the clouds, one file per scan"),
+    (b"ply", "a PLY cloud", "name the folder of the clouds, one file per scan"),
+)
+"""How other files begin, what they are, and what helps."""
 _RECORDED = "of a running robot, or a recording that comes through a pipe: pc2grid watch"
 
 
@@ -59,15 +75,12 @@ def is_submap_database(head: bytes) -> bool:
 def _open_file(path: Path, head: bytes, config: ReadConfig, recover: bool) -> MessageSource:
     if not head:
         raise LogTruncated(f"{path}: empty file", hint="was the recording interrupted?")
-    if head.startswith(_MCAP):
-        if os.path.getsize(path) <= len(_MCAP):  # noqa: PTH202 - the size, not the name, is meant
-            raise LogTruncated(
-                f"{path}: an MCAP that ends after its first 8 bytes", hint="nothing to recover"
-            )
-
-        return McapSource(path, config, recover=recover)
     if _MCAP.startswith(head):
-        raise LogTruncated(f"{path}: an MCAP that ends after {len(head)} bytes", hint="nothing to recover")
+        raise LogTruncated(
+            f"{path}: an MCAP that ends after its first {len(head)} bytes", hint="nothing to recover"
+        )
+    if head.startswith(_MCAP):
+        return McapSource(path, config, recover=recover)
     if head.startswith(_BAG):
         return RosbagsFile(path, config, is_bag=True)
     if is_submap_database(head):
@@ -76,7 +89,8 @@ def _open_file(path: Path, head: bytes, config: ReadConfig, recover: bool) -> Me
         )
     if head.startswith(_SQLITE):
         return RosbagsFile(path, config, is_bag=False)
-    raise NotALog(f"{path}: not a recording; looks like {_looks_like(head)}", hint=_advice(head))
+    name, advice = _looks_like(head)
+    raise NotALog(f"{path}: not a recording; looks like {name}", hint=advice)
 
 
 def _open_folder(path: Path, config: ReadConfig, recover: bool) -> MessageSource:
@@ -100,39 +114,15 @@ def _open_folder(path: Path, config: ReadConfig, recover: bool) -> MessageSource
     )
 
 
-def _looks_like(head: bytes) -> str:
-    kinds = {
-        b"#ROSBAG V": "a ROS 1 bag of an old format",
-        b"\x89PNG": "a PNG image",
-        b"P5": "a PGM image",
-        b"\x1f\x8b": "a gzip archive",
-        b"PK\x03\x04": "a zip archive",
-        b"\x28\xb5\x2f\xfd": "a zstd-compressed file",
-        b"\x04\x22\x4d\x18": "an lz4-compressed file",
-        b"# .PCD": "a PCD cloud",
-        b"ply": "a PLY cloud",
-    }
+def _looks_like(head: bytes) -> tuple[str, str]:
+    """What a file is that begins so, and what helps."""
     if is_lfs_pointer(head):
-        return "a Git LFS pointer to one"
-    for mark, name in kinds.items():
+        return "a Git LFS pointer to one", LFS_HINT
+    for mark, name, advice in _OTHERS:
         if head.startswith(mark):
-            return name
+            return name, advice
     try:
         text = head.decode("utf-8")
     except UnicodeDecodeError:
-        return "binary data of another kind"
-    return "text" if text.isprintable() or "\n" in text else "binary data of another kind"
-
-
-def _advice(head: bytes) -> str:
-    if is_lfs_pointer(head):
-        return LFS_HINT
-    if head.startswith((b"\x1f\x8b", b"PK\x03\x04", b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18")):
-        return "unpack it first"
-    if head.startswith(b"#ROSBAG V"):
-        return "`rosbag migrate` or `rosbag fix` makes it one of format 2.0"
-    if head.startswith((b"\x89PNG", b"P5")):
-        return "of a map, give the .yaml that names this image"
-    if head.startswith((b"ply", b"# .PCD")):
-        return "name the folder of the clouds, one file per scan"
-    return "pc2grid reads MCAP, ROS 1 bags, rosbag2 folders and .db3"
+        text = "\0"
+    return "text" if text.isprintable() or "\n" in text else "binary data of another kind", _READ

@@ -17,7 +17,7 @@ from mcap.records import Chunk, ChunkIndex, McapRecord, Message
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogCorrupt, LogError
-from pc2grid.io.containers.bounded_file import BoundedFile
+from pc2grid.io.containers.bounds import BoundedFile
 from pc2grid.io.containers.mcap_index import (
     McapIndex,
     Run,
@@ -158,27 +158,29 @@ class McapSource:
 
     def _load(self, listed: ChunkIndex, index: McapIndex) -> list[Message]:
         """The messages of a chunk that the index lists. Raises LogError if it is damaged."""
-        place, end = listed.chunk_start_offset, listed.chunk_start_offset + listed.chunk_length
         try:
-            self._stream.seek(place)
-            reader = records_of(self._stream, whole_file=False).records
-            records = [next(reader)]
-            while isinstance(listed, Run) and self._stream.tell() < end:
-                records.append(next(reader))
-            if self._stream.tell() != end or isinstance(records[0], Chunk) is isinstance(listed, Run):
-                raise LogCorrupt("the index points to something else")
-            if isinstance(records[0], Chunk):
-                records = self._content(records[0])
+            records = self._records(listed)
             messages = [record for record in records if isinstance(record, Message)]
             if any(message.channel_id not in index.channels for message in messages):
                 raise LogCorrupt("a message of a channel that is missing")
         except MemoryError:
             raise
         except Exception as error:
-            raise named(error, f"{self._path}: chunk at byte {place}") from error
+            raise named(error, f"{self._path}: chunk at byte {listed.chunk_start_offset}") from error
         return messages
 
-    def _content(self, chunk: Chunk) -> list[McapRecord]:
+    def _records(self, listed: ChunkIndex) -> list[McapRecord]:
+        """The records of a chunk, or of a run of messages."""
+        self._stream.seek(listed.chunk_start_offset)
+        end, reader = listed.chunk_start_offset + listed.chunk_length, records_of(self._stream)
+        records = [next(reader)]
+        while isinstance(listed, Run) and self._stream.tell() < end:
+            records.append(next(reader))
+        chunk = records[0]
+        if self._stream.tell() != end or isinstance(chunk, Chunk) is isinstance(listed, Run):
+            raise LogCorrupt("the index points to something else")
+        if not isinstance(chunk, Chunk):
+            return records
         if not chunk.uncompressed_crc and chunk.data:
             self.tally.warn(_UNCHECKED)
         return open_chunk(chunk, self._config.max_chunk_bytes)

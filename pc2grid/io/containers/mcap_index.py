@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import struct
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from mcap.opcode import Opcode
@@ -18,8 +19,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogError, LogTruncated, UnsupportedSchema
 from pc2grid.io import topics
-from pc2grid.io.containers.bounded_file import BoundedFile
-from pc2grid.io.containers.decompress import expand
+from pc2grid.io.containers.bounds import BoundedFile, expand
 from pc2grid.io.error_translation import RECOVER_HINT
 from pc2grid.io.message_source import TopicInfo
 from pc2grid.io.messages.ros_definitions import short_name
@@ -66,18 +66,19 @@ class McapIndex:
         )
 
 
-def records_of(stream: BoundedFile, *, whole_file: bool) -> StreamReader:
-    """A reader of the records of a stream, chunks as they are stored; `stream` bounds what it reads at once.
+def records_of(stream: BoundedFile, *, whole_file: bool = False) -> Iterator[McapRecord]:
+    """The records of a stream, chunks as they are stored; `stream` bounds what is read at once.
 
     whole_file : from the start of the file, the checksum of its data compared; else from where it stands.
     """
-    return StreamReader(
+    reader = StreamReader(
         stream,
         skip_magic=not whole_file,
         emit_chunks=True,
         validate_crcs=whole_file,
         record_size_limit=None,
     )
+    return reader.records
 
 
 def open_chunk(chunk: Chunk, most_bytes: int) -> list[McapRecord]:
@@ -115,8 +116,8 @@ def named(error: Exception, where: str, behind: str = "") -> LogError:
     return kind(f"{where}: {what}{behind}", hint=getattr(error, "hint", None) or RECOVER_HINT)
 
 
-def read_summary(stream: BoundedFile) -> McapIndex:
-    """The index in the summary at the end of a file. Raises LogError if there is none, or it is damaged."""
+def _has_checksum(stream: BoundedFile) -> bool:
+    """Whether the summary has a checksum. Raises LogError if it is wrong, or there is no summary."""
     size = stream.seek(0, io.SEEK_END)
     stream.seek(max(size - _FOOTER.size, 0))
     start, _, crc, magic = _FOOTER.unpack(stream.read(_FOOTER.size))
@@ -125,6 +126,12 @@ def read_summary(stream: BoundedFile) -> McapIndex:
     stream.seek(start)
     if start and crc and zlib.crc32(stream.read(size - start - len(_MAGIC) - 4)) != crc:
         raise LogCorrupt("its checksum (CRC) is wrong")
+    return bool(crc)
+
+
+def read_summary(stream: BoundedFile) -> McapIndex:
+    """The index in the summary at the end of a file. Raises LogError if there is none, or it is damaged."""
+    checked = _has_checksum(stream)
     stream.seek(0)
     summary = SeekingReader(stream, record_size_limit=None).get_summary()
     if summary is None or summary.statistics is None:
@@ -145,7 +152,7 @@ def read_summary(stream: BoundedFile) -> McapIndex:
         sum(counts.values()) == statistics.message_count,
         statistics.message_start_time,
         statistics.message_end_time,
-        checked=bool(crc),
+        checked=checked,
     )
 
 
@@ -197,7 +204,7 @@ class Survey:
         index.end_ns = max((last for _, last in spans), default=0)
 
     def _read(self, stream: BoundedFile) -> None:
-        for record in records_of(stream, whole_file=True).records:
+        for record in records_of(stream, whole_file=True):
             if not self.closed:  # what the summary repeats may be damaged
                 self._take(record, stream.tell())
             self.at = stream.tell()

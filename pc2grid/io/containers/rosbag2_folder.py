@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import yaml
 
 from pc2grid.errors import LogCorrupt, LogNotFound
-from pc2grid.io.containers.split_recording import SplitSource
-from pc2grid.io.message_source import MessageSource, Tally
+from pc2grid.io.containers.bounds import plain_message
+from pc2grid.io.message_source import LogInfo, MessageSource, RawMessage, Tally, TopicInfo
 from pc2grid.model import MISSING_FILES
 
 METADATA = "metadata.yaml"
@@ -48,14 +48,7 @@ def open_folder(
         tally.skip(MISSING_FILES)
     if not there:
         raise LogNotFound(f"{folder}: none of the files of the recording is there")
-    parts: list[MessageSource] = []
-    with contextlib.ExitStack() as opened:
-        for path in there:
-            part = open_file(path)
-            opened.callback(part.close)
-            parts.append(part)
-        opened.pop_all()
-    return SplitSource(folder, parts, tally, max_chunk_bytes)
+    return SplitSource(folder, [open_file(path) for path in there], tally, max_chunk_bytes)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -86,3 +79,72 @@ def _listed(metadata: Path) -> list[str]:
             f"{metadata}: not the metadata of a recording ({type(error).__name__})",
             hint="`ros2 bag reindex` writes it anew",
         ) from error
+
+
+class SplitSource:
+    """The parts of a recording in the order in which they were recorded; they share one tally."""
+
+    def __init__(
+        self, path: Path, parts: Sequence[MessageSource], tally: Tally, max_chunk_bytes: int
+    ) -> None:
+        self._parts = parts
+        self.files: tuple[Path, ...] = tuple(file for part in parts for file in part.files)
+        self.tally = tally
+        for part in parts:
+            tally.take_over(part.tally)
+            part.tally = tally
+        self._max_chunk_bytes = max_chunk_bytes
+        self.info = _info(path, [part.info for part in parts], tally)
+
+    def close(self) -> None:
+        """Close all files."""
+        for part in self._parts:
+            part.close()
+
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """See MessageSource.messages; parts outside of the time range are not read."""
+        for part in self._parts:
+            if start_ns is not None and part.info.end_ns < start_ns:
+                continue
+            if end_ns is not None and part.info.start_ns >= end_ns:
+                continue
+            for channel, log_time_ns, data in part.messages(topics, start_ns, end_ns):
+                yield RawMessage(channel, log_time_ns, plain_message(data, self._max_chunk_bytes))
+
+
+def _info(path: Path, infos: Sequence[LogInfo], tally: Tally) -> LogInfo:
+    """The facts about the whole recording, by those about its parts."""
+    spans = [info for info in infos if info.message_count != 0]
+    topics = _merged([t for info in infos for t in info.topics])
+    return LogInfo(
+        path=path,
+        format=next((info.format for info in infos if info.topics), infos[0].format),
+        size_bytes=sum(info.size_bytes for info in infos),
+        start_ns=min((s.start_ns for s in spans), default=0),
+        end_ns=max((s.end_ns for s in spans), default=0),
+        message_count=_total(info.message_count for info in infos),
+        topics=tuple(sorted(topics, key=lambda t: (t.topic, t.type))),
+        warnings=tuple(tally.warnings),
+    )
+
+
+def _merged(topics: Iterable[TopicInfo]) -> list[TopicInfo]:
+    """The topics of the whole recording, with all messages counted."""
+    groups: dict[TopicInfo, list[TopicInfo]] = {}
+    for topic in topics:
+        groups.setdefault(topic, []).append(topic)
+    return [
+        replace(
+            next((t for t in group if t.schema), group[0]),
+            message_count=_total(t.message_count for t in group),
+        )
+        for group in groups.values()
+    ]
+
+
+def _total(counts: Iterable[int | None]) -> int | None:
+    """The sum; None if one is unknown."""
+    known = list(counts)
+    return None if None in known else sum(count for count in known if count is not None)

@@ -6,6 +6,7 @@ so its reads and decompressions are bounded, and an index or a table that misses
 
 from __future__ import annotations
 
+import functools
 import io
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -14,8 +15,7 @@ from urllib.parse import quote
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogTruncated, NotALog
-from pc2grid.io.containers.bounded_file import BoundedFile
-from pc2grid.io.containers.decompress import plain_message, unpacker
+from pc2grid.io.containers.bounds import BoundedFile, plain_message, unpacked
 from pc2grid.io.error_translation import guarded, guarded_stream
 from pc2grid.io.message_source import LogInfo, RawMessage, Tally, TopicInfo
 from pc2grid.io.messages.ros_definitions import short_name
@@ -129,7 +129,7 @@ def _bag(path: Path, config: ReadConfig) -> Any:
         raise LogCorrupt("the index does not list what the chunks hold")
     names = {function: name for name, function in decompressors.items()}
     for place, chunk in reader.chunks.items():
-        bounded = unpacker(names[chunk.decompressor], config.max_chunk_bytes)
+        bounded = functools.partial(unpacked, names[chunk.decompressor], config.max_chunk_bytes)
         reader.chunks[place] = chunk._replace(decompressor=bounded)
     return reader
 

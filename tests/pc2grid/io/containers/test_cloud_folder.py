@@ -20,7 +20,7 @@ from pc2grid.errors import (
     UnsupportedSchema,
 )
 from pc2grid.io import open_log
-from pc2grid.io.trajectory import write_kitti, write_tum
+from pc2grid.io.trajectory import write_tum
 from pc2grid.model import Trajectory
 from tests.helpers.cloud_folders import KINDS, POINTS, folder_of, trajectory, write_cloud
 from tests.helpers.recordings import STEP, T0, read
@@ -91,19 +91,11 @@ def test_names_that_are_times(tmp_path: Path, names: str) -> None:
     assert not any("assumed" in w for w in report.warnings)
 
 
-def test_kitti_with_times_poses_and_calibration(tmp_path: Path) -> None:
+def test_times_as_kitti_has_them(tmp_path: Path) -> None:
     sequence = tmp_path / "00"
     folder = folder_of(sequence, "bin", name="velodyne")
     (sequence / "times.txt").write_text("".join(f"{0.1 * i:.6e}\n" for i in range(12)))
-    # Camera axes in lidar axes (x right, y down, z forward), 0.3 m behind.
-    T_cam_lidar = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, -0.3], [0, 0, 0, 1.0]])
-    expected = trajectory()
-    in_camera = T_cam_lidar @ expected.T_session_base @ np.linalg.inv(T_cam_lidar)
-    write_kitti(sequence / "poses.txt", Trajectory(stamps_ns=expected.stamps_ns, T_session_base=in_camera))
-    row = " ".join(str(v) for v in T_cam_lidar[:3].ravel())
-    (sequence / "calib.txt").write_text(f"P0: {row}\nTr: {row}\n")
     scans, report = read(folder)
-    np.testing.assert_allclose(np.array([s.T_odom_base for s in scans]), expected.T_session_base, atol=1e-8)
     assert np.diff([s.stamp_ns for s in scans]).tolist() == [STEP] * 11
     assert not any("assumed" in w for w in report.warnings)
     (sequence / "times.txt").write_text("0.0\n0.1\n")

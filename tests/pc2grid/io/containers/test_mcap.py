@@ -99,6 +99,8 @@ def test_writers_that_leave_parts_out(tmp_path: Path, options: dict[str, Any], w
     with open_log(path) as log, open_log(whole) as usual:
         assert [log.info.start_ns, log.info.end_ns] == [usual.info.start_ns, usual.info.end_ns]
         assert (log.info.message_count, log.info.topics) == (usual.info.message_count, usual.info.topics)
+        counts = [[t.message_count for t in info.topics] for info in (log.info, usual.info)]
+        assert counts[0] == counts[1]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -62,6 +63,8 @@ def check(messages: list[Message], *sources: MessageSource) -> None:
     for source in sources:
         assert source.tally.bytes_lost == 0
         assert source.info.message_count == len(messages)
+        counts = Counter(m.topic for m in messages)
+        assert all(t.message_count == counts[t.topic] for t in source.info.topics)
         assert source.info.start_ns == min(m.log_time_ns for m in messages)
         assert source.info.end_ns == max(m.log_time_ns for m in messages)
         for topics in (names, {"/points"}, {"/odom", "/tf"}, {"/none"}, set[str]()):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogTruncated
-from pc2grid.io.containers.bounded_file import BoundedFile
+from pc2grid.io.containers.bounds import BoundedFile
 from tests.helpers.memory import bounded_memory
 
 
